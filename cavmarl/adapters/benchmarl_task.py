@@ -18,8 +18,6 @@ try:
 except ModuleNotFoundError as error:
     raise missing(error, "benchmarl") from error
 
-__all__ = ["CavTask", "CavTaskClass"]
-
 DECIDED = ("num_envs", "device", "action.kind")
 
 

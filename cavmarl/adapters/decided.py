@@ -7,8 +7,6 @@ from typing import Any
 
 from cavmarl.core.errors import ConfigError
 
-__all__ = ["refuse_decided"]
-
 
 def refuse_decided(keys: Iterable[str], *given: Mapping[str, Any] | None) -> None:
     """Refuse what a caller gave for keys that the view decides.

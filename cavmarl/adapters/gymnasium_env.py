@@ -11,8 +11,6 @@ from cavmarl.adapters.decided import refuse_decided
 from cavmarl.config.registry import load_config
 from cavmarl.env.parallel import CavEnv, parallel_env
 
-__all__ = ["CavEgoEnv"]
-
 EGO = "car_0"
 DECIDED = ("agents", "population.agents", "population.budget")
 

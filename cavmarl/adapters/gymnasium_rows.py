@@ -17,8 +17,6 @@ from cavmarl.config.registry import load_config
 from cavmarl.core.errors import ConfigError
 from cavmarl.env.vector import CavVectorEnv, make_vec
 
-__all__ = ["CavAgentRows"]
-
 DECIDED = ("agents", "population.budget")
 
 

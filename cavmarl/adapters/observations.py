@@ -11,8 +11,6 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.spaces import named_observation, observation_parts, observation_space
 
-__all__ = ["ObservationForm"]
-
 Observations = NDArray[np.float32] | dict[str, NDArray[Any]]
 
 

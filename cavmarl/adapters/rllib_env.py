@@ -16,8 +16,6 @@ try:
 except ModuleNotFoundError as error:
     raise missing(error, "rllib") from error
 
-__all__ = ["CavRllibEnv"]
-
 Step = tuple[
     dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, float]]
 ]

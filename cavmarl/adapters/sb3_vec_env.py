@@ -24,8 +24,6 @@ try:
 except ModuleNotFoundError as error:
     raise missing(error, "sb3") from error
 
-__all__ = ["CavSb3VecEnv"]
-
 DECIDED = ("autoreset_mode", "copy")  # stable-baselines3 resets in the same step and keeps views
 ARRIVAL = TERMS.index("arrival")
 

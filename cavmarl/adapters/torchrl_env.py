@@ -30,8 +30,6 @@ try:
 except ModuleNotFoundError as error:
     raise missing(error, "torchrl") from error
 
-__all__ = ["GROUP", "CavTorchRLEnv"]
-
 GROUP = "car"
 DECIDED = ("autoreset_mode", "copy")  # TorchRL resets worlds itself and keeps what it is given
 

@@ -12,8 +12,6 @@ from cavmarl.balance.shard_placement import Placement, Workers
 from cavmarl.balance.sliding import divide_row, slide
 from cavmarl.balance.spreading import spread, string
 
-__all__ = ["assign", "workers_of"]
-
 
 def workers_of(problem: Problem) -> tuple[Workers, tuple[Rejection, ...]]:
     """Those that answer, and why which ones are given nothing."""

@@ -13,8 +13,6 @@ from cavmarl.balance.problem import Problem
 from cavmarl.balance.shard_placement import Placement
 from cavmarl.core.errors import ConfigError
 
-__all__ = ["Plan", "ShardMove", "WorkerLoad", "make_plan", "replan"]
-
 SCHEMA = "cavmarl.plan"
 VERSION = 1
 

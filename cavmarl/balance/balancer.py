@@ -11,8 +11,6 @@ from cavmarl.balance.problem import MEASURED_COSTS, BalanceRule, Problem, ShardC
 from cavmarl.balance.smoothing import SmoothCosts
 from cavmarl.core.errors import ConfigError
 
-__all__ = ["Balancer"]
-
 
 class Balancer:
     """Keeps the plan, and what is known of the shards' costs.

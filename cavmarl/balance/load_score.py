@@ -18,22 +18,6 @@ from typing import Literal, NamedTuple
 
 from cavmarl.core.errors import ConfigError, NoAdmissibleWorkerError
 
-__all__ = [
-    "RESOURCES",
-    "THRESHOLDS",
-    "WEIGHTS",
-    "Candidate",
-    "LoadRule",
-    "Outcome",
-    "Rejection",
-    "Selection",
-    "Utilisation",
-    "admissible",
-    "find_rejections",
-    "load_score",
-    "select",
-]
-
 RESOURCES = ("cpu", "ram", "gpu")
 WEIGHTS = (0.6, 0.2, 0.2)  # empirical in the paper; the processor carries nearly everything
 THRESHOLDS = (0.85, 0.90, 0.95)

@@ -12,8 +12,6 @@ from typing import Any
 from cavmarl.balance.load_score import Candidate, Utilisation
 from cavmarl.core.errors import ConfigError
 
-__all__ = ["NO_GPU", "SUPPOSED_IDLE", "LoadSnapshot", "idle_snapshot"]
-
 NO_GPU = "none"
 SUPPOSED_IDLE = "supposed idle"
 

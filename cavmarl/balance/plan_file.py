@@ -13,15 +13,6 @@ from cavmarl.balance.load_snapshot import LoadSnapshot
 from cavmarl.balance.problem import MEASURED_COSTS, BalanceRule, Problem, ShardCost
 from cavmarl.core.errors import ConfigError
 
-__all__ = [
-    "PLACEMENT",
-    "PLACEMENT_AT_END",
-    "plan_from_dict",
-    "read_plan",
-    "read_plans",
-    "snapshot_from_dict",
-]
-
 # Of a manifest: the plans when the run began, and those when it ended.
 PLACEMENT, PLACEMENT_AT_END = "placement", "placement_at_end"
 

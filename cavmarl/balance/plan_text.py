@@ -9,8 +9,6 @@ from itertools import groupby
 from cavmarl.balance.balance_plan import Plan
 from cavmarl.balance.problem import MEASURED_COSTS
 
-__all__ = ["describe_plan"]
-
 HEADINGS = (
     "worker",
     "cpu",

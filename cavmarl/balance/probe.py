@@ -14,8 +14,6 @@ from cavmarl.balance.load_score import Candidate, Utilisation
 from cavmarl.balance.load_snapshot import NO_GPU, LoadSnapshot
 from cavmarl.core.errors import ConfigError
 
-__all__ = ["MEASURED", "Watch", "take_snapshot"]
-
 MEASURED = "measured"
 INTERVAL_S = 0.2
 SHORTEST_S = 0.01  # a tick of the system's clocks

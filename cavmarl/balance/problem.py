@@ -12,8 +12,6 @@ from cavmarl.balance.load_score import LoadRule
 from cavmarl.balance.load_snapshot import LoadSnapshot
 from cavmarl.core.errors import ConfigError
 
-__all__ = ["MEASURED_COSTS", "BalanceRule", "Problem", "ShardCost", "equal_costs"]
-
 MEASURED_COSTS = "measured"
 
 MAX_COST_S = 1e6  # of a tick: sums stay finite

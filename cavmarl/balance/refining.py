@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from cavmarl.balance.problem import Problem
 from cavmarl.balance.shard_placement import Placement
 
-__all__ = ["LEAST_GAIN", "refine"]
-
 Floats = NDArray[np.float64]
 LEAST_GAIN = 1e-9  # of a tick: below it sums may differ by rounding
 MOVES_A_SHARD = 4  # a limit that is not met: every change makes the slowest pair faster

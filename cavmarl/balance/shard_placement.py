@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from cavmarl.balance.load_score import Candidate, Rejection, load_score
 from cavmarl.balance.problem import Problem
 
-__all__ = ["Placement", "Workers"]
-
 Floats = NDArray[np.float64]
 MIN_SPEED = 0.01  # of a worker that has nothing left: it is slow, not endless
 

@@ -12,8 +12,6 @@ from cavmarl.balance.refining import LEAST_GAIN
 from cavmarl.balance.shard_placement import Placement
 from cavmarl.core.errors import NoAdmissibleWorkerError
 
-__all__ = ["divide_row", "slide"]
-
 
 def divide_row(placement: Placement) -> Placement:
     """Cut the row into one piece a worker, as long as its speed; one shard at least.

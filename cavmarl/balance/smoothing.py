@@ -7,8 +7,6 @@ from collections.abc import Iterable
 from cavmarl.balance.problem import ShardCost
 from cavmarl.core.errors import ConfigError
 
-__all__ = ["NEWEST", "SmoothCosts"]
-
 NEWEST = 0.3  # weight of the newest measurement
 
 

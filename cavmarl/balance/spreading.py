@@ -7,8 +7,6 @@ from collections.abc import Iterable, Sequence
 
 from cavmarl.balance.shard_placement import Placement
 
-__all__ = ["spread", "string"]
-
 HALVINGS = 60  # of an interval: more than a float can tell
 
 

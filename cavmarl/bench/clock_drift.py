@@ -22,8 +22,6 @@ from cavmarl.cosim.followers.followed_world import FollowedWorld
 from cavmarl.cosim.time_master import OwnTicks
 from cavmarl.env.parallel import parallel_env
 
-__all__ = ["ClockDrift", "DriftRow", "measure_drift", "rows_of", "write_rows"]
-
 PROGRAM = "cavmarl.cosim.followers.clock_reader"
 ENDS_S = 30.0  # for the follower to end by itself
 JOINS_S = 60.0  # for it to start

@@ -19,8 +19,6 @@ from cavmarl.bench.worker_speed import WARM_STEPS, drive_ms
 from cavmarl.core.errors import ConfigError, WorkerError
 from cavmarl.env.vector import make_vec
 
-__all__ = ["CoreCeiling", "measure_ceiling"]
-
 START_S = 300.0  # that a program may take until its worlds can be stepped
 
 

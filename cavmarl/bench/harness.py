@@ -20,23 +20,6 @@ from rich.table import Table
 
 from cavmarl.core.errors import ConfigError
 
-__all__ = [
-    "Result",
-    "Say",
-    "Spread",
-    "check_positive",
-    "check_range",
-    "hardware_line",
-    "make_table",
-    "measuring",
-    "numbers_of",
-    "one_core",
-    "paired_ratio",
-    "silent",
-    "spread",
-    "take_turns",
-]
-
 Say = Callable[[str], None]
 Key = TypeVar("Key")
 Taken = TypeVar("Taken")

@@ -15,8 +15,6 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnvWrapper
 from cavmarl.bench.highway_worlds import highway_env
 from cavmarl.core.errors import require
 
-__all__ = ["HighwayRows"]
-
 
 class HighwayRows(VecEnvWrapper):
     """Each controlled vehicle is a row; the rows of a world end together, and are paid alike.

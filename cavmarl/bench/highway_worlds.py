@@ -12,20 +12,6 @@ from typing import Any
 
 from cavmarl.core.errors import require
 
-__all__ = [
-    "IDLE",
-    "KINEMATICS",
-    "LIDAR",
-    "RUN_OUT_M",
-    "THEIR_KINEMATICS",
-    "THEIR_LIDAR",
-    "THEIR_RAW_KINEMATICS",
-    "highway_env",
-    "length_m",
-    "overrides",
-    "straight_road",
-]
-
 RAYS = 64
 RANGE_M = 60.0
 NEIGHBORS = 16

@@ -34,8 +34,6 @@ from cavmarl.parallel.sensor_workers.sensor_shares import (
     share_in_turn,
 )
 
-__all__ = ["SensorBench", "first_job", "job_config", "measure_sensor_workers", "run_job"]
-
 MAX_WORKERS = 64
 PROGRAM = "cavmarl.bench.sensor_run"
 CEILING_STEPS, CEILING_TURNS = 10, 7

@@ -8,8 +8,6 @@ from pathlib import Path
 from cavmarl.bench.sensor_scaling import ScalingRow
 from cavmarl.core.errors import ConfigError, require
 
-__all__ = ["plot_sensor_workers"]
-
 FPS, STEP = "#2f6db5", "#d1793b"
 HEADROOM = 1.1  # over the largest value
 

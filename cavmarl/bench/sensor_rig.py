@@ -12,8 +12,6 @@ from cavmarl.config.registry import places
 from cavmarl.core.errors import ConfigError
 from cavmarl.sensors.mounted.catalogue import type_of
 
-__all__ = ["Rig", "describe_rig", "find_rig", "load_rig"]
-
 Rig = dict[str, dict[str, Any]]
 
 _PLACE = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")

@@ -23,8 +23,6 @@ from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.sensor_workers.sensor_pool import SensorWorkers, SensorWorkerTimes
 
-__all__ = ["PARTS", "SensorJob", "SensorRun", "Window", "main", "run_sensors"]
-
 WINDOW = 25  # steps
 
 PARTS = (

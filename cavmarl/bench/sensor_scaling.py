@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import ConfigError
 from cavmarl.evaluate.statistics import Interval, mean_interval
 
-__all__ = ["MIN_RUNS", "Measured", "ScalingRow", "Series", "scaling_table", "summarize"]
-
 MIN_RUNS = 5  # from so many on there is an interval between runs
 
 _PLACES = Decimal("0.01")

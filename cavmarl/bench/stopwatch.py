@@ -7,8 +7,6 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
-__all__ = ["Stopwatch"]
-
 CALIBRATION = 20_000  # empty calls
 
 

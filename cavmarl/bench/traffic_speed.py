@@ -30,8 +30,6 @@ from cavmarl.evaluate.traffic.native_side import advance, idle_commands, make_wo
 from cavmarl.evaluate.traffic.sumo_side import SumoJob, start_sumo, sumo_process
 from cavmarl.traffic.sumo.sumo_input import read_input
 
-__all__ = ["TURN_S", "TrafficSpeed", "Turn", "load_sumo", "measure_traffic_speed", "turn_of_sumo"]
-
 TURN_S = 10
 
 

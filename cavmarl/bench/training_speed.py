@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from cavmarl.learning.ppo_settings import PpoSettings
     from cavmarl.learning.run import Run
 
-__all__ = ["TrainingRow", "TrainingSpeed", "measure_training"]
-
 HORIZON_S = 40.0
 OUR_STEPS = 32  # of a world between two updates
 EPOCHS = 4

@@ -19,8 +19,6 @@ from cavmarl.evaluate.provenance.machine import describe_hardware
 from cavmarl.parallel.pooled_worlds import PooledWorlds
 from cavmarl.parallel.processes.worker_pool import Pool
 
-__all__ = ["WARM_STEPS", "Measured", "Row", "WorkerSpeed", "drive_ms", "measure_workers"]
-
 WARM_STEPS = 20
 PINGS = 2000  # a turn
 IDLE_S = 1.0

@@ -9,8 +9,6 @@ import typer
 
 from cavmarl.cli.output import JsonPath, Seed, write_json
 
-__all__ = ["app"]
-
 app = typer.Typer(help="Make files of demand.", no_args_is_help=True)
 
 

@@ -16,8 +16,6 @@ from cavmarl.cli.output import JsonPath, Seed, make_folder, write_json
 from cavmarl.cli.view import record
 from cavmarl.core.errors import ConfigError
 
-__all__ = ["demo"]
-
 _CHECKOUT = Path(__file__).resolve().parents[2]
 _SCRIPT = _CHECKOUT / "train" / "ippo_torch.py"
 _SETTINGS = _CHECKOUT / "configs" / "train" / "demo.yaml"

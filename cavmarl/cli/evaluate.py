@@ -35,16 +35,6 @@ if TYPE_CHECKING:
     from cavmarl.evaluate.report import Found, PairedDifference, PolicyReport
     from cavmarl.ownership.transfer_summary import TransferSummary
 
-__all__ = [
-    "difference_table",
-    "evaluate",
-    "evaluate_showing",
-    "progress_bar",
-    "report",
-    "report_cell",
-    "report_table",
-]
-
 HtmlPath = Annotated[
     Path | None, typer.Option("--html", help="Write a page with tables, plots and the map here.")
 ]

@@ -12,8 +12,6 @@ from cavmarl.cli.lead import DEFAULT_PLACE, address_of
 from cavmarl.cli.output import Environment, JsonPath, write_json
 from cavmarl.core.errors import ConfigError
 
-__all__ = ["follow"]
-
 
 def follow(
     env: Environment,

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from cavmarl.handoff.coordinator.journal_summary import JournalSummary
     from cavmarl.ownership.table import Table as OwnerTable
 
-__all__ = ["journal"]
-
 
 def journal(
     file: Annotated[

@@ -24,8 +24,6 @@ from cavmarl.core.errors import ConfigError
 if TYPE_CHECKING:
     from cavmarl.cosim.followers.followed_world import FollowedWorld
 
-__all__ = ["DEFAULT_PLACE", "address_of", "lead"]
-
 DEFAULT_PLACE = "cavmarl.sock"
 
 Place = Annotated[

@@ -10,8 +10,6 @@ from rich.table import Table
 from cavmarl.cli.output import JsonPath, write_json
 from cavmarl.config.registry import agent_entries, entries, load_config
 
-__all__ = ["list_entries"]
-
 
 def list_entries(json_path: JsonPath = None) -> None:
     """Show the environments and the drivers that a name can mean."""

@@ -17,8 +17,6 @@ from cavmarl.maps.check import MapReport, check_map
 from cavmarl.maps.netconvert import Box, BuildResult, build_network
 from cavmarl.roads.sumo_net.reader import map_name
 
-__all__ = ["app"]
-
 app = typer.Typer(
     help="Build road networks, check that they can be driven, and divide them.",
     no_args_is_help=True,

@@ -22,8 +22,6 @@ from cavmarl.zones.partition.zone_loops import zones_without_loop
 from cavmarl.zones.partition.zone_partition import ZonePartition
 from cavmarl.zones.partition.zone_statistics import ZoneStatistics, zone_statistics
 
-__all__ = ["zones"]
-
 
 def zones(
     env: Environment,

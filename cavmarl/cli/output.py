@@ -18,23 +18,6 @@ from cavmarl.core.seeds import check_seed
 if TYPE_CHECKING:
     from cavmarl.verify.differences import Difference
 
-__all__ = [
-    "Agents",
-    "Background",
-    "Environment",
-    "JsonPath",
-    "PolicyName",
-    "Seed",
-    "Settings",
-    "make_folder",
-    "number",
-    "parse_settings",
-    "print_error",
-    "say_difference",
-    "writable",
-    "write_json",
-]
-
 
 def writable(path: Path | None) -> Path | None:
     """Refuse a path that cannot be written before any work is done for it."""

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from cavmarl.roads.network import RoadNetwork
     from cavmarl.zones.partition.zone_partition import ZonePartition
 
-__all__ = ["plan"]
-
 NOW, IDLE = "now", "idle"
 LASTING_S = 3600  # of the worlds: longer than any measurement
 

@@ -19,8 +19,6 @@ from cavmarl.core.errors import ConfigError
 if TYPE_CHECKING:
     from cavmarl.evaluate.scenarios.scenario_runs import ScenarioRun
 
-__all__ = ["app"]
-
 WIDTH = 140  # of the table of a sweep, which goes into pages: it is never cut off
 
 app = typer.Typer(help="Scripted conflicts for agents.", no_args_is_help=True)

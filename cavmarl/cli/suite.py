@@ -17,8 +17,6 @@ from cavmarl.cli.output import JsonPath, Seed, make_folder, write_json
 if TYPE_CHECKING:
     from cavmarl.evaluate import EvaluationReport
 
-__all__ = ["suite"]
-
 SHOWN = ("success", "collision", "delay_s")  # as many as eighty columns hold
 
 

@@ -27,8 +27,6 @@ from cavmarl.core.errors import ConfigError
 if TYPE_CHECKING:
     from cavmarl.env.parallel import CavEnv
 
-__all__ = ["record", "view"]
-
 
 def view(
     env: Environment,

@@ -13,8 +13,6 @@ from typing import Any, ClassVar, get_args, get_type_hints
 
 from cavmarl.core.errors import ConfigError
 
-__all__ = ["Section", "Whole", "Within", "check", "check_finite", "check_ranges"]
-
 
 @dataclass(frozen=True)
 class Within:

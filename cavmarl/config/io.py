@@ -22,8 +22,6 @@ from pydantic_core import ErrorDetails
 
 from cavmarl.core.errors import ConfigError
 
-__all__ = ["dotted_keys", "read_yaml", "validate"]
-
 T = TypeVar("T")
 
 MAX_BYTES = 1 << 16

@@ -25,21 +25,6 @@ from cavmarl.core.errors import (
     require,
 )
 
-__all__ = [
-    "MAP_SUFFIXES",
-    "agent_entries",
-    "entries",
-    "find_entry",
-    "load_config",
-    "load_rig",
-    "places",
-    "resolve_buildings",
-    "resolve_demand",
-    "resolve_map",
-    "resolve_programs",
-    "resolve_zones",
-]
-
 MAP_SUFFIXES = (".net.xml", ".net.xml.gz", ".osm", ".osm.gz", ".osm.xml", ".xodr")
 
 _PACKAGE = Path(__file__).resolve().parents[1]

@@ -9,8 +9,6 @@ import warnings
 from collections.abc import Mapping
 from typing import Any
 
-__all__ = ["OLD_TERMS", "with_current_names"]
-
 # Dotted key before → now.
 KEYS = {
     "workers.repeats": "workers.max_retries",

@@ -20,28 +20,6 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from cavmarl.config.checks import Whole, Within, check, check_finite, check_ranges
 
-__all__ = [
-    "BevGridConfig",
-    "CameraConfig",
-    "CollisionConfig",
-    "DepthCameraConfig",
-    "GnssConfig",
-    "ImuConfig",
-    "LaneBoundaryConfig",
-    "LidarRigConfig",
-    "MountedConfig",
-    "OdometryConfig",
-    "RadarConfig",
-    "RgbCameraConfig",
-    "Rig",
-    "RigSensor",
-    "SampledConfig",
-    "SemanticCameraConfig",
-    "cadence",
-    "check_rig",
-    "samples_per_step",
-]
-
 MAX_SENSORS = 64
 MAX_RAYS = 8192  # of a layer: one every 0.05 degrees all around, and less than that
 MAX_SAMPLE_NUMBERS = 1 << 22  # of one sensor: a picture of 1920 by 1080 with two bytes

@@ -6,8 +6,6 @@ from dataclasses import dataclass, field
 
 from cavmarl.config.checks import check
 
-__all__ = ["ScenarioConfig"]
-
 
 @dataclass(frozen=True)
 class ScenarioConfig:

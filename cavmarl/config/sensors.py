@@ -15,23 +15,6 @@ from typing import Annotated, Literal
 from cavmarl.config.checks import Section, Whole, Within, check, check_finite
 from cavmarl.core.extensions import REGISTERED_SENSORS
 
-__all__ = [
-    "GRID_FEATURES",
-    "VEHICLE_FEATURES",
-    "EgoConfig",
-    "KinematicsConfig",
-    "LanesConfig",
-    "LidarConfig",
-    "LidarObservationConfig",
-    "MessagesConfig",
-    "NeighborsConfig",
-    "OccupancyGridConfig",
-    "RoadgraphConfig",
-    "RouteAheadConfig",
-    "SensorsConfig",
-    "SignalAheadConfig",
-]
-
 # highway-env's features of one vehicle, in the order of their codes in
 # sensors/kernels/vehicle_features.py.
 VEHICLE_FEATURES = (

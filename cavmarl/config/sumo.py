@@ -7,8 +7,6 @@ from typing import Annotated, Literal
 
 from cavmarl.config.checks import Section, Whole
 
-__all__ = ["SumoConfig"]
-
 
 @dataclass(frozen=True)
 class SumoConfig(Section, key="sumo"):

@@ -10,16 +10,6 @@ from typing import Annotated
 
 from cavmarl.config.checks import Section, Whole, Within, check
 
-__all__ = [
-    "CamConfig",
-    "ChannelConfig",
-    "DenmConfig",
-    "InboxConfig",
-    "PerceptionConfig",
-    "RoadsideConfig",
-    "V2xConfig",
-]
-
 MAX_RATE_HZ = 1000.0
 MAX_LATENCY_TICKS = 64
 EVERY_SIGNAL = "all"

@@ -37,38 +37,6 @@ import importlib
 from pathlib import Path
 from types import ModuleType
 
-__all__ = [
-    "ActionError",
-    "CapacityError",
-    "CavmarlError",
-    "ClockError",
-    "ConfigError",
-    "DemandError",
-    "EpisodeError",
-    "EvaluationError",
-    "FollowerError",
-    "FollowerLostError",
-    "JournalError",
-    "LostTickError",
-    "ManifestError",
-    "MapError",
-    "MessageError",
-    "MissingExtraError",
-    "NoAdmissibleWorkerError",
-    "PolicyError",
-    "ProtocolError",
-    "RegisteredFunctionError",
-    "RouteError",
-    "ScenarioError",
-    "SumoError",
-    "UnknownEnvironmentError",
-    "WorkerDeathError",
-    "WorkerError",
-    "WorkerFailureError",
-    "missing",
-    "require",
-]
-
 
 class CavmarlError(Exception):
     """Base of all errors of this package."""

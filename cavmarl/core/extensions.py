@@ -13,15 +13,6 @@ from typing import Any, Generic, TypeVar
 
 from cavmarl.core.errors import ConfigError, WorkerError
 
-__all__ = [
-    "REGISTERED_MODELS",
-    "REGISTERED_SENSORS",
-    "REGISTERED_TERMS",
-    "Registry",
-    "extension_modules",
-    "load_extensions",
-]
-
 T = TypeVar("T")
 
 

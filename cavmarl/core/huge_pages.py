@@ -15,8 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-__all__ = ["huge_copy", "huge_zeros"]
-
 PAGE = 1 << 21  # bytes
 LEAST = 1 << 16  # bytes of an array that is worth it
 _LINE = 64  # bytes of a cache line: no two arrays share one

@@ -7,7 +7,5 @@ from typing import Any, TypeAlias
 
 from numpy.typing import NDArray
 
-__all__ = ["Zeros"]
-
 Zeros: TypeAlias = Callable[..., NDArray[Any]]
 """Called like `numpy.zeros`, which it is unless processes share a world."""

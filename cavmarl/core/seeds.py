@@ -8,8 +8,6 @@ import numpy as np
 
 from cavmarl.core.errors import ConfigError
 
-__all__ = ["check_seed", "first_seed"]
-
 SEED_BITS = 63
 
 

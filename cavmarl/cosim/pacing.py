@@ -9,8 +9,6 @@ from typing import Protocol
 
 from cavmarl.core.errors import ConfigError
 
-__all__ = ["Lateness", "Pacer", "RealTime", "Stepwise", "Unpaced"]
-
 
 class Pacer(Protocol):
     """Says when the next step may begin."""

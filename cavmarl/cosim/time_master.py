@@ -25,8 +25,6 @@ from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.step_trace import StepTrace
 from cavmarl.shards.shard import Commands
 
-__all__ = ["ClockEvent", "OwnTicks", "Steppable", "TimeFollower", "TimeMaster"]
-
 OwnTicks = Literal["refuse", "ignore", "obey"]
 
 KEPT_EVENTS = 10_000

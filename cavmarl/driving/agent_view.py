@@ -17,8 +17,6 @@ from cavmarl.core.errors import RegisteredFunctionError
 from cavmarl.driving.vehicles import GHOST_FIELDS, STATE_FIELDS
 from cavmarl.roads.network import RoadNetwork
 
-__all__ = ["AgentView", "RegisteredFunction", "agent_view"]
-
 ORDER_CHECKS = 32  # of each function, the first with two others or more
 _OWN = list(STATE_FIELDS)
 _OTHERS = list(GHOST_FIELDS)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["CONTROLLER"]
-
 CONTROLLER = np.dtype(
     [
         ("phase", np.int64),  # PHASE row that is on

@@ -12,8 +12,6 @@ from cavmarl.core.extensions import REGISTERED_MODELS
 from cavmarl.core.records.codes import MODEL_ACC, MODEL_IDM, MODEL_KRAUSS
 from cavmarl.driving.kernels.registered_models import FIRST_REGISTERED, MAX_REGISTERED, put_model
 
-__all__ = ["MODELS", "NEAREST_MODEL", "model_code", "model_names", "register_driver_model"]
-
 # Code by name, the name being that of SUMO's carFollowModel.
 MODELS = {"IDM": MODEL_IDM, "Krauss": MODEL_KRAUSS, "ACC": MODEL_ACC}
 

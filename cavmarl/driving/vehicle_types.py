@@ -22,17 +22,6 @@ from cavmarl.driving.kernels.car_following import (
 from cavmarl.driving.kernels.motion import MAX_SPEED_MPS
 from cavmarl.roads.network import VEHICLE_CLASSES
 
-__all__ = [
-    "ALL_PERMISSIONS",
-    "CLASS_DEFAULTS",
-    "DEFAULT_TYPES",
-    "NEAREST_CLASS",
-    "NO_ROAD_CLASSES",
-    "VTYPE",
-    "ClassDefaults",
-    "generated_types",
-]
-
 # A vehicle of SUMO's class "ignoring" heeds no permission.
 ALL_PERMISSIONS = (1 << 32) - 1
 

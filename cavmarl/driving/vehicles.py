@@ -17,15 +17,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "GHOST_FIELDS",
-    "PLACEMENT_FIELDS",
-    "RECORD_VERSION",
-    "STATE_FIELDS",
-    "VEHICLE",
-    "blank_vehicle",
-]
-
 RECORD_VERSION = 1
 
 # The order is that of use: what every driver asks of every other comes first and shares two cache

@@ -13,8 +13,6 @@ from numba.core import event
 
 from cavmarl.core.numba import kernel_cache_dir
 
-__all__ = ["announce_compilation", "compiled_before", "compiling_all"]
-
 _Listener: Any = event.Listener
 
 

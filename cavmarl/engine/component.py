@@ -21,8 +21,6 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.mounted.frames import Frames
 from cavmarl.shards.shard import Commands, Shard
 
-__all__ = ["Attached", "ComponentContext"]
-
 
 class ComponentContext(NamedTuple):
     """What a part is attached to.

@@ -7,8 +7,6 @@ from cavmarl.engine.rig_component import MountedSensors
 from cavmarl.engine.scenario_cues import Cues
 from cavmarl.engine.v2x_component import Messaging
 
-__all__ = ["attach"]
-
 
 def attach(host: ComponentContext) -> tuple[Attached, ...]:
     """The parts that the environment asks for, in the order in which they act."""

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 from cavmarl.engine.spaces import STATE_FEATURES
 from cavmarl.roads.network import RoadNetwork
 
-__all__ = ["global_state"]
-
 SPEED_SCALE_MPS = 40.0
 
 

@@ -15,8 +15,6 @@ from cavmarl.sensors.mounted.mounted_sensor import Platform, SensedScene
 from cavmarl.sensors.mounted.sensor_rig import Rig
 from cavmarl.shards.shard import Commands
 
-__all__ = ["MountedSensors"]
-
 
 class MountedSensors:
     """The rig of an environment; see `Attached`.

@@ -13,8 +13,6 @@ from cavmarl.driving.kernels.scripted_rows import note_cues
 from cavmarl.handoff.division import Division
 from cavmarl.shards.shard import Commands, Shard
 
-__all__ = ["Cues"]
-
 
 class Cues:
     """Looks at the agents of all zones at the beginning of each tick; `Attached` to the worlds.

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from cavmarl.shards.executor import Phase, SerialExecutor
 from cavmarl.shards.shard import Shard
 
-__all__ = ["ShardClock"]
-
 NOT_OF_A_TICK = ("suggest",)  # what a driver would do is asked beside the tick
 
 

@@ -15,8 +15,6 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.kernels.output_reset import clear_outputs, settle_outputs
 from cavmarl.shards.agent_outputs import make_outputs
 
-__all__ = ["SharedOutputs"]
-
 
 class SharedOutputs:
     """What all shards of W worlds share, and the steps that are taken once for all of them.

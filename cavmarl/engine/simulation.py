@@ -49,8 +49,6 @@ from cavmarl.traffic.sumo.sumo_traffic import SumoTraffic
 from cavmarl.zones.partition.zone_partition import ZonePartition
 from cavmarl.zones.reach import longest_move_m
 
-__all__ = ["Simulation"]
-
 # Fields of `Gate` that outlive a tick.
 KEPT_BY_GATE = (
     "next_order", "queue", "num_queue", "next_id", "num_entered", "counts", "sums", "num_passing",

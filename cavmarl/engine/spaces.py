@@ -17,22 +17,6 @@ from cavmarl.sensors.mounted.catalogue import type_of
 from cavmarl.sensors.mounted.frames import Frames
 from cavmarl.sensors.observed import Feature, layout, sensors_of
 
-__all__ = [
-    "STATE_FEATURES",
-    "ObservationPart",
-    "action_space",
-    "flat_observation",
-    "flat_observation_space",
-    "frames_space",
-    "named_observation",
-    "observation_parts",
-    "observation_space",
-    "observation_table",
-    "sensed_observation",
-    "state_space",
-    "write_sensed",
-]
-
 # Features of one vehicle in the global state: present, x, y, cos, sin, speed.
 STATE_FEATURES = 6
 NUM_META_ACTIONS = 5

@@ -9,8 +9,6 @@ import numpy as np
 from cavmarl.driving.vehicles import STATE_FIELDS
 from cavmarl.engine.world_snapshot import Parts
 
-__all__ = ["digest_world"]
-
 
 def digest_world(parts: Parts, world: int) -> str:
     """Hex digest of one world; see `Simulation.state_hash`.

@@ -12,8 +12,6 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
-__all__ = ["MIRROR", "PHASES", "QUEUE", "SENSORS", "STACK", "SUMO", "TICK", "StepTrace", "Traced"]
-
 SUMO = "sumo"  # another simulator has gone to t + Δt
 MIRROR = "mirror"  # its vehicles have been moved to where it has them
 TICK = "tick"  # the world goes on by one tick

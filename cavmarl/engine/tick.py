@@ -21,8 +21,6 @@ from cavmarl.shards.shard import Commands, Shard
 from cavmarl.traffic.native import NativeTraffic
 from cavmarl.traffic.sumo.sumo_traffic import SumoTraffic
 
-__all__ = ["Tick"]
-
 
 class Tick:
     """The phases of a tick in their order, and the parts whose calls they are.

@@ -21,8 +21,6 @@ from cavmarl.traffic.sumo.sumo_demand import SumoDemand
 from cavmarl.zones.partition.zone_layouts import cut_map
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
-__all__ = ["cut_zones", "make_frames", "make_tick"]
-
 
 def make_tick(
     config: EnvConfig,

@@ -18,8 +18,6 @@ from cavmarl.core.records.codes import (
 )
 from cavmarl.handoff.division import Division
 
-__all__ = ["TrafficStats", "count_traffic"]
-
 
 @dataclass(frozen=True)
 class TrafficStats:

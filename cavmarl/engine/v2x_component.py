@@ -15,8 +15,6 @@ from cavmarl.v2x.bus import Bus
 if TYPE_CHECKING:
     from cavmarl.engine.component import ComponentContext
 
-__all__ = ["Messaging"]
-
 
 class Messaging:
     """Lets the stations of W worlds send and receive at the end of each tick; an `Attached`.

@@ -33,17 +33,6 @@ from cavmarl.zones.partition.zone_file import zones_for
 from cavmarl.zones.partition.zone_layouts import cut_map
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
-__all__ = [
-    "World",
-    "check_agents",
-    "check_workers",
-    "find_map",
-    "load_roads",
-    "load_world",
-    "load_zones",
-    "make_world",
-]
-
 
 class World(NamedTuple):
     """What a world is made of.

@@ -20,8 +20,6 @@ from cavmarl.shards.shard import COMMON
 from cavmarl.traffic.native import NativeTraffic
 from cavmarl.traffic.sumo.sumo_traffic import SumoTraffic
 
-__all__ = ["Parts", "join", "load", "save", "share_of"]
-
 Array = NDArray[Any]
 
 # Fields of `Gate` that outlive a tick, beside its queue. Between two steps no vehicle is passing

@@ -15,8 +15,6 @@ from cavmarl.core.records.codes import ACTION_IDLE, ACTION_SLOWER
 from cavmarl.engine.kernels.decoding import decode_choices, decode_pairs
 from cavmarl.shards.shard import Commands
 
-__all__ = ["ActionDecoder"]
-
 
 class ActionDecoder:
     """Checks and decodes the actions of W worlds with A agents each.

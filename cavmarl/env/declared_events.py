@@ -11,8 +11,6 @@ from cavmarl.core.errors import ActionError, ConfigError
 from cavmarl.shards.shard import Commands
 from cavmarl.v2x.v2x_messages import cause_code
 
-__all__ = ["DeclaredEvents"]
-
 
 class DeclaredEvents:
     """At most one event an agent and step; a later one takes the place of an earlier one.

@@ -33,8 +33,6 @@ from cavmarl.parallel.step_arrays import SteppedWorlds
 from cavmarl.render.world_view import WorldView
 from cavmarl.sensors.mounted.frames import SensorFrames
 
-__all__ = ["CavEnv", "parallel_env"]
-
 RENDER_MODES = ("human", "rgb_array")
 
 # What an agent's info holds, behind the terms.

@@ -20,8 +20,6 @@ from pettingzoo.utils.env import AECEnv
 from cavmarl.config.registry import entries
 from cavmarl.env.parallel import CavEnv, parallel_env
 
-__all__ = ["env", "raw_env", "register_all"]
-
 
 class CheckedActions(wrappers.OrderEnforcingWrapper):  # type: ignore[misc] # not typed
     """The AEC form that refuses a wrong action at once: kept for later, it would spoil the step.

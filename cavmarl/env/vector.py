@@ -32,8 +32,6 @@ from cavmarl.parallel.step_arrays import SteppedWorlds
 from cavmarl.sensors.mounted.frames import SensorFrames
 from cavmarl.shards.shard import Commands
 
-__all__ = ["CavVectorEnv", "make_vec"]
-
 MAX_WORLDS = 65_536
 
 Observations: TypeAlias = Any

@@ -15,8 +15,6 @@ from cavmarl.evaluate.traffic.native_side import load_demand
 from cavmarl.shards.shard import Commands
 from cavmarl.zones.partition.zone_file import named_zones
 
-__all__ = ["TICK_S", "DrivenWorld", "world_maker"]
-
 TICK_S = 0.1  # of a world of demand
 UNDIVIDED = "bisection"  # of one zone: all layouts are the same
 

@@ -10,8 +10,6 @@ from cavmarl.evaluate.kernels.watching import locate_agents, watch_encroachments
 from cavmarl.evaluate.recorder import Recorder
 from cavmarl.roads.network import RoadNetwork
 
-__all__ = ["EncounterWatch", "mirrored_conflicts"]
-
 
 def mirrored_conflicts(network: RoadNetwork) -> NDArray[np.int32]:
     """(num_conflicts,) the row of the same area as seen from the foe's path, -1 where paths merge.

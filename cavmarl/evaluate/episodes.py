@@ -24,8 +24,6 @@ from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.policies.policy import Policy, load_policy
 from cavmarl.zones.partition.zone_statistics import imbalance
 
-__all__ = ["EpisodeJob", "RunData", "Speed", "drive_run", "worlds_at_once"]
-
 MAX_VEHICLES = 100_000  # of the worlds that are stepped together
 MAX_WORLDS = 128
 TRACK_S = 0.5  # between the points of a track

@@ -43,8 +43,6 @@ from cavmarl.ownership.transfer_summary import TransferSummary
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.policies.policy import load_policy
 
-__all__ = ["evaluate", "load_map", "load_report", "load_tables", "load_tracks", "run_seeds"]
-
 Rows = NDArray[np.void]
 
 MAX_EPISODES = 100_000

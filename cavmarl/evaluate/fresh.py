@@ -18,8 +18,6 @@ import numpy as np
 from cavmarl.core import errors
 from cavmarl.evaluate.episodes import EpisodeJob, Progress, RunData, Speed, drive_run
 
-__all__ = ["drive_in_fresh_process", "main"]
-
 PROGRAM = "from cavmarl.evaluate.fresh import main; main()"
 
 

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 
-__all__ = ["map_outline"]
-
 PASSENGER = 1 << VEHICLE_CLASSES.index("passenger")
 TOLERANCE_M = 0.5  # that a line may leave the lane's centre by
 

@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from cavmarl.env.vector import CavVectorEnv
 
-__all__ = ["MESSAGE_COLUMNS", "MessageRecord"]
-
 MESSAGE_COLUMNS = ("v2x_reception_ratio", "v2x_latency_s", "v2x_busy_ratio")
 
 

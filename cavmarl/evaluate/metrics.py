@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from cavmarl.config.env import TERMS
 from cavmarl.evaluate.tables import reward_column
 
-__all__ = ["METRICS", "Metric", "metric_values"]
-
 
 @dataclass(frozen=True)
 class Metric:

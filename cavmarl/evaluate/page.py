@@ -15,8 +15,6 @@ from cavmarl.evaluate.provenance.manifest import write_text
 from cavmarl.evaluate.report import EvaluationReport, Found, PairedDifference
 from cavmarl.evaluate.statistics import Interval
 
-__all__ = ["write_page"]
-
 TEMPLATE = Path(__file__).with_name("page.html.j2")
 NOTHING = "-"
 

@@ -8,8 +8,6 @@ from typing import Any, NamedTuple
 from cavmarl.evaluate.report import EvaluationReport
 from cavmarl.ownership.transfer_summary import Spread, TransferSummary
 
-__all__ = ["transfer_rows"]
-
 NOTHING = "-"
 
 

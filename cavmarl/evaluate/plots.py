@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from cavmarl.evaluate.metrics import METRICS, Metric, metric_values
 from cavmarl.evaluate.report import EvaluationReport
 
-__all__ = ["color_of", "plot_distributions", "plot_map", "plot_metrics", "plot_outcomes"]
-
 Rows = NDArray[np.void]
 
 INK, MUTED, RULE, ROAD = "#1f2933", "#616e7c", "#d9dee5", "#cfd5dd"

@@ -11,8 +11,6 @@ from cavmarl.evaluate.statistics import gini_coefficient, jain_index
 from cavmarl.evaluate.tables import EPISODE, TRIP, reward_column
 from cavmarl.rewards.kernels.terms import TTC_HORIZON_S
 
-__all__ = ["PET_HORIZON_S", "SHORT_TTC_S", "Recorder"]
-
 SHORT_TTC_S = 1.5  # below this a driver has no time left to react (Hayward 1972; SSAM)
 PET_HORIZON_S = 10.0  # a later pass after another is no encounter
 MIN_DISTANCE_M = 1.0  # of a trip whose delay a kilometre is compared

@@ -19,8 +19,6 @@ from cavmarl.evaluate.metrics import METRICS, Metric, metric_values
 from cavmarl.evaluate.statistics import Interval, Within, mean_interval, within_run
 from cavmarl.ownership.transfer_summary import TransferSummary
 
-__all__ = ["EvaluationReport", "Found", "PairedDifference", "PolicyReport", "make_report"]
-
 NO_INTERVAL = "not available: one run says nothing about the next; use --repeats 2 or more"
 
 

@@ -13,8 +13,6 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.evaluate.driven_worlds import DrivenWorld
 
-__all__ = ["MeasuredRound", "MeasuredWorlds", "measure_rounds", "measure_shards"]
-
 PARTS = 5
 
 

@@ -9,17 +9,6 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "Interval",
-    "Within",
-    "gini_coefficient",
-    "jain_index",
-    "mean_interval",
-    "share_interval",
-    "student_quantile",
-    "within_run",
-]
-
 Z_95 = 1.959963984540054
 TWO_SIDED = 0.975  # of the distribution lies below the upper end of a 95 % interval
 

@@ -12,8 +12,6 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.evaluate.evaluation import evaluate
 from cavmarl.evaluate.report import EvaluationReport
 
-__all__ = ["Suite", "SuiteWorld", "find_suite", "load_suite", "run_suite", "worlds_of"]
-
 
 @dataclass(frozen=True)
 class Suite:

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import TERMS
 
-__all__ = ["EPISODE", "TRACK", "TRIP", "read_table", "reward_column", "write_table"]
-
 Rows = NDArray[np.void]
 
 

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from cavmarl.ownership.transfers import Transfer, TransferLog
 
-__all__ = ["TRANSFER", "TransferRecorder", "transfers_of"]
-
 TRANSFER = np.dtype(
     [
         ("run", np.int64),

@@ -32,8 +32,6 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 from cavmarl.zones.partition.zone_statistics import imbalance
 from cavmarl.zones.visibility import Visibility
 
-__all__ = ["Division", "ZoneLoads"]
-
 
 class ZoneLoads(NamedTuple):
     """What the zones of W worlds hold.

@@ -20,8 +20,6 @@ from cavmarl.zones.partition.zone_layouts import cut_map
 from cavmarl.zones.partition.zone_partition import ZonePartition
 from cavmarl.zones.partition.zone_statistics import imbalance
 
-__all__ = ["Proposal", "propose_zones", "vehicle_costs"]
-
 Floats = NDArray[np.float64]
 
 

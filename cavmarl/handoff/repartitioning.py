@@ -18,8 +18,6 @@ from cavmarl.handoff.repartition_plan import propose_zones
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
-__all__ = ["Recut", "Recutter"]
-
 
 class Recut(NamedTuple):
     """Worlds have been cut anew.

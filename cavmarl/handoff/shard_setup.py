@@ -24,8 +24,6 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 from cavmarl.zones.reach import driving_reach_m, longest_move_m
 from cavmarl.zones.visibility import Visibility
 
-__all__ = ["divide", "halo_m", "limits_of"]
-
 # Added to the halo, so that no rounding of its sum can make it too narrow.
 _ROUNDING_M = 1e-6
 

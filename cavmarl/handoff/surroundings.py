@@ -8,8 +8,6 @@ from collections.abc import Mapping, Sequence
 from cavmarl.handoff.coordinator.coordinator import Near
 from cavmarl.handoff.division import Division
 
-__all__ = ["NearBorders"]
-
 
 class NearBorders:
     """Vehicles near a border when the tick began, and those that have crossed one.

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from cavmarl.shards.shard import Shard
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
-__all__ = ["TransferInFlight", "ZoneView", "view_zones"]
-
 
 class TransferInFlight(NamedTuple):
     """A vehicle that is on its way from one zone to another.

@@ -18,8 +18,6 @@ from cavmarl.policies.networks import ActorCritic, NetworkConfig, load_network, 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-__all__ = ["RunState", "load_checkpoint", "read_state", "save_checkpoint"]
-
 OPTIMIZER_FILE = "optimizer.pt"
 STATE_FILE = "training.json"
 

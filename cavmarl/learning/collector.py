@@ -13,8 +13,6 @@ from cavmarl.learning.run_clock import RunClock
 from cavmarl.learning.trips import Trips
 from cavmarl.policies.networks import ActorCritic
 
-__all__ = ["Collector"]
-
 
 class Collector:
     """Drives the worlds with a network and keeps what comes of it.

@@ -12,9 +12,6 @@ from cavmarl.learning.batch import Batch
 from cavmarl.learning.ppo_settings import PpoSettings
 from cavmarl.policies.networks import ActorCritic
 
-__all__ = ["Learner"]
-
-
 NUMBERS = ("policy_loss", "value_loss", "entropy", "kl", "clipped")
 
 

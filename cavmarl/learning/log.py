@@ -13,8 +13,6 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from cavmarl.core.errors import require
 
-__all__ = ["CSV_FILE", "WINDOW", "Log", "curve_row", "describe", "progress_bar"]
-
 CSV_FILE = "progress.csv"
 
 

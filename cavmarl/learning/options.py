@@ -19,17 +19,6 @@ from cavmarl.core.errors import CavmarlError, ConfigError
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-__all__ = [
-    "check_above_zero",
-    "check_at_least",
-    "check_shares",
-    "given_options",
-    "parse_settings",
-    "run_folder",
-    "run_program",
-    "settings_of",
-]
-
 DRIVER = "driver: {folder}  (cavmarl evaluate ENV --policy {folder})"
 
 S = TypeVar("S", bound="DataclassInstance")

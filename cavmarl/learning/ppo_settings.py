@@ -18,8 +18,6 @@ from cavmarl.learning.options import (
     settings_of,
 )
 
-__all__ = ["PpoSettings", "parse_ppo"]
-
 # Settings that a resumed run may be given anew.
 CAN_CHANGE = frozenset(
     "total_agent_steps minutes resume threads zones workers tensorboard checkpoint_updates".split()

@@ -24,8 +24,6 @@ from cavmarl.learning.ppo_settings import PpoSettings
 from cavmarl.learning.scales import Scales
 from cavmarl.policies.networks import CONFIG_FILE, WEIGHTS_FILE, ActorCritic, NetworkConfig
 
-__all__ = ["Run", "train"]
-
 
 def make_worlds(settings: PpoSettings) -> CavVectorEnv:
     """The worlds that a run learns in.

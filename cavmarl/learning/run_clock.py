@@ -6,8 +6,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-__all__ = ["PHASES", "RunClock"]
-
 # Worlds that step; what goes between them and the tensors; what the network decides; the updates.
 PHASES = ("simulation", "transfer", "inference", "learning")
 

@@ -6,8 +6,6 @@ from torch import Tensor
 
 from cavmarl.policies.networks import ActorCritic
 
-__all__ = ["Scales"]
-
 LEAST_DEVIATION = 0.02  # of an observation; those that hardly change are not blown up
 
 

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from cavmarl.config.env import TERMS
 from cavmarl.learning.log import WINDOW
 
-__all__ = ["Trips"]
-
 ARRIVAL, COLLISION, OFF_ROAD = (TERMS.index(t) for t in ("arrival", "collision", "off_road"))
 
 

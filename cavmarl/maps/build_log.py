@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 from collections import Counter
 
-__all__ = ["BuildLog"]
-
 _QUOTED = re.compile(r"'[^']*'")
 _NUMBERED = re.compile(r"\S*\d\S*")
 _CORRECTION = re.compile(r"^(Joined|Guessed|Removed) |^[1-9]\d* .*(removed|computed|split|added)$")

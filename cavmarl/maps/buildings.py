@@ -16,8 +16,6 @@ from cavmarl.roads.kernels.backdrop_pieces import WALL
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import source_hash
 
-__all__ = ["convex_parts", "walls_of", "with_buildings"]
-
 # Buildings that are farther from every road's bounding box than any sensor sees are left out.
 FARTHEST_M = 300.0
 LARGEST_M = 5000.0

@@ -17,8 +17,6 @@ from cavmarl.maps.components import strong_components
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import SIGNAL_STATES, VEHICLE_CLASSES, RoadNetwork
 
-__all__ = ["MapReport", "check_map"]
-
 _CAR = 1 << VEHICLE_CLASSES.index("passenger")
 # Slower than a walk or faster than any car: likelier a wrong unit than a speed limit.
 _SPEED_RANGE_MPS = (1.0, 70.0)

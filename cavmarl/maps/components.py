@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["strong_components"]
-
 
 def strong_components(num_nodes: int, arcs: NDArray[np.int32]) -> NDArray[np.int32]:
     """The component of every node of a directed graph.

@@ -17,8 +17,6 @@ from cavmarl.core.errors import MapError, require
 from cavmarl.roads.network import GeoReference
 from cavmarl.roads.sumo_net.xml_source import read_xml
 
-__all__ = ["DEFAULT_HEIGHT_M", "LEVEL_M", "Footprint", "read_footprints"]
-
 Ring = NDArray[np.float64]
 
 DEFAULT_HEIGHT_M = 8.0  # of a building that says nothing of its height

@@ -10,8 +10,6 @@ from xml.sax.handler import ContentHandler
 from cavmarl.core.errors import MapError
 from cavmarl.roads.sumo_net.xml_source import read_xml
 
-__all__ = ["MAP_ENDINGS", "MapKind", "map_kind"]
-
 MapKind = Literal["sumo", "osm", "opendrive"]
 
 MAP_ENDINGS = (".net.xml", ".net.xml.gz", ".osm", ".osm.gz", ".osm.xml", ".osm.xml.gz", ".xodr")

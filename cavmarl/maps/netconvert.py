@@ -24,8 +24,6 @@ from cavmarl.maps.formats import MapKind, map_kind
 from cavmarl.roads.sumo_net.reader import map_name, read_network, source_hash
 from cavmarl.roads.sumo_net.xml_source import read_bytes
 
-__all__ = ["OPENDRIVE_OPTIONS", "OSM_OPTIONS", "Box", "BuildResult", "build_network", "map_file"]
-
 Box = tuple[float, float, float, float]
 
 OSM_OPTIONS = (

@@ -9,8 +9,6 @@ from typing import NamedTuple
 
 from cavmarl.ownership.transfers import Transfer
 
-__all__ = ["Spread", "TransferSummary"]
-
 
 class Spread(NamedTuple):
     """Nearest-rank percentiles; all None without values."""

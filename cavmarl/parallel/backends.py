@@ -15,16 +15,6 @@ from cavmarl.parallel.sensor_workers.sensor_worker_setup import local_worlds
 from cavmarl.parallel.split_hosts.divided_worlds import DividedWorlds
 from cavmarl.parallel.step_arrays import SteppedWorlds
 
-__all__ = [
-    "Backend",
-    "MakeWorlds",
-    "backend_names",
-    "check_hosts",
-    "keeps_state",
-    "make_worlds",
-    "register_backend",
-]
-
 LOCAL, PROCESSES, RAY = "local", "processes", "ray"
 
 

@@ -22,8 +22,6 @@ from cavmarl.parallel.work_shares import Part
 from cavmarl.parallel.worlds_job import Task
 from cavmarl.shards.shard import Commands
 
-__all__ = ["OrderedWorlds", "own_error"]
-
 ASKED_AT_ONCE = 500  # agents: an answer is one message
 
 log = logging.getLogger("cavmarl.workers")

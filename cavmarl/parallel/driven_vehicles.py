@@ -9,8 +9,6 @@ import numpy as np
 
 from cavmarl.engine.simulation import Simulation
 
-__all__ = ["Driven", "driven_by"]
-
 
 class Driven(NamedTuple):
     """An agent's vehicle, as plain numbers.

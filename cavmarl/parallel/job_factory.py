@@ -30,8 +30,6 @@ from cavmarl.parallel.team.team_job import LeaderJob
 from cavmarl.parallel.work_shares import Part
 from cavmarl.parallel.worlds_job import commands_of, fingerprint
 
-__all__ = ["make_jobs"]
-
 
 def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
     """The jobs of all workers, every kernel loaded.

@@ -12,16 +12,6 @@ from cavmarl.engine.world_setup import World
 from cavmarl.handoff.coordinator.coordinator_setup import WorldRun, check_faults, prepare_runs
 from cavmarl.parallel.work_shares import Part
 
-__all__ = [
-    "RunText",
-    "check_watched",
-    "is_watched",
-    "refuse_watched",
-    "runs_as_text",
-    "runs_of",
-    "unwatched",
-]
-
 RunText = tuple[str, str]  # the run in hex, and its journal; empty: it has none
 
 

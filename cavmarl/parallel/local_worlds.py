@@ -26,8 +26,6 @@ from cavmarl.sensors.mounted.catalogue import frame_layout
 from cavmarl.shards.shard import Commands
 from cavmarl.traffic.sumo.sumo_history import ToldLog
 
-__all__ = ["LocalWorlds"]
-
 
 class LocalWorlds:
     """W worlds of one environment; no loop of Python runs over agents or vehicles in a step.

@@ -13,8 +13,6 @@ from cavmarl.parallel.step_placement import StepPlacement
 from cavmarl.parallel.work_shares import Part, parts_of
 from cavmarl.parallel.worlds_job import Task
 
-__all__ = ["Mover"]
-
 Run = Callable[[Task, Any, bool], None]
 
 

@@ -27,8 +27,6 @@ from cavmarl.parallel.step_placement import StepPlacement
 from cavmarl.parallel.work_shares import Part, parts_of
 from cavmarl.parallel.worlds_job import Task, fingerprint
 
-__all__ = ["PooledWorlds"]
-
 PROGRAM = "cavmarl.parallel.world_worker"
 
 

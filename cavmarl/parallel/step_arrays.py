@@ -19,9 +19,6 @@ from cavmarl.sensors.mounted.catalogue import frame_layout, frames_in
 from cavmarl.sensors.mounted.frames import Frames
 from cavmarl.shards.shard import Commands
 
-__all__ = ["StepArrays", "SteppedWorlds", "layout_of"]
-
-
 FINAL_FRAMES = "final_rig."  # begins their names in a layout
 
 

@@ -19,8 +19,6 @@ from cavmarl.parallel.work_shares import make_plans
 if TYPE_CHECKING:
     from cavmarl.balance.probe import Watch
 
-__all__ = ["StepPlacement"]
-
 Floats = NDArray[np.float64]
 
 

@@ -15,8 +15,6 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import World
 from cavmarl.zones.partition.zone_statistics import zone_statistics
 
-__all__ = ["Part", "make_plans", "parts_of", "share_out"]
-
 # Of a zone in which no lane lies, as a length of lanes: it is looked at in every tick.
 _EMPTY_KM = 0.01
 _EQUAL = "number"

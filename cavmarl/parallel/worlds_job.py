@@ -15,8 +15,6 @@ from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.step_arrays import StepArrays
 from cavmarl.shards.shard import Commands
 
-__all__ = ["Task", "WorldsJob", "commands_of", "fingerprint"]
-
 
 class Task(IntEnum):
     """What a worker can be asked for."""

@@ -25,15 +25,6 @@ from cavmarl.config.env import ActionConfig, SensorsConfig
 from cavmarl.config.io import validate
 from cavmarl.core.errors import ConfigError, PolicyError
 
-__all__ = [
-    "CONFIG_FILE",
-    "WEIGHTS_FILE",
-    "ActorCritic",
-    "NetworkConfig",
-    "load_network",
-    "save_network",
-]
-
 WEIGHTS_FILE = "model.safetensors"
 CONFIG_FILE = "config.json"
 

@@ -30,8 +30,6 @@ from cavmarl.env.vector import CavVectorEnv
 if TYPE_CHECKING:
     from cavmarl.policies.networks import ActorCritic, NetworkConfig
 
-__all__ = ["NetworkPolicy", "Policy", "load_policy", "policy_files"]
-
 Environment = CavEnv | CavVectorEnv
 
 

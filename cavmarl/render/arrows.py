@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from cavmarl.roads.network import RoadNetwork
 
-__all__ = ["lane_arrows"]
-
 Points = NDArray[np.float64]
 
 BEFORE_END_M = 12.0  # from the arrow's foot to the stop line

@@ -17,8 +17,6 @@ from cavmarl.core.errors import require
 if TYPE_CHECKING:
     from pygame import Font, Surface
 
-__all__ = ["Part", "blank", "lettering", "load_pygame", "pixels", "stamp"]
-
 Part = tuple[Sequence[int], Sequence[Sequence[float]]]  # colour with alpha, corners in pixels
 
 # Stamps are drawn so many times larger, then reduced: edges move by fractions of a pixel.

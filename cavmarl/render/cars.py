@@ -28,8 +28,6 @@ from cavmarl.render.walkers import draw_walker, is_walker
 if TYPE_CHECKING:
     from pygame import Surface
 
-__all__ = ["BRAKING_MPS2", "Paint", "draw_cars", "in_view"]
-
 BRAKING_MPS2 = -1.0  # below this acceleration the brake lights are on
 
 # Seen from far above, a car is drawn larger than it is.

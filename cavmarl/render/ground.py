@@ -26,8 +26,6 @@ from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
 if TYPE_CHECKING:
     from pygame import Surface
 
-__all__ = ["draw_ground", "draw_stop_lines", "signal_codes", "signal_letter"]
-
 KERB_M = 0.6
 # Pixels a metre from which markings are worth their ink.
 SCALE_OF_MARKINGS = 0.9

@@ -17,8 +17,6 @@ from cavmarl.render.palette import (
     zone_color,
 )
 
-__all__ = ["SWATCH_PX", "Sample", "samples_of_drivers", "samples_of_zones"]
-
 SWATCH_PX = 16
 _HEIGHT_PX = 10.0
 

@@ -7,8 +7,6 @@ import math
 from cavmarl.render.canvas import Part
 from cavmarl.render.palette import INK, Color
 
-__all__ = ["bar", "disc", "opaque", "pill", "pointer", "ring", "target"]
-
 Corner = tuple[float, float]
 _SIDES = 32
 _WHITE = (255, 255, 255, 255)

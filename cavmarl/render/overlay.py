@@ -18,8 +18,6 @@ from cavmarl.render.viewport import Viewport
 if TYPE_CHECKING:
     from pygame import Surface
 
-__all__ = ["Overlay", "clock_text", "scale_bar_m"]
-
 MARGIN_PX = 14
 PADDING_PX = 9
 PANEL_ALPHA = 225

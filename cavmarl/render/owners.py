@@ -18,8 +18,6 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 if TYPE_CHECKING:
     from pygame import Surface
 
-__all__ = ["draw_transfers", "owner_paints"]
-
 # Between a vehicle and the ring around it, and the smallest ring.
 GAP_PX = 4.0
 MIN_RADIUS_PX = 10.0

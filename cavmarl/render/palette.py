@@ -2,32 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = [
-    "ACTOR",
-    "AGENTS",
-    "ASPHALT",
-    "BACKGROUND_CAR",
-    "BLINKER",
-    "BRAKE",
-    "CENTRE_LINE",
-    "COLLIDED",
-    "GLASS",
-    "HEADLIGHT",
-    "INK",
-    "KERB",
-    "LAND",
-    "MARKING",
-    "MUTED_INK",
-    "PANEL",
-    "PATH",
-    "SIGNALS",
-    "ZONES",
-    "Color",
-    "agent_color",
-    "ink_on",
-    "zone_color",
-]
-
 Color = tuple[int, int, int]
 
 LAND: Color = (235, 237, 230)

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from cavmarl.render.arrows import lane_arrows
 from cavmarl.roads.network import RoadNetwork
 
-__all__ = ["Patch", "RoadShapes", "convex_hull", "level_of", "offset_polyline", "road_shapes"]
-
 Points = NDArray[np.float64]
 
 DASH_M = 3.0

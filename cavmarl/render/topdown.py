@@ -25,8 +25,6 @@ from cavmarl.roads.network import RoadNetwork
 if TYPE_CHECKING:
     from pygame import Surface
 
-__all__ = ["TopDownRenderer"]
-
 # Smallest part of the world that a following camera shows, and how fast it turns to a new aim.
 FOLLOW_M = 150.0
 FOLLOW_SHARE = 0.12

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError, require
 
-__all__ = ["VideoWriter"]
-
 # Constant rate factor of x264: lower is better and larger; 18 is visually lossless, 23 its default.
 QUALITY = 20
 

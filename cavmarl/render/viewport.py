@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Bounds", "Viewport", "suitable_size"]
-
 Bounds = tuple[float, float, float, float]  # min_x, min_y, max_x, max_y in metres
 
 # Pixels of a picture whose size is not given, and how much wider than high it may be.

@@ -15,8 +15,6 @@ from cavmarl.render.palette import ACTOR, COLLIDED, INK, PANEL
 if TYPE_CHECKING:
     from pygame import Surface
 
-__all__ = ["draw_walker", "is_walker"]
-
 WALKER_M = 1.0  # no vehicle of a script is so short
 MIN_RADIUS_PX = 4.5
 CORNERS = 12

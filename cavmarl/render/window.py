@@ -9,8 +9,6 @@ from cavmarl.render.canvas import load_pygame
 if TYPE_CHECKING:
     from pygame import Surface
 
-__all__ = ["Window"]
-
 
 class Window:
     """Shows pictures at a steady pace; opens at the first one.

@@ -10,8 +10,6 @@ from cavmarl.engine.simulation import Simulation
 from cavmarl.render.canvas import pixels
 from cavmarl.render.topdown import TopDownRenderer
 
-__all__ = ["WorldView"]
-
 
 class WorldView:
     """Draws one world of a simulation from above, into arrays or into a window.

@@ -19,8 +19,6 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 if TYPE_CHECKING:
     from pygame import Rect, Surface
 
-__all__ = ["draw_sight", "draw_zones", "zone_picture"]
-
 WASH_ALPHA = 20
 HALO_ALPHA = 52
 BORDER_PX = 2

@@ -12,8 +12,6 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.core.extensions import REGISTERED_TERMS
 from cavmarl.driving.agent_view import AgentView
 
-__all__ = ["RegisteredTerm", "register_term", "terms_reach_m"]
-
 
 class RegisteredTerm(NamedTuple):
     """A term from outside."""

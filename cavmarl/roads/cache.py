@@ -32,8 +32,6 @@ from cavmarl.roads.network import (
 )
 from cavmarl.roads.sumo_net.reader import map_name, read_network, source_hash
 
-__all__ = ["load_network"]
-
 # Raise this when the reader gives other rows for the same file; record types count by themselves.
 FORMAT = 16
 

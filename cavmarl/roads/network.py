@@ -26,26 +26,6 @@ from cavmarl.core.records.arrays import RoadArrays
 from cavmarl.roads.kernels.backdrop_pieces import WALL
 from cavmarl.roads.kernels.signal_phases import DETECTOR_REACH_M
 
-__all__ = [
-    "CONFLICT",
-    "DETECTOR",
-    "EDGE",
-    "JUNCTION",
-    "LANE",
-    "LINK",
-    "PHASE",
-    "PLACE",
-    "POINT",
-    "PROGRAM",
-    "SIGNAL",
-    "SIGNAL_STATES",
-    "SWITCH",
-    "VEHICLE_CLASSES",
-    "GeoReference",
-    "RoadNetwork",
-    "content_of",
-]
-
 # The permission bits of LANE["permissions"], SUMO's abstract vehicle classes that drive on roads.
 VEHICLE_CLASSES = (
     "passenger",

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import MapError
 from cavmarl.roads.network import POINT
 
-__all__ = ["STUB_M", "clean_shape", "extend_stubs", "point_rows"]
-
 Shape = NDArray[np.float64]
 
 # SUMO writes centimetres: two points nearer than a tenth of that are one.

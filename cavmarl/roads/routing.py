@@ -18,8 +18,6 @@ from cavmarl.core.records.arrays import LaneGrid
 from cavmarl.roads.kernels.plans import plan_goal
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 
-__all__ = ["PLAN", "lane_grid", "make_plans", "way"]
-
 PLAN = np.dtype(
     [
         ("next", np.int32),  # LANE after this lane's end; -1: the goal's own lane, or no way

@@ -17,8 +17,6 @@ from cavmarl.sensors.mounted.mounted_sensor import MountedSensor
 from cavmarl.sensors.observed import SENSORS
 from cavmarl.sensors.observed.feature import Feature, Sensor
 
-__all__ = ["find_sensor", "register_sensor", "sensor_names"]
-
 _MOUNTED = {f"rig.{config.type}": kind for config, kind in TYPES.items()}  # type: ignore[attr-defined]
 _OBSERVED = {sensor.name: sensor for sensor in SENSORS}
 

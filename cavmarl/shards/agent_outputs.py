@@ -10,8 +10,6 @@ from cavmarl.core.memory import Zeros
 from cavmarl.core.records.arrays import Outputs
 from cavmarl.sensors.observed import frame_size
 
-__all__ = ["make_outputs"]
-
 
 def make_outputs(
     config: EnvConfig,

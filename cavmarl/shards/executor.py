@@ -8,8 +8,6 @@ from typing import Any, Literal, Protocol
 from cavmarl.shards.shard import Shard
 from cavmarl.shards.shard_group import ShardGroup
 
-__all__ = ["Executor", "Phase", "SerialExecutor", "Together"]
-
 # What a tick is made of: a name and its arguments can be sent anywhere.
 Phase = Literal[
     "begin_step",

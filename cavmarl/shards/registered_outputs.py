@@ -14,8 +14,6 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.kernels.stacking import newest_frame
 from cavmarl.sensors.observed import layout
 
-__all__ = ["RegisteredOutputs"]
-
 
 class RegisteredOutputs:
     """Asks the registered sensors and terms of a configuration.

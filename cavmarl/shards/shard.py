@@ -46,8 +46,6 @@ from cavmarl.traffic.kernels.leaving import leave
 from cavmarl.v2x.kernels.v2x_records import Mail
 from cavmarl.zones.kernels.zone_lookup import OUTER, Halo, ZoneArrays
 
-__all__ = ["Commands", "Shard", "make_worlds", "make_zoned"]
-
 CELL_M = 25.0  # of the spatial index over vehicles
 COMMON = Common._fields
 TICKS_IN_ORDER = 32  # for so long rows that have been put in the order of the lanes nearly stay so

@@ -29,8 +29,6 @@ from cavmarl.shards.kernels.group_phases import (
 )
 from cavmarl.shards.shard import TICKS_IN_ORDER, Commands, Shard
 
-__all__ = ["ShardGroup"]
-
 
 class ShardGroup:
     """Runs the phases of some shards, whichever they are: one, those of a worker, or all.

@@ -32,8 +32,6 @@ from cavmarl.core.records.arrays import Outputs, Worlds
 from cavmarl.core.records.codes import AUTHORITATIVE
 from cavmarl.driving.vehicles import RECORD_VERSION
 
-__all__ = ["GROUPS", "MAGIC", "MINOR_VERSION", "TransferCodec", "TransferHeader", "layout_text"]
-
 MAGIC = b"CVMV"
 MINOR_VERSION = 0
 

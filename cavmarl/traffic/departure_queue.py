@@ -9,8 +9,6 @@ import numpy as np
 from cavmarl.core.records.arrays import Gate, RoadArrays
 from cavmarl.core.records.codes import NUM_COUNTS, NUM_SUMS
 
-__all__ = ["DEPARTURE", "make_gate", "with_room"]
-
 DEPARTURE = np.dtype(
     [
         ("id", np.int64),  # of the vehicle; the queue is in this order

@@ -37,8 +37,6 @@ from cavmarl.traffic.sumo.stop_book import StopBook
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
 from cavmarl.traffic.way_slots import WaySlots, way_slots
 
-__all__ = ["NativeTraffic", "capacity_of"]
-
 PASSENGER = 1 << VEHICLE_CLASSES.index("passenger")
 FAST_FACTOR = 1.5  # a speed over the limit that hardly any driver of the demand wants
 MIN_ORIGIN_M = 15.0  # lanes shorter than this are no place to start

@@ -14,8 +14,6 @@ from cavmarl.core.errors import ConfigError, RouteError
 from cavmarl.maps.components import strong_components
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 
-__all__ = ["MAX_VEHICLES", "RandomTrips", "write_random_demand"]
-
 MAX_VEHICLES = 1_000_000
 _PASSENGER = 1 << VEHICLE_CLASSES.index("passenger")
 _TURNAROUND = ord("t")

@@ -24,8 +24,6 @@ from cavmarl.traffic.schedule import Schedule
 from cavmarl.traffic.way_search import Traffic, WaySearch, WaySearchResult
 from cavmarl.traffic.way_slots import WaySlots
 
-__all__ = ["LOOK", "Rerouting"]
-
 NEVER = np.iinfo(np.int64).max
 
 # What an ordered vehicle knows of its looking for ways, by VEHICLE["order"].

@@ -18,8 +18,6 @@ from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.demand.drawing import speed_factors
 from cavmarl.traffic.departure_queue import DEPARTURE
 
-__all__ = ["Schedule"]
-
 MAX_STEPS = 50_000_000
 MAX_EDGES = 100_000  # of one way
 MAX_DETOUR_STEPS = 8_000_000

@@ -9,8 +9,6 @@ from cavmarl.traffic.scenarios.movement_scripts import Actor
 from cavmarl.traffic.scenarios.scene import Scene, Seat
 from cavmarl.traffic.scenarios.streets import Crossing, Streets
 
-__all__ = ["approach", "meet_stream", "stream"]
-
 FREE_M = 20.0  # beyond the junction a built-in driver takes over
 
 

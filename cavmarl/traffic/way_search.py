@@ -22,8 +22,6 @@ from cavmarl.traffic.kernels.way_requests import (
 )
 from cavmarl.traffic.way_slots import WaySlots
 
-__all__ = ["Traffic", "WaySearch", "WaySearchResult"]
-
 
 class WaySearchResult(Enum):
     """What came of looking for a way."""

@@ -12,8 +12,6 @@ from cavmarl.core.errors import CapacityError
 from cavmarl.roads.routing import PLAN
 from cavmarl.traffic.schedule import MAX_STEPS, Schedule
 
-__all__ = ["WaySlots", "way_slots"]
-
 LEAST_STEPS = 128  # of a slot, if the map has so many lanes
 DETOUR_RATIO = 3  # a way may take this many times the steps of the longest known one
 

@@ -45,8 +45,6 @@ from cavmarl.v2x.network_simulator import Exchange, NetworkSimulator, check_rece
 from cavmarl.v2x.roadside import make_units
 from cavmarl.v2x.v2x_messages import cause_code
 
-__all__ = ["Bus"]
-
 Zeros = Callable[..., NDArray[Any]]
 
 CELL_M = 100.0  # of the packets of a tick

@@ -12,17 +12,6 @@ from cavmarl.config.v2x import ChannelConfig
 from cavmarl.core.math.walls import Walls
 from cavmarl.v2x.kernels.v2x_channel import Channel
 
-__all__ = [
-    "BUSY_LEVELS",
-    "airtime_s",
-    "chance_among_others",
-    "chance_of_reception",
-    "hidden_share",
-    "make_channel",
-    "median_range_m",
-    "reference_loss_db",
-]
-
 CARRIER_HZ = 5.9e9
 LIGHT_MPS = 299_792_458.0
 PREAMBLE_S = 40e-6  # of IEEE 802.11p in a channel of 10 MHz

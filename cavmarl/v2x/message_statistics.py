@@ -18,8 +18,6 @@ from cavmarl.v2x.kernels.v2x_records import (
     Mail,
 )
 
-__all__ = ["V2xStatistics", "statistics_of"]
-
 
 @dataclass(frozen=True)
 class V2xStatistics:

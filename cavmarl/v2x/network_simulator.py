@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import MessageError
 
-__all__ = ["RECEPTION", "Exchange", "NetworkSimulator", "check_receptions"]
-
 # One receiver receives one packet in the tick of the call.
 RECEPTION = np.dtype(
     [

@@ -13,8 +13,6 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.v2x.kernels.v2x_records import FIRST_ROADSIDE_ID, UNIT
 from cavmarl.v2x.v2x_messages import MAP
 
-__all__ = ["make_units", "map_of"]
-
 
 def make_units(config: RoadsideConfig, network: RoadNetwork) -> NDArray[np.void]:
     """UNIT (n,): one at each signal that has one, in the middle of its stop lines.

@@ -35,22 +35,6 @@ from cavmarl.v2x.kernels.v2x_records import (
     KIND_SPAT,
 )
 
-__all__ = [
-    "CAM",
-    "CAUSES",
-    "CPM_OBJECT",
-    "DENM",
-    "HEADER",
-    "KINDS",
-    "MAP",
-    "SCHEMA_VERSION",
-    "SPAT",
-    "cause_code",
-    "decode",
-    "encode",
-    "messages_of",
-]
-
 SCHEMA_VERSION = 1
 
 HEADER = np.dtype(

@@ -26,8 +26,6 @@ from cavmarl.core.errors import ConfigError, EvaluationError
 from cavmarl.core.seeds import check_seed
 from cavmarl.verify.differences import Arrays, Difference, find_difference
 
-__all__ = ["Determinism", "FirstDifference", "check_steps", "verify_determinism"]
-
 HASH_SEEDS = ("0", "1", "4294967295")  # of the three processes
 MAX_STEPS = 10_000_000
 

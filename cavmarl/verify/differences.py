@@ -15,16 +15,6 @@ from numpy.typing import NDArray
 from cavmarl.driving.vehicles import STATE_FIELDS
 from cavmarl.env.vector import CavVectorEnv, StepResult
 
-__all__ = [
-    "Arrays",
-    "Difference",
-    "find_difference",
-    "same_bytes",
-    "single_arrays",
-    "snapshot",
-    "step_results",
-]
-
 Arrays = dict[str, NDArray[Any]]
 
 

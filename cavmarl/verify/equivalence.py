@@ -33,8 +33,6 @@ from cavmarl.verify.fault_figures import FaultFigures, HandOverClock
 from cavmarl.zones.kernels.zone_lookup import zones_of
 from cavmarl.zones.partition.zone_file import read_zones
 
-__all__ = ["ZONES", "Equivalence", "ZoneResult", "verify_zones"]
-
 ZONES = (1, 2, 4, 9)
 
 

@@ -29,8 +29,6 @@ from cavmarl.verify.fault_figures import FaultFigures, HandOverClock, spread
 from cavmarl.verify.fault_matrix import MatrixLine, Rehearsal, matrix
 from cavmarl.verify.replay import replay_tick, world_of
 
-__all__ = ["Campaign", "LineResult", "run_campaign"]
-
 ENV = "grid4x4"
 ZONES = (4, 9)
 # A world in which many go over borders, and as much as can be goes with them.

@@ -15,8 +15,6 @@ from cavmarl.handoff.fault_injection.message_coordinator import MessageCoordinat
 from cavmarl.ownership.messages import Begin, Commit, Message, Need, Record, Reset
 from cavmarl.ownership.transport import Network
 
-__all__ = ["FaultFigures", "HandOverClock", "spread"]
-
 
 class HandOverClock:
     """A watcher of one world that measures how long hand-overs take.

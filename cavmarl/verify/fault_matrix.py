@@ -20,8 +20,6 @@ from cavmarl.handoff.fault_injection.injected_faults import Visit
 from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.ownership.transport import Rates
 
-__all__ = ["ELSEWHERE", "ROLES", "MatrixLine", "Rehearsal", "matrix"]
-
 ROLES = ("source", "target", "bystander")
 APART = 6  # ticks between two deaths of a run, so that each meets a settled world
 HAND_OVER = ("Prepare", "Ack", "Nack", "Abort", "Need")

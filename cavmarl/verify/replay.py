@@ -16,8 +16,6 @@ from cavmarl.handoff.fault_injection.fault_plan import Faults
 from cavmarl.handoff.fault_injection.reproducer_file import Reproducer
 from cavmarl.handoff.fault_injection.reproducer_recording import made_with, sources_of
 
-__all__ = ["changed_versions", "replay_tick", "world_of"]
-
 
 def world_of(kept: Reproducer, env: str | Path | None = None) -> World:
     """The world that a reproducer is of.

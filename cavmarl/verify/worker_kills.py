@@ -26,8 +26,6 @@ from cavmarl.parallel.split_hosts.divided_worlds import DividedWorlds
 from cavmarl.policies.policy import Policy, load_policy
 from cavmarl.verify.differences import same_bytes, step_results
 
-__all__ = ["Kill", "KillReport", "verify_kills"]
-
 FIRST_STEPS = 10  # before any is killed, to know how long a step takes
 PINGS = 500
 LATEST = 1.5  # of a step's time: some are killed when they are already waiting for the next one

@@ -16,8 +16,6 @@ from cavmarl.driving.kernels.junctions import EXIT_LOOK_M
 from cavmarl.driving.kernels.motion import CROSSINGS_PER_TICK, LATERAL_MPS, MAX_SPEED_MPS
 from cavmarl.roads.network import RoadNetwork
 
-__all__ = ["driving_reach_m", "longest_move_m", "off_lane_m"]
-
 ASIDE_M = 10.0  # between the centres of neighbour lanes, and of vehicles beside them
 
 

@@ -15,8 +15,6 @@ from cavmarl.zones.partition.zone_halo import inner_parts, lane_watchers, zone_h
 from cavmarl.zones.partition.zone_partition import ZonePartition
 from cavmarl.zones.reach import off_lane_m
 
-__all__ = ["Visibility"]
-
 
 @dataclass(frozen=True, eq=False)
 class Visibility:

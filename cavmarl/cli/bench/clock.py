@@ -22,8 +22,6 @@ from cavmarl.cli.output import (
 if TYPE_CHECKING:
     from cavmarl.bench.clock_drift import ClockDrift
 
-__all__ = ["clock"]
-
 
 def clock(
     env: Annotated[

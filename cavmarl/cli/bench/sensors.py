@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from cavmarl.bench.sensor_scaling import ScalingRow
     from cavmarl.parallel.sensor_workers.sensor_shares import Shares
 
-__all__ = ["sensors"]
-
 
 def sensors(
     env: Annotated[

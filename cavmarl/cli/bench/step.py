@@ -14,8 +14,6 @@ from cavmarl.cli.output import JsonPath, write_json
 if TYPE_CHECKING:
     from cavmarl.bench.step_speed import StepSpeed
 
-__all__ = ["step"]
-
 _SENSORS = {"lidar": "64 rays", "kinematics": "no rays"}
 _SIDES = {
     "batched": "cavmarl, batched",

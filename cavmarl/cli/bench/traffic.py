@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from cavmarl.bench.traffic_speed import TrafficSpeed
     from cavmarl.evaluate.traffic.traffic_comparison import TrafficComparison
 
-__all__ = ["traffic"]
-
 _ROWS = {
     "departed": "departed",
     "waiting": "waiting",

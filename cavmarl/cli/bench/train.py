@@ -15,8 +15,6 @@ from cavmarl.cli.output import JsonPath, write_json
 if TYPE_CHECKING:
     from cavmarl.bench.training_speed import TrainingSpeed
 
-__all__ = ["train"]
-
 _SIDES = {
     "cavmarl": "cavmarl",
     "cavmarl_overlap": "cavmarl, --overlap",

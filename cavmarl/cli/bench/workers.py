@@ -28,8 +28,6 @@ from cavmarl.cli.output import (
 if TYPE_CHECKING:
     from cavmarl.bench.worker_speed import WorkerSpeed
 
-__all__ = ["workers"]
-
 
 def workers(
     env: Annotated[

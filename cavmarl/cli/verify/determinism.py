@@ -21,8 +21,6 @@ from cavmarl.cli.output import (
     write_json,
 )
 
-__all__ = ["verify_determinism"]
-
 
 def verify_determinism(
     env: Environment,

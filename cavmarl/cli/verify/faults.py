@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from cavmarl.verify.fault_campaign import Campaign, LineResult
     from cavmarl.verify.fault_figures import FaultFigures
 
-__all__ = ["check_campaign", "print_campaign", "print_figures"]
-
 
 def check_campaign(layout: str | None, worlds: int, journal: Path | None) -> None:
     """Refuse what a campaign cannot take.

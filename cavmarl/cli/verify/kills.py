@@ -18,8 +18,6 @@ from cavmarl.cli.output import write_json
 if TYPE_CHECKING:
     from cavmarl.verify.worker_kills import Kill, KillReport
 
-__all__ = ["verify_with_kills"]
-
 BOUNDS_MS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 WIDTH = 30  # letters of the longest bar
 

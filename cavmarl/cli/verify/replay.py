@@ -10,8 +10,6 @@ from rich.console import Console
 from cavmarl.cli.output import write_json
 from cavmarl.core.errors import LostTickError
 
-__all__ = ["run_again"]
-
 
 def run_again(path: Path, env: str | None, json_path: Path | None) -> None:
     """As it was, then without the faults of its plan; exit code 1 if it fails as it was.

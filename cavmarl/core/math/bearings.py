@@ -5,8 +5,6 @@ from __future__ import annotations
 from cavmarl.core.math.geometry import PI
 from cavmarl.core.numba import kernel
 
-__all__ = ["ANGLE_ERROR_RAD", "rough_atan2"]
-
 # `rough_atan2` is off by less than this.
 ANGLE_ERROR_RAD = 0.005
 

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from cavmarl.core.numba import inlined_kernel, kernel
 
-__all__ = ["Lists", "add", "forget", "lay_out", "make_lists"]
-
 BLOCK_BITS = 3
 BLOCK = 1 << BLOCK_BITS
 WORD = 8 * BLOCK

@@ -17,20 +17,6 @@ from numpy.typing import NDArray
 
 from cavmarl.core.numba import kernel
 
-__all__ = [
-    "BODY",
-    "LEVEL_HEIGHT_M",
-    "SPOT",
-    "Grid",
-    "cell_at",
-    "cell_columns",
-    "cell_rows",
-    "fill_grid",
-    "k_nearest",
-    "make_grid",
-    "nearest_bodies",
-]
-
 LEVEL_HEIGHT_M = (
     4.0  # vehicles further apart in z are on different levels and do not see each other
 )

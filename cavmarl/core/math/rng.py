@@ -24,30 +24,6 @@ from numpy.typing import NDArray
 
 from cavmarl.core.numba import kernel
 
-__all__ = [
-    "DRAWS_PER_STREAM",
-    "STREAM_DEMAND",
-    "STREAM_DEPARTURE",
-    "STREAM_DRIVER",
-    "STREAM_ORIGIN",
-    "STREAM_PLACE",
-    "STREAM_POLICY",
-    "STREAM_REROUTER",
-    "STREAM_ROUTE",
-    "STREAM_SEAT",
-    "STREAM_SENSOR",
-    "STREAM_SPEED_FACTOR",
-    "STREAM_V2X",
-    "STREAM_VTYPE",
-    "STREAM_WORLD",
-    "below",
-    "fill_uniform",
-    "philox4x32",
-    "quick_uniform",
-    "uniform",
-    "world_key",
-]
-
 DRAWS_PER_STREAM = 1 << 16
 
 STREAM_WORLD = 0 * DRAWS_PER_STREAM  # keys of worlds and episodes

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from cavmarl.core.numba import kernel
 
-__all__ = ["clamp", "not_zero"]
-
 NEAR_ZERO = 0.01
 
 

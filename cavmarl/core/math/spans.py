@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 
 from cavmarl.core.numba import kernel
 
-__all__ = ["row_span"]
-
 
 @kernel
 def row_span(edges: NDArray[np.float64], num: int, row: int, width: int) -> tuple[int, int]:

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from cavmarl.core.numba import kernel
 
-__all__ = ["begins_second", "count_tick", "occasions", "totals"]
-
 
 @kernel
 def begins_second(ticks: NDArray[np.int64], ticks_per_s: int) -> bool:

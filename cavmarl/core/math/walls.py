@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from cavmarl.core.numba import kernel
 
-__all__ = ["Walls", "is_cut", "make_walls"]
-
 CELL_M = 50.0
 # A line that runs along the border of two cells is looked at in both.
 _MARGIN_M = 1e-6

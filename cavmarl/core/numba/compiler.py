@@ -39,8 +39,6 @@ from numba.core.types import IntegerLiteral, NamedTuple, int32, intp
 from numba.core.untyped_passes import InlineClosureLikes, InlineInlinables
 from numba.np import arrayobj
 
-__all__ = ["KernelCompiler", "call_as_part"]
-
 # Passes that look for what no kernel without arrays of its own has: array expressions, ...
 _NEEDLESS = {InlineClosureLikes, InlineInlinables, InlineOverloads, NopythonRewrites}
 

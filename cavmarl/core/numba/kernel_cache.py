@@ -21,8 +21,6 @@ import numba
 import numba.core.config
 from numba.core import caching as numba_caching
 
-__all__ = ["KernelCache", "cache_dir", "kernel_cache_dir"]
-
 caching: Any = numba_caching  # has no types
 
 # Every import of one file of kernels by another; a test holds that there is no other form of it.

@@ -18,8 +18,6 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-__all__ = ["SOON", "prefetch"]
-
 SOON = 8  # rounds of a loop over vehicles: about as long as memory takes to come
 
 _settings: Any = numba.core.config

@@ -12,8 +12,6 @@ from typing import Any, ParamSpec, TypeVar
 import numba
 import numba.core.config
 
-__all__ = ["repeated"]
-
 P = ParamSpec("P")
 R = TypeVar("R")
 

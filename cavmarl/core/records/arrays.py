@@ -14,21 +14,6 @@ from numpy.typing import NDArray
 
 from cavmarl.core.math.buckets import Lists
 
-__all__ = [
-    "Common",
-    "Demand",
-    "Gate",
-    "LaneGrid",
-    "Outputs",
-    "RoadArrays",
-    "Scratch",
-    "Scripts",
-    "Sensors",
-    "Travel",
-    "Worlds",
-    "Zoned",
-]
-
 
 class RoadArrays(NamedTuple):
     """What kernels take of a `RoadNetwork`: the record arrays and nothing else."""

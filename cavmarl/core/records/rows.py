@@ -7,8 +7,6 @@ import numpy as np
 from cavmarl.core.numba import inlined_kernel
 from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_SCRIPTED
 
-__all__ = ["ENTER_REACH_M", "FORK_BEYOND_M", "LOST_M", "is_lost", "is_off_lanes"]
-
 ENTER_REACH_M = 80.0  # how far along its lane a departing vehicle looks for others
 FORK_BEYOND_M = 3.0  # how far beyond a junction paths from one lane can still run together
 LOST_M = (

@@ -16,8 +16,6 @@ from fractions import Fraction
 from cavmarl.core.errors import ClockError
 from cavmarl.cosim.followers.follower_client import Follower
 
-__all__ = ["is_due"]
-
 
 def is_due(step: int, share: Fraction) -> bool:
     """Whether step 1, 2, … is one of those: of the first n there are always floor(n · share)."""

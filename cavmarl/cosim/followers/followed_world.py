@@ -34,8 +34,6 @@ from cavmarl.cosim.time_master import OwnTicks, TimeMaster
 from cavmarl.engine.step_trace import QUEUE, STACK, StepTrace
 from cavmarl.env.parallel import CavEnv
 
-__all__ = ["FollowedWorld"]
-
 
 class FollowedWorld:
     """A master, its world, and a socket for followers.

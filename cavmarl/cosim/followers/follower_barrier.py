@@ -22,8 +22,6 @@ from cavmarl.cosim.followers.follower_snapshots import SnapshotTime, take_snapsh
 from cavmarl.cosim.time_master import TimeFollower
 from cavmarl.env.parallel import CavEnv
 
-__all__ = ["BadControls", "Barrier", "BarrierOutcome", "FollowerSeat"]
-
 BadControls = Literal["error", "hold"]
 
 

@@ -23,8 +23,6 @@ from cavmarl.cosim.followers.follower_messages import (
     read_letter,
 )
 
-__all__ = ["Follower", "FollowerView", "Samples", "sight_of"]
-
 CALL_S = 10.0
 
 

@@ -30,8 +30,6 @@ from cavmarl.cosim.followers.follower_messages import (
 )
 from cavmarl.parallel.hosts.framed_socket import FramedSocket
 
-__all__ = ["Address", "FollowerConnection", "ReceivedFrame", "call", "listen"]
-
 Array = NDArray[Any]
 
 # A path of a Unix socket, or a port of this machine.

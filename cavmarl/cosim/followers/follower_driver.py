@@ -14,8 +14,6 @@ from cavmarl.cosim.stack.stack import Stack, StackConfig, sensor_of, vehicle_of
 from cavmarl.cosim.stack.stack_types import Mission
 from cavmarl.roads.network import RoadNetwork
 
-__all__ = ["StackDriver"]
-
 
 class StackDriver:
     """Drives the vehicles of a follower.

@@ -25,23 +25,6 @@ from pydantic import (
 from cavmarl.core.errors import FollowerError, require
 from cavmarl.parallel.hosts.framed_socket import Dialect
 
-__all__ = [
-    "FOLLOWERS",
-    "MAX_VEHICLES",
-    "ArrayView",
-    "Control",
-    "FollowerRefusal",
-    "FollowerSnapshot",
-    "Hello",
-    "Say",
-    "SensorView",
-    "Ticked",
-    "VehicleView",
-    "Welcome",
-    "letter_of",
-    "read_letter",
-]
-
 T = TypeVar("T")
 
 _msgpack: Any = require("msgpack", "followers")

@@ -22,8 +22,6 @@ from cavmarl.parallel.driven_vehicles import Driven
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.sensors.mounted.frames import SensorFrames
 
-__all__ = ["SnapshotTime", "take_snapshot", "welcome_to"]
-
 NO_SIGNAL = 255
 
 

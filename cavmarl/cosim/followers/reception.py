@@ -17,8 +17,6 @@ from cavmarl.cosim.followers.follower_messages import (
     read_letter,
 )
 
-__all__ = ["Reception", "refuse"]
-
 GREETING_S = 5.0  # for a caller to introduce itself
 HEARING_S = 1.0  # for what has begun to arrive
 MAX_GUESTS = 64  # not introduced yet

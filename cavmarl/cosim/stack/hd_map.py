@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from cavmarl.roads.network import RoadNetwork
 
-__all__ = ["HdMap", "OnLane", "wrap"]
-
 _CELL_M = 20.0
 
 

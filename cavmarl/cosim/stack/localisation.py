@@ -27,8 +27,6 @@ from cavmarl.cosim.stack.stack_types import (
 from cavmarl.sensors.kernels.inertia import GRAVITY_MPS2
 from cavmarl.sensors.mounted.geodesy import Geodesy
 
-__all__ = ["GnssInertial"]
-
 # Standard deviations: of what the model leaves out, a square root of a second, and of sensors
 # whose settings give none.
 _DRIFT = (0.1, 0.1, 0.01, 0.5)

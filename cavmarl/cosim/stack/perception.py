@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 from cavmarl.cosim.stack.hd_map import HdMap, OnLane, wrap
 from cavmarl.cosim.stack.stack_types import EgoPose, Obstacle, Readings, StackSensor
 
-__all__ = ["LidarObjects"]
-
 _GAP_M = 0.8
 _ROAD_M = 2.5  # from the centre of a lane
 _RANGE_MARGIN_M = 0.05

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-__all__ = ["REFERENCE_RIG"]
-
 # Noise of consumer-grade parts: a GNSS receiver without corrections, a MEMS inertial unit, wheel
 # encoders, a camera that looks for lane markings, and a lidar at the height of a bumper.
 REFERENCE_RIG: dict[str, dict[str, Any]] = {

@@ -28,8 +28,6 @@ from cavmarl.cosim.stack.hd_map import HdMap, OnLane, wrap
 from cavmarl.cosim.stack.stack_types import EgoPose, Mission, Obstacle, Trajectory
 from cavmarl.roads.routing import make_plans
 
-__all__ = ["LaneRoute"]
-
 _AHEAD_M = 70.0
 _MATCH_M = 5.0
 _HEADING_COST_M = 3.0  # of a radian, against metres beside a lane

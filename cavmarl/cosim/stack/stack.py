@@ -33,8 +33,6 @@ from cavmarl.cosim.stack.stack_types import (
 )
 from cavmarl.sensors.mounted.geodesy import Geodesy, geodesy_of
 
-__all__ = ["STAGES", "Stack", "StackConfig", "StageTimes", "Vehicle", "sensor_of", "vehicle_of"]
-
 
 class Vehicle(NamedTuple):
     """What a stage may know of the vehicle that it is made for.

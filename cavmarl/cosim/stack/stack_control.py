@@ -16,8 +16,6 @@ import numpy as np
 from cavmarl.cosim.stack.hd_map import wrap
 from cavmarl.cosim.stack.stack_types import Control2D, EgoPose, Mission, Trajectory
 
-__all__ = ["GAINS", "Gains", "PurePursuit"]
-
 
 class Gains(NamedTuple):
     """How one type of vehicle is controlled.

@@ -12,22 +12,6 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "Control2D",
-    "ControlStage",
-    "EgoPose",
-    "Localisation",
-    "Mission",
-    "Obstacle",
-    "Perception",
-    "Planning",
-    "Readings",
-    "SensorSamples",
-    "StackMount",
-    "StackSensor",
-    "Trajectory",
-]
-
 
 class SensorSamples(Protocol):
     """What one sensor has since the last step."""

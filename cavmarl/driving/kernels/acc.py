@@ -16,8 +16,6 @@ from cavmarl.core.math.scalars import clamp
 from cavmarl.core.numba import kernel
 from cavmarl.driving.kernels.krauss import safe_speed
 
-__all__ = ["SPEED_MODE_S", "acc_acceleration"]
-
 SPEED_MODE_S = 2.0  # time gap in s above which a leader does not count
 SPEED_GAIN = 0.4  # 1/s
 CONTROL_SPACE, CONTROL_SPEED = 0.23, 0.07  # 1/s², 1/s: near the wanted gap,

@@ -7,8 +7,6 @@ import numpy as np
 from cavmarl.core.numba import inlined_kernel
 from cavmarl.core.records.codes import HOLD_EXIT_BLOCKED, HOLD_NONE, HOLD_SIGNAL
 
-__all__ = ["APPROACH_M", "IMPATIENT_S", "STANDING_MPS", "announced_m", "is_let_stand"]
-
 APPROACH_M = 150.0  # how far ahead a vehicle announces itself at most,
 APPROACH_S = 8.0  # which it does this time before it arrives,
 APPROACH_STANDING_M = 30.0  # and this far ahead in any case

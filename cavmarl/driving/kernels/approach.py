@@ -17,12 +17,6 @@ from cavmarl.core.records.rows import FORK_BEYOND_M, is_lost
 from cavmarl.driving.kernels.announcing import announced_m
 from cavmarl.driving.kernels.ways import leave, next_step, own_step
 
-__all__ = [
-    "APPROACH",
-    "MAX_LINKS_AHEAD",
-    "register_links",
-]
-
 MAX_LINKS_AHEAD = 2
 BLOCK = 64  # rows that are still near in memory when they are looked at again
 

@@ -12,8 +12,6 @@ import math
 from cavmarl.core.math.geometry import wrap_angle
 from cavmarl.core.numba import kernel
 
-__all__ = ["MAX_SPEED_MPS", "MIN_SPEED_MPS", "bicycle_step", "clip_control"]
-
 MAX_SPEED_MPS = 40.0  # beyond it the engine gives way
 MIN_SPEED_MPS = -40.0
 

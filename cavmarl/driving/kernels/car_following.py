@@ -16,17 +16,6 @@ import math
 from cavmarl.core.math.scalars import not_zero
 from cavmarl.core.numba import kernel
 
-__all__ = [
-    "ACCEL_LIMIT",
-    "ACCEL_MAX",
-    "DECEL_COMFORT",
-    "JAM_DISTANCE_M",
-    "TIME_HEADWAY_S",
-    "idm_acceleration",
-    "idm_free",
-    "idm_interaction",
-]
-
 ACCEL_MAX = 3.0  # m/s², desired acceleration from rest on a free road
 DECEL_COMFORT = 5.0  # m/s², braking that feels comfortable, a positive number
 JAM_DISTANCE_M = 10.0  # m between the centres of two standing cars of 5 m: bumpers 5 m apart

@@ -11,8 +11,6 @@ from cavmarl.core.math.geometry import boxes_overlap
 from cavmarl.core.math.neighbors import Grid, cell_at, cell_columns, cell_rows
 from cavmarl.core.numba import inlined_kernel, kernel
 
-__all__ = ["find_contacts"]
-
 
 @kernel
 def _bodies_touch(one: np.void, other: np.void) -> bool:

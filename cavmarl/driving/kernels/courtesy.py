@@ -11,8 +11,6 @@ from cavmarl.driving.kernels.following import accel_behind
 from cavmarl.driving.kernels.lane_choice import LOOK_BACK_M, SIDE_GAP_M
 from cavmarl.driving.kernels.lane_index import behind_on, beside_s, comes_over
 
-__all__ = ["COURTESY_DECEL", "let_merge"]
-
 COURTESY_DECEL = 3.0  # m/s², the hardest braking to let a vehicle merge, or to fall in behind
 
 

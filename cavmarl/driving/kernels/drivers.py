@@ -35,8 +35,6 @@ from cavmarl.driving.kernels.lane_index import VIEW_M, ahead_on, beside_s, last_
 from cavmarl.driving.kernels.stopping import way_to_stop
 from cavmarl.driving.kernels.ways import leave, next_step
 
-__all__ = ["decide", "look_ahead_m", "see_line_m"]
-
 SEE_LINE_M = 8.0
 NEAR_M = 8.0  # to a leader so near the corner between matters,
 ASKEW_RAD = 0.7  # if it turns by so much,

@@ -20,18 +20,6 @@ from cavmarl.driving.kernels.car_following import ACCEL_LIMIT, idm_free, idm_int
 from cavmarl.driving.kernels.krauss import dawdle, safe_speed
 from cavmarl.driving.kernels.registered_models import ask_model
 
-__all__ = [
-    "LINE_MARGIN_M",
-    "REFERENCE_LENGTH_M",
-    "accel_behind",
-    "before_line",
-    "behind",
-    "no_press",
-    "response",
-    "speed_behind",
-    "wish",
-]
-
 # IDM's distances are measured between the centres of two cars of this length, as highway-env does.
 REFERENCE_LENGTH_M = 5.0
 LINE_MARGIN_M = 1.0  # a driver stops with its front this far before a line

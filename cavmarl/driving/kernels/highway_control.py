@@ -12,16 +12,6 @@ from cavmarl.core.math.geometry import wrap_angle
 from cavmarl.core.math.scalars import clamp, not_zero
 from cavmarl.core.numba import kernel
 
-__all__ = [
-    "KP_ACCEL",
-    "KP_HEADING",
-    "KP_LATERAL",
-    "MAX_STEERING_RAD",
-    "PURSUIT_S",
-    "speed_control",
-    "steering_control",
-]
-
 KP_ACCEL = 1.0 / 0.6  # 1/s, gain from speed error to acceleration
 KP_HEADING = 1.0 / 0.2  # 1/s, gain from heading error to yaw rate
 KP_LATERAL = 1.0 / 0.6  # 1/s, gain from lateral offset to lateral speed

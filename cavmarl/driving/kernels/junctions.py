@@ -34,14 +34,6 @@ from cavmarl.driving.kernels.announcing import IMPATIENT_S, STANDING_MPS, is_let
 from cavmarl.driving.kernels.following import LINE_MARGIN_M, before_line, behind, no_press
 from cavmarl.driving.kernels.ways import next_step
 
-__all__ = [
-    "STOP_SIGN_S",
-    "link_signal",
-    "may_enter",
-    "press_inside",
-    "waits_inside",
-]
-
 FOE_ACCEL = 2.5  # m/s², how a driver thinks that others speed up over a junction,
 OWN_ACCEL = 1.8  # and, to be safe, itself
 COMFORT_STOP = 3.0  # m/s², a driver stops for yellow where this braking is enough

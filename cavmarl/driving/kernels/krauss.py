@@ -11,8 +11,6 @@ import math
 
 from cavmarl.core.numba import kernel
 
-__all__ = ["dawdle", "safe_speed"]
-
 
 @kernel
 def safe_speed(

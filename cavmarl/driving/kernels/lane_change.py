@@ -8,15 +8,6 @@ from __future__ import annotations
 
 from cavmarl.core.numba import kernel
 
-__all__ = [
-    "LANE_CHANGE_DELAY_S",
-    "MAX_BRAKING_IMPOSED",
-    "MIN_ACCEL_GAIN",
-    "MIN_SPEED_MPS",
-    "POLITENESS",
-    "mobil_accepts",
-]
-
 POLITENESS = 0.0  # weight of the followers' gains, from 0 (selfish) to 1
 MIN_ACCEL_GAIN = 0.2  # m/s², a change that gains less is not worth it
 MAX_BRAKING_IMPOSED = 2.0  # m/s², harder braking makes a change unsafe

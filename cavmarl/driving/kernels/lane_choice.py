@@ -25,8 +25,6 @@ from cavmarl.driving.kernels.lane_index import ahead_on, beside_s, last_on, neig
 from cavmarl.driving.kernels.stopping import STAY, lane_to_stop
 from cavmarl.driving.kernels.ways import next_step
 
-__all__ = ["LOOK_BACK_M", "SIDE_GAP_M", "choose_lane", "needed_change", "thinks_of_lanes"]
-
 LOOK_BACK_M = 60.0  # how far back a lane change looks for followers
 CHANGE_EARLY_M = 80.0  # a change that the route needs is made this far before it must be,
 CHANGE_EARLY_S = 12.0  # plus the way of this time

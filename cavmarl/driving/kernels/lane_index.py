@@ -22,18 +22,6 @@ from cavmarl.core.records.codes import DRIVER_SCRIPTED
 from cavmarl.core.records.rows import is_lost
 from cavmarl.driving.kernels.announcing import announced_m
 
-__all__ = [
-    "ENTRY",
-    "VIEW_M",
-    "ahead_on",
-    "behind_on",
-    "beside_s",
-    "comes_over",
-    "index_lanes",
-    "last_on",
-    "neighbor_behind",
-]
-
 MAX_LOOK_BACK_LANES = 4
 VIEW_M = 250.0  # the farthest view along the road that a world can have
 

@@ -30,19 +30,6 @@ from cavmarl.driving.kernels.stopping import make_stop
 from cavmarl.driving.kernels.tracking import locate, side_lane
 from cavmarl.driving.kernels.ways import next_step, own_step, way_left
 
-__all__ = [
-    "ARRIVE_M",
-    "LATERAL_MPS",
-    "MAX_SPEED_MPS",
-    "Before",
-    "account",
-    "before_tick",
-    "lane_before",
-    "move_agent",
-    "move_background",
-    "place_on_lane",
-]
-
 LATERAL_MPS = 1.4  # fastest sideways motion of a lane change
 LATERAL_RATIO = 0.35  # and no faster than this share of the speed,
 LATERAL_MIN_MPS = 0.2  # but never stuck between two lanes

@@ -17,8 +17,6 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic, overload
 
-__all__ = ["FIRST_REGISTERED", "MAX_REGISTERED", "ask_model", "put_model"]
-
 FIRST_REGISTERED = 16  # MODEL_* code of the first registered model
 MAX_REGISTERED = 64
 

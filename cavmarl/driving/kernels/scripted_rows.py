@@ -16,8 +16,6 @@ from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_BACKGROUND
 from cavmarl.driving.kernels.motion import account, before_tick
 from cavmarl.driving.kernels.ways import own_step, way_left
 
-__all__ = ["follow_script", "note_cues", "stand_at"]
-
 
 @inlined_kernel
 def stand_at(frame: np.void, row: np.void) -> None:

@@ -9,8 +9,6 @@ from cavmarl.core.numba import kernel
 from cavmarl.core.records.arrays import RoadArrays
 from cavmarl.roads.kernels.signal_phases import program_at
 
-__all__ = ["time_to_change"]
-
 
 @kernel
 def time_to_change(

@@ -18,8 +18,6 @@ from cavmarl.core.records.codes import (
 )
 from cavmarl.driving.kernels.highway_control import PURSUIT_S, steering_control
 
-__all__ = ["nearest_speed", "steer_to_lane", "take_meta_action"]
-
 CHORD_M = 1.5  # real lanes have corners: their direction is that of a chord, this far to both sides
 
 

@@ -8,8 +8,6 @@ from cavmarl.core.numba import inlined_kernel
 from cavmarl.core.records.arrays import RoadArrays, Travel
 from cavmarl.core.records.codes import UNTIL_DEPARTURE
 
-__all__ = ["STAY", "lane_to_stop", "make_stop", "way_to_stop"]
-
 STANDING_MPS = 0.1
 STOPPED_M = 3.0  # a front this far before the place has reached it
 PASSED_M = 1.0  # a front this far beyond it will not stop there any more

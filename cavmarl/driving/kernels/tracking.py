@@ -17,8 +17,6 @@ from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import LaneGrid, RoadArrays
 from cavmarl.core.records.codes import EVENT_OFF_ROAD, EVENT_WRONG_WAY
 
-__all__ = ["locate", "side_lane"]
-
 JUNCTION_MARGIN_M = (
     2.0  # inside junctions lanes are guides: this much beyond their sides is still road
 )

@@ -13,8 +13,6 @@ import numpy as np
 from cavmarl.core.numba import inlined_kernel
 from cavmarl.core.records.arrays import RoadArrays, Travel
 
-__all__ = ["leave", "next_step", "own_step", "way_left"]
-
 
 @inlined_kernel
 def own_step(roads: RoadArrays, row: np.void) -> int:

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from cavmarl.core.numba import kernel
 from cavmarl.core.records.codes import ACTION_IDLE, ACTION_SLOWER
 
-__all__ = ["decode_choices", "decode_pairs"]
-
 
 @kernel
 def decode_pairs(

@@ -15,8 +15,6 @@ from cavmarl.core.numba import kernel
 from cavmarl.core.records.arrays import Gate, Outputs
 from cavmarl.core.records.codes import COUNT_ARRIVED, EVENTS_THAT_END
 
-__all__ = ["Results", "keep_last", "report", "report_who_goes_on"]
-
 
 class Results(NamedTuple):
     """See `stepping.arrays.StepArrays`, of which these are some."""

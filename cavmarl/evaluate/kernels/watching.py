@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from cavmarl.core.numba import kernel
 from cavmarl.core.records.arrays import RoadArrays
 
-__all__ = ["locate_agents", "watch_encroachments"]
-
 MIN_SPEED_MPS = 1.0  # of a front that is followed back to where it entered
 
 

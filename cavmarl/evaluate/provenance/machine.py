@@ -9,8 +9,6 @@ import subprocess
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-__all__ = ["describe_code", "describe_hardware", "describe_software"]
-
 _ROOT = Path(__file__).resolve().parents[3]
 
 PACKAGES = (

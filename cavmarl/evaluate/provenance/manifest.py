@@ -28,17 +28,6 @@ from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
-__all__ = [
-    "MANIFEST_FILE",
-    "close_manifest",
-    "describe_policies",
-    "describe_world",
-    "hash_of_file",
-    "open_manifest",
-    "read_closed",
-    "write_text",
-]
-
 MANIFEST_FILE = "manifest.json"
 SCHEMA = 1
 

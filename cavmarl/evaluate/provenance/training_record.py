@@ -23,8 +23,6 @@ from cavmarl.evaluate.provenance.manifest import (
     read_closed,
 )
 
-__all__ = ["begin_training", "end_training", "is_trained"]
-
 
 def begin_training(
     folder: Path,

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from cavmarl.core.math.geometry import boxes_overlap
 
-__all__ = ["TRACE", "post_encroachment_s", "time_to_collision_s", "trace_of"]
-
 TRACE = np.dtype(
     [
         ("time_s", np.float64),

@@ -20,8 +20,6 @@ from cavmarl.render.video import VideoWriter
 if TYPE_CHECKING:
     from pygame import Surface
 
-__all__ = ["ScenarioCamera"]
-
 SIZE = (1280, 720)
 HALF_M = (64.0, 36.0)  # of what is shown around the middle of the scene
 

@@ -32,8 +32,6 @@ from cavmarl.evaluate.scenarios.criticality import (
 )
 from cavmarl.policies.policy import load_policy
 
-__all__ = ["DENSITIES", "ScenarioRun", "make_scenario", "run_scenario"]
-
 DENSITIES = {"none": 0.0, "low": 2.0, "high": 8.0}
 """Background vehicles a kilometre of lane."""
 

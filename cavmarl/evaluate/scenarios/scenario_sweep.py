@@ -15,8 +15,6 @@ from typing import Any, NamedTuple
 from cavmarl.core.errors import ScenarioError
 from cavmarl.evaluate.scenarios.scenario_runs import ScenarioRun, make_scenario, run_scenario
 
-__all__ = ["SweepRow", "sweep_scenarios"]
-
 
 class SweepRow(NamedTuple):
     """One scenario on one map.

@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from cavmarl.core.records.codes import SIGNAL_RED, SIGNAL_RED_YELLOW
 from cavmarl.roads.network import RoadNetwork
 
-__all__ = ["STOP_LINE_M", "JunctionLocks"]
-
 STOP_LINE_M = 10.0  # a front nearer to the end of its lane than this stands at the stop line
 
 

@@ -16,8 +16,6 @@ from cavmarl.render.ground import signal_codes
 from cavmarl.shards.shard import Commands
 from cavmarl.traffic.sumo.sumo_input import read_input
 
-__all__ = ["advance", "idle_commands", "load_demand", "make_world", "run_native"]
-
 
 def load_demand(
     map_file: Path,

@@ -30,8 +30,6 @@ from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
 from cavmarl.traffic.sumo.sumo_input import SumoInput
 from cavmarl.traffic.sumo.sumo_options import command_words, free_libsumo
 
-__all__ = ["SumoJob", "run_sumo", "start_sumo", "sumo_process"]
-
 
 @dataclass(frozen=True)
 class SumoJob:

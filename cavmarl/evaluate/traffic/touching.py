@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from cavmarl.core.math.neighbors import make_grid
 from cavmarl.driving.kernels.contacts import find_contacts
 
-__all__ = ["TouchCounter"]
-
 CELL_M = 10.0
 
 

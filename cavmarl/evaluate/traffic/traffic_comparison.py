@@ -15,8 +15,6 @@ from cavmarl.evaluate.traffic.traffic_metrics import EDGE_MINUTE, TrafficRun
 from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.sumo.sumo_input import read_input
 
-__all__ = ["TrafficComparison", "compare_traffic"]
-
 MAX_SECONDS = 100_000
 RATIOS = ("departed", "waiting", "arrived", "mean_speed_mps", "mean_delay_s", "queue")
 

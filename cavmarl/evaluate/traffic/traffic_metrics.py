@@ -16,16 +16,6 @@ from cavmarl.evaluate.traffic.junction_locks import JunctionLocks
 from cavmarl.evaluate.traffic.touching import TouchCounter
 from cavmarl.roads.network import RoadNetwork
 
-__all__ = [
-    "EDGE_MINUTE",
-    "SAMPLES_PER_S",
-    "STANDING_MPS",
-    "TrafficCounts",
-    "TrafficFigures",
-    "TrafficMeter",
-    "TrafficRun",
-]
-
 STANDING_MPS = 0.1  # slower is standing, as in SUMO's waiting time
 SAMPLES_PER_S = 1
 MINUTE_S = 60

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import ConfigError, require
 from cavmarl.evaluate.traffic.traffic_comparison import TrafficComparison
 
-__all__ = ["plot_fundamental_diagram"]
-
 LEAST_EDGE_M = 50.0  # one vehicle on a shorter edge is a density of a jam
 BIN_PER_KM = 10.0  # a line joins the means of bins this wide
 LEAST_IN_BIN = 5

@@ -18,8 +18,6 @@ from cavmarl.handoff.coordinator.journal import AnyJournal
 from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.messages import Birth, Message, Record, Removed, Switch
 
-__all__ = ["ArrivingVehicle", "Coordinator", "Near", "Watcher"]
-
 
 class Near(NamedTuple):
     """A vehicle that another zone has to be told of; see `kernels.borders.NEAR`."""

@@ -34,15 +34,6 @@ from cavmarl.ownership.transfers import TransferLog
 from cavmarl.ownership.transport import Network
 from cavmarl.shards.shard import Shard
 
-__all__ = [
-    "CoordinatorSetup",
-    "WorldRun",
-    "check_faults",
-    "journal_path",
-    "make_coordinators",
-    "prepare_runs",
-]
-
 
 class CoordinatorSetup(NamedTuple):
     """The coordinators of a divided environment.

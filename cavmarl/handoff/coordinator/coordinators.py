@@ -22,8 +22,6 @@ from cavmarl.ownership.messages import Record
 from cavmarl.shards.shard import Commands
 from cavmarl.zones.kernels.zone_lookup import zones_of
 
-__all__ = ["Coordinators", "RowStates"]
-
 
 class RowStates:
     """States of one world's vehicles at the committed tick, read from the rows of their owners.

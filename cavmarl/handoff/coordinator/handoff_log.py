@@ -14,8 +14,6 @@ from cavmarl.handoff.division import Division
 from cavmarl.ownership.messages import Birth
 from cavmarl.zones.kernels.handoff import NOT_OWNED
 
-__all__ = ["HandoffLog", "OwnerChange"]
-
 
 class OwnerChange(NamedTuple):
     """A change of owner; see `kernels.handing_over.CHANGE`."""

@@ -35,8 +35,6 @@ from cavmarl.ownership.messages import Birth, Commit, Item, Message, Record, Res
 from cavmarl.ownership.trace import LOG, TraceEntry, describe
 from cavmarl.ownership.trace_check import Owner, TraceChecker
 
-__all__ = ["InvariantMonitor", "OwnersOnRecord"]
-
 WORD = 1 << 64
 
 

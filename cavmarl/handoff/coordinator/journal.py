@@ -22,8 +22,6 @@ from cavmarl.ownership.messages import Record
 if sys.platform != "win32":
     import fcntl
 
-__all__ = ["AnyJournal", "Journal", "JournalReader", "MemoryJournal", "Sync"]
-
 Sync: TypeAlias = Literal["flush", "fsync"]
 
 

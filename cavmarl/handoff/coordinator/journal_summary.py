@@ -11,8 +11,6 @@ from cavmarl.handoff.coordinator.journal import JournalReader
 from cavmarl.ownership.messages import Begin, Commit, Fence, Host, Record, Reset
 from cavmarl.ownership.table import Table
 
-__all__ = ["JournalSummary", "owners_at", "summarize"]
-
 
 @dataclass
 class JournalSummary:

@@ -33,8 +33,6 @@ from cavmarl.ownership.messages import Begin, Birth, Commit, Removed, Switch, Zo
 from cavmarl.ownership.transfers import Transfer, TransferLog
 from cavmarl.zones.kernels.handoff import LATE
 
-__all__ = ["LocalCoordinator"]
-
 
 class _News(NamedTuple):
     """Vehicles that have entered and left by the end of a tick."""

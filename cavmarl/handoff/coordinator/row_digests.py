@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from cavmarl.driving.vehicles import STATE_FIELDS, VEHICLE
 from cavmarl.handoff.kernels.digests import digest_rows
 
-__all__ = ["RowDigests", "digest_tables"]
-
 
 def digest_tables(fields: Iterable[str]) -> tuple[NDArray[np.uint64], NDArray[np.uint64]]:
     """Masks and factors (n,) of the words of VEHICLE, for digests in which some fields count."""

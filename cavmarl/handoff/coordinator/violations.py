@@ -19,8 +19,6 @@ from cavmarl.ownership.messages import Birth
 from cavmarl.ownership.trace_check import Owner
 from cavmarl.zones.kernels.zone_lookup import is_seen, squared_distance
 
-__all__ = ["Violations"]
-
 Place = tuple[int, np.void]
 """A zone and a row that it owns."""
 

@@ -18,8 +18,6 @@ from cavmarl.ownership.messages import Birth, Removed
 from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 from cavmarl.shards.shard import COMMON, Shard
 
-__all__ = ["COUNTS", "CommittedImage", "CommittedStore", "Notes"]
-
 # Counts of `Worlds` that each shard has of its own.
 COUNTS = ("num_owned", "num_rows", "num_through", "num_touching", "num_contacts")
 

@@ -11,16 +11,6 @@ from typing import Any, TypeVar
 from cavmarl.core.errors import ConfigError
 from cavmarl.ownership.transport import FaultPlan, Rates, check_rate, check_whole
 
-__all__ = [
-    "COORDINATOR_POINTS",
-    "MESSAGES",
-    "PHASES",
-    "ZONE_POINTS",
-    "Crash",
-    "Faults",
-    "read_faults",
-]
-
 MESSAGES = ("Step", "Done", "Prepare", "Ack", "Nack", "Abort", "Need")
 PHASES = (
     "begin_step", "advance", "choose_goals", "leave", "resolve", "rank_lanes", "propose", "admit",

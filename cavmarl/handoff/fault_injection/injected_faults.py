@@ -19,15 +19,6 @@ from cavmarl.ownership.messages import COORDINATOR, Begin, Commit, Output, Prepa
 from cavmarl.shards.executor import Executor, Phase, SerialExecutor
 from cavmarl.shards.shard import Shard
 
-__all__ = [
-    "CoordinatorDeath",
-    "Crashes",
-    "FaultyCoordinator",
-    "FaultyPhases",
-    "Visit",
-    "ZoneDeath",
-]
-
 Visit: TypeAlias = tuple[int, str, int]
 """A visit to a point: (tick of the run, point, zone or COORDINATOR)."""
 

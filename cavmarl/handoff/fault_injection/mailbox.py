@@ -7,8 +7,6 @@ from typing import Protocol, TypeAlias
 
 from cavmarl.ownership.messages import Message
 
-__all__ = ["Parcel", "Post"]
-
 Parcel: TypeAlias = tuple[int, Message, bool]
 """A message at its destination, and whether it is to be refused; see `transport.Delivery`."""
 

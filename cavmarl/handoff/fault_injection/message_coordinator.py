@@ -25,8 +25,6 @@ from cavmarl.ownership.offers import Approach
 from cavmarl.ownership.reactions import Advance
 from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 
-__all__ = ["MessageCoordinator"]
-
 PATIENCE = 10_000
 """So often a tick asks a zone that does not answer, before it gives up."""
 

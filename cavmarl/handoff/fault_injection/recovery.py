@@ -28,8 +28,6 @@ from cavmarl.handoff.fault_injection.message_coordinator import MessageCoordinat
 from cavmarl.ownership.directory import StoreError
 from cavmarl.shards.shard import Shard
 
-__all__ = ["Recovery", "Revival"]
-
 GARBAGE = 0xA5  # what is in a memory that is lost, byte by byte
 
 

@@ -26,8 +26,6 @@ from cavmarl.ownership.log_records import record_from_dict, record_to_dict
 from cavmarl.ownership.messages import Birth, Fence, Host, Record, Removed, Reset
 from cavmarl.shards.shard import Commands
 
-__all__ = ["Reproducer", "needed_records", "read_reproducer"]
-
 SCHEMA = "cavmarl.reproducer/1"
 MAX_BYTES = 1 << 31  # of one array: a damaged length shall not fill the memory
 

@@ -24,8 +24,6 @@ from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
-__all__ = ["Keeper", "RecordedTick", "made_with", "sources_of"]
-
 
 class RecordedTick(NamedTuple):
     """A tick among all ticks.

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from cavmarl.core.math.rng import mix
 from cavmarl.core.numba import kernel
 
-__all__ = ["digest_rows"]
-
 
 @kernel
 def digest_rows(

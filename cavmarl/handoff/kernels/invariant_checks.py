@@ -24,24 +24,6 @@ from cavmarl.zones.kernels.zone_lookup import (
     zone_of,
 )
 
-__all__ = [
-    "FINDING",
-    "KEPT",
-    "KIND_FAR",
-    "KIND_NONE",
-    "KIND_SUMS",
-    "KIND_TICK",
-    "LOST",
-    "TALLY",
-    "CheckTime",
-    "Kept",
-    "Strays",
-    "make_kept",
-    "make_strays",
-    "owner_hash",
-    "watch",
-]
-
 KEPT = np.dtype(
     [
         ("id", np.int64),

@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import WorkerError
 from cavmarl.shards.shard import Commands
 
-__all__ = ["ActionLog", "LoggedAction"]
-
 _COMMANDS = ("controls", "meta_actions", "declared")
 _READ_AT_ONCE = 64  # entries
 

@@ -13,8 +13,6 @@ from cavmarl.parallel.checkpoint.action_log import ActionLog, LoggedAction
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.worlds_job import Task, WorldsJob
 
-__all__ = ["ActionLogJob"]
-
 
 class ActionLogJob(WorldsJob):
     """Some of the worlds, next to each other, whose successor begins at their beginning.

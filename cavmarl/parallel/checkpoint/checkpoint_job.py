@@ -13,8 +13,6 @@ from cavmarl.parallel.checkpoint.checkpoint_log import CheckpointLog
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.worlds_job import Task, WorldsJob
 
-__all__ = ["CheckpointJob"]
-
 AGAIN_S = 0.04  # a successor goes through no more steps again than take that long
 
 

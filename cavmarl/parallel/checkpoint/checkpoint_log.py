@@ -19,8 +19,6 @@ from cavmarl.parallel.processes.state_image import Arrays, Image
 from cavmarl.shards.shard import Commands
 from cavmarl.traffic.sumo.sumo_history import ToldLog
 
-__all__ = ["CheckpointLog", "make_segments"]
-
 STEPS = 16  # from one image to the next: a successor repeats that many at most
 _FIRST_IMAGE_BYTES = 1 << 12
 _COMMANDS = ("controls", "meta_actions", "declared")

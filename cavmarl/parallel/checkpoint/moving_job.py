@@ -19,8 +19,6 @@ from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.processes.state_image import Image
 from cavmarl.parallel.worlds_job import Task, WorldsJob
 
-__all__ = ["MovingJob"]
-
 Array = NDArray[Any]
 Share = list[Array]
 MakeWorlds = Callable[[int, int], LocalWorlds]

@@ -5,8 +5,6 @@ from __future__ import annotations
 from cavmarl.core.errors import WorkerError
 from cavmarl.parallel.processes.shared_memory import Segment, arrays_in, size_of
 
-__all__ = ["MovingMemory"]
-
 _CASE_BYTES = 1 << 12  # of what a worker leaves for others; it grows
 
 

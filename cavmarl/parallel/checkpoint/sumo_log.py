@@ -11,8 +11,6 @@ from cavmarl.core.errors import WorkerError
 from cavmarl.parallel.processes.shared_memory import Segment
 from cavmarl.traffic.sumo.sumo_history import ToldLog
 
-__all__ = ["FIRST_LOG_BYTES", "KeptLog"]
-
 FIRST_LOG_BYTES = 1 << 12
 _WORD = 8
 

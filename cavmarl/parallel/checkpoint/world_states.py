@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from cavmarl.parallel.processes.state_image import Image
 
-__all__ = ["WorldMove", "buffers", "moves_of", "pack", "unpack"]
-
 Array = NDArray[Any]
 Bytes = NDArray[np.uint8]
 

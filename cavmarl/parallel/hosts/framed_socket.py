@@ -25,18 +25,6 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import MessageError
 
-__all__ = [
-    "HOSTS",
-    "MAGIC",
-    "MAX_DATA",
-    "MAX_LETTER",
-    "VERSION",
-    "Dialect",
-    "Frame",
-    "FramedSocket",
-    "Kind",
-]
-
 Array = NDArray[Any]
 
 MAGIC = b"cavW"

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import WorkerFailureError
 
-__all__ = ["Arrays", "CommittedState", "HostProgram", "OpenOrder", "Say"]
-
 Array = NDArray[Any]
 Arrays = Sequence[Array]
 Say = Callable[[int, bool], tuple[Any, Arrays]]

@@ -39,8 +39,6 @@ from cavmarl.parallel.processes.watchdog import CHECK_S
 from cavmarl.parallel.processes.worker_loop import NOTHING
 from cavmarl.parallel.processes.worker_pool import Death
 
-__all__ = ["HostPool"]
-
 COMES_S = 300.0  # a machine that has never run cavmarl compiles it first
 IMAGE_EVERY = 8  # commands that are noted: a successor repeats as many at most
 

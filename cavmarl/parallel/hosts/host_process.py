@@ -20,8 +20,6 @@ from cavmarl.parallel.processes.shared_memory import Segment
 from cavmarl.parallel.processes.state_image import Image, load_kernels
 from cavmarl.parallel.processes.worker_loop import NOTHING, OUT_OF_MEMORY, describe
 
-__all__ = ["BEAT_S", "Order", "RemoteJob", "TaskOutcome", "serve"]
-
 Array = NDArray[Any]
 
 BEAT_S = 0.1

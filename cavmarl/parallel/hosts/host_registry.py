@@ -13,8 +13,6 @@ from cavmarl.core.errors import MessageError, WorkerError, WorkerFailureError
 from cavmarl.parallel.hosts.framed_socket import FramedSocket, Kind
 from cavmarl.parallel.hosts.listener import MAX_GUESTS, Listener, PendingConnection
 
-__all__ = ["ENDED", "SILENCE_S", "HostConnection", "HostRegistry", "Launcher"]
-
 ENDED = (EOFError, ConnectionError)  # of a connection, as it does when the process at its end dies
 
 SILENCE_S = 0.8  # of a host that is at work, and tells so every `host.BEAT_S`

@@ -26,8 +26,6 @@ from cavmarl.parallel.step_arrays import StepArrays
 from cavmarl.parallel.worlds_job import Task, WorldsJob, fingerprint
 from cavmarl.sensors.mounted.frames import Frames
 
-__all__ = ["HostedWorlds", "code_stamp", "host_worlds", "inputs_of", "results_of"]
-
 Array = NDArray[Any]
 
 _CASE_BYTES = 1 << 12

@@ -20,8 +20,6 @@ import time
 from cavmarl.core.errors import MessageError, WorkerError
 from cavmarl.parallel.hosts.framed_socket import MAGIC, VERSION, FramedSocket
 
-__all__ = ["MAX_GUESTS", "Listener", "PendingConnection", "knock"]
-
 NONCE = 16  # bytes of a random number
 PROOF = 32  # of an HMAC
 SECRET = 32

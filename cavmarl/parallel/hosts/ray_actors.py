@@ -9,8 +9,6 @@ from typing import Any, NoReturn
 from cavmarl.core.errors import WorkerError, require
 from cavmarl.parallel.hosts.ray_cluster import choose_nodes, join, leave, nodes_with
 
-__all__ = ["SPARES", "Main", "RayActors", "RayHost"]
-
 SPARES = 1  # hosts that wait for another one's death: a new actor takes seconds
 
 Main = Callable[[str, tuple[str, int], bytes, int], NoReturn]

@@ -12,8 +12,6 @@ from typing import Any
 from cavmarl.balance.load_score import Candidate, Utilisation, select
 from cavmarl.core.errors import ConfigError, WorkerError, require
 
-__all__ = ["Node", "choose_nodes", "join", "leave", "nodes", "nodes_with"]
-
 ADDRESS = "RAY_ADDRESS"  # the environment's variable that Ray itself reads
 CALL_S = 5.0
 RELEASE_S = 2.0  # Ray hears of an actor's end by and by

@@ -32,8 +32,6 @@ from cavmarl.parallel.step_placement import StepPlacement
 from cavmarl.parallel.work_shares import Part, parts_of
 from cavmarl.parallel.worlds_job import Task, fingerprint
 
-__all__ = ["RemoteWorlds"]
-
 Array = NDArray[np.uint8]
 
 

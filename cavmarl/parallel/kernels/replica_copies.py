@@ -16,15 +16,6 @@ from numpy.typing import NDArray
 from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.codes import DRIVER_AGENT
 
-__all__ = [
-    "GROUP",
-    "mark_agents",
-    "note_agents",
-    "note_rows",
-    "note_spans",
-    "take_changes",
-]
-
 GROUP = 64  # words that share a mask
 _WORD = 8  # bytes
 

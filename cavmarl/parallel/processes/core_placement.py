@@ -13,8 +13,6 @@ from contextlib import suppress
 
 from cavmarl.parallel.processes.process_barrier import usable_cores
 
-__all__ = ["homes", "keep_apart"]
-
 UNKNOWN = -1  # as `barrier.present_core` says it where nothing is compiled
 
 

@@ -20,8 +20,6 @@ from cavmarl.core.errors import WorkerError, WorkerFailureError
 from cavmarl.parallel.processes.process_barrier import WAKE
 from cavmarl.parallel.processes.worker_loop import MAIL, MAX_MESSAGE
 
-__all__ = ["ForkServer", "Process", "ServerGoneError"]
-
 ANSWER_MS = 2_000  # to fork or to reap; a server that takes longer is stopped or broken
 END_S = 1.0  # for all to end by themselves
 

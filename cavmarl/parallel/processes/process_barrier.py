@@ -30,20 +30,6 @@ from numpy.typing import NDArray
 from cavmarl.core.numba import kernel
 from cavmarl.core.numba.repeated import repeated
 
-__all__ = [
-    "ASLEEP",
-    "LONG_WORK_S",
-    "NUMBER",
-    "WORDS",
-    "Meeting",
-    "Words",
-    "load_kernels",
-    "post",
-    "present_core",
-    "usable_cores",
-    "wait_for",
-]
-
 Words = NDArray[np.int64]
 
 WORDS = 8  # of a line; of a cache line, too

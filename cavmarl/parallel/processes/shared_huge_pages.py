@@ -20,8 +20,6 @@ from numpy.typing import DTypeLike, NDArray
 
 from cavmarl.parallel.processes.shared_memory import shared_zeros
 
-__all__ = ["HUGE_BYTES", "MOST_BYTES", "collapse_heap", "huge_shared_zeros"]
-
 HUGE_BYTES = 1 << 21  # of a huge page, on most processors
 MOST_BYTES = 1 << 28  # of an array that is had as a whole, whatever of it will be written
 

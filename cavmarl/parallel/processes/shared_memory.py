@@ -19,8 +19,6 @@ from numpy.typing import DTypeLike, NDArray
 
 from cavmarl.core.errors import WorkerError
 
-__all__ = ["Layout", "Segment", "arrays_in", "shared_zeros", "size_of"]
-
 Layout = Mapping[str, tuple[str, tuple[int, ...]]]
 """Arrays of a segment: name → dtype as text, shape."""
 

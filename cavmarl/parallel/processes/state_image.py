@@ -17,8 +17,6 @@ from cavmarl.core.numba import kernel
 from cavmarl.core.numba.repeated import repeated
 from cavmarl.parallel.processes.shared_memory import Segment
 
-__all__ = ["Arrays", "Image", "load_kernels"]
-
 Array = NDArray[Any]
 Arrays = Sequence[Array]
 

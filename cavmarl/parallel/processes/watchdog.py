@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-__all__ = ["CHECK_S", "Watchdog", "processor_s"]
-
 CHECK_S = 0.1
 STILL_CHECKS = 8  # for so long a process may sleep without the processor
 AT_WORK = ("R", "D")  # states: runs or could, waits for a disk

@@ -35,27 +35,6 @@ from cavmarl.parallel.processes.shared_huge_pages import collapse_heap
 from cavmarl.parallel.processes.shared_memory import Segment
 from cavmarl.parallel.processes.state_image import Arrays, Image
 
-__all__ = [
-    "ANSWER",
-    "ANSWERED",
-    "CORE",
-    "FAILED",
-    "LETTER",
-    "LOADS",
-    "MAIL",
-    "MAX_MESSAGE",
-    "NOTHING",
-    "OUT_OF_MEMORY",
-    "SILENT",
-    "SLOT",
-    "TASK",
-    "TRUTH",
-    "Job",
-    "describe",
-    "die_with_parent",
-    "serve",
-]
-
 # Words of the pool's line, behind those of `barrier`.
 TASK, LETTER, SLOT, TRUTH, LOADS = 2, 3, 4, 5, 6
 # Words of the worker's line: how its command ended, and on which core it began it.

@@ -25,8 +25,6 @@ from cavmarl.parallel.processes.process_barrier import (
 from cavmarl.parallel.processes.shared_memory import Segment
 from cavmarl.parallel.processes.worker_loop import ANSWER, CORE, LOADS, OUT_OF_MEMORY, SILENT, TASK
 
-__all__ = ["Program", "WorkerProcesses"]
-
 _LINE_BYTES = WORDS * 8
 _FIRST_IMAGE_BYTES = 1 << 12
 

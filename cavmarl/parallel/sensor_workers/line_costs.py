@@ -7,8 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LineCosts"]
-
 PARTS = 32  # of a frame, in each of which lines are taken to cost the same
 
 

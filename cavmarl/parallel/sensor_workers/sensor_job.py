@@ -18,8 +18,6 @@ from cavmarl.parallel.sensor_workers.sensor_scene import SceneArrays
 from cavmarl.sensors.kernels.sensor_share import put_first, take_rows
 from cavmarl.sensors.mounted.frames import Frames
 
-__all__ = ["SensorJob", "SensorTask"]
-
 
 class SensorTask(IntEnum):
     """What a sensor worker can be asked for."""

@@ -30,8 +30,6 @@ from cavmarl.sensors.kernels.sensor_share import gather_rows
 from cavmarl.sensors.mounted.mounted_sensor import SensedScene
 from cavmarl.sensors.mounted.sensor_rig import Turn, sense_here
 
-__all__ = ["SensorWorkerPlan", "SensorWorkerTimes", "SensorWorkers"]
-
 SHARED_ANEW = 32  # ticks from one sharing out to the next; at first 1, 2, 4, … until there are more
 NEW_COST = 0.5  # weight of the latest costs from then on; what is first measured is of cold caches
 

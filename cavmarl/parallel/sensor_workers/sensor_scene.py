@@ -16,8 +16,6 @@ from cavmarl.parallel.processes.shared_memory import Layout, Segment, arrays_in
 from cavmarl.sensors.kernels.rig_frames import POSE
 from cavmarl.sensors.kernels.rig_schedule import Due
 
-__all__ = ["NEVER", "SceneArrays", "SceneShape"]
-
 NEVER = -1  # a tick that there is not
 
 

@@ -23,8 +23,6 @@ from cavmarl.balance.refining import refine
 from cavmarl.balance.shard_placement import Placement
 from cavmarl.balance.spreading import spread
 
-__all__ = ["LineWorth", "Shares", "Unit", "cut", "divide", "share_by_cost", "share_in_turn"]
-
 PIECES_A_WORKER = 4  # of the agents of one sensor, where there are so many
 LEAST_S = 2e-4  # that has to be saved to divide frames: what stands around is looked up twice then
 

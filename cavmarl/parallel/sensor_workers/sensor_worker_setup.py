@@ -21,8 +21,6 @@ from cavmarl.parallel.sensor_workers.sensor_scene import SceneArrays, SceneShape
 from cavmarl.parallel.step_arrays import StepArrays, layout_of
 from cavmarl.sensors.mounted.catalogue import type_of
 
-__all__ = ["farm_of", "local_worlds", "make_sensor_jobs", "warn_if_crowded"]
-
 PROGRAM = "cavmarl.parallel.sensor_workers.sensor_worker"
 
 

@@ -34,8 +34,6 @@ from cavmarl.parallel.work_shares import Part, parts_of
 from cavmarl.parallel.worlds_job import Task, fingerprint
 from cavmarl.shards.shard import Commands, Shard
 
-__all__ = ["DividedWorlds"]
-
 log = logging.getLogger("cavmarl.workers")
 
 

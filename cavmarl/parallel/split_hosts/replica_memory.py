@@ -26,8 +26,6 @@ from cavmarl.parallel.kernels.replica_copies import (
     take_changes,
 )
 
-__all__ = ["MemoryReplica", "Place", "ReplicaMemory", "Spans"]
-
 Array = NDArray[Any]
 Words = NDArray[np.uint64]
 

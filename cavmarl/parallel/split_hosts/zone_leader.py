@@ -19,8 +19,6 @@ from cavmarl.shards.executor import Phase
 from cavmarl.shards.shard import Commands, Shard
 from cavmarl.shards.shard_group import ShardGroup
 
-__all__ = ["PHASE", "ZoneLeader"]
-
 PHASE = 0  # the one task of hosts
 
 Words = NDArray[np.uint64]

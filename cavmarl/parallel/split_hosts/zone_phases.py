@@ -23,8 +23,6 @@ from cavmarl.sensors.kernels.rig_schedule import Due
 from cavmarl.sensors.mounted.frames import Frames
 from cavmarl.shards.shard import Commands, Shard
 
-__all__ = ["PhaseInputs", "ZonePhase", "ZonePhases", "ZoneTurn"]
-
 Array = NDArray[Any]
 
 

@@ -28,8 +28,6 @@ from cavmarl.parallel.worlds_job import commands_of, fingerprint
 from cavmarl.sensors.kernels.rig_schedule import Due
 from cavmarl.sensors.mounted.sensor_rig import Turn, sense_here
 
-__all__ = ["PhaseOrder", "ZonesJob", "host_zones", "make_replicated"]
-
 Array = NDArray[Any]
 
 

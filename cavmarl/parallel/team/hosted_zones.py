@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from cavmarl.shards.shard import Shard
 from cavmarl.shards.shard_group import ShardGroup
 
-__all__ = ["HostedZones"]
-
 TIMED = 16  # one tick of so many is run zone by zone, with a clock
 
 

@@ -35,8 +35,6 @@ from cavmarl.shards.executor import Phase
 from cavmarl.shards.shard import Shard
 from cavmarl.shards.shard_group import ShardGroup
 
-__all__ = ["Leader", "LeftAloneError", "Team", "TeamFollower"]
-
 # Words of the leader's line, behind those of `barrier`: what is called with even numbers, and what
 # with odd ones.
 CALLS = (2, 3)

@@ -15,8 +15,6 @@ from cavmarl.parallel.team.team import Leader, Team, TeamFollower
 from cavmarl.parallel.worlds_job import Task, WorldsJob
 from cavmarl.shards.shard import Shard
 
-__all__ = ["FollowerJob", "LeaderJob"]
-
 # Phases that end a task for the followers; what comes after them the leader does alone, and one of
 # the followers wakes the caller in the meantime.
 LAST = {Task.STEP: "sense", Task.SUGGEST: "suggest"}

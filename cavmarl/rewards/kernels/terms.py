@@ -23,8 +23,6 @@ from cavmarl.core.records.codes import (
     EVENT_WRONG_WAY,
 )
 
-__all__ = ["NUM_TERMS", "TTC_HORIZON_S", "TTC_REACH_M", "write_terms"]
-
 NUM_TERMS = 10
 TTC_HORIZON_S = 4.0  # times to collision above this do not count
 TTC_REACH_M = 60.0

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from cavmarl.core.math.neighbors import Grid, cell_columns, cell_rows
 from cavmarl.core.numba import kernel
 
-__all__ = ["WALL", "Backdrop", "gather_quads", "gather_walls"]
-
 WALL = np.dtype(
     [
         ("ax", np.float64),  # its ends, m

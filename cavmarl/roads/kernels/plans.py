@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from cavmarl.core.numba import allocating_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays
 
-__all__ = ["LANE_CHANGE_COST_S", "change_cost", "plan_goal"]
-
 LANE_CHANGE_COST_S = 5.0  # what a lane change is worth in travel time on a long lane, s;
 LANE_CHANGE_M = 250.0  # twice as much on a lane of this length, which is hardly enough for one
 TURNAROUND = ord("t")

@@ -11,8 +11,6 @@ from cavmarl.core.numba import kernel
 from cavmarl.core.records.arrays import RoadArrays
 from cavmarl.roads.kernels.plans import change_cost
 
-__all__ = ["follow_plan", "plan_route", "trace_edges"]
-
 
 @kernel
 def plan_route(

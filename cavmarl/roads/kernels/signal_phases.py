@@ -19,13 +19,6 @@ from cavmarl.core.numba import kernel
 from cavmarl.core.records.arrays import RoadArrays
 from cavmarl.core.records.rows import is_off_lanes
 
-__all__ = [
-    "DETECTOR_REACH_M",
-    "detect",
-    "program_at",
-    "switch_signals",
-]
-
 # From a detector to the centre of any vehicle that is over it or has left it in this tick.
 DETECTOR_REACH_M = 30.0
 

@@ -11,19 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "CLEARANCE_M",
-    "NEAR_M",
-    "LinkPath",
-    "Overlap",
-    "Poses",
-    "grazing",
-    "overlap",
-    "poses",
-    "sample_path",
-    "touching",
-]
-
 SAMPLE_M = 0.5
 # Half a car (2 m wide) on either path and a margin that covers corners cut in a turn.
 NEAR_M = 1.0 + 1.0 + 0.6

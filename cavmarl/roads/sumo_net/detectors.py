@@ -17,8 +17,6 @@ from cavmarl.roads.network import DETECTOR, VEHICLE_CLASSES
 from cavmarl.roads.sumo_net.programs import SignalProgram
 from cavmarl.roads.sumo_net.signal_rows import DETECTOR_GAP_S, SignalRows, parameter
 
-__all__ = ["DetectorRoads", "place_detectors"]
-
 # SUMO's defaults of actuated programs, s.
 MAX_GAP_S = 3.0
 PASSING_TIME_S = 1.9

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from cavmarl.core.records.rows import FORK_BEYOND_M
 from cavmarl.roads.sumo_net.conflicts import NEAR_M, LinkPath
 
-__all__ = ["fork_lengths"]
-
 
 def fork_lengths(from_lane: Sequence[int], paths: Sequence[LinkPath | None]) -> NDArray[np.float64]:
     """The length of each link's path that lies near another one's from the same lane, in m.

@@ -15,8 +15,6 @@ from xml.sax.handler import ContentHandler
 from cavmarl.core.errors import MapError
 from cavmarl.roads.sumo_net.xml_source import read_xml
 
-__all__ = ["OFF", "Phase", "ProgramReader", "SignalProgram", "Timetable", "read_programs"]
-
 # The program that every signal has: nothing is lit, the right of way alone rules.
 OFF = "off"
 

@@ -25,8 +25,6 @@ from cavmarl.roads.sumo_net.selection import Movement, NetworkSelection, permiss
 from cavmarl.roads.sumo_net.signal_rows import SignalRows, read_signals
 from cavmarl.roads.sumo_net.stop_lines import stop_back
 
-__all__ = ["map_name", "read_network", "source_hash"]
-
 APPROACH_M = 12.0  # before a junction, where bodies still stand askew to vehicles that wait
 _ENDINGS = (".gz", ".xml", ".net", ".osm", ".xodr")
 

@@ -14,8 +14,6 @@ from cavmarl.roads.network import CONFLICT
 from cavmarl.roads.sumo_net.conflicts import LinkPath, Overlap, grazing, overlap
 from cavmarl.roads.sumo_net.selection import Movement
 
-__all__ = ["conflict_rows"]
-
 Row = tuple[int, bool, bool, float, float, float, float]
 
 

@@ -9,8 +9,6 @@ from typing import Any
 from cavmarl.core.errors import MapError
 from cavmarl.roads.network import VEHICLE_CLASSES
 
-__all__ = ["Movement", "NetworkSelection", "permission_bits", "select"]
-
 _ALL = (1 << len(VEHICLE_CLASSES)) - 1
 _ROAD = sum(1 << bit for bit, name in enumerate(VEHICLE_CLASSES) if name not in ("tram", "bicycle"))
 

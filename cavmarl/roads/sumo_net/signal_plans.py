@@ -16,8 +16,6 @@ from cavmarl.roads.sumo_net.programs import OFF, Phase, SignalProgram, Timetable
 from cavmarl.roads.sumo_net.reader import source_hash
 from cavmarl.roads.sumo_net.signal_rows import SignalRows
 
-__all__ = ["with_outages", "with_programs"]
-
 
 def with_programs(
     network: RoadNetwork, files: Sequence[Path] = (), chosen: Mapping[str, str] | None = None

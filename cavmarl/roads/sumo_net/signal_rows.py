@@ -15,8 +15,6 @@ from cavmarl.core.errors import MapError
 from cavmarl.roads.network import PHASE, PROGRAM, SIGNAL, SIGNAL_STATES, SWITCH, RoadNetwork
 from cavmarl.roads.sumo_net.programs import Phase, SignalProgram
 
-__all__ = ["SignalArrays", "SignalRows", "parameter", "read_signals"]
-
 # Trains switch these; no train runs here, so their links are read as links without a signal.
 RAIL_KINDS = ("rail_signal", "rail_crossing")
 

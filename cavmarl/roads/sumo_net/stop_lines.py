@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from cavmarl.roads.sumo_net.conflicts import CLEARANCE_M, LinkPath, Poses, poses, touching
 
-__all__ = ["stop_back"]
-
 LINE_MARGIN_M = 1.0  # drivers stop this far before a line, see kernels.following
 STEP_M = 0.5
 MOST_M = 8.0

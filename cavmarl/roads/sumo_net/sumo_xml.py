@@ -19,8 +19,6 @@ from cavmarl.core.errors import MapError
 from cavmarl.roads.sumo_net.programs import ProgramReader, SignalProgram
 from cavmarl.roads.sumo_net.xml_source import read_xml
 
-__all__ = ["parse_net"]
-
 _REQUIRED = {
     "edge": ("id",),
     "lane": ("id", "speed", "length", "shape"),

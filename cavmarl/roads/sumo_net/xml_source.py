@@ -15,8 +15,6 @@ from defusedxml.common import DefusedXmlException
 
 from cavmarl.core.errors import CavmarlError, MapError
 
-__all__ = ["MAX_XML_BYTES", "read_bytes", "read_xml"]
-
 # A country in OSM is larger than this, but no world that one machine can drive.
 MAX_XML_BYTES = 1 << 30
 

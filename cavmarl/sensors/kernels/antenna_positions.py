@@ -12,8 +12,6 @@ from cavmarl.sensors.kernels.mount_poses import Mount, sensor_pose
 from cavmarl.sensors.kernels.rig_noise import Noise, add_errors
 from cavmarl.sensors.kernels.rig_schedule import Due
 
-__all__ = ["measure_places"]
-
 
 @kernel
 def measure_places(

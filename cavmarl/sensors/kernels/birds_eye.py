@@ -18,8 +18,6 @@ from cavmarl.core.numba import kernel
 from cavmarl.sensors.kernels.panorama import Counts, Panorama
 from cavmarl.sensors.kernels.semantics import BUILDING, GROUND, LANE_LINE, ROAD
 
-__all__ = ["BirdsEye", "look_down", "make_birds_eye"]
-
 
 class BirdsEye(NamedTuple):
     """Where the grid lies in the vehicle's frame, and room."""

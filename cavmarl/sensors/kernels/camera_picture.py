@@ -21,16 +21,6 @@ from cavmarl.sensors.kernels.faces import (
 from cavmarl.sensors.kernels.panorama import Counts, Panorama
 from cavmarl.sensors.kernels.semantics import BUILDING, GROUND, NOTHING, ROAD
 
-__all__ = [
-    "GROUND_FACE",
-    "ROAD_FACE",
-    "SKY_FACE",
-    "find_faces",
-    "look",
-    "make_camera",
-    "make_picture",
-]
-
 # Faces that every picture has; those of bodies and buildings follow.
 SKY_FACE = 0
 GROUND_FACE = 1

@@ -11,8 +11,6 @@ from cavmarl.core.records.codes import DRIVER_AGENT, EVENT_COLLIDED
 from cavmarl.sensors.kernels.rig_noise import is_lost
 from cavmarl.sensors.kernels.rig_schedule import Due
 
-__all__ = ["report_events"]
-
 
 @kernel
 def report_events(

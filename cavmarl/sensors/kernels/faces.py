@@ -24,8 +24,6 @@ from numpy.typing import NDArray
 from cavmarl.core.math.spans import row_span
 from cavmarl.core.numba import kernel
 
-__all__ = ["CameraPose", "Faces", "PixelRows", "add_face", "draw_faces", "ground_at", "set_corner"]
-
 # Of a face with a corner nearer than this, or behind the camera, all rows are tried.
 NEAR_M = 0.01
 

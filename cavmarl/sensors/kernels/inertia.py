@@ -15,8 +15,6 @@ from cavmarl.sensors.kernels.mount_poses import Mount
 from cavmarl.sensors.kernels.rig_noise import Noise, add_errors
 from cavmarl.sensors.kernels.rig_schedule import Due
 
-__all__ = ["GRAVITY_MPS2", "feel", "measure_inertia"]
-
 GRAVITY_MPS2 = 9.80665  # standard gravity
 
 

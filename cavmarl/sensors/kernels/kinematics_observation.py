@@ -19,8 +19,6 @@ from cavmarl.core.records.arrays import RoadArrays
 from cavmarl.sensors.kernels.sensor_arrays import KinematicsSensor
 from cavmarl.sensors.kernels.vehicle_features import in_range, make_relative, vehicle_features
 
-__all__ = ["PERCEPTION_M", "observe_kinematics"]
-
 PERCEPTION_M = 200.0  # AbstractEnv.PERCEPTION_DISTANCE
 
 

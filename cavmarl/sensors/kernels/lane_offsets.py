@@ -15,8 +15,6 @@ from cavmarl.sensors.kernels.mount_poses import Mount, sensor_pose
 from cavmarl.sensors.kernels.rig_noise import Noise, add_errors
 from cavmarl.sensors.kernels.rig_schedule import Due
 
-__all__ = ["bend", "measure_lane_boundary"]
-
 _WINDOW_M = 15.0  # around the vehicle's place on its lane, where the sensor's is looked for
 
 

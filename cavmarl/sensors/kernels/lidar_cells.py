@@ -19,8 +19,6 @@ from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell
 from cavmarl.core.numba import kernel
 from cavmarl.sensors.kernels.sensor_arrays import LidarCells
 
-__all__ = ["cell_directions", "observe_lidar_cells"]
-
 TWO_PI = 2.0 * math.pi
 
 

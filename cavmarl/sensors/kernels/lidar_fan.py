@@ -18,8 +18,6 @@ from cavmarl.core.math.bearings import ANGLE_ERROR_RAD, rough_atan2
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
 from cavmarl.core.numba import kernel
 
-__all__ = ["ECHO", "lidar", "ray_directions"]
-
 # What a ray met first.
 ECHO = np.dtype(
     [

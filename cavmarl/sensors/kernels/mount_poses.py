@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 
 from cavmarl.core.numba import kernel
 
-__all__ = ["Mount", "rotation", "sensor_pose", "turned"]
-
 
 class Mount(NamedTuple):
     """A place and a direction in the vehicle's frame."""

@@ -18,15 +18,6 @@ from cavmarl.core.math.scalars import clamp
 from cavmarl.core.numba import kernel
 from cavmarl.sensors.kernels.sensor_arrays import RoadgraphSensor, RoadPoints
 
-__all__ = [
-    "NUM_RINGS",
-    "NUM_ROAD_TYPES",
-    "ROADGRAPH_FEATURES",
-    "ROAD_POINT",
-    "nearest_points",
-    "observe_roadgraph",
-]
-
 # ROAD_POINT["type"], in the order of the features that say which one it is
 TYPE_LANE = 0  # middle of a lane outside junctions
 TYPE_JUNCTION = 1  # middle of a lane inside a junction

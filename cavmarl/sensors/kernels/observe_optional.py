@@ -16,8 +16,6 @@ from cavmarl.sensors.kernels.occupancy import observe_occupancy
 from cavmarl.sensors.kernels.sensor_arrays import OptionalSensors
 from cavmarl.sensors.kernels.stacking import newest_frame
 
-__all__ = ["observe_optional"]
-
 
 @kernel
 def observe_optional(

@@ -31,17 +31,6 @@ from cavmarl.driving.kernels.junctions import link_signal
 from cavmarl.driving.kernels.signal_timing import time_to_change
 from cavmarl.sensors.kernels.lidar_fan import lidar
 
-__all__ = [
-    "EGO_FEATURES",
-    "NEIGHBOR_FEATURES",
-    "SIGNAL_FEATURES",
-    "observe_ego",
-    "observe_lidar",
-    "observe_neighbors",
-    "observe_route",
-    "observe_signal",
-]
-
 EGO_FEATURES = 13
 NEIGHBOR_FEATURES = 7
 SIGNAL_FEATURES = 6

@@ -21,8 +21,6 @@ from cavmarl.core.records.rows import is_off_lanes
 from cavmarl.driving.kernels.junctions import link_signal
 from cavmarl.driving.kernels.ways import next_step
 
-__all__ = ["HALF_M", "LANES_AHEAD", "LANES_FEATURES", "SLOWEST_MPS", "observe_lanes"]
-
 OWN = 0  # slots of two features each: a gap and a speed
 LEFT = 1  # ahead; behind in the slot after it
 RIGHT = 3

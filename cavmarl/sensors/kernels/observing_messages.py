@@ -20,16 +20,6 @@ from cavmarl.v2x.kernels.v2x_records import (
     Mail,
 )
 
-__all__ = [
-    "ACCEL_SCALE",
-    "AGE_SCALE_S",
-    "EVENT_FEATURES",
-    "OBJECT_FEATURES",
-    "SIGNAL_FEATURES",
-    "SPEED_SCALE",
-    "observe_messages",
-]
-
 OBJECT_FEATURES = 11
 EVENT_FEATURES = 8
 SIGNAL_FEATURES = 4

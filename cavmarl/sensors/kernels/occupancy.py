@@ -25,8 +25,6 @@ from cavmarl.sensors.kernels.vehicle_features import (
     vehicle_features,
 )
 
-__all__ = ["observe_occupancy"]
-
 # How far along a lane highway-env sets waypoints, from the place beside the vehicle.
 LANE_REACH_M = 100.0
 

@@ -13,8 +13,6 @@ from cavmarl.core.numba import kernel
 from cavmarl.core.records.arrays import Outputs
 from cavmarl.core.records.codes import DRIVER_AGENT
 
-__all__ = ["clear_outputs", "credit", "settle_outputs"]
-
 
 @kernel
 def clear_outputs(outputs: Outputs, chosen: NDArray[np.bool_]) -> None:

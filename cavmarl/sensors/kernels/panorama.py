@@ -21,14 +21,6 @@ from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell
 from cavmarl.core.numba import kernel
 from cavmarl.roads.kernels.backdrop_pieces import Backdrop, gather_quads, gather_walls
 
-__all__ = [
-    "PRISM",
-    "Counts",
-    "Panorama",
-    "gather",
-    "make_panorama",
-]
-
 PRISM = np.dtype(
     [
         ("id", np.int64),  # of the vehicle or pedestrian

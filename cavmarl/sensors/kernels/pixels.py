@@ -27,15 +27,6 @@ from cavmarl.sensors.kernels.semantics import (
     TRUCK,
 )
 
-__all__ = [
-    "LEAST_DEPTH_M",
-    "colours",
-    "measure_depths",
-    "write_classes",
-    "write_colours",
-    "write_halves",
-]
-
 # Nothing is nearer than this: a place inside of a body has no depth.
 LEAST_DEPTH_M = 0.01
 

@@ -14,8 +14,6 @@ from cavmarl.core.numba import kernel
 from cavmarl.sensors.kernels.panorama import Panorama
 from cavmarl.sensors.kernels.ray_fan import WALL_HIT, Fan
 
-__all__ = ["TARGET", "detect"]
-
 TARGET = np.dtype(
     [
         ("range", np.float64),  # m

@@ -22,8 +22,6 @@ from cavmarl.core.math.bearings import ANGLE_ERROR_RAD, rough_atan2
 from cavmarl.core.math.geometry import PI, TWO_PI
 from cavmarl.core.numba import kernel
 
-__all__ = ["HIT", "WALL_HIT", "Fan", "cast", "make_fan"]
-
 # What a ray met first.
 HIT = np.dtype(
     [

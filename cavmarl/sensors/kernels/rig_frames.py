@@ -11,8 +11,6 @@ from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.sensors.kernels.rig_noise import is_lost
 from cavmarl.sensors.kernels.rig_schedule import Due, SensorSchedule, stamp_of
 
-__all__ = ["POSE", "call_roll", "deliver", "note_poses"]
-
 POSE = np.dtype(
     [
         ("id", np.int64),  # of the vehicle; -1: none

@@ -16,8 +16,6 @@ from cavmarl.core.math.geometry import TWO_PI
 from cavmarl.core.math.rng import mix, quick_uniform
 from cavmarl.core.numba import kernel
 
-__all__ = ["Noise", "add_errors", "error_of", "gauss", "is_lost", "sensor_key"]
-
 # Numbers of draws, apart from those of the samples' numbers.
 _BIAS = 1 << 28
 _DROPOUT = 1 << 29

@@ -26,8 +26,6 @@ from cavmarl.sensors.kernels.pixels import (
 from cavmarl.sensors.kernels.rig_noise import Noise, error_of, sensor_key
 from cavmarl.sensors.kernels.rig_schedule import Due
 
-__all__ = ["camera_reach_m", "fill_grids", "take_classes", "take_colours", "take_depths"]
-
 
 @kernel
 def camera_reach_m(camera: CameraPose, width: int, height: int) -> float:

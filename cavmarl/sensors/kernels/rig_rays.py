@@ -18,8 +18,6 @@ from cavmarl.sensors.kernels.ray_fan import Fan, cast
 from cavmarl.sensors.kernels.rig_noise import Noise, error_of, sensor_key
 from cavmarl.sensors.kernels.rig_schedule import Due
 
-__all__ = ["measure_lidar", "measure_radar", "reach_of"]
-
 # Rays that are written together, a cache line of them: with 1,024 or more in a layer the same place
 # of all layers is kept in one set of the cache, which does not hold them.
 BLOCK = 16

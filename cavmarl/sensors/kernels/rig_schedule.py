@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from cavmarl.core.numba import kernel
 
-__all__ = ["Due", "SensorSchedule", "call_due", "stamp_of", "taken"]
-
 
 class SensorSchedule(NamedTuple):
     """The rate of a sensor: `samples` in `ticks` ticks, in lowest terms."""

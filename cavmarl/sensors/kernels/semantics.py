@@ -2,24 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = [
-    "BICYCLE",
-    "BUILDING",
-    "BUS",
-    "CAR",
-    "GROUND",
-    "LANE_LINE",
-    "MOTORCYCLE",
-    "NOTHING",
-    "NUM_SEMANTICS",
-    "PEDESTRIAN",
-    "ROAD",
-    "SEMANTIC_NAMES",
-    "SEMANTIC_OF_CLASS",
-    "TRAM",
-    "TRUCK",
-]
-
 NOTHING = 0  # the sky, or nothing in range
 GROUND = 1  # beside the roads
 ROAD = 2  # lanes and junctions

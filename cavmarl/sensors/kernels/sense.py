@@ -20,8 +20,6 @@ from cavmarl.sensors.kernels.observing import (
 from cavmarl.sensors.kernels.observing_lanes import observe_lanes
 from cavmarl.sensors.kernels.stacking import has_entered, newest_frame, shift_frames
 
-__all__ = ["sense"]
-
 
 @kernel
 def sense(

@@ -10,15 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "KinematicsSensor",
-    "LidarCells",
-    "OccupancyGrid",
-    "OptionalSensors",
-    "RoadPoints",
-    "RoadgraphSensor",
-]
-
 
 class KinematicsSensor(NamedTuple):
     """highway-env's `Kinematics`: see `kernels.kinematics_observation`."""

@@ -9,8 +9,6 @@ from cavmarl.core.numba import kernel
 from cavmarl.core.records.arrays import Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
 
-__all__ = ["gather_rows", "put_first", "take_rows"]
-
 
 @kernel
 def gather_rows(

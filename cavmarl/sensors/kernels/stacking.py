@@ -13,8 +13,6 @@ from cavmarl.core.numba import kernel
 from cavmarl.core.records.arrays import Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
 
-__all__ = ["fill_stacks", "has_entered", "newest_frame", "repeat_frame", "shift_frames"]
-
 
 @kernel
 def has_entered(row: np.void, ticks_per_step: int) -> bool:

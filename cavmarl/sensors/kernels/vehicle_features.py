@@ -15,14 +15,6 @@ from numpy.typing import NDArray
 from cavmarl.core.math.geometry import lane_pose, wrap_angle
 from cavmarl.core.numba import kernel
 
-__all__ = [
-    "FEATURE_ON_ROAD",
-    "NUM_VEHICLE_FEATURES",
-    "in_range",
-    "make_relative",
-    "vehicle_features",
-]
-
 # In the order of config_sensors.VEHICLE_FEATURES, then `on_road`, which is of a place and not of a
 # vehicle.
 FEATURE_PRESENCE = 0

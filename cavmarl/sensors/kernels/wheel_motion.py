@@ -11,8 +11,6 @@ from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.sensors.kernels.rig_noise import Noise, add_errors
 from cavmarl.sensors.kernels.rig_schedule import Due
 
-__all__ = ["measure_odometry"]
-
 
 @kernel
 def measure_odometry(

@@ -12,8 +12,6 @@ from cavmarl.roads.kernels.backdrop_pieces import Backdrop
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.sensors.kernels.semantics import SEMANTIC_OF_CLASS
 
-__all__ = ["lane_strips", "make_backdrop"]
-
 CELL_M = 32.0
 # Long straight strips are cut, so that what is near a vehicle is found by the middles of strips.
 STRIP_M = 24.0

@@ -18,8 +18,6 @@ from cavmarl.sensors.mounted.frames import SensorFrames
 from cavmarl.sensors.mounted.mount_transforms import mount_matrix
 from cavmarl.sensors.mounted.mounted_sensor import Bounds, MountedSensor, Platform, SensedScene
 
-__all__ = ["BevGrid"]
-
 
 class BevGrid(MountedSensor[BevGridConfig]):
     """The class of each cell's centre; see `kernels.semantics`."""

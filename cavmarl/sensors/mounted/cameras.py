@@ -36,8 +36,6 @@ from cavmarl.sensors.mounted.mounted_sensor import (
     noise_of,
 )
 
-__all__ = ["DepthCamera", "RgbCamera", "SemanticCamera"]
-
 C = TypeVar("C", bound=CameraConfig)
 
 

@@ -40,8 +40,6 @@ from cavmarl.sensors.mounted.mounted_sensor import MountedSensor, Platform
 from cavmarl.sensors.mounted.odometry import Odometry
 from cavmarl.sensors.mounted.radar import Radar
 
-__all__ = ["TYPES", "frame_layout", "frames_in", "mount", "rig_reach_m", "type_of"]
-
 Shape = tuple[int, ...]
 
 TYPES: dict[type[MountedConfig], type[MountedSensor[Any]]] = {

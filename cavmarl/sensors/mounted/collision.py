@@ -19,8 +19,6 @@ from cavmarl.sensors.mounted.mounted_sensor import (
     stream_of,
 )
 
-__all__ = ["Collision"]
-
 
 class Collision(MountedSensor[CollisionConfig]):
     """EVENT_* bits of what has just happened to the vehicle, and what it hit."""

@@ -8,8 +8,6 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Frames", "SensorFrames"]
-
 
 class SensorFrames(NamedTuple):
     """The samples of a sensor; S is the most that it takes in one step.

@@ -16,8 +16,6 @@ from cavmarl.config.rig import GnssConfig
 from cavmarl.core.errors import MapError, require
 from cavmarl.roads.network import GeoReference, RoadNetwork
 
-__all__ = ["Geodesy", "ProjectedMap", "TangentPlane", "geodesy_of"]
-
 Points = NDArray[np.float64]
 
 # WGS 84: semi-major axis in m, flattening, and the square of the first eccentricity.

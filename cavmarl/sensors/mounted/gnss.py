@@ -20,8 +20,6 @@ from cavmarl.sensors.mounted.mounted_sensor import (
     noise_of,
 )
 
-__all__ = ["Gnss"]
-
 
 class Gnss(MountedSensor[GnssConfig]):
     """The place of the antenna, with its errors, taken to the earth by the map's projection.

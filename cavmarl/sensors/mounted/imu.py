@@ -19,8 +19,6 @@ from cavmarl.sensors.mounted.mounted_sensor import (
     noise_of,
 )
 
-__all__ = ["Imu"]
-
 
 class Imu(MountedSensor[ImuConfig]):
     """What accelerometers and gyroscopes tell at the sensor's place, along its axes."""

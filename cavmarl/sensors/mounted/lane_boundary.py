@@ -19,8 +19,6 @@ from cavmarl.sensors.mounted.mounted_sensor import (
     noise_of,
 )
 
-__all__ = ["LaneBoundary"]
-
 
 class LaneBoundary(MountedSensor[LaneBoundaryConfig]):
     """Boundaries, width, direction and curvature of the lane that the vehicle is on."""

@@ -23,8 +23,6 @@ from cavmarl.sensors.mounted.mounted_sensor import (
     noise_of,
 )
 
-__all__ = ["Lidar", "azimuths", "lidar_fan"]
-
 
 def azimuths(fov_deg: float, rays: int) -> tuple[float, float, int]:
     """The first ray, from one to the next, and how many: in rad, counter-clockwise.

@@ -11,20 +11,6 @@ from cavmarl.config.rig import MountedConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.sensors.kernels.mount_poses import Mount, rotation
 
-__all__ = [
-    "SENSOR_FRAME",
-    "VEHICLE_FRAME",
-    "WORLD_FRAME",
-    "check_place",
-    "mount_matrix",
-    "mount_of",
-    "sensor_to_vehicle",
-    "transform",
-    "vehicle_to_sensor",
-    "vehicle_to_world",
-    "world_to_vehicle",
-]
-
 WORLD_FRAME = "map"  # x east, y north, z up, as in `roads.network`
 VEHICLE_FRAME = "vehicle"
 SENSOR_FRAME = "vehicle/{name}"

@@ -20,8 +20,6 @@ from cavmarl.sensors.kernels.rig_schedule import Due
 from cavmarl.sensors.mounted.frames import SensorFrames
 from cavmarl.sensors.mounted.mount_transforms import SENSOR_FRAME, check_place, mount_of
 
-__all__ = ["Bounds", "MountedSensor", "Platform", "SensedScene", "noise_of", "stream_of"]
-
 Bounds = tuple[NDArray[Any], NDArray[Any]]
 C = TypeVar("C", bound=MountedConfig)
 

@@ -19,8 +19,6 @@ from cavmarl.sensors.mounted.mounted_sensor import (
     noise_of,
 )
 
-__all__ = ["Odometry"]
-
 
 class Odometry(MountedSensor[OdometryConfig]):
     """Speed, yaw rate and driven distance of the vehicle's centre."""

@@ -25,8 +25,6 @@ from cavmarl.sensors.mounted.mounted_sensor import (
     noise_of,
 )
 
-__all__ = ["Radar"]
-
 
 class Radar(MountedSensor[RadarConfig]):
     """Bodies and buildings, nearest first; the rest of the list is zeros."""

@@ -16,8 +16,6 @@ from cavmarl.sensors.mounted.catalogue import mount
 from cavmarl.sensors.mounted.frames import Frames, SensorFrames
 from cavmarl.sensors.mounted.mounted_sensor import MountedSensor, Platform, SensedScene, stream_of
 
-__all__ = ["Rig", "Sense", "Turn", "sense_here"]
-
 
 class Turn(NamedTuple):
     """What a sensor has to do in the present tick.

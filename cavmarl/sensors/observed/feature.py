@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike, DTypeLike
 from cavmarl.config.env import SensorsConfig
 from cavmarl.driving.agent_view import AgentView
 
-__all__ = ["Feature", "Sensor"]
-
 
 @dataclass(frozen=True)
 class Feature:

@@ -12,15 +12,6 @@ from cavmarl.config.sensors import GRID_FEATURES, VEHICLE_FEATURES
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.observed.feature import Feature
 
-__all__ = [
-    "MAX_RELATIVE_MPS",
-    "codes",
-    "default_ranges",
-    "goal_places",
-    "range_table",
-    "vehicle_feature",
-]
-
 MAX_SPEED_MPS = 40.0  # Vehicle.MAX_SPEED
 LANE_WIDTH_M = 4.0  # AbstractLane.DEFAULT_WIDTH
 

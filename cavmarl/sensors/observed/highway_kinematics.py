@@ -19,8 +19,6 @@ from cavmarl.sensors.observed.highway import (
     vehicle_feature,
 )
 
-__all__ = ["features", "reach_m", "settings", "shape"]
-
 # The range of y is the map's; whatever it is, it becomes [-1, 1].
 _DEFAULT_RANGES = {
     "x": (-200.0, 200.0), "y": (-4.0, 4.0), "vx": (-80.0, 80.0), "vy": (-80.0, 80.0)

@@ -6,8 +6,6 @@ from cavmarl.config.env import SensorsConfig
 from cavmarl.sensors.kernels.observing_lanes import HALF_M
 from cavmarl.sensors.observed.feature import Feature
 
-__all__ = ["features", "reach_m"]
-
 # As `kernels.observing_lanes` scales ways.
 _NEARNESS = f"{HALF_M:g} m / ({HALF_M:g} m + way)"
 _GAPS = (

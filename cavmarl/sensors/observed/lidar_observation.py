@@ -11,8 +11,6 @@ from cavmarl.sensors.kernels.sensor_arrays import LidarCells
 from cavmarl.sensors.observed.feature import Feature
 from cavmarl.sensors.observed.highway import MAX_RELATIVE_MPS
 
-__all__ = ["features", "reach_m", "settings", "shape"]
-
 # Within a body distances are negative, by no more than its length.
 LONGEST_BODY_M = 30.0
 

@@ -9,8 +9,6 @@ from cavmarl.config.env import SensorsConfig
 from cavmarl.sensors.kernels.lidar_fan import ECHO, ray_directions
 from cavmarl.sensors.observed.feature import Feature
 
-__all__ = ["directions", "features", "reach_m", "room"]
-
 
 def features(config: SensorsConfig) -> list[Feature]:
     """Distances of all rays, then, with `speeds`, the relative speeds of what they met."""

@@ -9,8 +9,6 @@ import numpy as np
 from cavmarl.config.env import SensorsConfig
 from cavmarl.sensors.observed.feature import Feature
 
-__all__ = ["features", "reach_m", "room"]
-
 
 def features(config: SensorsConfig) -> list[Feature]:
     """Seven numbers a neighbour, nearest first; all 0 where there are fewer."""

@@ -5,8 +5,6 @@ from __future__ import annotations
 from cavmarl.config.env import SensorsConfig
 from cavmarl.sensors.observed.feature import Feature
 
-__all__ = ["features", "reach_m"]
-
 
 def features(config: SensorsConfig) -> list[Feature]:
     """All 0 where no such line is within range."""

@@ -14,8 +14,6 @@ from cavmarl.sensors.kernels.sensor_arrays import OccupancyGrid
 from cavmarl.sensors.observed.feature import Feature
 from cavmarl.sensors.observed.highway import codes, range_table, vehicle_feature
 
-__all__ = ["dtype", "features", "reach_m", "settings", "shape"]
-
 _DEFAULT_RANGES = {"vx": (-80.0, 80.0), "vy": (-80.0, 80.0)}
 
 

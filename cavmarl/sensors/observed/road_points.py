@@ -18,8 +18,6 @@ from cavmarl.sensors.kernels.nearest_road_points import (
 )
 from cavmarl.sensors.kernels.sensor_arrays import RoadPoints
 
-__all__ = ["lines_along", "road_points"]
-
 CELL_M = 16.0
 
 

@@ -11,8 +11,6 @@ from cavmarl.sensors.kernels.sensor_arrays import RoadgraphSensor, RoadPoints
 from cavmarl.sensors.observed.feature import Feature
 from cavmarl.sensors.observed.road_points import road_points
 
-__all__ = ["features", "reach_m", "settings", "shape"]
-
 
 def features(config: SensorsConfig) -> list[Feature]:
     """Ten numbers a point, nearest first; all 0 where there are fewer."""

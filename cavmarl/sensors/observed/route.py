@@ -5,8 +5,6 @@ from __future__ import annotations
 from cavmarl.config.env import SensorsConfig
 from cavmarl.sensors.observed.feature import Feature
 
-__all__ = ["features", "reach_m"]
-
 
 def features(config: SensorsConfig) -> list[Feature]:
     """X (forward) and y (left) of each point in the ego frame."""

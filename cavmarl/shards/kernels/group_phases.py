@@ -38,24 +38,6 @@ from cavmarl.traffic.kernels.leaving import drop_ghosts, leave
 from cavmarl.zones.kernels.ghost_exchange import gather
 from cavmarl.zones.kernels.zone_lookup import Halo, ZoneArrays
 
-__all__ = [
-    "FRAME",
-    "Members",
-    "admit_each",
-    "advance_each",
-    "begin_step_each",
-    "choose_goals_each",
-    "credit_each",
-    "detect_each",
-    "forget_each",
-    "gather_each",
-    "propose_each",
-    "rank_lanes_each",
-    "resolve_each",
-    "retire_each",
-    "sense_each",
-]
-
 FRAME = np.dtype(
     [
         ("min_x", np.float64),  # see `neighbors.Grid`

@@ -41,8 +41,6 @@ from cavmarl.driving.kernels.steering import nearest_speed, steer_to_lane, take_
 from cavmarl.driving.kernels.ways import own_step
 from cavmarl.zones.kernels.zone_lookup import is_inside, note_outer
 
-__all__ = ["advance", "begin_step", "resolve", "suggest"]
-
 
 @kernel
 def begin_step(

@@ -32,8 +32,6 @@ from cavmarl.traffic.demand.rerouting_device import device
 from cavmarl.traffic.demand.timing import Timing, flow_timing, single_timing
 from cavmarl.traffic.demand.xml_files import STOPPING_PLACES
 
-__all__ = ["DefinitionCollector"]
-
 _NO_DEPARTURE = ("triggered", "containerTriggered", "split", "now")
 _WAY = ("from", "to", "via", "fromJunction", "toJunction", "viaJunctions", "fromTaz", "toTaz")
 _OFF_MAP = ("fromXY", "toXY", "viaXY", "fromLonLat", "toLonLat", "viaLonLat")

@@ -31,8 +31,6 @@ from cavmarl.traffic.demand.resolver import Resolver
 from cavmarl.traffic.demand.sumo_config import read_sumo_config
 from cavmarl.traffic.demand.xml_files import read_elements
 
-__all__ = ["MAX_DEPARTURES", "DemandFile", "read_demand"]
-
 MAX_DEPARTURES = 2_000_000
 
 _COPIED = (

@@ -12,43 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "CODES",
-    "ELEMENT",
-    "FLOW_EXPONENTIAL",
-    "FLOW_PROBABILITY",
-    "FLOW_REGULAR",
-    "LANE_ALLOWED",
-    "LANE_BEST",
-    "LANE_CURRENT",
-    "LANE_FIRST",
-    "LANE_FREE",
-    "LANE_RANDOM",
-    "ORDER",
-    "POS_BASE",
-    "POS_FREE",
-    "POS_GIVEN",
-    "POS_LAST",
-    "POS_MAX",
-    "POS_RANDOM",
-    "POS_RANDOM_FREE",
-    "ROUTE",
-    "SPEED_AVERAGE",
-    "SPEED_CURRENT",
-    "SPEED_DESIRED",
-    "SPEED_GIVEN",
-    "SPEED_LAST",
-    "SPEED_LIMIT",
-    "SPEED_MAX",
-    "SPEED_RANDOM",
-    "STOP",
-    "UNTIL_ABSOLUTE",
-    "UNTIL_DEPARTURE",
-    "UNTIL_FLOW",
-    "Choices",
-    "Options",
-]
-
 # Lanes: a LANE row (in an ORDER) or SUMO's index on the edge (in an ELEMENT), or one of these.
 LANE_FIRST = -1  # rightmost one that the class may use (SUMO's default)
 LANE_RANDOM = -2

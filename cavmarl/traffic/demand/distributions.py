@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from cavmarl.traffic.demand.demand_records import Options
 from cavmarl.traffic.demand.element import Element
 
-__all__ = ["MAX_WEIGHT", "listed", "weighted"]
-
 MAX_WEIGHT = 1e9
 
 

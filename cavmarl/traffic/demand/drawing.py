@@ -13,8 +13,6 @@ from cavmarl.traffic.demand.demand_records import (
     FLOW_REGULAR,
 )
 
-__all__ = ["DRAW_REROUTE", "DRAW_ROUTE", "DRAW_TYPE", "chances", "departures_ms", "speed_factors"]
-
 DRAW_TIME = STREAM_DEMAND
 DRAW_TYPE = STREAM_DEMAND + 1
 DRAW_ROUTE = STREAM_DEMAND + 2

@@ -10,8 +10,6 @@ from difflib import get_close_matches
 
 from cavmarl.core.errors import CavmarlError, DemandError
 
-__all__ = ["MAX_TIME_MS", "Element", "near", "parse_time_ms"]
-
 # A century: later times are mistakes, and far from the end of the integers.
 MAX_TIME_MS = 100 * 366 * 86_400_000
 

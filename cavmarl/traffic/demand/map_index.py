@@ -11,8 +11,6 @@ from cavmarl.core.errors import CavmarlError, RouteError
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.traffic.demand.element import Element, near
 
-__all__ = ["MapIndex"]
-
 
 class MapIndex:
     """Edges, lanes and connections of one map.

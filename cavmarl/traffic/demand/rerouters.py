@@ -18,8 +18,6 @@ from cavmarl.traffic.demand.element import MAX_TIME_MS, Element, near
 from cavmarl.traffic.demand.map_index import MapIndex
 from cavmarl.traffic.demand.route_records import RouteTable
 
-__all__ = ["CLOSING", "KEEP_DESTINATION", "RULE", "Rerouters", "read_rerouters"]
-
 MAX_INTERVALS = 30_000  # each has random numbers of its own
 MAX_RULES = 300_000  # intervals times edges
 KEEP_DESTINATION = -1  # in place of an EDGE row

@@ -7,8 +7,6 @@ from typing import NamedTuple
 
 from cavmarl.traffic.demand.element import Element
 
-__all__ = ["DeviceOptions", "device"]
-
 _PREFIX = "device.rerouting."
 
 

@@ -24,8 +24,6 @@ from cavmarl.traffic.demand.route_records import RouteTable
 from cavmarl.traffic.demand.stops import StopReader
 from cavmarl.traffic.demand.type_table import TypeTable
 
-__all__ = ["Resolver"]
-
 # Classes with lanes of their own that road networks leave out: see `roads.selection`.
 _PARTLY_MAPPED = sum(1 << VEHICLE_CLASSES.index(name) for name in ("bicycle", "tram"))
 

@@ -21,8 +21,6 @@ from cavmarl.traffic.demand.element import Element, near
 from cavmarl.traffic.demand.map_index import MapIndex
 from cavmarl.traffic.demand.stops import Stop, StopReader
 
-__all__ = ["RouteTable"]
-
 MAX_ROUTE_EDGES = 50_000_000  # of all routes together
 
 _PLACES = ("Junction", "Taz", "XY", "LonLat")

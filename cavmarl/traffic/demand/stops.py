@@ -11,8 +11,6 @@ from cavmarl.traffic.demand.element import Element, near
 from cavmarl.traffic.demand.map_index import MapIndex
 from cavmarl.traffic.demand.xml_files import STOPPING_PLACES
 
-__all__ = ["Stop", "StopReader"]
-
 _NOT_MODELLED = ("triggered", "containerTriggered", "expected", "speed", "split", "join", "jump")
 
 

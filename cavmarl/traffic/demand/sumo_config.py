@@ -12,8 +12,6 @@ from cavmarl.roads.sumo_net.xml_source import read_xml
 from cavmarl.traffic.demand.element import Element
 from cavmarl.traffic.demand.rerouting_device import DeviceOptions
 
-__all__ = ["SumoConfigFile", "read_sumo_config"]
-
 _ROOTS = ("configuration", "sumoConfiguration")
 _OPTIONS = {
     "n": "net-file",

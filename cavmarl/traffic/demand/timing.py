@@ -8,8 +8,6 @@ from typing import NamedTuple
 from cavmarl.traffic.demand.demand_records import FLOW_EXPONENTIAL, FLOW_PROBABILITY, FLOW_REGULAR
 from cavmarl.traffic.demand.element import MAX_TIME_MS, Element
 
-__all__ = ["DAY_MS", "Timing", "flow_timing", "single_timing"]
-
 DAY_MS = 86_400_000  # SUMO lets flows without an end last so long
 MIN_RATE = 1e-12  # 1/s: less is never
 MAX_NUMBER = 1 << 40  # of a flow without a number: beyond every cap

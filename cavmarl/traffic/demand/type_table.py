@@ -12,8 +12,6 @@ from cavmarl.traffic.demand.distributions import MAX_WEIGHT, listed, weighted
 from cavmarl.traffic.demand.element import Element, near
 from cavmarl.traffic.demand.vehicle_type_reader import vtype_record
 
-__all__ = ["TypeTable"]
-
 
 class TypeTable:
     """VTYPE rows of all types that files define, and of SUMO's own that they use.

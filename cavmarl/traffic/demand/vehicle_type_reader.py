@@ -22,8 +22,6 @@ from cavmarl.traffic.demand.distributions import MAX_WEIGHT
 from cavmarl.traffic.demand.element import Element, near
 from cavmarl.traffic.demand.rerouting_device import device
 
-__all__ = ["vehicle_class", "vtype_record"]
-
 MIN_SPEED_FACTOR = 0.2  # SUMO's cuts of the distribution of speed factors
 MAX_SPEED_FACTOR = 2.0
 

@@ -12,8 +12,6 @@ from cavmarl.roads.sumo_net.xml_source import read_xml
 from cavmarl.traffic.demand.demand_report import DemandReport
 from cavmarl.traffic.demand.element import Element, near
 
-__all__ = ["STOPPING_PLACES", "read_elements"]
-
 MAX_INCLUDES = 16  # files inside files
 MAX_CHILDREN = 100_000  # of one definition
 

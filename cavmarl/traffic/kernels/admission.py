@@ -29,8 +29,6 @@ from cavmarl.traffic.kernels.entering import (
 )
 from cavmarl.zones.kernels.zone_lookup import Halo, ZoneArrays, is_seen, squared_distance, zone_of
 
-__all__ = ["accept", "admit", "assign_lanes", "propose", "rank_lanes"]
-
 ENTER_ROOM_M = 0.3  # free on all sides of a vehicle that enters
 
 

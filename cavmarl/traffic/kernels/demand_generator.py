@@ -42,8 +42,6 @@ from cavmarl.traffic.kernels.entering import (
     speed_at,
 )
 
-__all__ = ["call_orders", "choose_goals", "enter", "populate", "settle"]
-
 PLACE_TRIES = 24  # places tried for a vehicle at reset before it has to queue
 PLACE_GAP_M = 10.0  # m between bumpers of vehicles placed at reset
 END_ROOM_M = 12.0  # no vehicle starts nearer than this to the end of a lane, unless it is shorter

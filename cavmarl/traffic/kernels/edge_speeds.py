@@ -15,8 +15,6 @@ from cavmarl.core.numba import kernel
 from cavmarl.core.records.arrays import RoadArrays
 from cavmarl.core.records.codes import DRIVER_SCRIPTED
 
-__all__ = ["CLOSED_S", "limit_speeds", "sample_speeds", "slow_lanes"]
-
 CLOSED_S = 1e9  # time to drive along a closed lane: any way around it is faster
 LEAST_MPS = 0.001  # nothing is slower, so that a jam has a travel time
 

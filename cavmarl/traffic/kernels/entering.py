@@ -33,8 +33,6 @@ from cavmarl.driving.kernels.following import accel_behind, speed_behind
 from cavmarl.driving.kernels.lane_index import ahead_on, last_on, neighbor_behind
 from cavmarl.driving.kernels.ways import next_step
 
-__all__ = ["crowd", "entry_lane", "entry_place", "entry_speed", "follower_brakes", "speed_at"]
-
 ENTER_GAP_M = 1.0  # m between bumpers, the least with which a vehicle enters
 ENTER_DECEL = 2.0  # m/s², braking that an entering vehicle may impose, or need at the lane's end
 DRAW_LANE = 0  # draws of STREAM_DEPARTURE

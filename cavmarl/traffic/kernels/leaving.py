@@ -15,8 +15,6 @@ from cavmarl.core.records.codes import (
 )
 from cavmarl.zones.kernels.zone_lookup import note_outer
 
-__all__ = ["drop_ghosts", "leave"]
-
 
 @kernel
 def _is_through(row: np.void, driver: int, ticks_per_step: int) -> bool:

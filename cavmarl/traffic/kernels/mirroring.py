@@ -20,8 +20,6 @@ from cavmarl.driving.kernels.motion import account, before_tick, lane_before
 from cavmarl.driving.kernels.tracking import side_lane
 from cavmarl.driving.kernels.ways import own_step, way_left
 
-__all__ = ["Paths", "greet", "list_others", "mirror", "send_on"]
-
 BODY_LANES = 8  # that lie between a front and its body's centre
 BLINKS_RIGHT = 1  # bits of SUMO's vehicle signals
 BLINKS_LEFT = 2

@@ -17,16 +17,6 @@ from cavmarl.core.records.codes import DRIVER_BACKGROUND, EVENT_ARRIVED
 from cavmarl.roads.kernels.plans import change_cost
 from cavmarl.roads.kernels.route_steps import follow_plan, plan_route
 
-__all__ = [
-    "find_asking",
-    "find_way",
-    "has_room",
-    "mark_slots",
-    "put_on_way",
-    "take_slot",
-    "time_left",
-]
-
 REACTION_S = 1.0  # at its speed, before a driver brakes for another turn
 CHANGE_ROOM_M = 30.0  # that every lane change before the next junction needs
 

@@ -20,8 +20,6 @@ from cavmarl.traffic.scenarios.scene import Scene, Seat
 from cavmarl.traffic.scenarios.seats import take_seats
 from cavmarl.traffic.scenarios.streets import Streets
 
-__all__ = ["Cast"]
-
 SEAT_CLEAR_M = 30.0  # around the seat of an agent that is not the first
 
 

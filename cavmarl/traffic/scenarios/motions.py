@@ -16,8 +16,6 @@ from cavmarl.driving.kernels.announcing import announced_m
 from cavmarl.driving.kernels.approach import MAX_LINKS_AHEAD
 from cavmarl.roads.network import RoadNetwork
 
-__all__ = ["ACCEL_MPS2", "Act", "Await", "Move", "Pose", "Ride", "Wait", "arc", "path_of"]
-
 ACCEL_MPS2 = 2.5  # how actors speed up and slow down
 CREEP_MPS = 0.2  # on the last centimetres before they stand
 

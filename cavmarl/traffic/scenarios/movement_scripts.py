@@ -22,20 +22,6 @@ from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.traffic.scenarios.motions import Act, Pose
 from cavmarl.traffic.scenarios.shadows import Shadow, Shadows
 
-__all__ = [
-    "CLAIM",
-    "COVER",
-    "CUE",
-    "FORESIGHT_S",
-    "FRAME",
-    "NO_SCRIPTS",
-    "Actor",
-    "Cue",
-    "actor_types",
-    "bodies_of",
-    "compile_scripts",
-]
-
 FORESIGHT_S = 2.0  # drivers brake for actors that will be on their lane by then
 
 FRAME = np.dtype(

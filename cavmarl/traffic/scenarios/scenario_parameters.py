@@ -10,8 +10,6 @@ from typing import Any, TypeVar
 
 from cavmarl.core.errors import ConfigError
 
-__all__ = ["checked", "describe", "setting", "switch"]
-
 T = TypeVar("T")
 
 

@@ -8,8 +8,6 @@ from typing import NamedTuple
 
 from cavmarl.traffic.scenarios.movement_scripts import Actor, Cue
 
-__all__ = ["Outage", "Scene", "Seat"]
-
 
 @dataclass(frozen=True)
 class Seat:

@@ -9,8 +9,6 @@ from cavmarl.traffic.scenarios.motions import Ride
 from cavmarl.traffic.scenarios.scene import Scene, Seat
 from cavmarl.traffic.scenarios.streets import Streets
 
-__all__ = ["take_seats"]
-
 APART_M = 6.0  # between the centres of two agents, one behind the other,
 APART_S = 2.0  # and the way of this time
 START_M = 5.0  # of a lane on which no vehicle begins

@@ -13,8 +13,6 @@ from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.routing import lane_grid
 from cavmarl.traffic.scenarios.motions import Pose
 
-__all__ = ["Shadow", "Shadows"]
-
 SAMPLE_M = 0.5  # between the points of a body that are looked at
 LEVEL_M = 4.0  # lanes that differ by more in height are one above the other
 FARTHEST_M = 200.0  # from an actor to a lane

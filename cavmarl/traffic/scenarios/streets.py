@@ -13,8 +13,6 @@ from cavmarl.core.math.geometry import lane_pose, project
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.routing import lane_grid
 
-__all__ = ["Crossing", "Opposite", "Streets"]
-
 CAR = 1 << VEHICLE_CLASSES.index("passenger")
 STRAIGHT_RAD = 0.05  # the most that the direction of a straight lane changes
 BESIDE_M = 8.0  # the farthest between the middles of lanes of one road

@@ -12,8 +12,6 @@ from cavmarl.roads.kernels.route_steps import plan_route
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.traffic.kernels.mirroring import Paths
 
-__all__ = ["MAX_WAY_STEPS", "RouteBook"]
-
 MAX_WAY_STEPS = 8_000_000  # of all worlds; memory that is never written is never taken
 
 

@@ -12,8 +12,6 @@ from cavmarl.core.errors import CapacityError
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.traffic.demand.demand_records import STOP, UNTIL_ABSOLUTE
 
-__all__ = ["MAX_STOPS", "StopBook", "Told"]
-
 MAX_STOPS = 2_000_000  # of all worlds; memory that is never written is never taken
 OF_WORLD = 200_000
 

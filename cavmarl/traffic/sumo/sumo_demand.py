@@ -22,8 +22,6 @@ from cavmarl.traffic.sumo.sumo_input import SumoInput, read_input
 from cavmarl.traffic.sumo.sumo_options import command_words
 from cavmarl.traffic.sumo.sumo_process import SumoProcess, choose_interface
 
-__all__ = ["SumoDemand", "read_sumo_demand"]
-
 _SAME_NAME = ("length", "width", "height", "min_gap", "accel", "decel", "emergency_decel", "tau",
               "sigma", "max_speed", "speed_factor", "speed_dev")  # fmt: skip
 

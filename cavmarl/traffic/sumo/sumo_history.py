@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import SumoError
 from cavmarl.traffic.sumo.sumo_records import MOVED
 
-__all__ = ["ToldLog"]
-
 _TICKS, _SIZE, _IS_CUT, _HEAD = 0, 1, 2, 3  # words: ticks on record, words in use, given up
 _WORD = 8
 _RECORD = MOVED.itemsize // _WORD  # words

@@ -18,8 +18,6 @@ from defusedxml.common import DefusedXmlException
 from cavmarl.core.errors import ConfigError
 from cavmarl.roads.sumo_net.xml_source import read_bytes
 
-__all__ = ["SumoInput", "read_input", "without_outputs"]
-
 _INPUTS = {
     "net-file": "net-file",
     "net": "net-file",

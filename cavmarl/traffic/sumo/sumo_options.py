@@ -7,8 +7,6 @@ from pathlib import Path
 from cavmarl.core.errors import SumoError, require
 from cavmarl.traffic.sumo.sumo_input import SumoInput, without_outputs
 
-__all__ = ["command_words", "free_libsumo"]
-
 
 def command_words(
     map_file: Path,

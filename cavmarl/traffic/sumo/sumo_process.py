@@ -23,8 +23,6 @@ from cavmarl.core.errors import ConfigError, MissingExtraError, SumoError
 from cavmarl.traffic.sumo import sumo_child as child
 from cavmarl.traffic.sumo.sumo_records import MOVED, SEEN
 
-__all__ = ["SumoAnswer", "SumoProcess", "choose_interface"]
-
 ANSWER_S = 120.0  # a step that takes longer hangs
 END_S = 2.0  # for it to end by itself
 LAST_WORDS = 2000  # characters of what it has printed last

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["MOVED", "SEEN"]
-
 # A vehicle of SUMO's, in its own conventions: the middle of the front bumper, degrees clockwise
 # from north, the place on the lane in the lane's own length. Where SUMO moves no vehicles here,
 # what follows `signals` is 0 but for `pos`.

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import SumoError
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
 
-__all__ = ["ShownSignals"]
-
 
 class _Shown(NamedTuple):
     """What a world's signals have shown the last time."""

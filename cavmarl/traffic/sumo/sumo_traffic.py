@@ -37,8 +37,6 @@ from cavmarl.traffic.sumo.sumo_records import MOVED
 from cavmarl.traffic.sumo.sumo_signals import ShownSignals
 from cavmarl.traffic.sumo.sumo_worlds import SumoWorlds
 
-__all__ = ["SumoTraffic"]
-
 
 class SumoTraffic:
     """SUMO beside W worlds.

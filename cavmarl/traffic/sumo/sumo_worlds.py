@@ -23,8 +23,6 @@ from cavmarl.traffic.sumo.sumo_demand import SumoDemand
 from cavmarl.traffic.sumo.sumo_history import ToldLog
 from cavmarl.traffic.sumo.sumo_process import SumoAnswer, SumoProcess
 
-__all__ = ["SumoTick", "SumoWorlds"]
-
 SEED_BITS = 31
 
 log = logging.getLogger(__name__)

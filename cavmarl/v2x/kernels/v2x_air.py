@@ -13,8 +13,6 @@ from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.v2x.kernels.v2x_channel import Channel, gets_access
 from cavmarl.v2x.kernels.v2x_records import COUNT_NO_ACCESS, KIND_CAM, Air, Mail, V2xScratch
 
-__all__ = ["count_within", "find_cam", "let_on_the_air", "list_cams", "load_around"]
-
 
 @kernel
 def _fill_air(

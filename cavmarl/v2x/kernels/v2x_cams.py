@@ -30,8 +30,6 @@ from cavmarl.v2x.kernels.v2x_records import (
     V2xScratch,
 )
 
-__all__ = ["band_of", "hears", "let_in_cams", "refresh_by_cams"]
-
 
 @inlined_kernel
 def hears(

@@ -15,18 +15,6 @@ from cavmarl.core.math.rng import STREAM_V2X, mix, quick_uniform
 from cavmarl.core.math.walls import Walls, is_cut
 from cavmarl.core.numba import kernel
 
-__all__ = [
-    "Channel",
-    "busy_level",
-    "chance_at",
-    "draw",
-    "gets_access",
-    "is_equipped",
-    "is_heard",
-    "packet_word",
-    "receiver_word",
-]
-
 STREAM_ACCESS = STREAM_V2X + 16  # one a kind of packet
 STREAM_EQUIPPED = STREAM_V2X + 32
 

@@ -15,8 +15,6 @@ from cavmarl.v2x.kernels.v2x_receiving import age, deliver, learn
 from cavmarl.v2x.kernels.v2x_records import FIRST_ROADSIDE_ID, Mail, Sending, V2xScratch
 from cavmarl.v2x.kernels.v2x_sending import gather, send_from_units, send_from_vehicles
 
-__all__ = ["exchange_messages", "hand_out"]
-
 
 @kernel
 def _place_receivers(

@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from cavmarl.core.numba import kernel
 
-__all__ = ["empty", "find", "forget", "insert", "is_better", "sort_by_distance"]
-
 
 @kernel
 def empty(box: NDArray[np.void], first: int) -> None:

@@ -11,8 +11,6 @@ from cavmarl.core.math.walls import Walls, is_cut
 from cavmarl.core.numba import kernel
 from cavmarl.v2x.kernels.v2x_records import MAX_NEAR, V2xScratch
 
-__all__ = ["visible"]
-
 
 @kernel
 def _stands_between(body: np.void, x: float, y: float, cos: float, sin: float, far: float) -> bool:

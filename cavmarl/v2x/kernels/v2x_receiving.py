@@ -29,8 +29,6 @@ from cavmarl.v2x.kernels.v2x_records import (
     V2xScratch,
 )
 
-__all__ = ["age", "deliver", "learn"]
-
 
 @kernel
 def _take_others(

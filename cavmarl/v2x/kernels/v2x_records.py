@@ -14,42 +14,6 @@ from numpy.typing import NDArray
 
 from cavmarl.core.math.neighbors import Grid
 
-__all__ = [
-    "BANDS_PER_M",
-    "BAND_M",
-    "CAUSE_COLLISION",
-    "CAUSE_HARD_BRAKING",
-    "CAUSE_NONE",
-    "CAUSE_OBSTACLE",
-    "CAUSE_STATIONARY",
-    "COUNT_NO_ACCESS",
-    "COUNT_OVERFLOW",
-    "COUNT_REACHABLE",
-    "COUNT_RECEIVED",
-    "COUNT_SENT",
-    "FIRST_ROADSIDE_ID",
-    "KIND_CAM",
-    "KIND_CPM",
-    "KIND_DENM",
-    "KIND_SPAT",
-    "LAST_CAM",
-    "MAX_DELAYS",
-    "MAX_NEAR",
-    "NUM_BANDS",
-    "NUM_COUNTS",
-    "NUM_KINDS",
-    "PACKET",
-    "RECEIVER",
-    "REPORT",
-    "STATION",
-    "UNIT",
-    "Air",
-    "HeardCams",
-    "Mail",
-    "Sending",
-    "V2xScratch",
-]
-
 # PACKET["kind"], in the order in which one station sends them.
 KIND_CAM = 0
 KIND_DENM = 1

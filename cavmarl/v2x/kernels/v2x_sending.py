@@ -32,8 +32,6 @@ from cavmarl.v2x.kernels.v2x_records import (
     V2xScratch,
 )
 
-__all__ = ["gather", "phase_left_s", "send_from_units", "send_from_vehicles"]
-
 # When a CAM that is due is sent (ETSI EN 302 637-2, 6.1.3).
 CAM_DISTANCE_M = 4.0
 CAM_HEADING_RAD = math.radians(4.0)

@@ -12,8 +12,6 @@ from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import Zoned
 from cavmarl.zones.kernels.zone_lookup import ZoneArrays, squared_distance, zone_of
 
-__all__ = ["NEAR", "Borders", "find_near", "pass_on"]
-
 NEAR = np.dtype(
     [
         ("vehicle", np.int64),

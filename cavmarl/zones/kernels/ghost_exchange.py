@@ -28,8 +28,6 @@ from cavmarl.zones.kernels.zone_lookup import (
     zone_of,
 )
 
-__all__ = ["exchange", "gather", "note_gathered", "take_own"]
-
 ROW_LINES = 6  # of memory, that a VEHICLE row takes
 
 

@@ -18,20 +18,6 @@ from cavmarl.core.records.arrays import Zoned
 from cavmarl.zones.kernels.borders import NEAR, Borders, find_near, pass_on
 from cavmarl.zones.kernels.zone_lookup import ZoneArrays, squared_distance
 
-__all__ = [
-    "CHANGE",
-    "COMING",
-    "LATE",
-    "NOT_OWNED",
-    "NOT_SEEN",
-    "BorderRecords",
-    "hand_over",
-    "look",
-    "look_on",
-    "make_book",
-    "release",
-]
-
 # What `hand_over` returns where it cannot go on, as `pass_on` does.
 NOT_OWNED = -1
 NOT_SEEN = -2

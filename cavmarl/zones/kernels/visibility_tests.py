@@ -25,8 +25,6 @@ from cavmarl.driving.kernels.junctions import EXIT_LOOK_M
 from cavmarl.driving.kernels.lane_choice import LOOK_BACK_M
 from cavmarl.zones.kernels.zone_lookup import squared_distance
 
-__all__ = ["VisibilityScratch", "farthest_m", "find_looks", "make_room"]
-
 AT_LINE_M = 0.2  # so near before a line a vehicle may be about to drive over it
 ASIDE_M = 10.0  # places beside each other on lanes of one edge are not further apart, nor more of s
 BACK_M = max(LOOK_BACK_M, ENTER_REACH_M)  # to the end of a lane on which followers are looked for

@@ -20,21 +20,6 @@ from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.codes import DRIVER_BACKGROUND
 from cavmarl.driving.kernels.announcing import announced_m, is_let_stand
 
-__all__ = [
-    "LOOK",
-    "OUTER",
-    "WATCH",
-    "Halo",
-    "ZoneArrays",
-    "is_asked_about",
-    "is_inside",
-    "is_seen",
-    "note_outer",
-    "squared_distance",
-    "zone_of",
-    "zones_of",
-]
-
 
 class ZoneArrays(NamedTuple):
     """What kernels take of a `ZonePartition`; k zones."""

@@ -24,8 +24,6 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.zones.partition.zone_layouts import cut_map
 from cavmarl.zones.partition.zone_partition import Bounds, ZonePartition
 
-__all__ = ["SCHEMA", "VERSION", "named_zones", "read_zones", "write_zones", "zones_for"]
-
 SCHEMA = "cavmarl.zones"
 VERSION = 1
 DEFAULT_COUNT = 4

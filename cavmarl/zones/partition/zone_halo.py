@@ -15,8 +15,6 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.zones.kernels.zone_lookup import LOOK, WATCH, Halo
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
-__all__ = ["inner_parts", "lane_watchers", "zone_halo"]
-
 # Added to the halo, so that no rounding of the sum below can make it too narrow.
 _ROUNDING_M = 1e-6
 

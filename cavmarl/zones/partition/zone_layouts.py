@@ -19,8 +19,6 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.zones.partition.zone_partition import Bounds, ZonePartition
 from cavmarl.zones.partition.zone_survey import junction_boxes, lane_samples
 
-__all__ = ["MIN_SIDE_M", "cut_map"]
-
 Floats = NDArray[np.float64]
 Rect = tuple[float, float, float, float]
 

@@ -9,8 +9,6 @@ from cavmarl.maps.components import strong_components
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
-__all__ = ["zones_without_loop"]
-
 
 def zones_without_loop(network: RoadNetwork, partition: ZonePartition) -> tuple[int, ...]:
     """The zones that hold no closed way: no edges, with the junctions between them, wholly inside.

@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import ConfigError
 from cavmarl.zones.kernels.zone_lookup import ZoneArrays, zone_of, zones_of
 
-__all__ = ["Bounds", "Neighbor", "ZonePartition"]
-
 Bounds = tuple[float, float, float, float]  # min_x, min_y, max_x, max_y in metres
 
 _PLACE = np.dtype([("x", np.float64), ("y", np.float64)])

@@ -13,8 +13,6 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.zones.partition.zone_partition import ZonePartition
 from cavmarl.zones.partition.zone_survey import junction_boxes, lane_segments
 
-__all__ = ["ZoneStatistics", "imbalance", "zone_statistics"]
-
 Floats = NDArray[np.float64]
 
 

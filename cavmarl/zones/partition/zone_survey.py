@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from cavmarl.roads.network import RoadNetwork
 
-__all__ = ["junction_boxes", "lane_samples", "lane_segments"]
-
 Floats = NDArray[np.float64]
 
 _SAMPLE_M = 2.0  # longest piece of a lane that counts as one place
