@@ -180,7 +180,7 @@ def test_the_same_seed_gives_the_same_rows() -> None:
         ({"num_worlds": 3}, "num_envs = 8: must be a multiple of num_worlds = 3"),
         ({"num_worlds": 0}, "num_envs = 8: must be a multiple of num_worlds = 0"),
         ({"autoreset_mode": "Disabled"}, "autoreset_mode = 'Disabled': must be"),
-        ({"overrides": {"population.mode": "open"}}, r"population\.mode"),
+        ({"overrides": {"population.mode": "opened"}}, r"population\.mode"),
     ],
 )
 def test_rows_that_cannot_be_are_refused(arguments: dict[str, Any], message: str) -> None:
