@@ -246,20 +246,28 @@ def _collect(kind: str, name_of: Callable[[Path], str | None]) -> dict[str, Path
     found = {
         name: path
         for place in reversed(places(kind))
-        for path in place.iterdir()
+        for path in _listed(place)
         if (name := name_of(path)) is not None
     }
     return dict(sorted(found.items()))
 
 
+def _listed(place: Path) -> list[Path]:
+    """What lies in a folder and can be named; nothing of one that cannot be read."""
+    try:
+        return [path for path in place.iterdir() if path.name.isprintable()]
+    except OSError:
+        return []
+
+
 def _environment_name(path: Path) -> str | None:
-    return path.name if (path / "env.yaml").is_file() else None
+    return path.name if isfile(path / "env.yaml") else None
 
 
 def _agent_name(path: Path) -> str | None:
     if path.suffix == ".py" and not path.name.startswith("_"):
         return path.stem
-    return path.name if (path / "model.safetensors").is_file() else None
+    return path.name if isfile(path / "model.safetensors") else None
 
 
 def _advice(env: str | Path, known: Mapping[str, Path]) -> str:
