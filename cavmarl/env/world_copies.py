@@ -40,7 +40,7 @@ class CopiedWithWorlds:
 
 
 def _made_again(kind: type[Any], worlds: SteppedWorlds) -> Any:
-    made = kind.__new__(kind)
+    made: Any = object.__new__(kind)
     base = next(cls for cls in kind.__mro__ if CopiedWithWorlds in cls.__bases__)
     base.__init__(made, worlds)  # type: ignore[misc] # a subclass may take other arguments
     return made
