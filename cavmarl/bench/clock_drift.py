@@ -14,6 +14,7 @@ import sys
 from dataclasses import asdict, dataclass
 from fractions import Fraction
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, ClassVar
 
 from cavmarl.bench.harness import Result
@@ -85,13 +86,16 @@ def measure_drift(
     made = parallel_env(env, overrides=settings)
     dt_s = made.config.clock.sim_dt_s
     settings |= {"clock.ctrl_dt_s": dt_s, "horizon_s": dt_s * (BEFORE + 2 * steps + 1)}
-    with FollowedWorld(
-        parallel_env(env, overrides=settings),
-        0,
-        timeout_s=TIMEOUT_S,
-        own_ticks=answer,
-        on_drift="record",
-    ) as world:
+    with (
+        TemporaryDirectory() as folder,
+        FollowedWorld(
+            parallel_env(env, overrides=settings),
+            Path(folder) / "clock.sock",
+            timeout_s=TIMEOUT_S,
+            own_ticks=answer,
+            on_drift="record",
+        ) as world,
+    ):
         world.reset(seed)
         for _ in range(BEFORE):
             world.step()
