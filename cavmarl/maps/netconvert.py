@@ -114,9 +114,7 @@ def build_network(
         try:
             log = _build(kind, source, place, chosen, timeout_s)
         except OSError as error:
-            hint = "set CAVMARL_CACHE_DIR to a folder with room" if target is None else ""
-                "set CAVMARL_CACHE_DIR to a folder with room" if target is None else "name another"
-            )
+            cure = "name another target" if target else "set CAVMARL_CACHE_DIR to another folder"
             raise MapError(
                 f"{place}: cannot be written ({error.strerror or error}); {cure}"
             ) from error
