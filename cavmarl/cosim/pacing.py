@@ -27,20 +27,13 @@ class Unpaced:
 
 @dataclass(frozen=True)
 class Lateness:
-    """How late steps began, by the wall clock.
+    """How late steps began, by the wall clock."""
 
-    Attributes:
-        steps: that have begun.
-        late: of these, that could not begin when they were due, because what went before took
-            too long.
-        mean_wall_s: how long after they were due all of them began, on average.
-        worst_wall_s: the same, of the worst.
-    """
-
-    steps: int
+    steps: int  # that have begun
+    # of these, that could not begin when they were due, because what went before took too long
     late: int
-    mean_wall_s: float
-    worst_wall_s: float
+    mean_wall_s: float  # how long after they were due all of them began, on average
+    worst_wall_s: float  # the same, of the worst
 
 
 class RealTime:
@@ -49,10 +42,8 @@ class RealTime:
     A step is due at a fixed time after the first one began, so that lateness is made up for and
     does not add up.
 
-    Args:
-        factor: seconds of simulated time a second.
-        now: the wall clock in seconds.
-        sleep: waits so many seconds.
+    `factor`: seconds of simulated time a second. `now`: the wall clock in seconds. `sleep`: waits
+    so many seconds.
 
     Raises:
         ConfigError: a factor that is no number above 0.

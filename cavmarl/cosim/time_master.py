@@ -55,37 +55,23 @@ class Steppable(Protocol):
 
 
 class ClockEvent(NamedTuple):
-    """Something about time that should not have been.
+    """Something about time that should not have been."""
 
-    Attributes:
-        tick: the master's when it was noticed.
-        kind: `own_tick`: a follower wanted to tick; `drift`: a world is not where its master left
-            it.
-        who: name of the follower; unknown for a drift.
-        ticks: by how many the world has gone on, or would have.
-    """
-
-    tick: int
+    tick: int  # the master's when it was noticed
+    # `own_tick`: a follower wanted to tick; `drift`: a world is not where its master left it
     kind: Literal["own_tick", "drift"]
-    who: str
-    ticks: int
+    who: str  # name of the follower; unknown for a drift
+    ticks: int  # by how many the world has gone on, or would have
 
 
 @dataclass
 class TimeFollower:
-    """Reads the master's clock, in this process or at the other end of a socket.
+    """Reads the master's clock, in this process or at the other end of a socket."""
 
-    Attributes:
-        master: whose clock it reads.
-        name: of it.
-        since_tick: the master's when it has joined.
-        own_ticks: how often it has wanted to tick by itself.
-    """
-
-    master: TimeMaster
+    master: TimeMaster  # whose clock it reads
     name: str
-    since_tick: int
-    own_ticks: int = 0
+    since_tick: int  # the master's when it has joined
+    own_ticks: int = 0  # how often it has wanted to tick by itself
 
     @property
     def time_s(self) -> float:

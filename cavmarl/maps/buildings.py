@@ -25,10 +25,6 @@ MOST_CORNERS = 4000
 def with_buildings(network: RoadNetwork, path: Path) -> RoadNetwork:
     """A network with the buildings of a file.
 
-    Args:
-        network: not changed.
-        path: see `read_footprints`.
-
     Returns:
         A network with another `source_hash`, for it has more than one source.
 

@@ -31,18 +31,13 @@ _DIGITS = 6  # of a metre; sides that are nearly level would have endless slopes
 
 @dataclass(frozen=True)
 class Footprint:
-    """One building.
+    """One building."""
 
-    Attributes:
-        name: in the file.
-        rings: (n, 2) corners in m in the map's frame, first not repeated; a place is inside that
-            an odd number of them goes around.
-        height_m: over the ground.
-    """
-
-    name: str
+    name: str  # in the file
+    # (n, 2) corners in m in the map's frame, first not repeated; a place is inside that an odd
+    # number of them goes around
     rings: tuple[Ring, ...]
-    height_m: float
+    height_m: float  # over the ground
 
 
 def read_footprints(path: Path, geo: GeoReference | None) -> list[Footprint]:

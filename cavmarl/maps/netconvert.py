@@ -48,24 +48,17 @@ _SHOWN_LINES = 10
 
 @dataclass(frozen=True)
 class BuildResult:
-    """What a build did.
+    """What a build did."""
 
-    Attributes:
-        path: the SUMO network.
-        source: the file it was made from.
-        kind: of the source.
-        options: netconvert's options; empty where a SUMO network was taken as it is.
-        warnings: netconvert's warnings, counted by their text without names and numbers.
-        corrections: what netconvert says it changed: junctions joined, roundabouts guessed …
-        dropped: with `tolerant`, the errors that netconvert ignored: what they name was left out.
-    """
-
-    path: Path
-    source: Path
-    kind: MapKind
-    options: tuple[str, ...]
+    path: Path  # the SUMO network
+    source: Path  # the file it was made from
+    kind: MapKind  # of the source
+    options: tuple[str, ...]  # netconvert's options; empty where a SUMO network was taken as it is
+    # netconvert's warnings, counted by their text without names and numbers
     warnings: dict[str, int]
+    # what netconvert says it changed: junctions joined, roundabouts guessed …
     corrections: tuple[str, ...]
+    # with `tolerant`, the errors that netconvert ignored: what they name was left out
     dropped: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:

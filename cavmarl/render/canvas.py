@@ -79,10 +79,8 @@ def pixels(surface: Surface) -> NDArray[np.uint8]:
 def stamp(target: Surface, parts: Sequence[Part]) -> None:
     """Draw polygons over one another with smooth edges.
 
-    Args:
-        target: where to.
-        parts: colours (red, green, blue, alpha; the first three already multiplied by alpha) and
-            corners in pixels of `target`, fractions allowed.
+    `parts`: colours (red, green, blue, alpha; the first three already multiplied by alpha) and
+    corners in pixels of `target`, fractions allowed.
     """
     pygame = load_pygame()
     corners = [corner for _, polygon in parts for corner in polygon]

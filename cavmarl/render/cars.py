@@ -66,17 +66,11 @@ def in_view(vehicles: NDArray[np.void], camera: Viewport) -> NDArray[np.void]:
 
 
 class Paint(NamedTuple):
-    """How a car is painted.
+    """How a car is painted."""
 
-    Attributes:
-        body: its colour.
-        rims: colours of rims around it, the outer one first.
-        lined: whether a thin light line surrounds it.
-    """
-
-    body: Color
-    rims: tuple[Color, ...] = ()
-    lined: bool = False
+    body: Color  # its colour
+    rims: tuple[Color, ...] = ()  # colours of rims around it, the outer one first
+    lined: bool = False  # whether a thin light line surrounds it
 
 
 def draw_cars(
@@ -89,11 +83,7 @@ def draw_cars(
 
     Brake lights shine below `BRAKING_MPS2`; a red outline is a vehicle that has collided.
 
-    Args:
-        surface: where to.
-        vehicles: VEHICLE rows.
-        camera: the view.
-        paints: of each; by default agents have the colours of `palette.agent_color`.
+    `paints`: of each; by default agents have the colours of `palette.agent_color`.
     """
     if paints is None:
         paints = [_paint_of_driver(row) for row in vehicles]

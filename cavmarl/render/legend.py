@@ -22,23 +22,17 @@ _HEIGHT_PX = 10.0
 
 
 class Sample(NamedTuple):
-    """An entry of the legend.
+    """An entry of the legend."""
 
-    Attributes:
-        text: what it says.
-        draw: its sample, `SWATCH_PX` wide, from the left end and the middle of its height.
-    """
-
-    text: str
+    text: str  # what it says
+    # its sample, `SWATCH_PX` wide, from the left end and the middle of its height
     draw: Callable[[float, float], list[Part]]
 
 
 def samples_of_drivers(*, destinations: bool, actors: bool = False) -> list[Sample]:
     """Of a picture in which agents have colours of their own.
 
-    Args:
-        destinations: whether those of agents are shown.
-        actors: whether any follows a script.
+    `destinations`: whether those of agents are shown. `actors`: whether any follows a script.
     """
     samples = [Sample("agents", lambda x, y: _stripes([agent_color(k) for k in range(4)], x, y))]
     if destinations:
@@ -55,9 +49,7 @@ def samples_of_drivers(*, destinations: bool, actors: bool = False) -> list[Samp
 def samples_of_zones(count: int, ghosts_of: int | None) -> list[Sample]:
     """Of a picture in which vehicles have the colours of their zones.
 
-    Args:
-        count: how many zones.
-        ghosts_of: the zone whose ghosts are outlined, if one is.
+    `ghosts_of`: the zone whose ghosts are outlined, if one is.
     """
     owners = [zone_color(zone) for zone in range(min(count, 4))]
     samples = [Sample("vehicles by owner", lambda x, y: _stripes(owners, x, y))]

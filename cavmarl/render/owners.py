@@ -28,11 +28,9 @@ def owner_paints(
 ) -> list[Paint]:
     """How vehicles are painted by their zones.
 
-    Args:
-        view: of the world.
-        vehicles: all of it, as `Simulation.vehicles` gives them.
-        seen: those of them that are drawn, in any order.
-        ghosts_of: the zone whose ghosts get a rim in its colour; None: no zone's.
+    `vehicles`: all of it, as `Simulation.vehicles` gives them. `seen`: those of them that are
+    drawn, in any order. `ghosts_of`: the zone whose ghosts get a rim in its colour; None: no
+    zone's.
     """
     owners = dict(zip(vehicles["id"].tolist(), view.owners.tolist(), strict=True))
     ghosts = set() if ghosts_of is None else set(view.ghosts[ghosts_of].tolist())
@@ -48,11 +46,7 @@ def draw_transfers(
 ) -> None:
     """A ring in the target's colour around each vehicle in transfer, and a head towards it.
 
-    Args:
-        surface: where to.
-        view: of the world.
-        vehicles: all of it; a transfer of a vehicle that has left is not drawn.
-        camera: the view.
+    `vehicles`: all of it; a transfer of a vehicle that has left is not drawn.
     """
     rows = {int(row["id"]): row for row in vehicles}
     for transfer in view.transfers:

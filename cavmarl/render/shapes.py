@@ -40,35 +40,21 @@ class Patch:
 
 @dataclass(frozen=True)
 class RoadShapes:
-    """All shapes of a network, in metres.
+    """All shapes of a network, in metres."""
 
-    Attributes:
-        starts: (n, 2), each straight piece of a lane begins here and
-        ends: (n, 2) ends here.
-        half_widths: (n,) of the pieces.
-        joined: (n,) a round joint at the piece's end belongs to the road and covers no other level.
-        levels: (n,) as from `level_of`.
-        for_cars: (n,) the lane is open to cars.
-        junctions: the insides of junctions.
-        junction_boxes: (num junctions, 2, 2) their lower left and upper right corners.
-        dashes: (k, 2, 3) from and to, x y z, between lanes of one direction.
-        centre_lines: (k, 2, 3) between opposite directions.
-        arrows: (k, 4, 3) on lanes before junctions.
-        stop_lines: (num_links, 4, 2) the link's part of the bar at the end of its lane.
-    """
-
-    starts: Points
-    ends: Points
-    half_widths: Points
+    starts: Points  # (n, 2), each straight piece of a lane begins here and
+    ends: Points  # (n, 2) ends here
+    half_widths: Points  # (n,) of the pieces
+    # (n,) a round joint at the piece's end belongs to the road and covers no other level
     joined: NDArray[np.bool_]
-    levels: NDArray[np.int64]
-    for_cars: NDArray[np.bool_]
-    junctions: tuple[Patch, ...]
-    junction_boxes: Points
-    dashes: Points
-    centre_lines: Points
-    arrows: Points
-    stop_lines: Points
+    levels: NDArray[np.int64]  # (n,) as from `level_of`
+    for_cars: NDArray[np.bool_]  # (n,) the lane is open to cars
+    junctions: tuple[Patch, ...]  # the insides of junctions
+    junction_boxes: Points  # (num junctions, 2, 2) their lower left and upper right corners
+    dashes: Points  # (k, 2, 3) from and to, x y z, between lanes of one direction
+    centre_lines: Points  # (k, 2, 3) between opposite directions
+    arrows: Points  # (k, 4, 3) on lanes before junctions
+    stop_lines: Points  # (num_links, 4, 2) the link's part of the bar at the end of its lane
 
 
 def road_shapes(network: RoadNetwork) -> RoadShapes:

@@ -36,11 +36,9 @@ MOVING_DETAIL = 2
 class TopDownRenderer:
     """Draws the vehicles and signals of one map, off screen.
 
-    Args:
-        network: the map.
-        size: width and height of the picture in pixels; by default what suits the map's shape.
-        focus: (min_x, min_y, max_x, max_y) in metres to show; all roads by default.
-        goal_edges: EDGE rows by `VEHICLE["goal"]`; given, each agent's destination is marked.
+    `size`: width and height of the picture in pixels; by default what suits the map's shape.
+    `focus`: (min_x, min_y, max_x, max_y) in metres to show; all roads by default. `goal_edges`:
+    EDGE rows by `VEHICLE["goal"]`; given, each agent's destination is marked.
 
     Raises:
         MissingExtraError: pygame-ce is not installed.

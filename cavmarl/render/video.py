@@ -20,9 +20,7 @@ class VideoWriter:
 
     Missing folders are made. The first frame sets the size; without frames there is no file.
 
-    Args:
-        path: ends in `.mp4`.
-        fps: frames a second.
+    `path`: ends in `.mp4`.
 
     Raises:
         ConfigError: the path cannot be written, or is no `.mp4`.

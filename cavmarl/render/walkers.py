@@ -32,11 +32,7 @@ def is_walker(row: np.void) -> bool:
 def draw_walker(surface: Surface, row: np.void, center: list[float], scale: float) -> None:
     """Paint a pedestrian, from far above larger than one is.
 
-    Args:
-        surface: where to.
-        row: VEHICLE.
-        center: in pixels.
-        scale: pixels a metre.
+    `scale`: pixels a metre.
     """
     half = max(0.5 * float(row["width"]) * scale, MIN_RADIUS_PX)
     heading = float(row["heading"])

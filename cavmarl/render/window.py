@@ -15,9 +15,7 @@ class Window:
 
     When the person at the screen closes it, the run goes on unseen.
 
-    Args:
-        title: of the window.
-        fps: pictures a second; `show` waits for its turn.
+    `fps`: pictures a second; `show` waits for its turn.
     """
 
     def __init__(self, title: str, fps: float) -> None:

@@ -34,11 +34,8 @@ def zone_picture(
 ) -> Surface:
     """A map with its zones.
 
-    Args:
-        network: the map.
-        partition: of the map.
-        halo_m: how far zones see over their borders; each is darker where another sees it.
-        title: for the upper left corner.
+    `halo_m`: how far zones see over their borders; each is darker where another sees it. `title`:
+    for the upper left corner.
 
     Raises:
         MissingExtraError: pygame-ce is not installed.
@@ -54,14 +51,7 @@ def zone_picture(
 
 
 def draw_zones(surface: Surface, partition: ZonePartition, halo_m: float, camera: Viewport) -> None:
-    """Draw zones over what is there.
-
-    Args:
-        surface: where to.
-        partition: of the map.
-        halo_m: as in `zone_picture`.
-        camera: the view.
-    """
+    """Draw zones over what is there."""
     pygame = load_pygame()
     wash = blank(surface.get_size(), transparent=True)
     shown = _clipped(partition.reaching, camera)
@@ -83,15 +73,7 @@ def draw_zones(surface: Surface, partition: ZonePartition, halo_m: float, camera
 def draw_sight(
     surface: Surface, partition: ZonePartition, halo_m: float, zone: int, camera: Viewport
 ) -> None:
-    """Draw how far a zone sees: the line at the end of its halo, in its colour.
-
-    Args:
-        surface: where to.
-        partition: of the map.
-        halo_m: as in `zone_picture`.
-        zone: which.
-        camera: the view.
-    """
+    """Draw how far a zone sees: the line at the end of its halo, in its colour."""
     pygame = load_pygame()
     seen = partition.reaching[[zone]] + np.array([-halo_m, -halo_m, halo_m, halo_m])
     # Far enough out of view for the round corners of what is clipped to stay there.

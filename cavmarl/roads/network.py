@@ -235,17 +235,11 @@ PLACE = np.dtype(
 
 @dataclass(frozen=True)
 class GeoReference:
-    """Where a map lies on the earth: a place projected, plus the offset, is its x and y.
+    """Where a map lies on the earth: a place projected, plus the offset, is its x and y."""
 
-    Attributes:
-        projection: parameters of PROJ.
-        offset_x_m: added to the east of the projection.
-        offset_y_m: added to its north.
-    """
-
-    projection: str
-    offset_x_m: float
-    offset_y_m: float
+    projection: str  # parameters of PROJ
+    offset_x_m: float  # added to the east of the projection
+    offset_y_m: float  # added to its north
 
 
 @dataclass(frozen=True, eq=False)

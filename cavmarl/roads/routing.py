@@ -41,10 +41,8 @@ def make_plans(
 ) -> NDArray[np.void]:
     """The plans of several goals.
 
-    Args:
-        network: the roads.
-        goal_edges: EDGE rows to plan for.
-        vehicle_class: one of `VEHICLE_CLASSES`; lanes that forbid it are not used.
+    `goal_edges`: EDGE rows to plan for. `vehicle_class`: one of `VEHICLE_CLASSES`; lanes that
+    forbid it are not used.
 
     Returns:
         PLAN (len(goal_edges), num_lanes), read-only.

@@ -58,33 +58,20 @@ class _Calls:
 
 @dataclass(frozen=True)
 class NativeTraffic:
-    """Departures on one map for one population; a TrafficSource.
-
-    Attributes:
-        network: the roads.
-        traffic: settings of the generator.
-        population: which vehicles are in the world.
-        blank: VEHICLE (1,), the record that every vehicle starts from.
-        dt: seconds a tick.
-        horizon_s: seconds an episode.
-        file: the demand whose vehicles drive beside the generator's.
-        num_worlds: how many worlds are stepped together.
-        zeros: makes the table of ways, where vehicles find some while the world runs.
-        scene: what is played to the agents of each world.
-        sumo: in the place of a file: what SUMO runs beside these worlds.
-    """
+    """Departures on one map for one population; a TrafficSource."""
 
     network: RoadNetwork
-    traffic: TrafficConfig
-    population: PopulationConfig
-    blank: NDArray[np.void]
+    traffic: TrafficConfig  # settings of the generator
+    population: PopulationConfig  # which vehicles are in the world
+    blank: NDArray[np.void]  # VEHICLE (1,), the record that every vehicle starts from
     dt: float
-    horizon_s: float
-    file: DemandFile | None = None
+    horizon_s: float  # seconds an episode
+    file: DemandFile | None = None  # the demand whose vehicles drive beside the generator's
     num_worlds: int = 1
+    # makes the table of ways, where vehicles find some while the world runs
     zeros: Zeros = np.zeros
-    scene: Scene | None = None
-    sumo: SumoDemand | None = None
+    scene: Scene | None = None  # what is played to the agents of each world
+    sumo: SumoDemand | None = None  # in the place of a file: what SUMO runs beside these worlds
 
     def __post_init__(self) -> None:
         # Trips that do not exist are refused when the world is made, not at its first reset.

@@ -43,12 +43,8 @@ LOOK = np.dtype(
 class Rerouting:
     """Vehicles that reroute, what is known of the traffic, and the ways that were found; W worlds.
 
-    Args:
-        schedule: of the demand file.
-        travel: types and ways, with room behind them.
-        slots: that room.
-        first_type: VTYPE row of the file's first type.
-        dt: seconds a tick.
+    `travel`: types and ways, with room behind them. `slots`: that room. `first_type`: VTYPE row of
+    the file's first type.
     """
 
     def __init__(
@@ -83,10 +79,7 @@ class Rerouting:
     def begin(self, world: int, key: int, horizon_s: float) -> None:
         """Forget an episode of a world and take up the next.
 
-        Args:
-            world: which one.
-            key: of the world and the new episode.
-            horizon_s: seconds an episode.
+        `key`: of the world and the new episode. `horizon_s`: seconds an episode.
         """
         orders = self._schedule.orders(key, horizon_s)
         more = len(orders) - self._looks.shape[1]
@@ -126,9 +119,7 @@ class Rerouting:
     def state(self, world: int, rows: NDArray[np.void]) -> Iterator[NDArray[np.generic]]:
         """What of a world's state is kept here, as arrays without padding.
 
-        Args:
-            world: number of the world.
-            rows: VEHICLE (n,), its vehicles: only the ways that they drive on count.
+        `rows`: VEHICLE (n,), its vehicles: only the ways that they drive on count.
         """
         yield self._speed_sums[world]
         yield self._past[world]

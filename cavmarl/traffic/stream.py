@@ -15,11 +15,7 @@ FREE_M = 20.0  # beyond the junction a built-in driver takes over
 def approach(streets: Streets, link: int, far_m: float, speed_mps: float) -> Seat | None:
     """A seat on the lane that a link leaves, `far_m` before its end; None where that is shorter.
 
-    Args:
-        streets: of the map.
-        link: LINK row that the agent is to drive over.
-        far_m: of its centre to the end of the lane.
-        speed_mps: of the agent.
+    `link`: LINK row that the agent is to drive over. `far_m`: of its centre to the end of the lane.
     """
     row = streets.network.links[link]
     lane, beyond = int(row["from_lane"]), int(row["to_lane"])
@@ -34,12 +30,8 @@ def stream(
 ) -> list[Actor] | None:
     """Cars that drive over a link without reacting to others; None where there is no room for them.
 
-    Args:
-        streets: of the map.
-        link: LINK row.
-        middle_m: a place on its path, from the stop line.
-        speed_mps: of all of them, all the time.
-        times_s: when each one's centre is at that place, rising.
+    `middle_m`: a place on its path, from the stop line. `speed_mps`: of all of them, all the time.
+    `times_s`: when each one's centre is at that place, rising.
     """
     path = path_of(streets.network, link)
     far_m = times_s[-1] * speed_mps - middle_m
@@ -70,15 +62,9 @@ def meet_stream(
 ) -> Scene | None:
     """An agent that meets the first car of a stream if it keeps its speed; None: no room for them.
 
-    Args:
-        streets: of the map.
-        place: where both ways meet.
-        far_m: from the agent to the junction in the beginning.
-        speed_mps: of the agent.
-        stream_mps: of the cars.
-        cars: how many.
-        gap_s: between them, from centre to centre.
-        lead_s: how long the first is there before the agent.
+    `place`: where both ways meet. `far_m`: from the agent to the junction in the beginning.
+    `gap_s`: between them, from centre to centre. `lead_s`: how long the first is there before the
+    agent.
     """
     seat = approach(streets, place.link, far_m, speed_mps)
     if seat is None:

@@ -33,30 +33,18 @@ class WaySearchResult(Enum):
 
 
 class Traffic(NamedTuple):
-    """What is known of one world's traffic.
+    """What is known of one world's traffic."""
 
-    Attributes:
-        speed_sums: (num_edges,) mm/s, see `kernels.edge_speeds`.
-        samples: how many a sum has.
-        closed: (num_edges,) bits of the classes that an edge is closed to.
-    """
-
-    speed_sums: NDArray[np.int64]
-    samples: int
-    closed: NDArray[np.int64]
+    speed_sums: NDArray[np.int64]  # (num_edges,) mm/s, see `kernels.edge_speeds`
+    samples: int  # how many a sum has
+    closed: NDArray[np.int64]  # (num_edges,) bits of the classes that an edge is closed to
 
 
 class WaySearch:
     """Ways of one world's vehicles. Plans are made where they are asked for, each once.
 
-    Args:
-        roads: the road arrays.
-        travel: types and ways; new ones are written into the slots.
-        slots: where those are.
-        world: number of the world.
-        rows: VEHICLE, the world's.
-        num: how many of them count.
-        traffic: of the world.
+    `travel`: types and ways; new ones are written into the slots. `slots`: where those are. `rows`:
+    VEHICLE, the world's.
     """
 
     def __init__(
@@ -93,11 +81,9 @@ class WaySearch:
     def send(self, i: int, goal: int, knows: bool, anyhow: bool) -> WaySearchResult:
         """Put row i on the fastest way to a goal, if that is faster than its present way.
 
-        Args:
-            i: row of a vehicle outside junctions.
-            goal: EDGE row.
-            knows: whether it knows the speeds; otherwise the limits count. Closings all know.
-            anyhow: whether it leaves its present way even for a slower one.
+        `i`: row of a vehicle outside junctions. `knows`: whether it knows the speeds; otherwise the
+        limits count. Closings all know. `anyhow`: whether it leaves its present way even for a
+        slower one.
         """
         row = self._rows[i]
         permission = self._permission(i)

@@ -18,21 +18,14 @@ DETOUR_RATIO = 3  # a way may take this many times the steps of the longest know
 
 @dataclass(frozen=True)
 class WaySlots:
-    """Where the slots lie; they are never more, whatever an episode brings.
+    """Where the slots lie; they are never more, whatever an episode brings."""
 
-    Attributes:
-        first: PLAN row of the first world's first slot.
-        number: slots of one world.
-        steps: of one slot.
-        num_worlds: how many worlds have slots.
-        num_lanes: of the map. So many unused steps before the first slot keep the ways in slots
-            above all others: a way is a step's row minus that of a lane.
-    """
-
-    first: int
-    number: int
-    steps: int
-    num_worlds: int
+    first: int  # PLAN row of the first world's first slot
+    number: int  # slots of one world
+    steps: int  # of one slot
+    num_worlds: int  # how many worlds have slots
+    # of the map. So many unused steps before the first slot keep the ways in slots above all
+    # others: a way is a step's row minus that of a lane.
     num_lanes: int
 
     def table(self) -> NDArray[np.void]:
@@ -51,9 +44,7 @@ class WaySlots:
     def ways_of_first_world(self, ways: NDArray[np.int64], world: int) -> NDArray[np.int64]:
         """VEHICLE["way"] (n,) of a world as it would be in the first one: where slots play no part.
 
-        Args:
-            ways: of vehicles.
-            world: in which they are.
+        `world`: in which they are.
         """
         own = ways >= self.first - self.num_lanes
         return ways - own * (world * self.of_world)
@@ -64,12 +55,8 @@ def way_slots(
 ) -> WaySlots:
     """The slots of a demand: one for each vehicle that may need one at a time.
 
-    Args:
-        schedule: of the demand.
-        first_step: how many PLAN rows come before.
-        num_worlds: how many worlds are stepped together.
-        capacity: vehicles of one world.
-        horizon_s: seconds an episode.
+    `first_step`: how many PLAN rows come before. `capacity`: vehicles of one world. `horizon_s`:
+    seconds an episode.
 
     Raises:
         CapacityError: they would take more than `MAX_STEPS`.

@@ -54,13 +54,8 @@ BODY_CELL_M = 25.0  # of the vehicles that others see
 class Bus:
     """Sends, carries and keeps the messages of W worlds.
 
-    Args:
-        config: the environment; `v2x.enabled`.
-        network: its roads and buildings.
-        types: VTYPE (num_types,).
-        zoned: the vehicles of all zones.
-        common: clocks, keys and signals.
-        zeros: makes the arrays that outlive a tick.
+    `config`: the environment; `v2x.enabled`. `zoned`: the vehicles of all zones. `common`: clocks,
+    keys and signals. `zeros`: makes the arrays that outlive a tick.
 
     Attributes:
         units: UNIT (num_units,), the roadside units.

@@ -21,31 +21,19 @@ from cavmarl.v2x.kernels.v2x_records import (
 
 @dataclass(frozen=True)
 class V2xStatistics:
-    """Counts and ratios of one world; receivers are the agents and the roadside units.
+    """Counts and ratios of one world; receivers are the agents and the roadside units."""
 
-    Attributes:
-        sent: packets of each kind: CAM, DENM, CPM, SPAT.
-        overflow: packets for which there was no room (`v2x.capacity`).
-        no_access: packets that never found the air free.
-        reachable: pairs of a packet and a receiver within reach of it.
-        received: those of them that received it.
-        delays: (65,) receptions by ticks of delay.
-        mean_latency_s: of the receptions.
-        bands: (40, 2) reachable and received, in bands of `BAND_M`; of channels that lose packets.
-        busy_mean: channel busy ratio, mean over receivers and ticks.
-        busy_max: the largest.
-    """
-
-    sent: tuple[int, ...]
-    overflow: int
-    no_access: int
-    reachable: int
-    received: int
-    delays: NDArray[np.int64]
-    mean_latency_s: float
+    sent: tuple[int, ...]  # packets of each kind: CAM, DENM, CPM, SPAT
+    overflow: int  # packets for which there was no room (`v2x.capacity`)
+    no_access: int  # packets that never found the air free
+    reachable: int  # pairs of a packet and a receiver within reach of it
+    received: int  # those of them that received it
+    delays: NDArray[np.int64]  # (65,) receptions by ticks of delay
+    mean_latency_s: float  # of the receptions
+    # (40, 2) reachable and received, in bands of `BAND_M`; of channels that lose packets
     bands: NDArray[np.int64]
-    busy_mean: float
-    busy_max: float
+    busy_mean: float  # channel busy ratio, mean over receivers and ticks
+    busy_max: float  # the largest
 
     @property
     def reception_ratio(self) -> float:
@@ -74,13 +62,7 @@ class V2xStatistics:
 
 
 def statistics_of(mail: Mail, world: int, tick_s: float) -> V2xStatistics:
-    """The counts of one world.
-
-    Args:
-        mail: of the bus.
-        world: which one.
-        tick_s: seconds a tick.
-    """
+    """The counts of one world."""
     counts = mail.counts[world]
     delays = mail.delays[world].copy()
     busy_sum, busy_number, busy_max = mail.busy[world].tolist()

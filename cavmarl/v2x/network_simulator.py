@@ -26,18 +26,12 @@ RECEPTION = np.dtype(
 
 
 class Exchange(NamedTuple):
-    """What a network simulator is told of one tick of one world; views, not to be kept.
-
-    Attributes:
-        world: which one.
-        tick: of that world; it begins at 1 after a reset.
-        packets: PACKET (n,) that are sent now, by sender, then kind.
-        receivers: RECEIVER (R,), where the agents and the roadside units are; id -1: none.
-    """
+    """What a network simulator is told of one tick of one world; views, not to be kept."""
 
     world: int
-    tick: int
-    packets: NDArray[np.void]
+    tick: int  # of that world; it begins at 1 after a reset
+    packets: NDArray[np.void]  # PACKET (n,) that are sent now, by sender, then kind
+    # RECEIVER (R,), where the agents and the roadside units are; id -1: none
     receivers: NDArray[np.void]
 
 
@@ -49,9 +43,6 @@ class NetworkSimulator(Protocol):
 
         A tick that is begun again, because a host has died, is asked for again with the same
         packets, and must be answered alike.
-
-        Args:
-            sent: what is sent.
 
         Returns:
             RECEPTION (n,): what is received now, of this tick's packets or of earlier ones.
@@ -67,11 +58,8 @@ def check_receptions(
 ) -> NDArray[np.void]:
     """Refuse receptions that cannot be.
 
-    Args:
-        receptions: the answer to `sent`.
-        sent: what was asked.
-        latency_ticks: the longest delay.
-        num_packets: (latency_ticks + 1,) packets in flight, by tick modulo that.
+    `receptions`: the answer to `sent`. `latency_ticks`: the longest delay. `num_packets`:
+    (latency_ticks + 1,) packets in flight, by tick modulo that.
 
     Returns:
         them by receiver, tick and packet, so that the order of the answer does not matter.

@@ -17,9 +17,7 @@ from cavmarl.v2x.v2x_messages import MAP
 def make_units(config: RoadsideConfig, network: RoadNetwork) -> NDArray[np.void]:
     """UNIT (n,): one at each signal that has one, in the middle of its stop lines.
 
-    Args:
-        config: which signals.
-        network: the roads.
+    `config`: which signals.
 
     Raises:
         ConfigError: no signal of that name.
@@ -57,13 +55,7 @@ def _stop_lines(network: RoadNetwork, signal: int) -> NDArray[np.void]:
 
 
 def map_of(network: RoadNetwork, units: NDArray[np.void], unit: int) -> NDArray[np.void]:
-    """MAP (n,): the approaches that a roadside unit's phases are about; they never change.
-
-    Args:
-        network: the roads.
-        units: UNIT (num_units,).
-        unit: which one.
-    """
+    """MAP (n,): the approaches that a roadside unit's phases are about; they never change."""
     signal = int(units[unit]["signal"])
     rows = _links(network, signal)
     ends = _stop_lines(network, signal)

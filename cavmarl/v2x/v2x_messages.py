@@ -156,9 +156,7 @@ def cause_code(cause: str) -> int:
 def messages_of(kind: int, reports: NDArray[np.void]) -> NDArray[np.void]:
     """Reports of the bus as records of the schema.
 
-    Args:
-        kind: KIND_*.
-        reports: REPORT (n,) of that kind; places where none is (sender -1) are left out.
+    `reports`: REPORT (n,) of that kind; places where none is (sender -1) are left out.
 
     Returns:
         CAM, DENM, CPM_OBJECT or SPAT (n,).
@@ -173,9 +171,7 @@ def messages_of(kind: int, reports: NDArray[np.void]) -> NDArray[np.void]:
 def encode(packet: np.void, reports: NDArray[np.void]) -> bytes:
     """A packet as it goes over a wire: the header, then its records.
 
-    Args:
-        packet: PACKET.
-        reports: REPORT (Q,) of its tick.
+    `reports`: REPORT (Q,) of its tick.
     """
     kind, first, count = int(packet["kind"]), int(packet["first"]), int(packet["count"])
     header = np.zeros((), HEADER)

@@ -28,30 +28,20 @@ CALL_S = 10.0
 
 @dataclass(frozen=True)
 class Samples:
-    """What one sensor has since the last snapshot.
+    """What one sensor has since the last snapshot."""
 
-    Attributes:
-        values: (n, …) one sample a row, the newest last.
-        stamps_s: (n,) when each was taken, in simulated time since the reset.
-        lost: (n,) which were lost: zeros.
-    """
-
-    values: NDArray[Any]
-    stamps_s: NDArray[np.float64]
-    lost: NDArray[np.bool_]
+    values: NDArray[Any]  # (n, …) one sample a row, the newest last
+    stamps_s: NDArray[np.float64]  # (n,) when each was taken, in simulated time since the reset
+    lost: NDArray[np.bool_]  # (n,) which were lost: zeros
 
 
 @dataclass(frozen=True)
 class FollowerView:
-    """One snapshot.
+    """One snapshot."""
 
-    Attributes:
-        snapshot: the clock, and the vehicles that have to be driven.
-        sensors: by vehicle and name of the sensor; those that are due. What is of the whole map
-            stands under no name.
-    """
-
-    snapshot: FollowerSnapshot
+    snapshot: FollowerSnapshot  # the clock, and the vehicles that have to be driven
+    # by vehicle and name of the sensor; those that are due. What is of the whole map stands under
+    # no name.
     sensors: Mapping[str, Mapping[str, Samples]]
 
 
@@ -62,12 +52,9 @@ class Follower:
             for sight in follower:
                 follower.answer({"car_0": [0.2, 0.0]})
 
-    Args:
-        address: path of a Unix socket, or a port of this machine.
-        vehicles: agents to drive; none: it follows the clock only, and answers with {}.
-        name: for people.
-        joins_s: how long the world may take to welcome us, which it does between two steps; None:
-            for ever.
+    `address`: path of a Unix socket, or a port of this machine. `vehicles`: agents to drive; none:
+    it follows the clock only, and answers with {}. `joins_s`: how long the world may take to
+    welcome us, which it does between two steps; None: for ever.
 
     Attributes:
         welcome: how time goes in that world.

@@ -43,27 +43,17 @@ _MAX_AXES = 8
 
 
 class ReceivedFrame(NamedTuple):
-    """One frame.
+    """One frame."""
 
-    Attributes:
-        kind: what it says.
-        letter: as msgpack knows it.
-        size: bytes of its data.
-    """
-
-    kind: Say
-    letter: Any
-    size: int
+    kind: Say  # what it says
+    letter: Any  # as msgpack knows it
+    size: int  # bytes of its data
 
 
 class _Patient(socket.socket):
-    """A socket that has until a deadline for all calls together.
+    """A socket that has until a deadline for all calls together."""
 
-    Attributes:
-        until_s: by `time.monotonic`; None: for ever.
-    """
-
-    until_s: float | None = None
+    until_s: float | None = None  # by `time.monotonic`; None: for ever
 
     def _hurry(self) -> None:
         if self.until_s is None:
@@ -86,10 +76,8 @@ class _Patient(socket.socket):
 class FollowerConnection:
     """Sends and hears frames; whatever goes wrong with the other end is a `FollowerError`.
 
-    Args:
-        connection: a connected socket, which the line owns from here on.
-        name: of the other end, for people.
-        cure: what can be done when that is gone, as the end of a sentence.
+    `connection`: a connected socket, which the line owns from here on. `name`: of the other end,
+    for people. `cure`: what can be done when that is gone, as the end of a sentence.
     """
 
     def __init__(self, connection: socket.socket, name: str, cure: str = "") -> None:

@@ -19,27 +19,16 @@ def wrap(angle: float) -> float:
 
 
 class OnLane(NamedTuple):
-    """A place beside a lane.
-
-    Attributes:
-        lane: LANE row.
-        s_m: along it.
-        d_m: from its centre, positive to the left.
-        heading_rad: of the lane there.
-    """
+    """A place beside a lane."""
 
     lane: int
-    s_m: float
-    d_m: float
-    heading_rad: float
+    s_m: float  # along it
+    d_m: float  # from its centre, positive to the left
+    heading_rad: float  # of the lane there
 
 
 class HdMap:
-    """Lanes by place.
-
-    Args:
-        network: the roads.
-    """
+    """Lanes by place."""
 
     def __init__(self, network: RoadNetwork) -> None:
         self.network = network

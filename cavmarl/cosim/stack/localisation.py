@@ -43,11 +43,7 @@ _STRAIGHT_RAD = 0.5
 class GnssInertial:
     """The filter.
 
-    Args:
-        sensors: of the vehicle; one GNSS at least.
-        geodesy: where the map is on the earth.
-        hd_map: the lanes.
-        tick_s: seconds a step of the stack.
+    `sensors`: of the vehicle; one GNSS at least. `geodesy`: where the map is on the earth.
     """
 
     def __init__(
@@ -225,11 +221,8 @@ class GnssInertial:
     ) -> bool:
         """Take in one number; whether it was believed.
 
-        Args:
-            row: (4,) how it depends on the state.
-            surprise: the number less what was expected.
-            deviation: of its noise.
-            gate: squared deviations beyond which it is not believed.
+        `row`: (4,) how it depends on the state. `surprise`: the number less what was expected.
+        `gate`: squared deviations beyond which it is not believed.
         """
         spread = float(row @ self._spread @ row) + deviation**2
         if surprise**2 > gate * spread:

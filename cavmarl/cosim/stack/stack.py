@@ -35,18 +35,11 @@ from cavmarl.sensors.mounted.geodesy import Geodesy, geodesy_of
 
 
 class Vehicle(NamedTuple):
-    """What a stage may know of the vehicle that it is made for.
-
-    Attributes:
-        hd_map: the roads.
-        sensors: that are mounted.
-        geodesy: where the map is on the earth; None: there is no GNSS.
-        tick_s: seconds a step of the stack.
-    """
+    """What a stage may know of the vehicle that it is made for."""
 
     hd_map: HdMap
-    sensors: Sequence[StackSensor]
-    geodesy: Geodesy | None
+    sensors: Sequence[StackSensor]  # that are mounted
+    geodesy: Geodesy | None  # where the map is on the earth; None: there is no GNSS
     tick_s: float
 
 
@@ -80,19 +73,12 @@ STAGES: dict[str, dict[str, Callable[[Vehicle], Any]]] = {
 
 @dataclass(frozen=True)
 class StackConfig:
-    """Which stages a stack is made of.
+    """Which stages a stack is made of."""
 
-    Attributes:
-        perception: `lidar`, or `blind`.
-        localisation: `gnss_imu`.
-        planning: `lane_route`.
-        control: `pure_pursuit`.
-    """
-
-    perception: str = "lidar"
-    localisation: str = "gnss_imu"
-    planning: str = "lane_route"
-    control: str = "pure_pursuit"
+    perception: str = "lidar"  # `lidar`, or `blind`
+    localisation: str = "gnss_imu"  # `gnss_imu`
+    planning: str = "lane_route"  # `lane_route`
+    control: str = "pure_pursuit"  # `pure_pursuit`
 
     def __post_init__(self) -> None:
         for stage, known in STAGES.items():
@@ -103,16 +89,12 @@ class StackConfig:
 
 @dataclass
 class StageTimes:
-    """How long stages took, by the wall clock.
+    """How long stages took, by the wall clock."""
 
-    Attributes:
-        steps: of the stack.
-        wall_s: sum of each stage.
-        worst_wall_s: of one step.
-    """
-
-    steps: int = 0
+    steps: int = 0  # of the stack
+    # sum of each stage
     wall_s: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
+    # of one step
     worst_wall_s: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
 
     def add(self, stage: str, seconds: float) -> None:
@@ -123,9 +105,7 @@ class StageTimes:
 class Stack:
     """Drives one vehicle.
 
-    Args:
-        vehicle: that is driven.
-        config: of which stages.
+    `vehicle`: that is driven. `config`: of which stages.
 
     Attributes:
         times: how long the stages took.
@@ -159,11 +139,8 @@ class Stack:
     ) -> Control2D:
         """One step of all stages; without a pose the vehicle brakes.
 
-        Args:
-            readings: what the sensors have that is due.
-            signals: what signals show; see `Planning.plan`.
-            mission: where to go.
-            time_s: simulated.
+        `readings`: what the sensors have that is due. `signals`: what signals show; see
+        `Planning.plan`. `time_s`: simulated.
         """
         self.times.steps += 1
         pose = self.pose = self._timed(
@@ -198,10 +175,7 @@ def sensor_of(name: str, settings: Mapping[str, Any]) -> StackSensor:
 def vehicle_of(hd_map: HdMap, sensors: Sequence[StackSensor], tick_s: float) -> Vehicle:
     """What stages may know.
 
-    Args:
-        hd_map: the roads.
-        sensors: that are mounted.
-        tick_s: seconds a step of the stack.
+    `sensors`: that are mounted.
 
     Raises:
         MissingExtraError: the map is projected, and pyproj is not installed.

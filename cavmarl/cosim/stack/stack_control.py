@@ -18,21 +18,13 @@ from cavmarl.cosim.stack.stack_types import Control2D, EgoPose, Mission, Traject
 
 
 class Gains(NamedTuple):
-    """How one type of vehicle is controlled.
+    """How one type of vehicle is controlled."""
 
-    Attributes:
-        lookahead_s: how far ahead the steering looks, at the present speed.
-        least_lookahead_m: and at least.
-        accel_mps2: the most that it accelerates.
-        brake_mps2: the most that it brakes, positive.
-        steering_radps: how fast its front wheels are turned.
-    """
-
-    lookahead_s: float
-    least_lookahead_m: float
-    accel_mps2: float
-    brake_mps2: float
-    steering_radps: float
+    lookahead_s: float  # how far ahead the steering looks, at the present speed
+    least_lookahead_m: float  # and at least
+    accel_mps2: float  # the most that it accelerates
+    brake_mps2: float  # the most that it brakes, positive
+    steering_radps: float  # how fast its front wheels are turned
 
 
 _CAR = Gains(0.5, 3.5, 2.5, 6.0, 1.2)
@@ -43,11 +35,7 @@ GAINS = {"passenger": _CAR, "truck": _HEAVY, "bus": _HEAVY}
 
 
 class PurePursuit:
-    """The controller.
-
-    Args:
-        tick_s: seconds a step of the stack.
-    """
+    """The controller."""
 
     def __init__(self, tick_s: float) -> None:
         self._tick_s = tick_s

@@ -45,19 +45,12 @@ class StackMount(NamedTuple):
 
 
 class StackSensor(NamedTuple):
-    """One sensor of the vehicle.
-
-    Attributes:
-        name: in the rig.
-        type: of it.
-        mount: where it is.
-        settings: its keys in `env.yaml`.
-    """
+    """One sensor of the vehicle."""
 
     name: str
     type: str
     mount: StackMount
-    settings: Mapping[str, Any]
+    settings: Mapping[str, Any]  # its keys in `env.yaml`
 
 
 class EgoPose(NamedTuple):
@@ -120,17 +113,11 @@ class Control2D(NamedTuple):
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Where to drive, and how fast.
+    """Where to drive, and how fast."""
 
-    Attributes:
-        points: (n, 2) the way ahead, from beside the vehicle on; at least two.
-        accel_mps2: along it, now.
-        reason: what that is for: `free`, `gap`, `stop_line`, `yield` or `end`.
-    """
-
-    points: NDArray[np.float64]
-    accel_mps2: float
-    reason: str = "free"
+    points: NDArray[np.float64]  # (n, 2) the way ahead, from beside the vehicle on; at least two
+    accel_mps2: float  # along it, now
+    reason: str = "free"  # what that is for: `free`, `gap`, `stop_line`, `yield` or `end`
     lanes: Sequence[int] = field(default_factory=tuple)
 
 
@@ -162,11 +149,8 @@ class Planning(Protocol):
     ) -> Trajectory:
         """The way from here on.
 
-        Args:
-            pose: where it is.
-            obstacles: what is on the road.
-            signals: (num_links,) SIGNAL_* codes, 255: none; None: unknown.
-            mission: where it is to go.
+        `obstacles`: what is on the road. `signals`: (num_links,) SIGNAL_* codes, 255: none; None:
+        unknown. `mission`: where it is to go.
         """
         ...
 

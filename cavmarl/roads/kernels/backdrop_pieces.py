@@ -55,12 +55,8 @@ def gather_walls(
 ) -> int:
     """The walls around a vehicle, always in the same order.
 
-    Args:
-        ego: VEHICLE record of the one that looks.
-        walls: WALL (num_walls,) in the frame of the map.
-        index: of the walls.
-        reach_m: walls that are farther away are left out.
-        out: WALL (num_walls,), overwritten up to the returned number.
+    `walls`: WALL (num_walls,) in the frame of the map. `reach_m`: walls that are farther away are
+    left out. `out`: WALL (num_walls,), overwritten up to the returned number.
 
     Returns:
         how many there are.

@@ -56,10 +56,8 @@ def sample_path(s: NDArray[np.float64], xyz: NDArray[np.float64]) -> LinkPath:
 def overlap(path: LinkPath, foe: LinkPath, *, merging: bool) -> Overlap | None:
     """Where two foes meet, or None if one passes over the other.
 
-    Args:
-        path: the path of one link.
-        foe: the path of the other.
-        merging: both lead into the same lane, so the shared area lasts to the end of both.
+    `path`: the path of one link. `foe`: the path of the other. `merging`: both lead into the same
+    lane, so the shared area lasts to the end of both.
 
     Returns:
         The hull of all stretches with less than `NEAR_M` between the centre lines; `TOUCH_M` around
@@ -140,10 +138,8 @@ def touching(
 ) -> NDArray[np.bool_]:
     """Whether pairs of car boxes have no separating axis.
 
-    Args:
-        apart: (n, 2) between the centres, m.
-        mine: (n,) headings, rad.
-        theirs: (n,) headings, rad.
+    `apart`: (n, 2) between the centres, m. `mine`: (n,) headings, rad. `theirs`: (n,) headings,
+    rad.
     """
     across = np.abs(np.sin(mine - theirs))
     along = np.abs(np.cos(mine - theirs))

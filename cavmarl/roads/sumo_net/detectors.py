@@ -45,10 +45,7 @@ def place_detectors(
 ) -> tuple[NDArray[np.void], NDArray[np.int32]]:
     """Detectors of the actuated programs in `rows.specs`; their phases are told of them.
 
-    Args:
-        rows: the detectors of each phase are written.
-        roads: where they lie.
-        first_row: the number of the first detector.
+    `rows`: the detectors of each phase are written. `first_row`: the number of the first detector.
 
     Returns:
         DETECTOR (D,) and phase_detectors, beginning with the ones that `rows` already counts.

@@ -68,19 +68,13 @@ class SignalProgram:
 
 @dataclass(frozen=True)
 class Timetable:
-    """One <WAUT>: which program the signals that follow it run when.
+    """One <WAUT>: which program the signals that follow it run when."""
 
-    Attributes:
-        start: the program at the beginning.
-        switches: (seconds since the beginning, program), in the file's order.
-        signal_ids: the signals that follow it.
-        place: file and line, for complaints.
-    """
-
-    start: str
-    place: str
+    start: str  # the program at the beginning
+    place: str  # file and line, for complaints
+    # (seconds since the beginning, program), in the file's order
     switches: list[tuple[float, str]] = field(default_factory=list)
-    signal_ids: list[str] = field(default_factory=list)
+    signal_ids: list[str] = field(default_factory=list)  # the signals that follow it
 
 
 class ProgramReader:

@@ -26,10 +26,8 @@ def with_programs(
     says when the signals that follow it change their program: at once, whatever the phase, and
     every program counts its time from the beginning. A choice stands above all of that.
 
-    Args:
-        network: not changed.
-        files: additional files in loading order; elements other than signals' are passed over.
-        chosen: program by signal.
+    `files`: additional files in loading order; elements other than signals' are passed over.
+    `chosen`: program by signal.
 
     Returns:
         A network with another `source_hash`, for it has more than one source.
@@ -64,9 +62,7 @@ def with_outages(network: RoadNetwork, outages: Mapping[str, float]) -> RoadNetw
 
     They change to their program `off`: links that must give way anyway blink.
 
-    Args:
-        network: not changed.
-        outages: when each goes dark, in s since the beginning of the episode, by signal.
+    `outages`: when each goes dark, in s since the beginning of the episode, by signal.
 
     Returns:
         A network with another `source_hash`.

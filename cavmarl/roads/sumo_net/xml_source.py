@@ -50,10 +50,8 @@ class _Limited(io.RawIOBase):
 def read_xml(path: Path, handler: ContentHandler, failure: type[CavmarlError] = MapError) -> None:
     """Feed the elements of a plain or gzipped XML file to a SAX `handler`.
 
-    Args:
-        path: of the file.
-        handler: takes the elements; what it raises passes through.
-        failure: the error to raise, by what kind of file this is.
+    `handler`: takes the elements; what it raises passes through. `failure`: the error to raise, by
+    what kind of file this is.
 
     Raises:
         CavmarlError: of the type `failure`: the file is missing, is not well-formed XML, is too

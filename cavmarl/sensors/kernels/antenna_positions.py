@@ -25,14 +25,9 @@ def measure_places(
 ) -> None:
     """Write where the antennas are of the owned agents that are due.
 
-    Args:
-        worlds: committed rows.
-        mount: of the antenna.
-        due: in this tick, one sample at most.
-        noise: of the sensor, along the axes of the map.
-        room: (2, 3, 3), overwritten.
-        places: (W, A, 3) x, y, z in m.
-        measured: (W, A) set for those that are written.
+    `due`: in this tick, one sample at most. `noise`: of the sensor, along the axes of the map.
+    `room`: (2, 3, 3), overwritten. `places`: (W, A, 3) x, y, z in m. `measured`: (W, A) set for
+    those that are written.
     """
     for w in range(worlds.ticks.size):
         if due.num[w] == 0:

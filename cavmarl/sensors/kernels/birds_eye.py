@@ -127,11 +127,8 @@ def look_down(
 ) -> None:
     """Fill the grid.
 
-    Args:
-        grid: where it lies.
-        panorama: what stands around the vehicle, prisms ordered by id.
-        counts: how many things of each kind there are.
-        out: (rows, columns), overwritten.
+    `grid`: where it lies. `panorama`: what stands around the vehicle, prisms ordered by id. `out`:
+    (rows, columns), overwritten.
     """
     out[:] = GROUND
     for k in range(counts.strips):

@@ -169,11 +169,8 @@ def _add_wall(camera: CameraPose, picture: PixelRows, num: int, wall: np.void, n
 def find_faces(camera: CameraPose, panorama: Panorama, counts: Counts, picture: PixelRows) -> int:
     """Find the faces that a picture shows.
 
-    Args:
-        camera: where it looks from.
-        panorama: what stands around the vehicle, prisms ordered by id.
-        counts: how many things of each kind there are.
-        picture: its faces are overwritten.
+    `panorama`: what stands around the vehicle, prisms ordered by id. `picture`: its faces are
+    overwritten.
 
     Returns:
         how many there are.
@@ -198,12 +195,8 @@ def find_faces(camera: CameraPose, panorama: Panorama, counts: Counts, picture: 
 def look(camera: CameraPose, picture: PixelRows, num: int, first: int, last: int) -> None:
     """Take the rows [first, last) of a picture.
 
-    Args:
-        camera: where it looks from.
-        picture: with faces; its rows are overwritten from the first on.
-        num: how many faces there are.
-        first: row.
-        last: the one after the last; as many as there is room for, at most.
+    `picture`: with faces; its rows are overwritten from the first on. `num`: how many faces there
+    are. `last`: the one after the last; as many as there is room for, at most.
     """
     _clear(camera, picture, first, last)
     draw_faces(picture, num, first, last)

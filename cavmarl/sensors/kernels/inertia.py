@@ -36,13 +36,9 @@ def feel(
     the tick to that after it; r' and pitch' are its slopes. What a change of the slip angle adds is
     left out: the steering of the bicycle jumps.
 
-    Args:
-        row: VEHICLE, after the tick.
-        pose: POSE before it; of another vehicle: it was as it is now.
-        share: of the tick that has passed, in (0, 1].
-        tick_s: seconds a tick.
-        mount: of the sensor.
-        out: (6,) m/s² and rad/s, along the sensor's axes.
+    `row`: VEHICLE, after the tick. `pose`: POSE before it; of another vehicle: it was as it is now.
+    `share`: of the tick that has passed, in (0, 1]. `out`: (6,) m/s² and rad/s, along the sensor's
+    axes.
     """
     left = 1.0 - share if pose["id"] == row["id"] else 0.0
     speed = row["speed"] + left * (pose["speed"] - row["speed"])
@@ -85,15 +81,7 @@ def measure_inertia(
 ) -> None:
     """Write what is due of the owned agents.
 
-    Args:
-        worlds: committed rows.
-        before: POSE (W, A) of the tick before.
-        mount: of the sensor.
-        tick_s: seconds a tick.
-        due: in this tick.
-        noise: of the sensor.
-        room: (6,).
-        data: (W, A, S, 6) as `feel` gives it.
+    `before`: POSE (W, A) of the tick before. `room`: (6,). `data`: (W, A, S, 6) as `feel` gives it.
     """
     for w in range(worlds.ticks.size):
         num = due.num[w]

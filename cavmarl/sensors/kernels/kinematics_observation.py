@@ -115,13 +115,8 @@ def observe_kinematics(
 
     Where two vehicles are equally far along the lane, the one with the smaller id comes first.
 
-    Args:
-        roads: the road arrays.
-        rows: VEHICLE (C,).
-        i: the vehicle that looks.
-        grid: filled for this tick from these rows.
-        sensor: settings and room; ranges in the frame of `vehicle_features`.
-        out: an observation, zeros from `sensor.at` on.
+    `sensor`: settings and room; ranges in the frame of `vehicle_features`. `out`: an observation,
+    zeros from `sensor.at` on.
     """
     ego = rows[i]
     vehicle_features(roads.lanes, roads.points, ego, sensor.destinations, True, sensor.values)

@@ -65,18 +65,9 @@ def measure_lane_boundary(
 ) -> None:
     """Write what is due of the owned agents.
 
-    Args:
-        roads: the road arrays.
-        plans: PLAN (G, L).
-        worlds: committed rows.
-        mount: of the sensor.
-        lookahead_m: length of the way that the curvature is that of.
-        due: in this tick.
-        noise: of the sensor.
-        axes: (2, 3, 3), room.
-        room: (5,), room.
-        data: (W, A, S, 5) to the left boundary, to the right one, and the lane's width in m;
-            direction of the sensor from that of the lane in rad; curvature in 1/m.
+    `lookahead_m`: length of the way that the curvature is that of. `axes`: (2, 3, 3), room. `room`:
+    (5,), room. `data`: (W, A, S, 5) to the left boundary, to the right one, and the lane's width in
+    m; direction of the sensor from that of the lane in rad; curvature in 1/m.
     """
     for w in range(worlds.ticks.size):
         if due.num[w] == 0:

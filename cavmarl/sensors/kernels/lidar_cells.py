@@ -59,14 +59,8 @@ def _ray_to_body(
 ) -> float:
     """Distance along a ray, in units of its length, to a body; negative inside, inf if missed.
 
-    Args:
-        x: of the body's centre.
-        y: of the body's centre.
-        cos: of the body's heading.
-        sin: of the body's heading.
-        body: for its size.
-        ray_x: the ray, as long as it reaches.
-        ray_y: see `ray_x`.
+    `x`: of the body's centre. `y`: of the body's centre. `cos`: of the body's heading. `sin`: of
+    the body's heading. `body`: for its size. `ray_x`: the ray, as long as it reaches.
     """
     length = 2.0 * body["half_length"]
     width = 2.0 * body["half_width"]
@@ -141,12 +135,7 @@ def observe_lidar_cells(
 ) -> None:
     """Write distance and speed of each cell.
 
-    Args:
-        rows: VEHICLE (C,).
-        i: the vehicle that looks.
-        grid: filled for this tick from these rows.
-        sensor: settings and room.
-        out: an observation; 2 · cells numbers from `sensor.at` on are written.
+    `out`: an observation; 2 · cells numbers from `sensor.at` on are written.
     """
     ego = rows[i]
     ego_cos = math.cos(ego["heading"])

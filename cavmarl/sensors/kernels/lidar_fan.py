@@ -95,14 +95,8 @@ def _rays_over(
     Seen from the origin, the box keeps within `across` of the line to its centre and begins no
     nearer than `ahead`: the angle to each side is at most atan(across / ahead) < across / ahead.
 
-    Args:
-        x: m.
-        y: m.
-        along: of the origin from the centre, in m along the box, at least 0.
-        beside: the same across the box.
-        half_length: m.
-        half_width: m.
-        rays: how many there are.
+    `along`: of the origin from the centre, in m along the box, at least 0. `beside`: the same
+    across the box.
     """
     # Both times the distance to the centre, which cancels out.
     ahead = x * x + y * y - (half_length * along + half_width * beside)
@@ -183,13 +177,8 @@ def lidar(
 
     Where two vehicles are equally far along a ray, the one with the smaller id counts.
 
-    Args:
-        rows: VEHICLE (C,).
-        row: the vehicle that looks.
-        grid: filled for this tick from these rows.
-        rays: (num_rays, 2) directions in the vehicle's frame, from `ray_directions`.
-        range_m: how far it sees, in the plane.
-        out: ECHO (num_rays,), overwritten.
+    `rays`: (num_rays, 2) directions in the vehicle's frame, from `ray_directions`. `range_m`: how
+    far it sees, in the plane. `out`: ECHO (num_rays,), overwritten.
     """
     ego = rows[row]
     ego_cos = math.cos(ego["heading"])

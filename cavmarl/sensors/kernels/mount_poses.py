@@ -28,11 +28,8 @@ class Mount(NamedTuple):
 def rotation(yaw: float, pitch: float, roll: float, out: NDArray[np.float64]) -> None:
     """Write the matrix that turns a vector of the turned frame into the one around it.
 
-    Args:
-        yaw: rad.
-        pitch: rad, positive upwards.
-        roll: rad, positive with the left side up.
-        out: (3, 3), overwritten; its columns are the turned frame's axes.
+    `pitch`: rad, positive upwards. `roll`: rad, positive with the left side up. `out`: (3, 3),
+    overwritten; its columns are the turned frame's axes.
     """
     cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
     cos_pitch, sin_pitch = math.cos(pitch), math.sin(pitch)

@@ -125,11 +125,8 @@ def _sort_into_rings(found: int, count: int, range_m: float, sensor: RoadgraphSe
 def nearest_points(x: float, y: float, z: float, sensor: RoadgraphSensor) -> int:
     """The nearest road points around a place, by distance, then by index, into `sorted_point`.
 
-    Args:
-        x: m.
-        y: m.
-        z: m; points more than `LEVEL_HEIGHT_M` above or below are not seen.
-        sensor: settings, points and room.
+    `z`: m; points more than `LEVEL_HEIGHT_M` above or below are not seen. `sensor`: settings,
+    points and room.
 
     Returns:
         how many were found, at most `sensor.num_points`.
@@ -157,10 +154,7 @@ def nearest_points(x: float, y: float, z: float, sensor: RoadgraphSensor) -> int
 def observe_roadgraph(row: np.void, sensor: RoadgraphSensor, out: NDArray[np.float32]) -> None:
     """Write the nearest points in the ego frame, nearest first; what is left stays as it is.
 
-    Args:
-        row: the vehicle that looks.
-        sensor: settings, points and room.
-        out: an observation, zeros from `sensor.at` on.
+    `sensor`: settings, points and room. `out`: an observation, zeros from `sensor.at` on.
     """
     cos = math.cos(row["heading"])
     sin = math.sin(row["heading"])

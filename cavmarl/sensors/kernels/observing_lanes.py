@@ -191,15 +191,9 @@ def observe_lanes(
 ) -> None:
     """Gaps and relative speeds on the lanes around, and the first vehicle where ways cross.
 
-    Args:
-        roads: the road arrays.
-        travel: the ways of all.
-        rows: VEHICLE (C,).
-        i: row of the agent's vehicle.
-        grid: filled from these rows.
-        phase: (num_signals,) PHASE rows that are on.
-        sensors: range and place of the sensor; a range of 0 switches it off.
-        observation: (D,), of which `LANES_FEATURES` numbers are written; 0 before.
+    `i`: row of the agent's vehicle. `phase`: (num_signals,) PHASE rows that are on. `sensors`:
+    range and place of the sensor; a range of 0 switches it off. `observation`: (D,), of which
+    `LANES_FEATURES` numbers are written; 0 before.
     """
     range_m = sensors.lanes_range_m
     if range_m == 0.0:

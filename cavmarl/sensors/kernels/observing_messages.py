@@ -156,20 +156,9 @@ def observe_messages(
 ) -> None:
     """Write what the owned agents of the chosen worlds have in their inboxes.
 
-    Args:
-        roads: the road arrays.
-        plans: PLAN (G, L), the ways of agents.
-        worlds: committed rows at the end of the step.
-        mail: the inboxes.
-        at: where the sensor's part begins in a frame.
-        objects: vehicles that are shown.
-        events: likewise.
-        signal: whether the next signal is shown.
-        scale_m: what a place of 1 stands for.
-        tick_s: seconds a tick.
-        stack: frames in an observation.
-        chosen: (W,) which worlds.
-        observations: (W, A, D), the part of the newest frame is 0 before.
+    `mail`: the inboxes. `at`: where the sensor's part begins in a frame. `objects`: vehicles that
+    are shown. `signal`: whether the next signal is shown. `scale_m`: what a place of 1 stands for.
+    `observations`: (W, A, D), the part of the newest frame is 0 before.
     """
     for w in range(chosen.size):
         if not chosen[w]:

@@ -159,14 +159,8 @@ def observe_occupancy(
 ) -> None:
     """Write the layers of one vehicle, each by columns along x; empty cells are left as they are.
 
-    Args:
-        roads: the road arrays.
-        lane_grid: which lanes lie near a place.
-        rows: VEHICLE (C,).
-        i: the vehicle that looks.
-        grid: filled for this tick from these rows.
-        sensor: settings and room; cells and ranges in the frame of `vehicle_features`.
-        out: an observation, zeros from `sensor.at` on.
+    `sensor`: settings and room; cells and ranges in the frame of `vehicle_features`. `out`: an
+    observation, zeros from `sensor.at` on.
     """
     ego = rows[i]
     num_cells = sensor.num_x * sensor.num_y

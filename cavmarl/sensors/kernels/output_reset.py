@@ -35,11 +35,9 @@ def settle_outputs(
 ) -> None:
     """Finish the outputs that all shards have written.
 
-    Args:
-        outputs: rewards are written, and the observations of absent agents become 0.
-        weights: (T,) of the reward, a number for each term.
-        team_share: share of the reward that is the mean over the agents that acted.
-        chosen: (W,) which worlds.
+    `outputs`: rewards are written, and the observations of absent agents become 0. `weights`: (T,)
+    of the reward, a number for each term. `team_share`: share of the reward that is the mean over
+    the agents that acted.
     """
     for w in range(chosen.size):
         if chosen[w]:
@@ -85,11 +83,8 @@ def credit(
 ) -> None:
     """Add the rewards of the step to what owned agents have got in their episode.
 
-    Args:
-        rows: VEHICLE (W, C); episode_return of agents' rows is written.
-        num_owned: (W,) rows of the shard's own.
-        rewards: (W, A).
-        chosen: (W,) which worlds.
+    `rows`: VEHICLE (W, C); episode_return of agents' rows is written. `num_owned`: (W,) rows of the
+    shard's own. `rewards`: (W, A).
     """
     for w in range(chosen.size):
         if not chosen[w]:

@@ -109,13 +109,9 @@ def _gather_prisms(
 ) -> int:
     """The bodies around a vehicle, in no order that counts.
 
-    Args:
-        rows: VEHICLE (C,).
-        row: the vehicle that looks; it does not see itself.
-        grid: filled for this tick from these rows.
-        semantics: (num_types,) class of each type of vehicle.
-        reach_m: bodies that are farther away in the plane are left out.
-        out: PRISM (C,), overwritten up to the returned number.
+    `row`: the vehicle that looks; it does not see itself. `semantics`: (num_types,) class of each
+    type of vehicle. `reach_m`: bodies that are farther away in the plane are left out. `out`: PRISM
+    (C,), overwritten up to the returned number.
 
     Returns:
         how many there are.
@@ -173,14 +169,8 @@ def gather(
 ) -> Counts:
     """Gather what stands around a vehicle, in its frame.
 
-    Args:
-        rows: VEHICLE (C,).
-        row: the vehicle that looks; it does not see itself.
-        grid: filled for this tick from these rows.
-        backdrop: of the map.
-        reach_m: what is farther away in the plane is left out.
-        with_faces: also roofs and strips, and bodies in the order of their ids.
-        out: overwritten.
+    `row`: the vehicle that looks; it does not see itself. `reach_m`: what is farther away in the
+    plane is left out. `with_faces`: also roofs and strips, and bodies in the order of their ids.
     """
     ego = rows[row]
     prisms = _gather_prisms(rows, row, grid, backdrop.semantics, reach_m, out.prisms)

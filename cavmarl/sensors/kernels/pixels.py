@@ -82,11 +82,7 @@ def measure_depths(
 ) -> None:
     """Depths (rows, W) in metres along the optical axis, the range where nothing is.
 
-    Args:
-        camera: that took the picture.
-        picture: taken; its closeness is completed.
-        first: row.
-        out: (rows, W).
+    `camera`: that took the picture. `picture`: taken; its closeness is completed. `out`: (rows, W).
     """
     rows, width = out.shape
     _deepen(camera, picture, first, rows)
@@ -128,12 +124,8 @@ def write_colours(
 ) -> None:
     """Red, green and blue: the class's colour in the face's light, paler with the distance.
 
-    Args:
-        camera: that took the picture.
-        picture: taken; its closeness is completed.
-        first: row.
-        palette: (classes, 3).
-        out: (rows, W, 3).
+    `camera`: that took the picture. `picture`: taken; its closeness is completed. `palette`:
+    (classes, 3). `out`: (rows, W, 3).
     """
     rows, width, _ = out.shape
     _deepen(camera, picture, first, rows)

@@ -72,13 +72,8 @@ def detect(
 ) -> int:
     """List what the rays have met, nearest first.
 
-    Args:
-        fan: of one channel.
-        panorama: what stands around the vehicle.
-        ego: VEHICLE record of the one that looks.
-        hits: HIT (A, 1), from `cast`.
-        targets: TARGET (A,), overwritten up to the returned number, in no order.
-        order: (A,) likewise: which target is the next nearest.
+    `fan`: of one channel. `hits`: HIT (A, 1), from `cast`. `targets`: TARGET (A,), overwritten up
+    to the returned number, in no order. `order`: (A,) likewise: which target is the next nearest.
 
     Returns:
         how many there are.

@@ -140,10 +140,8 @@ def _ray_to_prism(
 ) -> float:
     """Distance along a ray to a box around the origin, 0 inside of it and inf if missed.
 
-    Args:
-        place: where the ray starts, mirrored into the first octant.
-        closing: the ray's direction, towards the origin: how fast each coordinate falls.
-        half: of the box's sides.
+    `place`: where the ray starts, mirrored into the first octant. `closing`: the ray's direction,
+    towards the origin: how fast each coordinate falls. `half`: of the box's sides.
     """
     # Negative for a slab that the ray starts in; beyond any range for one that it turns away from.
     enter_x = (place[0] - half[0]) / max(closing[0], _PARALLEL)
@@ -300,15 +298,8 @@ def cast(
 ) -> None:
     """Find what each ray of a fan meets first; the ground only where nothing else is.
 
-    Args:
-        fan: the rays.
-        prisms: PRISM (C,) of the panorama.
-        num_prisms: how many there are.
-        walls: WALL (num_walls,) of the panorama.
-        num_walls: how many there are.
-        first: column.
-        last: the one after the last that is cast.
-        hits: HIT (A, E), overwritten in these columns.
+    `prisms`: PRISM (C,) of the panorama. `walls`: WALL (num_walls,) of the panorama. `last`: the
+    one after the last that is cast. `hits`: HIT (A, E), overwritten in these columns.
     """
     for a in range(first, last):
         for e in range(hits.shape[1]):

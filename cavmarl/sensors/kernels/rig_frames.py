@@ -78,17 +78,9 @@ def deliver(
 ) -> None:
     """Stamp and count the samples that owned agents have got in this tick; lose some of them.
 
-    Args:
-        worlds: committed rows.
-        schedule: of the sensor.
-        due: in this tick.
-        tick_s: seconds a tick.
-        stream: of the sensor's random numbers.
-        dropout: chance that a sample is lost.
-        stamp_s: (W, A, S) in s since the reset.
-        lost: (W, A, S) which ones are lost.
-        fresh: (W, A) samples of this step, up to now.
-        data: (W, A, S, bytes); of lost samples all zeros.
+    `stream`: of the sensor's random numbers. `dropout`: chance that a sample is lost. `stamp_s`:
+    (W, A, S) in s since the reset. `lost`: (W, A, S) which ones are lost. `fresh`: (W, A) samples
+    of this step, up to now. `data`: (W, A, S, bytes); of lost samples all zeros.
     """
     for w in range(worlds.ticks.size):
         if due.num[w] == 0:

@@ -41,11 +41,7 @@ def gauss(key: np.uint64, vehicle: int, tick: int, draw: int) -> float:
 
     Box and Muller: "A note on the generation of random normal deviates", 1958.
 
-    Args:
-        key: see `sensor_key`.
-        vehicle: id.
-        tick: of the world.
-        draw: which one of this tick, below 2**30.
+    `draw`: which one of this tick, below 2**30.
     """
     radius = math.sqrt(-2.0 * math.log(1.0 - quick_uniform(key, vehicle, tick, 2 * draw)))
     return radius * math.cos(TWO_PI * quick_uniform(key, vehicle, tick, 2 * draw + 1))
@@ -57,13 +53,8 @@ def error_of(
 ) -> float:
     """What is added to a number that a sensor measures.
 
-    Args:
-        noise: of the sensor.
-        key: see `sensor_key`.
-        vehicle: id.
-        tick: of the world.
-        draw: number of the measured number among those of this tick, below 2**28.
-        channel: which one it belongs to.
+    `draw`: number of the measured number among those of this tick, below 2**28. `channel`: which
+    one it belongs to.
     """
     error = 0.0
     if noise.noise[channel] > 0.0:
@@ -79,12 +70,8 @@ def add_errors(
 ) -> None:
     """Add to each channel of a sample (channels,) its error.
 
-    Args:
-        noise: of the sensor.
-        row: VEHICLE that carries it.
-        tick: of the world.
-        sample: its number among those of the tick.
-        out: the sample, one number a channel.
+    `row`: VEHICLE that carries it. `sample`: its number among those of the tick. `out`: the sample,
+    one number a channel.
     """
     key = sensor_key(row, noise.stream)
     for channel in range(out.size):

@@ -65,19 +65,9 @@ def take_depths(
 ) -> None:
     """Write the depth pictures that are due of the owned agents.
 
-    Args:
-        worlds: committed rows.
-        grid: room for the index of one world.
-        backdrop: of the map.
-        due: in this tick.
-        lines: (W, agents, 2) rows [first, last) of each agent's picture that are written.
-        noise: of the sensor; what is as far as the range has none.
-        camera: the camera.
-        panorama: room.
-        picture: room.
-        room: (rows of `picture`, W) room.
-        room_bits: the same memory.
-        data: (W, agents, S, H, W) float16 as bits, m.
+    `lines`: (W, agents, 2) rows [first, last) of each agent's picture that are written. `noise`: of
+    the sensor; what is as far as the range has none. `room`: (rows of `picture`, W) room.
+    `room_bits`: the same memory. `data`: (W, agents, S, H, W) float16 as bits, m.
     """
     band, width = picture.face.shape
     reach_m = camera_reach_m(camera, width, picture.height)

@@ -44,17 +44,9 @@ def measure_lidar(
 ) -> None:
     """Write what is due of the owned agents.
 
-    Args:
-        worlds: committed rows.
-        grid: room for the index of one world.
-        backdrop: of the map.
-        due: in this tick.
-        lines: (W, agents, 2) columns [first, last) of each agent's rays that are written.
-        noise: of the sensor; what meets nothing has none.
-        fan: its rays.
-        panorama: room.
-        hits: HIT (A, E), room.
-        data: (W, agents, S, E, A) distances in m.
+    `lines`: (W, agents, 2) columns [first, last) of each agent's rays that are written. `noise`: of
+    the sensor; what meets nothing has none. `hits`: HIT (A, E), room. `data`: (W, agents, S, E, A)
+    distances in m.
     """
     reach_m = reach_of(fan)
     noisy = noise.noise[0] > 0.0 or noise.bias[0] > 0.0
@@ -122,18 +114,9 @@ def measure_radar(
 ) -> None:
     """Write what is due of the owned agents.
 
-    Args:
-        worlds: committed rows.
-        grid: room for the index of one world.
-        backdrop: of the map.
-        due: in this tick.
-        noise: of the sensor.
-        fan: its rays, of one channel.
-        panorama: room.
-        hits: HIT (A, 1), room.
-        targets: TARGET (A,), room.
-        order: (A,), room.
-        data: (W, agents, S, targets, 3) range in m, azimuth in rad, radial speed in m/s.
+    `fan`: its rays, of one channel. `hits`: HIT (A, 1), room. `targets`: TARGET (A,), room.
+    `order`: (A,), room. `data`: (W, agents, S, targets, 3) range in m, azimuth in rad, radial speed
+    in m/s.
     """
     reach_m = reach_of(fan)
     for w in range(worlds.ticks.size):

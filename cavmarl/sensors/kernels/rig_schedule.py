@@ -59,11 +59,7 @@ def call_due(
 ) -> bool:
     """Write what is due in the chosen worlds, and nothing for the others.
 
-    Args:
-        schedule: of the sensor.
-        ticks: (W,) since each world's reset.
-        chosen: (W,) which worlds.
-        due: overwritten.
+    `ticks`: (W,) since each world's reset.
 
     Returns:
         whether anything is.

@@ -40,17 +40,8 @@ def sense(
     does not end. `observe_optional` and `fill_stacks` complete the observations,
     `kernels.outputs` does what concerns the agents of all shards.
 
-    Args:
-        roads: the road arrays.
-        plans: PLAN (G, L), the ways of agents.
-        travel: the ways of all.
-        worlds: committed rows at the end of the step, ghosts among them.
-        grid: room for the spatial index of one world.
-        sensors: settings and room.
-        tick_s: seconds a tick.
-        ticks_per_step: ticks a step.
-        chosen: (W,) which worlds.
-        outputs: cleared where chosen; written at the indices of owned agents.
+    `worlds`: committed rows at the end of the step, ghosts among them. `outputs`: cleared where
+    chosen; written at the indices of owned agents.
     """
     step_s = tick_s * ticks_per_step
     for w in range(worlds.ticks.shape[0]):

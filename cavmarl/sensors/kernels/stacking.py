@@ -55,12 +55,7 @@ def fill_stacks(
 ) -> None:
     """Repeat the first frame of every vehicle that entered during the last step.
 
-    Args:
-        worlds: committed rows at the end of the step.
-        ticks_per_step: ticks a step.
-        stack: frames in an observation.
-        chosen: (W,) which worlds.
-        observations: (W, A, D) with the newest frames complete.
+    `observations`: (W, A, D) with the newest frames complete.
     """
     for w in range(chosen.size):
         if not chosen[w]:

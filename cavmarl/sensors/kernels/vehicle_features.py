@@ -45,13 +45,8 @@ def vehicle_features(
 ) -> None:
     """All features of a vehicle in the world's frame.
 
-    Args:
-        lanes: LANE (L,).
-        points: POINT (num_points,).
-        row: the vehicle.
-        destinations: (G, 2) x and y of each goal in m, our frame.
-        intentions: whether the direction to the vehicle's goal is shown; else it is 0.
-        out: (NUM_VEHICLE_FEATURES,), overwritten.
+    `destinations`: (G, 2) x and y of each goal in m, our frame. `intentions`: whether the direction
+    to the vehicle's goal is shown; else it is 0. `out`: (NUM_VEHICLE_FEATURES,), overwritten.
     """
     cos = math.cos(row["heading"])
     sin = math.sin(row["heading"])

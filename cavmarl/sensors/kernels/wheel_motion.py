@@ -26,13 +26,8 @@ def measure_odometry(
     Of n samples in a tick, the k-th lies a share of k / n on the straight line from the state
     before the tick to that after it; one that entered in this tick was before as it is now.
 
-    Args:
-        worlds: committed rows.
-        before: POSE (W, A) of the tick before.
-        due: in this tick.
-        noise: of the sensor.
-        room: (3,).
-        data: (W, A, S, 3) speed in m/s, yaw rate in rad/s, distance in m since departure.
+    `before`: POSE (W, A) of the tick before. `room`: (3,). `data`: (W, A, S, 3) speed in m/s, yaw
+    rate in rad/s, distance in m since departure.
     """
     for w in range(worlds.ticks.size):
         count = due.num[w]

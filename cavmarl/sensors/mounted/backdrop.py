@@ -26,9 +26,7 @@ _CLASS_NAMES = {**dict(enumerate(VEHICLE_CLASSES)), CLASS_PEDESTRIAN: "pedestria
 def make_backdrop(network: RoadNetwork, types: NDArray[np.void]) -> Backdrop:
     """The backdrop of a map.
 
-    Args:
-        network: the roads and buildings.
-        types: VTYPE (num_types,) of the vehicles that can be seen.
+    `types`: VTYPE (num_types,) of the vehicles that can be seen.
 
     Raises:
         ConfigError: a class of vehicles that has no semantic class.

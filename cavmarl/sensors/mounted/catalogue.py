@@ -77,9 +77,7 @@ def mount(rig: Mapping[str, MountedConfig], platform: Platform) -> list[MountedS
 def rig_reach_m(rig: Mapping[str, MountedConfig], largest_radius_m: float) -> float:
     """How far from an agent's centre the centre of a vehicle can be that its rig can tell, in m.
 
-    Args:
-        rig: the sensors by name.
-        largest_radius_m: half the diagonal of the largest body.
+    `rig`: the sensors by name.
     """
     reaches = (
         type_of(name, config).reach_m(config, largest_radius_m) for name, config in rig.items()
@@ -92,10 +90,7 @@ def frame_layout(
 ) -> dict[str, tuple[str, Shape]]:
     """Dtype as text, and shape, of all arrays of the frames of W worlds; see `frames_in`.
 
-    Args:
-        config: the environment.
-        num_worlds: W.
-        prefix: begins their names.
+    `prefix`: begins their names.
     """
     clock, layout = config.clock, {}
     agents = (num_worlds, config.population.num_ids)

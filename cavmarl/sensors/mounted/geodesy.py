@@ -53,9 +53,7 @@ def geodesy_of(network: RoadNetwork, config: GnssConfig) -> Geodesy:
 class ProjectedMap:
     """A map with a projection.
 
-    Args:
-        geo: how it is projected.
-        height_m: of z = 0 above the ellipsoid.
+    `geo`: how it is projected. `height_m`: of z = 0 above the ellipsoid.
     """
 
     def __init__(self, geo: GeoReference, height_m: float) -> None:
@@ -84,10 +82,8 @@ class TangentPlane:
     By way of earth-centred coordinates (Hofmann-Wellenhof, Lichtenegger, Wasle: "GNSS", 2008,
     chapter 8).
 
-    Args:
-        latitude_deg: of the map's (0, 0).
-        longitude_deg: of the map's (0, 0).
-        height_m: of z = 0 there, above the ellipsoid.
+    `latitude_deg`: of the map's (0, 0). `longitude_deg`: of the map's (0, 0). `height_m`: of z = 0
+    there, above the ellipsoid.
     """
 
     def __init__(self, latitude_deg: float, longitude_deg: float, height_m: float) -> None:

@@ -40,10 +40,7 @@ def mount_matrix(config: MountedConfig) -> NDArray[np.float64]:
 def check_place(name: str, config: MountedConfig, body: np.void) -> None:
     """Refuse a sensor outside of the body that it is mounted on.
 
-    Args:
-        name: of the sensor.
-        config: its settings.
-        body: VTYPE of agents' vehicles.
+    `body`: VTYPE of agents' vehicles.
 
     Raises:
         ConfigError: with the nearest place on the body.

@@ -25,58 +25,32 @@ C = TypeVar("C", bound=MountedConfig)
 
 
 class SensedScene(NamedTuple):
-    """What the agents of one zone can see, in the present tick.
+    """What the agents of one zone can see, in the present tick."""
 
-    Attributes:
-        roads: of the whole map.
-        lane_grid: which lanes lie near a place.
-        plans: PLAN (G, L), the ways of agents.
-        travel: types of vehicles.
-        worlds: the committed rows: first the zone's own, then ghosts.
-        grid: room for the spatial index of one world; callers that ask it fill it.
-        before: POSE (W, A) of all agents in the tick before.
-    """
-
-    roads: RoadArrays
+    roads: RoadArrays  # of the whole map
     lane_grid: LaneGrid
     plans: NDArray[np.void]
-    travel: Travel
-    worlds: Worlds
-    grid: Grid
-    before: NDArray[np.void]
+    travel: Travel  # types of vehicles
+    worlds: Worlds  # the committed rows: first the zone's own, then ghosts
+    grid: Grid  # room for the spatial index of one world; callers that ask it fill it
+    before: NDArray[np.void]  # POSE (W, A) of all agents in the tick before
 
 
 class Platform(NamedTuple):
-    """What sensors are mounted on.
-
-    Attributes:
-        network: the roads.
-        body: VTYPE of agents' vehicles.
-        num_worlds: W.
-        num_agents: A.
-        sim_dt_s: seconds a tick.
-        ticks_per_step: ticks a step.
-        capacity: the most rows of a world.
-        backdrop: what cameras and rays meet of the map.
-    """
+    """What sensors are mounted on."""
 
     network: RoadNetwork
-    body: np.void
+    body: np.void  # VTYPE of agents' vehicles
     num_worlds: int
     num_agents: int
     sim_dt_s: float
     ticks_per_step: int
-    capacity: int
-    backdrop: Backdrop
+    capacity: int  # the most rows of a world
+    backdrop: Backdrop  # what cameras and rays meet of the map
 
 
 class MountedSensor(ABC, Generic[C]):
     """One sensor of the rig, on the vehicles of all agents of W worlds.
-
-    Args:
-        name: in the rig.
-        config: its settings.
-        platform: what it is mounted on.
 
     Attributes:
         name: in the rig.
@@ -106,12 +80,7 @@ class MountedSensor(ABC, Generic[C]):
 
     @staticmethod
     def reach_m(config: C, largest_radius_m: float) -> float:
-        """How far from the vehicle's centre the centre of another can be that it can tell.
-
-        Args:
-            config: its settings.
-            largest_radius_m: half the diagonal of the largest body.
-        """
+        """How far from the vehicle's centre the centre of another can be that it can tell."""
         return 0.0
 
     @staticmethod
@@ -126,10 +95,8 @@ class MountedSensor(ABC, Generic[C]):
         What is written may depend on the agent's row, the others' rows within reach and the tick,
         and on nothing else: not on how rows are ordered, nor on which zone asks.
 
-        Args:
-            scenes: one a zone.
-            due: how many samples, and to which slots.
-            frames: `data` is written; stamps, counts and losses are the rig's business.
+        `scenes`: one a zone. `due`: how many samples, and to which slots. `frames`: `data` is
+        written; stamps, counts and losses are the rig's business.
         """
 
 

@@ -114,10 +114,6 @@ def sensing_reach_m(config: SensorsConfig, largest_radius_m: float) -> float:
     Sensors that ask for centres reach as far as they look, `lanes` too: it takes none that is
     further away in the plane. Rays end at bodies, whose centres are up to half a diagonal behind.
     Of the terms, time to collision alone looks at others; it is always on.
-
-    Args:
-        config: the sensors.
-        largest_radius_m: half the diagonal of the largest body.
     """
     sensors = sensors_of(config)
     reaches = (sensor.reach_of_centres_m(config, largest_radius_m) for sensor in sensors)
@@ -164,13 +160,7 @@ def sensor_arrays(config: SensorsConfig) -> Sensors:
 def optional_arrays(
     config: SensorsConfig, network: RoadNetwork, plans: NDArray[np.void]
 ) -> OptionalSensors | None:
-    """What `observe_optional` takes; None if all of its sensors are off.
-
-    Args:
-        config: the sensors.
-        network: the roads.
-        plans: PLAN (G, L).
-    """
+    """What `observe_optional` takes; None if all of its sensors are off."""
     if FURTHER.isdisjoint(layout(config)):
         return None
     starts = _starts(config)

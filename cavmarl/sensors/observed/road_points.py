@@ -26,9 +26,7 @@ def road_points(network: RoadNetwork, spacing_m: float) -> RoadPoints:
 
     The index of a point is its place in `points`: by cell, then by lane, line and way along it.
 
-    Args:
-        network: the roads.
-        spacing_m: largest distance between one point of a line and the next.
+    `spacing_m`: largest distance between one point of a line and the next.
     """
     parts = [
         line for lane in range(len(network.lanes)) for line in lines_along(network, lane, spacing_m)
@@ -52,10 +50,7 @@ def lines_along(network: RoadNetwork, lane: int, spacing_m: float) -> list[NDArr
 
     The line between two lanes belongs to the right one.
 
-    Args:
-        network: the roads.
-        lane: row of `network.lanes`.
-        spacing_m: largest distance between one point and the next.
+    `lane`: row of `network.lanes`. `spacing_m`: largest distance between one point and the next.
     """
     row = network.lanes[lane]
     middle = _middle(network, lane, spacing_m)

@@ -15,16 +15,12 @@ class Tally:
 
 @dataclass
 class DemandReport:
-    """Counts of one reading.
+    """Counts of one reading."""
 
-    Attributes:
-        files: that were read, in order.
-        read: number of elements by what they are: "vehicle", "flow", "route", …
-        tolerated: what was left out or taken for something near, by a sentence that says so.
-    """
-
-    files: list[str] = field(default_factory=list)
+    files: list[str] = field(default_factory=list)  # that were read, in order
+    # number of elements by what they are: "vehicle", "flow", "route", …
     read: dict[str, int] = field(default_factory=dict)
+    # what was left out or taken for something near, by a sentence that says so
     tolerated: dict[str, Tally] = field(default_factory=dict)
 
     def count(self, kind: str) -> None:

@@ -13,9 +13,7 @@ MAX_WEIGHT = 1e9
 def listed(source: Element, key: str) -> list[tuple[str, float | None]]:
     """Names in one attribute, their weights in another.
 
-    Args:
-        source: the distribution.
-        key: "vTypes" or "routes".
+    `key`: "vTypes" or "routes".
 
     Returns:
         Pairs of name and weight; None where `probabilities` says nothing.

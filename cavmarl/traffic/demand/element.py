@@ -40,21 +40,13 @@ def near(name: str, known: Iterable[str]) -> str:
 
 @dataclass(slots=True)
 class Element:
-    """An XML element.
+    """An XML element."""
 
-    Attributes:
-        name: of its tag.
-        attrs: its attributes as they stand.
-        path: of its file.
-        line: where it starts.
-        children: the elements inside, in order.
-    """
-
-    name: str
-    attrs: dict[str, str]
-    path: str
-    line: int
-    children: list[Element] = field(default_factory=list)
+    name: str  # of its tag
+    attrs: dict[str, str]  # its attributes as they stand
+    path: str  # of its file
+    line: int  # where it starts
+    children: list[Element] = field(default_factory=list)  # the elements inside, in order
 
     @property
     def place(self) -> str:

@@ -118,10 +118,7 @@ class MapIndex:
     ) -> str | None:
         """Why a class cannot follow edges in a row: a clause, or None if it can.
 
-        Args:
-            edges: EDGE rows.
-            exact: whether each must lead straight to the next.
-            permissions: bits of the class.
+        `exact`: whether each must lead straight to the next. `permissions`: bits of the class.
         """
         names = self.network.edge_ids
         rows = [int(edge) for edge in edges]

@@ -51,21 +51,13 @@ CLOSING = np.dtype(
 
 @dataclass(frozen=True, eq=False)
 class Rerouters:
-    """All rerouters of the files.
+    """All rerouters of the files."""
 
-    Attributes:
-        rules: RULE (n,), one for each interval and edge, in the order of the files.
-        types: (num_intervals, num_types) which VTYPE rows an interval is about.
-        closings: CLOSING (m,).
-        goals: what RULE["goals"] points into.
-        routes: what RULE["routes"] points into.
-    """
-
-    rules: NDArray[np.void]
-    types: NDArray[np.bool_]
-    closings: NDArray[np.void]
-    goals: Choices
-    routes: Choices
+    rules: NDArray[np.void]  # RULE (n,), one for each interval and edge, in the order of the files
+    types: NDArray[np.bool_]  # (num_intervals, num_types) which VTYPE rows an interval is about
+    closings: NDArray[np.void]  # CLOSING (m,)
+    goals: Choices  # what RULE["goals"] points into
+    routes: Choices  # what RULE["routes"] points into
 
     def __post_init__(self) -> None:
         for array in (self.rules, self.types, self.closings):
@@ -89,13 +81,9 @@ def read_rerouters(
 ) -> Rerouters:
     """The rerouters of files; what is not acted on is counted in `report`.
 
-    Args:
-        elements: <rerouter>s with what they hold.
-        index: of the map.
-        routes: gets the routes that they name.
-        type_ids: names by VTYPE row.
-        known_types: names of all types, those that drive on no road included.
-        report: of the reading.
+    `elements`: <rerouter>s with what they hold. `routes`: gets the routes that they name.
+    `type_ids`: names by VTYPE row. `known_types`: names of all types, those that drive on no road
+    included.
 
     Raises:
         DemandError: edges, routes, types, times or chances that cannot be.

@@ -53,11 +53,8 @@ class StopReader:
     ) -> list[Stop]:
         """Stops in the order in which a route reaches them.
 
-        Args:
-            stops: the <stop> elements in the order of the file.
-            edges: EDGE rows of the route.
-            exact: whether the route is those edges, or a way between them.
-            until_from: UNTIL_*.
+        `stops`: the <stop> elements in the order of the file. `edges`: EDGE rows of the route.
+        `exact`: whether the route is those edges, or a way between them.
 
         Raises:
             DemandError: a stop is not on the route after the one before it.

@@ -44,9 +44,7 @@ def single_timing(depart_ms: int) -> Timing:
 def flow_timing(element: Element, horizon_ms: int) -> Timing:
     """The timing of a <flow>.
 
-    Args:
-        element: the flow.
-        horizon_ms: end of the simulation, where the flow names none; -1: a day after its begin.
+    `horizon_ms`: end of the simulation, where the flow names none; -1: a day after its begin.
 
     Raises:
         DemandError: no rate or too many, a rate that is not positive, an end before the begin.

@@ -36,9 +36,7 @@ class TypeTable:
     def options(self, name: str, user: Element) -> Options | None:
         """The types to choose from under a name; None if vehicles of it drive on no road.
 
-        Args:
-            name: of a type or a distribution.
-            user: the element that names it.
+        `name`: of a type or a distribution. `user`: the element that names it.
 
         Raises:
             DemandError: there is neither, or nothing to choose from.

@@ -143,10 +143,8 @@ def read_elements(path: Path, report: DemandReport, take: Callable[[Element], No
 
     Flows inside an <interval> get its begin and end. What is no demand is counted in `report`.
 
-    Args:
-        path: of a plain or gzipped file.
-        report: where files, elements and what is skipped are counted.
-        take: gets each <vType>, <route>, <vehicle>, … with its children, when it has ended.
+    `path`: of a plain or gzipped file. `report`: where files, elements and what is skipped are
+    counted. `take`: gets each <vType>, <route>, <vehicle>, … with its children, when it has ended.
 
     Raises:
         DemandError: the file is missing, is no XML, or has another root.

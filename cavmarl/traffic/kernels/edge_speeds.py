@@ -28,10 +28,8 @@ def _millimetres(speed: float) -> int:
 def limit_speeds(roads: RoadArrays, past: NDArray[np.int32], speed_sums: NDArray[np.int64]) -> None:
     """Let all samples be what an empty map has.
 
-    Args:
-        roads: the road arrays.
-        past: (N, num_edges) mm/s, written.
-        speed_sums: (num_edges,) mm/s, written: the sums over the N samples.
+    `past`: (N, num_edges) mm/s, written. `speed_sums`: (num_edges,) mm/s, written: the sums over
+    the N samples.
     """
     for edge in range(roads.edges.shape[0]):
         row = roads.edges[edge]
@@ -59,15 +57,8 @@ def sample_speeds(
     A lane without vehicles counts as one vehicle at its limit; vehicles that make a stop or follow
     a script do not count.
 
-    Args:
-        roads: the road arrays.
-        rows: VEHICLE.
-        num: how many rows count.
-        number: of the sample, since the reset.
-        past: (N, num_edges) the last samples in mm/s.
-        speed_sums: (num_edges,) their sums.
-        lane_counts: (L,) room.
-        lane_sums: (L,) room.
+    `number`: of the sample, since the reset. `past`: (N, num_edges) the last samples in mm/s.
+    `speed_sums`: (num_edges,) their sums. `lane_counts`: (L,) room. `lane_sums`: (L,) room.
     """
     lane_counts[:] = 0
     lane_sums[:] = 0

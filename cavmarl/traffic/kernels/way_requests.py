@@ -36,14 +36,8 @@ def find_asking(
     These are background vehicles of the demand on a road, without a stop to make, whose time to
     look has come or that have come to an edge with rerouters.
 
-    Args:
-        roads: the road arrays.
-        rows: VEHICLE.
-        num: how many of them count.
-        tick: of the world.
-        has_rules: (num_edges,) where rerouters stand.
-        looks: LOOK, by VEHICLE["order"]; edges without rerouters are noted as seen.
-        asking: room for their rows.
+    `has_rules`: (num_edges,) where rerouters stand. `looks`: LOOK, by VEHICLE["order"]; edges
+    without rerouters are noted as seen. `asking`: room for their rows.
 
     Returns:
         how many.
@@ -113,11 +107,8 @@ def find_way(
 def time_left(roads: RoadArrays, steps: NDArray[np.void], way: int, lane: int) -> float:
     """Seconds from the start of a lane to the end of its way, lane changes counted in.
 
-    Args:
-        roads: the road arrays, with the speeds that count.
-        steps: PLAN, where the way lies.
-        way: VEHICLE["way"].
-        lane: LANE row.
+    `roads`: the road arrays, with the speeds that count. `steps`: PLAN, where the way lies. `way`:
+    VEHICLE["way"].
     """
     total: float = 0.0
     while True:
@@ -146,12 +137,8 @@ def has_room(
 ) -> bool:
     """Whether a vehicle can still follow another way from its lane on without braking hard.
 
-    Args:
-        roads: the road arrays.
-        travel: types, and the way that it has.
-        row: VEHICLE outside junctions.
-        steps: PLAN, where the other way lies.
-        way: where in it, as VEHICLE["way"].
+    `travel`: types, and the way that it has. `row`: VEHICLE outside junctions. `steps`: PLAN, where
+    the other way lies. `way`: where in it, as VEHICLE["way"].
     """
     step = steps[way + row["lane"]]
     present = travel.steps[row["way"] + row["lane"]]
@@ -175,13 +162,7 @@ def mark_slots(
 ) -> None:
     """Which slots of a world hold the way of a vehicle.
 
-    Args:
-        roads: the road arrays.
-        rows: VEHICLE.
-        num: how many of them count.
-        first_slot: PLAN row of the world's first slot.
-        slot_steps: steps of a slot.
-        used: (num_slots,), written.
+    `first_slot`: PLAN row of the world's first slot. `used`: (num_slots,), written.
     """
     used[:] = False
     for i in range(num):
@@ -213,14 +194,9 @@ def take_slot(
 ) -> bool:
     """Put the steps of a new way into a slot, and the vehicle on it.
 
-    Args:
-        roads: the road arrays.
-        travel: its steps from `first_slot` on are written.
-        row: VEHICLE, written.
-        found: PLAN, the steps; those of the vehicle's edge come first.
-        first_slot: PLAN row of the world's first slot.
-        slot_steps: steps of a slot.
-        used: (num_slots,) which are taken, written.
+    `travel`: its steps from `first_slot` on are written. `row`: VEHICLE, written. `found`: PLAN,
+    the steps; those of the vehicle's edge come first. `first_slot`: PLAN row of the world's first
+    slot. `used`: (num_slots,) which are taken, written.
 
     Returns:
         whether there was a slot.

@@ -25,25 +25,15 @@ SEAT_CLEAR_M = 30.0  # around the seat of an agent that is not the first
 
 @dataclass(frozen=True)
 class Cast:
-    """The actors of a scene, ready to enter worlds.
-
-    Attributes:
-        scene: what is played.
-        scripts: its tables.
-        firsts: FRAME of each actor at the beginning.
-        types: VTYPE rows of all bodies.
-        vtypes: (n,) VTYPE row of each actor, among all types of a world.
-        seats: of the agents.
-        goal: of all of them, a row of the plans' table.
-    """
+    """The actors of a scene, ready to enter worlds."""
 
     scene: Scene
-    scripts: Scripts
-    firsts: list[int]
-    types: NDArray[np.void]
-    vtypes: list[int]
-    seats: list[Seat]
-    goal: int
+    scripts: Scripts  # its tables
+    firsts: list[int]  # FRAME of each actor at the beginning
+    types: NDArray[np.void]  # VTYPE rows of all bodies
+    vtypes: list[int]  # (n,) VTYPE row of each actor, among all types of a world
+    seats: list[Seat]  # of the agents
+    goal: int  # of all of them, a row of the plans' table
 
     @staticmethod
     def of(
@@ -56,13 +46,8 @@ class Cast:
     ) -> Cast:
         """The cast of a scene.
 
-        Args:
-            scene: what is played.
-            network: the roads.
-            goals: row of the plans' table by EDGE.
-            first_type: how many types of vehicles there are without the actors'.
-            dt: seconds a tick.
-            num_agents: of a world.
+        `goals`: row of the plans' table by EDGE. `first_type`: how many types of vehicles there are
+        without the actors'. `num_agents`: of a world.
 
         Raises:
             ConfigError: the scene has no room for so many agents.
@@ -87,13 +72,8 @@ class Cast:
         Other vehicles in the scene are left out. Agents keep their ids, actors get the next
         ones.
 
-        Args:
-            roads: the road arrays.
-            travel: types and ways.
-            gate: written.
-            worlds: the rows of world w are written; it is not divided yet.
-            w: which world.
-            blank: VEHICLE (1,), the record that every vehicle starts from.
+        `worlds`: the rows of world w are written; it is not divided yet. `blank`: VEHICLE (1,), the
+        record that every vehicle starts from.
         """
         rows = worlds.rows[w]
         others = rows[: worlds.num_owned[w]]

@@ -77,31 +77,22 @@ class Await:
 
 @dataclass(frozen=True)
 class Move:
-    """Move freely along a line, from standstill to standstill.
+    """Move freely along a line, from standstill to standstill."""
 
-    Attributes:
-        line: (n, 3) x, y and heading, close enough together that straight lines between them will
-            do; a single row is a place to stand at.
-        beside: LANE row of the road on which, or beside which, this is.
-        speed_mps: on the way.
-        backwards: whether a vehicle reverses.
-    """
-
+    # (n, 3) x, y and heading, close enough together that straight lines between them will do; a
+    # single row is a place to stand at
     line: NDArray[np.float64]
-    beside: int
-    speed_mps: float = 0.0
-    backwards: bool = False
+    beside: int  # LANE row of the road on which, or beside which, this is
+    speed_mps: float = 0.0  # on the way
+    backwards: bool = False  # whether a vehicle reverses
 
     def poses(
         self, network: RoadNetwork, length: float, last: Pose | None, dt: float
     ) -> Iterator[Pose]:
         """The poses of each tick.
 
-        Args:
-            network: the roads.
-            length: of the body, m.
-            last: the pose before; None: this one begins the script, with a pose of its own.
-            dt: seconds a tick.
+        `length`: of the body, m. `last`: the pose before; None: this one begins the script, with a
+        pose of its own.
         """
         line = self.line
         if last is None:
@@ -122,23 +113,14 @@ class Move:
 
 @dataclass(frozen=True)
 class Ride:
-    """Ride along the middle of lanes as built-in drivers do, but without reacting to others.
+    """Ride along the middle of lanes as built-in drivers do, but without reacting to others."""
 
-    Attributes:
-        lanes: LANE rows one after the other, those inside junctions among them.
-        start_m: of the centre, from the start of the first lane.
-        end_m: of the centre, from the start of the first lane.
-        speed_mps: on the way.
-        start_mps: at the beginning.
-        end_mps: at the end.
-    """
-
-    lanes: tuple[int, ...]
-    start_m: float
-    end_m: float
-    speed_mps: float
-    start_mps: float = 0.0
-    end_mps: float = 0.0
+    lanes: tuple[int, ...]  # LANE rows one after the other, those inside junctions among them
+    start_m: float  # of the centre, from the start of the first lane
+    end_m: float  # of the centre, from the start of the first lane
+    speed_mps: float  # on the way
+    start_mps: float = 0.0  # at the beginning
+    end_mps: float = 0.0  # at the end
 
     def poses(
         self, network: RoadNetwork, length: float, last: Pose | None, dt: float

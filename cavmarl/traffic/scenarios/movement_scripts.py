@@ -108,16 +108,11 @@ class Cue(NamedTuple):
 
 @dataclass(frozen=True)
 class Actor:
-    """A road user that follows a script.
+    """A road user that follows a script."""
 
-    Attributes:
-        body: what it is: a name of `BODIES`.
-        acts: what it does, one after the other; each begins where the one before ends.
-        released_to: EDGE to which a built-in driver takes it in the end; None: it stays.
-    """
-
-    body: str
-    acts: Sequence[Act]
+    body: str  # what it is: a name of `BODIES`
+    acts: Sequence[Act]  # what it does, one after the other; each begins where the one before ends
+    # EDGE to which a built-in driver takes it in the end; None: it stays
     released_to: int | None = None
 
 
@@ -157,12 +152,8 @@ def compile_scripts(
 ) -> tuple[Scripts, list[int]]:
     """The frames of all actors, and the first one of each.
 
-    Args:
-        network: the roads.
-        actors: those that have a script.
-        cues: by the numbers that `Await` has.
-        goals: row of the plans' table by EDGE, for actors that are released.
-        dt: seconds a tick.
+    `actors`: those that have a script. `cues`: by the numbers that `Await` has. `goals`: row of the
+    plans' table by EDGE, for actors that are released.
     """
     tables = _Tables()
     shadows = Shadows(network)

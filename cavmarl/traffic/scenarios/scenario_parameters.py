@@ -31,10 +31,7 @@ def describe(parameters: type[Any]) -> list[tuple[str, str, str, str]]:
 def checked(parameters: type[T], given: Mapping[str, bool | float], scenario: str) -> T:
     """The parameters of a scenario with the given values.
 
-    Args:
-        parameters: a dataclass of `setting`s and `switch`es.
-        given: value by name.
-        scenario: whose they are.
+    `parameters`: a dataclass of `setting`s and `switch`es. `given`: value by name.
 
     Raises:
         ConfigError: a name that it does not have, or a value out of range.

@@ -11,19 +11,12 @@ from cavmarl.traffic.scenarios.movement_scripts import Actor, Cue
 
 @dataclass(frozen=True)
 class Seat:
-    """Where the agent's vehicle begins.
-
-    Attributes:
-        lane: LANE row.
-        s: of its centre on the lane, m.
-        speed_mps: at the beginning, and what its built-in driver would like to keep.
-        goal_edge: EDGE row where its trip ends.
-    """
+    """Where the agent's vehicle begins."""
 
     lane: int
-    s: float
-    speed_mps: float
-    goal_edge: int
+    s: float  # of its centre on the lane, m
+    speed_mps: float  # at the beginning, and what its built-in driver would like to keep
+    goal_edge: int  # EDGE row where its trip ends
 
 
 class Outage(NamedTuple):

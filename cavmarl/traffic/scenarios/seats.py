@@ -20,11 +20,6 @@ def take_seats(streets: Streets, scene: Scene, num: int) -> list[Seat]:
     The others come after it on its own approach, with the same speed and the same goal, on lanes
     outside junctions along which no actor rides: actors react to no vehicle.
 
-    Args:
-        streets: of the map.
-        scene: what is played.
-        num: how many agents.
-
     Raises:
         ConfigError: there is no room for so many behind the first.
     """

@@ -20,17 +20,11 @@ ON_ROAD = (1 << len(VEHICLE_CLASSES)) - 1
 
 
 class Shadow(NamedTuple):
-    """A stretch of a lane that a body covers.
+    """A stretch of a lane that a body covers."""
 
-    Attributes:
-        start: in m along the lane.
-        end: in m along the lane.
-        speed: of the body along the lane in m/s, not below 0.
-    """
-
-    start: float
-    end: float
-    speed: float
+    start: float  # in m along the lane
+    end: float  # in m along the lane
+    speed: float  # of the body along the lane in m/s, not below 0
 
     def joined(self, other: Shadow) -> Shadow:
         """The stretch from the start of the first to the end of the last."""
@@ -38,11 +32,7 @@ class Shadow(NamedTuple):
 
 
 class Shadows:
-    """Looks up lanes below bodies.
-
-    Args:
-        network: the roads.
-    """
+    """Looks up lanes below bodies."""
 
     def __init__(self, network: RoadNetwork) -> None:
         self._network = network

@@ -20,41 +20,24 @@ LOOK_MARGIN_M = 0.3
 
 
 class Crossing(NamedTuple):
-    """Two movements over a junction that share an area.
+    """Two movements over a junction that share an area."""
 
-    Attributes:
-        link: LINK row of the one.
-        foe: LINK row of the other.
-        middle_m: of the area, from the stop line of the one.
-        foe_middle_m: of the area, from the stop line of the other.
-    """
-
-    link: int
-    foe: int
-    middle_m: float
-    foe_middle_m: float
+    link: int  # LINK row of the one
+    foe: int  # LINK row of the other
+    middle_m: float  # of the area, from the stop line of the one
+    foe_middle_m: float  # of the area, from the stop line of the other
 
 
 class Opposite(NamedTuple):
-    """The lane beside another one in the opposite direction.
-
-    Attributes:
-        lane: LANE row.
-        s: on it, m.
-        apart_m: between the middles of both.
-    """
+    """The lane beside another one in the opposite direction."""
 
     lane: int
-    s: float
-    apart_m: float
+    s: float  # on it, m
+    apart_m: float  # between the middles of both
 
 
 class Streets:
-    """Questions about a road network.
-
-    Args:
-        network: the roads.
-    """
+    """Questions about a road network."""
 
     def __init__(self, network: RoadNetwork) -> None:
         self.network = network
@@ -118,10 +101,8 @@ class Streets:
     def crossings(self, directions: str, *, yields: bool, merges: bool) -> Iterator[Crossing]:
         """Pairs of movements of cars that share an area.
 
-        Args:
-            directions: SUMO's letters of the one, as `s` or `lL`.
-            yields: whether it has to give way to the other.
-            merges: whether both lead into one lane.
+        `directions`: SUMO's letters of the one, as `s` or `lL`. `yields`: whether it has to give
+        way to the other. `merges`: whether both lead into one lane.
         """
         links, conflicts, lanes = self.network.links, self.network.conflicts, self.network.lanes
         ends = lanes["permissions"][links["from_lane"]] & lanes["permissions"][links["to_lane"]]

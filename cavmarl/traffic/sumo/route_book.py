@@ -18,12 +18,8 @@ MAX_WAY_STEPS = 8_000_000  # of all worlds; memory that is never written is neve
 class RouteBook:
     """The paths of W worlds, each a route as vehicles with certain permissions can drive it.
 
-    Args:
-        network: the roads.
-        steps: PLAN, the table of all ways.
-        first: where in it these worlds' room begins; behind it is nothing else.
-        num_worlds: W.
-        permissions: (num_types,) of VTYPE rows.
+    `steps`: PLAN, the table of all ways. `first`: where in it these worlds' room begins; behind it
+    is nothing else. `permissions`: (num_types,) of VTYPE rows.
     """
 
     def __init__(

@@ -33,10 +33,7 @@ NO_STOPS = StopRange(-1, -1)
 class StopBook:
     """The stops of W worlds; equal lists of a world stand there once.
 
-    Args:
-        network: the roads.
-        table: STOP, of all worlds.
-        num_worlds: W.
+    `table`: STOP, of all worlds.
     """
 
     def __init__(self, network: RoadNetwork, table: NDArray[np.void], num_worlds: int) -> None:
@@ -59,9 +56,7 @@ class StopBook:
     def enter(self, w: int, stops: Sequence[Sequence[float]]) -> StopRange:
         """Where in the table the stops of a vehicle are, written if they are new.
 
-        Args:
-            w: which world.
-            stops: `Told` of each, in the order in which it reaches them.
+        `stops`: `Told` of each, in the order in which it reaches them.
 
         Raises:
             CapacityError: there is no room for more.

@@ -39,21 +39,14 @@ _DESTINATION = re.compile(rb"\b(file|dest)=(\"[^\"]*\"|'[^']*')")
 
 @dataclass(frozen=True)
 class SumoInput:
-    """Files and options.
+    """Files and options."""
 
-    Attributes:
-        route_files: demand that SUMO reads as it goes.
-        additional_files: types, stops, signal programs; read first.
-        begin_s: when the demand begins.
-        options: SUMO's own, of the configuration's sections that change what the traffic does.
-        net_file: the map that a configuration names.
-    """
-
-    route_files: tuple[Path, ...]
-    additional_files: tuple[Path, ...]
-    begin_s: float = 0.0
+    route_files: tuple[Path, ...]  # demand that SUMO reads as it goes
+    additional_files: tuple[Path, ...]  # types, stops, signal programs; read first
+    begin_s: float = 0.0  # when the demand begins
+    # SUMO's own, of the configuration's sections that change what the traffic does
     options: dict[str, str] = field(default_factory=dict)
-    net_file: Path | None = None
+    net_file: Path | None = None  # the map that a configuration names
 
 
 def read_input(demand: Sequence[Path]) -> SumoInput:

@@ -19,14 +19,9 @@ def command_words(
 ) -> list[str]:
     """The words behind the program's name.
 
-    Args:
-        map_file: a SUMO network.
-        demand: what drives on it.
-        folder: for copies of additional files that write nothing.
-        dt_s: step length.
-        seed: of SUMO's random numbers.
-        more: options, which stand above those of the demand's configuration.
-        additional: further additional files.
+    `map_file`: a SUMO network. `folder`: for copies of additional files that write nothing. `seed`:
+    of SUMO's random numbers. `more`: options, which stand above those of the demand's
+    configuration. `additional`: further additional files.
     """
     copies = folder / "additional"
     copies.mkdir(exist_ok=True)

@@ -31,17 +31,11 @@ HUGE_PAGES = "glibc.malloc.hugetlb=1"
 
 
 class SumoAnswer(NamedTuple):
-    """What a SUMO says after a step.
+    """What a SUMO says after a step."""
 
-    Attributes:
-        seen: SEEN (n,) by rising numbers.
-        letters: codes of characters, of all signals one after the other.
-        line: what is new: `departed`, `teleported`, `routes`.
-    """
-
-    seen: NDArray[np.void]
-    letters: bytes
-    line: dict[str, Any]
+    seen: NDArray[np.void]  # SEEN (n,) by rising numbers
+    letters: bytes  # codes of characters, of all signals one after the other
+    line: dict[str, Any]  # what is new: `departed`, `teleported`, `routes`
 
 
 def choose_interface(wanted: str) -> str:

@@ -22,9 +22,7 @@ class _Shown(NamedTuple):
 class ShownSignals:
     """Finds the phase of each signal that shows the same letters.
 
-    Args:
-        network: the roads, with all programs that SUMO has.
-        num_worlds: W.
+    `network`: the roads, with all programs that SUMO has.
     """
 
     def __init__(self, network: RoadNetwork, num_worlds: int) -> None:
@@ -48,10 +46,7 @@ class ShownSignals:
     def show(self, w: int, letters: bytes, phase: NDArray[np.int32]) -> None:
         """Write the PHASE rows of a world's signals.
 
-        Args:
-            w: which world.
-            letters: of all signals, one after the other.
-            phase: (num_signals,) is written.
+        `letters`: of all signals, one after the other. `phase`: (num_signals,) is written.
 
         Raises:
             SumoError: a signal shows what no program of the map's has.

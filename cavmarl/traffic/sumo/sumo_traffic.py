@@ -41,13 +41,9 @@ from cavmarl.traffic.sumo.sumo_worlds import SumoWorlds
 class SumoTraffic:
     """SUMO beside W worlds.
 
-    Args:
-        demand: what it runs.
-        network: the roads.
-        travel: types and ways, with room for its routes behind.
-        first_step: where that room begins.
-        zoned: the rows of all zones.
-        blank: VEHICLE (1,), the record that every vehicle starts from.
+    `travel`: types and ways, with room for its routes behind. `first_step`: where that room begins.
+    `zoned`: the rows of all zones. `blank`: VEHICLE (1,), the record that every vehicle starts
+    from.
 
     Attributes:
         drives: whether SUMO moves its vehicles.
@@ -119,9 +115,7 @@ class SumoTraffic:
     def step(self, worlds: Worlds, side: int) -> None:
         """Let SUMO take its step; errors as of `SumoWorlds.step`.
 
-        Args:
-            worlds: of any shard.
-            side: where the next rows are.
+        `worlds`: of any shard. `side`: where the next rows are.
         """
         self.worlds.step(worlds.ticks.tolist(), lambda w: self._moved(w, side))
 

@@ -122,13 +122,9 @@ def hand_out(
 ) -> None:
     """Let receivers have what a network simulator says that they receive in this tick.
 
-    Args:
-        receptions: RECEPTION (n,), of packets that are in flight, by receivers that are there.
-        tick: of the world.
-        latency: the longest delay, in ticks.
-        mail: inboxes and counts are written.
-        w: which world.
-        room: `receivers` as `exchange_messages` has left them.
+    `receptions`: RECEPTION (n,), of packets that are in flight, by receivers that are there.
+    `latency`: the longest delay, in ticks. `mail`: inboxes and counts are written. `room`:
+    `receivers` as `exchange_messages` has left them.
     """
     for r in range(room.receivers.size):
         if room.receivers[r]["id"] >= 0:

@@ -182,15 +182,8 @@ def deliver(
 ) -> None:
     """Let all receivers of a world receive the packets of one slot.
 
-    Args:
-        channel: the air.
-        mail: inboxes and counts are written.
-        w: which world.
-        slot: of the packets that are received now.
-        key: of the world.
-        tick: of the world.
-        latency: how many ticks ago they were sent.
-        room: `receivers` filled.
+    `mail`: inboxes and counts are written. `slot`: of the packets that are received now. `latency`:
+    how many ticks ago they were sent. `room`: `receivers` filled.
     """
     kinds = room.kinds
     kinds[:] = 0
@@ -233,14 +226,8 @@ def age(mail: Mail, w: int, r: int, tick: int, room: V2xScratch) -> None:
 def learn(mail: Mail, w: int, slot: int, p: int, r: int, delay: int, room: V2xScratch) -> None:
     """Deliver one packet to one receiver, as a network simulator has decided.
 
-    Args:
-        mail: inboxes and counts are written.
-        w: which world.
-        slot: of the packet.
-        p: the packet.
-        r: the receiver, which is there.
-        delay: ticks since it was sent.
-        room: `receivers` filled.
+    `mail`: inboxes and counts are written. `r`: the receiver, which is there. `delay`: ticks since
+    it was sent. `room`: `receivers` filled.
     """
     me = room.receivers[r]
     packet = mail.packets[w, slot, p]

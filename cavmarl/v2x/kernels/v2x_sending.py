@@ -47,12 +47,8 @@ def gather(
 ) -> int:
     """List the vehicles of all zones of a world by id; returns how many.
 
-    Args:
-        zoned: the rows.
-        side: on which of their sides they are.
-        w: which world.
-        stations: STATION (C,), overwritten.
-        spare: as large, overwritten.
+    `side`: on which of their sides they are. `stations`: STATION (C,), overwritten. `spare`: as
+    large, overwritten.
     """
     num = 0
     for zone in range(zoned.num_owned.shape[0]):
