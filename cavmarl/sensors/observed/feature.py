@@ -23,6 +23,10 @@ class Feature:
     high: float = 1.0  # largest value
 
 
+def _nowhere(config: SensorsConfig) -> float:
+    return 0.0
+
+
 def _flat(config: SensorsConfig) -> tuple[int, ...]:
     return (-1,)
 
@@ -38,7 +42,7 @@ class Sensor:
     name: str  # its key
     # its features in order; none where it is switched off
     features: Callable[[SensorsConfig], list[Feature]]
-    reach_m: Callable[[SensorsConfig], float]  # how far it looks for others, in m
+    reach_m: Callable[[SensorsConfig], float] = _nowhere  # how far it looks for others, in m
     # of its part of a Dict observation; -1 stands for all features
     shape: Callable[[SensorsConfig], tuple[int, ...]] = _flat
     dtype: Callable[[SensorsConfig], DTypeLike] = _float32  # of that part

@@ -37,10 +37,6 @@ def shape(config: SensorsConfig) -> tuple[int, ...]:
     return config.roadgraph.points, ROADGRAPH_FEATURES
 
 
-def reach_m(config: SensorsConfig) -> float:
-    return 0.0
-
-
 def settings(config: SensorsConfig, at: int, network: RoadNetwork) -> RoadgraphSensor:
     roadgraph = config.roadgraph
     road_map = road_points(network, roadgraph.spacing_m) if roadgraph.points else _no_points()
