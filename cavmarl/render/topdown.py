@@ -13,17 +13,59 @@ from cavmarl.handoff.zone_view import ZoneView
 from cavmarl.render.canvas import load_pygame, pixels
 from cavmarl.render.cars import draw_cars, in_view
 from cavmarl.render.ground import draw_ground, draw_stop_lines, signal_codes
-from cavmarl.render.legend import Sample, samples_of_drivers, samples_of_zones
-from cavmarl.render.overlay import Overlay, clock_text
-from cavmarl.render.owners import draw_transfers, owner_paints
+from cavmarl.render.overlay import Overlay, Sample, clock_text, samples_of_drivers, samples_of_zones
 from cavmarl.render.shapes import road_shapes
 from cavmarl.render.viewport import Bounds, Viewport, suitable_size
-from cavmarl.render.window import Window
-from cavmarl.render.zone_overlay import draw_sight, draw_zones
+from cavmarl.render.zone_overlay import draw_sight, draw_transfers, draw_zones, owner_paints
 from cavmarl.roads.network import RoadNetwork
 
 if TYPE_CHECKING:
     from pygame import Surface
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pygame import Surface
+
+
+class Window:
+    """Shows pictures at a steady pace; opens at the first one.
+
+    When the person at the screen closes it, the run goes on unseen.
+
+    `fps`: pictures a second; `show` waits for its turn.
+    """
+
+    def __init__(self, title: str, fps: float) -> None:
+        self.title = title
+        self.fps = fps
+        self.closed_by_person = False
+        self._window: Any = None
+        self._clock: Any = None
+
+    def show(self, surface: Surface) -> None:
+        """Put a picture on the screen and handle what the person did since the last one."""
+        if self.closed_by_person:
+            return
+        pygame = load_pygame()
+        if self._window is None:
+            pygame.display.init()
+            self._window = pygame.Window(self.title, surface.get_size())
+            self._clock = pygame.time.Clock()
+        self._window.get_surface().blit(surface, (0, 0))
+        self._window.flip()
+        self._clock.tick(self.fps)
+        for event in pygame.event.get():
+            if event.type in (pygame.QUIT, pygame.WINDOWCLOSE):
+                self.close()
+                self.closed_by_person = True
+                return
+
+    def close(self) -> None:
+        if self._window is not None:
+            self._window.destroy()
+            self._window = None
+
 
 # Smallest part of the world that a following camera shows, and how fast it turns to a new aim.
 FOLLOW_M = 150.0

@@ -32,10 +32,9 @@ from cavmarl.traffic.scenarios.cast import Cast
 from cavmarl.traffic.scenarios.movement_scripts import NO_SCRIPTS
 from cavmarl.traffic.scenarios.scene import Scene
 from cavmarl.traffic.schedule import Schedule
-from cavmarl.traffic.sumo.route_book import RouteBook
-from cavmarl.traffic.sumo.stop_book import StopBook
+from cavmarl.traffic.sumo.route_book import RouteBook, StopBook
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
-from cavmarl.traffic.way_slots import WaySlots, way_slots
+from cavmarl.traffic.way_search import WaySlots, way_slots
 
 PASSENGER = 1 << VEHICLE_CLASSES.index("passenger")
 FAST_FACTOR = 1.5  # a speed over the limit that hardly any driver of the demand wants

@@ -21,8 +21,7 @@ from cavmarl.traffic.demand.rerouters import KEEP_DESTINATION
 from cavmarl.traffic.kernels.edge_speeds import limit_speeds, sample_speeds
 from cavmarl.traffic.kernels.way_requests import find_asking, mark_slots
 from cavmarl.traffic.schedule import Schedule
-from cavmarl.traffic.way_search import Traffic, WaySearch, WaySearchResult
-from cavmarl.traffic.way_slots import WaySlots
+from cavmarl.traffic.way_search import Traffic, WaySearch, WaySearchResult, WaySlots
 
 NEVER = np.iinfo(np.int64).max
 

@@ -13,16 +13,17 @@ from cavmarl.core.records.arrays import Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.roads.kernels.backdrop_pieces import Backdrop
 from cavmarl.sensors.kernels.birds_eye import BirdsEye, look_down
-from cavmarl.sensors.kernels.camera_picture import find_faces, look
-from cavmarl.sensors.kernels.faces import CameraPose, PixelRows
-from cavmarl.sensors.kernels.panorama import Panorama, gather
-from cavmarl.sensors.kernels.pixels import (
+from cavmarl.sensors.kernels.camera_picture import (
     LEAST_DEPTH_M,
+    find_faces,
+    look,
     measure_depths,
     write_classes,
     write_colours,
     write_halves,
 )
+from cavmarl.sensors.kernels.faces import CameraPose, PixelRows
+from cavmarl.sensors.kernels.panorama import Panorama, gather
 from cavmarl.sensors.kernels.rig_noise import Noise, error_of, sensor_key
 from cavmarl.sensors.kernels.rig_schedule import Due
 

@@ -15,9 +15,8 @@ from cavmarl.config.rig import (
     SemanticCameraConfig,
 )
 from cavmarl.sensors.kernels.birds_eye import make_birds_eye
-from cavmarl.sensors.kernels.camera_picture import make_camera, make_picture
+from cavmarl.sensors.kernels.camera_picture import colours, make_camera, make_picture
 from cavmarl.sensors.kernels.faces import CameraPose
-from cavmarl.sensors.kernels.pixels import colours
 from cavmarl.sensors.kernels.rig_pictures import (
     camera_reach_m,
     fill_grids,

@@ -1,6 +1,6 @@
 """What the sensors that tell of the way, the traffic and the messages around a vehicle observe.
 
-The scales are those of `sensors/kernels/observing.py`, `observing_lanes.py` and
+The scales are those of `sensors/kernels/sense.py`, `observing_lanes.py` and
 `observing_messages.py`. A sensor that is off has no features.
 """
 

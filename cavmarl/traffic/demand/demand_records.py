@@ -12,6 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.traffic.demand.element import Element
+
 # Lanes: a LANE row (in an ORDER) or SUMO's index on the edge (in an ELEMENT), or one of these.
 LANE_FIRST = -1  # rightmost one that the class may use (SUMO's default)
 LANE_RANDOM = -2
@@ -195,3 +197,39 @@ class Choices:
         place = np.searchsorted(self.upper, choices + chances, side="right")
         # A sum can round up to the next list's range.
         return self.rows[np.clip(place, self.start[choices], self.start[choices + 1] - 1)]
+
+
+MAX_WEIGHT = 1e9
+
+
+def listed(source: Element, key: str) -> list[tuple[str, float | None]]:
+    """Names in one attribute, their weights in another.
+
+    `key`: "vTypes" or "routes".
+
+    Returns:
+        Pairs of name and weight; None where `probabilities` says nothing.
+    """
+    names = source.attrs.get(key, "").split()
+    texts = source.attrs.get("probabilities", "").split()
+    if texts and len(texts) != len(names):
+        raise source.error(
+            f"has {len(texts)} probabilities for {len(names)} {key}", "give one for each"
+        )
+    weights: list[float | None] = [
+        source.saying(probabilities=text).number("probabilities", 1.0, least=0.0, most=MAX_WEIGHT)
+        for text in texts
+    ]
+    return list(zip(names, weights or [None] * len(names), strict=True))
+
+
+def weighted(source: Element, found: Sequence[tuple[int, float]]) -> Options:
+    """What is found to choose from, without what is never chosen.
+
+    Raises:
+        DemandError: nothing is left.
+    """
+    kept = [(row, weight) for row, weight in found if weight > 0.0]
+    if not kept:
+        raise source.error("has nothing to choose from", "give it members with a probability")
+    return Options(tuple(row for row, _ in kept), tuple(weight for _, weight in kept))

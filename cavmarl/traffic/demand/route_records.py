@@ -10,13 +10,15 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import CapacityError
 from cavmarl.traffic.demand.demand_records import (
+    MAX_WEIGHT,
     ROUTE,
     STOP,
     UNTIL_DEPARTURE,
     Options,
+    listed,
+    weighted,
 )
 from cavmarl.traffic.demand.demand_report import DemandReport
-from cavmarl.traffic.demand.distributions import MAX_WEIGHT, listed, weighted
 from cavmarl.traffic.demand.element import Element, near
 from cavmarl.traffic.demand.map_index import MapIndex
 from cavmarl.traffic.demand.stops import Stop, StopReader

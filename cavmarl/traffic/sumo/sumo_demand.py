@@ -18,8 +18,7 @@ from cavmarl.core.records.codes import MODEL_KRAUSS
 from cavmarl.driving.vehicle_types import NEAREST_CLASS, NO_ROAD_CLASSES, VTYPE, generated_types
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.sumo_net.xml_source import read_bytes
-from cavmarl.traffic.sumo.sumo_input import SumoInput, read_input
-from cavmarl.traffic.sumo.sumo_options import command_words
+from cavmarl.traffic.sumo.sumo_input import SumoInput, command_words, read_input
 from cavmarl.traffic.sumo.sumo_process import SumoProcess, choose_interface
 
 _SAME_NAME = ("length", "width", "height", "min_gap", "accel", "decel", "emergency_decel", "tau",

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError, SumoError
 from cavmarl.traffic.kernels.mirroring import Paths
-from cavmarl.traffic.sumo.route_book import RouteBook
-from cavmarl.traffic.sumo.stop_book import StopBook
+from cavmarl.traffic.sumo.route_book import RouteBook, StopBook
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
 from cavmarl.traffic.sumo.sumo_history import ToldLog
 from cavmarl.traffic.sumo.sumo_process import SumoAnswer, SumoProcess

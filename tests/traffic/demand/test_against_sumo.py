@@ -15,7 +15,7 @@ from cavmarl.traffic.demand import DemandFile, read_demand
 from cavmarl.traffic.demand.demand_report import DemandReport
 from cavmarl.traffic.demand.element import Element
 from cavmarl.traffic.demand.sumo_config import read_sumo_config
-from cavmarl.traffic.demand.vehicle_type_reader import vtype_record
+from cavmarl.traffic.demand.type_table import vtype_record
 from tests.traffic.demand.conftest import Reader, sumo_binary
 
 VEHICLE = re.compile(
