@@ -75,7 +75,7 @@ def lead(
     """Run a world as its time master; followers that join over a socket drive its agents."""
     from cavmarl.cosim.followers.followed_world import FollowedWorld
     from cavmarl.cosim.pacing import RealTime
-    from cavmarl.cosim.stack.reference_rig import REFERENCE_RIG
+    from cavmarl.cosim.stack.stack import REFERENCE_RIG
     from cavmarl.env.parallel import parallel_env
 
     if followers < 0 or (steps is not None and steps < 1):

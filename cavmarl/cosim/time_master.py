@@ -6,11 +6,14 @@ resets them; an environment without a master pays nothing for that. Followers co
 world runs. What one of them does when it ticks by itself, which made the world of the
 co-simulation paper advance 1.92 times as fast as its master, is refused, ignored or, to show the
 fault, obeyed; each is counted, and what has passed the master by is noticed before his next step.
+
+A `Pacer` paces steps on the wall clock; simulated time does not depend on it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, Protocol
@@ -19,11 +22,100 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
-from cavmarl.core.errors import ClockError
-from cavmarl.cosim.pacing import Pacer, Unpaced
+from cavmarl.core.errors import ClockError, ConfigError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.step_trace import StepTrace
 from cavmarl.shards.shard import Commands
+
+
+class Pacer(Protocol):
+    """Says when the next step may begin."""
+
+    def wait(self, elapsed_s: float) -> None:
+        """Return when the step may begin that starts after `elapsed_s` of simulated time."""
+        ...
+
+
+class Unpaced:
+    """A step begins as soon as the one before has ended."""
+
+    def wait(self, elapsed_s: float) -> None:
+        """Go on at once."""
+
+
+@dataclass(frozen=True)
+class Lateness:
+    """How late steps began, by the wall clock."""
+
+    steps: int  # that have begun
+    # of these, that could not begin when they were due, because what went before took too long
+    late: int
+    mean_wall_s: float  # how long after they were due all of them began, on average
+    worst_wall_s: float  # the same, of the worst
+
+
+class RealTime:
+    """Simulated time goes on `factor` times as fast as the wall clock, or slower if it has to.
+
+    A step is due at a fixed time after the first one began, so that lateness is made up for and
+    does not add up.
+
+    `factor`: seconds of simulated time a second. `now`: the wall clock in seconds. `sleep`: waits
+    so many seconds.
+
+    Raises:
+        ConfigError: a factor that is no number above 0.
+    """
+
+    def __init__(
+        self,
+        factor: float = 1.0,
+        now: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        if not 0.0 < factor < float("inf"):
+            raise ConfigError(f"pacing by {factor}: must be a number above 0, as 1 or 2.5")
+        self._factor = factor
+        self._now, self._sleep = now, sleep
+        self._origin: float | None = None
+        self._steps = self._late = 0
+        self._sum_s = self._worst_s = 0.0
+
+    def wait(self, elapsed_s: float) -> None:
+        now = self._now()
+        if self._origin is None:
+            self._origin = now - elapsed_s / self._factor
+        early_s = self._origin + elapsed_s / self._factor - now
+        if early_s > 0.0:
+            self._sleep(early_s)
+            early_s = self._origin + elapsed_s / self._factor - self._now()
+        elif early_s < 0.0:
+            self._late += 1
+        late_s = max(0.0, -early_s)
+        self._steps += 1
+        self._sum_s += late_s
+        self._worst_s = max(self._worst_s, late_s)
+
+    @property
+    def lateness(self) -> Lateness:
+        mean_s = self._sum_s / max(self._steps, 1)
+        return Lateness(self._steps, self._late, mean_s, self._worst_s)
+
+
+class Stepwise:
+    """Each step waits for permission.
+
+    Args:
+        ask: called with the simulated time in seconds before each step; the step begins when it
+            returns.
+    """
+
+    def __init__(self, ask: Callable[[float], object]) -> None:
+        self._ask = ask
+
+    def wait(self, elapsed_s: float) -> None:
+        self._ask(elapsed_s)
+
 
 OwnTicks = Literal["refuse", "ignore", "obey"]
 

@@ -18,8 +18,12 @@ from cavmarl.core.records.codes import COUNT_REROUTED
 from cavmarl.roads.routing import PLAN
 from cavmarl.traffic.demand import Choices
 from cavmarl.traffic.demand.rerouters import KEEP_DESTINATION
-from cavmarl.traffic.kernels.edge_speeds import limit_speeds, sample_speeds
-from cavmarl.traffic.kernels.way_requests import find_asking, mark_slots
+from cavmarl.traffic.kernels.way_requests import (
+    find_asking,
+    limit_speeds,
+    mark_slots,
+    sample_speeds,
+)
 from cavmarl.traffic.schedule import Schedule
 from cavmarl.traffic.way_search import Traffic, WaySearch, WaySearchResult, WaySlots
 

@@ -17,12 +17,13 @@ from cavmarl.core.errors import CapacityError
 from cavmarl.core.records.arrays import RoadArrays, Travel
 from cavmarl.roads.kernels.plans import plan_goal
 from cavmarl.roads.routing import PLAN
-from cavmarl.traffic.kernels.edge_speeds import CLOSED_S, slow_lanes
 from cavmarl.traffic.kernels.way_requests import (
+    CLOSED_S,
     find_way,
     has_room,
     mark_slots,
     put_on_way,
+    slow_lanes,
     take_slot,
     time_left,
 )
@@ -106,7 +107,7 @@ class WaySearchResult(Enum):
 class Traffic(NamedTuple):
     """What is known of one world's traffic."""
 
-    speed_sums: NDArray[np.int64]  # (num_edges,) mm/s, see `kernels.edge_speeds`
+    speed_sums: NDArray[np.int64]  # (num_edges,) mm/s, see `sample_speeds`
     samples: int  # how many a sum has
     closed: NDArray[np.int64]  # (num_edges,) bits of the classes that an edge is closed to
 

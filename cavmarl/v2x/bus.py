@@ -41,9 +41,8 @@ from cavmarl.v2x.kernels.v2x_records import (
     V2xScratch,
 )
 from cavmarl.v2x.message_statistics import V2xStatistics, statistics_of
-from cavmarl.v2x.network_simulator import Exchange, NetworkSimulator, check_receptions
 from cavmarl.v2x.roadside import make_units
-from cavmarl.v2x.v2x_messages import cause_code
+from cavmarl.v2x.v2x_messages import Exchange, NetworkSimulator, cause_code, check_receptions
 
 Zeros = Callable[..., NDArray[Any]]
 

@@ -25,12 +25,15 @@ from cavmarl.core.errors import (
     FollowerLostError,
 )
 from cavmarl.cosim.followers.follower_barrier import BadControls, Barrier, FollowerSeat
-from cavmarl.cosim.followers.follower_connection import Address, FollowerConnection
+from cavmarl.cosim.followers.follower_connection import (
+    Address,
+    FollowerConnection,
+    Reception,
+    refuse,
+)
 from cavmarl.cosim.followers.follower_messages import Hello, Say
 from cavmarl.cosim.followers.follower_snapshots import SnapshotTime, welcome_to
-from cavmarl.cosim.followers.reception import Reception, refuse
-from cavmarl.cosim.pacing import Pacer
-from cavmarl.cosim.time_master import OwnTicks, TimeMaster
+from cavmarl.cosim.time_master import OwnTicks, Pacer, TimeMaster
 from cavmarl.engine.step_trace import QUEUE, STACK, StepTrace
 from cavmarl.env.parallel import CavEnv
 

@@ -24,7 +24,7 @@ from cavmarl.cosim.stack.stack_types import (
     StackMount,
     StackSensor,
 )
-from cavmarl.sensors.kernels.inertia import GRAVITY_MPS2
+from cavmarl.sensors.kernels.vehicle_readings import GRAVITY_MPS2
 from cavmarl.sensors.mounted.geodesy import Geodesy
 
 # Standard deviations: of what the model leaves out, a square root of a second, and of sensors

@@ -1,7 +1,7 @@
 """highway-env's `LidarObservation`: distance and radial speed in equal sectors around a vehicle.
 
 The sectors do not turn with the vehicle: the middle of cell k lies k steps clockwise from east (the
-frame of `kernels.vehicle_features`). It differs from our `lidar`, whose rays meet bodies exactly
+frame of `vehicle_features`). It differs from our `lidar`, whose rays meet bodies exactly
 and turn with the vehicle, in ways that are kept here: a vehicle is seen if its centre is in range;
 it is also drawn into the cell of its centre, at its distance less half its width; within a body
 distances are negative; and speeds are divided by the range in metres, as distances are. Cells

@@ -13,8 +13,8 @@ from cavmarl.sensors.kernels.kinematics_observation import observe_kinematics
 from cavmarl.sensors.kernels.lidar_cells import observe_lidar_cells
 from cavmarl.sensors.kernels.nearest_road_points import observe_roadgraph
 from cavmarl.sensors.kernels.occupancy import observe_occupancy
+from cavmarl.sensors.kernels.output_reset import newest_frame
 from cavmarl.sensors.kernels.sensor_arrays import OptionalSensors
-from cavmarl.sensors.kernels.stacking import newest_frame
 
 
 @kernel

@@ -17,13 +17,13 @@ from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell
 from cavmarl.core.math.scalars import clamp
 from cavmarl.core.numba import kernel
 from cavmarl.core.records.arrays import LaneGrid, RoadArrays
-from cavmarl.sensors.kernels.sensor_arrays import OccupancyGrid
-from cavmarl.sensors.kernels.vehicle_features import (
+from cavmarl.sensors.kernels.kinematics_observation import (
     FEATURE_ON_ROAD,
     in_range,
     make_relative,
     vehicle_features,
 )
+from cavmarl.sensors.kernels.sensor_arrays import OccupancyGrid
 
 # How far along a lane highway-env sets waypoints, from the place beside the vehicle.
 LANE_REACH_M = 100.0

@@ -34,7 +34,7 @@ from cavmarl.driving.kernels.signal_timing import time_to_change
 from cavmarl.rewards.kernels.terms import write_terms
 from cavmarl.sensors.kernels.lidar_fan import lidar
 from cavmarl.sensors.kernels.observing_lanes import observe_lanes
-from cavmarl.sensors.kernels.stacking import has_entered, newest_frame, shift_frames
+from cavmarl.sensors.kernels.output_reset import has_entered, newest_frame, shift_frames
 
 EGO_FEATURES = 13
 NEIGHBOR_FEATURES = 7

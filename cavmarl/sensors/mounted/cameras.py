@@ -14,17 +14,17 @@ from cavmarl.config.rig import (
     RgbCameraConfig,
     SemanticCameraConfig,
 )
-from cavmarl.sensors.kernels.birds_eye import make_birds_eye
 from cavmarl.sensors.kernels.camera_picture import colours, make_camera, make_picture
 from cavmarl.sensors.kernels.faces import CameraPose
+from cavmarl.sensors.kernels.rig_frames import Due
 from cavmarl.sensors.kernels.rig_pictures import (
     camera_reach_m,
     fill_grids,
+    make_birds_eye,
     take_classes,
     take_colours,
     take_depths,
 )
-from cavmarl.sensors.kernels.rig_schedule import Due
 from cavmarl.sensors.kernels.semantics import NUM_SEMANTICS
 from cavmarl.sensors.mounted.frames import SensorFrames
 from cavmarl.sensors.mounted.mount_transforms import mount_matrix

@@ -8,10 +8,9 @@ from typing import Any, TypeVar
 import numpy as np
 
 from cavmarl.config.rig import LidarRigConfig, RadarConfig
-from cavmarl.sensors.kernels.radar_targets import TARGET
 from cavmarl.sensors.kernels.ray_fan import HIT, Fan, make_fan
-from cavmarl.sensors.kernels.rig_rays import measure_lidar, measure_radar
-from cavmarl.sensors.kernels.rig_schedule import Due
+from cavmarl.sensors.kernels.rig_frames import Due
+from cavmarl.sensors.kernels.rig_rays import TARGET, measure_lidar, measure_radar
 from cavmarl.sensors.mounted.frames import SensorFrames
 from cavmarl.sensors.mounted.mount_transforms import mount_matrix
 from cavmarl.sensors.mounted.mounted_sensor import Bounds, ImagingSensor, Platform, SensedScene

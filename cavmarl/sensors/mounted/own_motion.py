@@ -14,12 +14,14 @@ from cavmarl.config.rig import (
     LaneBoundaryConfig,
     OdometryConfig,
 )
-from cavmarl.sensors.kernels.antenna_positions import measure_places
-from cavmarl.sensors.kernels.event_reports import report_events
-from cavmarl.sensors.kernels.inertia import measure_inertia
-from cavmarl.sensors.kernels.lane_offsets import measure_lane_boundary
-from cavmarl.sensors.kernels.rig_schedule import Due
-from cavmarl.sensors.kernels.wheel_motion import measure_odometry
+from cavmarl.sensors.kernels.rig_frames import Due
+from cavmarl.sensors.kernels.vehicle_readings import (
+    measure_inertia,
+    measure_lane_boundary,
+    measure_odometry,
+    measure_places,
+    report_events,
+)
 from cavmarl.sensors.mounted.frames import SensorFrames
 from cavmarl.sensors.mounted.geodesy import geodesy_of
 from cavmarl.sensors.mounted.mounted_sensor import (

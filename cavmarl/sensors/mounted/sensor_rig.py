@@ -10,8 +10,15 @@ from numpy.typing import NDArray
 
 from cavmarl.config.rig import MountedConfig, SampledConfig, cadence
 from cavmarl.core.numba.repeated import repeated
-from cavmarl.sensors.kernels.rig_frames import POSE, call_roll, deliver, note_poses
-from cavmarl.sensors.kernels.rig_schedule import Due, SensorSchedule, call_due
+from cavmarl.sensors.kernels.rig_frames import (
+    POSE,
+    Due,
+    SensorSchedule,
+    call_due,
+    call_roll,
+    deliver,
+    note_poses,
+)
 from cavmarl.sensors.mounted.frames import Frames, SensorFrames
 from cavmarl.sensors.mounted.mounted_sensor import MountedSensor, Platform, SensedScene, stream_of
 from cavmarl.sensors.registry import mount

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from cavmarl.traffic.demand.demand_file import DemandFile, read_demand
 from cavmarl.traffic.demand.demand_records import ELEMENT, ORDER, ROUTE, STOP, Choices
-from cavmarl.traffic.demand.demand_report import DemandReport
+from cavmarl.traffic.demand.element import DemandReport
 
 __all__ = [
     "ELEMENT",

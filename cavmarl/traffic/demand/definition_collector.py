@@ -33,8 +33,7 @@ from cavmarl.traffic.demand.demand_records import (
     SPEED_CURRENT,
     SPEED_GIVEN,
 )
-from cavmarl.traffic.demand.demand_report import DemandReport
-from cavmarl.traffic.demand.element import MAX_TIME_MS, Element
+from cavmarl.traffic.demand.element import MAX_TIME_MS, DemandReport, Element
 from cavmarl.traffic.demand.rerouting_device import device
 from cavmarl.traffic.demand.xml_files import STOPPING_PLACES
 

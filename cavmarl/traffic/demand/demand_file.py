@@ -15,7 +15,6 @@ from cavmarl.core.errors import DemandError
 from cavmarl.roads.network import RoadNetwork, content_of
 from cavmarl.traffic.demand.definition_collector import DefinitionCollector
 from cavmarl.traffic.demand.demand_records import ORDER, POS_GIVEN, Choices
-from cavmarl.traffic.demand.demand_report import DemandReport
 from cavmarl.traffic.demand.drawing import (
     DRAW_REROUTE,
     DRAW_ROUTE,
@@ -23,7 +22,7 @@ from cavmarl.traffic.demand.drawing import (
     chances,
     departures_ms,
 )
-from cavmarl.traffic.demand.element import MAX_TIME_MS
+from cavmarl.traffic.demand.element import MAX_TIME_MS, DemandReport
 from cavmarl.traffic.demand.map_index import MapIndex
 from cavmarl.traffic.demand.rerouters import Rerouters
 from cavmarl.traffic.demand.rerouting_device import DeviceOptions

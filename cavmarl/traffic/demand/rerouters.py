@@ -12,8 +12,7 @@ from cavmarl.core.errors import CapacityError
 from cavmarl.driving.vehicle_types import ALL_PERMISSIONS, NEAREST_CLASS, NO_ROAD_CLASSES
 from cavmarl.roads.network import VEHICLE_CLASSES
 from cavmarl.traffic.demand.demand_records import MAX_WEIGHT, Choices, Options, weighted
-from cavmarl.traffic.demand.demand_report import DemandReport
-from cavmarl.traffic.demand.element import MAX_TIME_MS, Element, near
+from cavmarl.traffic.demand.element import MAX_TIME_MS, DemandReport, Element, near
 from cavmarl.traffic.demand.map_index import MapIndex
 from cavmarl.traffic.demand.route_records import RouteTable
 

@@ -18,8 +18,7 @@ from cavmarl.traffic.demand.demand_records import (
     listed,
     weighted,
 )
-from cavmarl.traffic.demand.demand_report import DemandReport
-from cavmarl.traffic.demand.element import Element, near
+from cavmarl.traffic.demand.element import DemandReport, Element, near
 from cavmarl.traffic.demand.map_index import MapIndex
 from cavmarl.traffic.demand.stops import Stop, StopReader
 

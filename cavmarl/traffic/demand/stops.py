@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from cavmarl.core.errors import CavmarlError
-from cavmarl.traffic.demand.demand_report import DemandReport
-from cavmarl.traffic.demand.element import Element, near
+from cavmarl.traffic.demand.element import DemandReport, Element, near
 from cavmarl.traffic.demand.map_index import MapIndex
 from cavmarl.traffic.demand.xml_files import STOPPING_PLACES
 

@@ -19,8 +19,7 @@ from cavmarl.driving.vehicle_types import (
 )
 from cavmarl.roads.network import VEHICLE_CLASSES
 from cavmarl.traffic.demand.demand_records import MAX_WEIGHT, Options, listed, weighted
-from cavmarl.traffic.demand.demand_report import DemandReport
-from cavmarl.traffic.demand.element import Element, near
+from cavmarl.traffic.demand.element import DemandReport, Element, near
 from cavmarl.traffic.demand.rerouting_device import device
 
 MIN_SPEED_FACTOR = 0.2  # SUMO's cuts of the distribution of speed factors

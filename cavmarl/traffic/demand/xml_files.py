@@ -9,8 +9,7 @@ from xml.sax.handler import ContentHandler
 
 from cavmarl.core.errors import DemandError
 from cavmarl.roads.sumo_net.xml_source import read_xml
-from cavmarl.traffic.demand.demand_report import DemandReport
-from cavmarl.traffic.demand.element import Element, near
+from cavmarl.traffic.demand.element import DemandReport, Element, near
 
 MAX_INCLUDES = 16  # files inside files
 MAX_CHILDREN = 100_000  # of one definition

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError, MissingExtraError, SumoError
 from cavmarl.traffic.sumo import sumo_child as child
-from cavmarl.traffic.sumo.sumo_records import MOVED, SEEN
+from cavmarl.traffic.sumo.sumo_history import MOVED, SEEN
 
 ANSWER_S = 120.0  # a step that takes longer hangs
 END_S = 2.0  # for it to end by itself

@@ -32,8 +32,7 @@ from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
 from cavmarl.traffic.kernels.mirroring import greet, list_others, mirror, send_on
 from cavmarl.traffic.sumo.route_book import RouteBook, StopBook
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
-from cavmarl.traffic.sumo.sumo_history import ToldLog
-from cavmarl.traffic.sumo.sumo_records import MOVED
+from cavmarl.traffic.sumo.sumo_history import MOVED, ToldLog
 from cavmarl.traffic.sumo.sumo_worlds import SumoWorlds
 
 
