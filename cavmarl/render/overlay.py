@@ -20,13 +20,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from cavmarl.render.canvas import Part, bar, opaque, ring
-from cavmarl.render.palette import (
-    ACTOR,
-    BACKGROUND_CAR,
-    COLLIDED,
-    Color,
-    zone_color,
-)
+from cavmarl.render.palette import ACTOR, BACKGROUND_CAR, COLLIDED, Color, zone_color
 
 SWATCH_PX = 16
 _HEIGHT_PX = 10.0

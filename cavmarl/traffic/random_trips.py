@@ -79,13 +79,7 @@ class RandomTrips:
 
 
 def write_random_demand(
-    network: RoadNetwork,
-    path: Path,
-    *,
-    vehicles: int,
-    within_s: float,
-    route_m: float,
-    seed: int,
+    network: RoadNetwork, path: Path, *, vehicles: int, within_s: float, route_m: float, seed: int
 ) -> None:
     """Write a `.rou.xml` of cars that depart evenly spread over a time.
 

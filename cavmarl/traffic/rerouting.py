@@ -51,12 +51,7 @@ class Rerouting:
     """
 
     def __init__(
-        self,
-        schedule: Schedule,
-        travel: Travel,
-        slots: WaySlots,
-        first_type: int,
-        dt: float,
+        self, schedule: Schedule, travel: Travel, slots: WaySlots, first_type: int, dt: float
     ) -> None:
         self._schedule = schedule
         self._travel = travel

@@ -219,12 +219,7 @@ def _make_sending(v2x: V2xConfig, dt: float) -> Sending:
 
 
 def _make_mail(
-    v2x: V2xConfig,
-    num_worlds: int,
-    capacity: int,
-    num_receivers: int,
-    num_units: int,
-    zeros: Zeros,
+    v2x: V2xConfig, num_worlds: int, capacity: int, num_receivers: int, num_units: int, zeros: Zeros
 ) -> Mail:
     stations = capacity + num_units
     most = v2x.capacity or 3 * stations

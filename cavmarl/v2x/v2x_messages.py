@@ -245,10 +245,7 @@ class NetworkSimulator(Protocol):
 
 
 def check_receptions(
-    receptions: NDArray[np.void],
-    sent: Exchange,
-    latency_ticks: int,
-    num_packets: NDArray[np.int64],
+    receptions: NDArray[np.void], sent: Exchange, latency_ticks: int, num_packets: NDArray[np.int64]
 ) -> NDArray[np.void]:
     """Refuse receptions that cannot be.
 

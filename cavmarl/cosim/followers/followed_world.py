@@ -18,12 +18,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
-from cavmarl.core.errors import (
-    ConfigError,
-    EpisodeError,
-    FollowerError,
-    FollowerLostError,
-)
+from cavmarl.core.errors import ConfigError, EpisodeError, FollowerError, FollowerLostError
 from cavmarl.cosim.followers.follower_barrier import BadControls, Barrier, FollowerSeat
 from cavmarl.cosim.followers.follower_connection import (
     Address,

@@ -10,12 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from cavmarl.core.errors import (
-    ActionError,
-    ClockError,
-    FollowerError,
-    FollowerLostError,
-)
+from cavmarl.core.errors import ActionError, ClockError, FollowerError, FollowerLostError
 from cavmarl.cosim.followers.follower_connection import FollowerConnection
 from cavmarl.cosim.followers.follower_messages import Control, Say, Ticked, read_letter
 from cavmarl.cosim.followers.follower_snapshots import SnapshotTime, take_snapshot

@@ -19,12 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import (
-    ConfigError,
-    FollowerError,
-    FollowerLostError,
-    MessageError,
-)
+from cavmarl.core.errors import ConfigError, FollowerError, FollowerLostError, MessageError
 from cavmarl.cosim.followers.follower_messages import (
     FOLLOWERS,
     MAX_VEHICLES,

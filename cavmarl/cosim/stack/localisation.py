@@ -236,7 +236,4 @@ class GnssInertial:
 def _centre(fix: tuple[float, float], mount: StackMount, heading: float) -> tuple[float, float]:
     """Where the vehicle's centre is when its antenna is at a place."""
     cos, sin = math.cos(heading), math.sin(heading)
-    return (
-        fix[0] - mount.x_m * cos + mount.y_m * sin,
-        fix[1] - mount.x_m * sin - mount.y_m * cos,
-    )
+    return (fix[0] - mount.x_m * cos + mount.y_m * sin, fix[1] - mount.x_m * sin - mount.y_m * cos)

@@ -98,27 +98,16 @@ def _point_at(trajectory: Trajectory, pose: EgoPose, ahead_m: float) -> tuple[fl
         past = (s - along[-1]) / safe[-1]
         end = points[-1] + past * steps[-1]
         return float(end[0]), float(end[1])
-    return (
-        float(np.interp(s, along, points[:, 0])),
-        float(np.interp(s, along, points[:, 1])),
-    )
+    return (float(np.interp(s, along, points[:, 0])), float(np.interp(s, along, points[:, 1])))
 
 
 # Noise of consumer-grade parts: a GNSS receiver without corrections, a MEMS inertial unit, wheel
 # encoders, a camera that looks for lane markings, and a lidar at the height of a bumper.
 REFERENCE_RIG: dict[str, dict[str, Any]] = {
     "gnss": {"type": "gnss", "rate_hz": 10, "noise": [1.0, 1.0, 2.0], "z_m": 1.5},
-    "imu": {
-        "type": "imu",
-        "rate_hz": 100,
-        "noise": [0.05, 0.05, 0.05, 0.003, 0.003, 0.003],
-    },
+    "imu": {"type": "imu", "rate_hz": 100, "noise": [0.05, 0.05, 0.05, 0.003, 0.003, 0.003]},
     "odometry": {"type": "odometry", "rate_hz": 20, "noise": [0.05, 0.01, 0.1]},
-    "markings": {
-        "type": "lane_boundary",
-        "rate_hz": 20,
-        "noise": [0.05, 0.05, 0.05, 0.01, 0.001],
-    },
+    "markings": {"type": "lane_boundary", "rate_hz": 20, "noise": [0.05, 0.05, 0.05, 0.01, 0.001]},
     "lidar": {
         "type": "lidar",
         "rate_hz": 10,
@@ -227,11 +216,7 @@ class Stack:
         self._localisation.reset_pose(pose)
 
     def drive(
-        self,
-        readings: Readings,
-        signals: NDArray[np.uint8] | None,
-        mission: Mission,
-        time_s: float,
+        self, readings: Readings, signals: NDArray[np.uint8] | None, mission: Mission, time_s: float
     ) -> Control2D:
         """One step of all stages; without a pose the vehicle brakes.
 

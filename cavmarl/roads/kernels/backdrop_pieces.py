@@ -47,11 +47,7 @@ class Backdrop(NamedTuple):
 
 @kernel
 def gather_walls(
-    ego: np.void,
-    walls: NDArray[np.void],
-    index: Grid,
-    reach_m: float,
-    out: NDArray[np.void],
+    ego: np.void, walls: NDArray[np.void], index: Grid, reach_m: float, out: NDArray[np.void]
 ) -> int:
     """The walls around a vehicle, always in the same order.
 

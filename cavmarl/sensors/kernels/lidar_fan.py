@@ -47,12 +47,7 @@ def ray_directions(num_rays: int) -> NDArray[np.float64]:
 
 @kernel
 def _ray_to_box(
-    x: float,
-    y: float,
-    closing_x: float,
-    closing_y: float,
-    half_length: float,
-    half_width: float,
+    x: float, y: float, closing_x: float, closing_y: float, half_length: float, half_width: float
 ) -> float:
     """Distance along a ray to a box around the origin, 0 inside of it and inf if missed.
 

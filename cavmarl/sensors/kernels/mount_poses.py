@@ -57,10 +57,7 @@ def turned(matrix: NDArray[np.float64], x: float, y: float, z: float) -> tuple[f
 
 @kernel
 def sensor_pose(
-    row: np.void,
-    mount: Mount,
-    body: NDArray[np.float64],
-    axes: NDArray[np.float64],
+    row: np.void, mount: Mount, body: NDArray[np.float64], axes: NDArray[np.float64]
 ) -> tuple[float, float, float]:
     """Where a sensor is in the world, and how it is turned.
 

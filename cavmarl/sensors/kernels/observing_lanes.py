@@ -45,13 +45,7 @@ def _scaled_speed(speed: float) -> np.float32:
 
 @kernel
 def _way_between(
-    roads: RoadArrays,
-    travel: Travel,
-    lane: int,
-    way: int,
-    s: float,
-    target: int,
-    target_s: float,
+    roads: RoadArrays, travel: Travel, lane: int, way: int, s: float, target: int, target_s: float
 ) -> float:
     """Metres along a way from `s` of `lane` to `target_s` of lane `target`; inf: not on it."""
     start = -s

@@ -135,12 +135,7 @@ def _fill_line(
 
 
 @kernel
-def look_down(
-    grid: BirdsEye,
-    panorama: Panorama,
-    counts: Counts,
-    out: NDArray[np.uint8],
-) -> None:
+def look_down(grid: BirdsEye, panorama: Panorama, counts: Counts, out: NDArray[np.uint8]) -> None:
     """Fill the grid.
 
     `grid`: where it lies. `panorama`: what stands around the vehicle, prisms ordered by id. `out`:
@@ -242,12 +237,7 @@ def take_depths(
 
 @kernel
 def _add_noise(
-    noise: Noise,
-    row: np.void,
-    tick: int,
-    range_m: float,
-    first: int,
-    depths: NDArray[np.float32],
+    noise: Noise, row: np.void, tick: int, range_m: float, first: int, depths: NDArray[np.float32]
 ) -> None:
     """Make depths (rows, W) less than the range wrong, from a centimetre to the range.
 

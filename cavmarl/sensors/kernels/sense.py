@@ -64,10 +64,7 @@ def _soonness(time: float) -> float:
 
 @kernel
 def observe_ego(
-    roads: RoadArrays,
-    plans: NDArray[np.void],
-    row: np.void,
-    out: NDArray[np.float32],
+    roads: RoadArrays, plans: NDArray[np.void], row: np.void, out: NDArray[np.float32]
 ) -> None:
     """The vehicle itself, its lane and what its plan asks of it."""
     lane = roads.lanes[row["lane"]]

@@ -141,11 +141,7 @@ class DemandFile:
         ) or (self.device.chance > 0.0 and len(self.elements) > 0)
 
     def _said(
-        self,
-        field: str,
-        element: NDArray[np.void],
-        types: NDArray[np.int32],
-        default: float,
+        self, field: str, element: NDArray[np.void], types: NDArray[np.int32], default: float
     ) -> NDArray[np.float64]:
         """What vehicles (n,) say of their device, else their types, else the configuration."""
         said: NDArray[np.float64] = self.types[field][types].astype(np.float64)

@@ -8,10 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.math.rng import STREAM_DEMAND, fill_uniform
-from cavmarl.traffic.demand.demand_records import (
-    FLOW_PROBABILITY,
-    FLOW_REGULAR,
-)
+from cavmarl.traffic.demand.demand_records import FLOW_PROBABILITY, FLOW_REGULAR
 
 DRAW_TIME = STREAM_DEMAND
 DRAW_TYPE = STREAM_DEMAND + 1

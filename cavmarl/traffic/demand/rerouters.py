@@ -152,11 +152,7 @@ class _Reader:
         return np.array([not names or name in names for name in self._type_ids], dtype=np.bool_)
 
     def _interval(
-        self,
-        interval: Element,
-        edges: Sequence[int],
-        chance: float,
-        types: NDArray[np.bool_],
+        self, interval: Element, edges: Sequence[int], chance: float, types: NDArray[np.bool_]
     ) -> None:
         begin_ms = interval.time_ms("begin", 0)
         end_ms = interval.time_ms("end", MAX_TIME_MS)

@@ -127,10 +127,7 @@ class _Handler(ContentHandler):
 
 
 def _read(
-    path: Path,
-    report: DemandReport,
-    take: Callable[[Element], None],
-    including: tuple[Path, ...],
+    path: Path, report: DemandReport, take: Callable[[Element], None], including: tuple[Path, ...]
 ) -> None:
     if str(path) not in report.files:
         report.files.append(str(path))

@@ -38,9 +38,7 @@ from cavmarl.core.records.codes import (
 )
 from cavmarl.driving.kernels.motion import place_on_lane
 from cavmarl.driving.kernels.ways import own_step, way_left
-from cavmarl.traffic.kernels.entering import (
-    speed_at,
-)
+from cavmarl.traffic.kernels.entering import speed_at
 
 PLACE_TRIES = 24  # places tried for a vehicle at reset before it has to queue
 PLACE_GAP_M = 10.0  # m between bumpers of vehicles placed at reset

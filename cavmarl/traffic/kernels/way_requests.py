@@ -3,7 +3,7 @@
 A way that was found while the world runs is kept in a slot: room for one way's steps at the end of
 `Travel.steps`. Slots belong to a world; which of them are free is seen from its vehicles.
 
-How fast traffic is on every edge is sampled, smoothed, and put in the place of the limits, as SUMO's
+The speed on every edge is sampled, smoothed, and put in the place of the limits, as SUMO's
 rerouting device does it (Behrisch, Krajzewicz, Wang: "Comparing performance and quality of traffic
 assignment techniques for microscopic road traffic simulations", DTA 2008): the mean speed of an
 edge's vehicles, averaged over the last samples. Everything that is summed is whole millimetres a

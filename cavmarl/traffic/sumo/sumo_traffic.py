@@ -22,12 +22,7 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import CapacityError, SumoError
 from cavmarl.core.numba.repeated import repeated
 from cavmarl.core.records.arrays import Gate, RoadArrays, Travel, Worlds, Zoned
-from cavmarl.core.records.codes import (
-    COUNT_REROUTED,
-    LANE_GIVEN,
-    POS_GIVEN,
-    SPEED_MAX,
-)
+from cavmarl.core.records.codes import COUNT_REROUTED, LANE_GIVEN, POS_GIVEN, SPEED_MAX
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
 from cavmarl.traffic.kernels.mirroring import greet, list_others, mirror, send_on
 from cavmarl.traffic.sumo.route_book import RouteBook, StopBook

@@ -362,12 +362,7 @@ def exchange_messages(
 
 @kernel
 def hand_out(
-    receptions: NDArray[np.void],
-    tick: int,
-    latency: int,
-    mail: Mail,
-    w: int,
-    room: V2xScratch,
+    receptions: NDArray[np.void], tick: int, latency: int, mail: Mail, w: int, room: V2xScratch
 ) -> None:
     """Let receivers have what a network simulator says that they receive in this tick.
 

@@ -132,13 +132,7 @@ def _open(
 
 @kernel
 def _tell(
-    report: np.void,
-    row: np.void,
-    sender: int,
-    kind: int,
-    code: int,
-    tick: int,
-    expires: int,
+    report: np.void, row: np.void, sender: int, kind: int, code: int, tick: int, expires: int
 ) -> None:
     """Write what is said of a vehicle."""
     report["subject"] = row["id"]
