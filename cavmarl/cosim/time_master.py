@@ -63,8 +63,7 @@ class RealTime:
     `factor`: seconds of simulated time a second. `now`: the wall clock in seconds. `sleep`: waits
     so many seconds.
 
-    Raises:
-        ConfigError: a factor that is no number above 0.
+    Raises ConfigError: a factor that is no number above 0.
     """
 
     def __init__(
@@ -173,8 +172,7 @@ class TimeFollower:
     def tick(self) -> bool:
         """Try to advance the world; whether it has advanced.
 
-        Raises:
-            ClockError: the master refuses; see `TimeMaster`; it is no follower any more.
+        Raises ClockError: the master refuses; see `TimeMaster`; it is no follower any more.
         """
         self.master.check_follower(self)
         self.own_ticks += 1
@@ -288,8 +286,7 @@ class TimeMaster:
     def step(self, actions: Any) -> Any:
         """Advance the environment by one step; returns what its `step` returns.
 
-        Raises:
-            ClockError: a world is not where the last step has left it.
+        Raises ClockError: a world is not where the last step has left it.
         """
         with self._turn():
             return self.env.step(actions)
@@ -316,8 +313,7 @@ class TimeMaster:
     def _mine(self) -> _Worlds:
         """The worlds behind the guard.
 
-        Raises:
-            ClockError: they have been let go.
+        Raises ClockError: they have been let go.
         """
         if self.env.worlds is not self._mastered:
             raise ClockError("this master has been released: make another TimeMaster")
@@ -327,8 +323,7 @@ class TimeMaster:
     def check_turn(self, what: str) -> None:
         """Refuse a caller that is not the master.
 
-        Raises:
-            ClockError: `what` was called on the environment itself.
+        Raises ClockError: `what` was called on the environment itself.
         """
         if not self._is_turn:
             raise ClockError(
@@ -339,8 +334,7 @@ class TimeMaster:
     def check_follower(self, follower: TimeFollower) -> None:
         """Refuse a follower that does not follow any more.
 
-        Raises:
-            ClockError: it has left, or the master was released.
+        Raises ClockError: it has left, or the master was released.
         """
         if follower not in self._followers:
             raise ClockError(f"'{follower.name}' follows no more: join again (TimeMaster.follow)")
@@ -364,8 +358,7 @@ class TimeMaster:
     def look_for_drift(self) -> None:
         """Notice worlds that are not where the last step has left them.
 
-        Raises:
-            ClockError: there are some, and `on_drift` is `error`.
+        Raises ClockError: there are some, and `on_drift` is `error`.
         """
         found = self._mine().ticks()
         if (found == self._left).all():
@@ -387,8 +380,7 @@ class TimeMaster:
     def tick_for(self, follower: TimeFollower) -> bool:
         """A follower wants to tick by itself; whether the world has advanced.
 
-        Raises:
-            ClockError: `own_ticks` is `refuse`.
+        Raises ClockError: `own_ticks` is `refuse`.
         """
         self.own_ticks += 1
         self._keep(ClockEvent(self.tick, "own_tick", follower.name, self._per_step))

@@ -95,8 +95,7 @@ class MapReport:
 def check_map(source: str | Path | RoadNetwork) -> MapReport:
     """Gather statistics of a SUMO network and look for what makes it unfit.
 
-    Raises:
-        MapError: the network cannot be read at all; see `read_network`.
+    Raises MapError: the network cannot be read at all; see `read_network`.
     """
     network = source if isinstance(source, RoadNetwork) else load_network(source)
     cars = _Cars(network)

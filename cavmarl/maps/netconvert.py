@@ -52,8 +52,7 @@ class _Root(ContentHandler):
 def map_kind(path: Path) -> MapKind:
     """Read a map file to its end and tell its kind by its root element.
 
-    Raises:
-        MapError: the file cannot be read, is broken or hostile XML, or is no map.
+    Raises MapError: the file cannot be read, is broken or hostile XML, or is no map.
     """
     root = _Root()
     try:
@@ -203,8 +202,7 @@ def build_network(
 def map_file(path: str | Path) -> Path:
     """The SUMO network of any map file: the file itself, or what netconvert once made of it.
 
-    Raises:
-        MapError: see `build_network`.
+    Raises MapError: see `build_network`.
     """
     path = Path(path)
     if path.name.endswith((".net.xml", ".net.xml.gz")):
@@ -257,8 +255,7 @@ def _run(
 ) -> BuildLog:
     """Run netconvert.
 
-    Raises:
-        MapError: it fails or takes too long.
+    Raises MapError: it fails or takes too long.
     """
     home = Path(require("sumo", "sumo").SUMO_HOME)
     command = [str(home / "bin" / "netconvert"), _INPUT[kind], str(source), "-o", str(draft)]

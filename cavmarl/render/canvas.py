@@ -32,8 +32,7 @@ _QUIET = "PYGAME_HIDE_SUPPORT_PROMPT"
 def load_pygame() -> ModuleType:
     """Pygame without the greeting that it prints; no window is opened and the environment is kept.
 
-    Raises:
-        MissingExtraError: pygame-ce is not installed.
+    Raises MissingExtraError: pygame-ce is not installed.
     """
     before = os.environ.get(_QUIET)
     os.environ[_QUIET] = "1"

@@ -89,8 +89,7 @@ class TopDownRenderer:
     `focus`: (min_x, min_y, max_x, max_y) in metres to show; all roads by default. `goal_edges`:
     EDGE rows by `VEHICLE["goal"]`; given, each agent's destination is marked.
 
-    Raises:
-        MissingExtraError: pygame-ce is not installed.
+    Raises MissingExtraError: pygame-ce is not installed.
     """
 
     def __init__(

@@ -22,9 +22,8 @@ class VideoWriter:
 
     `path`: ends in `.mp4`.
 
-    Raises:
-        ConfigError: the path cannot be written, or is no `.mp4`.
-        MissingExtraError: imageio-ffmpeg is not installed.
+    Raises ConfigError: the path cannot be written, or is no `.mp4`; MissingExtraError:
+    imageio-ffmpeg is not installed.
     """
 
     def __init__(self, path: str | Path, fps: float) -> None:
@@ -61,9 +60,8 @@ class VideoWriter:
     def write(self, frame: NDArray[np.uint8]) -> None:
         """Append a frame, (height, width, 3).
 
-        Raises:
-            ConfigError: not uint8 (height, width, 3), another size than the first frame's, or the
-                file cannot be written.
+        Raises ConfigError: not uint8 (height, width, 3), another size than the first frame's, or
+        the file cannot be written.
         """
         if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
             raise ConfigError(

@@ -49,8 +49,7 @@ def zone_picture(
     `halo_m`: how far zones see over their borders; each is darker where another sees it. `title`:
     for the upper left corner.
 
-    Raises:
-        MissingExtraError: pygame-ce is not installed.
+    Raises MissingExtraError: pygame-ce is not installed.
     """
     size = suitable_size(partition.bounds)
     camera = Viewport.fit(partition.bounds, size, MARGIN_PX)

@@ -44,8 +44,7 @@ def make_plans(
     `goal_edges`: EDGE rows to plan for. `vehicle_class`: one of `VEHICLE_CLASSES`; lanes that
     forbid it are not used.
 
-    Returns:
-        PLAN (len(goal_edges), num_lanes), read-only.
+    Returns PLAN (len(goal_edges), num_lanes), read-only.
     """
     plans = np.zeros((len(goal_edges), len(network.lanes)), dtype=PLAN)
     permission = 1 << VEHICLE_CLASSES.index(vehicle_class)
@@ -58,8 +57,7 @@ def make_plans(
 def way(network: RoadNetwork, plan: NDArray[np.void], lane: int) -> list[int]:
     """The lanes from `lane` to the goal of one plan (L,), both included, with lane changes.
 
-    Raises:
-        RouteError: the goal cannot be reached from there.
+    Raises RouteError: the goal cannot be reached from there.
     """
     if not np.isfinite(plan[lane]["to_go"]):
         raise RouteError(

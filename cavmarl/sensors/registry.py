@@ -56,8 +56,7 @@ def sensor_names() -> tuple[str, ...]:
 def find_sensor(name: str) -> Sensor | MountedType:
     """The sensor of a name.
 
-    Raises:
-        ConfigError: there is none.
+    Raises ConfigError: there is none.
     """
     if name in _OBSERVED:
         return _OBSERVED[name]
@@ -108,8 +107,7 @@ def register_sensor(
 def type_of(name: str, config: MountedConfig) -> MountedType:
     """The class of a sensor.
 
-    Raises:
-        ConfigError: there is none of that type.
+    Raises ConfigError: there is none of that type.
     """
     try:
         return TYPES[type(config)]

@@ -233,8 +233,7 @@ class NativeTraffic:
     def demand(self) -> Demand:
         """The tables that departures are drawn from.
 
-        Raises:
-            ConfigError: no trip of the wanted length exists on this map.
+        Raises ConfigError: no trip of the wanted length exists on this map.
         """
         lanes = self.network.lanes
         edges = set(self._drivable_edges(MIN_ORIGIN_M))
@@ -266,8 +265,7 @@ class NativeTraffic:
     def draw_orders(self, gate: Gate, worlds: Worlds, chosen: NDArray[np.bool_]) -> Gate:
         """Draw what the demand file orders in the chosen worlds' (W,) new episodes.
 
-        Returns:
-            the gate, or a larger one if there are more orders than ever before.
+        Returns the gate, or a larger one if there are more orders than ever before.
         """
         if self.schedule is None:
             return gate
@@ -311,8 +309,7 @@ class NativeTraffic:
     def _check_room(self) -> None:
         """Refuse a population that cannot stand on the map, bumper to bumper.
 
-        Raises:
-            CapacityError: more vehicles than that.
+        Raises CapacityError: more vehicles than that.
         """
         lanes = self.network.lanes
         usable = ~lanes["internal"] & (lanes["permissions"] & PASSENGER != 0)

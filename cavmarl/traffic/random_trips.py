@@ -27,8 +27,7 @@ class RandomTrips:
 
     `seed`: of the draws; equal arguments give equal routes.
 
-    Raises:
-        RouteError: the map has no two such edges.
+    Raises RouteError: the map has no two such edges.
     """
 
     def __init__(self, network: RoadNetwork, seed: int) -> None:
@@ -86,9 +85,8 @@ def write_random_demand(
     `within_s`: the time from the first departure to just after the last. `route_m`: routes are at
     least as long. `seed`: equal arguments give equal bytes.
 
-    Raises:
-        ConfigError: a number out of range, or the file cannot be written.
-        RouteError: the map has no circuit.
+    Raises ConfigError: a number out of range, or the file cannot be written; RouteError: the map
+    has no circuit.
     """
     if not 1 <= vehicles <= MAX_VEHICLES:
         raise ConfigError(f"vehicles = {vehicles}: must be from 1 to {MAX_VEHICLES}")

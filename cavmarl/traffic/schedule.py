@@ -33,9 +33,7 @@ class Schedule:
     `demand`: of the files. `first_type`: VTYPE row of the file's first type in the world's table.
     `first_step`: PLAN row of the first route's first step in the world's table.
 
-    Raises:
-        RouteError: a trip without a way.
-        CapacityError: the routes have too many steps.
+    Raises RouteError: a trip without a way; CapacityError: the routes have too many steps.
     """
 
     def __init__(self, demand: DemandFile, first_type: int, first_step: int) -> None:

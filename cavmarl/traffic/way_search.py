@@ -75,8 +75,7 @@ def way_slots(
     `first_step`: how many PLAN rows come before. `capacity`: vehicles of one world. `horizon_s`:
     seconds an episode.
 
-    Raises:
-        CapacityError: they would take more than `MAX_STEPS`.
+    Raises CapacityError: they would take more than `MAX_STEPS`.
     """
     number = capacity
     if not len(schedule.demand.rerouters.rules):

@@ -95,8 +95,7 @@ class Bus:
     def connect(self, network: NetworkSimulator) -> None:
         """From now on let a network simulator decide receptions.
 
-        Raises:
-            ConfigError: the channel is one of our own.
+        Raises ConfigError: the channel is one of our own.
         """
         if not self._config.channel.external:
             raise ConfigError("the channel is our own: set v2x.channel.external to connect another")
@@ -173,8 +172,7 @@ class Bus:
     def receiver_of_unit(self, unit: int) -> int:
         """The row of `mail.objects[world]` and the like that are a roadside unit's.
 
-        Raises:
-            ConfigError: there is no such unit.
+        Raises ConfigError: there is no such unit.
         """
         if not 0 <= unit < len(self.units):
             raise ConfigError(f"roadside unit {unit}: there are {len(self.units)}")
@@ -183,8 +181,7 @@ class Bus:
     def declare_of_unit(self, world: int, unit: int, cause: str) -> None:
         """Let a roadside unit tell of an event in the next tick.
 
-        Raises:
-            ConfigError: there is no such unit, or no such cause.
+        Raises ConfigError: there is no such unit, or no such cause.
         """
         self.mail.declared[world, self.receiver_of_unit(unit)] = cause_code(cause)
 

@@ -19,8 +19,7 @@ def make_units(config: RoadsideConfig, network: RoadNetwork) -> NDArray[np.void]
 
     `config`: which signals.
 
-    Raises:
-        ConfigError: no signal of that name.
+    Raises ConfigError: no signal of that name.
     """
     known = network.signal_ids
     names = known if config.signals == (EVERY_SIGNAL,) else config.signals

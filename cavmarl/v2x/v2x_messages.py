@@ -150,8 +150,7 @@ _OWN_NAMES = {
 def cause_code(cause: str) -> int:
     """ETSI's code of a cause.
 
-    Raises:
-        ConfigError: no cause of that name.
+    Raises ConfigError: no cause of that name.
     """
     if cause not in CAUSES:
         raise ConfigError(f"cause = {cause!r}: there are {', '.join(CAUSES)}")
@@ -163,8 +162,7 @@ def messages_of(kind: int, reports: NDArray[np.void]) -> NDArray[np.void]:
 
     `reports`: REPORT (n,) of that kind; places where none is (sender -1) are left out.
 
-    Returns:
-        CAM, DENM, CPM_OBJECT or SPAT (n,).
+    Returns CAM, DENM, CPM_OBJECT or SPAT (n,).
     """
     there = reports[(reports["sender"] >= 0) & (reports["kind"] == kind)]
     found = np.zeros(len(there), KINDS[kind])
@@ -189,8 +187,7 @@ def encode(packet: np.void, reports: NDArray[np.void]) -> bytes:
 def decode(data: bytes) -> tuple[np.void, NDArray[np.void]]:
     """Header and records of a packet.
 
-    Raises:
-        MessageError: of another version, of an unknown kind, or of the wrong length.
+    Raises MessageError: of another version, of an unknown kind, or of the wrong length.
     """
     if len(data) < HEADER.itemsize:
         raise MessageError(f"{len(data)} bytes are no message: a header has {HEADER.itemsize}")
@@ -238,8 +235,7 @@ class NetworkSimulator(Protocol):
         A tick that is begun again, because a host has died, is asked for again with the same
         packets, and must be answered alike.
 
-        Returns:
-            RECEPTION (n,): what is received now, of this tick's packets or of earlier ones.
+        Returns RECEPTION (n,): what is received now, of this tick's packets or of earlier ones.
         """
         ...
 

@@ -115,8 +115,7 @@ class FollowedWorld:
     def wait_for(self, followers: int, within_s: float) -> None:
         """Wait until so many follow.
 
-        Raises:
-            FollowerLostError: they have not come in time.
+        Raises FollowerLostError: they have not come in time.
         """
         until_s = time.monotonic() + within_s
         while len(self._seats) < followers:
@@ -132,8 +131,7 @@ class FollowedWorld:
     def reset(self, seed: int | None = None) -> None:
         """Begin an episode, and let followers see it.
 
-        Raises:
-            FollowerError: see `step`.
+        Raises FollowerError: see `step`.
         """
         self._admit(0.0)
         self.master.reset(seed)
@@ -216,8 +214,7 @@ class FollowedWorld:
     def _indices(self, vehicles: Sequence[str]) -> tuple[int, ...]:
         """The agents that a newcomer wants.
 
-        Raises:
-            FollowerError: there are none of that name, or somebody else drives them.
+        Raises FollowerError: there are none of that name, or somebody else drives them.
         """
         known = {agent: k for k, agent in enumerate(self.env.possible_agents)}
         taken = {k: seat.clock.name for seat in self._seats for k in seat.agents}
@@ -252,9 +249,8 @@ class FollowedWorld:
     def _exchange(self, seats: Sequence[FollowerSeat]) -> None:
         """Let followers see the world as it is, and queue what they do.
 
-        Raises:
-            FollowerError: of the first one, in their order, with which it cannot go on; what the
-                others do is queued all the same.
+        Raises FollowerError: of the first one, in their order, with which it cannot go on; what the
+        others do is queued all the same.
         """
         if self._episode < 0 or not seats:
             return

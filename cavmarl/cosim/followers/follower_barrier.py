@@ -128,8 +128,7 @@ class Barrier:
     ) -> bool:
         """One frame of a follower; whether it is done.
 
-        Raises:
-            FollowerError: the world cannot go on with it.
+        Raises FollowerError: the world cannot go on with it.
         """
         # What has arrived in time is read even if that was just before the end.
         within_s = max(within_s, 1e-3)
@@ -172,8 +171,7 @@ class Barrier:
     ) -> dict[str, Any]:
         """The actions of a follower's vehicles.
 
-        Raises:
-            FollowerError: they cannot be carried out, and `bad_controls` is `error`.
+        Raises FollowerError: they cannot be carried out, and `bad_controls` is `error`.
         """
         strangers = controls.keys() - set(vehicles)
         if strangers:
@@ -199,8 +197,7 @@ class Barrier:
 def _action(vehicle: str, controls: Mapping[str, Any]) -> Any:
     """One vehicle's action.
 
-    Raises:
-        FollowerError: there is none.
+    Raises FollowerError: there is none.
     """
     if vehicle not in controls:
         raise FollowerError(f"no controls of {vehicle}, which is in the frame")

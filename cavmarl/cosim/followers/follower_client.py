@@ -94,10 +94,8 @@ class Follower:
     def __iter__(self) -> Iterator[FollowerView]:
         """Snapshots, until the world says goodbye; each but those of an end has to be answered.
 
-        Raises:
-            FollowerLostError: the world has ended without a goodbye.
-            FollowerError: what it says cannot be understood, or a frame is missing; it does not go
-                on with us.
+        Raises FollowerLostError: the world has ended without a goodbye; FollowerError: what it says
+        cannot be understood, or a frame is missing; it does not go on with us.
         """
         while (sight := self.wait()) is not None:
             yield sight
@@ -105,8 +103,7 @@ class Follower:
     def wait(self) -> FollowerView | None:
         """The next snapshot, however long it takes; None: the world has said goodbye.
 
-        Raises:
-            FollowerError: as of `__iter__`.
+        Raises FollowerError: as of `__iter__`.
         """
         heard = self._expect(None, Say.SNAPSHOT, Say.GOODBYE)
         if heard.kind is Say.GOODBYE:
@@ -135,8 +132,7 @@ class Follower:
     def tick(self) -> Ticked:
         """Try to advance the world, which a follower should not do; what has become of it.
 
-        Raises:
-            ClockError: the world's master refuses.
+        Raises ClockError: the world's master refuses.
         """
         self._line.say(Say.TICK)
         ticked = read_letter(Ticked, self._expect(None, Say.TICKED).letter)

@@ -123,9 +123,8 @@ class FollowerConnection:
     def hear(self, within_s: float | None = None) -> ReceivedFrame:
         """The next frame; its data then have to be taken (`take`) or left out (`skip`).
 
-        Raises:
-            FollowerLostError: there is none in time; the other end is gone.
-            FollowerError: this is no frame, or one of another version.
+        Raises FollowerLostError: there is none in time; the other end is gone; FollowerError: this
+        is no frame, or one of another version.
         """
         self._allow(within_s)
         try:
@@ -141,8 +140,7 @@ class FollowerConnection:
     def skip(self, heard: ReceivedFrame) -> None:
         """Leave out the data of what was heard.
 
-        Raises:
-            FollowerError: as of `hear`; and there are some, where none belong.
+        Raises FollowerError: as of `hear`; and there are some, where none belong.
         """
         if heard.size:
             raise FollowerError(
@@ -153,8 +151,7 @@ class FollowerConnection:
     def take(self, heard: ReceivedFrame) -> tuple[FollowerSnapshot, list[Array]]:
         """The snapshot that was heard, with its arrays.
 
-        Raises:
-            FollowerError: as of `hear`.
+        Raises FollowerError: as of `hear`.
         """
         snapshot = read_letter(FollowerSnapshot, heard.letter)
         sizes = [_size(view) for view in snapshot.arrays]
@@ -197,9 +194,8 @@ class FollowerConnection:
 def _size(view: ArrayView) -> int:
     """Bytes of an array.
 
-    Raises:
-        FollowerError: of a dtype that holds no plain numbers, a shape that no array has, or
-            stamps of other samples.
+    Raises FollowerError: of a dtype that holds no plain numbers, a shape that no array has, or
+    stamps of other samples.
     """
     shape, name = view.shape, view.name[:80]
     if view.dtype not in _DTYPES:
@@ -250,9 +246,7 @@ def listen(address: Address) -> socket.socket:
 def call(address: Address, within_s: float) -> FollowerConnection:
     """Connect to a world that listens at an address.
 
-    Raises:
-        FollowerLostError: no process listens there.
-        ConfigError: a path that no socket can have.
+    Raises FollowerLostError: no process listens there; ConfigError: a path that no socket can have.
     """
     family = socket.AF_INET if isinstance(address, int) else socket.AF_UNIX
     place = (LOOPBACK, address) if isinstance(address, int) else str(_path_of(address))

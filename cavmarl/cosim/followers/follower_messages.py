@@ -182,8 +182,7 @@ def letter_of(message: Any) -> dict[str, Any]:
 def read_letter(kind: type[T], letter: object) -> T:
     """The message of a class that a letter is.
 
-    Raises:
-        FollowerError: it is none: a field is missing, unknown or of another type.
+    Raises FollowerError: it is none: a field is missing, unknown or of another type.
     """
     if kind not in _ADAPTERS:
         _ADAPTERS[kind] = TypeAdapter(kind)

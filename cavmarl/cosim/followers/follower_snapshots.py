@@ -65,8 +65,7 @@ def take_snapshot(
 
     `env`: the world or worlds. `agents`: indices of the follower's. `moment`: when that is.
 
-    Returns:
-        the message, and its arrays.
+    Returns the message, and its arrays.
     """
     worlds = env.worlds.arrays
     due = [k for k in agents if worlds.mask[world, k] and not moment.is_over]

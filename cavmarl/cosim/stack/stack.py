@@ -258,9 +258,8 @@ def vehicle_of(hd_map: HdMap, sensors: Sequence[StackSensor], tick_s: float) -> 
 
     `sensors`: that are mounted.
 
-    Raises:
-        MissingExtraError: the map is projected, and pyproj is not installed.
-        MapError: its projection is unknown.
+    Raises MissingExtraError: the map is projected, and pyproj is not installed; MapError: its
+    projection is unknown.
     """
     gnss = [sensor for sensor in sensors if sensor.type == "gnss"]
     geodesy = None

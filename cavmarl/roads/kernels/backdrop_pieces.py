@@ -54,8 +54,7 @@ def gather_walls(
     `walls`: WALL (num_walls,) in the frame of the map. `reach_m`: walls that are farther away are
     left out. `out`: WALL (num_walls,), overwritten up to the returned number.
 
-    Returns:
-        how many there are.
+    Returns how many there are.
     """
     cos = math.cos(ego["heading"])
     sin = math.sin(ego["heading"])

@@ -147,8 +147,7 @@ def trace_edges(
 
     `plan`: PLAN (L,) of one goal. `out`: room for the EDGE rows, the first one included.
 
-    Returns:
-        how many edges, 0 where the plan has no way, -1 where `out` is too short.
+    Returns how many edges, 0 where the plan has no way, -1 where `out` is too short.
     """
     edge = roads.edges[first_edge]
     lane = -1
@@ -170,8 +169,7 @@ def follow_plan(
     `plan`: PLAN (L,) of one goal, with a way from that lane. `lane`: LANE row outside junctions.
     `out`: room for the EDGE rows, that of the lane included.
 
-    Returns:
-        how many edges, -1 where `out` is too short.
+    Returns how many edges, -1 where `out` is too short.
     """
     out[0] = roads.lanes[lane]["edge"]
     found = 1

@@ -71,9 +71,8 @@ def overlap(path: LinkPath, foe: LinkPath, *, merging: bool) -> Overlap | None:
     `path`: the path of one link. `foe`: the path of the other. `merging`: both lead into the same
     lane, so the shared area lasts to the end of both.
 
-    Returns:
-        The hull of all stretches with less than `NEAR_M` between the centre lines; `TOUCH_M` around
-        the closest points where no stretch is that near.
+    Returns the hull of all stretches with less than `NEAR_M` between the centre lines; `TOUCH_M`
+    around the closest points where no stretch is that near.
     """
     plane = path.xyz[:, None, :2] - foe.xyz[None, :, :2]
     square = plane[..., 0] * plane[..., 0] + plane[..., 1] * plane[..., 1]

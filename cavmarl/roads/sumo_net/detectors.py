@@ -47,11 +47,8 @@ def place_detectors(
 
     `rows`: the detectors of each phase are written. `first_row`: the number of the first detector.
 
-    Returns:
-        DETECTOR (D,) and phase_detectors, beginning with the ones that `rows` already counts.
-
-    Raises:
-        MapError: a parameter of a program is no number, or names a detector of its own.
+    Returns DETECTOR (D,) and phase_detectors, beginning with the ones that `rows` already counts.
+    Raises MapError: a parameter of a program is no number, or names a detector of its own.
     """
     detectors: list[tuple[int, float, float]] = []
     for row, program in rows.specs.items():

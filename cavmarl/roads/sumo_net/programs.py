@@ -95,8 +95,7 @@ class ProgramReader:
     def start(self, name: str, attrs: Mapping[str, str], line: int) -> None:
         """Take an element in; others than those of signals are passed over.
 
-        Raises:
-            MapError: an attribute is missing or no number, or it stands in the wrong place.
+        Raises MapError: an attribute is missing or no number, or it stands in the wrong place.
         """
         place = f"{self._path}, line {line}: <{name}>"
         if missing := [key for key in _REQUIRED.get(name, ()) if key not in attrs]:
@@ -134,8 +133,7 @@ class ProgramReader:
 def read_programs(path: Path) -> ProgramReader:
     """Read the signal programs and timetables of an additional file (`.add.xml`, also gzipped).
 
-    Raises:
-        MapError: hostile or broken XML, or an element that `ProgramReader.start` refuses.
+    Raises MapError: hostile or broken XML, or an element that `ProgramReader.start` refuses.
     """
     handler = _AdditionalHandler(path)
     read_xml(path, handler)

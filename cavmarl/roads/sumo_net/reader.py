@@ -43,8 +43,7 @@ def map_name(path: Path) -> str:
 def source_hash(path: Path) -> str:
     """SHA-256 of a file, hex.
 
-    Raises:
-        MapError: the file cannot be read.
+    Raises MapError: the file cannot be read.
     """
     try:
         with path.open("rb") as stream:
@@ -58,8 +57,7 @@ def read_network(path: str | Path) -> RoadNetwork:
 
     Lane lengths are those of the polylines; EDGE["length_m"] is the length that the map states.
 
-    Raises:
-        MapError: the file is broken, hostile or inconsistent, or nothing in it can be driven.
+    Raises MapError: the file is broken, hostile or inconsistent, or nothing in it can be driven.
     """
     # sumolib is only loaded where the cache has no network yet.
     from cavmarl.roads.sumo_net.sumo_xml import parse_net

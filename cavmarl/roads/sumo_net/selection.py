@@ -51,8 +51,7 @@ def select(net: Any) -> NetworkSelection:
     Pure pavements, crossings, walking areas, rails and bicycle lanes are left out, and so are
     internal lanes that no movement uses.
 
-    Raises:
-        MapError: an internal lane belongs to two movements or leads nowhere.
+    Raises MapError: an internal lane belongs to two movements or leads nowhere.
     """
     chosen = NetworkSelection()
     for edge in net.getEdges(withInternal=False):

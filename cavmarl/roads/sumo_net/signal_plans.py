@@ -29,11 +29,8 @@ def with_programs(
     `files`: additional files in loading order; elements other than signals' are passed over.
     `chosen`: program by signal.
 
-    Returns:
-        A network with another `source_hash`, for it has more than one source.
-
-    Raises:
-        MapError: a broken file, an unknown signal or program, a program that does not fit.
+    Returns A network with another `source_hash`, for it has more than one source. Raises MapError:
+    a broken file, an unknown signal or program, a program that does not fit.
     """
     chosen = chosen or {}
     if not files and not chosen:
@@ -64,11 +61,7 @@ def with_outages(network: RoadNetwork, outages: Mapping[str, float]) -> RoadNetw
 
     `outages`: when each goes dark, in s since the beginning of the episode, by signal.
 
-    Returns:
-        A network with another `source_hash`.
-
-    Raises:
-        MapError: an unknown signal.
+    Returns A network with another `source_hash`. Raises MapError: an unknown signal.
     """
     rows = SignalRows.of(network)
     sources = [network.source_hash]

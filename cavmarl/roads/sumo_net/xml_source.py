@@ -94,8 +94,7 @@ def _check_encoding(path: Path, stream: io.BufferedIOBase, failure: type[Cavmarl
 def read_bytes(path: Path) -> bytes:
     """The XML text of a plain or gzipped file.
 
-    Raises:
-        OSError: the file cannot be read.
+    Raises OSError: the file cannot be read.
     """
     content = path.read_bytes()
     return gzip.decompress(content) if content.startswith(_GZIP_MAGIC) else content

@@ -189,8 +189,7 @@ def find_faces(camera: CameraPose, panorama: Panorama, counts: Counts, picture: 
     `panorama`: what stands around the vehicle, prisms ordered by id. `picture`: its faces are
     overwritten.
 
-    Returns:
-        how many there are.
+    Returns how many there are.
     """
     num = 0
     if camera.mount[2, 3] > 0.0:

@@ -128,8 +128,7 @@ def nearest_points(x: float, y: float, z: float, sensor: RoadgraphSensor) -> int
     `z`: m; points more than `LEVEL_HEIGHT_M` above or below are not seen. `sensor`: settings,
     points and room.
 
-    Returns:
-        how many were found, at most `sensor.num_points`.
+    Returns how many were found, at most `sensor.num_points`.
     """
     points = sensor.sorted_point
     squares = sensor.sorted_squared

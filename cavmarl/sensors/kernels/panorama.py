@@ -113,8 +113,7 @@ def _gather_prisms(
     type of vehicle. `reach_m`: bodies that are farther away in the plane are left out. `out`: PRISM
     (C,), overwritten up to the returned number.
 
-    Returns:
-        how many there are.
+    Returns how many there are.
     """
     ego = rows[row]
     axes = (

@@ -65,8 +65,7 @@ def call_due(
 
     `ticks`: (W,) since each world's reset.
 
-    Returns:
-        whether anything is.
+    Returns whether anything is.
     """
     found = False
     for w in range(ticks.size):

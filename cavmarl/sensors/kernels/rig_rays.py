@@ -83,8 +83,7 @@ def detect(
     `fan`: of one channel. `hits`: HIT (A, 1), from `cast`. `targets`: TARGET (A,), overwritten up
     to the returned number, in no order. `order`: (A,) likewise: which target is the next nearest.
 
-    Returns:
-        how many there are.
+    Returns how many there are.
     """
     found = 0
     for a in range(hits.shape[0]):

@@ -28,8 +28,7 @@ def make_backdrop(network: RoadNetwork, types: NDArray[np.void]) -> Backdrop:
 
     `types`: VTYPE (num_types,) of the vehicles that can be seen.
 
-    Raises:
-        ConfigError: a class of vehicles that has no semantic class.
+    Raises ConfigError: a class of vehicles that has no semantic class.
     """
     strips, lined = lane_strips(network)
     walls, roofs = network.walls, network.roofs
@@ -77,9 +76,8 @@ def _index(corners: NDArray[np.float64]) -> tuple[Grid, NDArray[np.intp]]:
 def lane_strips(network: RoadNetwork) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The lanes of a map in convex pieces.
 
-    Returns:
-        (n, 4, 2) corners in m: right and left at the start, left and right at the end; pieces of
-        one lane share corners. (n,) 1 where the sides are lane lines, 0 inside junctions.
+    Returns (n, 4, 2) corners in m: right and left at the start, left and right at the end; pieces
+    of one lane share corners. (n,) 1 where the sides are lane lines, 0 inside junctions.
     """
     lanes, points = network.lanes, network.points
     of = np.repeat(np.arange(len(lanes)), lanes["num_points"])

@@ -41,9 +41,8 @@ class Geodesy(Protocol):
 def geodesy_of(network: RoadNetwork, config: GnssConfig) -> Geodesy:
     """Where a map lies: as it says itself, else where the sensor's settings put it.
 
-    Raises:
-        MissingExtraError: the map is projected, and pyproj is not installed.
-        MapError: PROJ does not know the projection.
+    Raises MissingExtraError: the map is projected, and pyproj is not installed; MapError: PROJ does
+    not know the projection.
     """
     if network.geo is not None:
         return ProjectedMap(network.geo, config.origin_height_m)

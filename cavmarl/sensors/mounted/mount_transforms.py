@@ -42,8 +42,7 @@ def check_place(name: str, config: MountedConfig, body: np.void) -> None:
 
     `body`: VTYPE of agents' vehicles.
 
-    Raises:
-        ConfigError: with the nearest place on the body.
+    Raises ConfigError: with the nearest place on the body.
     """
     half_m, half_width_m, height_m = 0.5 * body["length"], 0.5 * body["width"], body["height"]
     for key, low, high in (

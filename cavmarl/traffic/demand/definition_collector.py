@@ -75,8 +75,7 @@ def flow_timing(element: Element, horizon_ms: int) -> Timing:
 
     `horizon_ms`: end of the simulation, where the flow names none; -1: a day after its begin.
 
-    Raises:
-        DemandError: no rate or too many, a rate that is not positive, an end before the begin.
+    Raises DemandError: no rate or too many, a rate that is not positive, an end before the begin.
     """
     rates = [key for key in _RATES if key in element.attrs]
     if len(rates) > 1:
@@ -165,9 +164,8 @@ class DefinitionCollector:
     def take(self, element: Element) -> None:
         """Keep one definition.
 
-        Raises:
-            DemandError: an attribute is missing or wrong, an id occurs twice.
-            CapacityError: more departures than the cap.
+        Raises DemandError: an attribute is missing or wrong, an id occurs twice; CapacityError:
+        more departures than the cap.
         """
         if element.name in ("vehicle", "trip", "flow"):
             self._take_vehicles(element)

@@ -103,8 +103,7 @@ class DemandFile:
         `key`: of the world and episode, see `kernels.rng.world_key`. `until_s`: no vehicle departs
         at or after this time; the end of the files' simulation if None.
 
-        Returns:
-            ORDER (n,), sorted by departure, at one time in the order of the files.
+        Returns ORDER (n,), sorted by departure, at one time in the order of the files.
         """
         end_ms = self.end_ms if until_s is None else min(self.end_ms, round(until_s * 1000.0))
         rows, numbers, times = departures_ms(self.elements, key, self.begin_ms, end_ms)

@@ -207,8 +207,7 @@ def listed(source: Element, key: str) -> list[tuple[str, float | None]]:
 
     `key`: "vTypes" or "routes".
 
-    Returns:
-        Pairs of name and weight; None where `probabilities` says nothing.
+    Returns pairs of name and weight; None where `probabilities` says nothing.
     """
     names = source.attrs.get(key, "").split()
     texts = source.attrs.get("probabilities", "").split()
@@ -226,8 +225,7 @@ def listed(source: Element, key: str) -> list[tuple[str, float | None]]:
 def weighted(source: Element, found: Sequence[tuple[int, float]]) -> Options:
     """What is found to choose from, without what is never chosen.
 
-    Raises:
-        DemandError: nothing is left.
+    Raises DemandError: nothing is left.
     """
     kept = [(row, weight) for row, weight in found if weight > 0.0]
     if not kept:

@@ -35,8 +35,7 @@ def departures_ms(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """When vehicles of elements depart within [begin_ms, end_ms).
 
-    Returns:
-        Three arrays (n,): ELEMENT row, number of the vehicle in its flow, time in milliseconds.
+    Returns three arrays (n,): ELEMENT row, number of the vehicle in its flow, time in milliseconds.
     """
     regular = _regular(elements, begin_ms, end_ms)
     parts = [regular]

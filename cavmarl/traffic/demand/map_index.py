@@ -58,8 +58,7 @@ class MapIndex:
     def edge(self, name: str, element: Element) -> int:
         """The EDGE row of an id.
 
-        Raises:
-            DemandError: the map has no such edge.
+        Raises DemandError: the map has no such edge.
         """
         row = self.edge_row.get(name, -1)
         if row < 0:
@@ -90,8 +89,7 @@ class MapIndex:
     def lane(self, name: str, element: Element) -> int:
         """The LANE row of an id.
 
-        Raises:
-            DemandError: the map has no such lane.
+        Raises DemandError: the map has no such lane.
         """
         row = self.lane_row.get(name, -1)
         if row < 0 or name.startswith(":"):

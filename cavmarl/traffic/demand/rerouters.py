@@ -83,9 +83,8 @@ def read_rerouters(
     `type_ids`: names by VTYPE row. `known_types`: names of all types, those that drive on no road
     included.
 
-    Raises:
-        DemandError: edges, routes, types, times or chances that cannot be.
-        CapacityError: more than `MAX_INTERVALS` intervals, or `MAX_RULES` times edges.
+    Raises DemandError: edges, routes, types, times or chances that cannot be; CapacityError: more
+    than `MAX_INTERVALS` intervals, or `MAX_RULES` times edges.
     """
     reader = _Reader(index, routes, type_ids, known_types, report)
     for element in elements:

@@ -44,8 +44,7 @@ class DeviceOptions(NamedTuple):
     def of(cls, options: Mapping[str, Element]) -> DeviceOptions:
         """From the options of a configuration, each an element with a `value`.
 
-        Raises:
-            DemandError: values that cannot be, or an average that is not kept here.
+        Raises DemandError: values that cannot be, or an average that is not kept here.
         """
         own = {
             key.removeprefix(_PREFIX): element.saying(**{key: element.attrs["value"]})

@@ -55,8 +55,7 @@ class StopReader:
         `stops`: the <stop> elements in the order of the file. `edges`: EDGE rows of the route.
         `exact`: whether the route is those edges, or a way between them.
 
-        Raises:
-            DemandError: a stop is not on the route after the one before it.
+        Raises DemandError: a stop is not on the route after the one before it.
         """
         found: list[Stop] = []
         at, end = 0, -1.0

@@ -59,8 +59,7 @@ class _Handler(ContentHandler):
 def read_sumo_config(path: Path) -> SumoConfigFile:
     """Read a `.sumocfg`.
 
-    Raises:
-        DemandError: it is missing, is no SUMO configuration, or holds times that are none.
+    Raises DemandError: it is missing, is no SUMO configuration, or holds times that are none.
     """
     handler = _Handler(path)
     read_xml(path, handler, DemandError)

@@ -66,8 +66,7 @@ def vehicle_class(element: Element) -> str:
 def vtype_record(element: Element, report: DemandReport) -> NDArray[np.void] | None:
     """One VTYPE () from a <vType>; None for a class that drives on no road.
 
-    Raises:
-        DemandError: a vehicle of that type cannot exist.
+    Raises DemandError: a vehicle of that type cannot exist.
     """
     attrs = dict(element.attrs)
     for child in element.children:
@@ -185,8 +184,7 @@ class TypeTable:
 
         `name`: of a type or a distribution. `user`: the element that names it.
 
-        Raises:
-            DemandError: there is neither, or nothing to choose from.
+        Raises DemandError: there is neither, or nothing to choose from.
         """
         if name in self._distributions:
             return self._distribution(self._distributions[name])

@@ -142,7 +142,6 @@ def read_elements(path: Path, report: DemandReport, take: Callable[[Element], No
     `path`: of a plain or gzipped file. `report`: where files, elements and what is skipped are
     counted. `take`: gets each <vType>, <route>, <vehicle>, … with its children, when it has ended.
 
-    Raises:
-        DemandError: the file is missing, is no XML, or has another root.
+    Raises DemandError: the file is missing, is no XML, or has another root.
     """
     _read(path, report, take, ())

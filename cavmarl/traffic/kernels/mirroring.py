@@ -51,8 +51,7 @@ def mirror(
     `seen`: SEEN (n,) by rising numbers, with paths in the place of routes. `zoned`: the owned rows
     of `side` are written; those that SUMO has no more have arrived. `side`: 0 or 1.
 
-    Returns:
-        how many have arrived.
+    Returns how many have arrived.
     """
     gone = 0
     for zone in range(zoned.num_owned.shape[0]):
@@ -151,8 +150,7 @@ def send_on(
     `numbers`: (n,) VEHICLE["order"] of the vehicles meant, rising. `chosen`: (n,) their new paths.
     `zoned`: the owned rows of `side` are written. `side`: 0 or 1.
 
-    Returns:
-        how many have taken it.
+    Returns how many have taken it.
     """
     taken = 0
     for zone in range(zoned.num_owned.shape[0]):

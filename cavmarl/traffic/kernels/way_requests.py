@@ -45,8 +45,7 @@ def find_asking(
     `has_rules`: (num_edges,) where rerouters stand. `looks`: LOOK, by VEHICLE["order"]; edges
     without rerouters are noted as seen. `asking`: room for their rows.
 
-    Returns:
-        how many.
+    Returns how many.
     """
     found = 0
     for i in range(num):
@@ -204,8 +203,7 @@ def take_slot(
     the steps; those of the vehicle's edge come first. `first_slot`: PLAN row of the world's first
     slot. `used`: (num_slots,) which are taken, written.
 
-    Returns:
-        whether there was a slot.
+    Returns whether there was a slot.
     """
     slot = slot_of(roads, row, first_slot, slot_steps)
     if slot < 0:

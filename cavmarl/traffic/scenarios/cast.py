@@ -35,8 +35,7 @@ def take_seats(streets: Streets, scene: Scene, num: int) -> list[Seat]:
     The others come after it on its own approach, with the same speed and the same goal, on lanes
     outside junctions along which no actor rides: actors react to no vehicle.
 
-    Raises:
-        ConfigError: there is no room for so many behind the first.
+    Raises ConfigError: there is no room for so many behind the first.
     """
     rides = [act for actor in scene.actors for act in actor.acts if isinstance(act, Ride)]
     closed = {lane for ride in rides for lane in ride.lanes}
@@ -91,8 +90,7 @@ class Cast:
         `goals`: row of the plans' table by EDGE. `first_type`: how many types of vehicles there are
         without the actors'. `num_agents`: of a world.
 
-        Raises:
-            ConfigError: the scene has no room for so many agents.
+        Raises ConfigError: the scene has no room for so many agents.
         """
         seats = take_seats(Streets(network), scene, num_agents)
         scripts, firsts = compile_scripts(network, scene.actors, scene.cues, goals, dt)

@@ -33,8 +33,7 @@ def checked(parameters: type[T], given: Mapping[str, bool | float], scenario: st
 
     `parameters`: a dataclass of `setting`s and `switch`es. `given`: value by name.
 
-    Raises:
-        ConfigError: a name that it does not have, or a value out of range.
+    Raises ConfigError: a name that it does not have, or a value out of range.
     """
     kind: Any = parameters
     known = {f.name: f for f in fields(kind)}

@@ -74,8 +74,7 @@ class RouteBook:
     ) -> NDArray[np.int32]:
         """The paths (n,) of vehicles of VTYPE rows (n,) on routes (n,).
 
-        Raises:
-            CapacityError: there is no room for more.
+        Raises CapacityError: there is no room for more.
         """
         pages, classes = self._worlds[w], len(self._masks)
         pairs = routes.astype(np.int64) * classes + self._class_of_type[vtypes]
@@ -208,8 +207,7 @@ class StopBook:
 
         `stops`: `Told` of each, in the order in which it reaches them.
 
-        Raises:
-            CapacityError: there is no room for more.
+        Raises CapacityError: there is no room for more.
         """
         if not stops:
             return NO_STOPS

@@ -65,9 +65,8 @@ def read_sumo_demand(
     `config`: the environment; its `traffic.source` is one of SUMO's. `map_file`: the same, as SUMO
     reads them. `files`: one `.sumocfg`, or files of routes and additional files.
 
-    Raises:
-        DemandError: SUMO refuses them on this map, with its words; or its signals are others.
-        MissingExtraError: SUMO is not installed.
+    Raises DemandError: SUMO refuses them on this map, with its words; or its signals are others;
+    MissingExtraError: SUMO is not installed.
     """
     given = read_input(files)
     interface = choose_interface(config.sumo.interface)

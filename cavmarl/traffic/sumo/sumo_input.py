@@ -193,9 +193,8 @@ def command_words(
 def free_libsumo() -> object:
     """This process's libsumo, in which nothing runs.
 
-    Raises:
-        MissingExtraError: it is not installed.
-        SumoError: a simulation runs in it: a second start would silently replace it.
+    Raises MissingExtraError: it is not installed; SumoError: a simulation runs in it: a second
+    start would silently replace it.
     """
     libsumo = require("libsumo", "sumo")
     if libsumo.isLoaded():

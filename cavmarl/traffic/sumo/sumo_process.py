@@ -41,8 +41,7 @@ class SumoAnswer(NamedTuple):
 def choose_interface(wanted: str) -> str:
     """`libsumo`, or `traci` where that is not installed, unless one is asked for.
 
-    Raises:
-        MissingExtraError: neither is there, or not the one that is wanted.
+    Raises MissingExtraError: neither is there, or not the one that is wanted.
     """
     choices = ("libsumo", "traci") if wanted == "auto" else (wanted,)
     for name in choices:
@@ -94,9 +93,7 @@ class SumoProcess:
     def look_up(self, words: list[str]) -> dict[str, Any]:
         """Begin with a command line, and say what its files have.
 
-        Raises:
-            ConfigError: SUMO refuses them.
-            SumoError: the process has ended.
+        Raises ConfigError: SUMO refuses them; SumoError: the process has ended.
         """
         self._send(child.LOOK_UP, {"words": words})
         return self._receive().line

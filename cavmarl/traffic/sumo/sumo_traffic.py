@@ -67,8 +67,7 @@ class ShownSignals:
 
         `letters`: of all signals, one after the other. `phase`: (num_signals,) is written.
 
-        Raises:
-            SumoError: a signal shows what no program of the map's has.
+        Raises SumoError: a signal shows what no program of the map's has.
         """
         codes, last = np.frombuffer(letters, dtype=np.uint8), self._last[w]
         if last is None:
@@ -152,8 +151,7 @@ class SumoTraffic:
     def catch_up(self, worlds: Worlds) -> None:
         """Bring SUMO to the worlds' ticks, from the beginning of their episodes.
 
-        Raises:
-            SumoError: SUMO has been told where ours are, and that is not on record.
+        Raises SumoError: SUMO has been told where ours are, and that is not on record.
         """
         for w, (key, tick) in enumerate(zip(worlds.keys, worlds.ticks.tolist(), strict=True)):
             told: Iterable[NDArray[np.void]] = repeat(np.zeros(0, dtype=MOVED), tick)
@@ -174,8 +172,7 @@ class SumoTraffic:
     def mirror(self, worlds: Worlds, side: int) -> int:
         """Bring SUMO's vehicles to where they are after its step; arguments as of `step`.
 
-        Returns:
-            how many vehicles leave, in all worlds.
+        Returns how many vehicles leave, in all worlds.
         """
         return sum(
             self._mirror(
@@ -201,8 +198,7 @@ class SumoTraffic:
     def let_in(self, gate: Gate, worlds: Worlds) -> bool:
         """Fill `gate.passing` with the vehicles that SUMO has let in; whether there are any.
 
-        Raises:
-            CapacityError: more than there is room for.
+        Raises CapacityError: more than there is room for.
         """
         for w in range(len(worlds.ticks)):
             now = self.worlds.at(w)
@@ -228,8 +224,7 @@ class SumoTraffic:
     def order(self, gate: Gate, worlds: Worlds) -> None:
         """Put the vehicles that SUMO has let in at the end of the queue, with routes of theirs.
 
-        Raises:
-            CapacityError: more wait than there is room for.
+        Raises CapacityError: more wait than there is room for.
         """
         for w in range(len(worlds.ticks)):
             now = self.worlds.at(w)

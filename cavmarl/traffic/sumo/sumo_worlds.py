@@ -78,9 +78,7 @@ class SumoWorlds:
 
         `key`: the root of its random numbers.
 
-        Raises:
-            ConfigError: SUMO refuses its files.
-            SumoError: the process ended.
+        Raises ConfigError: SUMO refuses its files; SumoError: the process ended.
         """
         process = self._processes[w]
         if process is None or not process.lives:

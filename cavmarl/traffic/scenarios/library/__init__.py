@@ -88,10 +88,8 @@ def summary_of(name: str) -> str:
 def plan_scene(config: ScenarioConfig, network: RoadNetwork) -> Scene | None:
     """What is played on a map; None without a scenario.
 
-    Raises:
-        ConfigError: no such scenario, or no such place on the map; a parameter that it does not
-            have, or a value out of range.
-        ScenarioError: the map has none at all.
+    Raises ConfigError: no such scenario, or no such place on the map; a parameter that it does not
+    have, or a value out of range; ScenarioError: the map has none at all.
     """
     if not config.name:
         return None
