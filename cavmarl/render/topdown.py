@@ -188,30 +188,9 @@ class TopDownRenderer:
         draw_transfers(surface, zones, vehicles, camera)
         return samples_of_zones(zones.partition.count, ghosts_of)
 
-    def frame(
-        self,
-        vehicles: NDArray[np.void],
-        signal_phases: NDArray[np.int32] | None = None,
-        *,
-        title: str = "",
-        clock_s: float | None = None,
-        follow: Sequence[int] | None = None,
-        center: tuple[float, float] | None = None,
-        zones: ZoneView | None = None,
-        ghosts_of: int | None = None,
-    ) -> NDArray[np.uint8]:
+    def frame(self, *args: Any, **named: Any) -> NDArray[np.uint8]:
         """The picture of `draw` as uint8 (height, width, 3), red green blue."""
-        surface = self.draw(
-            vehicles,
-            signal_phases,
-            title=title,
-            clock_s=clock_s,
-            follow=follow,
-            center=center,
-            zones=zones,
-            ghosts_of=ghosts_of,
-        )
-        return pixels(surface)
+        return pixels(self.draw(*args, **named))
 
     def show(self, surface: Surface, title: str, fps: float) -> None:
         """Put a picture of `draw` in a window, no sooner than 1/`fps` s after the last one."""

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
+from typing import Any
 
 from cavmarl.traffic.scenarios.motions import Ride, path_of
 from cavmarl.traffic.scenarios.movement_scripts import Actor
 from cavmarl.traffic.scenarios.scene import Scene, Seat
 from cavmarl.traffic.scenarios.streets import Crossing, Streets
+
+Meeting = tuple[Crossing, Scene]
 
 FREE_M = 20.0  # beyond the junction a built-in driver takes over
 
@@ -50,29 +54,39 @@ def stream(
 
 
 def meet_stream(
-    streets: Streets,
-    place: Crossing,
-    far_m: float,
-    speed_mps: float,
-    stream_mps: float,
-    *,
-    cars: float,
-    gap_s: float,
-    lead_s: float,
+    streets: Streets, place: Crossing, far_m: float, stream_mps: float, said: Any
 ) -> Scene | None:
     """An agent that meets the first car of a stream if it keeps its speed; None: no room for them.
 
-    `place`: where both ways meet. `far_m`: from the agent to the junction in the beginning.
-    `gap_s`: between them, from centre to centre. `lead_s`: how long the first is there before the
-    agent.
+    `place`: where both ways meet. `far_m`: from the agent to the junction in the beginning. `said`:
+    the scenario's parameters: `speed_mps` of the agent, how many `cars`, `gap_s` between their
+    centres, `lead_s` that the first is there before the agent.
     """
-    seat = approach(streets, place.link, far_m, speed_mps)
+    seat = approach(streets, place.link, far_m, said.speed_mps)
     if seat is None:
         return None
-    first_s = (far_m + place.middle_m) / speed_mps - lead_s
-    times_s = [first_s + k * gap_s for k in range(math.floor(cars))]
+    first_s = (far_m + place.middle_m) / said.speed_mps - said.lead_s
+    times_s = [first_s + k * said.gap_s for k in range(math.floor(said.cars))]
     actors = stream(streets, place.foe, place.foe_middle_m, stream_mps, times_s)
     if actors is None:
         return None
     x, y, _ = streets.point(seat.lane, streets.length_m(seat.lane)).tolist()
     return Scene(streets.name(seat.lane), x, y, seat, actors)
+
+
+def meetings(
+    streets: Streets,
+    crossings: Iterable[Crossing],
+    far_m: float,
+    stream_mps: float,
+    said: Any,
+) -> dict[str, Meeting]:
+    """The first crossing of each lane where an agent meets a stream, and what is played there."""
+    found: dict[str, Meeting] = {}
+    for crossing in crossings:
+        name = streets.name(int(streets.network.links["from_lane"][crossing.link]))
+        if name not in found:
+            scene = meet_stream(streets, crossing, far_m, stream_mps, said)
+            if scene is not None:
+                found[name] = crossing, scene
+    return found

@@ -11,7 +11,7 @@ import socket
 import stat
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -113,12 +113,8 @@ class FollowerConnection:
         """
         self._allow(within_s)
         letter = None if message is None else letter_of(message)
-        try:
+        with self._blaming("read", within_s):
             self._wire.send(kind, 0, letter, arrays)
-        except TimeoutError as error:
-            raise self.too_late("read", within_s) from error
-        except OSError as error:
-            raise self._lost(error) from error
 
     def hear(self, within_s: float | None = None) -> ReceivedFrame:
         """The next frame; its data then have to be taken (`take`) or left out (`skip`).
@@ -127,14 +123,8 @@ class FollowerConnection:
         is no frame, or one of another version.
         """
         self._allow(within_s)
-        try:
+        with self._blaming("answered", within_s):
             frame = self._wire.receive()
-        except TimeoutError as error:
-            raise self.too_late("answered", within_s) from error
-        except (EOFError, OSError) as error:
-            raise self._lost(error) from error
-        except MessageError as error:
-            raise FollowerError(f"{self.name}: {error}") from error
         return ReceivedFrame(Say(frame.kind), frame.letter, frame.size)
 
     def skip(self, heard: ReceivedFrame) -> None:
@@ -167,12 +157,18 @@ class FollowerConnection:
         self._wire.close()
 
     def _take(self, arrays: list[Array]) -> None:
-        try:
+        with self._blaming("sent its data", None):
             self._wire.take(arrays)
+
+    @contextmanager
+    def _blaming(self, what: str, within_s: float | None) -> Iterator[None]:
+        """Say of the other end what goes wrong while it should do `what`."""
+        try:
+            yield
         except TimeoutError as error:
-            raise self.too_late("sent its data", None) from error
+            raise self.too_late(what, within_s) from error
         except (EOFError, OSError) as error:
-            raise self._lost(error) from error
+            raise FollowerLostError(f"{self.name} has ended ({error}){self._cure}") from error
         except MessageError as error:
             raise FollowerError(f"{self.name}: {error}") from error
 
@@ -186,9 +182,6 @@ class FollowerConnection:
             f"{self.name} has not {what} {span}: it is dead, stopped or too slow{self._cure}",
             is_late=True,
         )
-
-    def _lost(self, error: Exception) -> FollowerLostError:
-        return FollowerLostError(f"{self.name} has ended ({error}){self._cure}")
 
 
 def _size(view: ArrayView) -> int:

@@ -17,19 +17,11 @@ class SensorSamples(Protocol):
     """What one sensor has since the last step."""
 
     @property
-    def values(self) -> NDArray[Any]:
-        """(n, …) one sample a row, the newest last."""
-        ...
-
+    def values(self) -> NDArray[Any]: ...  # (n, …) one sample a row, the newest last
     @property
-    def stamps_s(self) -> NDArray[np.float64]:
-        """(n,) when each was taken."""
-        ...
-
+    def stamps_s(self) -> NDArray[np.float64]: ...  # (n,) when each was taken
     @property
-    def lost(self) -> NDArray[np.bool_]:
-        """(n,) which were lost."""
-        ...
+    def lost(self) -> NDArray[np.bool_]: ...  # (n,) which were lost
 
 
 Readings = Mapping[str, SensorSamples]
@@ -54,35 +46,21 @@ class StackSensor(NamedTuple):
 
 
 class EgoPose(NamedTuple):
-    """Where the vehicle's centre is, and how it moves.
-
-    Attributes:
-        x_m, y_m: place.
-        heading_rad: of the body.
-        speed_mps: forward.
-        yaw_rate_radps: of the body.
-    """
+    """Where the vehicle's centre is, and how it moves."""
 
     x_m: float
     y_m: float
     heading_rad: float
-    speed_mps: float
+    speed_mps: float  # forward
     yaw_rate_radps: float = 0.0
 
 
 class Obstacle(NamedTuple):
-    """Something on the road.
+    """Something on the road, as far as it is seen."""
 
-    Attributes:
-        x_m, y_m: its middle, as far as it is seen.
-        heading_rad: of its longer axis, along the road.
-        length_m, width_m: of what is seen of it.
-        vx_mps, vy_mps: velocity.
-    """
-
-    x_m: float
+    x_m: float  # its middle
     y_m: float
-    heading_rad: float
+    heading_rad: float  # of its longer axis, along the road
     length_m: float
     width_m: float
     vx_mps: float
@@ -90,16 +68,10 @@ class Obstacle(NamedTuple):
 
 
 class Mission(NamedTuple):
-    """What the vehicle is to do, and what it is.
+    """What the vehicle is to do, and what it is."""
 
-    Attributes:
-        goal_edge: EDGE row at whose end it is to be.
-        vclass: SUMO's class.
-        length_m, width_m: of its body.
-    """
-
-    goal_edge: int
-    vclass: str
+    goal_edge: int  # EDGE row at whose end it is to be
+    vclass: str  # SUMO's
     length_m: float
     width_m: float
 
