@@ -166,7 +166,6 @@ class TimeFollower:
 
     @property
     def time_s(self) -> float:
-        """The master's time."""
         return self.master.time_s
 
     def tick(self) -> bool:
@@ -261,7 +260,6 @@ class TimeMaster:
 
     @property
     def time_s(self) -> float:
-        """Seconds: tick · Δt, from the integer, so that nothing adds up."""
         return self.tick * self.dt_s
 
     @property
@@ -271,7 +269,6 @@ class TimeMaster:
 
     @property
     def followers(self) -> tuple[TimeFollower, ...]:
-        """The followers, in the order in which they joined."""
         return tuple(self._followers)
 
     def follow(self, name: str) -> TimeFollower:

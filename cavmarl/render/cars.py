@@ -44,7 +44,6 @@ COLLIDED_PX = 2.5
 
 
 def is_walker(row: np.void) -> bool:
-    """Whether a VEHICLE row is a pedestrian."""
     return bool(row["driver"] == DRIVER_SCRIPTED and row["length"] < WALKER_M)
 
 

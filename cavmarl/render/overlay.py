@@ -97,7 +97,6 @@ SCALE_BAR_PX = 140
 
 
 def clock_text(seconds: float) -> str:
-    """Minutes, seconds and tenths."""
     tenths = round(seconds * 10)
     return f"{tenths // 600}:{tenths // 10 % 60:02d}.{tenths % 10}"
 

@@ -64,12 +64,10 @@ MUTED_INK: Color = (112, 120, 130)
 
 
 def agent_color(agent: int) -> Color:
-    """The colour of an agent, by its index."""
     return AGENTS[agent % len(AGENTS)]
 
 
 def zone_color(zone: int) -> Color:
-    """The colour of a zone, by its number."""
     return ZONES[zone % len(ZONES)]
 
 

@@ -127,7 +127,6 @@ class RoadShapes:
 
 
 def road_shapes(network: RoadNetwork) -> RoadShapes:
-    """Work out the shapes of a network."""
     lanes = network.lanes
     counts = lanes["num_points"]
     lane_of_point = np.repeat(np.arange(len(lanes)), counts)

@@ -308,5 +308,4 @@ class WorldView:
         return None
 
     def close(self) -> None:
-        """Close the window, if there is one."""
         self._renderer.close()

@@ -62,7 +62,6 @@ def zone_picture(
 
 
 def draw_zones(surface: Surface, partition: ZonePartition, halo_m: float, camera: Viewport) -> None:
-    """Draw zones over what is there."""
     pygame = load_pygame()
     wash = blank(surface.get_size(), transparent=True)
     shown = _clipped(partition.reaching, camera)

@@ -14,25 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import RouteError
+from cavmarl.core.records import record
 from cavmarl.core.records.arrays import LaneGrid
 from cavmarl.roads.kernels.plans import plan_goal
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 
-PLAN = np.dtype(
-    [
-        ("next", np.int32),  # LANE after this lane's end; -1: the goal's own lane, or no way
-        ("link", np.int32),  # LINK that leads there; -1 inside junctions
-        ("shift", np.int32),  # what to add to a vehicle's way there, see `kernels.ways`
-        ("change", np.int16),  # side of the better lane: 1 left, -1 right, 0 this one is best
-        ("changes", np.int16),  # lane changes to the best lane of this edge
-        ("turnarounds", np.int16),  # U-turns on the way: where a road ends, plans turn round
-        (
-            "room",
-            np.float64,
-        ),  # m from the lane's start that can be driven before a change is needed
-        ("to_go", np.float64),  # m from the lane's start to the end of the goal edge; inf: no way
-    ],
-    align=True,
+PLAN = record(
+    ("next", np.int32),  # LANE after this lane's end; -1: the goal's own lane, or no way
+    ("link", np.int32),  # LINK that leads there; -1 inside junctions
+    ("shift", np.int32),  # what to add to a vehicle's way there, see `kernels.ways`
+    ("change", np.int16),  # side of the better lane: 1 left, -1 right, 0 this one is best
+    ("changes", np.int16),  # lane changes to the best lane of this edge
+    ("turnarounds", np.int16),  # U-turns on the way: where a road ends, plans turn round
+    # m from the lane's start that can be driven before a change is needed
+    ("room", np.float64),
+    ("to_go", np.float64),  # m from the lane's start to the end of the goal edge; inf: no way
 )
 
 

@@ -118,7 +118,6 @@ class NativeTraffic:
 
     @cached_property
     def cast(self) -> Cast | None:
-        """The actors of the scene."""
         if self.scene is None:
             return None
         first_type = len(generated_types()) + (0 if self.file is None else len(self.file.types))

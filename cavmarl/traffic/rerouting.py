@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.math.rng import STREAM_REROUTER, uniform
+from cavmarl.core.records import record
 from cavmarl.core.records.arrays import Gate, RoadArrays, Travel, Worlds
 from cavmarl.core.records.codes import COUNT_REROUTED
 from cavmarl.roads.routing import PLAN
@@ -30,16 +31,13 @@ from cavmarl.traffic.way_search import Traffic, WaySearch, WaySearchResult, WayS
 NEVER = np.iinfo(np.int64).max
 
 # What an ordered vehicle knows of its looking for ways, by VEHICLE["order"].
-LOOK = np.dtype(
-    [
-        ("next", np.int64),  # tick from which on it looks again
-        ("period", np.int64),  # ticks until it does so once more; 0: it does not
-        ("goal", np.int32),  # EDGE row that it drives to
-        ("seen", np.int32),  # EDGE row on which it has asked the rerouters last
-        ("may_leave", np.bool_),  # no edge between first and last is one that it has to pass
-        ("equipped", np.bool_),  # it has a rerouting device: knows the speeds
-    ],
-    align=True,
+LOOK = record(
+    ("next", np.int64),  # tick from which on it looks again
+    ("period", np.int64),  # ticks until it does so once more; 0: it does not
+    ("goal", np.int32),  # EDGE row that it drives to
+    ("seen", np.int32),  # EDGE row on which it has asked the rerouters last
+    ("may_leave", np.bool_),  # no edge between first and last is one that it has to pass
+    ("equipped", np.bool_),  # it has a rerouting device: knows the speeds
 )
 
 

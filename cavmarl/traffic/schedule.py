@@ -137,7 +137,6 @@ class Schedule:
         )
 
     def detour_goal(self, route: int, vtype: int) -> int:
-        """VEHICLE["goal"] of vehicles on a route, or -1."""
         return int(self._goal[route, self._class_of_type[vtype]])
 
     def _edges(self, route: int, mask: int) -> NDArray[np.int32]:

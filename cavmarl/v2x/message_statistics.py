@@ -62,7 +62,6 @@ class V2xStatistics:
 
 
 def statistics_of(mail: Mail, world: int, tick_s: float) -> V2xStatistics:
-    """The counts of one world."""
     counts = mail.counts[world]
     delays = mail.delays[world].copy()
     busy_sum, busy_number, busy_max = mail.busy[world].tolist()

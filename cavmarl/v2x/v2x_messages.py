@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError, MessageError
+from cavmarl.core.records import record
 from cavmarl.v2x.kernels.v2x_records import (
     CAUSE_COLLISION,
     CAUSE_HARD_BRAKING,
@@ -206,13 +207,10 @@ def decode(data: bytes) -> tuple[np.void, NDArray[np.void]]:
 
 
 # One receiver receives one packet in the tick of the call.
-RECEPTION = np.dtype(
-    [
-        ("tick", np.int64),  # in which the packet was sent
-        ("packet", np.int64),  # its number among the packets of that tick
-        ("receiver", np.int64),  # row of `Exchange.receivers`
-    ],
-    align=True,
+RECEPTION = record(
+    ("tick", np.int64),  # in which the packet was sent
+    ("packet", np.int64),  # its number among the packets of that tick
+    ("receiver", np.int64),  # row of `Exchange.receivers`
 )
 
 

@@ -99,7 +99,6 @@ class FollowedWorld:
 
     @property
     def seats(self) -> tuple[FollowerSeat, ...]:
-        """The followers, in the order in which they are served."""
         return tuple(self._seats)
 
     @property

@@ -155,7 +155,6 @@ class Follower:
 
 
 def sight_of(snapshot: FollowerSnapshot, arrays: Sequence[NDArray[Any]]) -> FollowerView:
-    """A snapshot with its arrays where they belong."""
     sensors: dict[str, dict[str, Samples]] = {vehicle: {} for vehicle in snapshot.vehicles}
     for view, array in zip(snapshot.arrays, arrays, strict=True):
         samples = Samples(array, np.array(view.stamps_s), np.array(view.lost, dtype=np.bool_))

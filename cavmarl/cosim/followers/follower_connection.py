@@ -90,7 +90,6 @@ class FollowerConnection:
         self._cure = f"; {cure}" if cure else ""
 
     def fileno(self) -> int:
-        """The socket's descriptor."""
         return self._socket.fileno()
 
     def say(

@@ -13,17 +13,15 @@ from numpy.typing import NDArray
 
 from cavmarl.core.math.neighbors import Grid, cell_columns, cell_rows
 from cavmarl.core.numba import kernel
+from cavmarl.core.records import record
 
-WALL = np.dtype(
-    [
-        ("ax", np.float64),  # its ends, m
-        ("ay", np.float64),
-        ("bx", np.float64),
-        ("by", np.float64),
-        ("height", np.float64),  # m over the ground
-        ("building", np.int64),
-    ],
-    align=True,
+WALL = record(
+    ("ax", np.float64),  # its ends, m
+    ("ay", np.float64),
+    ("bx", np.float64),
+    ("by", np.float64),
+    ("height", np.float64),  # m over the ground
+    ("building", np.int64),
 )
 
 

@@ -91,7 +91,6 @@ def switch_signals(
 
 @kernel
 def program_at(roads: RoadArrays, k: int, time: float, dt: float) -> int:
-    """The program of a signal that is on at `time`."""
     signal = roads.signals[k]
     program = signal["program"]
     for row in range(signal["first_switch"], signal["first_switch"] + signal["num_switches"]):

@@ -107,7 +107,6 @@ def _clear(camera: CameraPose, picture: PixelRows, first: int, last: int) -> Non
 
 @kernel
 def _corner_of(prism: np.void, along: float, across: float) -> tuple[float, float]:
-    """A corner of a body's outline."""
     x = along * prism["half_length"]
     y = across * prism["half_width"]
     cos = prism["cos"]

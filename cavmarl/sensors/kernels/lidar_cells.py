@@ -107,7 +107,6 @@ def _record(echo: np.void, distance: float, speed: float, vehicle_id: int) -> No
 
 @kernel
 def _trace(ego: np.void, ego_cos: float, ego_sin: float, body: np.void, sensor: LidarCells) -> None:
-    """Draw one body into the cells."""
     x = body["x"] - ego["x"]
     y = ego["y"] - body["y"]
     distance = math.sqrt(x * x + y * y)

@@ -17,19 +17,15 @@ from numpy.typing import NDArray
 from cavmarl.core.math.bearings import ANGLE_ERROR_RAD, rough_atan2
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
 from cavmarl.core.numba import kernel
+from cavmarl.core.records import record
 
 # What a ray met first.
-ECHO = np.dtype(
-    [
-        ("distance", np.float64),  # m; 0 from inside of a body, the range where nothing is
-        (
-            "speed",
-            np.float64,
-        ),  # its velocity less the own one, in m/s along the ray: positive where
-        # it goes away (highway-env's sign); 0 where nothing is
-        ("id", np.int64),  # of the vehicle; -1 where nothing is
-    ],
-    align=True,
+ECHO = record(
+    ("distance", np.float64),  # m; 0 from inside of a body, the range where nothing is
+    # its velocity less the own one, in m/s along the ray: positive where it goes away
+    # (highway-env's sign); 0 where nothing is
+    ("speed", np.float64),
+    ("id", np.int64),  # of the vehicle; -1 where nothing is
 )
 
 PI = math.pi

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M
 from cavmarl.core.math.scalars import clamp
 from cavmarl.core.numba import kernel
+from cavmarl.core.records import record
 from cavmarl.sensors.kernels.sensor_arrays import RoadgraphSensor, RoadPoints
 
 # ROAD_POINT["type"], in the order of the features that say which one it is
@@ -29,16 +30,13 @@ NUM_ROAD_TYPES = 5
 # valid, x, y, dir_x, dir_y, then one flag a type
 ROADGRAPH_FEATURES = 5 + NUM_ROAD_TYPES
 
-ROAD_POINT = np.dtype(
-    [
-        ("x", np.float64),  # m
-        ("y", np.float64),
-        ("z", np.float64),
-        ("cos", np.float64),  # direction of the line that it is part of
-        ("sin", np.float64),
-        ("type", np.int64),  # TYPE_*
-    ],
-    align=True,
+ROAD_POINT = record(
+    ("x", np.float64),  # m
+    ("y", np.float64),
+    ("z", np.float64),
+    ("cos", np.float64),  # direction of the line that it is part of
+    ("sin", np.float64),
+    ("type", np.int64),  # TYPE_*
 )
 
 # Points are put into rings of equal area before they are sorted: few need to be compared.

@@ -41,7 +41,6 @@ def _unit(number: float) -> np.float32:
 def _observe_place(
     report: np.void, row: np.void, cos: float, sin: float, scale_m: float, out: NDArray[np.float32]
 ) -> None:
-    """Presence and place in the ego frame."""
     dx = report["x"] - row["x"]
     dy = report["y"] - row["y"]
     out[0] = 1.0
@@ -59,7 +58,6 @@ def _observe_object(
     tick_s: float,
     out: NDArray[np.float32],
 ) -> None:
-    """What is known of one vehicle, relative to the own one."""
     _observe_place(report, row, cos, sin, scale_m, out)
     turned = report["heading"] - row["heading"]
     turned_cos = math.cos(turned)

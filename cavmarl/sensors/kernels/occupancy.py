@@ -128,7 +128,6 @@ def _draw_road(
     at: int,
     out: NDArray[np.float32],
 ) -> None:
-    """Write the layer `on_road` from position `at` on."""
     seen = sensor.lane_seen
     now = seen.size - 1
     seen[now] += 1

@@ -26,13 +26,11 @@ def has_entered(row: np.void, ticks_per_step: int) -> bool:
 
 @kernel
 def newest_frame(observation: NDArray[np.float32], stack: int) -> int:
-    """Where the newest frame begins."""
     return observation.size - observation.size // stack
 
 
 @kernel
 def shift_frames(observation: NDArray[np.float32], stack: int) -> None:
-    """Drop the oldest frame; the newest one becomes 0."""
     newest = newest_frame(observation, stack)
     size = observation.size - newest
     for k in range(newest):

@@ -19,24 +19,22 @@ from numpy.typing import NDArray
 
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
 from cavmarl.core.numba import kernel
+from cavmarl.core.records import record
 from cavmarl.roads.kernels.backdrop_pieces import Backdrop, gather_quads, gather_walls
 
-PRISM = np.dtype(
-    [
-        ("id", np.int64),  # of the vehicle or pedestrian
-        ("semantic", np.int64),  # see kernels.semantics
-        ("x", np.float64),  # centre, m
-        ("y", np.float64),
-        ("bottom", np.float64),  # z, m
-        ("top", np.float64),
-        ("cos", np.float64),  # of its heading in the frame
-        ("sin", np.float64),
-        ("half_length", np.float64),  # m
-        ("half_width", np.float64),
-        ("radius", np.float64),  # half the diagonal, m
-        ("speed", np.float64),  # over the ground along its heading, m/s
-    ],
-    align=True,
+PRISM = record(
+    ("id", np.int64),  # of the vehicle or pedestrian
+    ("semantic", np.int64),  # see kernels.semantics
+    ("x", np.float64),  # centre, m
+    ("y", np.float64),
+    ("bottom", np.float64),  # z, m
+    ("top", np.float64),
+    ("cos", np.float64),  # of its heading in the frame
+    ("sin", np.float64),
+    ("half_length", np.float64),  # m
+    ("half_width", np.float64),
+    ("radius", np.float64),  # half the diagonal, m
+    ("speed", np.float64),  # over the ground along its heading, m/s
 )
 
 
@@ -78,7 +76,6 @@ def make_panorama(backdrop: Backdrop, capacity: int) -> Panorama:
 def _fill_prism(
     prism: np.void, body: np.void, ego: np.void, axes: tuple[float, float, float, float]
 ) -> None:
-    """Bring a body into the frame whose cosines and sines of heading and pitch are `axes`."""
     cos, sin, pitch_cos, pitch_sin = axes
     dx = body["x"] - ego["x"]
     dy = body["y"] - ego["y"]

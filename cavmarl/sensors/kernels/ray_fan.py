@@ -21,15 +21,13 @@ from numpy.typing import NDArray
 from cavmarl.core.math.bearings import ANGLE_ERROR_RAD, rough_atan2
 from cavmarl.core.math.geometry import PI, TWO_PI
 from cavmarl.core.numba import kernel
+from cavmarl.core.records import record
 
 # What a ray met first.
-HIT = np.dtype(
-    [
-        ("distance", np.float64),  # m along the ray; 0 from inside of a body, the range for nothing
-        ("id", np.int64),  # of the vehicle or pedestrian; -1: none
-        ("what", np.int64),  # PRISM row of the panorama; or see `WALL_HIT`
-    ],
-    align=True,
+HIT = record(
+    ("distance", np.float64),  # m along the ray; 0 from inside of a body, the range for nothing
+    ("id", np.int64),  # of the vehicle or pedestrian; -1: none
+    ("what", np.int64),  # PRISM row of the panorama; or see `WALL_HIT`
 )
 NO_HIT = -1
 GROUND_HIT = -2

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.numba import kernel
+from cavmarl.core.records import record
 from cavmarl.core.records.arrays import Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.sensors.kernels.rig_noise import is_lost
@@ -84,22 +85,19 @@ def call_due(
     return found
 
 
-POSE = np.dtype(
-    [
-        ("id", np.int64),  # of the vehicle; -1: none
-        ("x", np.float64),  # as in VEHICLE
-        ("y", np.float64),
-        ("z", np.float64),
-        ("heading", np.float64),
-        ("pitch", np.float64),
-        ("speed", np.float64),
-        ("accel", np.float64),
-        ("yaw_rate", np.float64),
-        ("steering", np.float64),
-        ("distance_m", np.float64),
-        ("events", np.int32),
-    ],
-    align=True,
+POSE = record(
+    ("id", np.int64),  # of the vehicle; -1: none
+    ("x", np.float64),  # as in VEHICLE
+    ("y", np.float64),
+    ("z", np.float64),
+    ("heading", np.float64),
+    ("pitch", np.float64),
+    ("speed", np.float64),
+    ("accel", np.float64),
+    ("yaw_rate", np.float64),
+    ("steering", np.float64),
+    ("distance_m", np.float64),
+    ("events", np.int32),
 )
 
 

@@ -119,7 +119,6 @@ def _fill_line(
     half_m: float,
     out: NDArray[np.uint8],
 ) -> None:
-    """Fill a lane line between two corners of a strip."""
     dx = strip[b, 0] - strip[a, 0]
     dy = strip[b, 1] - strip[a, 1]
     length = math.hypot(dx, dy)
@@ -181,7 +180,6 @@ def camera_reach_m(camera: CameraPose, width: int, height: int) -> float:
 
 @kernel
 def _is_noisy(noise: Noise) -> bool:
-    """Whether any channel is wrong at all."""
     for channel in range(noise.noise.size):
         if noise.noise[channel] > 0.0 or noise.bias[channel] > 0.0:
             return True

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.math.neighbors import Grid, fill_grid
 from cavmarl.core.numba import kernel
+from cavmarl.core.records import record
 from cavmarl.core.records.arrays import Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.roads.kernels.backdrop_pieces import Backdrop
@@ -22,15 +23,12 @@ from cavmarl.sensors.kernels.ray_fan import WALL_HIT, Fan, cast
 from cavmarl.sensors.kernels.rig_frames import Due
 from cavmarl.sensors.kernels.rig_noise import Noise, error_of, sensor_key
 
-TARGET = np.dtype(
-    [
-        ("range", np.float64),  # m
-        ("azimuth", np.float64),  # rad in the sensor's frame, positive to the left
-        ("speed", np.float64),  # m/s, positive away
-        ("body", np.int64),  # 1: a body, 0: a building
-        ("id", np.int64),  # of the vehicle, or number of the building
-    ],
-    align=True,
+TARGET = record(
+    ("range", np.float64),  # m
+    ("azimuth", np.float64),  # rad in the sensor's frame, positive to the left
+    ("speed", np.float64),  # m/s, positive away
+    ("body", np.int64),  # 1: a body, 0: a building
+    ("id", np.int64),  # of the vehicle, or number of the building
 )
 
 

@@ -55,7 +55,6 @@ class _Camera(ImagingSensor[C]):
 
     @staticmethod
     def num_lines(config: C) -> int:
-        """The rows of the picture."""
         return config.height
 
 
@@ -71,7 +70,6 @@ class DepthCamera(_Camera[DepthCameraConfig]):
 
     @staticmethod
     def bounds(config: DepthCameraConfig) -> Bounds:
-        """From 0 to the range."""
         return np.zeros(config.shape), np.full(config.shape, config.range_m)
 
     def arguments(self, scene: SensedScene, due: Due, frames: SensorFrames) -> tuple[Any, ...]:
@@ -89,7 +87,6 @@ class SemanticCamera(_Camera[SemanticCameraConfig]):
 
     @staticmethod
     def bounds(config: SemanticCameraConfig) -> Bounds:
-        """The classes."""
         return np.zeros(config.shape), np.full(config.shape, NUM_SEMANTICS - 1.0)
 
     def arguments(self, scene: SensedScene, due: Due, frames: SensorFrames) -> tuple[Any, ...]:
@@ -106,7 +103,6 @@ class RgbCamera(_Camera[RgbCameraConfig]):
 
     @staticmethod
     def bounds(config: RgbCameraConfig) -> Bounds:
-        """From 0 to 255."""
         return np.zeros(config.shape), np.full(config.shape, 255.0)
 
     def arguments(self, scene: SensedScene, due: Due, frames: SensorFrames) -> tuple[Any, ...]:
@@ -129,7 +125,6 @@ class BevGrid(ImagingSensor[BevGridConfig]):
 
     @staticmethod
     def bounds(config: BevGridConfig) -> Bounds:
-        """The classes."""
         return np.zeros(config.shape), np.full(config.shape, NUM_SEMANTICS - 1.0)
 
     @staticmethod

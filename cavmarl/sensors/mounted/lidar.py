@@ -30,7 +30,6 @@ def azimuths(fov_deg: float, rays: int) -> tuple[float, float, int]:
 
 
 def lidar_fan(config: LidarRigConfig) -> Fan:
-    """The rays of a lidar."""
     lowest, highest = math.radians(config.lower_deg), math.radians(config.upper_deg)
     layers = np.linspace(lowest, highest, config.layers) if config.layers > 1 else np.zeros(1)
     return make_fan(
@@ -60,12 +59,10 @@ class Lidar(_Rays[LidarRigConfig]):
 
     @staticmethod
     def bounds(config: LidarRigConfig) -> Bounds:
-        """From 0 to the range."""
         return np.zeros(config.shape), np.full(config.shape, config.range_m)
 
     @staticmethod
     def num_lines(config: LidarRigConfig) -> int:
-        """The columns of rays."""
         return config.rays
 
     def arguments(self, scene: SensedScene, due: Due, frames: SensorFrames) -> tuple[Any, ...]:

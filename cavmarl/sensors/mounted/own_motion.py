@@ -102,7 +102,6 @@ class Gnss(MountedSensor[GnssConfig]):
 
     @staticmethod
     def bounds(config: GnssConfig) -> Bounds:
-        """Of the angles; of the height, none."""
         high = np.array([90.0, 180.0, np.inf])
         return -high, high
 
@@ -133,7 +132,6 @@ class Collision(MountedSensor[CollisionConfig]):
 
     @staticmethod
     def bounds(config: CollisionConfig) -> Bounds:
-        """All that the type can hold."""
         limits = np.iinfo(np.int64)
         return np.array([0, -1]), np.array([limits.max, limits.max])
 

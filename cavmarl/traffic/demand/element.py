@@ -97,7 +97,6 @@ class Element:
         return value
 
     def whole(self, key: str, default: int, *, least: int) -> int:
-        """A whole number of at least `least`."""
         if key not in self.attrs:
             return default
         text = self.attrs[key].strip()
@@ -127,7 +126,6 @@ class Element:
         return value
 
     def params(self) -> dict[str, str]:
-        """The <param> children as a dictionary."""
         return {
             child.attrs.get("key", ""): child.attrs.get("value", "")
             for child in self.children

@@ -135,7 +135,6 @@ class MapIndex:
         return None
 
     def route_error(self, element: Element, gap: str) -> CavmarlError:
-        """The error for a route that cannot be followed."""
         return element.error(
             f"cannot be driven: {gap}",
             "mend the route (duarouter --repair), or skip such (traffic.on_bad_route = skip)",

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import CapacityError
+from cavmarl.core.records import record
 from cavmarl.driving.vehicle_types import ALL_PERMISSIONS, NEAREST_CLASS, NO_ROAD_CLASSES
 from cavmarl.roads.network import VEHICLE_CLASSES
 from cavmarl.traffic.demand.demand_records import MAX_WEIGHT, Choices, Options, weighted
@@ -22,28 +23,22 @@ KEEP_DESTINATION = -1  # in place of an EDGE row
 _ACTED_ON = ("closingReroute", "destProbReroute", "routeProbReroute")
 _NOT_MODELLED = ("timeThreshold", "radius", "file")
 
-RULE = np.dtype(
-    [
-        ("begin_s", np.float64),  # clock
-        ("end_s", np.float64),
-        ("chance", np.float64),  # that a vehicle follows it
-        ("edge", np.int32),  # EDGE row on which it is asked
-        ("closes", np.bool_),  # it is about vehicles whose way leads over a closed edge
-        ("goals", np.int32),  # choice among EDGE rows or KEEP_DESTINATION; -1: none
-        ("routes", np.int32),  # choice among ROUTE rows; -1: none
-        ("interval", np.int32),  # equal for the edges of one interval: one draw for all
-    ],
-    align=True,
+RULE = record(
+    ("begin_s", np.float64),  # clock
+    ("end_s", np.float64),
+    ("chance", np.float64),  # that a vehicle follows it
+    ("edge", np.int32),  # EDGE row on which it is asked
+    ("closes", np.bool_),  # it is about vehicles whose way leads over a closed edge
+    ("goals", np.int32),  # choice among EDGE rows or KEEP_DESTINATION; -1: none
+    ("routes", np.int32),  # choice among ROUTE rows; -1: none
+    ("interval", np.int32),  # equal for the edges of one interval: one draw for all
 )
 
-CLOSING = np.dtype(
-    [
-        ("begin_s", np.float64),
-        ("end_s", np.float64),
-        ("edge", np.int32),  # EDGE row
-        ("classes", np.int64),  # bits of those that it is closed to
-    ],
-    align=True,
+CLOSING = record(
+    ("begin_s", np.float64),
+    ("end_s", np.float64),
+    ("edge", np.int32),  # EDGE row
+    ("classes", np.int64),  # bits of those that it is closed to
 )
 
 

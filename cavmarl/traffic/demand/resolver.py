@@ -59,7 +59,6 @@ class Resolver:
         self._place_stops(list(collector.stops.values()))
 
     def elements(self) -> NDArray[np.void]:
-        """ELEMENT (num_elements,)."""
         return self._elements
 
     def type_choices(self) -> Choices:

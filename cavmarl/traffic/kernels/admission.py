@@ -34,7 +34,6 @@ ENTER_ROOM_M = 0.3  # free on all sides of a vehicle that enters
 
 @kernel
 def _zone_on(roads: RoadArrays, zones: ZoneArrays, lane: int, s: float) -> int:
-    """The zone of a place on a lane."""
     row = roads.lanes[lane]
     x, y, _, _, _, _ = lane_pose(roads.points, row["first_point"], row["num_points"], s)
     return zone_of(zones, x, y)

@@ -18,7 +18,6 @@ from cavmarl.zones.kernels.zone_lookup import note_outer
 
 @kernel
 def _is_through(row: np.void, driver: int, ticks_per_step: int) -> bool:
-    """Whether a vehicle of one kind of driver leaves now."""
     ending = EVENTS_THAT_END if driver == DRIVER_AGENT else EVENT_ARRIVED
     if row["driver"] != driver or not row["events"] & ending:
         return False

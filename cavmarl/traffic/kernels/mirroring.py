@@ -187,7 +187,6 @@ def _find(seen: NDArray[np.void], number: int) -> int:
 
 @inlined_kernel
 def _stand_in(roads: RoadArrays, travel: Travel, paths: Paths, seen: np.void, row: np.void) -> None:
-    """Write where a vehicle is and how it moves."""
     half = 0.5 * row["length"]
     heading = wrap_angle(0.5 * math.pi - math.radians(seen["angle"]))
     row["heading"] = heading

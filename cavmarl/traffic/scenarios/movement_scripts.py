@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.math.geometry import lane_pose, project
+from cavmarl.core.records import record
 from cavmarl.core.records.arrays import Scripts
 from cavmarl.core.records.codes import CLASS_PEDESTRIAN, MODEL_IDM
 from cavmarl.driving.vehicle_types import CLASS_DEFAULTS, generated_types
@@ -143,55 +144,43 @@ def _outline(pose: Pose, length: float, width: float) -> NDArray[np.float64]:
 
 FORESIGHT_S = 2.0  # drivers brake for actors that will be on their lane by then
 
-FRAME = np.dtype(
-    [
-        ("x", np.float64),  # as in VEHICLE
-        ("y", np.float64),
-        ("z", np.float64),
-        ("heading", np.float64),
-        ("pitch", np.float64),
-        ("speed", np.float64),
-        ("s", np.float64),  # on `lane`, which is the nearest one
-        ("d", np.float64),
-        ("lane", np.int32),
-        ("link", np.int32),
-        ("following", np.int32),  # FRAME of the next tick; the last one follows itself
-        ("cue", np.int32),  # CUE without which it stays; -1: it goes on by itself
-        ("released_to", np.int32),  # goal to which a built-in driver takes it from here, or -1
-        ("first_cover", np.int32),  # COVER rows
-        ("num_covers", np.int32),
-        ("first_claim", np.int32),  # CLAIM rows
-        ("num_claims", np.int32),
-    ],
-    align=True,
+FRAME = record(
+    ("x", np.float64),  # as in VEHICLE
+    ("y", np.float64),
+    ("z", np.float64),
+    ("heading", np.float64),
+    ("pitch", np.float64),
+    ("speed", np.float64),
+    ("s", np.float64),  # on `lane`, which is the nearest one
+    ("d", np.float64),
+    ("lane", np.int32),
+    ("link", np.int32),
+    ("following", np.int32),  # FRAME of the next tick; the last one follows itself
+    ("cue", np.int32),  # CUE without which it stays; -1: it goes on by itself
+    ("released_to", np.int32),  # goal to which a built-in driver takes it from here, or -1
+    ("first_cover", np.int32),  # COVER rows
+    ("num_covers", np.int32),
+    ("first_claim", np.int32),  # CLAIM rows
+    ("num_claims", np.int32),
 )
 
-COVER = np.dtype(
-    [
-        ("s", np.float64),  # middle of the covered part of the lane, m
-        ("half", np.float64),  # and half its length
-        ("speed", np.float64),  # m/s along the lane, not below 0
-        ("lane", np.int32),
-    ],
-    align=True,
+COVER = record(
+    ("s", np.float64),  # middle of the covered part of the lane, m
+    ("half", np.float64),  # and half its length
+    ("speed", np.float64),  # m/s along the lane, not below 0
+    ("lane", np.int32),
 )
 
-CLAIM = np.dtype(
-    [
-        ("dist", np.float64),  # of the centre to the stop line, m; negative beyond it
-        ("link", np.int32),
-    ],
-    align=True,
+CLAIM = record(
+    ("dist", np.float64),  # of the centre to the stop line, m; negative beyond it
+    ("link", np.int32),
 )
 
-CUE = np.dtype(
-    [
-        ("x", np.float64),  # an agent's centre is within `radius_m` of this place
-        ("y", np.float64),
-        ("radius_m", np.float64),
-        ("tick", np.int64),  # or this tick has come; -1: it does not matter
-    ],
-    align=True,
+CUE = record(
+    ("x", np.float64),  # an agent's centre is within `radius_m` of this place
+    ("y", np.float64),
+    ("radius_m", np.float64),
+    ("tick", np.int64),  # or this tick has come; -1: it does not matter
 )
 
 NO_SCRIPTS = Scripts(
@@ -246,7 +235,6 @@ def actor_types() -> NDArray[np.void]:
 
 
 def bodies_of(actors: Sequence[Actor]) -> list[int]:
-    """Which of the rows of `actor_types` each actor has."""
     names = list(BODIES)
     return [names.index(actor.body) for actor in actors]
 
@@ -295,7 +283,6 @@ def compile_scripts(
 
 
 def _poses(network: RoadNetwork, actor: Actor, dt: float) -> Iterator[Pose]:
-    """Where an actor is in each tick, from its first place on."""
     last: Pose | None = None
     for act in actor.acts:
         for pose in act.poses(network, BODIES[actor.body].length, last, dt):

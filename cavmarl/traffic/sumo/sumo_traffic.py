@@ -272,7 +272,6 @@ class SumoTraffic:
         self.worlds.stops.shift(rows, worlds)
 
     def close(self) -> None:
-        """End all processes."""
         self.worlds.close()
 
     def _moved(self, w: int, side: int) -> NDArray[np.void]:

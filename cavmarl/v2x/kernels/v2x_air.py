@@ -110,7 +110,6 @@ def list_cams(room: V2xScratch, packets: NDArray[np.void], num: int) -> None:
 
 @inlined_kernel
 def find_cam(room: V2xScratch, packets: NDArray[np.void], sender: int) -> int:
-    """The CAM of a sender, or -1."""
     table = room.cam_of
     place = _place_of(sender, table.size)
     while table[place] >= 0 and packets[table[place]]["sender"] != sender:

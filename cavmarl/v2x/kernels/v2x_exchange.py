@@ -155,7 +155,6 @@ def _receive(
     kinds: NDArray[np.int64],
     room: V2xScratch,
 ) -> None:
-    """Bring the inboxes of one receiver to the present tick."""
     me = room.receivers[r]
     level = 0
     if channel.load > 0.0:
