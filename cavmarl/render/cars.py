@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.records.codes import DRIVER_SCRIPTED, EVENT_COLLIDED
-from cavmarl.render.canvas import Part, opaque, stamp
-from cavmarl.render.palette import (
+from cavmarl.render.canvas import (
     ACTOR,
     BACKGROUND_CAR,
     BLINKER,
@@ -19,7 +18,10 @@ from cavmarl.render.palette import (
     GLASS,
     HEADLIGHT,
     Color,
+    Part,
     agent_color,
+    opaque,
+    stamp,
 )
 from cavmarl.render.viewport import Viewport
 
@@ -29,7 +31,7 @@ if TYPE_CHECKING:
 import math
 from typing import TYPE_CHECKING
 
-from cavmarl.render.palette import INK, PANEL
+from cavmarl.render.canvas import INK, PANEL
 
 if TYPE_CHECKING:
     from pygame import Surface

@@ -8,8 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.records.codes import SIGNAL_NONE
-from cavmarl.render.canvas import blank, load_pygame, stamp
-from cavmarl.render.palette import ASPHALT, CENTRE_LINE, KERB, LAND, MARKING, PATH, SIGNALS, Color
+from cavmarl.render.canvas import (
+    ASPHALT,
+    CENTRE_LINE,
+    KERB,
+    LAND,
+    MARKING,
+    PATH,
+    SIGNALS,
+    Color,
+    blank,
+    load_pygame,
+    stamp,
+)
 from cavmarl.render.shapes import RoadShapes, level_of
 from cavmarl.render.viewport import Viewport
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork

@@ -9,8 +9,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.render.canvas import blank, lettering, load_pygame, pill, stamp, target
-from cavmarl.render.palette import INK, MUTED_INK, PANEL, agent_color, ink_on
+from cavmarl.render.canvas import (
+    INK,
+    MUTED_INK,
+    PANEL,
+    agent_color,
+    blank,
+    ink_on,
+    lettering,
+    load_pygame,
+    pill,
+    stamp,
+    target,
+)
 from cavmarl.render.viewport import Viewport
 
 if TYPE_CHECKING:
@@ -19,8 +30,17 @@ if TYPE_CHECKING:
 from collections.abc import Callable
 from typing import NamedTuple
 
-from cavmarl.render.canvas import Part, bar, opaque, ring
-from cavmarl.render.palette import ACTOR, BACKGROUND_CAR, COLLIDED, Color, zone_color
+from cavmarl.render.canvas import (
+    ACTOR,
+    BACKGROUND_CAR,
+    COLLIDED,
+    Color,
+    Part,
+    bar,
+    opaque,
+    ring,
+    zone_color,
+)
 
 SWATCH_PX = 16
 _HEIGHT_PX = 10.0

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.render.canvas import blank, lettering, load_pygame
+from cavmarl.render.canvas import INK, blank, ink_on, lettering, load_pygame, zone_color
 from cavmarl.render.ground import draw_ground
 from cavmarl.render.overlay import Overlay
-from cavmarl.render.palette import INK, ink_on, zone_color
 from cavmarl.render.shapes import road_shapes
 from cavmarl.render.viewport import Viewport, suitable_size
 from cavmarl.roads.network import RoadNetwork

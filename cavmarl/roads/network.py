@@ -199,47 +199,37 @@ class GeoReference:
 class RoadNetwork:
     """An immutable road map; see the module's docstring for frames and the dtypes for fields.
 
-    Attributes:
-        name: the source file's name without its endings.
-        source_hash: SHA-256 of the source, hex; part of every manifest and cache key.
-        points, lanes, edges, links, conflicts, junctions: record arrays, read-only.
-        signals, programs, phases, switches, detectors: record arrays, read-only.
-        into: LANE rows, see LANE["first_into"].
-        phase_states: signal letters as codes, see PHASE.
-        phase_detectors: DETECTOR rows, see PHASE["first_detector"].
-        lane_ids, edge_ids, junction_ids, signal_ids, program_ids: the source's names, by row.
-        junction_kinds: SUMO's junction types that occur, by `JUNCTION["kind"]`.
-        geo: where it lies on the earth; None: the map does not say.
-        walls: WALL (num_walls,) of the buildings, if they were asked for; see `maps.buildings`.
-        roofs: (num_roofs, 4, 2) corners in m of the convex parts of their footprints.
-        roof_height: (num_roofs,) m over the ground.
+    Arrays are read-only; ids are the names of the source, by row.
     """
 
-    name: str
-    source_hash: str
+    name: str  # the source file's name without its endings
+    source_hash: str  # SHA-256 of the source, hex; part of every manifest and cache key
     points: NDArray[np.void]
     lanes: NDArray[np.void]
     edges: NDArray[np.void]
     links: NDArray[np.void]
     conflicts: NDArray[np.void]
     junctions: NDArray[np.void]
-    into: NDArray[np.int32]
+    into: NDArray[np.int32]  # LANE rows, see LANE["first_into"]
     signals: NDArray[np.void]
     programs: NDArray[np.void]
     phases: NDArray[np.void]
-    phase_states: NDArray[np.uint8]
+    phase_states: NDArray[np.uint8]  # signal letters as codes, see PHASE
     switches: NDArray[np.void]
     detectors: NDArray[np.void]
-    phase_detectors: NDArray[np.int32]
+    phase_detectors: NDArray[np.int32]  # DETECTOR rows, see PHASE["first_detector"]
     lane_ids: tuple[str, ...]
     edge_ids: tuple[str, ...]
     junction_ids: tuple[str, ...]
     signal_ids: tuple[str, ...]
     program_ids: tuple[str, ...]
-    junction_kinds: tuple[str, ...]
-    geo: GeoReference | None = None
+    junction_kinds: tuple[str, ...]  # SUMO's types that occur, by `JUNCTION["kind"]`
+    geo: GeoReference | None = None  # where it lies on the earth; None: the map does not say
+    # WALL (num_walls,) of the buildings, if they were asked for; see `maps.buildings`
     walls: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, WALL))
+    # (num_roofs, 4, 2) corners in m of the convex parts of their footprints
     roofs: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 4, 2)))
+    # (num_roofs,) m over the ground
     roof_height: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:

@@ -21,7 +21,7 @@ from cavmarl.sensors.kernels.camera_picture import (
     write_halves,
 )
 from cavmarl.sensors.kernels.faces import CameraPose, PixelRows
-from cavmarl.sensors.kernels.semantics import BUILDING, CAR, GROUND, NOTHING, PEDESTRIAN, ROAD
+from cavmarl.sensors.kernels.panorama import BUILDING, CAR, GROUND, NOTHING, PEDESTRIAN, ROAD
 from tests.naive import imaging as naive
 from tests.support.builders import crowds, vehicles
 from tests.support.imaging import NO_WALLS, backdrop, look_around, mount, mounts, wall_sets

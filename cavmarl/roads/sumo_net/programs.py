@@ -29,41 +29,27 @@ _REQUIRED = {
 
 @dataclass(frozen=True)
 class Phase:
-    """One <phase>.
+    """One <phase>."""
 
-    Attributes:
-        duration_s, min_s, max_s: stated; SUMO's defaults fill in what is not.
-        state: a letter for every link of the signal.
-        following: phases that may come next, by number; empty: the one behind it.
-    """
-
-    duration_s: float
+    duration_s: float  # stated; SUMO's defaults fill in what is not
     min_s: float
     max_s: float
-    state: str
+    state: str  # a letter for every link of the signal
+    # phases that may come next, by number; empty: the one behind it
     following: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
 class SignalProgram:
-    """One <tlLogic>.
+    """One <tlLogic>."""
 
-    Attributes:
-        signal_id, program_id: together the program's name.
-        kind: SUMO's type: `static`, `actuated`, `delay_based`, `NEMA`, …
-        offset_s: by which all phases are late.
-        phases: in their order.
-        params: <param> by key.
-        place: file and line, for complaints.
-    """
-
-    signal_id: str
+    signal_id: str  # together the program's name
     program_id: str
-    kind: str
-    offset_s: float
-    place: str
-    phases: list[Phase] = field(default_factory=list)
-    params: dict[str, str] = field(default_factory=dict)
+    kind: str  # SUMO's type: `static`, `actuated`, `delay_based`, `NEMA`, …
+    offset_s: float  # by which all phases are late
+    place: str  # file and line, for complaints
+    phases: list[Phase] = field(default_factory=list)  # in their order
+    params: dict[str, str] = field(default_factory=dict)  # <param> by key
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,7 @@ from cavmarl.sensors.kernels.faces import (
     ground_at,
     set_corner,
 )
-from cavmarl.sensors.kernels.panorama import Counts, Panorama
-from cavmarl.sensors.kernels.semantics import (
+from cavmarl.sensors.kernels.panorama import (
     BICYCLE,
     BUILDING,
     BUS,
@@ -36,6 +35,8 @@ from cavmarl.sensors.kernels.semantics import (
     ROAD,
     TRAM,
     TRUCK,
+    Counts,
+    Panorama,
 )
 
 # Faces that every picture has; those of bodies and buildings follow.

@@ -29,10 +29,16 @@ from cavmarl.sensors.kernels.camera_picture import (
     write_halves,
 )
 from cavmarl.sensors.kernels.faces import CameraPose, PixelRows
-from cavmarl.sensors.kernels.panorama import Counts, Panorama, gather
-from cavmarl.sensors.kernels.rig_frames import Due
-from cavmarl.sensors.kernels.rig_noise import Noise, error_of, sensor_key
-from cavmarl.sensors.kernels.semantics import BUILDING, GROUND, LANE_LINE, ROAD
+from cavmarl.sensors.kernels.panorama import (
+    BUILDING,
+    GROUND,
+    LANE_LINE,
+    ROAD,
+    Counts,
+    Panorama,
+    gather,
+)
+from cavmarl.sensors.kernels.rig_frames import Due, Noise, error_of, sensor_key
 
 
 class BirdsEye(NamedTuple):

@@ -11,9 +11,7 @@ from cavmarl.core.math.geometry import lane_pose, project_near, wrap_angle
 from cavmarl.core.numba import kernel
 from cavmarl.core.records.arrays import RoadArrays, Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT, EVENT_COLLIDED
-from cavmarl.sensors.kernels.mount_poses import Mount, sensor_pose
-from cavmarl.sensors.kernels.rig_frames import Due
-from cavmarl.sensors.kernels.rig_noise import Noise, add_errors, is_lost
+from cavmarl.sensors.kernels.rig_frames import Due, Mount, Noise, add_errors, is_lost, sensor_pose
 
 GRAVITY_MPS2 = 9.80665  # standard gravity
 

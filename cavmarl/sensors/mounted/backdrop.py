@@ -10,7 +10,7 @@ from cavmarl.core.math.neighbors import Grid, cell_at, make_grid
 from cavmarl.core.records.codes import CLASS_PEDESTRIAN
 from cavmarl.roads.kernels.backdrop_pieces import Backdrop
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
-from cavmarl.sensors.kernels.semantics import SEMANTIC_OF_CLASS
+from cavmarl.sensors.kernels.panorama import SEMANTIC_OF_CLASS
 
 CELL_M = 32.0
 # Long straight strips are cut, so that what is near a vehicle is found by the middles of strips.

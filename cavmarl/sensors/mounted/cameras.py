@@ -16,6 +16,7 @@ from cavmarl.config.rig import (
 )
 from cavmarl.sensors.kernels.camera_picture import colours, make_camera, make_picture
 from cavmarl.sensors.kernels.faces import CameraPose
+from cavmarl.sensors.kernels.panorama import NUM_SEMANTICS
 from cavmarl.sensors.kernels.rig_frames import Due
 from cavmarl.sensors.kernels.rig_pictures import (
     camera_reach_m,
@@ -25,7 +26,6 @@ from cavmarl.sensors.kernels.rig_pictures import (
     take_colours,
     take_depths,
 )
-from cavmarl.sensors.kernels.semantics import NUM_SEMANTICS
 from cavmarl.sensors.mounted.frames import SensorFrames
 from cavmarl.sensors.mounted.mount_transforms import mount_matrix
 from cavmarl.sensors.mounted.mounted_sensor import Bounds, ImagingSensor, Platform, SensedScene

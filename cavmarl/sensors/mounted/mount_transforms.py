@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.rig import MountedConfig
 from cavmarl.core.errors import ConfigError
-from cavmarl.sensors.kernels.mount_poses import Mount, rotation
+from cavmarl.sensors.kernels.rig_frames import Mount, rotation
 
 WORLD_FRAME = "map"  # x east, y north, z up, as in `roads.network`
 VEHICLE_FRAME = "vehicle"

@@ -18,8 +18,7 @@ from cavmarl.core.records.arrays import LaneGrid, RoadArrays, Travel, Worlds
 from cavmarl.roads.kernels.backdrop_pieces import Backdrop
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.kernels.panorama import make_panorama
-from cavmarl.sensors.kernels.rig_frames import Due
-from cavmarl.sensors.kernels.rig_noise import Noise
+from cavmarl.sensors.kernels.rig_frames import Due, Noise
 from cavmarl.sensors.mounted.frames import SensorFrames
 from cavmarl.sensors.mounted.mount_transforms import SENSOR_FRAME, check_place, mount_of
 

@@ -21,31 +21,20 @@ CREEP_MPS = 0.2  # on the last centimetres before they stand
 
 
 class Pose(NamedTuple):
-    """Where an actor is in one tick.
+    """Where an actor is in one tick."""
 
-    Attributes:
-        x, y: of its centre, m.
-        heading: rad.
-        speed: along it in m/s, negative backwards.
-        pitch: rad.
-        beside: LANE row on whose level it is.
-        on: lane, s and d of an actor that rides along lanes; None: it moves freely.
-        link: LINK row that it is on or has entered last.
-        claims: the distance to the stop line, and the LINK row, of each link that it is on or will
-            be on soon.
-        cue: that it waits for, or -1.
-    """
-
-    x: float
+    x: float  # of its centre, m
     y: float
     heading: float
-    speed: float
-    beside: int
+    speed: float  # along it in m/s, negative backwards
+    beside: int  # LANE row on whose level it is
     pitch: float = 0.0
+    # lane, s and d of an actor that rides along lanes; None: it moves freely
     on: tuple[int, float, float] | None = None
-    link: int = -1
+    link: int = -1  # LINK row that it is on or has entered last
+    # the distance to the stop line, and the LINK row, of each link that it is on or will be on soon
     claims: tuple[tuple[float, int], ...] = ()
-    cue: int = -1
+    cue: int = -1  # that it waits for, or -1
 
 
 @dataclass(frozen=True)

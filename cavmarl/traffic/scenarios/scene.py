@@ -28,26 +28,16 @@ class Outage(NamedTuple):
 
 @dataclass(frozen=True)
 class Scene:
-    """One conflict, played to an agent; others may come behind it (`seats`).
+    """One conflict, played to an agent; others may come behind it (`seats`)."""
 
-    Attributes:
-        place: where, by the map's name.
-        x, y: its middle, m.
-        seat: of the agent.
-        actors: those that follow a script.
-        cues: what they wait for, by the numbers of their `Await`s.
-        clear_m: how far around the middle no other vehicle is in the beginning.
-        outages: signals that go dark, and stay so.
-    """
-
-    place: str
-    x: float
+    place: str  # where, by the map's name
+    x: float  # its middle, m
     y: float
     seat: Seat
-    actors: Sequence[Actor]
-    cues: Sequence[Cue] = ()
-    clear_m: float = 90.0
-    outages: Sequence[Outage] = ()
+    actors: Sequence[Actor]  # those that follow a script
+    cues: Sequence[Cue] = ()  # what they wait for, by the numbers of their `Await`s
+    clear_m: float = 90.0  # how far around the middle no other vehicle is in the beginning
+    outages: Sequence[Outage] = ()  # signals that go dark, and stay so
 
     @property
     def goal_edges(self) -> list[int]:
