@@ -1,4 +1,7 @@
-"""pygame, loaded late and quietly, and the one way in which we draw smooth polygons with it."""
+"""pygame, loaded late and quietly, and the one way in which we draw smooth polygons with it.
+
+With the colours of all pictures, red green blue: a quiet map, so that the agents stand out.
+"""
 
 from __future__ import annotations
 

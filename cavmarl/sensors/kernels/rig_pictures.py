@@ -193,7 +193,7 @@ def _is_noisy(noise: Noise) -> bool:
 
 
 @kernel
-def take_depths(
+def take_pictures(
     worlds: Worlds,
     grid: Grid,
     backdrop: Backdrop,
@@ -203,15 +203,20 @@ def take_depths(
     camera: CameraPose,
     panorama: Panorama,
     picture: PixelRows,
-    room: NDArray[np.float32],
-    room_bits: NDArray[np.uint32],
-    data: NDArray[np.uint16],
+    room: NDArray[np.float32] | None,
+    room_bits: NDArray[np.uint32] | None,
+    palette: NDArray[np.float64] | None,
+    classes: bool | None,
+    data: NDArray[np.unsignedinteger],
 ) -> None:
-    """Write the depth pictures that are due of the owned agents.
+    """Write the pictures that are due of the owned agents: depths, colours, or classes.
 
     `lines`: (W, agents, 2) rows [first, last) of each agent's picture that are written. `noise`: of
-    the sensor; what is as far as the range has none. `room`: (rows of `picture`, W) room.
-    `room_bits`: the same memory. `data`: (W, agents, S, H, W) float16 as bits, m.
+    depths, what is as far as the range has none. `room`: (rows of `picture`, W), and `room_bits`,
+    the same memory, for depths only. `palette`: for colours only. `classes`: True for them only.
+    `data`: (W, agents, S, H, W) float16 as bits, m; or uint8, (…, 3) for colours.
+
+    Numba leaves out the branches of what is None.
     """
     band, width = picture.face.shape
     reach_m = camera_reach_m(camera, width, picture.height)
@@ -227,16 +232,24 @@ def take_depths(
                 continue
             counts = gather(rows, i, grid, backdrop, reach_m, True, panorama)
             num = find_faces(camera, panorama, counts, picture)
-            out = data[w, row["agent"], due.slot[w]]
+            shown = data[w, row["agent"], due.slot[w]]
             begin, end = lines[w, row["agent"], 0], lines[w, row["agent"], 1]
             for first in range(begin, end, band):
                 last = min(first + band, end)
                 look(camera, picture, num, first, last)
-                depths = room[: last - first]
-                measure_depths(camera, picture, first, depths)
-                if noisy:
-                    _add_noise(noise, row, worlds.ticks[w], camera.range_m, first, depths)
-                write_halves(room_bits, out[first:last])
+                out = shown[first:last]
+                if room is not None and room_bits is not None:
+                    depths = room[: last - first]
+                    measure_depths(camera, picture, first, depths)
+                    if noisy:
+                        _add_noise(noise, row, worlds.ticks[w], camera.range_m, first, depths)
+                    write_halves(room_bits, out)
+                if palette is not None:
+                    write_colours(camera, picture, first, palette, out)
+                    if noisy:
+                        _add_colour_noise(noise, row, worlds.ticks[w], first, out)
+                if classes is not None:
+                    write_classes(picture, out)
 
 
 @kernel
@@ -254,79 +267,6 @@ def _add_noise(
             if depths[j, i] < range_m:
                 error = error_of(noise, key, row["id"], tick, (first + j) * width + i, 0)
                 depths[j, i] = min(max(depths[j, i] + error, LEAST_DEPTH_M), range_m)
-
-
-@kernel
-def take_classes(
-    worlds: Worlds,
-    grid: Grid,
-    backdrop: Backdrop,
-    due: Due,
-    lines: NDArray[np.int32],
-    camera: CameraPose,
-    panorama: Panorama,
-    picture: PixelRows,
-    data: NDArray[np.uint8],
-) -> None:
-    """Write the semantic pictures (W, agents, S, H, W) that are due; see `take_depths`."""
-    band, width = picture.face.shape
-    reach_m = camera_reach_m(camera, width, picture.height)
-    for w in range(worlds.ticks.size):
-        if due.num[w] == 0:
-            continue
-        rows = worlds.rows[w]
-        fill_grid(rows, worlds.num_rows[w], grid)
-        for i in range(worlds.num_owned[w]):
-            row = rows[i]
-            if row["driver"] != DRIVER_AGENT:
-                continue
-            counts = gather(rows, i, grid, backdrop, reach_m, True, panorama)
-            num = find_faces(camera, panorama, counts, picture)
-            out = data[w, row["agent"], due.slot[w]]
-            begin, end = lines[w, row["agent"], 0], lines[w, row["agent"], 1]
-            for first in range(begin, end, band):
-                last = min(first + band, end)
-                look(camera, picture, num, first, last)
-                write_classes(picture, out[first:last])
-
-
-@kernel
-def take_colours(
-    worlds: Worlds,
-    grid: Grid,
-    backdrop: Backdrop,
-    due: Due,
-    lines: NDArray[np.int32],
-    noise: Noise,
-    camera: CameraPose,
-    panorama: Panorama,
-    picture: PixelRows,
-    palette: NDArray[np.float64],
-    data: NDArray[np.uint8],
-) -> None:
-    """Write the coloured pictures (W, agents, S, H, W, 3) that are due; see `take_depths`."""
-    band, width = picture.face.shape
-    reach_m = camera_reach_m(camera, width, picture.height)
-    noisy = _is_noisy(noise)
-    for w in range(worlds.ticks.size):
-        if due.num[w] == 0:
-            continue
-        rows = worlds.rows[w]
-        fill_grid(rows, worlds.num_rows[w], grid)
-        for i in range(worlds.num_owned[w]):
-            row = rows[i]
-            if row["driver"] != DRIVER_AGENT:
-                continue
-            counts = gather(rows, i, grid, backdrop, reach_m, True, panorama)
-            num = find_faces(camera, panorama, counts, picture)
-            out = data[w, row["agent"], due.slot[w]]
-            begin, end = lines[w, row["agent"], 0], lines[w, row["agent"], 1]
-            for first in range(begin, end, band):
-                last = min(first + band, end)
-                look(camera, picture, num, first, last)
-                write_colours(camera, picture, first, palette, out[first:last])
-                if noisy:
-                    _add_colour_noise(noise, row, worlds.ticks[w], first, out[first:last])
 
 
 @kernel
@@ -355,7 +295,7 @@ def fill_grids(
     panorama: Panorama,
     data: NDArray[np.uint8],
 ) -> None:
-    """Write the bird's-eye grids (W, agents, S, rows, columns) that are due; see `take_depths`.
+    """Write the bird's-eye grids (W, agents, S, rows, columns) that are due; see `take_pictures`.
 
     `reach_m` is the distance from the vehicle's place to the farthest corner of the grid.
     """

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from cavmarl.config.rig import (
     BevGridConfig,
@@ -22,9 +23,7 @@ from cavmarl.sensors.kernels.rig_pictures import (
     camera_reach_m,
     fill_grids,
     make_birds_eye,
-    take_classes,
-    take_colours,
-    take_depths,
+    take_pictures,
 )
 from cavmarl.sensors.mounted.frames import SensorFrames
 from cavmarl.sensors.mounted.mount_transforms import mount_matrix
@@ -42,6 +41,10 @@ def camera_of(config: CameraConfig) -> CameraPose:
 class _Camera(ImagingSensor[C]):
     """What all cameras have."""
 
+    kernel = take_pictures
+    written_as: ClassVar[DTypeLike] = np.uint8
+    _own: tuple[Any, ...]  # what is for its kind alone: room, the same as bits, palette, classes
+
     def __init__(self, name: str, config: C, platform: Platform) -> None:
         super().__init__(name, config, platform)
         self._camera = camera_of(config)
@@ -57,57 +60,48 @@ class _Camera(ImagingSensor[C]):
     def num_lines(config: C) -> int:
         return config.height
 
+    def arguments(self, scene: SensedScene, due: Due, frames: SensorFrames) -> tuple[Any, ...]:
+        taken = (self._camera, self._panorama, self._picture, *self._own)
+        data = frames.data.view(self.written_as)
+        return (*self.view(scene, due), self.lines, self.noise, *taken, data)
+
 
 class DepthCamera(_Camera[DepthCameraConfig]):
     """Depth along the optical axis, as float16 in m."""
 
     dtype = np.float16
-    kernel = take_depths
+    written_as = np.uint16
 
     def __init__(self, name: str, config: DepthCameraConfig, platform: Platform) -> None:
         super().__init__(name, config, platform)
-        self._room = np.zeros(self._picture.face.shape, np.float32)
+        room = np.zeros(self._picture.face.shape, np.float32)
+        self._own = (room, room.view(np.uint32), None, None)
 
     @staticmethod
     def bounds(config: DepthCameraConfig) -> Bounds:
         return np.zeros(config.shape), np.full(config.shape, config.range_m)
-
-    def arguments(self, scene: SensedScene, due: Due, frames: SensorFrames) -> tuple[Any, ...]:
-        taken = (self._camera, self._panorama, self._picture)
-        room = (self._room, self._room.view(np.uint32))
-        data = frames.data.view(np.uint16)
-        return (*self.view(scene, due), self.lines, self.noise, *taken, *room, data)
 
 
 class SemanticCamera(_Camera[SemanticCameraConfig]):
     """The class of what each pixel shows; see `kernels.semantics`."""
 
     dtype = np.uint8
-    kernel = take_classes
+    _own = (None, None, None, True)
 
     @staticmethod
     def bounds(config: SemanticCameraConfig) -> Bounds:
         return np.zeros(config.shape), np.full(config.shape, NUM_SEMANTICS - 1.0)
-
-    def arguments(self, scene: SensedScene, due: Due, frames: SensorFrames) -> tuple[Any, ...]:
-        taken = (self._camera, self._panorama, self._picture)
-        return (*self.view(scene, due), self.lines, *taken, frames.data)
 
 
 class RgbCamera(_Camera[RgbCameraConfig]):
     """The colour of each pixel: that of its class, in the light of its face and the haze."""
 
     dtype = np.uint8
-    kernel = take_colours
-    palette = colours()
+    _own = (None, None, colours(), None)
 
     @staticmethod
     def bounds(config: RgbCameraConfig) -> Bounds:
         return np.zeros(config.shape), np.full(config.shape, 255.0)
-
-    def arguments(self, scene: SensedScene, due: Due, frames: SensorFrames) -> tuple[Any, ...]:
-        taken = (self._camera, self._panorama, self._picture, self.palette)
-        return (*self.view(scene, due), self.lines, self.noise, *taken, frames.data)
 
 
 class BevGrid(ImagingSensor[BevGridConfig]):
