@@ -47,8 +47,13 @@ from cavmarl.v2x.kernels.v2x_records import (
     Sending,
     V2xScratch,
 )
-from cavmarl.v2x.roadside import make_units
-from cavmarl.v2x.v2x_messages import Exchange, NetworkSimulator, cause_code, check_receptions
+from cavmarl.v2x.v2x_messages import (
+    Exchange,
+    NetworkSimulator,
+    cause_code,
+    check_receptions,
+    make_units,
+)
 
 Zeros = Callable[..., NDArray[Any]]
 

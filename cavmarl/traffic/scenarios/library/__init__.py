@@ -26,8 +26,7 @@ from cavmarl.config.scenario import ScenarioConfig
 from cavmarl.core.errors import ConfigError, ScenarioError
 from cavmarl.core.math.rng import STREAM_PLACE, below, world_key
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.traffic.scenarios.scenario_parameters import checked
-from cavmarl.traffic.scenarios.scene import Scene
+from cavmarl.traffic.scenarios.scene import Scene, checked
 from cavmarl.traffic.scenarios.streets import Streets
 
 __all__ = ["load_scenario", "plan_scene", "scenario_names", "summary_of"]

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from cavmarl.traffic.scenarios.scenario_parameters import setting
-from cavmarl.traffic.scenarios.scene import Scene
+from cavmarl.traffic.scenarios.scene import Meeting, Scene, meetings, setting
 from cavmarl.traffic.scenarios.streets import Streets
-from cavmarl.traffic.stream import Meeting, meetings
 
 NEEDS = "a movement that gives way to another one into the same lane, with 45 m of road before it"
 

@@ -7,10 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from cavmarl.traffic.scenarios.scenario_parameters import setting
-from cavmarl.traffic.scenarios.scene import Outage, Scene
+from cavmarl.traffic.scenarios.scene import Meeting, Outage, Scene, meetings, setting
 from cavmarl.traffic.scenarios.streets import Crossing, Streets
-from cavmarl.traffic.stream import Meeting, meetings
 
 NEEDS = (
     "a signal, and a way straight on that gives way to another one where it is off, with 55 m of "
