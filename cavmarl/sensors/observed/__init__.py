@@ -20,21 +20,8 @@ from cavmarl.sensors.kernels.sensor_arrays import OptionalSensors
 from cavmarl.sensors.observed import ego_features as seen
 from cavmarl.sensors.observed import highway_kinematics as kinematics
 from cavmarl.sensors.observed import lidar_observation, occupancy_grid, roadgraph
-from cavmarl.sensors.observed.feature import Feature, Sensor
+from cavmarl.sensors.observed.feature import Sensor
 from cavmarl.sensors.observed.highway import goal_places
-
-__all__ = [
-    "SENSORS",
-    "Feature",
-    "Sensor",
-    "frame_size",
-    "largest_radius_m",
-    "layout",
-    "optional_arrays",
-    "sensing_reach_m",
-    "sensor_arrays",
-    "sensors_of",
-]
 
 # Those of the package, in the order of their features in a frame.
 SENSORS: tuple[Sensor, ...] = (

@@ -29,8 +29,6 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.traffic.scenarios.scene import Scene, checked
 from cavmarl.traffic.scenarios.streets import Streets
 
-__all__ = ["load_scenario", "plan_scene", "scenario_names", "summary_of"]
-
 PARTS = ("NEEDS", "Parameters", "places", "stage")
 
 
