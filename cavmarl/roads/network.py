@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.huge_pages import huge_copy
+from cavmarl.core.math.geometry import lane_pose, project
 from cavmarl.core.records import record
 from cavmarl.core.records.arrays import RoadArrays
 from cavmarl.roads.kernels.backdrop_pieces import WALL
@@ -306,9 +307,23 @@ class RoadNetwork:
 
     def lane_polyline(self, lane: int) -> NDArray[np.float64]:
         """The centre line of a lane as (num_points, 3) x, y, z in metres."""
-        row = self.lanes[lane]
-        points = self.points[row["first_point"] : row["first_point"] + row["num_points"]]
+        points = self.lane_points(lane)
         return np.stack([points["x"], points["y"], points["z"]], axis=1)
+
+    def lane_points(self, lane: int) -> NDArray[np.void]:
+        """POINT (num_points,) of a lane."""
+        row = self.lanes[lane]
+        return self.points[row["first_point"] : row["first_point"] + row["num_points"]]
+
+    def pose_on(self, lane: int, s: float) -> tuple[float, float, float, float, float, float]:
+        """X, y and z of a place on a lane, and cosine, sine and slope of its direction there."""
+        row = self.lanes[lane]
+        return lane_pose(self.points, row["first_point"], row["num_points"], s)
+
+    def beside(self, lane: int, x: float, y: float) -> tuple[float, float, float, float]:
+        """S and d of a place beside a lane, and cosine and sine of the lane's direction there."""
+        row = self.lanes[lane]
+        return project(self.points, row["first_point"], row["num_points"], x, y)
 
     @cached_property
     def content_hash(self) -> str:

@@ -103,8 +103,7 @@ class HdMap:
 
     def polyline(self, lane: int, from_m: float) -> NDArray[np.float64]:
         """(n, 2) the centre of a lane from a place on to its end."""
-        row = self.network.lanes[lane]
-        points = self.network.points[row["first_point"] : row["first_point"] + row["num_points"]]
+        points = self.network.lane_points(lane)
         s = np.concatenate([[from_m], points["s"][points["s"] > from_m + 1e-6]])
         return np.stack(
             [np.interp(s, points["s"], points["x"]), np.interp(s, points["s"], points["y"])], axis=1

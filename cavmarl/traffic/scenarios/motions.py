@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.geometry import lane_pose
 from cavmarl.driving.kernels.announcing import announced_m
 from cavmarl.driving.kernels.approach import MAX_LINKS_AHEAD
 from cavmarl.roads.network import RoadNetwork
@@ -123,7 +122,7 @@ class Ride:
     def _pose(self, network: RoadNetwork, length: float, u: float, speed: float) -> Pose:
         front, rear = (self._point(network, u + side * 0.5 * length) for side in (1.0, -1.0))
         lane, s = self._place(network, u)
-        _, _, _, _, _, slope = _lane_pose(network, lane, s)
+        _, _, _, _, _, slope = network.pose_on(lane, s)
         return Pose(
             0.5 * (front[0] + rear[0]),
             0.5 * (front[1] + rear[1]),
@@ -146,7 +145,7 @@ class Ride:
         return self.lanes[-1], u
 
     def _point(self, network: RoadNetwork, u: float) -> tuple[float, float]:
-        x, y, *_ = _lane_pose(network, *self._place(network, u))
+        x, y, *_ = network.pose_on(*self._place(network, u))
         return x, y
 
     def _entered(self, network: RoadNetwork, lane: int) -> int:
@@ -245,10 +244,3 @@ def _link_between(network: RoadNetwork, before: int, after: int) -> int:
         if network.links["next_lane"][link] == after:
             return int(link)
     return -1
-
-
-def _lane_pose(
-    network: RoadNetwork, lane: int, s: float
-) -> tuple[float, float, float, float, float, float]:
-    row = network.lanes[lane]
-    return lane_pose(network.points, row["first_point"], row["num_points"], s)

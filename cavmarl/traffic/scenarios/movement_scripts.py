@@ -18,7 +18,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.geometry import lane_pose, project
 from cavmarl.core.records import record
 from cavmarl.core.records.arrays import Scripts
 from cavmarl.core.records.codes import CLASS_PEDESTRIAN, MODEL_IDM
@@ -60,13 +59,13 @@ class Shadows:
             row = self._network.lanes[lane]
             if not self._is_level(lane, pose.beside):
                 continue
-            places = [self._project(lane, x, y) for x, y in points]
+            places = [self._network.beside(lane, x, y)[:2] for x, y in points]
             reach = 0.5 * float(row["width_m"])
             length_m = float(row["length_m"])
             covered = [s for s, d in places if abs(d) < reach and 0.0 <= s <= length_m]
             if covered:
                 start, end = min(covered), max(covered)
-                _, _, _, cos, sin, _ = self._pose(lane, 0.5 * (start + end))
+                _, _, _, cos, sin, _ = self._network.pose_on(lane, 0.5 * (start + end))
                 along = math.cos(pose.heading) * cos + math.sin(pose.heading) * sin
                 found[lane] = Shadow(start, end, max(pose.speed * along, 0.0))
         return found
@@ -77,7 +76,7 @@ class Shadows:
         for lane in self._around(pose.x, pose.y):
             if not self._is_level(lane, pose.beside):
                 continue
-            s, d = self._project(lane, pose.x, pose.y)
+            s, d, _, _ = self._network.beside(lane, pose.x, pose.y)
             length = float(self._network.lanes["length_m"][lane])
             on = min(max(s, 0.0), length)
             off = math.hypot(abs(s - on), d)
@@ -86,11 +85,11 @@ class Shadows:
         return best
 
     def height_m(self, lane: int, s: float) -> float:
-        return self._pose(lane, s)[2]
+        return self._network.pose_on(lane, s)[2]
 
     def distance_m(self, lane: int, s: float, pose: Pose) -> float:
         """From a place on a lane to an actor, in the plane."""
-        x, y, *_ = self._pose(lane, s)
+        x, y, *_ = self._network.pose_on(lane, s)
         return math.hypot(x - pose.x, y - pose.y)
 
     def _is_level(self, lane: int, other: int) -> bool:
@@ -122,15 +121,6 @@ class Shadows:
         start = self._grid.cell_start
         lanes: list[int] = self._grid.cell_lanes[start[cell] : start[cell + 1]].tolist()
         return [lane for lane in lanes if self._network.lanes["permissions"][lane] & ON_ROAD]
-
-    def _project(self, lane: int, x: float, y: float) -> tuple[float, float]:
-        row = self._network.lanes[lane]
-        s, d, _, _ = project(self._network.points, row["first_point"], row["num_points"], x, y)
-        return s, d
-
-    def _pose(self, lane: int, s: float) -> tuple[float, float, float, float, float, float]:
-        row = self._network.lanes[lane]
-        return lane_pose(self._network.points, row["first_point"], row["num_points"], s)
 
 
 def _outline(pose: Pose, length: float, width: float) -> NDArray[np.float64]:

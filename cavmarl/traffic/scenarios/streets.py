@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.geometry import lane_pose, project
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.routing import lane_grid
 
@@ -45,10 +44,7 @@ class Streets:
 
     def point(self, lane: int, s: float, d: float = 0.0) -> NDArray[np.float64]:
         """(3,) x, y and heading of a place on a lane, `d` m to the left of its middle."""
-        row = self.network.lanes[lane]
-        x, y, _, cos, sin, _ = lane_pose(
-            self.network.points, row["first_point"], row["num_points"], s
-        )
+        x, y, _, cos, sin, _ = self.network.pose_on(lane, s)
         return np.array([x - d * sin, y + d * cos, math.atan2(sin, cos)])
 
     def edge(self, lane: int) -> int:
@@ -88,11 +84,8 @@ class Streets:
         other = self._lane_at(np.array([x, y, heading]))
         if other < 0:
             return None
-        row = self.network.lanes[other]
         middle = self.point(lane, s)
-        place, d, cos, sin = project(
-            self.network.points, row["first_point"], row["num_points"], middle[0], middle[1]
-        )
+        place, d, cos, sin = self.network.beside(other, middle[0], middle[1])
         along = cos * math.cos(heading) + sin * math.sin(heading)
         if along > -0.99 or abs(d) > BESIDE_M:
             return None
@@ -186,9 +179,7 @@ class Streets:
         return self.network.lane_ids[lane]
 
     def _bend(self, lane: int) -> float:
-        row = self.network.lanes[lane]
-        points = self.network.points[row["first_point"] : row["first_point"] + row["num_points"]]
-        return float(np.ptp(np.unwrap(points["heading"])))
+        return float(np.ptp(np.unwrap(self.network.lane_points(lane)["heading"])))
 
     def _lane_at(self, place: NDArray[np.float64]) -> int:
         """The lane outside junctions that a place is on, or -1."""
@@ -201,7 +192,7 @@ class Streets:
             row = self.network.lanes[lane]
             if row["internal"]:
                 continue
-            s, d, _, _ = project(self.network.points, row["first_point"], row["num_points"], x, y)
+            s, d, _, _ = self.network.beside(lane, x, y)
             if abs(d) < 0.5 * row["width_m"] and 0.0 <= s <= row["length_m"]:
                 return int(lane)
         return -1
