@@ -135,7 +135,7 @@ def draw_cars(
 
     Brake lights shine below `BRAKING_MPS2`; a red outline is a vehicle that has collided.
 
-    `paints`: of each; by default agents have the colours of `palette.agent_color`.
+    `paints`: of each; by default agents have the colours of `agent_color`.
     """
     if paints is None:
         paints = [_paint_of_driver(row) for row in vehicles]

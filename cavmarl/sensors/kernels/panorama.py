@@ -68,7 +68,7 @@ SEMANTIC_OF_CLASS = {
 
 PRISM = record(
     ("id", np.int64),  # of the vehicle or pedestrian
-    ("semantic", np.int64),  # see kernels.semantics
+    ("semantic", np.int64),  # one of the classes above
     ("x", np.float64),  # centre, m
     ("y", np.float64),
     ("bottom", np.float64),  # z, m

@@ -83,7 +83,7 @@ class DepthCamera(_Camera[DepthCameraConfig]):
 
 
 class SemanticCamera(_Camera[SemanticCameraConfig]):
-    """The class of what each pixel shows; see `kernels.semantics`."""
+    """The class of what each pixel shows; see `kernels.panorama`."""
 
     dtype = np.uint8
     _own = (None, None, None, True)
@@ -105,7 +105,7 @@ class RgbCamera(_Camera[RgbCameraConfig]):
 
 
 class BevGrid(ImagingSensor[BevGridConfig]):
-    """The class of each cell's centre, seen from above; see `kernels.semantics`."""
+    """The class of each cell's centre, seen from above; see `kernels.panorama`."""
 
     dtype = np.uint8
     kernel = fill_grids

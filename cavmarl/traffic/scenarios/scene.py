@@ -37,7 +37,7 @@ class Outage(NamedTuple):
 
 @dataclass(frozen=True)
 class Scene:
-    """One conflict, played to an agent; others may come behind it (`seats`)."""
+    """One conflict, played to an agent; others may come behind it."""
 
     place: str  # where, by the map's name
     x: float  # its middle, m
