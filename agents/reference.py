@@ -1,6 +1,6 @@
 """The reference stack: perception, localisation, planning and control from sensors and the map.
 
-It needs the sensors of `cavmarl.cosim.stack.reference_rig` on its vehicle. Here it runs in
+It needs the sensors of `cavmarl.cosim.stack.stack` on its vehicle. Here it runs in
 the process of the environment, from the same snapshots that `cavmarl follow` gets over a socket.
 """
 

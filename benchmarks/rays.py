@@ -19,8 +19,8 @@ from cavmarl.config.registry import load_config
 from cavmarl.engine.rig_component import MountedSensors
 from cavmarl.engine.simulation import Simulation
 from cavmarl.evaluate.driven_worlds import DrivenWorld, world_maker
-from cavmarl.sensors.kernels.rig_schedule import Due
-from cavmarl.sensors.mounted.catalogue import mount
+from cavmarl.sensors.kernels.rig_frames import Due
+from cavmarl.sensors.registry import mount
 
 ENV = "grid4x4"
 CARS_PER_KM2 = 400

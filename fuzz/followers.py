@@ -26,7 +26,7 @@ import msgpack
 from cavmarl.core.errors import ClockError, FollowerError
 from cavmarl.cosim.followers.follower_barrier import Barrier, FollowerSeat
 from cavmarl.cosim.followers.follower_client import Follower
-from cavmarl.cosim.followers.follower_connection import FollowerConnection, listen
+from cavmarl.cosim.followers.follower_connection import FollowerConnection, Reception, listen
 from cavmarl.cosim.followers.follower_messages import (
     FOLLOWERS,
     Control,
@@ -37,7 +37,6 @@ from cavmarl.cosim.followers.follower_messages import (
     letter_of,
 )
 from cavmarl.cosim.followers.follower_snapshots import SnapshotTime, take_snapshot, welcome_to
-from cavmarl.cosim.followers.reception import Reception
 from cavmarl.cosim.time_master import TimeMaster
 from cavmarl.env.parallel import CavEnv, parallel_env
 from fuzz.files import Target

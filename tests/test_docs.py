@@ -16,7 +16,7 @@ import pytest
 from cavmarl.config.env import TERMS, EnvConfig
 from cavmarl.config.io import dotted_keys
 from cavmarl.config.rig import CollisionConfig, SampledConfig
-from cavmarl.sensors.mounted.catalogue import TYPES
+from cavmarl.sensors.registry import TYPES
 from tests.support.generated import check_block, table
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cavmarl import make_vec
-from cavmarl.sensors.mounted.catalogue import TYPES
+from cavmarl.sensors.registry import TYPES
 from cavmarl.verify.equivalence import verify_zones
 from tests.support.faulted import ROUGH, record, replay
 

@@ -10,7 +10,7 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.config.io import read_yaml
 from cavmarl.config.registry import places
 from cavmarl.core.errors import ConfigError
-from cavmarl.sensors.mounted.catalogue import type_of
+from cavmarl.sensors.registry import type_of
 
 Rig = dict[str, dict[str, Any]]
 

@@ -114,8 +114,8 @@ def lead(
 ) -> None:
     """Run a world as its time master; followers that join over a socket drive its agents."""
     from cavmarl.cosim.followers.followed_world import FollowedWorld
-    from cavmarl.cosim.pacing import RealTime
-    from cavmarl.cosim.stack.reference_rig import REFERENCE_RIG
+    from cavmarl.cosim.stack.stack import REFERENCE_RIG
+    from cavmarl.cosim.time_master import RealTime
     from cavmarl.env.parallel import parallel_env
 
     if followers < 0 or (steps is not None and steps < 1):

@@ -28,7 +28,7 @@ app = typer.Typer(help="Scripted conflicts for agents.", no_args_is_help=True)
 def list_scenarios(json_path: JsonPath = None) -> None:
     """Show the scenarios, what each needs of a map, and its parameters."""
     from cavmarl.traffic.scenarios.library import load_scenario, scenario_names, summary_of
-    from cavmarl.traffic.scenarios.scenario_parameters import describe
+    from cavmarl.traffic.scenarios.scene import describe
 
     console = Console()
     document: dict[str, Any] = {}

@@ -16,7 +16,7 @@ from cavmarl.config.checks import Section, Whole, Within, check, check_finite
 from cavmarl.core.extensions import REGISTERED_SENSORS
 
 # highway-env's features of one vehicle, in the order of their codes in
-# sensors/kernels/vehicle_features.py.
+# sensors/kernels/kinematics_observation.py.
 VEHICLE_FEATURES = (
     "presence",
     "x",

@@ -6,11 +6,14 @@ resets them; an environment without a master pays nothing for that. Followers co
 world runs. What one of them does when it ticks by itself, which made the world of the
 co-simulation paper advance 1.92 times as fast as its master, is refused, ignored or, to show the
 fault, obeyed; each is counted, and what has passed the master by is noticed before his next step.
+
+A `Pacer` paces steps on the wall clock; simulated time does not depend on it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, Protocol
@@ -19,11 +22,99 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
-from cavmarl.core.errors import ClockError
-from cavmarl.cosim.pacing import Pacer, Unpaced
+from cavmarl.core.errors import ClockError, ConfigError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.step_trace import StepTrace
 from cavmarl.shards.shard import Commands
+
+
+class Pacer(Protocol):
+    """Says when the next step may begin."""
+
+    def wait(self, elapsed_s: float) -> None:
+        """Return when the step may begin that starts after `elapsed_s` of simulated time."""
+        ...
+
+
+class Unpaced:
+    """A step begins as soon as the one before has ended."""
+
+    def wait(self, elapsed_s: float) -> None:
+        """Go on at once."""
+
+
+@dataclass(frozen=True)
+class Lateness:
+    """How late steps began, by the wall clock."""
+
+    steps: int  # that have begun
+    # of these, that could not begin when they were due, because what went before took too long
+    late: int
+    mean_wall_s: float  # how long after they were due all of them began, on average
+    worst_wall_s: float  # the same, of the worst
+
+
+class RealTime:
+    """Simulated time goes on `factor` times as fast as the wall clock, or slower if it has to.
+
+    A step is due at a fixed time after the first one began, so that lateness is made up for and
+    does not add up.
+
+    `factor`: seconds of simulated time a second. `now`: the wall clock in seconds. `sleep`: waits
+    so many seconds.
+
+    Raises ConfigError: a factor that is no number above 0.
+    """
+
+    def __init__(
+        self,
+        factor: float = 1.0,
+        now: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        if not 0.0 < factor < float("inf"):
+            raise ConfigError(f"pacing by {factor}: must be a number above 0, as 1 or 2.5")
+        self._factor = factor
+        self._now, self._sleep = now, sleep
+        self._origin: float | None = None
+        self._steps = self._late = 0
+        self._sum_s = self._worst_s = 0.0
+
+    def wait(self, elapsed_s: float) -> None:
+        now = self._now()
+        if self._origin is None:
+            self._origin = now - elapsed_s / self._factor
+        early_s = self._origin + elapsed_s / self._factor - now
+        if early_s > 0.0:
+            self._sleep(early_s)
+            early_s = self._origin + elapsed_s / self._factor - self._now()
+        elif early_s < 0.0:
+            self._late += 1
+        late_s = max(0.0, -early_s)
+        self._steps += 1
+        self._sum_s += late_s
+        self._worst_s = max(self._worst_s, late_s)
+
+    @property
+    def lateness(self) -> Lateness:
+        mean_s = self._sum_s / max(self._steps, 1)
+        return Lateness(self._steps, self._late, mean_s, self._worst_s)
+
+
+class Stepwise:
+    """Each step waits for permission.
+
+    Args:
+        ask: called with the simulated time in seconds before each step; the step begins when it
+            returns.
+    """
+
+    def __init__(self, ask: Callable[[float], object]) -> None:
+        self._ask = ask
+
+    def wait(self, elapsed_s: float) -> None:
+        self._ask(elapsed_s)
+
 
 OwnTicks = Literal["refuse", "ignore", "obey"]
 
@@ -55,48 +146,32 @@ class Steppable(Protocol):
 
 
 class ClockEvent(NamedTuple):
-    """Something about time that should not have been.
+    """Something about time that should not have been."""
 
-    Attributes:
-        tick: the master's when it was noticed.
-        kind: `own_tick`: a follower wanted to tick; `drift`: a world is not where its master left
-            it.
-        who: name of the follower; unknown for a drift.
-        ticks: by how many the world has gone on, or would have.
-    """
-
-    tick: int
+    tick: int  # the master's when it was noticed
+    # `own_tick`: a follower wanted to tick; `drift`: a world is not where its master left it
     kind: Literal["own_tick", "drift"]
-    who: str
-    ticks: int
+    who: str  # name of the follower; unknown for a drift
+    ticks: int  # by how many the world has gone on, or would have
 
 
 @dataclass
 class TimeFollower:
-    """Reads the master's clock, in this process or at the other end of a socket.
+    """Reads the master's clock, in this process or at the other end of a socket."""
 
-    Attributes:
-        master: whose clock it reads.
-        name: of it.
-        since_tick: the master's when it has joined.
-        own_ticks: how often it has wanted to tick by itself.
-    """
-
-    master: TimeMaster
+    master: TimeMaster  # whose clock it reads
     name: str
-    since_tick: int
-    own_ticks: int = 0
+    since_tick: int  # the master's when it has joined
+    own_ticks: int = 0  # how often it has wanted to tick by itself
 
     @property
     def time_s(self) -> float:
-        """The master's time."""
         return self.master.time_s
 
     def tick(self) -> bool:
         """Try to advance the world; whether it has advanced.
 
-        Raises:
-            ClockError: the master refuses; see `TimeMaster`; it is no follower any more.
+        Raises ClockError: the master refuses; see `TimeMaster`; it is no follower any more.
         """
         self.master.check_follower(self)
         self.own_ticks += 1
@@ -185,7 +260,6 @@ class TimeMaster:
 
     @property
     def time_s(self) -> float:
-        """Seconds: tick · Δt, from the integer, so that nothing adds up."""
         return self.tick * self.dt_s
 
     @property
@@ -195,7 +269,6 @@ class TimeMaster:
 
     @property
     def followers(self) -> tuple[TimeFollower, ...]:
-        """The followers, in the order in which they joined."""
         return tuple(self._followers)
 
     def follow(self, name: str) -> TimeFollower:
@@ -210,8 +283,7 @@ class TimeMaster:
     def step(self, actions: Any) -> Any:
         """Advance the environment by one step; returns what its `step` returns.
 
-        Raises:
-            ClockError: a world is not where the last step has left it.
+        Raises ClockError: a world is not where the last step has left it.
         """
         with self._turn():
             return self.env.step(actions)
@@ -238,8 +310,7 @@ class TimeMaster:
     def _mine(self) -> _Worlds:
         """The worlds behind the guard.
 
-        Raises:
-            ClockError: they have been let go.
+        Raises ClockError: they have been let go.
         """
         if self.env.worlds is not self._mastered:
             raise ClockError("this master has been released: make another TimeMaster")
@@ -249,8 +320,7 @@ class TimeMaster:
     def check_turn(self, what: str) -> None:
         """Refuse a caller that is not the master.
 
-        Raises:
-            ClockError: `what` was called on the environment itself.
+        Raises ClockError: `what` was called on the environment itself.
         """
         if not self._is_turn:
             raise ClockError(
@@ -261,8 +331,7 @@ class TimeMaster:
     def check_follower(self, follower: TimeFollower) -> None:
         """Refuse a follower that does not follow any more.
 
-        Raises:
-            ClockError: it has left, or the master was released.
+        Raises ClockError: it has left, or the master was released.
         """
         if follower not in self._followers:
             raise ClockError(f"'{follower.name}' follows no more: join again (TimeMaster.follow)")
@@ -286,8 +355,7 @@ class TimeMaster:
     def look_for_drift(self) -> None:
         """Notice worlds that are not where the last step has left them.
 
-        Raises:
-            ClockError: there are some, and `on_drift` is `error`.
+        Raises ClockError: there are some, and `on_drift` is `error`.
         """
         found = self._mine().ticks()
         if (found == self._left).all():
@@ -309,8 +377,7 @@ class TimeMaster:
     def tick_for(self, follower: TimeFollower) -> bool:
         """A follower wants to tick by itself; whether the world has advanced.
 
-        Raises:
-            ClockError: `own_ticks` is `refuse`.
+        Raises ClockError: `own_ticks` is `refuse`.
         """
         self.own_ticks += 1
         self._keep(ClockEvent(self.tick, "own_tick", follower.name, self._per_step))

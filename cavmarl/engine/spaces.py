@@ -13,9 +13,10 @@ from numpy.typing import DTypeLike, NDArray
 
 from cavmarl.config.env import ActionConfig, EnvConfig, SensorsConfig
 from cavmarl.config.rig import samples_per_step
-from cavmarl.sensors.mounted.catalogue import type_of
 from cavmarl.sensors.mounted.frames import Frames
-from cavmarl.sensors.observed import Feature, layout, sensors_of
+from cavmarl.sensors.observed import layout, sensors_of
+from cavmarl.sensors.observed.feature import Feature
+from cavmarl.sensors.registry import type_of
 
 # Features of one vehicle in the global state: present, x, y, cos, sin, speed.
 STATE_FEATURES = 6

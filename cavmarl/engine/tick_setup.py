@@ -11,8 +11,8 @@ from cavmarl.engine.shared_outputs import SharedOutputs
 from cavmarl.engine.tick import Tick
 from cavmarl.handoff.shard_setup import divide
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.sensors.mounted.catalogue import frame_layout, frames_in
 from cavmarl.sensors.mounted.frames import Frames
+from cavmarl.sensors.registry import frame_layout, frames_in
 from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.departure_queue import make_gate
 from cavmarl.traffic.native import NativeTraffic

@@ -31,7 +31,7 @@ from cavmarl.env.declared_events import DeclaredEvents
 from cavmarl.env.world_copies import CopiedWithWorlds
 from cavmarl.parallel.backends import check_hosts, keeps_state, make_worlds
 from cavmarl.parallel.step_arrays import SteppedWorlds
-from cavmarl.render.world_view import WorldView
+from cavmarl.render.topdown import WorldView
 from cavmarl.sensors.mounted.frames import SensorFrames
 
 RENDER_MODES = ("human", "rgb_array")

@@ -14,8 +14,8 @@ from cavmarl.ownership.distances import Distances, check_coverage, needed_overla
 from cavmarl.ownership.limits import DeadlinePolicy, Limits
 from cavmarl.rewards.registered_terms import terms_reach_m
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.sensors.mounted.catalogue import rig_reach_m
 from cavmarl.sensors.observed import largest_radius_m, sensing_reach_m
+from cavmarl.sensors.registry import rig_reach_m
 from cavmarl.shards.shard import Shard, make_zoned
 from cavmarl.shards.vehicle_codec import TransferCodec
 from cavmarl.traffic.native import NativeTraffic

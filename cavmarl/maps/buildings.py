@@ -1,20 +1,255 @@
-"""Buildings on a map: walls that rays end at, and their footprints in convex parts."""
+"""Buildings on a map: walls that rays end at, and their footprints in convex parts.
+
+They are read from OpenStreetMap or from SUMO's polygon files.
+"""
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import replace
+import math
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
+from xml.sax.handler import ContentHandler
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import MapError
-from cavmarl.maps.footprints import Footprint, read_footprints
+from cavmarl.core.errors import MapError, require
 from cavmarl.roads.kernels.backdrop_pieces import WALL
-from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.network import GeoReference, RoadNetwork
 from cavmarl.roads.sumo_net.reader import source_hash
+from cavmarl.roads.sumo_net.xml_source import read_xml
+
+Ring = NDArray[np.float64]
+
+DEFAULT_HEIGHT_M = 8.0  # of a building that says nothing of its height
+LEVEL_M = 3.0  # of a building of which only the levels are known
+
+# Values of building=* that rays pass under, or that do not stand there.
+_NO_WALLS = frozenset(("no", "roof", "carport", "canopy", "demolished", "ruins"))
+_METRES = re.compile(r"\s*([0-9]+(?:\.[0-9]+)?)\s*(?:m|metres?)?\s*")
+_MOST_HEIGHT_M = 1000.0
+_DIGITS = 6  # of a metre; sides that are nearly level would have endless slopes
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """One building."""
+
+    name: str  # in the file
+    # (n, 2) corners in m in the map's frame, first not repeated; a place is inside that an odd
+    # number of them goes around
+    rings: tuple[Ring, ...]
+    height_m: float  # over the ground
+
+
+def read_footprints(path: Path, geo: GeoReference | None) -> list[Footprint]:
+    """The buildings of a file, in its order.
+
+    Args:
+        path: OpenStreetMap (<osm>), or a SUMO file with <poly> elements; also gzipped.
+        geo: where the map lies on the earth; None: it does not say.
+
+    Raises:
+        MapError: the file is broken, or is of another map, or says places on the earth while the
+            map does not say where it lies.
+        MissingExtraError: places have to be projected, and pyproj is not installed.
+    """
+    reader = _Reader(path, geo)
+    read_xml(path, reader)
+    if reader.root == "osm":
+        return list(_osm_buildings(path, reader, geo))
+    if reader.root in ("additional", "polygons", "shapes"):
+        found = [
+            Footprint(element.name, _rings([ring]), _height_m(element.tags))
+            for element, ring in reader.polygons
+        ]
+        return [footprint for footprint in found if footprint.rings]
+    raise MapError(
+        f"{path}: <{reader.root}> is the root of no file of buildings: give an OpenStreetMap "
+        "extract (<osm>) or SUMO polygons (<additional>, .poly.xml)"
+    )
+
+
+@dataclass
+class _Element:
+    """A way or relation of OSM, or a polygon of SUMO, with what is said of it."""
+
+    name: str
+    line: int
+    tags: dict[str, str] = field(default_factory=dict)
+    nodes: list[str] = field(default_factory=list)
+    ways: list[str] = field(default_factory=list)
+
+    @property
+    def is_building(self) -> bool:
+        kind = self.tags.get("building", "no")
+        return kind not in _NO_WALLS and self.tags.get("location") != "underground"
+
+
+class _Reader(ContentHandler):
+    """Takes in nodes, ways and multipolygons of OSM, and polygons of SUMO."""
+
+    def __init__(self, path: Path, geo: GeoReference | None) -> None:
+        super().__init__()
+        self.root = ""
+        self.places: dict[str, tuple[float, float]] = {}
+        self.ways: dict[str, _Element] = {}
+        self.relations: list[_Element] = []
+        self.polygons: list[tuple[_Element, Ring]] = []
+        self._open: _Element | None = None
+        self._path = path
+        self._geo = geo
+        self._locator: Any = None
+
+    def startElement(self, name: str, attrs: Any) -> None:
+        self.root = self.root or name
+        try:
+            self._take(name, attrs)
+        except KeyError as error:
+            raise self._error(name, f"has no attribute {error}") from error
+        except ValueError as error:
+            raise self._error(name, f"holds no numbers ({error})") from error
+
+    def endElement(self, name: str) -> None:
+        if name in ("way", "relation", "poly"):
+            self._open = None
+
+    def _take(self, name: str, attrs: Mapping[str, str]) -> None:
+        if name == "node":
+            place = (float(attrs["lon"]), float(attrs["lat"]))
+            self.places[attrs["id"]] = _finite(place)
+        elif name in ("way", "relation"):
+            self._open = _Element(f"{name} {attrs['id']}", self._locator.getLineNumber())
+            if name == "way":
+                self.ways[attrs["id"]] = self._open
+            else:
+                self.relations.append(self._open)
+        elif name == "nd" and self._open is not None:
+            self._open.nodes.append(attrs["ref"])
+        elif name == "member" and self._open is not None:
+            if attrs["type"] == "way" and attrs.get("role") in ("outer", "inner", ""):
+                self._open.ways.append(attrs["ref"])
+        elif name == "tag" and self._open is not None:
+            self._open.tags[attrs["k"]] = attrs["v"]
+        elif name == "location":
+            self._check_location(attrs)
+        elif name == "poly" and attrs.get("type", "").startswith("building"):
+            self._open = _Element(f"poly {attrs['id']}", self._locator.getLineNumber())
+            self.polygons.append((self._open, self._ring(attrs)))
+        elif name == "param" and self._open is not None:
+            self._open.tags[attrs["key"]] = attrs["value"]
+
+    def _ring(self, attrs: Mapping[str, str]) -> Ring:
+        places = [
+            _finite(tuple(map(float, word.split(",")[:2]))) for word in attrs["shape"].split()
+        ]
+        ring = np.array(places, dtype=np.float64).reshape(-1, 2)
+        if attrs.get("geo", "false") in ("1", "true"):
+            ring = _project(self._path, ring, self._geo)
+        return ring
+
+    def _check_location(self, attrs: Mapping[str, str]) -> None:
+        """Refuse polygons that were made for a network at another place."""
+        offset = tuple(map(float, attrs["netOffset"].split(",")))
+        geo = self._geo
+        ours = (0.0, 0.0) if geo is None else (geo.offset_x_m, geo.offset_y_m)
+        if math.dist(offset, ours) > 0.01:
+            raise self._error(
+                "location",
+                f"has the offset {attrs['netOffset']}, the map {ours[0]:.2f},{ours[1]:.2f}: these "
+                "buildings are of another network",
+            )
+
+    def _error(self, name: str, problem: str) -> MapError:
+        return MapError(
+            f"{self._path}, line {self._locator.getLineNumber()}: <{name}> {problem}: export the "
+            "file again for this map"
+        )
+
+
+def _finite(place: tuple[float, ...]) -> tuple[float, float]:
+    x, y = place
+    if not (math.isfinite(x) and math.isfinite(y)):
+        raise ValueError(f"{x}, {y}")
+    return x, y
+
+
+def _osm_buildings(path: Path, osm: _Reader, geo: GeoReference | None) -> Iterator[Footprint]:
+    """Closed ways and multipolygons that are buildings; those that leave the extract are not."""
+    for element in [*osm.ways.values(), *osm.relations]:
+        if not element.is_building:
+            continue
+        ways = [element.nodes] if element.nodes else [
+            osm.ways[way].nodes for way in element.ways if way in osm.ways
+        ]  # fmt: skip
+        closed = [
+            np.array([osm.places[node] for node in nodes[:-1]])
+            for nodes in _closed(ways)
+            if all(node in osm.places for node in nodes)
+        ]
+        rings = _rings([_project(path, ring, geo) for ring in closed])
+        if rings:
+            yield Footprint(element.name, rings, _height_m(element.tags))
+
+
+def _closed(ways: list[list[str]]) -> list[list[str]]:
+    found, open_ways = [], []
+    for way in ways:
+        if len(way) >= 4 and way[0] == way[-1]:
+            found.append(way)
+        elif len(way) >= 2:
+            open_ways.append(list(way))
+    while open_ways:
+        ring = open_ways.pop(0)
+        while ring[0] != ring[-1]:
+            following = next((way for way in open_ways if ring[-1] in (way[0], way[-1])), None)
+            if following is None:
+                break
+            open_ways.remove(following)
+            ring += following[1:] if following[0] == ring[-1] else following[-2::-1]
+        if ring[0] == ring[-1] and len(ring) >= 4:
+            found.append(ring)
+    return found
+
+
+def _rings(rings: list[Ring]) -> tuple[Ring, ...]:
+    """Those with at least three corners, to the micrometre, without the first one at the end."""
+    rounded = [np.round(ring, _DIGITS) for ring in rings]
+    opened = [ring[:-1] if len(ring) and (ring[0] == ring[-1]).all() else ring for ring in rounded]
+    return tuple(ring for ring in opened if len(ring) >= 3)
+
+
+def _height_m(tags: Mapping[str, str]) -> float:
+    """Of `height`, else of `building:levels`; what cannot be understood is not said."""
+    for key, unit_m in (("height", 1.0), ("building:levels", LEVEL_M)):
+        match = _METRES.fullmatch(tags.get(key, ""))
+        if match is not None and 0.0 < float(match[1]) * unit_m <= _MOST_HEIGHT_M:
+            return float(match[1]) * unit_m
+    return DEFAULT_HEIGHT_M
+
+
+def _project(path: Path, ring: Ring, geo: GeoReference | None) -> Ring:
+    """Longitudes and latitudes (n, 2) as places on the map."""
+    if geo is None:
+        raise MapError(
+            f"{path}: says where its buildings lie on the earth, and the map does not say where it "
+            "lies: build it with a projection, or give buildings in the map's own frame"
+        )
+    pyproj: Any = require("pyproj", "maps")
+    x, y = pyproj.Proj(projparams=geo.projection)(ring[:, 0], ring[:, 1])
+    placed: Ring = np.stack([x + geo.offset_x_m, y + geo.offset_y_m], axis=1)
+    if not np.isfinite(placed).all():
+        raise MapError(
+            f"{path}: a building near longitude {ring[0, 0]:g}, latitude {ring[0, 1]:g} cannot be "
+            "projected as the map is: export the file again for this map"
+        )
+    return placed
+
 
 # Buildings that are farther from every road's bounding box than any sensor sees are left out.
 FARTHEST_M = 300.0
@@ -24,10 +259,6 @@ MOST_CORNERS = 4000
 
 def with_buildings(network: RoadNetwork, path: Path) -> RoadNetwork:
     """A network with the buildings of a file.
-
-    Args:
-        network: not changed.
-        path: see `read_footprints`.
 
     Returns:
         A network with another `source_hash`, for it has more than one source.

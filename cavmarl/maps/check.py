@@ -27,62 +27,37 @@ _GREEN = [SIGNAL_STATES.index(letter) for letter in "gGosOY"]
 
 @dataclass(frozen=True)
 class MapReport:
-    """What `check_map` found.
+    """What `check_map` found."""
 
-    Attributes:
-        name, source_hash: of the network.
-        road_km, lane_km: stated length of all edges, of all lanes.
-        edges, lanes: how many.
-        junctions: where more than two edges meet.
-        junctions_by_type: all nodes of the map by SUMO's type.
-        signals: traffic lights.
-        programs: of all traffic lights together.
-        actuated_signals: traffic lights whose program follows the traffic.
-        programs_simplified: signal programs (signal/program) for which SUMO has rules that are not
-            run here: a choice among following phases, delay-based and NEMA control, which run for
-            their stated durations, and limits of single links.
-        extent_m: min x, min y, max x, max y of the lanes.
-        elevation_m: lowest and highest point of the lanes.
-        max_grade: steepest slope of a lane, as a ratio.
-        connected_edges: edges in the largest part in which every edge reaches every other.
-        connected_share: of all edges.
-        dead_ends: edges that lead nowhere.
-        lanes_without_successor: lanes that lead nowhere on edges that go on.
-        junctions_without_right_of_way: where lanes meet and the map has no rule.
-        signals_without_lanes: traffic lights that control no lane.
-        lanes_never_green: lanes whose signal never opens for a movement.
-        self_loops: edges that end where they begin.
-        speed_outliers: lanes with a speed limit below 1 or above 70 m/s.
-        problems: why the map cannot be driven; empty if it can.
-        notes: what else to know.
-    """
-
-    name: str
+    name: str  # of the network
     source_hash: str
-    road_km: float
+    road_km: float  # stated length of all edges, of all lanes
     lane_km: float
     edges: int
     lanes: int
-    junctions: int
-    junctions_by_type: dict[str, int]
-    signals: int
-    programs: int
-    actuated_signals: int
-    extent_m: tuple[float, float, float, float]
-    elevation_m: tuple[float, float]
-    max_grade: float
-    connected_edges: int
-    connected_share: float
-    dead_ends: tuple[str, ...]
-    lanes_without_successor: tuple[str, ...]
-    junctions_without_right_of_way: tuple[str, ...]
-    signals_without_lanes: tuple[str, ...]
-    lanes_never_green: tuple[str, ...]
+    junctions: int  # where more than two edges meet
+    junctions_by_type: dict[str, int]  # all nodes of the map by SUMO's type
+    signals: int  # traffic lights
+    programs: int  # of all traffic lights together
+    actuated_signals: int  # traffic lights whose program follows the traffic
+    extent_m: tuple[float, float, float, float]  # min x, min y, max x, max y of the lanes
+    elevation_m: tuple[float, float]  # lowest and highest point of the lanes
+    max_grade: float  # steepest slope of a lane, as a ratio
+    connected_edges: int  # edges in the largest part in which every edge reaches every other
+    connected_share: float  # of all edges
+    dead_ends: tuple[str, ...]  # edges that lead nowhere
+    lanes_without_successor: tuple[str, ...]  # lanes that lead nowhere on edges that go on
+    junctions_without_right_of_way: tuple[str, ...]  # where lanes meet and the map has no rule
+    signals_without_lanes: tuple[str, ...]  # traffic lights that control no lane
+    lanes_never_green: tuple[str, ...]  # lanes whose signal never opens for a movement
+    # signal programs (signal/program) for which SUMO has rules that are not run here: a choice
+    # among following phases, delay-based and NEMA control, which run for their stated durations,
+    # and limits of single links
     programs_simplified: tuple[str, ...]
-    self_loops: tuple[str, ...]
-    speed_outliers: tuple[str, ...]
-    problems: tuple[str, ...]
-    notes: tuple[str, ...]
+    self_loops: tuple[str, ...]  # edges that end where they begin
+    speed_outliers: tuple[str, ...]  # lanes with a speed limit below 1 or above 70 m/s
+    problems: tuple[str, ...]  # why the map cannot be driven; empty if it can
+    notes: tuple[str, ...]  # what else to know
 
     @property
     def drivable(self) -> bool:
@@ -95,8 +70,7 @@ class MapReport:
 def check_map(source: str | Path | RoadNetwork) -> MapReport:
     """Gather statistics of a SUMO network and look for what makes it unfit.
 
-    Raises:
-        MapError: the network cannot be read at all; see `read_network`.
+    Raises MapError: the network cannot be read at all; see `read_network`.
     """
     network = source if isinstance(source, RoadNetwork) else load_network(source)
     cars = _Cars(network)

@@ -11,12 +11,9 @@ def strong_components(num_nodes: int, arcs: NDArray[np.int32]) -> NDArray[np.int
 
     Kosaraju's two searches, without recursion: a city is deeper than Python's stack.
 
-    Args:
-        num_nodes: N.
-        arcs: (num_arcs, 2) from-node, to-node.
+    `arcs`: (num_arcs, 2) from-node, to-node.
 
-    Returns:
-        (N,) component numbers from 0; nodes that reach each other share one.
+    Returns (N,) component numbers from 0; nodes that reach each other share one.
     """
     onward: list[list[int]] = [[] for _ in range(num_nodes)]
     backward: list[list[int]] = [[] for _ in range(num_nodes)]

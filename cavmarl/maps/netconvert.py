@@ -1,6 +1,8 @@
 """OpenStreetMap and OpenDRIVE made into SUMO networks by netconvert of the `eclipse-sumo` wheel.
 
 The same source and options give the same bytes: netconvert's comment with the date is dropped.
+
+The kind of a map file is told by its content and not by its name.
 """
 
 from __future__ import annotations
@@ -11,18 +13,96 @@ import os
 import re
 import subprocess
 import tempfile
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+from xml.sax import SAXParseException
+from xml.sax.handler import ContentHandler
 
 from cavmarl.core.cache_folder import cache_dir
 from cavmarl.core.errors import ConfigError, MapError, require
-from cavmarl.maps.build_log import BuildLog
-from cavmarl.maps.formats import MapKind, map_kind
 from cavmarl.roads.sumo_net.reader import map_name, read_network, source_hash
-from cavmarl.roads.sumo_net.xml_source import read_bytes
+from cavmarl.roads.sumo_net.xml_source import read_bytes, read_xml
+
+MapKind = Literal["sumo", "osm", "opendrive"]
+
+MAP_ENDINGS = (".net.xml", ".net.xml.gz", ".osm", ".osm.gz", ".osm.xml", ".osm.xml.gz", ".xodr")
+
+_KINDS = (
+    "give a SUMO network (<net>, .net.xml), an OpenStreetMap extract (<osm>, .osm or .osm.xml) or "
+    "an OpenDRIVE file (<OpenDRIVE>, .xodr); the first two also gzipped (.gz)"
+)
+_ROOTS: dict[str, MapKind] = {"net": "sumo", "osm": "osm", "OpenDRIVE": "opendrive"}
+
+
+class _Root(ContentHandler):
+    """Remembers the root element; the parser around it finds what is broken or hostile."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.name = ""
+
+    def startElement(self, name: str, attrs: Any) -> None:
+        self.name = self.name or name
+
+
+def map_kind(path: Path) -> MapKind:
+    """Read a map file to its end and tell its kind by its root element.
+
+    Raises MapError: the file cannot be read, is broken or hostile XML, or is no map.
+    """
+    root = _Root()
+    try:
+        read_xml(path, root)
+    except MapError as error:
+        no_xml = isinstance(error.__cause__, SAXParseException) and not root.name
+        if no_xml and not path.name.endswith(MAP_ENDINGS):
+            raise MapError(f"{path}: is no map: {_KINDS}") from error
+        raise
+    if root.name not in _ROOTS:
+        raise MapError(f"{path}: <{root.name}> is the root of no map: {_KINDS}")
+    return _ROOTS[root.name]
+
+
+_QUOTED = re.compile(r"'[^']*'")
+_NUMBERED = re.compile(r"\S*\d\S*")
+_CORRECTION = re.compile(r"^(Joined|Guessed|Removed) |^[1-9]\d* .*(removed|computed|split|added)$")
+
+
+class BuildLog:
+    """The output of one run with `--verbose` and without aggregated warnings."""
+
+    def __init__(self, stdout: str = "", stderr: str = "") -> None:
+        self._said = stdout.splitlines()
+        self._complained = stderr.splitlines()
+
+    def errors(self) -> tuple[str, ...]:
+        return self._after("Error: ")
+
+    def warnings(self) -> dict[str, int]:
+        """How often each warning came, by its text with `%` for names and numbers."""
+        kinds = Counter(
+            _NUMBERED.sub("%", _QUOTED.sub("'%'", line)) for line in self._after("Warning: ")
+        )
+        return dict(kinds.most_common())
+
+    def corrections(self) -> tuple[str, ...]:
+        """What netconvert changed on its own account, in its words."""
+        lines = (line.strip().rstrip(".") for line in self._said if line.startswith(" "))
+        return tuple(line for line in lines if _CORRECTION.search(line))
+
+    def complaint(self) -> tuple[str, ...]:
+        """The errors or, if it died without one, all that it complained about."""
+        return self.errors() or tuple(self._complained) or ("no message",)
+
+    def _after(self, prefix: str) -> tuple[str, ...]:
+        return tuple(
+            line.removeprefix(prefix) for line in self._complained if line.startswith(prefix)
+        )
+
 
 Box = tuple[float, float, float, float]
 
@@ -48,24 +128,17 @@ _SHOWN_LINES = 10
 
 @dataclass(frozen=True)
 class BuildResult:
-    """What a build did.
+    """What a build did."""
 
-    Attributes:
-        path: the SUMO network.
-        source: the file it was made from.
-        kind: of the source.
-        options: netconvert's options; empty where a SUMO network was taken as it is.
-        warnings: netconvert's warnings, counted by their text without names and numbers.
-        corrections: what netconvert says it changed: junctions joined, roundabouts guessed …
-        dropped: with `tolerant`, the errors that netconvert ignored: what they name was left out.
-    """
-
-    path: Path
-    source: Path
-    kind: MapKind
-    options: tuple[str, ...]
+    path: Path  # the SUMO network
+    source: Path  # the file it was made from
+    kind: MapKind  # of the source
+    options: tuple[str, ...]  # netconvert's options; empty where a SUMO network was taken as it is
+    # netconvert's warnings, counted by their text without names and numbers
     warnings: dict[str, int]
+    # what netconvert says it changed: junctions joined, roundabouts guessed …
     corrections: tuple[str, ...]
+    # with `tolerant`, the errors that netconvert ignored: what they name was left out
     dropped: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
@@ -132,8 +205,7 @@ def build_network(
 def map_file(path: str | Path) -> Path:
     """The SUMO network of any map file: the file itself, or what netconvert once made of it.
 
-    Raises:
-        MapError: see `build_network`.
+    Raises MapError: see `build_network`.
     """
     path = Path(path)
     if path.name.endswith((".net.xml", ".net.xml.gz")):
@@ -186,8 +258,7 @@ def _run(
 ) -> BuildLog:
     """Run netconvert.
 
-    Raises:
-        MapError: it fails or takes too long.
+    Raises MapError: it fails or takes too long.
     """
     home = Path(require("sumo", "sumo").SUMO_HOME)
     command = [str(home / "bin" / "netconvert"), _INPUT[kind], str(source), "-o", str(draft)]

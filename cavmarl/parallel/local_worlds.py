@@ -24,7 +24,7 @@ from cavmarl.handoff.coordinator.coordinator_setup import WorldRun
 from cavmarl.parallel.driven_vehicles import Driven, driven_by
 from cavmarl.parallel.sensor_workers.sensor_pool import SensorWorkers
 from cavmarl.parallel.step_arrays import StepArrays, layout_of
-from cavmarl.sensors.mounted.catalogue import frame_layout
+from cavmarl.sensors.registry import frame_layout
 from cavmarl.shards.shard import Commands
 from cavmarl.traffic.sumo.sumo_history import ToldLog
 

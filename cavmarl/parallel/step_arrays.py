@@ -15,8 +15,8 @@ from cavmarl.engine.spaces import flat_observation_space, state_space
 from cavmarl.engine.world_setup import World
 from cavmarl.parallel.driven_vehicles import Driven
 from cavmarl.parallel.processes.shared_memory import Layout
-from cavmarl.sensors.mounted.catalogue import frame_layout, frames_in
 from cavmarl.sensors.mounted.frames import Frames
+from cavmarl.sensors.registry import frame_layout, frames_in
 from cavmarl.shards.shard import Commands
 
 FINAL_FRAMES = "final_rig."  # begins their names in a layout

@@ -1,4 +1,7 @@
-"""pygame, loaded late and quietly, and the one way in which we draw smooth polygons with it."""
+"""pygame, loaded late and quietly, and the one way in which we draw smooth polygons with it.
+
+With the colours of all pictures, red green blue: a quiet map, so that the agents stand out.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +20,82 @@ from cavmarl.core.errors import require
 if TYPE_CHECKING:
     from pygame import Font, Surface
 
+
+Color = tuple[int, int, int]
+
+LAND: Color = (235, 237, 230)
+KERB: Color = (205, 208, 200)
+ASPHALT: Color = (98, 107, 119)
+PATH: Color = (212, 211, 203)  # lanes that are closed to cars
+MARKING: Color = (214, 219, 224)
+CENTRE_LINE: Color = (226, 206, 150)
+
+BACKGROUND_CAR: Color = (186, 204, 225)
+ACTOR: Color = (250, 232, 120)  # follows a script
+GLASS: Color = (48, 58, 72)
+HEADLIGHT: Color = (255, 250, 225)
+BRAKE: Color = (255, 56, 48)
+BLINKER: Color = (255, 178, 36)
+COLLIDED: Color = (222, 22, 34)
+
+# Alternating hues, so that agents with neighbouring numbers differ most.
+AGENTS: tuple[Color, ...] = (
+    (255, 127, 14),
+    (30, 144, 255),
+    (236, 64, 122),
+    (46, 184, 92),
+    (255, 202, 40),
+    (149, 97, 226),
+    (0, 188, 212),
+    (244, 81, 60),
+    (156, 204, 40),
+    (205, 92, 190),
+)
+
+# Of zones and their vehicles; zones that touch seldom have the same. They are those of M. Okabe and
+# K. Ito, Color Universal Design (2008), which people with any colour vision can tell apart.
+ZONES: tuple[Color, ...] = (
+    (0, 114, 178),
+    (230, 159, 0),
+    (0, 158, 115),
+    (204, 121, 167),
+    (213, 94, 0),
+    (86, 180, 233),
+    (240, 228, 66),
+)
+
+# By signal code, the positions in roads.network.SIGNAL_STATES = "rugGysoOY".
+SIGNALS: tuple[Color, ...] = (
+    (232, 58, 52),
+    (245, 132, 42),
+    (88, 196, 116),
+    (38, 208, 98),
+    (250, 204, 56),
+    (150, 110, 220),
+    (224, 190, 120),
+    (170, 176, 182),
+    (250, 204, 56),
+)
+
+PANEL: Color = (252, 252, 250)
+INK: Color = (44, 52, 62)
+MUTED_INK: Color = (112, 120, 130)
+
+
+def agent_color(agent: int) -> Color:
+    return AGENTS[agent % len(AGENTS)]
+
+
+def zone_color(zone: int) -> Color:
+    return ZONES[zone % len(ZONES)]
+
+
+def ink_on(color: Color) -> Color:
+    """Dark or light ink, whichever reads better (luma of ITU-R BT.601)."""
+    luma = 0.299 * color[0] + 0.587 * color[1] + 0.114 * color[2]
+    return INK if luma > 140 else PANEL
+
+
 Part = tuple[Sequence[int], Sequence[Sequence[float]]]  # colour with alpha, corners in pixels
 
 # Stamps are drawn so many times larger, then reduced: edges move by fractions of a pixel.
@@ -29,8 +108,7 @@ _QUIET = "PYGAME_HIDE_SUPPORT_PROMPT"
 def load_pygame() -> ModuleType:
     """Pygame without the greeting that it prints; no window is opened and the environment is kept.
 
-    Raises:
-        MissingExtraError: pygame-ce is not installed.
+    Raises MissingExtraError: pygame-ce is not installed.
     """
     before = os.environ.get(_QUIET)
     os.environ[_QUIET] = "1"
@@ -79,10 +157,8 @@ def pixels(surface: Surface) -> NDArray[np.uint8]:
 def stamp(target: Surface, parts: Sequence[Part]) -> None:
     """Draw polygons over one another with smooth edges.
 
-    Args:
-        target: where to.
-        parts: colours (red, green, blue, alpha; the first three already multiplied by alpha) and
-            corners in pixels of `target`, fractions allowed.
+    `parts`: colours (red, green, blue, alpha; the first three already multiplied by alpha) and
+    corners in pixels of `target`, fractions allowed.
     """
     pygame = load_pygame()
     corners = [corner for _, polygon in parts for corner in polygon]
@@ -102,3 +178,81 @@ def stamp(target: Surface, parts: Sequence[Part]) -> None:
     # Averages of premultiplied colours are premultiplied colours: no dark seams at the edges.
     small = pygame.transform.smoothscale(large, (width, height))
     target.blit(small, (left, top), special_flags=pygame.BLEND_PREMULTIPLIED)
+
+
+Corner = tuple[float, float]
+_SIDES = 32
+_WHITE = (255, 255, 255, 255)
+_SHADOW = (0, 0, 0, 50)
+
+RING_WIDTH_PX = 3.0
+CASING_PX = 1.3  # dark edges, so that a figure shows on any ground
+HEAD_PX = 12.0  # from the ring to the tip
+
+
+def opaque(color: Color) -> tuple[int, int, int, int]:
+    return (*color, 255)
+
+
+def disc(x: float, y: float, radius: float) -> list[Corner]:
+    return [
+        (x + radius * math.cos(angle), y + radius * math.sin(angle))
+        for angle in (2.0 * math.pi * k / _SIDES for k in range(_SIDES))
+    ]
+
+
+def bar(x: float, y: float, width: float, height: float) -> list[Corner]:
+    """A rectangle with its upper left corner at (x, y)."""
+    return [(x, y), (x + width, y), (x + width, y + height), (x, y + height)]
+
+
+def pill(x: float, y: float, width: float, height: float) -> list[Corner]:
+    radius = height / 2.0
+    turns = [math.pi * k / 12 for k in range(13)]
+    right = [
+        (x + width - radius + radius * math.sin(a), y + radius - radius * math.cos(a))
+        for a in turns
+    ]
+    left = [(x + radius - radius * math.sin(a), y + radius + radius * math.cos(a)) for a in turns]
+    return right + left
+
+
+def target(x: float, y: float, color: Color) -> list[Part]:
+    return [
+        (_SHADOW, disc(x + 0.8, y + 0.8, 6.0)),
+        (_WHITE, disc(x, y, 5.6)),
+        (opaque(color), disc(x, y, 4.4)),
+        (_WHITE, disc(x, y, 2.0)),
+    ]
+
+
+def ring(x: float, y: float, radius: float, color: Color) -> list[Part]:
+    """A ring with dark edges that leaves what it surrounds uncovered."""
+    return [
+        (opaque(INK), _annulus(x, y, radius - CASING_PX, radius + RING_WIDTH_PX + CASING_PX)),
+        (opaque(color), _annulus(x, y, radius, radius + RING_WIDTH_PX)),
+    ]
+
+
+def pointer(
+    x: float, y: float, radius: float, direction: tuple[float, float], color: Color
+) -> list[Part]:
+    """A ring with a head that points away from it; `direction` has length 1, y down."""
+    ahead, aside = direction, (-direction[1], direction[0])
+
+    def head(grown: float) -> list[Corner]:
+        base, tip = radius - grown, radius + HEAD_PX + 1.6 * grown
+        half = 0.6 * HEAD_PX + 1.4 * grown
+        return [
+            (x + a * ahead[0] + b * aside[0], y + a * ahead[1] + b * aside[1])
+            for a, b in ((tip, 0.0), (base, half), (base, -half))
+        ]
+
+    edge, inside = ring(x, y, radius, color)
+    return [(opaque(INK), head(CASING_PX)), edge, (opaque(color), head(0.0)), inside]
+
+
+def _annulus(x: float, y: float, inner: float, outer: float) -> list[Corner]:
+    """Out around and back inside: one polygon, closed along a seam without width."""
+    there, back = disc(x, y, outer), disc(x, y, inner)
+    return [*there, there[0], back[0], *reversed(back)]

@@ -1,4 +1,4 @@
-"""Vehicles, seen from above."""
+"""Vehicles and pedestrians, seen from above."""
 
 from __future__ import annotations
 
@@ -9,9 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.records.codes import DRIVER_SCRIPTED, EVENT_COLLIDED
-from cavmarl.render.canvas import Part, stamp
-from cavmarl.render.marks import opaque
-from cavmarl.render.palette import (
+from cavmarl.render.canvas import (
     ACTOR,
     BACKGROUND_CAR,
     BLINKER,
@@ -20,13 +18,67 @@ from cavmarl.render.palette import (
     GLASS,
     HEADLIGHT,
     Color,
+    Part,
     agent_color,
+    opaque,
+    stamp,
 )
 from cavmarl.render.viewport import Viewport
-from cavmarl.render.walkers import draw_walker, is_walker
 
 if TYPE_CHECKING:
     from pygame import Surface
+
+import math
+from typing import TYPE_CHECKING
+
+from cavmarl.render.canvas import INK, PANEL
+
+if TYPE_CHECKING:
+    from pygame import Surface
+
+WALKER_M = 1.0  # no vehicle of a script is so short
+MIN_RADIUS_PX = 4.5
+CORNERS = 12
+DEPTH = 0.6  # of the shoulders, in parts of their width
+HEAD = 0.5
+RIM_PX = 1.0
+COLLIDED_PX = 2.5
+
+
+def is_walker(row: np.void) -> bool:
+    return bool(row["driver"] == DRIVER_SCRIPTED and row["length"] < WALKER_M)
+
+
+def draw_walker(surface: Surface, row: np.void, center: list[float], scale: float) -> None:
+    """Paint a pedestrian, from far above larger than one is.
+
+    `scale`: pixels a metre.
+    """
+    half = max(0.5 * float(row["width"]) * scale, MIN_RADIUS_PX)
+    heading = float(row["heading"])
+
+    def oval(depth: float, width: float) -> list[tuple[float, float]]:
+        corners = []
+        for k in range(CORNERS):
+            angle = 2.0 * math.pi * k / CORNERS
+            ahead, aside = depth * math.cos(angle), width * math.sin(angle)
+            corners.append(
+                (
+                    center[0] + ahead * math.cos(heading) - aside * math.sin(heading),
+                    center[1] - ahead * math.sin(heading) - aside * math.cos(heading),
+                )
+            )
+        return corners
+
+    hurt = row["hit"] >= 0 or row["events"] & EVENT_COLLIDED
+    rim, rim_px = (COLLIDED, COLLIDED_PX) if hurt else (PANEL, RIM_PX)
+    parts: list[Part] = [
+        (opaque(rim), oval(DEPTH * half + rim_px, half + rim_px)),
+        (opaque(ACTOR), oval(DEPTH * half, half)),
+        (opaque(INK), oval(HEAD * half, HEAD * half)),
+    ]
+    stamp(surface, parts)
+
 
 BRAKING_MPS2 = -1.0  # below this acceleration the brake lights are on
 
@@ -66,17 +118,11 @@ def in_view(vehicles: NDArray[np.void], camera: Viewport) -> NDArray[np.void]:
 
 
 class Paint(NamedTuple):
-    """How a car is painted.
+    """How a car is painted."""
 
-    Attributes:
-        body: its colour.
-        rims: colours of rims around it, the outer one first.
-        lined: whether a thin light line surrounds it.
-    """
-
-    body: Color
-    rims: tuple[Color, ...] = ()
-    lined: bool = False
+    body: Color  # its colour
+    rims: tuple[Color, ...] = ()  # colours of rims around it, the outer one first
+    lined: bool = False  # whether a thin light line surrounds it
 
 
 def draw_cars(
@@ -89,11 +135,7 @@ def draw_cars(
 
     Brake lights shine below `BRAKING_MPS2`; a red outline is a vehicle that has collided.
 
-    Args:
-        surface: where to.
-        vehicles: VEHICLE rows.
-        camera: the view.
-        paints: of each; by default agents have the colours of `palette.agent_color`.
+    `paints`: of each; by default agents have the colours of `agent_color`.
     """
     if paints is None:
         paints = [_paint_of_driver(row) for row in vehicles]

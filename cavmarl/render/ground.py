@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.records.codes import SIGNAL_NONE
-from cavmarl.render.canvas import blank, load_pygame, stamp
-from cavmarl.render.palette import (
+from cavmarl.render.canvas import (
     ASPHALT,
     CENTRE_LINE,
     KERB,
@@ -18,6 +17,9 @@ from cavmarl.render.palette import (
     PATH,
     SIGNALS,
     Color,
+    blank,
+    load_pygame,
+    stamp,
 )
 from cavmarl.render.shapes import RoadShapes, level_of
 from cavmarl.render.viewport import Viewport
@@ -39,9 +41,7 @@ MIN_STOP_LINE_PX = 4.0
 def signal_codes(network: RoadNetwork, signal_phases: NDArray[np.int32]) -> NDArray[np.uint8]:
     """What each link's signal shows, (num_links,): positions in SIGNAL_STATES, or SIGNAL_NONE.
 
-    Args:
-        network: the map.
-        signal_phases: (num_signals,) PHASE rows that are on.
+    `signal_phases`: (num_signals,) PHASE rows that are on.
     """
     codes = np.full(len(network.links), SIGNAL_NONE, dtype=np.uint8)
     signalled = np.flatnonzero(network.links["signal"] >= 0)
@@ -60,10 +60,8 @@ def signal_letter(network: RoadNetwork, link: int, signal_phases: NDArray[np.int
 def draw_ground(shapes: RoadShapes, camera: Viewport, detail: int) -> Surface:
     """Land, roads and markings as seen by `camera`.
 
-    Args:
-        shapes: of the network.
-        camera: the view.
-        detail: drawn this many times larger, then reduced: the smoothness of edges.
+    `shapes`: of the network. `detail`: drawn this many times larger, then reduced: the smoothness
+    of edges.
     """
     pygame = load_pygame()
     large = camera.enlarged(detail)
@@ -88,11 +86,7 @@ def draw_stop_lines(
 ) -> None:
     """Paint each signalled link's part of the stop line.
 
-    Args:
-        surface: where to.
-        shapes: of the network.
-        codes: (num_links,) as from `signal_codes`.
-        camera: the view.
+    `shapes`: of the network. `codes`: (num_links,) as from `signal_codes`.
     """
     links = np.flatnonzero(codes != SIGNAL_NONE)
     quads = camera.to_pixels(shapes.stop_lines[links])

@@ -5,14 +5,83 @@ Made once per network; no drawing here.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.render.arrows import lane_arrows
 from cavmarl.roads.network import RoadNetwork
+
+BEFORE_END_M = 12.0  # from the arrow's foot to the stop line
+MIN_LANE_M = 25.0
+STROKE_M = 0.22
+HEAD_M = 1.1
+HEAD_WIDTH_M = 0.75
+# Ahead and to the left of the arrow's foot, m: where branches begin and where their heads are.
+FORK = (1.1, 0.0)
+TIPS = {"s": (3.6, 0.0), "l": (1.9, 0.6), "r": (1.9, -0.6)}
+BRANCHES = {"s": "s", "l": "l", "L": "l", "r": "r", "R": "r"}
+
+
+def lane_arrows(network: RoadNetwork) -> Points:
+    """Quadrilaterals (k, 4, 3) in metres, the parts of all arrows; on roads of several lanes."""
+    lanes, links = network.lanes, network.links
+    parts = [np.zeros((0, 4, 3))]
+    wide = network.edges["num_lanes"][lanes["edge"]] > 1
+    for lane in np.flatnonzero(wide & (lanes["num_links"] > 0) & (lanes["length_m"] > MIN_LANE_M)):
+        row = lanes[lane]
+        first = row["first_link"]
+        codes = links["direction"][first : first + row["num_links"]]
+        branches = {BRANCHES[chr(code)] for code in codes if chr(code) in BRANCHES}
+        if not branches:
+            continue
+        foot, ahead = _place(network, row, row["length_m"] - BEFORE_END_M)
+        turn = np.array([[ahead[0], ahead[1], 0.0], [-ahead[1], ahead[0], 0.0]])
+        parts.append(foot + _arrow(branches) @ turn)
+    return np.concatenate(parts)
+
+
+def _place(network: RoadNetwork, lane: np.void, s: float) -> tuple[Points, Points]:
+    points = network.points[lane["first_point"] : lane["first_point"] + lane["num_points"]]
+    start = points[np.searchsorted(points["s"], s) - 1]
+    ahead = np.array([start["cos"], start["sin"]])
+    rest = s - start["s"]
+    foot = [start["x"] + rest * ahead[0], start["y"] + rest * ahead[1], start["z"]]
+    return np.array(foot), ahead
+
+
+def _arrow(branches: set[str]) -> Points:
+    """An arrow (k, 4, 2) in metres ahead of and to the left of its foot."""
+    parts = [_stroke((0.0, 0.0), FORK)]
+    for branch in sorted(branches):
+        parts += [_stroke(FORK, TIPS[branch]), _head(FORK, TIPS[branch])]
+    return np.array(parts)
+
+
+def _stroke(start: tuple[float, float], end: tuple[float, float]) -> list[tuple[float, float]]:
+    ahead, aside = _unit(start, end)
+    half = STROKE_M / 2.0
+    return [
+        (x + sign * half * -aside, y + sign * half * ahead)
+        for (x, y), sign in ((start, 1), (end, 1), (end, -1), (start, -1))
+    ]
+
+
+def _head(start: tuple[float, float], base: tuple[float, float]) -> list[tuple[float, float]]:
+    ahead, aside = _unit(start, base)
+    half = HEAD_WIDTH_M / 2.0
+    left = base[0] - half * aside, base[1] + half * ahead
+    right = base[0] + half * aside, base[1] - half * ahead
+    tip = base[0] + HEAD_M * ahead, base[1] + HEAD_M * aside
+    return [left, tip, tip, right]
+
+
+def _unit(start: tuple[float, float], end: tuple[float, float]) -> tuple[float, float]:
+    length = math.dist(start, end)
+    return (end[0] - start[0]) / length, (end[1] - start[1]) / length
+
 
 Points = NDArray[np.float64]
 
@@ -40,39 +109,24 @@ class Patch:
 
 @dataclass(frozen=True)
 class RoadShapes:
-    """All shapes of a network, in metres.
+    """All shapes of a network, in metres."""
 
-    Attributes:
-        starts: (n, 2), each straight piece of a lane begins here and
-        ends: (n, 2) ends here.
-        half_widths: (n,) of the pieces.
-        joined: (n,) a round joint at the piece's end belongs to the road and covers no other level.
-        levels: (n,) as from `level_of`.
-        for_cars: (n,) the lane is open to cars.
-        junctions: the insides of junctions.
-        junction_boxes: (num junctions, 2, 2) their lower left and upper right corners.
-        dashes: (k, 2, 3) from and to, x y z, between lanes of one direction.
-        centre_lines: (k, 2, 3) between opposite directions.
-        arrows: (k, 4, 3) on lanes before junctions.
-        stop_lines: (num_links, 4, 2) the link's part of the bar at the end of its lane.
-    """
-
-    starts: Points
-    ends: Points
-    half_widths: Points
+    starts: Points  # (n, 2), each straight piece of a lane begins here and
+    ends: Points  # (n, 2) ends here
+    half_widths: Points  # (n,) of the pieces
+    # (n,) a round joint at the piece's end belongs to the road and covers no other level
     joined: NDArray[np.bool_]
-    levels: NDArray[np.int64]
-    for_cars: NDArray[np.bool_]
-    junctions: tuple[Patch, ...]
-    junction_boxes: Points
-    dashes: Points
-    centre_lines: Points
-    arrows: Points
-    stop_lines: Points
+    levels: NDArray[np.int64]  # (n,) as from `level_of`
+    for_cars: NDArray[np.bool_]  # (n,) the lane is open to cars
+    junctions: tuple[Patch, ...]  # the insides of junctions
+    junction_boxes: Points  # (num junctions, 2, 2) their lower left and upper right corners
+    dashes: Points  # (k, 2, 3) from and to, x y z, between lanes of one direction
+    centre_lines: Points  # (k, 2, 3) between opposite directions
+    arrows: Points  # (k, 4, 3) on lanes before junctions
+    stop_lines: Points  # (num_links, 4, 2) the link's part of the bar at the end of its lane
 
 
 def road_shapes(network: RoadNetwork) -> RoadShapes:
-    """Work out the shapes of a network."""
     lanes = network.lanes
     counts = lanes["num_points"]
     lane_of_point = np.repeat(np.arange(len(lanes)), counts)

@@ -1,4 +1,7 @@
-"""`TopDownRenderer`: a world from above, as a picture."""
+"""`TopDownRenderer`: a world from above, as a picture.
+
+`WorldView` is what `env.render()` shows.
+"""
 
 from __future__ import annotations
 
@@ -13,17 +16,63 @@ from cavmarl.handoff.zone_view import ZoneView
 from cavmarl.render.canvas import load_pygame, pixels
 from cavmarl.render.cars import draw_cars, in_view
 from cavmarl.render.ground import draw_ground, draw_stop_lines, signal_codes
-from cavmarl.render.legend import Sample, samples_of_drivers, samples_of_zones
-from cavmarl.render.overlay import Overlay, clock_text
-from cavmarl.render.owners import draw_transfers, owner_paints
+from cavmarl.render.overlay import Overlay, Sample, clock_text, samples_of_drivers, samples_of_zones
 from cavmarl.render.shapes import road_shapes
 from cavmarl.render.viewport import Bounds, Viewport, suitable_size
-from cavmarl.render.window import Window
-from cavmarl.render.zone_overlay import draw_sight, draw_zones
+from cavmarl.render.zone_overlay import draw_sight, draw_transfers, draw_zones, owner_paints
 from cavmarl.roads.network import RoadNetwork
 
 if TYPE_CHECKING:
     from pygame import Surface
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pygame import Surface
+
+
+from cavmarl.core.errors import ConfigError
+from cavmarl.engine.simulation import Simulation
+
+
+class Window:
+    """Shows pictures at a steady pace; opens at the first one.
+
+    When the person at the screen closes it, the run goes on unseen.
+
+    `fps`: pictures a second; `show` waits for its turn.
+    """
+
+    def __init__(self, title: str, fps: float) -> None:
+        self.title = title
+        self.fps = fps
+        self.closed_by_person = False
+        self._window: Any = None
+        self._clock: Any = None
+
+    def show(self, surface: Surface) -> None:
+        """Put a picture on the screen and handle what the person did since the last one."""
+        if self.closed_by_person:
+            return
+        pygame = load_pygame()
+        if self._window is None:
+            pygame.display.init()
+            self._window = pygame.Window(self.title, surface.get_size())
+            self._clock = pygame.time.Clock()
+        self._window.get_surface().blit(surface, (0, 0))
+        self._window.flip()
+        self._clock.tick(self.fps)
+        for event in pygame.event.get():
+            if event.type in (pygame.QUIT, pygame.WINDOWCLOSE):
+                self.close()
+                self.closed_by_person = True
+                return
+
+    def close(self) -> None:
+        if self._window is not None:
+            self._window.destroy()
+            self._window = None
+
 
 # Smallest part of the world that a following camera shows, and how fast it turns to a new aim.
 FOLLOW_M = 150.0
@@ -36,14 +85,11 @@ MOVING_DETAIL = 2
 class TopDownRenderer:
     """Draws the vehicles and signals of one map, off screen.
 
-    Args:
-        network: the map.
-        size: width and height of the picture in pixels; by default what suits the map's shape.
-        focus: (min_x, min_y, max_x, max_y) in metres to show; all roads by default.
-        goal_edges: EDGE rows by `VEHICLE["goal"]`; given, each agent's destination is marked.
+    `size`: width and height of the picture in pixels; by default what suits the map's shape.
+    `focus`: (min_x, min_y, max_x, max_y) in metres to show; all roads by default. `goal_edges`:
+    EDGE rows by `VEHICLE["goal"]`; given, each agent's destination is marked.
 
-    Raises:
-        MissingExtraError: pygame-ce is not installed.
+    Raises MissingExtraError: pygame-ce is not installed.
     """
 
     def __init__(
@@ -142,30 +188,9 @@ class TopDownRenderer:
         draw_transfers(surface, zones, vehicles, camera)
         return samples_of_zones(zones.partition.count, ghosts_of)
 
-    def frame(
-        self,
-        vehicles: NDArray[np.void],
-        signal_phases: NDArray[np.int32] | None = None,
-        *,
-        title: str = "",
-        clock_s: float | None = None,
-        follow: Sequence[int] | None = None,
-        center: tuple[float, float] | None = None,
-        zones: ZoneView | None = None,
-        ghosts_of: int | None = None,
-    ) -> NDArray[np.uint8]:
+    def frame(self, *args: Any, **named: Any) -> NDArray[np.uint8]:
         """The picture of `draw` as uint8 (height, width, 3), red green blue."""
-        surface = self.draw(
-            vehicles,
-            signal_phases,
-            title=title,
-            clock_s=clock_s,
-            follow=follow,
-            center=center,
-            zones=zones,
-            ghosts_of=ghosts_of,
-        )
-        return pixels(surface)
+        return pixels(self.draw(*args, **named))
 
     def show(self, surface: Surface, title: str, fps: float) -> None:
         """Put a picture of `draw` in a window, no sooner than 1/`fps` s after the last one."""
@@ -232,3 +257,55 @@ def _edge_ends(network: RoadNetwork, edges: NDArray[np.int32]) -> NDArray[np.flo
         lanes = range(first, first + edge["num_lanes"])
         ends[row] = np.mean([network.lane_polyline(lane)[-1, :2] for lane in lanes], axis=0)
     return ends
+
+
+class WorldView:
+    """Draws one world of a simulation from above, into arrays or into a window.
+
+    Args:
+        simulation: the worlds; the first one is shown.
+        mode: `rgb_array` or `human`.
+        title: for the picture's corner and the window.
+        fps: pictures a second of the window.
+
+    Raises:
+        MissingExtraError: pygame-ce is not installed.
+    """
+
+    def __init__(self, simulation: Simulation, mode: str, title: str, fps: int) -> None:
+        self._simulation = simulation
+        self._mode = mode
+        self._title = title
+        self._fps = fps
+        self._renderer = TopDownRenderer(simulation.network, goal_edges=simulation.goal_edges)
+
+    def show(self, ghosts_of: int | None = None) -> NDArray[np.uint8] | None:
+        """Draw the present moment: (height, width, 3) for `rgb_array`, None for `human`.
+
+        A divided world is drawn with its zones, and vehicles in the colours of their owners.
+
+        Args:
+            ghosts_of: the zone whose sight and ghosts are outlined.
+
+        Raises:
+            ConfigError: the world has no such zone.
+        """
+        simulation = self._simulation
+        count = simulation.partition.count
+        if ghosts_of is not None and not 0 <= ghosts_of < count:
+            raise ConfigError(f"ghosts_of = {ghosts_of}: the world has the zones 0 to {count - 1}")
+        picture = self._renderer.draw(
+            simulation.vehicles(),
+            simulation.signal_phases(),
+            title=self._title,
+            clock_s=float(simulation.ticks()[0]) * simulation.config.clock.sim_dt_s,
+            zones=simulation.zone_view() if count > 1 else None,
+            ghosts_of=ghosts_of,
+        )
+        if self._mode == "rgb_array":
+            return pixels(picture)
+        self._renderer.show(picture, self._title, self._fps)
+        return None
+
+    def close(self) -> None:
+        self._renderer.close()

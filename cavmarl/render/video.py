@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +19,10 @@ class VideoWriter:
 
     Missing folders are made. The first frame sets the size; without frames there is no file.
 
-    Args:
-        path: ends in `.mp4`.
-        fps: frames a second.
+    `path`: ends in `.mp4`.
 
-    Raises:
-        ConfigError: the path cannot be written, or is no `.mp4`.
-        MissingExtraError: imageio-ffmpeg is not installed.
+    Raises ConfigError: the path cannot be written, or is no `.mp4`; MissingExtraError:
+    imageio-ffmpeg is not installed.
     """
 
     def __init__(self, path: str | Path, fps: float) -> None:
@@ -52,20 +48,14 @@ class VideoWriter:
     def __enter__(self) -> VideoWriter:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def write(self, frame: NDArray[np.uint8]) -> None:
         """Append a frame, (height, width, 3).
 
-        Raises:
-            ConfigError: not uint8 (height, width, 3), another size than the first frame's, or the
-                file cannot be written.
+        Raises ConfigError: not uint8 (height, width, 3), another size than the first frame's, or
+        the file cannot be written.
         """
         if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
             raise ConfigError(

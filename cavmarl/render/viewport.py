@@ -17,19 +17,12 @@ MAX_ASPECT = 3.0
 
 @dataclass(frozen=True)
 class Viewport:
-    """A view from straight above, north up, the same scale both ways.
+    """A view from straight above, north up, the same scale both ways."""
 
-    Attributes:
-        x: of the picture's centre, m.
-        y: of the picture's centre, m.
-        scale: pixels a metre.
-        size: width and height in pixels.
-    """
-
-    x: float
-    y: float
-    scale: float
-    size: tuple[int, int]
+    x: float  # of the picture's centre, m
+    y: float  # of the picture's centre, m
+    scale: float  # pixels a metre
+    size: tuple[int, int]  # width and height in pixels
 
     @classmethod
     def fit(cls, bounds: Bounds, size: tuple[int, int], margin_px: float = 0.0) -> Viewport:

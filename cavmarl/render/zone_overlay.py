@@ -1,4 +1,7 @@
-"""Zones over a map: a wash of colour, the halo that others see of them, borders, numbers."""
+"""Zones over a map: a wash of colour, the halo that others see of them, borders, numbers.
+
+Vehicles show which zone owns them, which see them as ghosts, and where they are handed over.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.render.canvas import blank, lettering, load_pygame
+from cavmarl.render.canvas import INK, blank, ink_on, lettering, load_pygame, zone_color
 from cavmarl.render.ground import draw_ground
 from cavmarl.render.overlay import Overlay
-from cavmarl.render.palette import INK, ink_on, zone_color
 from cavmarl.render.shapes import road_shapes
 from cavmarl.render.viewport import Viewport, suitable_size
 from cavmarl.roads.network import RoadNetwork
@@ -18,6 +20,15 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 
 if TYPE_CHECKING:
     from pygame import Rect, Surface
+
+from typing import TYPE_CHECKING
+
+from cavmarl.handoff.zone_view import TransferInFlight, ZoneView
+from cavmarl.render.canvas import pointer, stamp
+from cavmarl.render.cars import Paint
+
+if TYPE_CHECKING:
+    from pygame import Surface
 
 WASH_ALPHA = 20
 HALO_ALPHA = 52
@@ -34,14 +45,10 @@ def zone_picture(
 ) -> Surface:
     """A map with its zones.
 
-    Args:
-        network: the map.
-        partition: of the map.
-        halo_m: how far zones see over their borders; each is darker where another sees it.
-        title: for the upper left corner.
+    `halo_m`: how far zones see over their borders; each is darker where another sees it. `title`:
+    for the upper left corner.
 
-    Raises:
-        MissingExtraError: pygame-ce is not installed.
+    Raises MissingExtraError: pygame-ce is not installed.
     """
     size = suitable_size(partition.bounds)
     camera = Viewport.fit(partition.bounds, size, MARGIN_PX)
@@ -54,14 +61,6 @@ def zone_picture(
 
 
 def draw_zones(surface: Surface, partition: ZonePartition, halo_m: float, camera: Viewport) -> None:
-    """Draw zones over what is there.
-
-    Args:
-        surface: where to.
-        partition: of the map.
-        halo_m: as in `zone_picture`.
-        camera: the view.
-    """
     pygame = load_pygame()
     wash = blank(surface.get_size(), transparent=True)
     shown = _clipped(partition.reaching, camera)
@@ -83,15 +82,7 @@ def draw_zones(surface: Surface, partition: ZonePartition, halo_m: float, camera
 def draw_sight(
     surface: Surface, partition: ZonePartition, halo_m: float, zone: int, camera: Viewport
 ) -> None:
-    """Draw how far a zone sees: the line at the end of its halo, in its colour.
-
-    Args:
-        surface: where to.
-        partition: of the map.
-        halo_m: as in `zone_picture`.
-        zone: which.
-        camera: the view.
-    """
+    """Draw how far a zone sees: the line at the end of its halo, in its colour."""
     pygame = load_pygame()
     seen = partition.reaching[[zone]] + np.array([-halo_m, -halo_m, halo_m, halo_m])
     # Far enough out of view for the round corners of what is clipped to stay there.
@@ -125,3 +116,61 @@ def _number(surface: Surface, zone: int, room: Rect) -> None:
     if room.contains(plate):
         pygame.draw.rect(surface, color, plate, border_radius=NUMBER_PADDING_PX)
         surface.blit(text, text.get_rect(center=room.center))
+
+
+# Between a vehicle and the ring around it, and the smallest ring.
+GAP_PX = 4.0
+MIN_RADIUS_PX = 10.0
+
+
+def owner_paints(
+    view: ZoneView, vehicles: NDArray[np.void], seen: NDArray[np.void], ghosts_of: int | None
+) -> list[Paint]:
+    """How vehicles are painted by their zones.
+
+    `vehicles`: all of it, as `Simulation.vehicles` gives them. `seen`: those of them that are
+    drawn, in any order. `ghosts_of`: the zone whose ghosts get a rim in its colour; None: no
+    zone's.
+    """
+    owners = dict(zip(vehicles["id"].tolist(), view.owners.tolist(), strict=True))
+    ghosts = set() if ghosts_of is None else set(view.ghosts[ghosts_of].tolist())
+    rims = () if ghosts_of is None else (INK, zone_color(ghosts_of))
+    return [
+        Paint(zone_color(owners[i]), rims if i in ghosts else (), lined=True)
+        for i in seen["id"].tolist()
+    ]
+
+
+def draw_transfers(
+    surface: Surface, view: ZoneView, vehicles: NDArray[np.void], camera: Viewport
+) -> None:
+    """A ring in the target's colour around each vehicle in transfer, and a head towards it.
+
+    `vehicles`: all of it; a transfer of a vehicle that has left is not drawn.
+    """
+    rows = {int(row["id"]): row for row in vehicles}
+    for transfer in view.transfers:
+        row = rows.get(transfer.vehicle)
+        if row is None:
+            continue
+        place = np.array([row["x"], row["y"]])
+        x, y = camera.to_pixels(place).tolist()
+        east, north = _towards(view.partition, transfer, place, float(row["heading"]))
+        radius = max(0.5 * float(row["length"]) * camera.scale + GAP_PX, MIN_RADIUS_PX)
+        color = zone_color(transfer.target)
+        stamp(surface, pointer(x, y, radius, (east, -north), color))
+
+
+def _towards(
+    partition: ZonePartition, transfer: TransferInFlight, place: NDArray[np.float64], heading: float
+) -> tuple[float, float]:
+    """From the source to the target, seen from a place at their border: a direction in the plane.
+
+    A vehicle on the border itself is on its way: its own direction.
+    """
+    source, target = partition.reaching[[transfer.source, transfer.target]]
+    way = np.clip(place, target[:2], target[2:]) - np.clip(place, source[:2], source[2:])
+    length = float(np.hypot(*way))
+    if length == 0.0:
+        return float(np.cos(heading)), float(np.sin(heading))
+    return float(way[0] / length), float(way[1] / length)

@@ -59,8 +59,7 @@ _IDS = ("lane_ids", "edge_ids", "junction_ids", "signal_ids", "program_ids", "ju
 def load_network(path: str | Path) -> RoadNetwork:
     """`read_network` with a cache beside the compiled kernels; a broken cache entry is built again.
 
-    Raises:
-        MapError: see `read_network`.
+    Raises MapError: see `read_network`.
     """
     path = Path(path)
     digest = source_hash(path)

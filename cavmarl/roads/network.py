@@ -22,6 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.huge_pages import huge_copy
+from cavmarl.core.math.geometry import lane_pose, project
+from cavmarl.core.records import record
 from cavmarl.core.records.arrays import RoadArrays
 from cavmarl.roads.kernels.backdrop_pieces import WALL
 from cavmarl.roads.kernels.signal_phases import DETECTOR_REACH_M
@@ -42,257 +44,193 @@ VEHICLE_CLASSES = (
 # SUMO's signal letters in the order of their codes in `phase_states`.
 SIGNAL_STATES = "rugGysoOY"
 
-POINT = np.dtype(
-    [
-        ("x", np.float64),  # m
-        ("y", np.float64),  # m
-        ("z", np.float64),  # m
-        ("s", np.float64),  # m from the start of its lane, in the plane
-        (
-            "cos",
-            np.float64,
-        ),  # direction of the segment that starts here (the last point repeats the one before)
-        ("sin", np.float64),
-        ("slope", np.float64),  # dz/ds of that segment
-        ("heading", np.float64),  # of that segment, rad
-        ("left_s", np.float64),  # where on the left neighbour of its lane the point lies, m
-        ("right_s", np.float64),
-    ],
-    align=True,
+POINT = record(
+    ("x", np.float64),  # m
+    ("y", np.float64),  # m
+    ("z", np.float64),  # m
+    ("s", np.float64),  # m from the start of its lane, in the plane
+    # direction of the segment that starts here (the last point repeats the one before)
+    ("cos", np.float64),
+    ("sin", np.float64),
+    ("slope", np.float64),  # dz/ds of that segment
+    ("heading", np.float64),  # of that segment, rad
+    ("left_s", np.float64),  # where on the left neighbour of its lane the point lies, m
+    ("right_s", np.float64),
 )
 
 # What drivers ask all the time comes first and shares a cache line.
-LANE = np.dtype(
-    [
-        (
-            "length_m",
-            np.float64,
-        ),  # arc length of the polyline in the plane: the `s` of its last point
-        ("speed_mps", np.float64),  # speed limit
-        ("width_m", np.float64),
-        ("internal", np.bool_),  # lies inside a junction
-        ("left", np.int32),  # LANE row of the neighbour to the left in the same direction
-        ("right", np.int32),
-        ("successor", np.int32),  # internal lanes: the one LANE that follows (internal or normal)
-        ("link", np.int32),  # internal lanes: the LINK that this lane is part of
-        (
-            "first_link",
-            np.int32,
-        ),  # LINK rows of the movements that leave this lane's end, sorted by
-        ("num_links", np.int32),  # from-lane; 0 for internal lanes (see `successor`)
-        ("first_point", np.int32),  # POINT rows [first_point, first_point + num_points)
-        ("num_points", np.int32),  # at least 2
-        ("edge", np.int32),  # EDGE row; internal lanes too
-        (
-            "link_offset_m",
-            np.float64,
-        ),  # internal lanes: path length of the link before this lane starts
-        ("stop_back_m", np.float64),  # from the stop line to the end, where paths of others sweep
-        (
-            "first_into",
-            np.int32,
-        ),  # into[first_into : first_into + num_into]: LANE rows whose ends lead here
-        ("num_into", np.int32),  # (internal lanes where the map has them)
-        ("permissions", np.uint32),  # bit k set: VEHICLE_CLASSES[k] may drive here
-        ("index", np.int32),  # position on its edge, 0 = rightmost
-        ("min_x", np.float64),  # bounding box of the polyline, m
-        ("min_y", np.float64),
-        ("max_x", np.float64),
-        ("max_y", np.float64),
-    ],
-    align=True,
+LANE = record(
+    # arc length of the polyline in the plane: the `s` of its last point
+    ("length_m", np.float64),
+    ("speed_mps", np.float64),  # speed limit
+    ("width_m", np.float64),
+    ("internal", np.bool_),  # lies inside a junction
+    ("left", np.int32),  # LANE row of the neighbour to the left in the same direction
+    ("right", np.int32),
+    ("successor", np.int32),  # internal lanes: the one LANE that follows (internal or normal)
+    ("link", np.int32),  # internal lanes: the LINK that this lane is part of
+    # LINK rows of the movements that leave this lane's end, sorted by from-lane; 0 of them for
+    # internal lanes (see `successor`)
+    ("first_link", np.int32),
+    ("num_links", np.int32),
+    ("first_point", np.int32),  # POINT rows [first_point, first_point + num_points)
+    ("num_points", np.int32),  # at least 2
+    ("edge", np.int32),  # EDGE row; internal lanes too
+    # internal lanes: path length of the link before this lane starts
+    ("link_offset_m", np.float64),
+    ("stop_back_m", np.float64),  # from the stop line to the end, where paths of others sweep
+    # into[first_into : first_into + num_into]: LANE rows whose ends lead here (internal lanes where
+    # the map has them)
+    ("first_into", np.int32),
+    ("num_into", np.int32),
+    ("permissions", np.uint32),  # bit k set: VEHICLE_CLASSES[k] may drive here
+    ("index", np.int32),  # position on its edge, 0 = rightmost
+    ("min_x", np.float64),  # bounding box of the polyline, m
+    ("min_y", np.float64),
+    ("max_x", np.float64),
+    ("max_y", np.float64),
 )
 
-EDGE = np.dtype(
-    [
-        (
-            "first_lane",
-            np.int32,
-        ),  # LANE rows [first_lane, first_lane + num_lanes), from right to left
-        ("num_lanes", np.int32),
-        ("internal", np.bool_),
-        ("from_junction", np.int32),  # JUNCTION rows; both the same for internal edges
-        ("to_junction", np.int32),
-        ("length_m", np.float64),
-        ("speed_mps", np.float64),
-    ],
-    align=True,
+EDGE = record(
+    # LANE rows [first_lane, first_lane + num_lanes), from right to left
+    ("first_lane", np.int32),
+    ("num_lanes", np.int32),
+    ("internal", np.bool_),
+    ("from_junction", np.int32),  # JUNCTION rows; both the same for internal edges
+    ("to_junction", np.int32),
+    ("length_m", np.float64),
+    ("speed_mps", np.float64),
 )
 
-LINK = np.dtype(
-    [
-        ("from_lane", np.int32),  # LANE it leaves; its end is the stop line
-        ("to_lane", np.int32),  # LANE it reaches
-        ("first_internal", np.int32),  # first LANE of the chain inside the junction
-        (
-            "next_lane",
-            np.int32,
-        ),  # where a vehicle is after the end of from_lane: first_internal, or to_lane
-        ("length_m", np.float64),  # of the chain of internal lanes
-        ("fork_m", np.float64),  # of its path that others from the same lane come near
-        ("wait_m", np.float64),  # from the stop line to the waiting position inside; inf: none
-        ("junction", np.int32),
-        ("index", np.int32),  # the link's bit in its junction's request, response and foes
-        ("signal", np.int32),  # SIGNAL row
-        ("signal_index", np.int32),  # which letter of the signal's state
-        ("direction", np.uint8),  # ord of SUMO's dir: s t l r L R
-        ("state", np.uint8),  # ord of SUMO's link state without a signal: M m = s w Z o …
-        ("first_conflict", np.int32),  # CONFLICT rows, sorted by the foe's LINK row
-        ("num_conflicts", np.int32),
-    ],
-    align=True,
+LINK = record(
+    ("from_lane", np.int32),  # LANE it leaves; its end is the stop line
+    ("to_lane", np.int32),  # LANE it reaches
+    ("first_internal", np.int32),  # first LANE of the chain inside the junction
+    # where a vehicle is after the end of from_lane: first_internal, or to_lane
+    ("next_lane", np.int32),
+    ("length_m", np.float64),  # of the chain of internal lanes
+    ("fork_m", np.float64),  # of its path that others from the same lane come near
+    ("wait_m", np.float64),  # from the stop line to the waiting position inside; inf: none
+    ("junction", np.int32),
+    ("index", np.int32),  # the link's bit in its junction's request, response and foes
+    ("signal", np.int32),  # SIGNAL row
+    ("signal_index", np.int32),  # which letter of the signal's state
+    ("direction", np.uint8),  # ord of SUMO's dir: s t l r L R
+    ("state", np.uint8),  # ord of SUMO's link state without a signal: M m = s w Z o …
+    ("first_conflict", np.int32),  # CONFLICT rows, sorted by the foe's LINK row
+    ("num_conflicts", np.int32),
 )
 
-CONFLICT = np.dtype(
-    [
-        ("foe", np.int32),  # LINK whose path crosses or merges with this link's path (a `foes` bit)
-        ("merging", np.bool_),  # both lead into one lane
-        ("must_yield", np.bool_),  # this link has to give way to the foe (a `response` bit)
-        ("enter_m", np.float64),  # where on this link's path the shared area begins and ends,
-        ("leave_m", np.float64),  # from the stop line; leave = the whole length where both merge
-        ("foe_enter_m", np.float64),  # the same area on the foe's path
-        ("foe_leave_m", np.float64),
-    ],
-    align=True,
+CONFLICT = record(
+    ("foe", np.int32),  # LINK whose path crosses or merges with this link's path (a `foes` bit)
+    ("merging", np.bool_),  # both lead into one lane
+    ("must_yield", np.bool_),  # this link has to give way to the foe (a `response` bit)
+    ("enter_m", np.float64),  # where on this link's path the shared area begins and ends,
+    ("leave_m", np.float64),  # from the stop line; leave = the whole length where both merge
+    ("foe_enter_m", np.float64),  # the same area on the foe's path
+    ("foe_leave_m", np.float64),
 )
 
-JUNCTION = np.dtype(
-    [
-        ("x", np.float64),
-        ("y", np.float64),
-        ("z", np.float64),
-        ("kind", np.int32),  # index into RoadNetwork.junction_kinds
-        ("signal", np.int32),  # SIGNAL row of a traffic light here
-    ],
-    align=True,
+JUNCTION = record(
+    ("x", np.float64),
+    ("y", np.float64),
+    ("z", np.float64),
+    ("kind", np.int32),  # index into RoadNetwork.junction_kinds
+    ("signal", np.int32),  # SIGNAL row of a traffic light here
 )
 
-SIGNAL = np.dtype(
-    [
-        ("program", np.int32),  # PROGRAM that is on at the beginning
-        ("num_links", np.int32),  # letters in a state
-        ("first_switch", np.int32),  # SWITCH rows, by rising time
-        ("num_switches", np.int32),
-    ],
-    align=True,
+SIGNAL = record(
+    ("program", np.int32),  # PROGRAM that is on at the beginning
+    ("num_links", np.int32),  # letters in a state
+    ("first_switch", np.int32),  # SWITCH rows, by rising time
+    ("num_switches", np.int32),
 )
 
-PROGRAM = np.dtype(
-    [
-        ("signal", np.int32),
-        ("first_phase", np.int32),  # PHASE rows [first_phase, first_phase + num_phases)
-        ("num_phases", np.int32),
-        ("offset_s", np.float64),  # by which all phases are late
-        ("cycle_s", np.float64),  # sum of the phases' durations
-        ("controller", np.int32),  # actuated: its place in a world's controllers
-        ("detector_gap_s", np.float64),  # actuated: from a detector to the stop line, at the limit
-        ("simplified", np.bool_),  # SUMO has rules for it that are not run here
-    ],
-    align=True,
+PROGRAM = record(
+    ("signal", np.int32),
+    ("first_phase", np.int32),  # PHASE rows [first_phase, first_phase + num_phases)
+    ("num_phases", np.int32),
+    ("offset_s", np.float64),  # by which all phases are late
+    ("cycle_s", np.float64),  # sum of the phases' durations
+    ("controller", np.int32),  # actuated: its place in a world's controllers
+    ("detector_gap_s", np.float64),  # actuated: from a detector to the stop line, at the limit
+    ("simplified", np.bool_),  # SUMO has rules for it that are not run here
 )
 
-PHASE = np.dtype(
-    [
-        ("duration_s", np.float64),
-        ("min_ms", np.int64),  # actuated: bounds of the duration, in SUMO's unit of time
-        ("max_ms", np.int64),
-        ("following", np.int32),  # actuated: PHASE that comes next
-        ("green", np.bool_),  # some letter is green and none is yellow: it may be prolonged
-        ("first_state", np.int32),  # phase_states[first_state : first_state + num_links]
-        ("first_detector", np.int32),  # phase_detectors that prolong it
-        ("num_detectors", np.int32),
-    ],
-    align=True,
+PHASE = record(
+    ("duration_s", np.float64),
+    ("min_ms", np.int64),  # actuated: bounds of the duration, in SUMO's unit of time
+    ("max_ms", np.int64),
+    ("following", np.int32),  # actuated: PHASE that comes next
+    ("green", np.bool_),  # some letter is green and none is yellow: it may be prolonged
+    ("first_state", np.int32),  # phase_states[first_state : first_state + num_links]
+    ("first_detector", np.int32),  # phase_detectors that prolong it
+    ("num_detectors", np.int32),
 )
 
-SWITCH = np.dtype(
-    [
-        ("signal", np.int32),
-        ("at_s", np.float64),  # since the beginning
-        ("program", np.int32),  # PROGRAM that is on from then
-    ],
-    align=True,
+SWITCH = record(
+    ("signal", np.int32),
+    ("at_s", np.float64),  # since the beginning
+    ("program", np.int32),  # PROGRAM that is on from then
 )
 
-DETECTOR = np.dtype(
-    [
-        ("lane", np.int32),  # LANE on which it lies; its signal may be one lane farther on
-        ("s_m", np.float64),  # where on that lane
-        ("max_gap_s", np.float64),  # between two vehicles of which the second prolongs the green
-    ],
-    align=True,
+DETECTOR = record(
+    ("lane", np.int32),  # LANE on which it lies; its signal may be one lane farther on
+    ("s_m", np.float64),  # where on that lane
+    ("max_gap_s", np.float64),  # between two vehicles of which the second prolongs the green
 )
 
-PLACE = np.dtype(
-    [
-        ("next", np.int32),  # the next PLACE of the same lane
-        ("detector", np.int32),
-        ("s_m", np.float64),  # of the detector in the lane's s; beyond its ends on lanes beside it
-    ],
-    align=True,
+PLACE = record(
+    ("next", np.int32),  # the next PLACE of the same lane
+    ("detector", np.int32),
+    ("s_m", np.float64),  # of the detector in the lane's s; beyond its ends on lanes beside it
 )
 
 
 @dataclass(frozen=True)
 class GeoReference:
-    """Where a map lies on the earth: a place projected, plus the offset, is its x and y.
+    """Where a map lies on the earth: a place projected, plus the offset, is its x and y."""
 
-    Attributes:
-        projection: parameters of PROJ.
-        offset_x_m: added to the east of the projection.
-        offset_y_m: added to its north.
-    """
-
-    projection: str
-    offset_x_m: float
-    offset_y_m: float
+    projection: str  # parameters of PROJ
+    offset_x_m: float  # added to the east of the projection
+    offset_y_m: float  # added to its north
 
 
 @dataclass(frozen=True, eq=False)
 class RoadNetwork:
     """An immutable road map; see the module's docstring for frames and the dtypes for fields.
 
-    Attributes:
-        name: the source file's name without its endings.
-        source_hash: SHA-256 of the source, hex; part of every manifest and cache key.
-        points, lanes, edges, links, conflicts, junctions: record arrays, read-only.
-        signals, programs, phases, switches, detectors: record arrays, read-only.
-        into: LANE rows, see LANE["first_into"].
-        phase_states: signal letters as codes, see PHASE.
-        phase_detectors: DETECTOR rows, see PHASE["first_detector"].
-        lane_ids, edge_ids, junction_ids, signal_ids, program_ids: the source's names, by row.
-        junction_kinds: SUMO's junction types that occur, by `JUNCTION["kind"]`.
-        geo: where it lies on the earth; None: the map does not say.
-        walls: WALL (num_walls,) of the buildings, if they were asked for; see `maps.buildings`.
-        roofs: (num_roofs, 4, 2) corners in m of the convex parts of their footprints.
-        roof_height: (num_roofs,) m over the ground.
+    Arrays are read-only; ids are the names of the source, by row.
     """
 
-    name: str
-    source_hash: str
+    name: str  # the source file's name without its endings
+    source_hash: str  # SHA-256 of the source, hex; part of every manifest and cache key
     points: NDArray[np.void]
     lanes: NDArray[np.void]
     edges: NDArray[np.void]
     links: NDArray[np.void]
     conflicts: NDArray[np.void]
     junctions: NDArray[np.void]
-    into: NDArray[np.int32]
+    into: NDArray[np.int32]  # LANE rows, see LANE["first_into"]
     signals: NDArray[np.void]
     programs: NDArray[np.void]
     phases: NDArray[np.void]
-    phase_states: NDArray[np.uint8]
+    phase_states: NDArray[np.uint8]  # signal letters as codes, see PHASE
     switches: NDArray[np.void]
     detectors: NDArray[np.void]
-    phase_detectors: NDArray[np.int32]
+    phase_detectors: NDArray[np.int32]  # DETECTOR rows, see PHASE["first_detector"]
     lane_ids: tuple[str, ...]
     edge_ids: tuple[str, ...]
     junction_ids: tuple[str, ...]
     signal_ids: tuple[str, ...]
     program_ids: tuple[str, ...]
-    junction_kinds: tuple[str, ...]
-    geo: GeoReference | None = None
+    junction_kinds: tuple[str, ...]  # SUMO's types that occur, by `JUNCTION["kind"]`
+    geo: GeoReference | None = None  # where it lies on the earth; None: the map does not say
+    # WALL (num_walls,) of the buildings, if they were asked for; see `maps.buildings`
     walls: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, WALL))
+    # (num_roofs, 4, 2) corners in m of the convex parts of their footprints
     roofs: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 4, 2)))
+    # (num_roofs,) m over the ground
     roof_height: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
@@ -369,9 +307,23 @@ class RoadNetwork:
 
     def lane_polyline(self, lane: int) -> NDArray[np.float64]:
         """The centre line of a lane as (num_points, 3) x, y, z in metres."""
-        row = self.lanes[lane]
-        points = self.points[row["first_point"] : row["first_point"] + row["num_points"]]
+        points = self.lane_points(lane)
         return np.stack([points["x"], points["y"], points["z"]], axis=1)
+
+    def lane_points(self, lane: int) -> NDArray[np.void]:
+        """POINT (num_points,) of a lane."""
+        row = self.lanes[lane]
+        return self.points[row["first_point"] : row["first_point"] + row["num_points"]]
+
+    def pose_on(self, lane: int, s: float) -> tuple[float, float, float, float, float, float]:
+        """X, y and z of a place on a lane, and cosine, sine and slope of its direction there."""
+        row = self.lanes[lane]
+        return lane_pose(self.points, row["first_point"], row["num_points"], s)
+
+    def beside(self, lane: int, x: float, y: float) -> tuple[float, float, float, float]:
+        """S and d of a place beside a lane, and cosine and sine of the lane's direction there."""
+        row = self.lanes[lane]
+        return project(self.points, row["first_point"], row["num_points"], x, y)
 
     @cached_property
     def content_hash(self) -> str:

@@ -21,8 +21,7 @@ STUB_M = 0.01
 def clean_shape(points: Sequence[tuple[float, float, float]]) -> Shape:
     """Drop points that repeat the one before in the plane; (n, 3) metres, n ≥ 1.
 
-    Raises:
-        MapError: the shape has no points.
+    Raises MapError: the shape has no points.
     """
     shape: Shape = np.array(points, dtype=np.float64).reshape(-1, 3)
     if not len(shape):

@@ -14,25 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import RouteError
+from cavmarl.core.records import record
 from cavmarl.core.records.arrays import LaneGrid
 from cavmarl.roads.kernels.plans import plan_goal
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 
-PLAN = np.dtype(
-    [
-        ("next", np.int32),  # LANE after this lane's end; -1: the goal's own lane, or no way
-        ("link", np.int32),  # LINK that leads there; -1 inside junctions
-        ("shift", np.int32),  # what to add to a vehicle's way there, see `kernels.ways`
-        ("change", np.int16),  # side of the better lane: 1 left, -1 right, 0 this one is best
-        ("changes", np.int16),  # lane changes to the best lane of this edge
-        ("turnarounds", np.int16),  # U-turns on the way: where a road ends, plans turn round
-        (
-            "room",
-            np.float64,
-        ),  # m from the lane's start that can be driven before a change is needed
-        ("to_go", np.float64),  # m from the lane's start to the end of the goal edge; inf: no way
-    ],
-    align=True,
+PLAN = record(
+    ("next", np.int32),  # LANE after this lane's end; -1: the goal's own lane, or no way
+    ("link", np.int32),  # LINK that leads there; -1 inside junctions
+    ("shift", np.int32),  # what to add to a vehicle's way there, see `kernels.ways`
+    ("change", np.int16),  # side of the better lane: 1 left, -1 right, 0 this one is best
+    ("changes", np.int16),  # lane changes to the best lane of this edge
+    ("turnarounds", np.int16),  # U-turns on the way: where a road ends, plans turn round
+    # m from the lane's start that can be driven before a change is needed
+    ("room", np.float64),
+    ("to_go", np.float64),  # m from the lane's start to the end of the goal edge; inf: no way
 )
 
 
@@ -41,13 +37,10 @@ def make_plans(
 ) -> NDArray[np.void]:
     """The plans of several goals.
 
-    Args:
-        network: the roads.
-        goal_edges: EDGE rows to plan for.
-        vehicle_class: one of `VEHICLE_CLASSES`; lanes that forbid it are not used.
+    `goal_edges`: EDGE rows to plan for. `vehicle_class`: one of `VEHICLE_CLASSES`; lanes that
+    forbid it are not used.
 
-    Returns:
-        PLAN (len(goal_edges), num_lanes), read-only.
+    Returns PLAN (len(goal_edges), num_lanes), read-only.
     """
     plans = np.zeros((len(goal_edges), len(network.lanes)), dtype=PLAN)
     permission = 1 << VEHICLE_CLASSES.index(vehicle_class)
@@ -60,8 +53,7 @@ def make_plans(
 def way(network: RoadNetwork, plan: NDArray[np.void], lane: int) -> list[int]:
     """The lanes from `lane` to the goal of one plan (L,), both included, with lane changes.
 
-    Raises:
-        RouteError: the goal cannot be reached from there.
+    Raises RouteError: the goal cannot be reached from there.
     """
     if not np.isfinite(plan[lane]["to_go"]):
         raise RouteError(

@@ -1,4 +1,4 @@
-"""What agents observe, and what their vehicles carry: one file a sensor.
+"""What agents observe, and what their vehicles carry.
 
 Kernels beside them; `shards` senses in each step.
 """

@@ -11,7 +11,7 @@ from cavmarl.core.records.arrays import Outputs, Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.driving.agent_view import RegisteredFunction, agent_view
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.sensors.kernels.stacking import newest_frame
+from cavmarl.sensors.kernels.output_reset import newest_frame
 from cavmarl.sensors.observed import layout
 
 

@@ -38,7 +38,7 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN, lane_grid
 from cavmarl.sensors.kernels.observe_optional import observe_optional
 from cavmarl.sensors.kernels.observing_messages import observe_messages
-from cavmarl.sensors.kernels.stacking import fill_stacks
+from cavmarl.sensors.kernels.output_reset import fill_stacks
 from cavmarl.sensors.observed import layout, optional_arrays, sensor_arrays
 from cavmarl.shards.kernels.world_phases import suggest
 from cavmarl.shards.registered_outputs import RegisteredOutputs

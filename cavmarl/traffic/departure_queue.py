@@ -6,29 +6,27 @@ from typing import Any
 
 import numpy as np
 
+from cavmarl.core.records import record
 from cavmarl.core.records.arrays import Gate, RoadArrays
 from cavmarl.core.records.codes import NUM_COUNTS, NUM_SUMS
 
-DEPARTURE = np.dtype(
-    [
-        ("id", np.int64),  # of the vehicle; the queue is in this order
-        ("due", np.int64),  # tick
-        ("way", np.int64),  # as VEHICLE["way"], on its first edge
-        ("agent", np.int32),  # index of the agent that will drive it, or -1
-        ("order", np.int32),  # its own row in `Gate.orders`; -1: of the generator
-        ("vtype", np.int32),  # VTYPE row
-        ("goal", np.int32),  # row of the plans' table, or -1: the end of its route
-        ("lane", np.int32),  # LANE where it enters, or any lane of that edge
-        ("stop", np.int32),  # STOP rows [stop, stops_end)
-        ("stops_end", np.int32),
-        ("lane_code", np.int8),  # LANE_*
-        ("pos_code", np.int8),  # POS_*
-        ("speed_code", np.int8),  # SPEED_*
-        ("pos", np.float64),  # of the front bumper, m; negative: from the end of the lane
-        ("speed", np.float64),  # m/s
-        ("speed_factor", np.float64),  # desired speed over the limit
-    ],
-    align=True,
+DEPARTURE = record(
+    ("id", np.int64),  # of the vehicle; the queue is in this order
+    ("due", np.int64),  # tick
+    ("way", np.int64),  # as VEHICLE["way"], on its first edge
+    ("agent", np.int32),  # index of the agent that will drive it, or -1
+    ("order", np.int32),  # its own row in `Gate.orders`; -1: of the generator
+    ("vtype", np.int32),  # VTYPE row
+    ("goal", np.int32),  # row of the plans' table, or -1: the end of its route
+    ("lane", np.int32),  # LANE where it enters, or any lane of that edge
+    ("stop", np.int32),  # STOP rows [stop, stops_end)
+    ("stops_end", np.int32),
+    ("lane_code", np.int8),  # LANE_*
+    ("pos_code", np.int8),  # POS_*
+    ("speed_code", np.int8),  # SPEED_*
+    ("pos", np.float64),  # of the front bumper, m; negative: from the end of the lane
+    ("speed", np.float64),  # m/s
+    ("speed_factor", np.float64),  # desired speed over the limit
 )
 
 

@@ -32,10 +32,9 @@ from cavmarl.traffic.scenarios.cast import Cast
 from cavmarl.traffic.scenarios.movement_scripts import NO_SCRIPTS
 from cavmarl.traffic.scenarios.scene import Scene
 from cavmarl.traffic.schedule import Schedule
-from cavmarl.traffic.sumo.route_book import RouteBook
-from cavmarl.traffic.sumo.stop_book import StopBook
+from cavmarl.traffic.sumo.route_book import RouteBook, StopBook
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
-from cavmarl.traffic.way_slots import WaySlots, way_slots
+from cavmarl.traffic.way_search import WaySlots, way_slots
 
 PASSENGER = 1 << VEHICLE_CLASSES.index("passenger")
 FAST_FACTOR = 1.5  # a speed over the limit that hardly any driver of the demand wants
@@ -58,33 +57,20 @@ class _Calls:
 
 @dataclass(frozen=True)
 class NativeTraffic:
-    """Departures on one map for one population; a TrafficSource.
-
-    Attributes:
-        network: the roads.
-        traffic: settings of the generator.
-        population: which vehicles are in the world.
-        blank: VEHICLE (1,), the record that every vehicle starts from.
-        dt: seconds a tick.
-        horizon_s: seconds an episode.
-        file: the demand whose vehicles drive beside the generator's.
-        num_worlds: how many worlds are stepped together.
-        zeros: makes the table of ways, where vehicles find some while the world runs.
-        scene: what is played to the agents of each world.
-        sumo: in the place of a file: what SUMO runs beside these worlds.
-    """
+    """Departures on one map for one population; a TrafficSource."""
 
     network: RoadNetwork
-    traffic: TrafficConfig
-    population: PopulationConfig
-    blank: NDArray[np.void]
+    traffic: TrafficConfig  # settings of the generator
+    population: PopulationConfig  # which vehicles are in the world
+    blank: NDArray[np.void]  # VEHICLE (1,), the record that every vehicle starts from
     dt: float
-    horizon_s: float
-    file: DemandFile | None = None
+    horizon_s: float  # seconds an episode
+    file: DemandFile | None = None  # the demand whose vehicles drive beside the generator's
     num_worlds: int = 1
+    # makes the table of ways, where vehicles find some while the world runs
     zeros: Zeros = np.zeros
-    scene: Scene | None = None
-    sumo: SumoDemand | None = None
+    scene: Scene | None = None  # what is played to the agents of each world
+    sumo: SumoDemand | None = None  # in the place of a file: what SUMO runs beside these worlds
 
     def __post_init__(self) -> None:
         # Trips that do not exist are refused when the world is made, not at its first reset.
@@ -132,7 +118,6 @@ class NativeTraffic:
 
     @cached_property
     def cast(self) -> Cast | None:
-        """The actors of the scene."""
         if self.scene is None:
             return None
         first_type = len(generated_types()) + (0 if self.file is None else len(self.file.types))
@@ -247,8 +232,7 @@ class NativeTraffic:
     def demand(self) -> Demand:
         """The tables that departures are drawn from.
 
-        Raises:
-            ConfigError: no trip of the wanted length exists on this map.
+        Raises ConfigError: no trip of the wanted length exists on this map.
         """
         lanes = self.network.lanes
         edges = set(self._drivable_edges(MIN_ORIGIN_M))
@@ -280,8 +264,7 @@ class NativeTraffic:
     def draw_orders(self, gate: Gate, worlds: Worlds, chosen: NDArray[np.bool_]) -> Gate:
         """Draw what the demand file orders in the chosen worlds' (W,) new episodes.
 
-        Returns:
-            the gate, or a larger one if there are more orders than ever before.
+        Returns the gate, or a larger one if there are more orders than ever before.
         """
         if self.schedule is None:
             return gate
@@ -325,8 +308,7 @@ class NativeTraffic:
     def _check_room(self) -> None:
         """Refuse a population that cannot stand on the map, bumper to bumper.
 
-        Raises:
-            CapacityError: more vehicles than that.
+        Raises CapacityError: more vehicles than that.
         """
         lanes = self.network.lanes
         usable = ~lanes["internal"] & (lanes["permissions"] & PASSENGER != 0)

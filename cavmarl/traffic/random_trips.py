@@ -25,12 +25,9 @@ class RandomTrips:
     Places are edges, drawn in proportion to the length of their lanes. Only the largest part of the
     map is used in which every edge can be reached from every other without turning round.
 
-    Args:
-        network: the roads.
-        seed: of the draws; equal arguments give equal routes.
+    `seed`: of the draws; equal arguments give equal routes.
 
-    Raises:
-        RouteError: the map has no two such edges.
+    Raises RouteError: the map has no two such edges.
     """
 
     def __init__(self, network: RoadNetwork, seed: int) -> None:
@@ -81,27 +78,15 @@ class RandomTrips:
 
 
 def write_random_demand(
-    network: RoadNetwork,
-    path: Path,
-    *,
-    vehicles: int,
-    within_s: float,
-    route_m: float,
-    seed: int,
+    network: RoadNetwork, path: Path, *, vehicles: int, within_s: float, route_m: float, seed: int
 ) -> None:
     """Write a `.rou.xml` of cars that depart evenly spread over a time.
 
-    Args:
-        network: the roads.
-        path: the file.
-        vehicles: how many.
-        within_s: the time from the first departure to just after the last.
-        route_m: routes are at least as long.
-        seed: equal arguments give equal bytes.
+    `within_s`: the time from the first departure to just after the last. `route_m`: routes are at
+    least as long. `seed`: equal arguments give equal bytes.
 
-    Raises:
-        ConfigError: a number out of range, or the file cannot be written.
-        RouteError: the map has no circuit.
+    Raises ConfigError: a number out of range, or the file cannot be written; RouteError: the map
+    has no circuit.
     """
     if not 1 <= vehicles <= MAX_VEHICLES:
         raise ConfigError(f"vehicles = {vehicles}: must be from 1 to {MAX_VEHICLES}")

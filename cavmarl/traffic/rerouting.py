@@ -13,51 +13,43 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.math.rng import STREAM_REROUTER, uniform
+from cavmarl.core.records import record
 from cavmarl.core.records.arrays import Gate, RoadArrays, Travel, Worlds
 from cavmarl.core.records.codes import COUNT_REROUTED
 from cavmarl.roads.routing import PLAN
 from cavmarl.traffic.demand import Choices
 from cavmarl.traffic.demand.rerouters import KEEP_DESTINATION
-from cavmarl.traffic.kernels.edge_speeds import limit_speeds, sample_speeds
-from cavmarl.traffic.kernels.way_requests import find_asking, mark_slots
+from cavmarl.traffic.kernels.way_requests import (
+    find_asking,
+    limit_speeds,
+    mark_slots,
+    sample_speeds,
+)
 from cavmarl.traffic.schedule import Schedule
-from cavmarl.traffic.way_search import Traffic, WaySearch, WaySearchResult
-from cavmarl.traffic.way_slots import WaySlots
+from cavmarl.traffic.way_search import Traffic, WaySearch, WaySearchResult, WaySlots
 
 NEVER = np.iinfo(np.int64).max
 
 # What an ordered vehicle knows of its looking for ways, by VEHICLE["order"].
-LOOK = np.dtype(
-    [
-        ("next", np.int64),  # tick from which on it looks again
-        ("period", np.int64),  # ticks until it does so once more; 0: it does not
-        ("goal", np.int32),  # EDGE row that it drives to
-        ("seen", np.int32),  # EDGE row on which it has asked the rerouters last
-        ("may_leave", np.bool_),  # no edge between first and last is one that it has to pass
-        ("equipped", np.bool_),  # it has a rerouting device: knows the speeds
-    ],
-    align=True,
+LOOK = record(
+    ("next", np.int64),  # tick from which on it looks again
+    ("period", np.int64),  # ticks until it does so once more; 0: it does not
+    ("goal", np.int32),  # EDGE row that it drives to
+    ("seen", np.int32),  # EDGE row on which it has asked the rerouters last
+    ("may_leave", np.bool_),  # no edge between first and last is one that it has to pass
+    ("equipped", np.bool_),  # it has a rerouting device: knows the speeds
 )
 
 
 class Rerouting:
     """Vehicles that reroute, what is known of the traffic, and the ways that were found; W worlds.
 
-    Args:
-        schedule: of the demand file.
-        travel: types and ways, with room behind them.
-        slots: that room.
-        first_type: VTYPE row of the file's first type.
-        dt: seconds a tick.
+    `travel`: types and ways, with room behind them. `slots`: that room. `first_type`: VTYPE row of
+    the file's first type.
     """
 
     def __init__(
-        self,
-        schedule: Schedule,
-        travel: Travel,
-        slots: WaySlots,
-        first_type: int,
-        dt: float,
+        self, schedule: Schedule, travel: Travel, slots: WaySlots, first_type: int, dt: float
     ) -> None:
         self._schedule = schedule
         self._travel = travel
@@ -83,10 +75,7 @@ class Rerouting:
     def begin(self, world: int, key: int, horizon_s: float) -> None:
         """Forget an episode of a world and take up the next.
 
-        Args:
-            world: which one.
-            key: of the world and the new episode.
-            horizon_s: seconds an episode.
+        `key`: of the world and the new episode. `horizon_s`: seconds an episode.
         """
         orders = self._schedule.orders(key, horizon_s)
         more = len(orders) - self._looks.shape[1]
@@ -126,9 +115,7 @@ class Rerouting:
     def state(self, world: int, rows: NDArray[np.void]) -> Iterator[NDArray[np.generic]]:
         """What of a world's state is kept here, as arrays without padding.
 
-        Args:
-            world: number of the world.
-            rows: VEHICLE (n,), its vehicles: only the ways that they drive on count.
+        `rows`: VEHICLE (n,), its vehicles: only the ways that they drive on count.
         """
         yield self._speed_sums[world]
         yield self._past[world]

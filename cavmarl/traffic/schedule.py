@@ -30,14 +30,10 @@ class Schedule:
     Ways of trips are found once, when the world is made: the fastest ones at the speed limits, over
     the edges that the trip names.
 
-    Args:
-        demand: of the files.
-        first_type: VTYPE row of the file's first type in the world's table.
-        first_step: PLAN row of the first route's first step in the world's table.
+    `demand`: of the files. `first_type`: VTYPE row of the file's first type in the world's table.
+    `first_step`: PLAN row of the first route's first step in the world's table.
 
-    Raises:
-        RouteError: a trip without a way.
-        CapacityError: the routes have too many steps.
+    Raises RouteError: a trip without a way; CapacityError: the routes have too many steps.
     """
 
     def __init__(self, demand: DemandFile, first_type: int, first_step: int) -> None:
@@ -126,10 +122,7 @@ class Schedule:
     def way_on(self, route: int, vtype: int, edge: int) -> int:
         """The way of a <route>'s vehicle on one of its edges, or -1.
 
-        Args:
-            route: ROUTE row, with all edges.
-            vtype: VTYPE row of the file.
-            edge: EDGE row.
+        `route`: ROUTE row, with all edges. `vtype`: VTYPE row of the file.
         """
         row = self.demand.routes[route]
         begin = self._way[route, self._class_of_type[vtype]]
@@ -144,7 +137,6 @@ class Schedule:
         )
 
     def detour_goal(self, route: int, vtype: int) -> int:
-        """VEHICLE["goal"] of vehicles on a route, or -1."""
         return int(self._goal[route, self._class_of_type[vtype]])
 
     def _edges(self, route: int, mask: int) -> NDArray[np.int32]:
@@ -191,10 +183,7 @@ class Schedule:
     def draw(self, key: int, horizon_s: float, dt: float) -> NDArray[np.void]:
         """The departures of one episode, DEPARTURE (n,) in order of `due`.
 
-        Args:
-            key: of the world and episode.
-            horizon_s: seconds an episode; later departures are not drawn.
-            dt: seconds a tick.
+        `horizon_s`: seconds an episode; later departures are not drawn.
         """
         demand = self.demand
         orders = self.orders(key, horizon_s)

@@ -1,26 +1,97 @@
-"""`WaySearch`: ways through one world in one second, by what is known of its traffic then."""
+"""`WaySearch`: ways through one world in one second, by what is known of its traffic then.
+
+Ways that are found lie in slots behind the table of all ways.
+"""
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.errors import CapacityError
 from cavmarl.core.records.arrays import RoadArrays, Travel
 from cavmarl.roads.kernels.plans import plan_goal
 from cavmarl.roads.routing import PLAN
-from cavmarl.traffic.kernels.edge_speeds import CLOSED_S, slow_lanes
 from cavmarl.traffic.kernels.way_requests import (
+    CLOSED_S,
     find_way,
     has_room,
     mark_slots,
     put_on_way,
+    slow_lanes,
     take_slot,
     time_left,
 )
-from cavmarl.traffic.way_slots import WaySlots
+from cavmarl.traffic.schedule import MAX_STEPS, Schedule
+
+LEAST_STEPS = 128  # of a slot, if the map has so many lanes
+DETOUR_RATIO = 3  # a way may take this many times the steps of the longest known one
+
+
+@dataclass(frozen=True)
+class WaySlots:
+    """Where the slots lie; they are never more, whatever an episode brings."""
+
+    first: int  # PLAN row of the first world's first slot
+    number: int  # slots of one world
+    steps: int  # of one slot
+    num_worlds: int  # how many worlds have slots
+    # of the map. So many unused steps before the first slot keep the ways in slots above all
+    # others: a way is a step's row minus that of a lane.
+    num_lanes: int
+
+    def table(self) -> NDArray[np.void]:
+        """PLAN, all steps of all slots, to be put behind the others."""
+        return np.zeros(self.num_lanes + self.num_worlds * self.of_world, dtype=PLAN)
+
+    @property
+    def of_world(self) -> int:
+        """Steps of one world's slots."""
+        return self.number * self.steps
+
+    def first_of(self, world: int) -> int:
+        """PLAN row of a world's first slot."""
+        return self.first + world * self.of_world
+
+    def ways_of_first_world(self, ways: NDArray[np.int64], world: int) -> NDArray[np.int64]:
+        """VEHICLE["way"] (n,) of a world as it would be in the first one: where slots play no part.
+
+        `world`: in which they are.
+        """
+        own = ways >= self.first - self.num_lanes
+        return ways - own * (world * self.of_world)
+
+
+def way_slots(
+    schedule: Schedule, first_step: int, num_worlds: int, capacity: int, horizon_s: float
+) -> WaySlots:
+    """The slots of a demand: one for each vehicle that may need one at a time.
+
+    `first_step`: how many PLAN rows come before. `capacity`: vehicles of one world. `horizon_s`:
+    seconds an episode.
+
+    Raises CapacityError: they would take more than `MAX_STEPS`.
+    """
+    number = capacity
+    if not len(schedule.demand.rerouters.rules):
+        # With a device only: how many have it is drawn.
+        equipped = int(schedule.orders(0, horizon_s)["reroute"].sum())
+        number = min(capacity, equipped + 6 * math.isqrt(equipped) + 16)
+    num_lanes = len(schedule.demand.network.lanes)
+    outside = int((~schedule.demand.network.lanes["internal"]).sum())
+    steps = min(outside, max(LEAST_STEPS, DETOUR_RATIO * schedule.longest))
+    if num_worlds * number * steps > MAX_STEPS:
+        raise CapacityError(
+            f"ways of {number} vehicles that look for their own, {steps} steps each, in "
+            f"{num_worlds} worlds are over {MAX_STEPS} steps: fewer worlds, or fewer vehicles "
+            "with a rerouting device"
+        )
+    return WaySlots(first_step + num_lanes, number, steps, num_worlds, num_lanes)
 
 
 class WaySearchResult(Enum):
@@ -33,30 +104,18 @@ class WaySearchResult(Enum):
 
 
 class Traffic(NamedTuple):
-    """What is known of one world's traffic.
+    """What is known of one world's traffic."""
 
-    Attributes:
-        speed_sums: (num_edges,) mm/s, see `kernels.edge_speeds`.
-        samples: how many a sum has.
-        closed: (num_edges,) bits of the classes that an edge is closed to.
-    """
-
-    speed_sums: NDArray[np.int64]
-    samples: int
-    closed: NDArray[np.int64]
+    speed_sums: NDArray[np.int64]  # (num_edges,) mm/s, see `sample_speeds`
+    samples: int  # how many a sum has
+    closed: NDArray[np.int64]  # (num_edges,) bits of the classes that an edge is closed to
 
 
 class WaySearch:
     """Ways of one world's vehicles. Plans are made where they are asked for, each once.
 
-    Args:
-        roads: the road arrays.
-        travel: types and ways; new ones are written into the slots.
-        slots: where those are.
-        world: number of the world.
-        rows: VEHICLE, the world's.
-        num: how many of them count.
-        traffic: of the world.
+    `travel`: types and ways; new ones are written into the slots. `slots`: where those are. `rows`:
+    VEHICLE, the world's.
     """
 
     def __init__(
@@ -93,11 +152,9 @@ class WaySearch:
     def send(self, i: int, goal: int, knows: bool, anyhow: bool) -> WaySearchResult:
         """Put row i on the fastest way to a goal, if that is faster than its present way.
 
-        Args:
-            i: row of a vehicle outside junctions.
-            goal: EDGE row.
-            knows: whether it knows the speeds; otherwise the limits count. Closings all know.
-            anyhow: whether it leaves its present way even for a slower one.
+        `i`: row of a vehicle outside junctions. `knows`: whether it knows the speeds; otherwise the
+        limits count. Closings all know. `anyhow`: whether it leaves its present way even for a
+        slower one.
         """
         row = self._rows[i]
         permission = self._permission(i)

@@ -8,6 +8,7 @@ is divided.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,12 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.v2x.channel import make_channel
 from cavmarl.v2x.kernels.v2x_exchange import exchange_messages, hand_out
 from cavmarl.v2x.kernels.v2x_records import (
+    BAND_M,
+    COUNT_NO_ACCESS,
+    COUNT_OVERFLOW,
+    COUNT_REACHABLE,
+    COUNT_RECEIVED,
+    COUNT_SENT,
     LAST_CAM,
     MAX_DELAYS,
     MAX_NEAR,
@@ -40,10 +47,13 @@ from cavmarl.v2x.kernels.v2x_records import (
     Sending,
     V2xScratch,
 )
-from cavmarl.v2x.message_statistics import V2xStatistics, statistics_of
-from cavmarl.v2x.network_simulator import Exchange, NetworkSimulator, check_receptions
-from cavmarl.v2x.roadside import make_units
-from cavmarl.v2x.v2x_messages import cause_code
+from cavmarl.v2x.v2x_messages import (
+    Exchange,
+    NetworkSimulator,
+    cause_code,
+    check_receptions,
+    make_units,
+)
 
 Zeros = Callable[..., NDArray[Any]]
 
@@ -54,13 +64,8 @@ BODY_CELL_M = 25.0  # of the vehicles that others see
 class Bus:
     """Sends, carries and keeps the messages of W worlds.
 
-    Args:
-        config: the environment; `v2x.enabled`.
-        network: its roads and buildings.
-        types: VTYPE (num_types,).
-        zoned: the vehicles of all zones.
-        common: clocks, keys and signals.
-        zeros: makes the arrays that outlive a tick.
+    `config`: the environment; `v2x.enabled`. `zoned`: the vehicles of all zones. `common`: clocks,
+    keys and signals. `zeros`: makes the arrays that outlive a tick.
 
     Attributes:
         units: UNIT (num_units,), the roadside units.
@@ -101,8 +106,7 @@ class Bus:
     def connect(self, network: NetworkSimulator) -> None:
         """From now on let a network simulator decide receptions.
 
-        Raises:
-            ConfigError: the channel is one of our own.
+        Raises ConfigError: the channel is one of our own.
         """
         if not self._config.channel.external:
             raise ConfigError("the channel is our own: set v2x.channel.external to connect another")
@@ -179,8 +183,7 @@ class Bus:
     def receiver_of_unit(self, unit: int) -> int:
         """The row of `mail.objects[world]` and the like that are a roadside unit's.
 
-        Raises:
-            ConfigError: there is no such unit.
+        Raises ConfigError: there is no such unit.
         """
         if not 0 <= unit < len(self.units):
             raise ConfigError(f"roadside unit {unit}: there are {len(self.units)}")
@@ -189,8 +192,7 @@ class Bus:
     def declare_of_unit(self, world: int, unit: int, cause: str) -> None:
         """Let a roadside unit tell of an event in the next tick.
 
-        Raises:
-            ConfigError: there is no such unit, or no such cause.
+        Raises ConfigError: there is no such unit, or no such cause.
         """
         self.mail.declared[world, self.receiver_of_unit(unit)] = cause_code(cause)
 
@@ -225,12 +227,7 @@ def _make_sending(v2x: V2xConfig, dt: float) -> Sending:
 
 
 def _make_mail(
-    v2x: V2xConfig,
-    num_worlds: int,
-    capacity: int,
-    num_receivers: int,
-    num_units: int,
-    zeros: Zeros,
+    v2x: V2xConfig, num_worlds: int, capacity: int, num_receivers: int, num_units: int, zeros: Zeros
 ) -> Mail:
     stations = capacity + num_units
     most = v2x.capacity or 3 * stations
@@ -298,4 +295,66 @@ def _make_room(network: RoadNetwork, mail: Mail, zoned: Zoned, num_receivers: in
         ),
         tally=np.zeros(2 * NUM_BANDS, np.int64),
         squared=np.zeros(largest),
+    )
+
+
+@dataclass(frozen=True)
+class V2xStatistics:
+    """Counts and ratios of one world; receivers are the agents and the roadside units."""
+
+    sent: tuple[int, ...]  # packets of each kind: CAM, DENM, CPM, SPAT
+    overflow: int  # packets for which there was no room (`v2x.capacity`)
+    no_access: int  # packets that never found the air free
+    reachable: int  # pairs of a packet and a receiver within reach of it
+    received: int  # those of them that received it
+    delays: NDArray[np.int64]  # (65,) receptions by ticks of delay
+    mean_latency_s: float  # of the receptions
+    # (40, 2) reachable and received, in bands of `BAND_M`; of channels that lose packets
+    bands: NDArray[np.int64]
+    busy_mean: float  # channel busy ratio, mean over receivers and ticks
+    busy_max: float  # the largest
+
+    @property
+    def reception_ratio(self) -> float:
+        """Packet reception ratio, 1 where nothing could be received."""
+        return self.received / self.reachable if self.reachable else 1.0
+
+    def ratio_by_distance(self) -> dict[float, float]:
+        """Packet reception ratio by the middle of each band of distance, m."""
+        return {
+            (band + 0.5) * BAND_M: received / reachable
+            for band, (reachable, received) in enumerate(self.bands.tolist())
+            if reachable
+        }
+
+    def to_dict(self) -> dict[str, float]:
+        """The numbers of a report, named as in `traffic_stats`."""
+        return {
+            "v2x_sent": float(sum(self.sent)),
+            "v2x_received": float(self.received),
+            "v2x_lost": float(self.reachable - self.received),
+            "v2x_dropped": float(self.overflow + self.no_access),
+            "v2x_reception_ratio": self.reception_ratio,
+            "v2x_latency_s": self.mean_latency_s,
+            "v2x_busy_ratio": self.busy_mean,
+        }
+
+
+def statistics_of(mail: Mail, world: int, tick_s: float) -> V2xStatistics:
+    counts = mail.counts[world]
+    delays = mail.delays[world].copy()
+    busy_sum, busy_number, busy_max = mail.busy[world].tolist()
+    total = int(delays.sum())
+    late = int((delays * np.arange(len(delays))).sum())
+    return V2xStatistics(
+        sent=tuple(counts[COUNT_SENT : COUNT_SENT + NUM_KINDS].tolist()),
+        overflow=int(counts[COUNT_OVERFLOW]),
+        no_access=int(counts[COUNT_NO_ACCESS]),
+        reachable=int(counts[COUNT_REACHABLE]),
+        received=int(counts[COUNT_RECEIVED]),
+        delays=delays,
+        mean_latency_s=tick_s * late / total if total else 0.0,
+        bands=mail.bands[world].copy(),
+        busy_mean=busy_sum / busy_number if busy_number else 0.0,
+        busy_max=busy_max,
     )

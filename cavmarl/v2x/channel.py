@@ -34,10 +34,8 @@ def chance_of_reception(config: ChannelConfig, distance_m: float, extra_db: floa
     distributed, in dB, around P = tx - loss(1 m) - 10 n log10(d), so that the chance is
     Φ((P - sensitivity) / σ).
 
-    Args:
-        config: of which `path_loss_exponent` is not 0.
-        distance_m: between the antennas; below 1 m it counts as 1 m.
-        extra_db: lost besides, in a building.
+    `config`: of which `path_loss_exponent` is not 0. `distance_m`: between the antennas; below 1 m
+    it counts as 1 m. `extra_db`: lost besides, in a building.
     """
     lost_db = 10.0 * config.path_loss_exponent * math.log10(max(distance_m, 1.0))
     power_dbm = config.tx_power_dbm - reference_loss_db() - lost_db - extra_db
@@ -116,11 +114,6 @@ def make_channel(config: ChannelConfig, tick_s: float, walls: Walls) -> Channel:
     """What kernels take of a channel.
 
     The chance of reception is (1 - loss) · `chance_of_reception` · `chance_among_others`.
-
-    Args:
-        config: the channel.
-        tick_s: seconds a tick.
-        walls: of buildings.
     """
     reach_m = config.range_m or math.inf
     sensing_m = min(median_range_m(config), reach_m)

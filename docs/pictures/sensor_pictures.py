@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from cavmarl.config.registry import load_config
 from cavmarl.engine.world_setup import load_roads
 from cavmarl.render.canvas import load_pygame
-from cavmarl.sensors.kernels.pixels import colours
-from cavmarl.sensors.kernels.semantics import LANE_LINE
+from cavmarl.sensors.kernels.camera_picture import colours
+from cavmarl.sensors.kernels.panorama import LANE_LINE
 from cavmarl.sensors.mounted.frames import Frames
 from docs.pictures.pictures import moment
 

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 import cavmarl
-from cavmarl.cosim.stack.reference_rig import REFERENCE_RIG
+from cavmarl.cosim.stack.stack import REFERENCE_RIG
 from cavmarl.policies.policy import load_policy
 
 RIG: dict[str, Any] = {"clock.ctrl_dt_s": 0.05, "rig": REFERENCE_RIG}

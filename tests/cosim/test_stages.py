@@ -19,10 +19,17 @@ from cavmarl.cosim.followers.follower_snapshots import SnapshotTime, take_snapsh
 from cavmarl.cosim.stack.hd_map import HdMap, wrap
 from cavmarl.cosim.stack.localisation import GnssInertial
 from cavmarl.cosim.stack.perception import LidarObjects
-from cavmarl.cosim.stack.reference_rig import REFERENCE_RIG
 from cavmarl.cosim.stack.route_planning import LaneRoute
-from cavmarl.cosim.stack.stack import STAGES, Stack, StackConfig, sensor_of, vehicle_of
-from cavmarl.cosim.stack.stack_control import GAINS, PurePursuit
+from cavmarl.cosim.stack.stack import (
+    GAINS,
+    REFERENCE_RIG,
+    STAGES,
+    PurePursuit,
+    Stack,
+    StackConfig,
+    sensor_of,
+    vehicle_of,
+)
 from cavmarl.cosim.stack.stack_types import (
     EgoPose,
     Mission,

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cavmarl.core.errors import ConfigError, FollowerError, FollowerLostError
-from cavmarl.cosim.followers import reception
+from cavmarl.cosim.followers import follower_connection as reception
 from cavmarl.cosim.followers.followed_world import FollowedWorld
 from cavmarl.cosim.followers.follower_client import Follower
 from cavmarl.cosim.followers.follower_connection import FollowerConnection

@@ -10,8 +10,7 @@ from cavmarl.core.errors import (
     ClockError,
     ConfigError,
 )
-from cavmarl.cosim.pacing import Pacer, RealTime, Stepwise
-from cavmarl.cosim.time_master import OwnTicks, TimeMaster
+from cavmarl.cosim.time_master import OwnTicks, Pacer, RealTime, Stepwise, TimeMaster
 from cavmarl.engine.step_trace import SENSORS, TICK, StepTrace
 
 FOREVER = {"population.mode": "respawn", "clock.ctrl_dt_s": 0.05, "horizon_s": 600}

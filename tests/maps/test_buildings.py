@@ -8,8 +8,15 @@ import pytest
 
 from cavmarl.core.errors import MapError
 from cavmarl.engine.world_setup import load_world
-from cavmarl.maps.buildings import convex_parts, walls_of, with_buildings
-from cavmarl.maps.footprints import DEFAULT_HEIGHT_M, LEVEL_M, Footprint, read_footprints
+from cavmarl.maps.buildings import (
+    DEFAULT_HEIGHT_M,
+    LEVEL_M,
+    Footprint,
+    convex_parts,
+    read_footprints,
+    walls_of,
+    with_buildings,
+)
 from cavmarl.roads.network import GeoReference
 from cavmarl.roads.sumo_net.reader import read_network
 

@@ -8,8 +8,7 @@ import pytest
 from cavmarl.core.errors import SumoError, WorkerError
 from cavmarl.parallel.checkpoint.sumo_log import FIRST_LOG_BYTES, KeptLog
 from cavmarl.parallel.processes.shared_memory import Segment
-from cavmarl.traffic.sumo.sumo_history import ToldLog
-from cavmarl.traffic.sumo.sumo_records import MOVED
+from cavmarl.traffic.sumo.sumo_history import MOVED, ToldLog
 
 
 def told(number: int, vehicles: int) -> np.ndarray:

@@ -15,7 +15,7 @@ import pytest
 
 from cavmarl.config.registry import agent_entries
 from cavmarl.core.errors import MissingExtraError, PolicyError
-from cavmarl.cosim.stack.reference_rig import REFERENCE_RIG
+from cavmarl.cosim.stack.stack import REFERENCE_RIG
 from cavmarl.env.parallel import CavEnv, parallel_env
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.policies.policy import Policy, load_policy

@@ -15,7 +15,7 @@ pytest.importorskip("pygame", reason="pictures need the extra 'render'")
 from cavmarl import parallel_env
 from cavmarl.core.errors import ConfigError
 from cavmarl.handoff.zone_view import TransferInFlight, ZoneView
-from cavmarl.render import palette
+from cavmarl.render import canvas as palette
 from cavmarl.render.canvas import blank, pixels
 from cavmarl.render.topdown import MARGIN_PX, TopDownRenderer
 from cavmarl.render.viewport import Viewport

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import MissingExtraError
 from cavmarl.driving.vehicles import VEHICLE
-from cavmarl.render import palette
+from cavmarl.render import canvas as palette
 from cavmarl.render.canvas import load_pygame
 from cavmarl.render.cars import BRAKING_MPS2
 from cavmarl.render.ground import signal_codes, signal_letter

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from cavmarl.sensors.kernels.birds_eye import look_down, make_birds_eye
-from cavmarl.sensors.kernels.semantics import CAR, GROUND, LANE_LINE, PEDESTRIAN, ROAD
+from cavmarl.sensors.kernels.panorama import CAR, GROUND, LANE_LINE, PEDESTRIAN, ROAD
+from cavmarl.sensors.kernels.rig_pictures import look_down, make_birds_eye
 from tests.naive import imaging as naive
 from tests.support.builders import crowds, vehicles
 from tests.support.imaging import backdrop, look_around, mount

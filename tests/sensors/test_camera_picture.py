@@ -9,16 +9,19 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cavmarl.roads.kernels.backdrop_pieces import WALL
-from cavmarl.sensors.kernels.camera_picture import find_faces, look, make_camera, make_picture
-from cavmarl.sensors.kernels.faces import CameraPose, PixelRows
-from cavmarl.sensors.kernels.pixels import (
+from cavmarl.sensors.kernels.camera_picture import (
     colours,
+    find_faces,
+    look,
+    make_camera,
+    make_picture,
     measure_depths,
     write_classes,
     write_colours,
     write_halves,
 )
-from cavmarl.sensors.kernels.semantics import BUILDING, CAR, GROUND, NOTHING, PEDESTRIAN, ROAD
+from cavmarl.sensors.kernels.faces import CameraPose, PixelRows
+from cavmarl.sensors.kernels.panorama import BUILDING, CAR, GROUND, NOTHING, PEDESTRIAN, ROAD
 from tests.naive import imaging as naive
 from tests.support.builders import crowds, vehicles
 from tests.support.imaging import NO_WALLS, backdrop, look_around, mount, mounts, wall_sets

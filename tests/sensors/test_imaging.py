@@ -17,7 +17,7 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.roads.network import VEHICLE_CLASSES
-from cavmarl.sensors.kernels.semantics import (
+from cavmarl.sensors.kernels.panorama import (
     BUILDING,
     LANE_LINE,
     PEDESTRIAN,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cavmarl import make_vec
 from cavmarl.env.vector import CavVectorEnv
-from cavmarl.sensors.kernels.inertia import GRAVITY_MPS2
+from cavmarl.sensors.kernels.vehicle_readings import GRAVITY_MPS2
 from tests.naive import rig as naive
 
 PLACE = {"x_m": 1.5, "y_m": -0.5, "z_m": 1.2, "yaw_deg": 20.0, "pitch_deg": -5.0, "roll_deg": 3.0}

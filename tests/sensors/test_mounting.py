@@ -12,7 +12,7 @@ from cavmarl.config.rig import OdometryConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.driving.vehicle_types import generated_types
 from cavmarl.driving.vehicles import blank_vehicle
-from cavmarl.sensors.kernels.mount_poses import sensor_pose
+from cavmarl.sensors.kernels.rig_frames import sensor_pose
 from cavmarl.sensors.mounted.mount_transforms import (
     check_place,
     mount_of,

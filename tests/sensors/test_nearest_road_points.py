@@ -18,7 +18,7 @@ from cavmarl.sensors.kernels.nearest_road_points import (
     observe_roadgraph,
 )
 from cavmarl.sensors.observed import roadgraph
-from cavmarl.sensors.observed.road_points import road_points
+from cavmarl.sensors.observed.roadgraph import road_points
 from tests.naive import roadgraph as naive
 from tests.support.builders import vehicles
 from tests.support.traffic import NAMES, network

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cavmarl.roads.kernels.backdrop_pieces import WALL
-from cavmarl.sensors.kernels.radar_targets import TARGET, detect
 from cavmarl.sensors.kernels.ray_fan import HIT, cast, make_fan
+from cavmarl.sensors.kernels.rig_rays import TARGET, detect
 from tests.naive import imaging as naive
 from tests.support.builders import crowds, vehicles
 from tests.support.imaging import NO_WALLS, backdrop, look_around, mount, mounts, wall_sets

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from cavmarl import make_vec
-from cavmarl.sensors.kernels.rig_noise import gauss
+from cavmarl.sensors.kernels.rig_frames import gauss
 from cavmarl.sensors.mounted.mounted_sensor import stream_of
 
 CLEAN = {"type": "odometry", "rate_hz": 20}

@@ -11,7 +11,7 @@ import pytest
 from cavmarl import make_vec
 from cavmarl.config.registry import load_config
 from cavmarl.core.errors import ConfigError
-from cavmarl.sensors.kernels.rig_schedule import Due, SensorSchedule, call_due, taken
+from cavmarl.sensors.kernels.rig_frames import Due, SensorSchedule, call_due, taken
 from tests.naive.rig import sample_ticks
 
 RATES = [Fraction(1), Fraction(1, 2), Fraction(1, 20), Fraction(5), Fraction(3, 20), Fraction(7, 9)]

@@ -10,8 +10,14 @@ from numpy.typing import NDArray
 
 from cavmarl.core.math.neighbors import Grid, fill_grid, make_grid
 from cavmarl.roads.kernels.backdrop_pieces import WALL, Backdrop
-from cavmarl.sensors.kernels.panorama import Counts, Panorama, gather, make_panorama
-from cavmarl.sensors.kernels.semantics import CAR, PEDESTRIAN
+from cavmarl.sensors.kernels.panorama import (
+    CAR,
+    PEDESTRIAN,
+    Counts,
+    Panorama,
+    gather,
+    make_panorama,
+)
 from tests.naive.imaging import turn
 from tests.support.builders import coordinates
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from cavmarl.engine.simulation import Simulation
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
-from cavmarl.traffic.sumo.sumo_options import free_libsumo
+from cavmarl.traffic.sumo.sumo_input import free_libsumo
 from tests.support.demand_worlds import TINY, make
 from tests.support.driving import start
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
-from cavmarl.traffic.kernels.edge_speeds import CLOSED_S, limit_speeds, sample_speeds, slow_lanes
+from cavmarl.traffic.kernels.way_requests import CLOSED_S, limit_speeds, sample_speeds, slow_lanes
 from tests.naive import edge_speeds as naive
 from tests.support.traffic import NAMES, network
 

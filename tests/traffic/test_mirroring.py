@@ -16,7 +16,7 @@ from cavmarl.shards.shard import make_zoned
 from cavmarl.traffic.demand import STOP
 from cavmarl.traffic.kernels.mirroring import Paths, list_others, mirror
 from cavmarl.traffic.scenarios.movement_scripts import NO_SCRIPTS
-from cavmarl.traffic.sumo.sumo_records import SEEN
+from cavmarl.traffic.sumo.sumo_history import SEEN
 from tests.naive import mirroring as naive
 
 LENGTH_M = 7.0

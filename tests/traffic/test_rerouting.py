@@ -9,7 +9,7 @@ import pytest
 
 from cavmarl.core.errors import CapacityError
 from cavmarl.engine.simulation import Simulation
-from cavmarl.traffic import way_slots
+from cavmarl.traffic import way_search as way_slots
 from tests.engine.test_row_order import shuffle_rows
 from tests.support.driving import drive, start
 from tests.support.rerouting import (

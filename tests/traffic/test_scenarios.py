@@ -19,7 +19,7 @@ from cavmarl.evaluate.scenarios.scenario_runs import ScenarioRun, make_scenario,
 from cavmarl.policies.policy import load_policy
 from cavmarl.roads.network import SIGNAL_STATES
 from cavmarl.traffic.scenarios.library import load_scenario, scenario_names, summary_of
-from cavmarl.traffic.scenarios.scenario_parameters import describe
+from cavmarl.traffic.scenarios.scene import describe
 
 NAMES = (
     "failed_u_turn",
@@ -263,7 +263,7 @@ def test_who_never_yields_steers() -> None:
 OWN = '''"""Nobody is there."""
 from dataclasses import dataclass
 from cavmarl.traffic.scenarios.scene import Scene, Seat
-from cavmarl.traffic.scenarios.scenario_parameters import setting
+from cavmarl.traffic.scenarios.scene import setting
 
 NEEDS = "a straight road"
 

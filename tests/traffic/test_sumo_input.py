@@ -10,8 +10,7 @@ import pytest
 
 from cavmarl.config.registry import find_entry
 from cavmarl.core.errors import ConfigError
-from cavmarl.traffic.sumo.sumo_input import read_input
-from cavmarl.traffic.sumo.sumo_options import command_words
+from cavmarl.traffic.sumo.sumo_input import command_words, read_input
 
 sumo = pytest.importorskip("sumo", reason="needs the extra 'sumo'")
 

@@ -26,7 +26,7 @@ from cavmarl.engine.world_setup import load_world, make_world
 from cavmarl.evaluate.provenance.manifest import describe_world
 from cavmarl.parallel.hosts.hosted_worlds_job import HostedWorlds
 from cavmarl.parallel.worlds_job import Task, fingerprint
-from cavmarl.traffic.sumo.sumo_options import free_libsumo
+from cavmarl.traffic.sumo.sumo_input import free_libsumo
 from tests.support.driving import drive, start
 from tests.support.rerouting import make_map
 from tests.support.sumo_worlds import MODES, alone, coupled, demand_of, tiny_file

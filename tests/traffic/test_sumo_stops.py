@@ -12,7 +12,7 @@ from cavmarl import make_vec
 from cavmarl.core.errors import CapacityError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.traffic.demand import read_demand
-from cavmarl.traffic.sumo.stop_book import StopBook
+from cavmarl.traffic.sumo.route_book import StopBook
 from cavmarl.verify.equivalence import verify_zones
 from tests.support.driving import drive
 from tests.support.sumo_worlds import coupled, write_stops

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError, MessageError
 from cavmarl.v2x.kernels.v2x_records import KIND_CAM
-from cavmarl.v2x.network_simulator import RECEPTION, Exchange
-from cavmarl.v2x.v2x_messages import messages_of
+from cavmarl.v2x.v2x_messages import RECEPTION, Exchange, messages_of
 from tests.v2x.station_worlds import Standing
 
 PLACES = np.array([[100.0, 100.0], [120.0, 100.0], [150.0, 100.0], [200.0, 100.0]])

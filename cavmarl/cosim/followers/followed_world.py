@@ -15,22 +15,19 @@ import time
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal, Self
 
-from cavmarl.core.errors import (
-    ConfigError,
-    EpisodeError,
-    FollowerError,
-    FollowerLostError,
-)
+from cavmarl.core.errors import ConfigError, EpisodeError, FollowerError, FollowerLostError
 from cavmarl.cosim.followers.follower_barrier import BadControls, Barrier, FollowerSeat
-from cavmarl.cosim.followers.follower_connection import Address, FollowerConnection
+from cavmarl.cosim.followers.follower_connection import (
+    Address,
+    FollowerConnection,
+    Reception,
+    refuse,
+)
 from cavmarl.cosim.followers.follower_messages import Hello, Say
 from cavmarl.cosim.followers.follower_snapshots import SnapshotTime, welcome_to
-from cavmarl.cosim.followers.reception import Reception, refuse
-from cavmarl.cosim.pacing import Pacer
-from cavmarl.cosim.time_master import OwnTicks, TimeMaster
+from cavmarl.cosim.time_master import OwnTicks, Pacer, TimeMaster
 from cavmarl.engine.step_trace import QUEUE, STACK, StepTrace
 from cavmarl.env.parallel import CavEnv
 
@@ -100,17 +97,11 @@ class FollowedWorld:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     @property
     def seats(self) -> tuple[FollowerSeat, ...]:
-        """The followers, in the order in which they are served."""
         return tuple(self._seats)
 
     @property
@@ -120,8 +111,7 @@ class FollowedWorld:
     def wait_for(self, followers: int, within_s: float) -> None:
         """Wait until so many follow.
 
-        Raises:
-            FollowerLostError: they have not come in time.
+        Raises FollowerLostError: they have not come in time.
         """
         until_s = time.monotonic() + within_s
         while len(self._seats) < followers:
@@ -137,8 +127,7 @@ class FollowedWorld:
     def reset(self, seed: int | None = None) -> None:
         """Begin an episode, and let followers see it.
 
-        Raises:
-            FollowerError: see `step`.
+        Raises FollowerError: see `step`.
         """
         self._admit(0.0)
         self.master.reset(seed)
@@ -221,8 +210,7 @@ class FollowedWorld:
     def _indices(self, vehicles: Sequence[str]) -> tuple[int, ...]:
         """The agents that a newcomer wants.
 
-        Raises:
-            FollowerError: there are none of that name, or somebody else drives them.
+        Raises FollowerError: there are none of that name, or somebody else drives them.
         """
         known = {agent: k for k, agent in enumerate(self.env.possible_agents)}
         taken = {k: seat.clock.name for seat in self._seats for k in seat.agents}
@@ -257,9 +245,8 @@ class FollowedWorld:
     def _exchange(self, seats: Sequence[FollowerSeat]) -> None:
         """Let followers see the world as it is, and queue what they do.
 
-        Raises:
-            FollowerError: of the first one, in their order, with which it cannot go on; what the
-                others do is queued all the same.
+        Raises FollowerError: of the first one, in their order, with which it cannot go on; what the
+        others do is queued all the same.
         """
         if self._episode < 0 or not seats:
             return

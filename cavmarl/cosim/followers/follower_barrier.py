@@ -10,12 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from cavmarl.core.errors import (
-    ActionError,
-    ClockError,
-    FollowerError,
-    FollowerLostError,
-)
+from cavmarl.core.errors import ActionError, ClockError, FollowerError, FollowerLostError
 from cavmarl.cosim.followers.follower_connection import FollowerConnection
 from cavmarl.cosim.followers.follower_messages import Control, Say, Ticked, read_letter
 from cavmarl.cosim.followers.follower_snapshots import SnapshotTime, take_snapshot
@@ -27,31 +22,18 @@ BadControls = Literal["error", "hold"]
 
 @dataclass(eq=False)
 class FollowerSeat:
-    """A follower, as the world knows it.
-
-    Attributes:
-        line: to it.
-        clock: its place at the master's clock.
-        agents: indices of the agents that it drives, rising.
-        frame: of the last snapshot that it was sent; -1: none yet.
-        held: the last controls of its vehicles.
-        answers: controls that it has sent in time.
-        late: answers to earlier snapshots, which were thrown away.
-        bad: controls of a vehicle that could not be carried out.
-        wait_wall_s: how long the world has waited for it, by the wall clock.
-        slowest: in how many steps it was the last one to answer.
-    """
+    """A follower, as the world knows it."""
 
     line: FollowerConnection
-    clock: TimeFollower
-    agents: tuple[int, ...]
-    frame: int = -1
-    held: dict[str, Any] = field(default_factory=dict)
-    answers: int = 0
-    late: int = 0
-    bad: int = 0
-    wait_wall_s: float = 0.0
-    slowest: int = 0
+    clock: TimeFollower  # its place at the master's clock
+    agents: tuple[int, ...]  # indices of the agents that it drives, rising
+    frame: int = -1  # of the last snapshot that it was sent; -1: none yet
+    held: dict[str, Any] = field(default_factory=dict)  # the last controls of its vehicles
+    answers: int = 0  # controls that it has sent in time
+    late: int = 0  # answers to earlier snapshots, which were thrown away
+    bad: int = 0  # controls of a vehicle that could not be carried out
+    wait_wall_s: float = 0.0  # how long the world has waited for it, by the wall clock
+    slowest: int = 0  # in how many steps it was the last one to answer
 
     @property
     def rank(self) -> tuple[float, str]:
@@ -61,27 +43,19 @@ class FollowerSeat:
 
 @dataclass
 class BarrierOutcome:
-    """What has come of one barrier.
+    """What has come of one barrier."""
 
-    Attributes:
-        actions: by agent.
-        failed: followers with which the world cannot go on, and why.
-        left: followers that have said goodbye.
-    """
-
-    actions: dict[str, Any] = field(default_factory=dict)
+    actions: dict[str, Any] = field(default_factory=dict)  # by agent
+    # followers with which the world cannot go on, and why
     failed: dict[FollowerSeat, FollowerError] = field(default_factory=dict)
-    left: list[FollowerSeat] = field(default_factory=list)
+    left: list[FollowerSeat] = field(default_factory=list)  # followers that have said goodbye
 
 
 class Barrier:
     """Asks followers and waits for them.
 
-    Args:
-        env: the world.
-        timeout_s: for so long all of them together may take, by the wall clock.
-        bad_controls: `error`: a follower that sends them fails; `hold`: the vehicle's last ones are
-            used.
+    `timeout_s`: for so long all of them together may take, by the wall clock. `bad_controls`:
+    `error`: a follower that sends them fails; `hold`: the vehicle's last ones are used.
     """
 
     def __init__(self, env: CavEnv, timeout_s: float, bad_controls: BadControls) -> None:
@@ -92,9 +66,7 @@ class Barrier:
     def pass_through(self, seats: Sequence[FollowerSeat], moment: SnapshotTime) -> BarrierOutcome:
         """Send each its snapshot, and hear what its vehicles do.
 
-        Args:
-            seats: in the order in which they are served.
-            moment: of the snapshots.
+        `seats`: in the order in which they are served. `moment`: of the snapshots.
         """
         found = BarrierOutcome()
         asked: dict[FollowerSeat, list[str]] = {}
@@ -156,8 +128,7 @@ class Barrier:
     ) -> bool:
         """One frame of a follower; whether it is done.
 
-        Raises:
-            FollowerError: the world cannot go on with it.
+        Raises FollowerError: the world cannot go on with it.
         """
         # What has arrived in time is read even if that was just before the end.
         within_s = max(within_s, 1e-3)
@@ -200,8 +171,7 @@ class Barrier:
     ) -> dict[str, Any]:
         """The actions of a follower's vehicles.
 
-        Raises:
-            FollowerError: they cannot be carried out, and `bad_controls` is `error`.
+        Raises FollowerError: they cannot be carried out, and `bad_controls` is `error`.
         """
         strangers = controls.keys() - set(vehicles)
         if strangers:
@@ -227,8 +197,7 @@ class Barrier:
 def _action(vehicle: str, controls: Mapping[str, Any]) -> Any:
     """One vehicle's action.
 
-    Raises:
-        FollowerError: there is none.
+    Raises FollowerError: there is none.
     """
     if vehicle not in controls:
         raise FollowerError(f"no controls of {vehicle}, which is in the frame")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -28,30 +27,20 @@ CALL_S = 10.0
 
 @dataclass(frozen=True)
 class Samples:
-    """What one sensor has since the last snapshot.
+    """What one sensor has since the last snapshot."""
 
-    Attributes:
-        values: (n, …) one sample a row, the newest last.
-        stamps_s: (n,) when each was taken, in simulated time since the reset.
-        lost: (n,) which were lost: zeros.
-    """
-
-    values: NDArray[Any]
-    stamps_s: NDArray[np.float64]
-    lost: NDArray[np.bool_]
+    values: NDArray[Any]  # (n, …) one sample a row, the newest last
+    stamps_s: NDArray[np.float64]  # (n,) when each was taken, in simulated time since the reset
+    lost: NDArray[np.bool_]  # (n,) which were lost: zeros
 
 
 @dataclass(frozen=True)
 class FollowerView:
-    """One snapshot.
+    """One snapshot."""
 
-    Attributes:
-        snapshot: the clock, and the vehicles that have to be driven.
-        sensors: by vehicle and name of the sensor; those that are due. What is of the whole map
-            stands under no name.
-    """
-
-    snapshot: FollowerSnapshot
+    snapshot: FollowerSnapshot  # the clock, and the vehicles that have to be driven
+    # by vehicle and name of the sensor; those that are due. What is of the whole map stands under
+    # no name.
     sensors: Mapping[str, Mapping[str, Samples]]
 
 
@@ -62,13 +51,10 @@ class Follower:
             for sight in follower:
                 follower.answer({"car_0": [0.2, 0.0]})
 
-    Args:
-        address: path of a Unix socket, or a port of this machine.
-        vehicles: agents to drive; none: it follows the clock only, and answers with {}.
-        name: for people.
-        joins_s: how long the world may take to welcome us, which it does between two steps; None:
-            for ever.
-        secret: of the world, if it listens at a port.
+    `address`: path of a Unix socket, or a port of this machine. `vehicles`: agents to drive; none:
+    it follows the clock only, and answers with {}. `joins_s`: how long the world may take to
+    welcome us, which it does between two steps; None: for ever. `secret`: of the world, if it
+    listens at a port.
 
     Attributes:
         welcome: how time goes in that world.
@@ -98,21 +84,14 @@ class Follower:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def __iter__(self) -> Iterator[FollowerView]:
         """Snapshots, until the world says goodbye; each but those of an end has to be answered.
 
-        Raises:
-            FollowerLostError: the world has ended without a goodbye.
-            FollowerError: what it says cannot be understood, or a frame is missing; it does not go
-                on with us.
+        Raises FollowerLostError: the world has ended without a goodbye; FollowerError: what it says
+        cannot be understood, or a frame is missing; it does not go on with us.
         """
         while (sight := self.wait()) is not None:
             yield sight
@@ -120,8 +99,7 @@ class Follower:
     def wait(self) -> FollowerView | None:
         """The next snapshot, however long it takes; None: the world has said goodbye.
 
-        Raises:
-            FollowerError: as of `__iter__`.
+        Raises FollowerError: as of `__iter__`.
         """
         heard = self._expect(None, Say.SNAPSHOT, Say.GOODBYE)
         if heard.kind is Say.GOODBYE:
@@ -150,8 +128,7 @@ class Follower:
     def tick(self) -> Ticked:
         """Try to advance the world, which a follower should not do; what has become of it.
 
-        Raises:
-            ClockError: the world's master refuses.
+        Raises ClockError: the world's master refuses.
         """
         self._line.say(Say.TICK)
         ticked = read_letter(Ticked, self._expect(None, Say.TICKED).letter)
@@ -180,7 +157,6 @@ class Follower:
 
 
 def sight_of(snapshot: FollowerSnapshot, arrays: Sequence[NDArray[Any]]) -> FollowerView:
-    """A snapshot with its arrays where they belong."""
     sensors: dict[str, dict[str, Samples]] = {vehicle: {} for vehicle in snapshot.vehicles}
     for view, array in zip(snapshot.arrays, arrays, strict=True):
         samples = Samples(array, np.array(view.stamps_s), np.array(view.lost, dtype=np.bool_))

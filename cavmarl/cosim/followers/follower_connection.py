@@ -1,12 +1,18 @@
-"""`FollowerConnection`: one end of the connection between a world and a follower."""
+"""`FollowerConnection`: one end of the connection between a world and a follower.
+
+`Reception` accepts followers while a world runs, without waiting for any of them.
+"""
 
 from __future__ import annotations
 
 import os
+import selectors
 import socket
 import stat
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from hmac import compare_digest
 from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,16 +20,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import (
-    ConfigError,
-    FollowerError,
-    FollowerLostError,
-    MessageError,
-)
+from cavmarl.core.errors import ConfigError, FollowerError, FollowerLostError, MessageError
 from cavmarl.cosim.followers.follower_messages import (
     FOLLOWERS,
+    MAX_VEHICLES,
     ArrayView,
+    FollowerRefusal,
     FollowerSnapshot,
+    Hello,
     Say,
     letter_of,
     read_letter,
@@ -43,27 +47,17 @@ _MAX_AXES = 8
 
 
 class ReceivedFrame(NamedTuple):
-    """One frame.
+    """One frame."""
 
-    Attributes:
-        kind: what it says.
-        letter: as msgpack knows it.
-        size: bytes of its data.
-    """
-
-    kind: Say
-    letter: Any
-    size: int
+    kind: Say  # what it says
+    letter: Any  # as msgpack knows it
+    size: int  # bytes of its data
 
 
 class _Patient(socket.socket):
-    """A socket that has until a deadline for all calls together.
+    """A socket that has until a deadline for all calls together."""
 
-    Attributes:
-        until_s: by `time.monotonic`; None: for ever.
-    """
-
-    until_s: float | None = None
+    until_s: float | None = None  # by `time.monotonic`; None: for ever
 
     def _hurry(self) -> None:
         if self.until_s is None:
@@ -86,10 +80,8 @@ class _Patient(socket.socket):
 class FollowerConnection:
     """Sends and hears frames; whatever goes wrong with the other end is a `FollowerError`.
 
-    Args:
-        connection: a connected socket, which the line owns from here on.
-        name: of the other end, for people.
-        cure: what can be done when that is gone, as the end of a sentence.
+    `connection`: a connected socket, which the line owns from here on. `name`: of the other end,
+    for people. `cure`: what can be done when that is gone, as the end of a sentence.
     """
 
     def __init__(self, connection: socket.socket, name: str, cure: str = "") -> None:
@@ -99,7 +91,6 @@ class FollowerConnection:
         self._cure = f"; {cure}" if cure else ""
 
     def fileno(self) -> int:
-        """The socket's descriptor."""
         return self._socket.fileno()
 
     def say(
@@ -122,36 +113,24 @@ class FollowerConnection:
         """
         self._allow(within_s)
         letter = None if message is None else letter_of(message)
-        try:
+        with self._blaming("read", within_s):
             self._wire.send(kind, 0, letter, arrays)
-        except TimeoutError as error:
-            raise self.too_late("read", within_s) from error
-        except OSError as error:
-            raise self._lost(error) from error
 
     def hear(self, within_s: float | None = None) -> ReceivedFrame:
         """The next frame; its data then have to be taken (`take`) or left out (`skip`).
 
-        Raises:
-            FollowerLostError: there is none in time; the other end is gone.
-            FollowerError: this is no frame, or one of another version.
+        Raises FollowerLostError: there is none in time; the other end is gone; FollowerError: this
+        is no frame, or one of another version.
         """
         self._allow(within_s)
-        try:
+        with self._blaming("answered", within_s):
             frame = self._wire.receive()
-        except TimeoutError as error:
-            raise self.too_late("answered", within_s) from error
-        except (EOFError, OSError) as error:
-            raise self._lost(error) from error
-        except MessageError as error:
-            raise FollowerError(f"{self.name}: {error}") from error
         return ReceivedFrame(Say(frame.kind), frame.letter, frame.size)
 
     def skip(self, heard: ReceivedFrame) -> None:
         """Leave out the data of what was heard.
 
-        Raises:
-            FollowerError: as of `hear`; and there are some, where none belong.
+        Raises FollowerError: as of `hear`; and there are some, where none belong.
         """
         if heard.size:
             raise FollowerError(
@@ -162,8 +141,7 @@ class FollowerConnection:
     def take(self, heard: ReceivedFrame) -> tuple[FollowerSnapshot, list[Array]]:
         """The snapshot that was heard, with its arrays.
 
-        Raises:
-            FollowerError: as of `hear`.
+        Raises FollowerError: as of `hear`.
         """
         snapshot = read_letter(FollowerSnapshot, heard.letter)
         sizes = [_size(view) for view in snapshot.arrays]
@@ -179,12 +157,18 @@ class FollowerConnection:
         self._wire.close()
 
     def _take(self, arrays: list[Array]) -> None:
-        try:
+        with self._blaming("sent its data", None):
             self._wire.take(arrays)
+
+    @contextmanager
+    def _blaming(self, what: str, within_s: float | None) -> Iterator[None]:
+        """Say of the other end what goes wrong while it should do `what`."""
+        try:
+            yield
         except TimeoutError as error:
-            raise self.too_late("sent its data", None) from error
+            raise self.too_late(what, within_s) from error
         except (EOFError, OSError) as error:
-            raise self._lost(error) from error
+            raise FollowerLostError(f"{self.name} has ended ({error}){self._cure}") from error
         except MessageError as error:
             raise FollowerError(f"{self.name}: {error}") from error
 
@@ -199,16 +183,12 @@ class FollowerConnection:
             is_late=True,
         )
 
-    def _lost(self, error: Exception) -> FollowerLostError:
-        return FollowerLostError(f"{self.name} has ended ({error}){self._cure}")
-
 
 def _size(view: ArrayView) -> int:
     """Bytes of an array.
 
-    Raises:
-        FollowerError: of a dtype that holds no plain numbers, a shape that no array has, or
-            stamps of other samples.
+    Raises FollowerError: of a dtype that holds no plain numbers, a shape that no array has, or
+    stamps of other samples.
     """
     shape, name = view.shape, view.name[:80]
     if view.dtype not in _DTYPES:
@@ -259,9 +239,7 @@ def listen(address: Address) -> socket.socket:
 def call(address: Address, within_s: float) -> FollowerConnection:
     """Connect to a world that listens at an address.
 
-    Raises:
-        FollowerLostError: no process listens there.
-        ConfigError: a path that no socket can have.
+    Raises FollowerLostError: no process listens there; ConfigError: a path that no socket can have.
     """
     family = socket.AF_INET if isinstance(address, int) else socket.AF_UNIX
     place = (LOOPBACK, address) if isinstance(address, int) else str(_path_of(address))
@@ -292,3 +270,119 @@ def _remove_leftover(path: Path) -> None:
             probe.connect(str(path))
         except ConnectionRefusedError:
             path.unlink()
+
+
+GREETING_S = 5.0  # for a caller to introduce itself
+HEARING_S = 1.0  # for what has begun to arrive
+MAX_GUESTS = 64  # not introduced yet
+GOES_ON = (
+    "the world is whole and can be stepped on, with the built-in driver in its place or another "
+    "follower"
+)
+
+
+class Reception:
+    """Listens at an address.
+
+    Args:
+        address: path of a Unix socket, or a port of this machine.
+        secret: that callers have to say; empty: none.
+
+    Attributes:
+        address: where it listens; the port that was found, where any would do.
+        turned_away: how many callers were not understood, or said nothing.
+
+    Raises:
+        ConfigError: the socket cannot be opened.
+    """
+
+    def __init__(self, address: Address, secret: str = "") -> None:
+        if isinstance(address, int) and not secret:
+            raise ConfigError(
+                f"address = {address}: every user of this machine can call a port; give a secret "
+                "(cavmarl lead --secret-file), or the path of a Unix socket"
+            )
+        self._secret = secret.encode()
+        self._listener = listen(address)
+        self._listener.setblocking(False)
+        name = self._listener.getsockname()
+        self.address: Address = name[1] if isinstance(name, tuple) else name
+        self.turned_away = 0
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(self._listener, selectors.EVENT_READ)
+        self._since: dict[FollowerConnection, float] = {}
+
+    def callers(self, within_s: float = 0.0) -> Iterator[tuple[FollowerConnection, Hello]]:
+        """Followers that have introduced themselves since the last call, in order.
+
+        Args:
+            within_s: how long to wait for the first; 0: not at all.
+        """
+        heard = self._selector.select(within_s)
+        for key, _ in sorted(heard, key=lambda found: found[0].fd):
+            if key.fileobj is self._listener:
+                self._open()
+                continue
+            line = key.data
+            self._forget(line)
+            try:
+                yield line, self._greeting(line)
+            except FollowerError as error:
+                self.turn_away(line, str(error))
+        self._dismiss_the_silent()
+
+    def turn_away(self, line: FollowerConnection, reason: str) -> None:
+        self.turned_away += 1
+        refuse(line, reason)
+
+    def close(self) -> None:
+        """Listen no more; a Unix socket's path is removed."""
+        for line in list(self._since):
+            self._forget(line)
+            line.close()
+        self._selector.close()
+        self._listener.close()
+
+    def _open(self) -> None:
+        try:
+            connection, _ = self._listener.accept()
+        except OSError:  # it is gone already
+            return
+        line = FollowerConnection(connection, "a caller", GOES_ON)
+        if len(self._since) == MAX_GUESTS:
+            self.turn_away(line, "too many callers have not introduced themselves")
+            return
+        self._since[line] = time.monotonic()
+        self._selector.register(line, selectors.EVENT_READ, line)
+
+    def _greeting(self, line: FollowerConnection) -> Hello:
+        heard = line.hear(HEARING_S)
+        if heard.kind is not Say.HELLO:
+            raise FollowerError(f"a caller begins with {heard.kind.name}: HELLO comes first")
+        line.skip(heard)
+        hello = read_letter(Hello, heard.letter)
+        if self._secret and not compare_digest(hello.secret.encode(), self._secret):
+            raise FollowerError("a caller does not know the secret of this world")
+        if not hello.name.isprintable():
+            raise FollowerError("a caller's name has characters that cannot be printed")
+        if len(hello.vehicles) > MAX_VEHICLES:
+            raise FollowerError(f"a caller wants {len(hello.vehicles)} vehicles")
+        line.name = f"follower '{hello.name[:80]}'"
+        return hello
+
+    def _dismiss_the_silent(self) -> None:
+        for line, since in list(self._since.items()):
+            if time.monotonic() - since > GREETING_S:
+                self._forget(line)
+                self.turn_away(line, f"said nothing within {GREETING_S:g} s")
+
+    def _forget(self, line: FollowerConnection) -> None:
+        del self._since[line]
+        self._selector.unregister(line)
+
+
+def refuse(line: FollowerConnection, reason: str) -> None:
+    """Tell a follower why it is not gone on with, if it still listens, and hang up."""
+    with suppress(FollowerError):
+        line.say(Say.REFUSAL, FollowerRefusal(reason), within_s=HEARING_S)
+    line.close()

@@ -18,10 +18,8 @@ from cavmarl.roads.network import RoadNetwork
 class StackDriver:
     """Drives the vehicles of a follower.
 
-    Args:
-        network: the map, which has to be the world's.
-        welcome: how time goes there, and what the vehicles carry.
-        config: of the stacks.
+    `network`: the map, which has to be the world's. `welcome`: how time goes there, and what the
+    vehicles carry.
 
     Attributes:
         stacks: of the vehicles that are driven now, by agent.

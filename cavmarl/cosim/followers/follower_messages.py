@@ -65,165 +65,106 @@ FOLLOWERS = Dialect(
 @with_config(_CLOSED)
 @dataclass(frozen=True)
 class Hello:
-    """The first words of a follower.
-
-    Attributes:
-        name: for people.
-        vehicles: agents that it wants to drive; none: it follows the clock only.
-        secret: of the world, if it listens at a port.
-    """
+    """The first words of a follower."""
 
     name: StrictStr
+    # agents that it wants to drive; none: it follows the clock only
     vehicles: list[StrictStr] = field(default_factory=list)
-    secret: StrictStr = ""
+    secret: StrictStr = ""  # of the world, if it listens at a port
 
 
 @with_config(_CLOSED)
 @dataclass(frozen=True)
 class SensorView:
-    """One sensor of every vehicle.
-
-    Attributes:
-        name: in the rig.
-        units: of its channels.
-        settings: its keys in `env.yaml`: type, place on the vehicle, rate, range and so on.
-    """
+    """One sensor of every vehicle."""
 
     name: StrictStr
-    units: list[StrictStr]
+    units: list[StrictStr]  # of its channels
+    # its keys in `env.yaml`: type, place on the vehicle, rate, range and so on
     settings: dict[StrictStr, Any]
 
 
 @with_config(_CLOSED)
 @dataclass(frozen=True)
 class Welcome:
-    """The answer.
+    """The answer."""
 
-    Attributes:
-        environment: name and version.
-        map_hash: of the roads' source: a stack needs the same map.
-        vehicles: those that the follower has been given.
-        tick: the master's, now.
-        dt_s: seconds a tick.
-        ticks_per_step: ticks from one snapshot to the next.
-        control_latency_ticks: that controls wait in the vehicle, after the step that they are for
-            has begun.
-        action: `continuous` or `discrete`.
-        acceleration_mps2: what 1 means as the first number of a control.
-        steering_rad: what 1 means as the second.
-        sensors: of every vehicle; none: a snapshot has the `observation` of the environment.
-    """
-
-    environment: StrictStr
-    map_hash: StrictStr
-    vehicles: list[StrictStr]
-    tick: StrictInt
+    environment: StrictStr  # name and version
+    map_hash: StrictStr  # of the roads' source: a stack needs the same map
+    vehicles: list[StrictStr]  # those that the follower has been given
+    tick: StrictInt  # the master's, now
     dt_s: StrictFloat
-    ticks_per_step: StrictInt
+    ticks_per_step: StrictInt  # ticks from one snapshot to the next
+    # that controls wait in the vehicle, after the step that they are for has begun
     control_latency_ticks: StrictInt
-    action: StrictStr
-    acceleration_mps2: StrictFloat
-    steering_rad: StrictFloat
+    action: StrictStr  # `continuous` or `discrete`
+    acceleration_mps2: StrictFloat  # what 1 means as the first number of a control
+    steering_rad: StrictFloat  # what 1 means as the second
+    # of every vehicle; none: a snapshot has the `observation` of the environment
     sensors: list[SensorView]
 
 
 @with_config(_CLOSED)
 @dataclass(frozen=True)
 class ArrayView:
-    """One array of a snapshot; its bytes lie in the frame's data, in the order of the list.
+    """One array of a snapshot; its bytes lie in the frame's data, in the order of the list."""
 
-    Attributes:
-        vehicle: whose; nothing: it is of the whole map, as `signals`: (1, links) what the signal of
-            each link shows, as a SIGNAL_* code (255: it has none).
-        name: of the sensor.
-        dtype: as NumPy writes it, little-endian.
-        shape: of the array; the first axis are samples.
-        stamps_s: when each was taken, in simulated time since the reset.
-        lost: which of them were lost: zeros.
-    """
-
+    # whose; nothing: it is of the whole map, as `signals`: (1, links) what the signal of each link
+    # shows, as a SIGNAL_* code (255: it has none)
     vehicle: StrictStr
     name: StrictStr
-    dtype: StrictStr
-    shape: list[StrictInt]
-    stamps_s: list[StrictFloat]
-    lost: list[StrictBool]
+    dtype: StrictStr  # as NumPy writes it, little-endian
+    shape: list[StrictInt]  # of the array; the first axis are samples
+    stamps_s: list[StrictFloat]  # when each was taken, in simulated time since the reset
+    lost: list[StrictBool]  # which of them were lost: zeros
 
 
 @with_config(_CLOSED)
 @dataclass(frozen=True)
 class VehicleView:
-    """One of the follower's vehicles that is in the world.
+    """One of the follower's vehicles that is in the world."""
 
-    Attributes:
-        vehicle_id: of the vehicle; another one: the agent drives a new vehicle.
-        vclass: SUMO's class of it.
-        length_m: of its body.
-        width_m: of its body.
-        goal_edge: where it is to go, an edge of the map.
-        goal_m: the end of that way: x and y on the map.
-    """
-
-    vehicle_id: StrictInt
-    vclass: StrictStr
-    length_m: StrictFloat
-    width_m: StrictFloat
-    goal_edge: StrictStr
-    goal_m: list[StrictFloat]
+    vehicle_id: StrictInt  # of the vehicle; another one: the agent drives a new vehicle
+    vclass: StrictStr  # SUMO's class of it
+    length_m: StrictFloat  # of its body
+    width_m: StrictFloat  # of its body
+    goal_edge: StrictStr  # where it is to go, an edge of the map
+    goal_m: list[StrictFloat]  # the end of that way: x and y on the map
 
 
 @with_config(_CLOSED)
 @dataclass(frozen=True)
 class FollowerSnapshot:
-    """What a follower gets after each step.
+    """What a follower gets after each step."""
 
-    Attributes:
-        frame: its number; the next one's is one more.
-        episode: goes up with each reset.
-        tick: of the world, since its reset.
-        time_s: tick · dt_s, simulated time.
-        is_over: the episode has ended; no controls are due.
-        vehicles: those of the follower's that are in the world, and have to be driven.
-        arrays: what their sensors have that is due.
-    """
-
-    frame: StrictInt
-    episode: StrictInt
-    tick: StrictInt
-    time_s: StrictFloat
-    is_over: StrictBool
+    frame: StrictInt  # its number; the next one's is one more
+    episode: StrictInt  # goes up with each reset
+    tick: StrictInt  # of the world, since its reset
+    time_s: StrictFloat  # tick · dt_s, simulated time
+    is_over: StrictBool  # the episode has ended; no controls are due
+    # those of the follower's that are in the world, and have to be driven
     vehicles: dict[StrictStr, VehicleView]
-    arrays: list[ArrayView]
+    arrays: list[ArrayView]  # what their sensors have that is due
 
 
 @with_config(_CLOSED)
 @dataclass(frozen=True)
 class Control:
-    """The answer to a snapshot.
+    """The answer to a snapshot."""
 
-    Attributes:
-        frame: of the snapshot.
-        controls: of each vehicle in it: two numbers in [-1, 1], or the number of a meta-action.
-    """
-
-    frame: StrictInt
+    frame: StrictInt  # of the snapshot
+    # of each vehicle in it: two numbers in [-1, 1], or the number of a meta-action
     controls: dict[StrictStr, list[StrictFloat] | StrictInt]
 
 
 @with_config(_CLOSED)
 @dataclass(frozen=True)
 class Ticked:
-    """What has become of a follower's own tick.
+    """What has become of a follower's own tick."""
 
-    Attributes:
-        done: whether the world has gone on.
-        refused: why it was refused; nothing if it was not.
-        tick: of the world now, since its reset.
-    """
-
-    done: StrictBool
-    refused: StrictStr
-    tick: StrictInt
+    done: StrictBool  # whether the world has gone on
+    refused: StrictStr  # why it was refused; nothing if it was not
+    tick: StrictInt  # of the world now, since its reset
 
 
 @with_config(_CLOSED)
@@ -242,8 +183,7 @@ def letter_of(message: Any) -> dict[str, Any]:
 def read_letter(kind: type[T], letter: object) -> T:
     """The message of a class that a letter is.
 
-    Raises:
-        FollowerError: it is none: a field is missing, unknown or of another type.
+    Raises FollowerError: it is none: a field is missing, unknown or of another type.
     """
     if kind not in _ADAPTERS:
         _ADAPTERS[kind] = TypeAdapter(kind)

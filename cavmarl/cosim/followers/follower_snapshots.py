@@ -28,10 +28,7 @@ NO_SIGNAL = 255
 def welcome_to(env: CavEnv | CavVectorEnv, vehicles: Sequence[str], tick: int) -> Welcome:
     """How time goes in a world, and what its vehicles carry.
 
-    Args:
-        env: the world.
-        vehicles: that a follower has been given.
-        tick: the master's.
+    `vehicles`: that a follower has been given. `tick`: the master's.
     """
     action, clock = env.config.action, env.config.clock
     return Welcome(
@@ -53,19 +50,12 @@ def welcome_to(env: CavEnv | CavVectorEnv, vehicles: Sequence[str], tick: int) -
 
 
 class SnapshotTime(NamedTuple):
-    """When a snapshot is taken.
+    """When a snapshot is taken."""
 
-    Attributes:
-        frame: its number.
-        episode: goes up with each reset.
-        tick: of the world, since its reset.
-        is_over: the episode has ended.
-    """
-
-    frame: int
-    episode: int
-    tick: int
-    is_over: bool
+    frame: int  # its number
+    episode: int  # goes up with each reset
+    tick: int  # of the world, since its reset
+    is_over: bool  # the episode has ended
 
 
 def take_snapshot(
@@ -73,14 +63,9 @@ def take_snapshot(
 ) -> tuple[FollowerSnapshot, list[NDArray[Any]]]:
     """What a follower is sent.
 
-    Args:
-        env: the world or worlds.
-        agents: indices of the follower's.
-        moment: when that is.
-        world: which one, of several.
+    `env`: the world or worlds. `agents`: indices of the follower's. `moment`: when that is.
 
-    Returns:
-        the message, and its arrays.
+    Returns the message, and its arrays.
     """
     worlds = env.worlds.arrays
     due = [k for k in agents if worlds.mask[world, k] and not moment.is_over]

@@ -19,27 +19,16 @@ def wrap(angle: float) -> float:
 
 
 class OnLane(NamedTuple):
-    """A place beside a lane.
-
-    Attributes:
-        lane: LANE row.
-        s_m: along it.
-        d_m: from its centre, positive to the left.
-        heading_rad: of the lane there.
-    """
+    """A place beside a lane."""
 
     lane: int
-    s_m: float
-    d_m: float
-    heading_rad: float
+    s_m: float  # along it
+    d_m: float  # from its centre, positive to the left
+    heading_rad: float  # of the lane there
 
 
 class HdMap:
-    """Lanes by place.
-
-    Args:
-        network: the roads.
-    """
+    """Lanes by place."""
 
     def __init__(self, network: RoadNetwork) -> None:
         self.network = network
@@ -114,8 +103,7 @@ class HdMap:
 
     def polyline(self, lane: int, from_m: float) -> NDArray[np.float64]:
         """(n, 2) the centre of a lane from a place on to its end."""
-        row = self.network.lanes[lane]
-        points = self.network.points[row["first_point"] : row["first_point"] + row["num_points"]]
+        points = self.network.lane_points(lane)
         s = np.concatenate([[from_m], points["s"][points["s"] > from_m + 1e-6]])
         return np.stack(
             [np.interp(s, points["s"], points["x"]), np.interp(s, points["s"], points["y"])], axis=1

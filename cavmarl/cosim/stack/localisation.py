@@ -24,7 +24,7 @@ from cavmarl.cosim.stack.stack_types import (
     StackMount,
     StackSensor,
 )
-from cavmarl.sensors.kernels.inertia import GRAVITY_MPS2
+from cavmarl.sensors.kernels.vehicle_readings import GRAVITY_MPS2
 from cavmarl.sensors.mounted.geodesy import Geodesy
 
 # Standard deviations: of what the model leaves out, a square root of a second, and of sensors
@@ -43,11 +43,7 @@ _STRAIGHT_RAD = 0.5
 class GnssInertial:
     """The filter.
 
-    Args:
-        sensors: of the vehicle; one GNSS at least.
-        geodesy: where the map is on the earth.
-        hd_map: the lanes.
-        tick_s: seconds a step of the stack.
+    `sensors`: of the vehicle; one GNSS at least. `geodesy`: where the map is on the earth.
     """
 
     def __init__(
@@ -225,11 +221,8 @@ class GnssInertial:
     ) -> bool:
         """Take in one number; whether it was believed.
 
-        Args:
-            row: (4,) how it depends on the state.
-            surprise: the number less what was expected.
-            deviation: of its noise.
-            gate: squared deviations beyond which it is not believed.
+        `row`: (4,) how it depends on the state. `surprise`: the number less what was expected.
+        `gate`: squared deviations beyond which it is not believed.
         """
         spread = float(row @ self._spread @ row) + deviation**2
         if surprise**2 > gate * spread:
@@ -243,7 +236,4 @@ class GnssInertial:
 def _centre(fix: tuple[float, float], mount: StackMount, heading: float) -> tuple[float, float]:
     """Where the vehicle's centre is when its antenna is at a place."""
     cos, sin = math.cos(heading), math.sin(heading)
-    return (
-        fix[0] - mount.x_m * cos + mount.y_m * sin,
-        fix[1] - mount.x_m * sin - mount.y_m * cos,
-    )
+    return (fix[0] - mount.x_m * cos + mount.y_m * sin, fix[1] - mount.x_m * sin - mount.y_m * cos)

@@ -43,9 +43,7 @@ class _Track:
 class LidarObjects:
     """The stage.
 
-    Args:
-        sensors: of the vehicle; those that are lidars are used.
-        hd_map: the lanes.
+    `sensors`: of the vehicle; those that are lidars are used.
     """
 
     def __init__(self, sensors: Sequence[StackSensor], hd_map: HdMap) -> None:
@@ -132,10 +130,7 @@ def _groups(
 ) -> list[NDArray[np.float64]]:
     """Echoes on the map, (n, 2) each group.
 
-    Args:
-        lidar: the sensor.
-        scan: (layers, rays) distances in m.
-        pose: of the vehicle.
+    `scan`: (layers, rays) distances in m.
     """
     settings = lidar.settings
     layers, rays, fov = scan.shape[0], scan.shape[1], math.radians(settings["fov_deg"])

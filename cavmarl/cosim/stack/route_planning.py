@@ -50,11 +50,7 @@ class _Limit(NamedTuple):
 
 
 class LaneRoute:
-    """The stage.
-
-    Args:
-        hd_map: the lanes.
-    """
+    """The stage."""
 
     def __init__(self, hd_map: HdMap) -> None:
         self._map = hd_map

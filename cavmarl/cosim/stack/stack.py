@@ -1,4 +1,11 @@
-"""`Stack`: perception, localisation, planning and control, each chosen by name and timed."""
+"""`Stack`: perception, localisation, planning and control, each chosen by name and timed.
+
+Control is pure pursuit for the steering, within limits of the vehicle's type for the acceleration.
+Coulter: "Implementation of the pure pursuit path tracking algorithm", CMU-RI-TR-92-01, 1992: the
+circle through the vehicle's centre, tangent to its motion, that meets a point of the path ahead has
+the curvature 2 sin(alpha) / distance. The kinematic bicycle turns with that curvature at the slip
+angle asin(curvature · L / 2), whose tangent is half that of the steering angle.
+"""
 
 from __future__ import annotations
 
@@ -13,11 +20,10 @@ from numpy.typing import NDArray
 
 from cavmarl.config.rig import GnssConfig
 from cavmarl.core.errors import ConfigError
-from cavmarl.cosim.stack.hd_map import HdMap
+from cavmarl.cosim.stack.hd_map import HdMap, wrap
 from cavmarl.cosim.stack.localisation import GnssInertial
 from cavmarl.cosim.stack.perception import LidarObjects
 from cavmarl.cosim.stack.route_planning import LaneRoute
-from cavmarl.cosim.stack.stack_control import PurePursuit
 from cavmarl.cosim.stack.stack_types import (
     Control2D,
     ControlStage,
@@ -30,23 +36,95 @@ from cavmarl.cosim.stack.stack_types import (
     Readings,
     StackMount,
     StackSensor,
+    Trajectory,
 )
 from cavmarl.sensors.mounted.geodesy import Geodesy, geodesy_of
 
 
-class Vehicle(NamedTuple):
-    """What a stage may know of the vehicle that it is made for.
+class Gains(NamedTuple):
+    """How one type of vehicle is controlled."""
 
-    Attributes:
-        hd_map: the roads.
-        sensors: that are mounted.
-        geodesy: where the map is on the earth; None: there is no GNSS.
-        tick_s: seconds a step of the stack.
-    """
+    lookahead_s: float  # how far ahead the steering looks, at the present speed
+    least_lookahead_m: float  # and at least
+    accel_mps2: float  # the most that it accelerates
+    brake_mps2: float  # the most that it brakes, positive
+    steering_radps: float  # how fast its front wheels are turned
+
+
+_CAR = Gains(0.5, 3.5, 2.5, 6.0, 1.2)
+_HEAVY = Gains(0.7, 6.0, 1.2, 5.0, 0.6)
+
+# By SUMO's class; others drive as cars do.
+GAINS = {"passenger": _CAR, "truck": _HEAVY, "bus": _HEAVY}
+
+
+class PurePursuit:
+    """The controller."""
+
+    def __init__(self, tick_s: float) -> None:
+        self._tick_s = tick_s
+        self._steering = 0.0
+
+    def control(self, pose: EgoPose, trajectory: Trajectory, mission: Mission) -> Control2D:
+        gains = GAINS.get(mission.vclass, _CAR)
+        slip = math.atan(0.5 * math.tan(self._steering))
+        ahead_m = max(gains.least_lookahead_m, gains.lookahead_s * pose.speed_mps)
+        x_m, y_m = _point_at(trajectory, pose, ahead_m)
+        east, north = x_m - pose.x_m, y_m - pose.y_m
+        distance = max(math.hypot(east, north), 0.5)
+        alpha = wrap(math.atan2(north, east) - pose.heading_rad - slip)
+        curvature = 2.0 * math.sin(alpha) / distance
+        wanted_slip = math.asin(max(-0.6, min(0.6, 0.5 * mission.length_m * curvature)))
+        wanted = math.atan(2.0 * math.tan(wanted_slip))
+        turn = gains.steering_radps * self._tick_s
+        self._steering += max(-turn, min(turn, wanted - self._steering))
+        accel = max(-gains.brake_mps2, min(gains.accel_mps2, trajectory.accel_mps2))
+        return Control2D(accel, self._steering)
+
+
+def _point_at(trajectory: Trajectory, pose: EgoPose, ahead_m: float) -> tuple[float, float]:
+    """The place on the way that lies so far ahead of the one beside the vehicle."""
+    points = trajectory.points
+    steps = np.diff(points, axis=0)
+    lengths = np.hypot(steps[:, 0], steps[:, 1])
+    along = np.concatenate([[0.0], np.cumsum(lengths)])
+    offset = np.array([pose.x_m, pose.y_m]) - points[:-1]
+    safe = np.maximum(lengths, 1e-9)
+    share = np.clip((offset * steps).sum(axis=1) / safe**2, 0.0, 1.0)
+    off = np.hypot(*(offset - share[:, None] * steps).T)
+    beside = int(np.argmin(off))
+    s = along[beside] + share[beside] * lengths[beside] + ahead_m
+    if s > along[-1]:  # beyond the end the last direction goes on
+        past = (s - along[-1]) / safe[-1]
+        end = points[-1] + past * steps[-1]
+        return float(end[0]), float(end[1])
+    return (float(np.interp(s, along, points[:, 0])), float(np.interp(s, along, points[:, 1])))
+
+
+# Noise of consumer-grade parts: a GNSS receiver without corrections, a MEMS inertial unit, wheel
+# encoders, a camera that looks for lane markings, and a lidar at the height of a bumper.
+REFERENCE_RIG: dict[str, dict[str, Any]] = {
+    "gnss": {"type": "gnss", "rate_hz": 10, "noise": [1.0, 1.0, 2.0], "z_m": 1.5},
+    "imu": {"type": "imu", "rate_hz": 100, "noise": [0.05, 0.05, 0.05, 0.003, 0.003, 0.003]},
+    "odometry": {"type": "odometry", "rate_hz": 20, "noise": [0.05, 0.01, 0.1]},
+    "markings": {"type": "lane_boundary", "rate_hz": 20, "noise": [0.05, 0.05, 0.05, 0.01, 0.001]},
+    "lidar": {
+        "type": "lidar",
+        "rate_hz": 10,
+        "rays": 360,
+        "range_m": 60.0,
+        "noise": [0.02],
+        "z_m": 0.6,
+    },
+}
+
+
+class Vehicle(NamedTuple):
+    """What a stage may know of the vehicle that it is made for."""
 
     hd_map: HdMap
-    sensors: Sequence[StackSensor]
-    geodesy: Geodesy | None
+    sensors: Sequence[StackSensor]  # that are mounted
+    geodesy: Geodesy | None  # where the map is on the earth; None: there is no GNSS
     tick_s: float
 
 
@@ -80,19 +158,12 @@ STAGES: dict[str, dict[str, Callable[[Vehicle], Any]]] = {
 
 @dataclass(frozen=True)
 class StackConfig:
-    """Which stages a stack is made of.
+    """Which stages a stack is made of."""
 
-    Attributes:
-        perception: `lidar`, or `blind`.
-        localisation: `gnss_imu`.
-        planning: `lane_route`.
-        control: `pure_pursuit`.
-    """
-
-    perception: str = "lidar"
-    localisation: str = "gnss_imu"
-    planning: str = "lane_route"
-    control: str = "pure_pursuit"
+    perception: str = "lidar"  # `lidar`, or `blind`
+    localisation: str = "gnss_imu"  # `gnss_imu`
+    planning: str = "lane_route"  # `lane_route`
+    control: str = "pure_pursuit"  # `pure_pursuit`
 
     def __post_init__(self) -> None:
         for stage, known in STAGES.items():
@@ -103,16 +174,12 @@ class StackConfig:
 
 @dataclass
 class StageTimes:
-    """How long stages took, by the wall clock.
+    """How long stages took, by the wall clock."""
 
-    Attributes:
-        steps: of the stack.
-        wall_s: sum of each stage.
-        worst_wall_s: of one step.
-    """
-
-    steps: int = 0
+    steps: int = 0  # of the stack
+    # sum of each stage
     wall_s: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
+    # of one step
     worst_wall_s: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
 
     def add(self, stage: str, seconds: float) -> None:
@@ -123,9 +190,7 @@ class StageTimes:
 class Stack:
     """Drives one vehicle.
 
-    Args:
-        vehicle: that is driven.
-        config: of which stages.
+    `vehicle`: that is driven. `config`: of which stages.
 
     Attributes:
         times: how long the stages took.
@@ -151,19 +216,12 @@ class Stack:
         self._localisation.reset_pose(pose)
 
     def drive(
-        self,
-        readings: Readings,
-        signals: NDArray[np.uint8] | None,
-        mission: Mission,
-        time_s: float,
+        self, readings: Readings, signals: NDArray[np.uint8] | None, mission: Mission, time_s: float
     ) -> Control2D:
         """One step of all stages; without a pose the vehicle brakes.
 
-        Args:
-            readings: what the sensors have that is due.
-            signals: what signals show; see `Planning.plan`.
-            mission: where to go.
-            time_s: simulated.
+        `readings`: what the sensors have that is due. `signals`: what signals show; see
+        `Planning.plan`. `time_s`: simulated.
         """
         self.times.steps += 1
         pose = self.pose = self._timed(
@@ -198,14 +256,10 @@ def sensor_of(name: str, settings: Mapping[str, Any]) -> StackSensor:
 def vehicle_of(hd_map: HdMap, sensors: Sequence[StackSensor], tick_s: float) -> Vehicle:
     """What stages may know.
 
-    Args:
-        hd_map: the roads.
-        sensors: that are mounted.
-        tick_s: seconds a step of the stack.
+    `sensors`: that are mounted.
 
-    Raises:
-        MissingExtraError: the map is projected, and pyproj is not installed.
-        MapError: its projection is unknown.
+    Raises MissingExtraError: the map is projected, and pyproj is not installed; MapError: its
+    projection is unknown.
     """
     gnss = [sensor for sensor in sensors if sensor.type == "gnss"]
     geodesy = None

@@ -17,19 +17,11 @@ class SensorSamples(Protocol):
     """What one sensor has since the last step."""
 
     @property
-    def values(self) -> NDArray[Any]:
-        """(n, …) one sample a row, the newest last."""
-        ...
-
+    def values(self) -> NDArray[Any]: ...  # (n, …) one sample a row, the newest last
     @property
-    def stamps_s(self) -> NDArray[np.float64]:
-        """(n,) when each was taken."""
-        ...
-
+    def stamps_s(self) -> NDArray[np.float64]: ...  # (n,) when each was taken
     @property
-    def lost(self) -> NDArray[np.bool_]:
-        """(n,) which were lost."""
-        ...
+    def lost(self) -> NDArray[np.bool_]: ...  # (n,) which were lost
 
 
 Readings = Mapping[str, SensorSamples]
@@ -45,51 +37,30 @@ class StackMount(NamedTuple):
 
 
 class StackSensor(NamedTuple):
-    """One sensor of the vehicle.
-
-    Attributes:
-        name: in the rig.
-        type: of it.
-        mount: where it is.
-        settings: its keys in `env.yaml`.
-    """
+    """One sensor of the vehicle."""
 
     name: str
     type: str
     mount: StackMount
-    settings: Mapping[str, Any]
+    settings: Mapping[str, Any]  # its keys in `env.yaml`
 
 
 class EgoPose(NamedTuple):
-    """Where the vehicle's centre is, and how it moves.
-
-    Attributes:
-        x_m, y_m: place.
-        heading_rad: of the body.
-        speed_mps: forward.
-        yaw_rate_radps: of the body.
-    """
+    """Where the vehicle's centre is, and how it moves."""
 
     x_m: float
     y_m: float
     heading_rad: float
-    speed_mps: float
+    speed_mps: float  # forward
     yaw_rate_radps: float = 0.0
 
 
 class Obstacle(NamedTuple):
-    """Something on the road.
+    """Something on the road, as far as it is seen."""
 
-    Attributes:
-        x_m, y_m: its middle, as far as it is seen.
-        heading_rad: of its longer axis, along the road.
-        length_m, width_m: of what is seen of it.
-        vx_mps, vy_mps: velocity.
-    """
-
-    x_m: float
+    x_m: float  # its middle
     y_m: float
-    heading_rad: float
+    heading_rad: float  # of its longer axis, along the road
     length_m: float
     width_m: float
     vx_mps: float
@@ -97,16 +68,10 @@ class Obstacle(NamedTuple):
 
 
 class Mission(NamedTuple):
-    """What the vehicle is to do, and what it is.
+    """What the vehicle is to do, and what it is."""
 
-    Attributes:
-        goal_edge: EDGE row at whose end it is to be.
-        vclass: SUMO's class.
-        length_m, width_m: of its body.
-    """
-
-    goal_edge: int
-    vclass: str
+    goal_edge: int  # EDGE row at whose end it is to be
+    vclass: str  # SUMO's
     length_m: float
     width_m: float
 
@@ -120,17 +85,11 @@ class Control2D(NamedTuple):
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Where to drive, and how fast.
+    """Where to drive, and how fast."""
 
-    Attributes:
-        points: (n, 2) the way ahead, from beside the vehicle on; at least two.
-        accel_mps2: along it, now.
-        reason: what that is for: `free`, `gap`, `stop_line`, `yield` or `end`.
-    """
-
-    points: NDArray[np.float64]
-    accel_mps2: float
-    reason: str = "free"
+    points: NDArray[np.float64]  # (n, 2) the way ahead, from beside the vehicle on; at least two
+    accel_mps2: float  # along it, now
+    reason: str = "free"  # what that is for: `free`, `gap`, `stop_line`, `yield` or `end`
     lanes: Sequence[int] = field(default_factory=tuple)
 
 
@@ -162,11 +121,8 @@ class Planning(Protocol):
     ) -> Trajectory:
         """The way from here on.
 
-        Args:
-            pose: where it is.
-            obstacles: what is on the road.
-            signals: (num_links,) SIGNAL_* codes, 255: none; None: unknown.
-            mission: where it is to go.
+        `obstacles`: what is on the road. `signals`: (num_links,) SIGNAL_* codes, 255: none; None:
+        unknown. `mission`: where it is to go.
         """
         ...
 

@@ -27,8 +27,7 @@ from cavmarl.driving.vehicles import VEHICLE, blank_vehicle
 from cavmarl.evaluate.traffic.traffic_metrics import TrafficCounts, TrafficMeter, TrafficRun
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
-from cavmarl.traffic.sumo.sumo_input import SumoInput
-from cavmarl.traffic.sumo.sumo_options import command_words, free_libsumo
+from cavmarl.traffic.sumo.sumo_input import SumoInput, command_words, free_libsumo
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.parallel.processes.shared_memory import Layout, Segment, arrays_in
-from cavmarl.sensors.kernels.rig_frames import POSE
-from cavmarl.sensors.kernels.rig_schedule import Due
+from cavmarl.sensors.kernels.rig_frames import POSE, Due
 
 NEVER = -1  # a tick that there is not
 

@@ -19,7 +19,7 @@ from cavmarl.parallel.sensor_workers.sensor_job import SensorJob
 from cavmarl.parallel.sensor_workers.sensor_pool import SensorWorkerPlan, SensorWorkers
 from cavmarl.parallel.sensor_workers.sensor_scene import SceneArrays, SceneShape
 from cavmarl.parallel.step_arrays import StepArrays, layout_of
-from cavmarl.sensors.mounted.catalogue import type_of
+from cavmarl.sensors.registry import type_of
 
 PROGRAM = "cavmarl.parallel.sensor_workers.sensor_worker"
 

@@ -18,8 +18,7 @@ from cavmarl.core.numba.repeated import repeated
 from cavmarl.core.records.arrays import Common
 from cavmarl.parallel.kernels.replica_copies import mark_agents
 from cavmarl.parallel.split_hosts.replica_memory import MemoryReplica, Place, ReplicaMemory
-from cavmarl.sensors.kernels.rig_frames import POSE
-from cavmarl.sensors.kernels.rig_schedule import Due
+from cavmarl.sensors.kernels.rig_frames import POSE, Due
 from cavmarl.sensors.mounted.frames import Frames
 from cavmarl.shards.shard import Commands, Shard
 

@@ -25,7 +25,7 @@ from cavmarl.parallel.split_hosts.zone_phases import PhaseInputs, ZonePhase, Zon
 from cavmarl.parallel.step_arrays import StepArrays, layout_of
 from cavmarl.parallel.team.hosted_zones import HostedZones
 from cavmarl.parallel.worlds_job import commands_of, fingerprint
-from cavmarl.sensors.kernels.rig_schedule import Due
+from cavmarl.sensors.kernels.rig_frames import Due
 from cavmarl.sensors.mounted.sensor_rig import Turn, sense_here
 
 Array = NDArray[Any]

@@ -13,17 +13,15 @@ from numpy.typing import NDArray
 
 from cavmarl.core.math.neighbors import Grid, cell_columns, cell_rows
 from cavmarl.core.numba import kernel
+from cavmarl.core.records import record
 
-WALL = np.dtype(
-    [
-        ("ax", np.float64),  # its ends, m
-        ("ay", np.float64),
-        ("bx", np.float64),
-        ("by", np.float64),
-        ("height", np.float64),  # m over the ground
-        ("building", np.int64),
-    ],
-    align=True,
+WALL = record(
+    ("ax", np.float64),  # its ends, m
+    ("ay", np.float64),
+    ("bx", np.float64),
+    ("by", np.float64),
+    ("height", np.float64),  # m over the ground
+    ("building", np.int64),
 )
 
 
@@ -47,23 +45,14 @@ class Backdrop(NamedTuple):
 
 @kernel
 def gather_walls(
-    ego: np.void,
-    walls: NDArray[np.void],
-    index: Grid,
-    reach_m: float,
-    out: NDArray[np.void],
+    ego: np.void, walls: NDArray[np.void], index: Grid, reach_m: float, out: NDArray[np.void]
 ) -> int:
     """The walls around a vehicle, always in the same order.
 
-    Args:
-        ego: VEHICLE record of the one that looks.
-        walls: WALL (num_walls,) in the frame of the map.
-        index: of the walls.
-        reach_m: walls that are farther away are left out.
-        out: WALL (num_walls,), overwritten up to the returned number.
+    `walls`: WALL (num_walls,) in the frame of the map. `reach_m`: walls that are farther away are
+    left out. `out`: WALL (num_walls,), overwritten up to the returned number.
 
-    Returns:
-        how many there are.
+    Returns how many there are.
     """
     cos = math.cos(ego["heading"])
     sin = math.sin(ego["heading"])

@@ -130,11 +130,7 @@ def _settle(
 
 @allocating_kernel
 def plan_goal(
-    roads: RoadArrays,
-    goal_edge: int,
-    permission: int,
-    change_weight: float,
-    plan: NDArray[np.void],
+    roads: RoadArrays, goal_edge: int, permission: int, change_weight: float, plan: NDArray[np.void]
 ) -> None:
     """Fill the plan of one goal.
 

@@ -145,14 +145,9 @@ def trace_edges(
 ) -> int:
     """The edges that a plan leads along, from the lane of an edge from which it is shortest.
 
-    Args:
-        roads: the road arrays.
-        plan: PLAN (L,) of one goal.
-        first_edge: EDGE row.
-        out: room for the EDGE rows, the first one included.
+    `plan`: PLAN (L,) of one goal. `out`: room for the EDGE rows, the first one included.
 
-    Returns:
-        how many edges, 0 where the plan has no way, -1 where `out` is too short.
+    Returns how many edges, 0 where the plan has no way, -1 where `out` is too short.
     """
     edge = roads.edges[first_edge]
     lane = -1
@@ -171,14 +166,10 @@ def follow_plan(
 ) -> int:
     """The edges that a plan leads along from a lane.
 
-    Args:
-        roads: the road arrays.
-        plan: PLAN (L,) of one goal, with a way from that lane.
-        lane: LANE row outside junctions.
-        out: room for the EDGE rows, that of the lane included.
+    `plan`: PLAN (L,) of one goal, with a way from that lane. `lane`: LANE row outside junctions.
+    `out`: room for the EDGE rows, that of the lane included.
 
-    Returns:
-        how many edges, -1 where `out` is too short.
+    Returns how many edges, -1 where `out` is too short.
     """
     out[0] = roads.lanes[lane]["edge"]
     found = 1

@@ -39,14 +39,9 @@ def detect(
 
     The latest counts, so that neither the order of rows nor their owner matters.
 
-    Args:
-        lane_place: (L,) see `RoadArrays`.
-        places: PLACE (num_places,).
-        rows: VEHICLE (W, C), the committed ones of the tick.
-        num_owned: (W,) rows to look at.
-        ticks: (W,) since reset.
-        dt: seconds of the tick.
-        detected_s: (W, D), written; begun afresh at a reset.
+    `lane_place`: (L,) see `RoadArrays`. `places`: PLACE (num_places,). `rows`: VEHICLE (W, C), the
+    committed ones of the tick. `num_owned`: (W,) rows to look at. `detected_s`: (W, D), written;
+    begun afresh at a reset.
     """
     for w in range(ticks.size):
         if ticks[w] == 0:
@@ -76,13 +71,8 @@ def switch_signals(
 ) -> None:
     """Bring every signal to the worlds' ticks; once more at the same tick changes nothing.
 
-    Args:
-        roads: the road arrays.
-        ticks: (W,) since reset.
-        detected_s: (W, D) what bodies of all shards did up to these ticks.
-        dt: seconds of the tick.
-        controllers: CONTROLLER (W, num_controllers), written.
-        signal_phase: (W, num_signals), written.
+    `detected_s`: (W, D) what bodies of all shards did up to these ticks. `controllers`: CONTROLLER
+    (W, num_controllers), written. `signal_phase`: (W, num_signals), written.
     """
     for w in range(ticks.size):
         time = ticks[w] * dt
@@ -101,7 +91,6 @@ def switch_signals(
 
 @kernel
 def program_at(roads: RoadArrays, k: int, time: float, dt: float) -> int:
-    """The program of a signal that is on at `time`."""
     signal = roads.signals[k]
     program = signal["program"]
     for row in range(signal["first_switch"], signal["first_switch"] + signal["num_switches"]):

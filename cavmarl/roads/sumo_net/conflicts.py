@@ -2,14 +2,26 @@
 
 The map says *that* two links are foes (a bit of the junction's request); this module says *where*:
 the stretch of each path on which a vehicle could touch one on the other path.
+
+From that follow CONFLICT rows, how far the movements out of one lane share their way, and where
+cars have to stop so that no vehicle that drives over the junction touches them: maps put the stop
+line at the end of a lane, and some paths sweep across it.
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
+from collections.abc import Sequence
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from cavmarl.core.errors import MapError
+from cavmarl.core.records.rows import FORK_BEYOND_M
+from cavmarl.roads.network import CONFLICT
+from cavmarl.roads.sumo_net.selection import Movement
 
 SAMPLE_M = 0.5
 # Half a car (2 m wide) on either path and a margin that covers corners cut in a turn.
@@ -56,14 +68,11 @@ def sample_path(s: NDArray[np.float64], xyz: NDArray[np.float64]) -> LinkPath:
 def overlap(path: LinkPath, foe: LinkPath, *, merging: bool) -> Overlap | None:
     """Where two foes meet, or None if one passes over the other.
 
-    Args:
-        path: the path of one link.
-        foe: the path of the other.
-        merging: both lead into the same lane, so the shared area lasts to the end of both.
+    `path`: the path of one link. `foe`: the path of the other. `merging`: both lead into the same
+    lane, so the shared area lasts to the end of both.
 
-    Returns:
-        The hull of all stretches with less than `NEAR_M` between the centre lines; `TOUCH_M` around
-        the closest points where no stretch is that near.
+    Returns the hull of all stretches with less than `NEAR_M` between the centre lines; `TOUCH_M`
+    around the closest points where no stretch is that near.
     """
     plane = path.xyz[:, None, :2] - foe.xyz[None, :, :2]
     square = plane[..., 0] * plane[..., 0] + plane[..., 1] * plane[..., 1]
@@ -140,10 +149,8 @@ def touching(
 ) -> NDArray[np.bool_]:
     """Whether pairs of car boxes have no separating axis.
 
-    Args:
-        apart: (n, 2) between the centres, m.
-        mine: (n,) headings, rad.
-        theirs: (n,) headings, rad.
+    `apart`: (n, 2) between the centres, m. `mine`: (n,) headings, rad. `theirs`: (n,) headings,
+    rad.
     """
     across = np.abs(np.sin(mine - theirs))
     along = np.abs(np.cos(mine - theirs))
@@ -165,3 +172,175 @@ def _from_centres(path: LinkPath, centres: NDArray[np.float64]) -> tuple[float, 
 
 def _stretch(path: LinkPath, start: float, end: float) -> tuple[float, float]:
     return max(0.0, start), min(path.s[-1], end)
+
+
+def fork_lengths(from_lane: Sequence[int], paths: Sequence[LinkPath | None]) -> NDArray[np.float64]:
+    """The length of each link's path that lies near another one's from the same lane, in m.
+
+    Args:
+        from_lane: (K,) LANE row that each link leaves.
+        paths: (K,) the path of each link, None where the map has none.
+    """
+    lengths = np.zeros(len(paths))
+    leaving: dict[int, list[int]] = defaultdict(list)
+    for link, lane in enumerate(from_lane):
+        leaving[lane].append(link)
+    for links in leaving.values():
+        for link in links:
+            path = paths[link]
+            others = [other for k in links if k != link and (other := paths[k]) is not None]
+            if path is not None and others:
+                lengths[link] = max(_shared_m(path, other) for other in others)
+    return lengths
+
+
+def _shared_m(path: LinkPath, other: LinkPath) -> float:
+    apart = path.xyz[:, None, :2] - other.xyz[None, :, :2]
+    nearest = (apart[..., 0] * apart[..., 0] + apart[..., 1] * apart[..., 1]).min(axis=1)
+    parted = np.flatnonzero(nearest > NEAR_M * NEAR_M)
+    return float(path.s[parted[0]]) if parted.size else float(path.s[-1]) + FORK_BEYOND_M
+
+
+LINE_MARGIN_M = 1.0  # drivers stop this far before a line, see kernels.following
+STEP_M = 0.5
+MOST_M = 8.0
+BODY_M = 5.0
+
+
+def stop_back(
+    ends: NDArray[np.float64],
+    edge: NDArray[np.int32],
+    from_lane: Sequence[int],
+    junction: Sequence[int],
+    paths: Sequence[LinkPath | None],
+    approaches: Sequence[LinkPath | None],
+) -> NDArray[np.float64]:
+    """How far before its end a lane has its stop line, in m.
+
+    Args:
+        ends: (L, 4) x, y, z of each lane's end, m, and its direction there, rad.
+        edge: (L,) EDGE row of each lane.
+        from_lane: (K,) LANE row that each link leaves.
+        junction: (K,) JUNCTION row of each link.
+        paths: (K,) the path of each link, None where the map has none.
+        approaches: (K,) the same with the last metres before the junction: vehicles from another
+            road is asked about there, too.
+
+    Returns:
+        (L,), 0 for lanes that no path of another lane's links comes near. Where `MOST_M` is not
+        enough, the lane keeps the map's line.
+    """
+    back = np.zeros(len(ends))
+    at: dict[int, list[int]] = defaultdict(list)
+    for link, row in enumerate(junction):
+        if paths[link] is not None:
+            at[row].append(link)
+    for links in at.values():
+        inside = {link: poses(path) for link in links if (path := paths[link]) is not None}
+        coming = {link: poses(path) for link in links if (path := approaches[link]) is not None}
+        for lane in {from_lane[link] for link in links}:
+            others = [
+                (inside if edge[from_lane[link]] == edge[lane] else coming)[link]
+                for link in links
+                if from_lane[link] != lane
+            ]
+            if others:
+                back[lane] = _first_free(ends[lane], others)
+    return back
+
+
+def _first_free(end: NDArray[np.float64], others: Sequence[Poses]) -> float:
+    x, y, z, heading = end
+    for step in range(int(MOST_M / STEP_M) + 1):
+        back = step * STEP_M
+        centre = LINE_MARGIN_M + back + 0.5 * BODY_M
+        body = Poses(
+            np.array([[x - centre * np.cos(heading), y - centre * np.sin(heading), z]]),
+            np.array([heading]),
+        )
+        if not any(_meets(body, other) for other in others):
+            return back
+    return 0.0
+
+
+def _meets(body: Poses, other: Poses) -> bool:
+    level = np.abs(other.xyz[:, 2] - body.xyz[0, 2]) <= CLEARANCE_M
+    apart = other.xyz[level, :2] - body.xyz[0, :2]
+    own = np.broadcast_to(body.heading, (int(level.sum()),))
+    return bool(touching(apart, own, other.heading[level]).any())
+
+
+Row = tuple[int, bool, bool, float, float, float, float]
+
+
+def conflict_rows(
+    movements: Sequence[Movement], paths: Sequence[LinkPath | None]
+) -> tuple[NDArray[np.void], NDArray[np.int32]]:
+    """All conflicts of all links, and each link's first row with the end as last entry.
+
+    Two links are foes if either names the other: some maps set the bit on one side only, but a
+    shared area is shared. Links over a bridge and below it are none, whatever the map says. Links
+    from different lanes that the map calls free of each other, but that pass so narrowly that cars
+    would touch, are foes too; of these a left turn gives way.
+
+    Args:
+        movements: one a LINK row.
+        paths: the path of each link; None where the map has no internal lanes.
+
+    Raises:
+        MapError: a junction's request has fewer bits than the junction has links.
+    """
+    by_node: dict[int, list[int]] = defaultdict(list)
+    for link, movement in enumerate(movements):
+        by_node[id(movement.node)].append(link)
+    found: list[list[Row]] = [[] for _ in movements]
+    for links in by_node.values():
+        for one, other in combinations(links, 2):
+            a, b = movements[one], movements[other]
+            merging = a.connection.getToLane() is b.connection.getToLane()
+            if _bit(a, b, a.node._foes) or _bit(b, a, a.node._foes):
+                shared = _shared(paths[one], paths[other], merging=merging)
+                yields = _bit(a, b, a.node._prohibits), _bit(b, a, a.node._prohibits)
+            elif a.connection.getFromLane() is not b.connection.getFromLane() and not merging:
+                shared = _grazing(paths[one], paths[other])
+                yields = _turns_left(a) and not _turns_left(b), _turns_left(b)
+            else:
+                continue
+            if shared is None:
+                continue
+            mine, theirs = shared[:2], shared[2:]
+            found[one].append((other, merging, yields[0], *mine, *theirs))
+            found[other].append((one, merging, yields[1], *theirs, *mine))
+
+    counts = [len(rows) for rows in found]
+    conflicts = np.zeros(sum(counts), CONFLICT)
+    conflicts[:] = [row for rows in found for row in sorted(rows)]
+    return conflicts, np.concatenate([[0], np.cumsum(counts, dtype=np.int32)]).astype(np.int32)
+
+
+def _bit(mine: Movement, foe: Movement, requests: dict[int, str]) -> bool:
+    """The foe's bit in my row of the requests; SUMO writes bit 0 at the right."""
+    if not requests:
+        return False
+    row = requests.get(mine.index, "")
+    if foe.index >= len(row):
+        raise MapError(
+            f"junction '{mine.node.getID()}' has {len(requests)} requests, but more links: build "
+            "the network again with netconvert"
+        )
+    return row[-1 - foe.index] == "1"
+
+
+def _turns_left(movement: Movement) -> bool:
+    return movement.connection.getDirection() in "lLt"
+
+
+def _grazing(path: LinkPath | None, foe: LinkPath | None) -> Overlap | None:
+    return None if path is None or foe is None else grazing(path, foe)
+
+
+def _shared(path: LinkPath | None, foe: LinkPath | None, *, merging: bool) -> Overlap | None:
+    """The shared area; without internal lanes the junction is a point."""
+    if path is None or foe is None:
+        return Overlap(0.0, path.s[-1] if path else 0.0, 0.0, foe.s[-1] if foe else 0.0)
+    return overlap(path, foe, merging=merging)

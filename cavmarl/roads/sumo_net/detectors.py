@@ -45,16 +45,10 @@ def place_detectors(
 ) -> tuple[NDArray[np.void], NDArray[np.int32]]:
     """Detectors of the actuated programs in `rows.specs`; their phases are told of them.
 
-    Args:
-        rows: the detectors of each phase are written.
-        roads: where they lie.
-        first_row: the number of the first detector.
+    `rows`: the detectors of each phase are written. `first_row`: the number of the first detector.
 
-    Returns:
-        DETECTOR (D,) and phase_detectors, beginning with the ones that `rows` already counts.
-
-    Raises:
-        MapError: a parameter of a program is no number, or names a detector of its own.
+    Returns DETECTOR (D,) and phase_detectors, beginning with the ones that `rows` already counts.
+    Raises MapError: a parameter of a program is no number, or names a detector of its own.
     """
     detectors: list[tuple[int, float, float]] = []
     for row, program in rows.specs.items():

@@ -29,58 +29,38 @@ _REQUIRED = {
 
 @dataclass(frozen=True)
 class Phase:
-    """One <phase>.
+    """One <phase>."""
 
-    Attributes:
-        duration_s, min_s, max_s: stated; SUMO's defaults fill in what is not.
-        state: a letter for every link of the signal.
-        following: phases that may come next, by number; empty: the one behind it.
-    """
-
-    duration_s: float
+    duration_s: float  # stated; SUMO's defaults fill in what is not
     min_s: float
     max_s: float
-    state: str
+    state: str  # a letter for every link of the signal
+    # phases that may come next, by number; empty: the one behind it
     following: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
 class SignalProgram:
-    """One <tlLogic>.
+    """One <tlLogic>."""
 
-    Attributes:
-        signal_id, program_id: together the program's name.
-        kind: SUMO's type: `static`, `actuated`, `delay_based`, `NEMA`, …
-        offset_s: by which all phases are late.
-        phases: in their order.
-        params: <param> by key.
-        place: file and line, for complaints.
-    """
-
-    signal_id: str
+    signal_id: str  # together the program's name
     program_id: str
-    kind: str
-    offset_s: float
-    place: str
-    phases: list[Phase] = field(default_factory=list)
-    params: dict[str, str] = field(default_factory=dict)
+    kind: str  # SUMO's type: `static`, `actuated`, `delay_based`, `NEMA`, …
+    offset_s: float  # by which all phases are late
+    place: str  # file and line, for complaints
+    phases: list[Phase] = field(default_factory=list)  # in their order
+    params: dict[str, str] = field(default_factory=dict)  # <param> by key
 
 
 @dataclass(frozen=True)
 class Timetable:
-    """One <WAUT>: which program the signals that follow it run when.
+    """One <WAUT>: which program the signals that follow it run when."""
 
-    Attributes:
-        start: the program at the beginning.
-        switches: (seconds since the beginning, program), in the file's order.
-        signal_ids: the signals that follow it.
-        place: file and line, for complaints.
-    """
-
-    start: str
-    place: str
+    start: str  # the program at the beginning
+    place: str  # file and line, for complaints
+    # (seconds since the beginning, program), in the file's order
     switches: list[tuple[float, str]] = field(default_factory=list)
-    signal_ids: list[str] = field(default_factory=list)
+    signal_ids: list[str] = field(default_factory=list)  # the signals that follow it
 
 
 class ProgramReader:
@@ -101,8 +81,7 @@ class ProgramReader:
     def start(self, name: str, attrs: Mapping[str, str], line: int) -> None:
         """Take an element in; others than those of signals are passed over.
 
-        Raises:
-            MapError: an attribute is missing or no number, or it stands in the wrong place.
+        Raises MapError: an attribute is missing or no number, or it stands in the wrong place.
         """
         place = f"{self._path}, line {line}: <{name}>"
         if missing := [key for key in _REQUIRED.get(name, ()) if key not in attrs]:
@@ -140,8 +119,7 @@ class ProgramReader:
 def read_programs(path: Path) -> ProgramReader:
     """Read the signal programs and timetables of an additional file (`.add.xml`, also gzipped).
 
-    Raises:
-        MapError: hostile or broken XML, or an element that `ProgramReader.start` refuses.
+    Raises MapError: hostile or broken XML, or an element that `ProgramReader.start` refuses.
     """
     handler = _AdditionalHandler(path)
     read_xml(path, handler)

@@ -16,14 +16,17 @@ from cavmarl.core.math.geometry import project
 from cavmarl.core.records.rows import FORK_BEYOND_M
 from cavmarl.roads.network import EDGE, JUNCTION, LANE, LINK, GeoReference, RoadNetwork
 from cavmarl.roads.polylines import clean_shape, extend_stubs, point_rows
-from cavmarl.roads.sumo_net.conflicts import LinkPath, sample_path
+from cavmarl.roads.sumo_net.conflicts import (
+    LinkPath,
+    conflict_rows,
+    fork_lengths,
+    sample_path,
+    stop_back,
+)
 from cavmarl.roads.sumo_net.detectors import DetectorRoads, place_detectors
-from cavmarl.roads.sumo_net.forks import fork_lengths
 from cavmarl.roads.sumo_net.programs import SignalProgram
-from cavmarl.roads.sumo_net.right_of_way import conflict_rows
 from cavmarl.roads.sumo_net.selection import Movement, NetworkSelection, permission_bits, select
 from cavmarl.roads.sumo_net.signal_rows import SignalRows, read_signals
-from cavmarl.roads.sumo_net.stop_lines import stop_back
 
 APPROACH_M = 12.0  # before a junction, where bodies still stand askew to vehicles that wait
 _ENDINGS = (".gz", ".xml", ".net", ".osm", ".xodr")
@@ -40,8 +43,7 @@ def map_name(path: Path) -> str:
 def source_hash(path: Path) -> str:
     """SHA-256 of a file, hex.
 
-    Raises:
-        MapError: the file cannot be read.
+    Raises MapError: the file cannot be read.
     """
     try:
         with path.open("rb") as stream:
@@ -55,8 +57,7 @@ def read_network(path: str | Path) -> RoadNetwork:
 
     Lane lengths are those of the polylines; EDGE["length_m"] is the length that the map states.
 
-    Raises:
-        MapError: the file is broken, hostile or inconsistent, or nothing in it can be driven.
+    Raises MapError: the file is broken, hostile or inconsistent, or nothing in it can be driven.
     """
     # sumolib is only loaded where the cache has no network yet.
     from cavmarl.roads.sumo_net.sumo_xml import parse_net

@@ -15,19 +15,13 @@ _ROAD = sum(1 << bit for bit, name in enumerate(VEHICLE_CLASSES) if name not in 
 
 @dataclass(frozen=True)
 class Movement:
-    """A permitted movement over a junction, before it becomes a LINK.
+    """A permitted movement over a junction, before it becomes a LINK."""
 
-    Attributes:
-        connection: sumolib's connection out of a normal lane.
-        chain: sumolib's internal lanes on its way, in order; empty where the map has none.
-        node: sumolib's junction.
-        index: the movement's bit in the junction's request.
-    """
-
-    connection: Any
+    connection: Any  # sumolib's connection out of a normal lane
+    # sumolib's internal lanes on its way, in order; empty where the map has none
     chain: tuple[Any, ...]
-    node: Any
-    index: int
+    node: Any  # sumolib's junction
+    index: int  # the movement's bit in the junction's request
 
 
 @dataclass
@@ -57,8 +51,7 @@ def select(net: Any) -> NetworkSelection:
     Pure pavements, crossings, walking areas, rails and bicycle lanes are left out, and so are
     internal lanes that no movement uses.
 
-    Raises:
-        MapError: an internal lane belongs to two movements or leads nowhere.
+    Raises MapError: an internal lane belongs to two movements or leads nowhere.
     """
     chosen = NetworkSelection()
     for edge in net.getEdges(withInternal=False):

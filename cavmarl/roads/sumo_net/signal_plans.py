@@ -26,16 +26,11 @@ def with_programs(
     says when the signals that follow it change their program: at once, whatever the phase, and
     every program counts its time from the beginning. A choice stands above all of that.
 
-    Args:
-        network: not changed.
-        files: additional files in loading order; elements other than signals' are passed over.
-        chosen: program by signal.
+    `files`: additional files in loading order; elements other than signals' are passed over.
+    `chosen`: program by signal.
 
-    Returns:
-        A network with another `source_hash`, for it has more than one source.
-
-    Raises:
-        MapError: a broken file, an unknown signal or program, a program that does not fit.
+    Returns A network with another `source_hash`, for it has more than one source. Raises MapError:
+    a broken file, an unknown signal or program, a program that does not fit.
     """
     chosen = chosen or {}
     if not files and not chosen:
@@ -64,15 +59,9 @@ def with_outages(network: RoadNetwork, outages: Mapping[str, float]) -> RoadNetw
 
     They change to their program `off`: links that must give way anyway blink.
 
-    Args:
-        network: not changed.
-        outages: when each goes dark, in s since the beginning of the episode, by signal.
+    `outages`: when each goes dark, in s since the beginning of the episode, by signal.
 
-    Returns:
-        A network with another `source_hash`.
-
-    Raises:
-        MapError: an unknown signal.
+    Returns A network with another `source_hash`. Raises MapError: an unknown signal.
     """
     rows = SignalRows.of(network)
     sources = [network.source_hash]

@@ -82,9 +82,8 @@ class SignalRows:
     def add(self, program: SignalProgram) -> None:
         """Append a program; of several the last is on, as in SUMO.
 
-        Raises:
-            MapError: no phases, phases of different lengths, an unknown letter, a cycle of no time,
-                a name that is taken.
+        Raises MapError: no phases, phases of different lengths, an unknown letter, a cycle of no
+        time, a name that is taken.
         """
         signal_id = program.signal_id
         cycle = sum(phase.duration_s for phase in program.phases)
@@ -161,8 +160,7 @@ class SignalRows:
     def find(self, connection: Any, junction_kind: str) -> tuple[int, int]:
         """The SIGNAL row and state letter of a connection, (-1, -1) without a signal.
 
-        Raises:
-            MapError: the connection's signal has no program or no letter for it.
+        Raises MapError: the connection's signal has no program or no letter for it.
         """
         signal_id = connection.getTLSID()
         if not signal_id or (signal_id not in self.row and junction_kind in RAIL_KINDS):
@@ -193,8 +191,7 @@ class SignalRows:
 def read_signals(programs: list[SignalProgram]) -> SignalRows:
     """The programs of a network's traffic lights.
 
-    Raises:
-        MapError: see `SignalRows.add`.
+    Raises MapError: see `SignalRows.add`.
     """
     rows = SignalRows()
     for program in programs:
@@ -220,8 +217,7 @@ def _simplified(program: SignalProgram) -> bool:
 def parameter(program: SignalProgram, key: str, default: float) -> float:
     """A parameter of a program in seconds.
 
-    Raises:
-        MapError: no number from 0.
+    Raises MapError: no number from 0.
     """
     text = program.params.get(key)
     if text is None:

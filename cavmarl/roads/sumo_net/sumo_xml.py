@@ -26,10 +26,7 @@ _REQUIRED = {
     "connection": ("from", "to", "fromLane", "toLane", "dir", "state"),
     "request": ("index", "response", "foes"),
 }
-_FINITE = {
-    "lane": ("speed", "length", "width"),
-    "junction": ("x", "y", "z"),
-}
+_FINITE = {"lane": ("speed", "length", "width"), "junction": ("x", "y", "z")}
 _POSITIVE = {("lane", "speed"), ("lane", "length"), ("lane", "width")}
 _VERSION = re.compile(r"[0-9]+\.[0-9]+(\.[0-9]+)?")
 _BITS = re.compile(r"[01]+")

@@ -50,10 +50,8 @@ class _Limited(io.RawIOBase):
 def read_xml(path: Path, handler: ContentHandler, failure: type[CavmarlError] = MapError) -> None:
     """Feed the elements of a plain or gzipped XML file to a SAX `handler`.
 
-    Args:
-        path: of the file.
-        handler: takes the elements; what it raises passes through.
-        failure: the error to raise, by what kind of file this is.
+    `handler`: takes the elements; what it raises passes through. `failure`: the error to raise, by
+    what kind of file this is.
 
     Raises:
         CavmarlError: of the type `failure`: the file is missing, is not well-formed XML, is too
@@ -96,8 +94,7 @@ def _check_encoding(path: Path, stream: io.BufferedIOBase, failure: type[Cavmarl
 def read_bytes(path: Path) -> bytes:
     """The XML text of a plain or gzipped file.
 
-    Raises:
-        OSError: the file cannot be read.
+    Raises OSError: the file cannot be read.
     """
     content = path.read_bytes()
     return gzip.decompress(content) if content.startswith(_GZIP_MAGIC) else content

@@ -104,9 +104,8 @@ def _is_aside(camera: CameraPose, width: int, height: int) -> bool:
 def _set_face(camera: CameraPose, width: int, height: int) -> tuple[int, int, float, float, float]:
     """Set the edges of the face whose corners are set, the fifth being the range.
 
-    Returns:
-        the rows [first, last) that it can be in, and the closeness of the plane that it lies in:
-        constant, by column, by row. No rows for a face that cannot be seen.
+    Returns the rows [first, last) that it can be in, and the closeness of the plane that it lies
+    in: constant, by column, by row. No rows for a face that cannot be seen.
     """
     if _is_aside(camera, width, height):
         return 0, 0, 0.0, 0.0, 0.0
@@ -155,8 +154,7 @@ def _set_face(camera: CameraPose, width: int, height: int) -> tuple[int, int, fl
 def add_face(camera: CameraPose, picture: PixelRows, num: int, number: int, flat: bool) -> int:
     """Put the face whose corners are set behind the `num` that are drawn before it.
 
-    Returns:
-        how many there are now: no more if it cannot be seen.
+    Returns how many there are now: no more if it cannot be seen.
     """
     width = picture.face.shape[1]
     first, last, constant, by_column, by_row = _set_face(camera, width, picture.height)

@@ -1,7 +1,7 @@
 """highway-env's `LidarObservation`: distance and radial speed in equal sectors around a vehicle.
 
 The sectors do not turn with the vehicle: the middle of cell k lies k steps clockwise from east (the
-frame of `kernels.vehicle_features`). It differs from our `lidar`, whose rays meet bodies exactly
+frame of `vehicle_features`). It differs from our `lidar`, whose rays meet bodies exactly
 and turn with the vehicle, in ways that are kept here: a vehicle is seen if its centre is in range;
 it is also drawn into the cell of its centre, at its distance less half its width; within a body
 distances are negative; and speeds are divided by the range in metres, as distances are. Cells
@@ -59,14 +59,8 @@ def _ray_to_body(
 ) -> float:
     """Distance along a ray, in units of its length, to a body; negative inside, inf if missed.
 
-    Args:
-        x: of the body's centre.
-        y: of the body's centre.
-        cos: of the body's heading.
-        sin: of the body's heading.
-        body: for its size.
-        ray_x: the ray, as long as it reaches.
-        ray_y: see `ray_x`.
+    `x`: of the body's centre. `y`: of the body's centre. `cos`: of the body's heading. `sin`: of
+    the body's heading. `body`: for its size. `ray_x`: the ray, as long as it reaches.
     """
     length = 2.0 * body["half_length"]
     width = 2.0 * body["half_width"]
@@ -113,7 +107,6 @@ def _record(echo: np.void, distance: float, speed: float, vehicle_id: int) -> No
 
 @kernel
 def _trace(ego: np.void, ego_cos: float, ego_sin: float, body: np.void, sensor: LidarCells) -> None:
-    """Draw one body into the cells."""
     x = body["x"] - ego["x"]
     y = ego["y"] - body["y"]
     distance = math.sqrt(x * x + y * y)
@@ -141,12 +134,7 @@ def observe_lidar_cells(
 ) -> None:
     """Write distance and speed of each cell.
 
-    Args:
-        rows: VEHICLE (C,).
-        i: the vehicle that looks.
-        grid: filled for this tick from these rows.
-        sensor: settings and room.
-        out: an observation; 2 · cells numbers from `sensor.at` on are written.
+    `out`: an observation; 2 · cells numbers from `sensor.at` on are written.
     """
     ego = rows[i]
     ego_cos = math.cos(ego["heading"])

@@ -17,19 +17,15 @@ from numpy.typing import NDArray
 from cavmarl.core.math.bearings import ANGLE_ERROR_RAD, rough_atan2
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
 from cavmarl.core.numba import kernel
+from cavmarl.core.records import record
 
 # What a ray met first.
-ECHO = np.dtype(
-    [
-        ("distance", np.float64),  # m; 0 from inside of a body, the range where nothing is
-        (
-            "speed",
-            np.float64,
-        ),  # its velocity less the own one, in m/s along the ray: positive where
-        # it goes away (highway-env's sign); 0 where nothing is
-        ("id", np.int64),  # of the vehicle; -1 where nothing is
-    ],
-    align=True,
+ECHO = record(
+    ("distance", np.float64),  # m; 0 from inside of a body, the range where nothing is
+    # its velocity less the own one, in m/s along the ray: positive where it goes away
+    # (highway-env's sign); 0 where nothing is
+    ("speed", np.float64),
+    ("id", np.int64),  # of the vehicle; -1 where nothing is
 )
 
 PI = math.pi
@@ -47,12 +43,7 @@ def ray_directions(num_rays: int) -> NDArray[np.float64]:
 
 @kernel
 def _ray_to_box(
-    x: float,
-    y: float,
-    closing_x: float,
-    closing_y: float,
-    half_length: float,
-    half_width: float,
+    x: float, y: float, closing_x: float, closing_y: float, half_length: float, half_width: float
 ) -> float:
     """Distance along a ray to a box around the origin, 0 inside of it and inf if missed.
 
@@ -95,14 +86,8 @@ def _rays_over(
     Seen from the origin, the box keeps within `across` of the line to its centre and begins no
     nearer than `ahead`: the angle to each side is at most atan(across / ahead) < across / ahead.
 
-    Args:
-        x: m.
-        y: m.
-        along: of the origin from the centre, in m along the box, at least 0.
-        beside: the same across the box.
-        half_length: m.
-        half_width: m.
-        rays: how many there are.
+    `along`: of the origin from the centre, in m along the box, at least 0. `beside`: the same
+    across the box.
     """
     # Both times the distance to the centre, which cancels out.
     ahead = x * x + y * y - (half_length * along + half_width * beside)
@@ -183,13 +168,8 @@ def lidar(
 
     Where two vehicles are equally far along a ray, the one with the smaller id counts.
 
-    Args:
-        rows: VEHICLE (C,).
-        row: the vehicle that looks.
-        grid: filled for this tick from these rows.
-        rays: (num_rays, 2) directions in the vehicle's frame, from `ray_directions`.
-        range_m: how far it sees, in the plane.
-        out: ECHO (num_rays,), overwritten.
+    `rays`: (num_rays, 2) directions in the vehicle's frame, from `ray_directions`. `range_m`: how
+    far it sees, in the plane. `out`: ECHO (num_rays,), overwritten.
     """
     ego = rows[row]
     ego_cos = math.cos(ego["heading"])

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M
 from cavmarl.core.math.scalars import clamp
 from cavmarl.core.numba import kernel
+from cavmarl.core.records import record
 from cavmarl.sensors.kernels.sensor_arrays import RoadgraphSensor, RoadPoints
 
 # ROAD_POINT["type"], in the order of the features that say which one it is
@@ -29,16 +30,13 @@ NUM_ROAD_TYPES = 5
 # valid, x, y, dir_x, dir_y, then one flag a type
 ROADGRAPH_FEATURES = 5 + NUM_ROAD_TYPES
 
-ROAD_POINT = np.dtype(
-    [
-        ("x", np.float64),  # m
-        ("y", np.float64),
-        ("z", np.float64),
-        ("cos", np.float64),  # direction of the line that it is part of
-        ("sin", np.float64),
-        ("type", np.int64),  # TYPE_*
-    ],
-    align=True,
+ROAD_POINT = record(
+    ("x", np.float64),  # m
+    ("y", np.float64),
+    ("z", np.float64),
+    ("cos", np.float64),  # direction of the line that it is part of
+    ("sin", np.float64),
+    ("type", np.int64),  # TYPE_*
 )
 
 # Points are put into rings of equal area before they are sorted: few need to be compared.
@@ -125,14 +123,10 @@ def _sort_into_rings(found: int, count: int, range_m: float, sensor: RoadgraphSe
 def nearest_points(x: float, y: float, z: float, sensor: RoadgraphSensor) -> int:
     """The nearest road points around a place, by distance, then by index, into `sorted_point`.
 
-    Args:
-        x: m.
-        y: m.
-        z: m; points more than `LEVEL_HEIGHT_M` above or below are not seen.
-        sensor: settings, points and room.
+    `z`: m; points more than `LEVEL_HEIGHT_M` above or below are not seen. `sensor`: settings,
+    points and room.
 
-    Returns:
-        how many were found, at most `sensor.num_points`.
+    Returns how many were found, at most `sensor.num_points`.
     """
     points = sensor.sorted_point
     squares = sensor.sorted_squared
@@ -157,10 +151,7 @@ def nearest_points(x: float, y: float, z: float, sensor: RoadgraphSensor) -> int
 def observe_roadgraph(row: np.void, sensor: RoadgraphSensor, out: NDArray[np.float32]) -> None:
     """Write the nearest points in the ego frame, nearest first; what is left stays as it is.
 
-    Args:
-        row: the vehicle that looks.
-        sensor: settings, points and room.
-        out: an observation, zeros from `sensor.at` on.
+    `sensor`: settings, points and room. `out`: an observation, zeros from `sensor.at` on.
     """
     cos = math.cos(row["heading"])
     sin = math.sin(row["heading"])

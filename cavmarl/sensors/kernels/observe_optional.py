@@ -13,8 +13,8 @@ from cavmarl.sensors.kernels.kinematics_observation import observe_kinematics
 from cavmarl.sensors.kernels.lidar_cells import observe_lidar_cells
 from cavmarl.sensors.kernels.nearest_road_points import observe_roadgraph
 from cavmarl.sensors.kernels.occupancy import observe_occupancy
+from cavmarl.sensors.kernels.output_reset import newest_frame
 from cavmarl.sensors.kernels.sensor_arrays import OptionalSensors
-from cavmarl.sensors.kernels.stacking import newest_frame
 
 
 @kernel
@@ -30,15 +30,8 @@ def observe_optional(
 ) -> None:
     """Write these sensors' parts of every agent's newest frame in the chosen worlds.
 
-    Args:
-        roads: the road arrays.
-        lane_grid: which lanes lie near a place.
-        worlds: committed rows at the end of the step.
-        grid: room for the spatial index of one world.
-        further: settings and room; sensors that are off write nothing.
-        stack: frames in an observation.
-        chosen: (W,) which worlds.
-        observations: (W, A, D), the parts 0 before.
+    `further`: settings and room; sensors that are off write nothing. `observations`: (W, A, D), the
+    parts 0 before.
     """
     kinematics, occupancy, lidar_cells, roadgraph = further
     for w in range(chosen.size):

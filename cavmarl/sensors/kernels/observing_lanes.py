@@ -45,13 +45,7 @@ def _scaled_speed(speed: float) -> np.float32:
 
 @kernel
 def _way_between(
-    roads: RoadArrays,
-    travel: Travel,
-    lane: int,
-    way: int,
-    s: float,
-    target: int,
-    target_s: float,
+    roads: RoadArrays, travel: Travel, lane: int, way: int, s: float, target: int, target_s: float
 ) -> float:
     """Metres along a way from `s` of `lane` to `target_s` of lane `target`; inf: not on it."""
     start = -s
@@ -191,15 +185,9 @@ def observe_lanes(
 ) -> None:
     """Gaps and relative speeds on the lanes around, and the first vehicle where ways cross.
 
-    Args:
-        roads: the road arrays.
-        travel: the ways of all.
-        rows: VEHICLE (C,).
-        i: row of the agent's vehicle.
-        grid: filled from these rows.
-        phase: (num_signals,) PHASE rows that are on.
-        sensors: range and place of the sensor; a range of 0 switches it off.
-        observation: (D,), of which `LANES_FEATURES` numbers are written; 0 before.
+    `i`: row of the agent's vehicle. `phase`: (num_signals,) PHASE rows that are on. `sensors`:
+    range and place of the sensor; a range of 0 switches it off. `observation`: (D,), of which
+    `LANES_FEATURES` numbers are written; 0 before.
     """
     range_m = sensors.lanes_range_m
     if range_m == 0.0:

@@ -11,7 +11,7 @@ from cavmarl.core.math.scalars import clamp
 from cavmarl.core.numba import kernel
 from cavmarl.core.records.arrays import RoadArrays, Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT, SIGNAL_GREEN_MAJOR, SIGNAL_GREEN_MINOR
-from cavmarl.sensors.kernels.stacking import newest_frame
+from cavmarl.sensors.kernels.output_reset import newest_frame
 from cavmarl.v2x.kernels.v2x_records import (
     CAUSE_COLLISION,
     CAUSE_HARD_BRAKING,
@@ -41,7 +41,6 @@ def _unit(number: float) -> np.float32:
 def _observe_place(
     report: np.void, row: np.void, cos: float, sin: float, scale_m: float, out: NDArray[np.float32]
 ) -> None:
-    """Presence and place in the ego frame."""
     dx = report["x"] - row["x"]
     dy = report["y"] - row["y"]
     out[0] = 1.0
@@ -59,7 +58,6 @@ def _observe_object(
     tick_s: float,
     out: NDArray[np.float32],
 ) -> None:
-    """What is known of one vehicle, relative to the own one."""
     _observe_place(report, row, cos, sin, scale_m, out)
     turned = report["heading"] - row["heading"]
     turned_cos = math.cos(turned)
@@ -156,20 +154,9 @@ def observe_messages(
 ) -> None:
     """Write what the owned agents of the chosen worlds have in their inboxes.
 
-    Args:
-        roads: the road arrays.
-        plans: PLAN (G, L), the ways of agents.
-        worlds: committed rows at the end of the step.
-        mail: the inboxes.
-        at: where the sensor's part begins in a frame.
-        objects: vehicles that are shown.
-        events: likewise.
-        signal: whether the next signal is shown.
-        scale_m: what a place of 1 stands for.
-        tick_s: seconds a tick.
-        stack: frames in an observation.
-        chosen: (W,) which worlds.
-        observations: (W, A, D), the part of the newest frame is 0 before.
+    `mail`: the inboxes. `at`: where the sensor's part begins in a frame. `objects`: vehicles that
+    are shown. `signal`: whether the next signal is shown. `scale_m`: what a place of 1 stands for.
+    `observations`: (W, A, D), the part of the newest frame is 0 before.
     """
     for w in range(chosen.size):
         if not chosen[w]:

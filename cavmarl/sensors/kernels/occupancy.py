@@ -17,13 +17,13 @@ from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell
 from cavmarl.core.math.scalars import clamp
 from cavmarl.core.numba import kernel
 from cavmarl.core.records.arrays import LaneGrid, RoadArrays
-from cavmarl.sensors.kernels.sensor_arrays import OccupancyGrid
-from cavmarl.sensors.kernels.vehicle_features import (
+from cavmarl.sensors.kernels.kinematics_observation import (
     FEATURE_ON_ROAD,
     in_range,
     make_relative,
     vehicle_features,
 )
+from cavmarl.sensors.kernels.sensor_arrays import OccupancyGrid
 
 # How far along a lane highway-env sets waypoints, from the place beside the vehicle.
 LANE_REACH_M = 100.0
@@ -128,7 +128,6 @@ def _draw_road(
     at: int,
     out: NDArray[np.float32],
 ) -> None:
-    """Write the layer `on_road` from position `at` on."""
     seen = sensor.lane_seen
     now = seen.size - 1
     seen[now] += 1
@@ -159,14 +158,8 @@ def observe_occupancy(
 ) -> None:
     """Write the layers of one vehicle, each by columns along x; empty cells are left as they are.
 
-    Args:
-        roads: the road arrays.
-        lane_grid: which lanes lie near a place.
-        rows: VEHICLE (C,).
-        i: the vehicle that looks.
-        grid: filled for this tick from these rows.
-        sensor: settings and room; cells and ranges in the frame of `vehicle_features`.
-        out: an observation, zeros from `sensor.at` on.
+    `sensor`: settings and room; cells and ranges in the frame of `vehicle_features`. `out`: an
+    observation, zeros from `sensor.at` on.
     """
     ego = rows[i]
     num_cells = sensor.num_x * sensor.num_y

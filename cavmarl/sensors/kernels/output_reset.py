@@ -2,6 +2,10 @@
 
 The order at the end of a step: `clear_outputs`, `sense` of every shard, `settle_outputs`, `credit`
 of every shard. Sums go in agent order, so that results do not depend on which shard wrote what.
+
+Observations can hold the last few frames, one after the other, oldest first. The frames of an agent
+stand in the output arrays at its index and nowhere else, so a carrier of the outputs of an agent
+carries its past.
 """
 
 from __future__ import annotations
@@ -10,8 +14,58 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.numba import kernel
-from cavmarl.core.records.arrays import Outputs
+from cavmarl.core.records.arrays import Outputs, Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
+
+
+@kernel
+def has_entered(row: np.void, ticks_per_step: int) -> bool:
+    """Whether a vehicle entered during the last step, at reset too."""
+    return bool(row["departed"] > row["tick"] - ticks_per_step)
+
+
+@kernel
+def newest_frame(observation: NDArray[np.float32], stack: int) -> int:
+    return observation.size - observation.size // stack
+
+
+@kernel
+def shift_frames(observation: NDArray[np.float32], stack: int) -> None:
+    newest = newest_frame(observation, stack)
+    size = observation.size - newest
+    for k in range(newest):
+        observation[k] = observation[k + size]
+    observation[newest:] = 0.0
+
+
+@kernel
+def repeat_frame(observation: NDArray[np.float32], stack: int) -> None:
+    """Make all frames the newest one: what an agent sees that has just entered."""
+    newest = newest_frame(observation, stack)
+    size = observation.size - newest
+    for k in range(newest):
+        observation[k] = observation[newest + k % size]
+
+
+@kernel
+def fill_stacks(
+    worlds: Worlds,
+    ticks_per_step: int,
+    stack: int,
+    chosen: NDArray[np.bool_],
+    observations: NDArray[np.float32],
+) -> None:
+    """Repeat the first frame of every vehicle that entered during the last step.
+
+    `observations`: (W, A, D) with the newest frames complete.
+    """
+    for w in range(chosen.size):
+        if not chosen[w]:
+            continue
+        for i in range(worlds.num_owned[w]):
+            row = worlds.rows[w, i]
+            if row["driver"] == DRIVER_AGENT and has_entered(row, ticks_per_step):
+                repeat_frame(observations[w, row["agent"]], stack)
 
 
 @kernel
@@ -35,11 +89,9 @@ def settle_outputs(
 ) -> None:
     """Finish the outputs that all shards have written.
 
-    Args:
-        outputs: rewards are written, and the observations of absent agents become 0.
-        weights: (T,) of the reward, a number for each term.
-        team_share: share of the reward that is the mean over the agents that acted.
-        chosen: (W,) which worlds.
+    `outputs`: rewards are written, and the observations of absent agents become 0. `weights`: (T,)
+    of the reward, a number for each term. `team_share`: share of the reward that is the mean over
+    the agents that acted.
     """
     for w in range(chosen.size):
         if chosen[w]:
@@ -85,11 +137,8 @@ def credit(
 ) -> None:
     """Add the rewards of the step to what owned agents have got in their episode.
 
-    Args:
-        rows: VEHICLE (W, C); episode_return of agents' rows is written.
-        num_owned: (W,) rows of the shard's own.
-        rewards: (W, A).
-        chosen: (W,) which worlds.
+    `rows`: VEHICLE (W, C); episode_return of agents' rows is written. `num_owned`: (W,) rows of the
+    shard's own. `rewards`: (W, A).
     """
     for w in range(chosen.size):
         if not chosen[w]:

@@ -19,24 +19,66 @@ from numpy.typing import NDArray
 
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
 from cavmarl.core.numba import kernel
+from cavmarl.core.records import record
 from cavmarl.roads.kernels.backdrop_pieces import Backdrop, gather_quads, gather_walls
 
-PRISM = np.dtype(
-    [
-        ("id", np.int64),  # of the vehicle or pedestrian
-        ("semantic", np.int64),  # see kernels.semantics
-        ("x", np.float64),  # centre, m
-        ("y", np.float64),
-        ("bottom", np.float64),  # z, m
-        ("top", np.float64),
-        ("cos", np.float64),  # of its heading in the frame
-        ("sin", np.float64),
-        ("half_length", np.float64),  # m
-        ("half_width", np.float64),
-        ("radius", np.float64),  # half the diagonal, m
-        ("speed", np.float64),  # over the ground along its heading, m/s
-    ],
-    align=True,
+NOTHING = 0  # the sky, or nothing in range
+GROUND = 1  # beside the roads
+ROAD = 2  # lanes and junctions
+LANE_LINE = 3  # the edges of lanes, in the bird's-eye grid
+BUILDING = 4
+CAR = 5
+TRUCK = 6
+BUS = 7
+TRAM = 8
+MOTORCYCLE = 9
+BICYCLE = 10
+PEDESTRIAN = 11
+
+SEMANTIC_NAMES = (
+    "nothing",
+    "ground",
+    "road",
+    "lane line",
+    "building",
+    "car",
+    "truck",
+    "bus",
+    "tram",
+    "motorcycle",
+    "bicycle",
+    "pedestrian",
+)
+NUM_SEMANTICS = len(SEMANTIC_NAMES)
+
+# By SUMO's abstract vehicle class; those of one shape look the same.
+SEMANTIC_OF_CLASS = {
+    "passenger": CAR,
+    "taxi": CAR,
+    "delivery": TRUCK,
+    "emergency": TRUCK,
+    "truck": TRUCK,
+    "bus": BUS,
+    "tram": TRAM,
+    "motorcycle": MOTORCYCLE,
+    "bicycle": BICYCLE,
+    "pedestrian": PEDESTRIAN,
+}
+
+
+PRISM = record(
+    ("id", np.int64),  # of the vehicle or pedestrian
+    ("semantic", np.int64),  # one of the classes above
+    ("x", np.float64),  # centre, m
+    ("y", np.float64),
+    ("bottom", np.float64),  # z, m
+    ("top", np.float64),
+    ("cos", np.float64),  # of its heading in the frame
+    ("sin", np.float64),
+    ("half_length", np.float64),  # m
+    ("half_width", np.float64),
+    ("radius", np.float64),  # half the diagonal, m
+    ("speed", np.float64),  # over the ground along its heading, m/s
 )
 
 
@@ -78,7 +120,6 @@ def make_panorama(backdrop: Backdrop, capacity: int) -> Panorama:
 def _fill_prism(
     prism: np.void, body: np.void, ego: np.void, axes: tuple[float, float, float, float]
 ) -> None:
-    """Bring a body into the frame whose cosines and sines of heading and pitch are `axes`."""
     cos, sin, pitch_cos, pitch_sin = axes
     dx = body["x"] - ego["x"]
     dy = body["y"] - ego["y"]
@@ -109,16 +150,11 @@ def _gather_prisms(
 ) -> int:
     """The bodies around a vehicle, in no order that counts.
 
-    Args:
-        rows: VEHICLE (C,).
-        row: the vehicle that looks; it does not see itself.
-        grid: filled for this tick from these rows.
-        semantics: (num_types,) class of each type of vehicle.
-        reach_m: bodies that are farther away in the plane are left out.
-        out: PRISM (C,), overwritten up to the returned number.
+    `row`: the vehicle that looks; it does not see itself. `semantics`: (num_types,) class of each
+    type of vehicle. `reach_m`: bodies that are farther away in the plane are left out. `out`: PRISM
+    (C,), overwritten up to the returned number.
 
-    Returns:
-        how many there are.
+    Returns how many there are.
     """
     ego = rows[row]
     axes = (
@@ -173,14 +209,8 @@ def gather(
 ) -> Counts:
     """Gather what stands around a vehicle, in its frame.
 
-    Args:
-        rows: VEHICLE (C,).
-        row: the vehicle that looks; it does not see itself.
-        grid: filled for this tick from these rows.
-        backdrop: of the map.
-        reach_m: what is farther away in the plane is left out.
-        with_faces: also roofs and strips, and bodies in the order of their ids.
-        out: overwritten.
+    `row`: the vehicle that looks; it does not see itself. `reach_m`: what is farther away in the
+    plane is left out. `with_faces`: also roofs and strips, and bodies in the order of their ids.
     """
     ego = rows[row]
     prisms = _gather_prisms(rows, row, grid, backdrop.semantics, reach_m, out.prisms)

@@ -21,15 +21,13 @@ from numpy.typing import NDArray
 from cavmarl.core.math.bearings import ANGLE_ERROR_RAD, rough_atan2
 from cavmarl.core.math.geometry import PI, TWO_PI
 from cavmarl.core.numba import kernel
+from cavmarl.core.records import record
 
 # What a ray met first.
-HIT = np.dtype(
-    [
-        ("distance", np.float64),  # m along the ray; 0 from inside of a body, the range for nothing
-        ("id", np.int64),  # of the vehicle or pedestrian; -1: none
-        ("what", np.int64),  # PRISM row of the panorama; or see `WALL_HIT`
-    ],
-    align=True,
+HIT = record(
+    ("distance", np.float64),  # m along the ray; 0 from inside of a body, the range for nothing
+    ("id", np.int64),  # of the vehicle or pedestrian; -1: none
+    ("what", np.int64),  # PRISM row of the panorama; or see `WALL_HIT`
 )
 NO_HIT = -1
 GROUND_HIT = -2
@@ -140,10 +138,8 @@ def _ray_to_prism(
 ) -> float:
     """Distance along a ray to a box around the origin, 0 inside of it and inf if missed.
 
-    Args:
-        place: where the ray starts, mirrored into the first octant.
-        closing: the ray's direction, towards the origin: how fast each coordinate falls.
-        half: of the box's sides.
+    `place`: where the ray starts, mirrored into the first octant. `closing`: the ray's direction,
+    towards the origin: how fast each coordinate falls. `half`: of the box's sides.
     """
     # Negative for a slab that the ray starts in; beyond any range for one that it turns away from.
     enter_x = (place[0] - half[0]) / max(closing[0], _PARALLEL)
@@ -300,15 +296,8 @@ def cast(
 ) -> None:
     """Find what each ray of a fan meets first; the ground only where nothing else is.
 
-    Args:
-        fan: the rays.
-        prisms: PRISM (C,) of the panorama.
-        num_prisms: how many there are.
-        walls: WALL (num_walls,) of the panorama.
-        num_walls: how many there are.
-        first: column.
-        last: the one after the last that is cast.
-        hits: HIT (A, E), overwritten in these columns.
+    `prisms`: PRISM (C,) of the panorama. `walls`: WALL (num_walls,) of the panorama. `last`: the
+    one after the last that is cast. `hits`: HIT (A, E), overwritten in these columns.
     """
     for a in range(first, last):
         for e in range(hits.shape[1]):

@@ -1,32 +1,247 @@
-"""What all mounted sensors have in common: carriers, stamps, counts, and lost samples."""
+"""What all mounted sensors have in common: places, errors, rates, stamps, counts, and lost samples.
+
+When samples are taken is a pure function of a world's tick: sample k is due k · ticks / samples
+ticks after the phase, and delivered by the first tick at or after that. So nothing has to be kept,
+and no migration, reset or repeated tick can move it.
+
+Frames are right-handed: x forward, y to the left, z up. A direction is given by yaw (counter-
+clockwise seen from above), then pitch (positive upwards), then roll (positive with the left side
+up), each about the axes as turned by those before. The vehicle's origin lies on the ground below
+the centre of the body.
+
+Errors are a function of vehicle, tick, sensor and draw alone. A sensor's random numbers have a key
+of their own, mixed from that of the vehicle and the stream of the sensor, so that no two sensors
+share numbers and another sensor in the rig changes none.
+"""
 
 from __future__ import annotations
+
+import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.math.geometry import TWO_PI
+from cavmarl.core.math.rng import mix, quick_uniform
 from cavmarl.core.numba import kernel
+from cavmarl.core.records import record
 from cavmarl.core.records.arrays import Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
-from cavmarl.sensors.kernels.rig_noise import is_lost
-from cavmarl.sensors.kernels.rig_schedule import Due, SensorSchedule, stamp_of
 
-POSE = np.dtype(
-    [
-        ("id", np.int64),  # of the vehicle; -1: none
-        ("x", np.float64),  # as in VEHICLE
-        ("y", np.float64),
-        ("z", np.float64),
-        ("heading", np.float64),
-        ("pitch", np.float64),
-        ("speed", np.float64),
-        ("accel", np.float64),
-        ("yaw_rate", np.float64),
-        ("steering", np.float64),
-        ("distance_m", np.float64),
-        ("events", np.int32),
-    ],
-    align=True,
+# Numbers of draws, apart from those of the samples' numbers.
+_BIAS = 1 << 28
+_DROPOUT = 1 << 29
+
+
+class Noise(NamedTuple):
+    """How wrong a sensor is."""
+
+    stream: np.uint64
+    noise: NDArray[np.float64]  # (channels,) standard deviation of each sample
+    bias: NDArray[np.float64]  # (channels,) of what stays the same for a vehicle's episode
+
+
+@kernel
+def sensor_key(row: np.void, stream: np.uint64) -> np.uint64:
+    """The key of a sensor's random numbers on a vehicle."""
+    return mix(row["rng_key"] ^ stream)
+
+
+@kernel
+def gauss(key: np.uint64, vehicle: int, tick: int, draw: int) -> float:
+    """A standard normal number.
+
+    Box and Muller: "A note on the generation of random normal deviates", 1958.
+
+    `draw`: which one of this tick, below 2**30.
+    """
+    radius = math.sqrt(-2.0 * math.log(1.0 - quick_uniform(key, vehicle, tick, 2 * draw)))
+    return radius * math.cos(TWO_PI * quick_uniform(key, vehicle, tick, 2 * draw + 1))
+
+
+@kernel
+def error_of(
+    noise: Noise, key: np.uint64, vehicle: int, tick: int, draw: int, channel: int
+) -> float:
+    """What is added to a number that a sensor measures.
+
+    `draw`: number of the measured number among those of this tick, below 2**28. `channel`: which
+    one it belongs to.
+    """
+    error = 0.0
+    if noise.noise[channel] > 0.0:
+        error = noise.noise[channel] * gauss(key, vehicle, tick, draw)
+    if noise.bias[channel] > 0.0:
+        error += noise.bias[channel] * gauss(key, vehicle, 0, _BIAS + channel)
+    return error
+
+
+@kernel
+def add_errors(
+    noise: Noise, row: np.void, tick: int, sample: int, out: NDArray[np.float64]
+) -> None:
+    """Add to each channel of a sample (channels,) its error.
+
+    `row`: VEHICLE that carries it. `sample`: its number among those of the tick. `out`: the sample,
+    one number a channel.
+    """
+    key = sensor_key(row, noise.stream)
+    for channel in range(out.size):
+        draw = sample * out.size + channel
+        out[channel] += error_of(noise, key, row["id"], tick, draw, channel)
+
+
+@kernel
+def is_lost(row: np.void, stream: np.uint64, tick: int, sample: int, dropout: float) -> bool:
+    """Whether a sample of a tick is lost, with the chance of `dropout`."""
+    if dropout <= 0.0:
+        return False
+    key = sensor_key(row, stream)
+    return quick_uniform(key, row["id"], tick, _DROPOUT + sample) < dropout
+
+
+class Mount(NamedTuple):
+    """A place and a direction in the vehicle's frame."""
+
+    place: NDArray[np.float64]  # (3,) m
+    turn: NDArray[np.float64]  # (3, 3) a vector of the sensor's frame in the vehicle's frame
+
+
+@kernel
+def rotation(yaw: float, pitch: float, roll: float, out: NDArray[np.float64]) -> None:
+    """Write the matrix that turns a vector of the turned frame into the one around it.
+
+    `pitch`: rad, positive upwards. `roll`: rad, positive with the left side up. `out`: (3, 3),
+    overwritten; its columns are the turned frame's axes.
+    """
+    cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
+    cos_pitch, sin_pitch = math.cos(pitch), math.sin(pitch)
+    cos_roll, sin_roll = math.cos(roll), math.sin(roll)
+    out[0, 0] = cos_yaw * cos_pitch
+    out[1, 0] = sin_yaw * cos_pitch
+    out[2, 0] = sin_pitch
+    out[0, 1] = -cos_yaw * sin_pitch * sin_roll - sin_yaw * cos_roll
+    out[1, 1] = -sin_yaw * sin_pitch * sin_roll + cos_yaw * cos_roll
+    out[2, 1] = cos_pitch * sin_roll
+    out[0, 2] = -cos_yaw * sin_pitch * cos_roll + sin_yaw * sin_roll
+    out[1, 2] = -sin_yaw * sin_pitch * cos_roll - cos_yaw * sin_roll
+    out[2, 2] = cos_pitch * cos_roll
+
+
+@kernel
+def turned(matrix: NDArray[np.float64], x: float, y: float, z: float) -> tuple[float, float, float]:
+    """A vector, turned by a matrix (3, 3)."""
+    return (
+        matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z,
+        matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z,
+        matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z,
+    )
+
+
+@kernel
+def sensor_pose(
+    row: np.void, mount: Mount, body: NDArray[np.float64], axes: NDArray[np.float64]
+) -> tuple[float, float, float]:
+    """Where a sensor is in the world, and how it is turned.
+
+    Args:
+        row: VEHICLE that carries it.
+        mount: on the vehicle.
+        body: (3, 3), overwritten: a vector of the vehicle's frame in the world.
+        axes: (3, 3), overwritten: a vector of the sensor's frame in the world.
+
+    Returns:
+        x, y, z in m.
+    """
+    rotation(row["heading"], row["pitch"], 0.0, body)
+    for column in range(3):
+        axes[0, column], axes[1, column], axes[2, column] = turned(
+            body, mount.turn[0, column], mount.turn[1, column], mount.turn[2, column]
+        )
+    x, y, z = turned(body, mount.place[0], mount.place[1], mount.place[2])
+    return row["x"] + x, row["y"] + y, row["z"] + z
+
+
+class SensorSchedule(NamedTuple):
+    """The rate of a sensor: `samples` in `ticks` ticks, in lowest terms."""
+
+    samples: int
+    ticks: int
+    phase: int  # tick of sample 0
+    ticks_per_step: int
+    slots: int  # the most samples in a step
+
+
+class Due(NamedTuple):
+    """What one sensor has to deliver in the present tick of each world."""
+
+    num: NDArray[np.int64]  # (W,) samples
+    first: NDArray[np.int64]  # (W,) number of the first one, since the reset
+    slot: NDArray[np.int64]  # (W,) where it is written; the last of a step lies in the last slot
+
+
+@kernel
+def taken(schedule: SensorSchedule, tick: int) -> int:
+    """How many samples are taken at or before a tick."""
+    since = tick - schedule.phase
+    if since < 0:
+        return 0
+    return since * schedule.samples // schedule.ticks + 1
+
+
+@kernel
+def stamp_of(schedule: SensorSchedule, number: int, tick: int, tick_s: float) -> float:
+    """The time of a sample in s since the reset, delivered by `tick`.
+
+    Of a sensor with several samples a tick it may lie between two; all others sense the state of
+    the tick, and that is what the stamp says.
+    """
+    if schedule.samples <= schedule.ticks:
+        return tick * tick_s
+    return (schedule.phase + number * schedule.ticks / schedule.samples) * tick_s
+
+
+@kernel
+def call_due(
+    schedule: SensorSchedule, ticks: NDArray[np.int64], chosen: NDArray[np.bool_], due: Due
+) -> bool:
+    """Write what is due in the chosen worlds, and nothing for the others.
+
+    `ticks`: (W,) since each world's reset.
+
+    Returns whether anything is.
+    """
+    found = False
+    for w in range(ticks.size):
+        due.num[w] = 0
+        if not chosen[w]:
+            continue
+        tick = ticks[w]
+        before = taken(schedule, tick - 1)
+        count = taken(schedule, tick) - before
+        if count > 0:
+            step_end = -(-tick // schedule.ticks_per_step) * schedule.ticks_per_step
+            due.num[w] = count
+            due.first[w] = before
+            due.slot[w] = schedule.slots - (taken(schedule, step_end) - before)
+            found = True
+    return found
+
+
+POSE = record(
+    ("id", np.int64),  # of the vehicle; -1: none
+    ("x", np.float64),  # as in VEHICLE
+    ("y", np.float64),
+    ("z", np.float64),
+    ("heading", np.float64),
+    ("pitch", np.float64),
+    ("speed", np.float64),
+    ("accel", np.float64),
+    ("yaw_rate", np.float64),
+    ("steering", np.float64),
+    ("distance_m", np.float64),
+    ("events", np.int32),
 )
 
 
@@ -78,17 +293,9 @@ def deliver(
 ) -> None:
     """Stamp and count the samples that owned agents have got in this tick; lose some of them.
 
-    Args:
-        worlds: committed rows.
-        schedule: of the sensor.
-        due: in this tick.
-        tick_s: seconds a tick.
-        stream: of the sensor's random numbers.
-        dropout: chance that a sample is lost.
-        stamp_s: (W, A, S) in s since the reset.
-        lost: (W, A, S) which ones are lost.
-        fresh: (W, A) samples of this step, up to now.
-        data: (W, A, S, bytes); of lost samples all zeros.
+    `stream`: of the sensor's random numbers. `dropout`: chance that a sample is lost. `stamp_s`:
+    (W, A, S) in s since the reset. `lost`: (W, A, S) which ones are lost. `fresh`: (W, A) samples
+    of this step, up to now. `data`: (W, A, S, bytes); of lost samples all zeros.
     """
     for w in range(worlds.ticks.size):
         if due.num[w] == 0:

@@ -1,30 +1,175 @@
-"""What cameras and bird's-eye grids on agents' vehicles see."""
+"""What cameras and bird's-eye grids on agents' vehicles see.
+
+In a bird's-eye grid, later ones cover earlier ones: ground, roads, lane lines, buildings, bodies in
+the order of their ids. It is that of a sensor that looks along its own x axis; row 0 is farthest
+ahead, column 0 farthest to the left.
+"""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.math.neighbors import Grid, fill_grid
+from cavmarl.core.math.spans import row_span
 from cavmarl.core.numba import kernel
 from cavmarl.core.records.arrays import Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.roads.kernels.backdrop_pieces import Backdrop
-from cavmarl.sensors.kernels.birds_eye import BirdsEye, look_down
-from cavmarl.sensors.kernels.camera_picture import find_faces, look
-from cavmarl.sensors.kernels.faces import CameraPose, PixelRows
-from cavmarl.sensors.kernels.panorama import Panorama, gather
-from cavmarl.sensors.kernels.pixels import (
+from cavmarl.sensors.kernels.camera_picture import (
     LEAST_DEPTH_M,
+    find_faces,
+    look,
     measure_depths,
     write_classes,
     write_colours,
     write_halves,
 )
-from cavmarl.sensors.kernels.rig_noise import Noise, error_of, sensor_key
-from cavmarl.sensors.kernels.rig_schedule import Due
+from cavmarl.sensors.kernels.faces import CameraPose, PixelRows
+from cavmarl.sensors.kernels.panorama import (
+    BUILDING,
+    GROUND,
+    LANE_LINE,
+    ROAD,
+    Counts,
+    Panorama,
+    gather,
+)
+from cavmarl.sensors.kernels.rig_frames import Due, Noise, error_of, sensor_key
+
+
+class BirdsEye(NamedTuple):
+    """Where the grid lies in the vehicle's frame, and room."""
+
+    x: float  # of the sensor, m
+    y: float
+    cos: float  # of its yaw
+    sin: float
+    ahead_m: float  # from the sensor to the upper edge of the grid
+    left_m: float  # and to the left one
+    cell_m: float
+    edges: NDArray[np.float64]  # (4, 4)
+    face: NDArray[np.float64]  # (4, 2) corners in the grid, in cells: column, row
+
+
+def make_birds_eye(
+    mount: NDArray[np.float64], ahead_m: float, left_m: float, cell_m: float
+) -> BirdsEye:
+    """A grid.
+
+    Args:
+        mount: (3, 4) axes and place in the vehicle's frame, not tilted.
+        ahead_m: from the sensor to the upper edge.
+        left_m: from the sensor to the left edge.
+        cell_m: side of a cell.
+    """
+    return BirdsEye(
+        float(mount[0, 3]),
+        float(mount[1, 3]),
+        float(mount[0, 0]),
+        float(mount[1, 0]),
+        ahead_m,
+        left_m,
+        cell_m,
+        np.zeros((4, 4)),
+        np.zeros((4, 2)),
+    )
+
+
+@kernel
+def _set_corner(grid: BirdsEye, c: int, x: float, y: float) -> None:
+    """Bring a corner from the vehicle's frame into the grid."""
+    dx = x - grid.x
+    dy = y - grid.y
+    grid.face[c, 0] = (grid.left_m - (dy * grid.cos - dx * grid.sin)) / grid.cell_m
+    grid.face[c, 1] = (grid.ahead_m - (dx * grid.cos + dy * grid.sin)) / grid.cell_m
+
+
+@kernel
+def _fill(grid: BirdsEye, semantic: int, out: NDArray[np.uint8]) -> None:
+    """Fill the cells whose centres lie in the convex quad of the set corners."""
+    height, width = out.shape
+    face = grid.face
+    top = min(min(face[0, 1], face[1, 1]), min(face[2, 1], face[3, 1]))
+    bottom = max(max(face[0, 1], face[1, 1]), max(face[2, 1], face[3, 1]))
+    left = min(min(face[0, 0], face[1, 0]), min(face[2, 0], face[3, 0]))
+    right = max(max(face[0, 0], face[1, 0]), max(face[2, 0], face[3, 0]))
+    if not (top < height and bottom > 0.0 and left < width and right > 0.0):
+        return
+    area = 0.0
+    for c in range(4):
+        d = c + 1 if c < 3 else 0
+        area += face[c, 0] * face[d, 1] - face[d, 0] * face[c, 1]
+    sign = math.copysign(1.0, area)
+    for c in range(4):
+        d = c + 1 if c < 3 else 0
+        by_column = -sign * (face[d, 1] - face[c, 1])
+        grid.edges[c, 0] = sign * (face[c, 0] * face[d, 1] - face[d, 0] * face[c, 1])
+        grid.edges[c, 1] = by_column
+        grid.edges[c, 2] = sign * (face[d, 0] - face[c, 0])
+        grid.edges[c, 3] = 1.0 / by_column if by_column != 0.0 else 0.0
+    for j in range(max(math.floor(top), 0), min(math.ceil(bottom), height)):
+        begin, end = row_span(grid.edges, 4, j, width)
+        out[j, begin:end] = semantic
+
+
+@kernel
+def _fill_line(
+    grid: BirdsEye,
+    strip: NDArray[np.float64],
+    a: int,
+    b: int,
+    half_m: float,
+    out: NDArray[np.uint8],
+) -> None:
+    dx = strip[b, 0] - strip[a, 0]
+    dy = strip[b, 1] - strip[a, 1]
+    length = math.hypot(dx, dy)
+    if length == 0.0:
+        return
+    x = -dy / length * half_m
+    y = dx / length * half_m
+    _set_corner(grid, 0, strip[a, 0] - x, strip[a, 1] - y)
+    _set_corner(grid, 1, strip[b, 0] - x, strip[b, 1] - y)
+    _set_corner(grid, 2, strip[b, 0] + x, strip[b, 1] + y)
+    _set_corner(grid, 3, strip[a, 0] + x, strip[a, 1] + y)
+    _fill(grid, LANE_LINE, out)
+
+
+@kernel
+def look_down(grid: BirdsEye, panorama: Panorama, counts: Counts, out: NDArray[np.uint8]) -> None:
+    """Fill the grid.
+
+    `grid`: where it lies. `panorama`: what stands around the vehicle, prisms ordered by id. `out`:
+    (rows, columns), overwritten.
+    """
+    out[:] = GROUND
+    for k in range(counts.strips):
+        for c in range(4):
+            _set_corner(grid, c, panorama.strips[k, c, 0], panorama.strips[k, c, 1])
+        _fill(grid, ROAD, out)
+    # As wide as a cell's diagonal reaches: a line shows in every row that it crosses.
+    half_m = 0.5 * grid.cell_m
+    for k in range(counts.strips):
+        if panorama.lined[k] > 0.0:
+            _fill_line(grid, panorama.strips[k], 0, 3, half_m, out)
+            _fill_line(grid, panorama.strips[k], 1, 2, half_m, out)
+    for k in range(counts.roofs):
+        for c in range(4):
+            _set_corner(grid, c, panorama.roofs[k, c, 0], panorama.roofs[k, c, 1])
+        _fill(grid, BUILDING, out)
+    for n in range(counts.prisms):
+        prism = panorama.prisms[panorama.order[n]]
+        for c in range(4):
+            x = prism["half_length"] if c in (0, 3) else -prism["half_length"]
+            y = prism["half_width"] if c in (0, 1) else -prism["half_width"]
+            cos = prism["cos"]
+            sin = prism["sin"]
+            _set_corner(grid, c, prism["x"] + x * cos - y * sin, prism["y"] + x * sin + y * cos)
+        _fill(grid, prism["semantic"], out)
 
 
 @kernel
@@ -41,7 +186,6 @@ def camera_reach_m(camera: CameraPose, width: int, height: int) -> float:
 
 @kernel
 def _is_noisy(noise: Noise) -> bool:
-    """Whether any channel is wrong at all."""
     for channel in range(noise.noise.size):
         if noise.noise[channel] > 0.0 or noise.bias[channel] > 0.0:
             return True
@@ -49,7 +193,7 @@ def _is_noisy(noise: Noise) -> bool:
 
 
 @kernel
-def take_depths(
+def take_pictures(
     worlds: Worlds,
     grid: Grid,
     backdrop: Backdrop,
@@ -59,25 +203,20 @@ def take_depths(
     camera: CameraPose,
     panorama: Panorama,
     picture: PixelRows,
-    room: NDArray[np.float32],
-    room_bits: NDArray[np.uint32],
-    data: NDArray[np.uint16],
+    room: NDArray[np.float32] | None,
+    room_bits: NDArray[np.uint32] | None,
+    palette: NDArray[np.float64] | None,
+    classes: bool | None,
+    data: NDArray[np.unsignedinteger],
 ) -> None:
-    """Write the depth pictures that are due of the owned agents.
+    """Write the pictures that are due of the owned agents: depths, colours, or classes.
 
-    Args:
-        worlds: committed rows.
-        grid: room for the index of one world.
-        backdrop: of the map.
-        due: in this tick.
-        lines: (W, agents, 2) rows [first, last) of each agent's picture that are written.
-        noise: of the sensor; what is as far as the range has none.
-        camera: the camera.
-        panorama: room.
-        picture: room.
-        room: (rows of `picture`, W) room.
-        room_bits: the same memory.
-        data: (W, agents, S, H, W) float16 as bits, m.
+    `lines`: (W, agents, 2) rows [first, last) of each agent's picture that are written. `noise`: of
+    depths, what is as far as the range has none. `room`: (rows of `picture`, W), and `room_bits`,
+    the same memory, for depths only. `palette`: for colours only. `classes`: True for them only.
+    `data`: (W, agents, S, H, W) float16 as bits, m; or uint8, (…, 3) for colours.
+
+    Numba leaves out the branches of what is None.
     """
     band, width = picture.face.shape
     reach_m = camera_reach_m(camera, width, picture.height)
@@ -93,26 +232,29 @@ def take_depths(
                 continue
             counts = gather(rows, i, grid, backdrop, reach_m, True, panorama)
             num = find_faces(camera, panorama, counts, picture)
-            out = data[w, row["agent"], due.slot[w]]
+            shown = data[w, row["agent"], due.slot[w]]
             begin, end = lines[w, row["agent"], 0], lines[w, row["agent"], 1]
             for first in range(begin, end, band):
                 last = min(first + band, end)
                 look(camera, picture, num, first, last)
-                depths = room[: last - first]
-                measure_depths(camera, picture, first, depths)
-                if noisy:
-                    _add_noise(noise, row, worlds.ticks[w], camera.range_m, first, depths)
-                write_halves(room_bits, out[first:last])
+                out = shown[first:last]
+                if room is not None and room_bits is not None:
+                    depths = room[: last - first]
+                    measure_depths(camera, picture, first, depths)
+                    if noisy:
+                        _add_noise(noise, row, worlds.ticks[w], camera.range_m, first, depths)
+                    write_halves(room_bits, out)
+                if palette is not None:
+                    write_colours(camera, picture, first, palette, out)
+                    if noisy:
+                        _add_colour_noise(noise, row, worlds.ticks[w], first, out)
+                if classes is not None:
+                    write_classes(picture, out)
 
 
 @kernel
 def _add_noise(
-    noise: Noise,
-    row: np.void,
-    tick: int,
-    range_m: float,
-    first: int,
-    depths: NDArray[np.float32],
+    noise: Noise, row: np.void, tick: int, range_m: float, first: int, depths: NDArray[np.float32]
 ) -> None:
     """Make depths (rows, W) less than the range wrong, from a centimetre to the range.
 
@@ -125,79 +267,6 @@ def _add_noise(
             if depths[j, i] < range_m:
                 error = error_of(noise, key, row["id"], tick, (first + j) * width + i, 0)
                 depths[j, i] = min(max(depths[j, i] + error, LEAST_DEPTH_M), range_m)
-
-
-@kernel
-def take_classes(
-    worlds: Worlds,
-    grid: Grid,
-    backdrop: Backdrop,
-    due: Due,
-    lines: NDArray[np.int32],
-    camera: CameraPose,
-    panorama: Panorama,
-    picture: PixelRows,
-    data: NDArray[np.uint8],
-) -> None:
-    """Write the semantic pictures (W, agents, S, H, W) that are due; see `take_depths`."""
-    band, width = picture.face.shape
-    reach_m = camera_reach_m(camera, width, picture.height)
-    for w in range(worlds.ticks.size):
-        if due.num[w] == 0:
-            continue
-        rows = worlds.rows[w]
-        fill_grid(rows, worlds.num_rows[w], grid)
-        for i in range(worlds.num_owned[w]):
-            row = rows[i]
-            if row["driver"] != DRIVER_AGENT:
-                continue
-            counts = gather(rows, i, grid, backdrop, reach_m, True, panorama)
-            num = find_faces(camera, panorama, counts, picture)
-            out = data[w, row["agent"], due.slot[w]]
-            begin, end = lines[w, row["agent"], 0], lines[w, row["agent"], 1]
-            for first in range(begin, end, band):
-                last = min(first + band, end)
-                look(camera, picture, num, first, last)
-                write_classes(picture, out[first:last])
-
-
-@kernel
-def take_colours(
-    worlds: Worlds,
-    grid: Grid,
-    backdrop: Backdrop,
-    due: Due,
-    lines: NDArray[np.int32],
-    noise: Noise,
-    camera: CameraPose,
-    panorama: Panorama,
-    picture: PixelRows,
-    palette: NDArray[np.float64],
-    data: NDArray[np.uint8],
-) -> None:
-    """Write the coloured pictures (W, agents, S, H, W, 3) that are due; see `take_depths`."""
-    band, width = picture.face.shape
-    reach_m = camera_reach_m(camera, width, picture.height)
-    noisy = _is_noisy(noise)
-    for w in range(worlds.ticks.size):
-        if due.num[w] == 0:
-            continue
-        rows = worlds.rows[w]
-        fill_grid(rows, worlds.num_rows[w], grid)
-        for i in range(worlds.num_owned[w]):
-            row = rows[i]
-            if row["driver"] != DRIVER_AGENT:
-                continue
-            counts = gather(rows, i, grid, backdrop, reach_m, True, panorama)
-            num = find_faces(camera, panorama, counts, picture)
-            out = data[w, row["agent"], due.slot[w]]
-            begin, end = lines[w, row["agent"], 0], lines[w, row["agent"], 1]
-            for first in range(begin, end, band):
-                last = min(first + band, end)
-                look(camera, picture, num, first, last)
-                write_colours(camera, picture, first, palette, out[first:last])
-                if noisy:
-                    _add_colour_noise(noise, row, worlds.ticks[w], first, out[first:last])
 
 
 @kernel
@@ -226,7 +295,7 @@ def fill_grids(
     panorama: Panorama,
     data: NDArray[np.uint8],
 ) -> None:
-    """Write the bird's-eye grids (W, agents, S, rows, columns) that are due; see `take_depths`.
+    """Write the bird's-eye grids (W, agents, S, rows, columns) that are due; see `take_pictures`.
 
     `reach_m` is the distance from the vehicle's place to the farthest corner of the grid.
     """

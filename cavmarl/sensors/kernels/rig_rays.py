@@ -1,4 +1,9 @@
-"""What lidars and radars on agents' vehicles sense."""
+"""What lidars and radars on agents' vehicles sense.
+
+A target of a radar is a body or a building of which a ray of the fan meets something first; its
+echo is the nearest of those. The radial speed is that of the target's centre less that of the
+sensor, along the ray: positive where the distance grows. The ground and clutter give no echo.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +14,99 @@ from numpy.typing import NDArray
 
 from cavmarl.core.math.neighbors import Grid, fill_grid
 from cavmarl.core.numba import kernel
+from cavmarl.core.records import record
 from cavmarl.core.records.arrays import Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.roads.kernels.backdrop_pieces import Backdrop
 from cavmarl.sensors.kernels.panorama import Panorama, gather
-from cavmarl.sensors.kernels.radar_targets import detect
-from cavmarl.sensors.kernels.ray_fan import Fan, cast
-from cavmarl.sensors.kernels.rig_noise import Noise, error_of, sensor_key
-from cavmarl.sensors.kernels.rig_schedule import Due
+from cavmarl.sensors.kernels.ray_fan import WALL_HIT, Fan, cast
+from cavmarl.sensors.kernels.rig_frames import Due, Noise, error_of, sensor_key
+
+TARGET = record(
+    ("range", np.float64),  # m
+    ("azimuth", np.float64),  # rad in the sensor's frame, positive to the left
+    ("speed", np.float64),  # m/s, positive away
+    ("body", np.int64),  # 1: a body, 0: a building
+    ("id", np.int64),  # of the vehicle, or number of the building
+)
+
+
+@kernel
+def _radial_speed(fan: Fan, panorama: Panorama, ego: np.void, hit: np.void, a: int) -> float:
+    """Of what column `a` has met."""
+    ray_x = fan.rays[a, 0, 0]
+    ray_y = fan.rays[a, 0, 1]
+    # The sensor turns with the vehicle, about its centre.
+    x = -(ego["speed"] - ego["yaw_rate"] * fan.mount[1, 3])
+    y = -(ego["yaw_rate"] * fan.mount[0, 3])
+    if hit["what"] >= 0:
+        prism = panorama.prisms[hit["what"]]
+        x += prism["speed"] * prism["cos"]
+        y += prism["speed"] * prism["sin"]
+    speed: float = x * ray_x + y * ray_y
+    return speed
+
+
+@kernel
+def _place_of(targets: NDArray[np.void], found: int, body: int, number: int) -> int:
+    """Where a target is in the list; `found` if it is new."""
+    for k in range(found - 1, -1, -1):
+        if targets[k]["body"] == body and targets[k]["id"] == number:
+            return k
+    return found
+
+
+@kernel
+def _before(target: np.void, other: np.void) -> bool:
+    """Whether a target comes before another: by range, then by kind and number."""
+    if target["range"] != other["range"]:
+        return bool(target["range"] < other["range"])
+    if target["body"] != other["body"]:
+        return bool(target["body"] > other["body"])
+    return bool(target["id"] < other["id"])
+
+
+@kernel
+def detect(
+    fan: Fan,
+    panorama: Panorama,
+    ego: np.void,
+    hits: NDArray[np.void],
+    targets: NDArray[np.void],
+    order: NDArray[np.int32],
+) -> int:
+    """List what the rays have met, nearest first.
+
+    `fan`: of one channel. `hits`: HIT (A, 1), from `cast`. `targets`: TARGET (A,), overwritten up
+    to the returned number, in no order. `order`: (A,) likewise: which target is the next nearest.
+
+    Returns how many there are.
+    """
+    found = 0
+    for a in range(hits.shape[0]):
+        hit = hits[a, 0]
+        wall = WALL_HIT - hit["what"]
+        if hit["what"] < 0 and wall < 0:
+            continue
+        body = 1 if hit["what"] >= 0 else 0
+        number = hit["id"] if body == 1 else panorama.walls[wall]["building"]
+        place = _place_of(targets, found, body, number)
+        target = targets[place]
+        if place == found or hit["distance"] < target["range"]:
+            target["range"] = hit["distance"]
+            target["azimuth"] = fan.first_rad + a * fan.step_rad
+            target["speed"] = _radial_speed(fan, panorama, ego, hit, a)
+            target["body"] = body
+            target["id"] = number
+        found = max(found, place + 1)
+    for k in range(found):
+        place = k
+        while place > 0 and _before(targets[k], targets[order[place - 1]]):
+            order[place] = order[place - 1]
+            place -= 1
+        order[place] = k
+    return found
+
 
 # Rays that are written together, a cache line of them: with 1,024 or more in a layer the same place
 # of all layers is kept in one set of the cache, which does not hold them.
@@ -44,17 +134,9 @@ def measure_lidar(
 ) -> None:
     """Write what is due of the owned agents.
 
-    Args:
-        worlds: committed rows.
-        grid: room for the index of one world.
-        backdrop: of the map.
-        due: in this tick.
-        lines: (W, agents, 2) columns [first, last) of each agent's rays that are written.
-        noise: of the sensor; what meets nothing has none.
-        fan: its rays.
-        panorama: room.
-        hits: HIT (A, E), room.
-        data: (W, agents, S, E, A) distances in m.
+    `lines`: (W, agents, 2) columns [first, last) of each agent's rays that are written. `noise`: of
+    the sensor; what meets nothing has none. `hits`: HIT (A, E), room. `data`: (W, agents, S, E, A)
+    distances in m.
     """
     reach_m = reach_of(fan)
     noisy = noise.noise[0] > 0.0 or noise.bias[0] > 0.0
@@ -122,18 +204,9 @@ def measure_radar(
 ) -> None:
     """Write what is due of the owned agents.
 
-    Args:
-        worlds: committed rows.
-        grid: room for the index of one world.
-        backdrop: of the map.
-        due: in this tick.
-        noise: of the sensor.
-        fan: its rays, of one channel.
-        panorama: room.
-        hits: HIT (A, 1), room.
-        targets: TARGET (A,), room.
-        order: (A,), room.
-        data: (W, agents, S, targets, 3) range in m, azimuth in rad, radial speed in m/s.
+    `fan`: its rays, of one channel. `hits`: HIT (A, 1), room. `targets`: TARGET (A,), room.
+    `order`: (A,), room. `data`: (W, agents, S, targets, 3) range in m, azimuth in rad, radial speed
+    in m/s.
     """
     reach_m = reach_of(fan)
     for w in range(worlds.ticks.size):

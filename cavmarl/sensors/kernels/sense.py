@@ -1,24 +1,240 @@
-"""The end of a step: what the agents of one shard observe, and their terms."""
+"""The end of a step: what the agents of one shard observe, and their terms.
+
+One function a sensor: it writes its features, scaled numbers in [-1, 1], from position `at` on. The
+scales stand here; the names and meanings of the features in `sensors/observed/ego_features.py`.
+"""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.neighbors import Grid, fill_grid
+from cavmarl.core.math.geometry import lane_pose, wrap_angle
+from cavmarl.core.math.neighbors import Grid, fill_grid, nearest_bodies
+from cavmarl.core.math.scalars import clamp
 from cavmarl.core.numba import kernel
 from cavmarl.core.records.arrays import Outputs, RoadArrays, Sensors, Travel, Worlds
-from cavmarl.core.records.codes import DRIVER_AGENT, EVENTS_THAT_END
-from cavmarl.rewards.kernels.terms import write_terms
-from cavmarl.sensors.kernels.observing import (
-    observe_ego,
-    observe_lidar,
-    observe_neighbors,
-    observe_route,
-    observe_signal,
+from cavmarl.core.records.codes import (
+    DRIVER_AGENT,
+    EVENTS_THAT_END,
+    SIGNAL_GREEN_MAJOR,
+    SIGNAL_GREEN_MINOR,
+    SIGNAL_NONE,
+    SIGNAL_OFF,
+    SIGNAL_RED,
+    SIGNAL_RED_YELLOW,
+    SIGNAL_STOP_THEN_GO,
+    SIGNAL_YELLOW_MAJOR,
+    SIGNAL_YELLOW_MINOR,
 )
+from cavmarl.driving.kernels.junctions import link_signal
+from cavmarl.driving.kernels.signal_timing import time_to_change
+from cavmarl.rewards.kernels.terms import write_terms
+from cavmarl.sensors.kernels.lidar_fan import lidar
 from cavmarl.sensors.kernels.observing_lanes import observe_lanes
-from cavmarl.sensors.kernels.stacking import has_entered, newest_frame, shift_frames
+from cavmarl.sensors.kernels.output_reset import has_entered, newest_frame, shift_frames
+
+EGO_FEATURES = 13
+NEIGHBOR_FEATURES = 7
+SIGNAL_FEATURES = 6
+
+SPEED_SCALE = 40.0  # m/s
+ACCEL_SCALE = 10.0  # m/s²
+STEERING_SCALE = math.pi / 4.0
+YAW_SCALE = 1.0  # rad/s
+OFFSET_SCALE = 4.0  # m
+ROOM_SCALE = 200.0  # m
+TO_GO_SCALE = 1000.0  # m
+HALF_S = 5.0  # a time of this length is a soonness of 0.5
+SLOWEST_MPS = 1.0  # a standing vehicle is taken to come on with
+
+
+@kernel
+def _unit(value: float) -> float:
+    return clamp(value, -1.0, 1.0)
+
+
+@kernel
+def _soonness(time: float) -> float:
+    """1 now, 0.5 in `HALF_S`, 0 in a long time: seconds count where they are few."""
+    return HALF_S / (HALF_S + time)
+
+
+@kernel
+def observe_ego(
+    roads: RoadArrays, plans: NDArray[np.void], row: np.void, out: NDArray[np.float32]
+) -> None:
+    """The vehicle itself, its lane and what its plan asks of it."""
+    lane = roads.lanes[row["lane"]]
+    step = plans[row["goal"], row["lane"]]
+    _, _, _, cos, sin, _ = lane_pose(
+        roads.points, lane["first_point"], lane["num_points"], row["s"]
+    )
+    error = wrap_angle(row["heading"] - math.atan2(sin, cos))
+    out[0] = _unit(row["speed"] / SPEED_SCALE)
+    out[1] = _unit(row["accel"] / ACCEL_SCALE)
+    out[2] = _unit(row["steering"] / STEERING_SCALE)
+    out[3] = _unit(row["yaw_rate"] / YAW_SCALE)
+    out[4] = _unit(row["d"] / OFFSET_SCALE)
+    out[5] = error / math.pi
+    out[6] = _unit(lane["speed_mps"] / SPEED_SCALE)
+    out[7] = 1.0 if lane["left"] >= 0 else 0.0
+    out[8] = 1.0 if lane["right"] >= 0 else 0.0
+    out[9] = step["change"]
+    out[10] = _unit(max(step["room"] - row["s"], 0.0) / ROOM_SCALE)
+    out[11] = _unit(max(row["to_go"], 0.0) / TO_GO_SCALE)
+    out[12] = _unit(row["target_speed"] / SPEED_SCALE)
+
+
+@kernel
+def observe_route(
+    roads: RoadArrays,
+    plans: NDArray[np.void],
+    row: np.void,
+    sensors: Sensors,
+    out: NDArray[np.float32],
+) -> None:
+    """Points of the way ahead in the ego frame; beyond the way's end its last point."""
+    cos_heading = math.cos(row["heading"])
+    sin_heading = math.sin(row["heading"])
+    scale = sensors.route_points * sensors.route_spacing_m
+    lane = row["lane"]
+    s = row["s"]
+    for k in range(sensors.route_points):
+        s += sensors.route_spacing_m
+        while s > roads.lanes[lane]["length_m"]:
+            following = plans[row["goal"], lane]["next"]
+            if following < 0:
+                s = roads.lanes[lane]["length_m"]
+                break
+            s -= roads.lanes[lane]["length_m"]
+            lane = following
+        here = roads.lanes[lane]
+        x, y, _, _, _, _ = lane_pose(roads.points, here["first_point"], here["num_points"], s)
+        dx = x - row["x"]
+        dy = y - row["y"]
+        at = sensors.route_at + 2 * k
+        out[at] = _unit((dx * cos_heading + dy * sin_heading) / scale)
+        out[at + 1] = _unit((dy * cos_heading - dx * sin_heading) / scale)
+
+
+@kernel
+def observe_neighbors(
+    rows: NDArray[np.void], i: int, grid: Grid, sensors: Sensors, out: NDArray[np.float32]
+) -> None:
+    """The nearest vehicles in the ego frame, nearest first; zeros where there are fewer."""
+    if sensors.neighbors == 0:
+        return
+    row = rows[i]
+    found = nearest_bodies(
+        grid,
+        i,
+        row["x"],
+        row["y"],
+        row["z"],
+        sensors.neighbors_range_m,
+        sensors.neighbors,
+        sensors.near_body,
+        sensors.near_squared,
+    )
+    cos_heading = math.cos(row["heading"])
+    sin_heading = math.sin(row["heading"])
+    for k in range(found):
+        other = grid.bodies[sensors.near_body[k]]
+        dx = other["x"] - row["x"]
+        dy = other["y"] - row["y"]
+        cos_other = other["cos"]
+        sin_other = other["sin"]
+        dvx = other["speed"] * cos_other - row["speed"] * cos_heading
+        dvy = other["speed"] * sin_other - row["speed"] * sin_heading
+        at = sensors.neighbors_at + NEIGHBOR_FEATURES * k
+        out[at] = 1.0
+        out[at + 1] = (dx * cos_heading + dy * sin_heading) / sensors.neighbors_range_m
+        out[at + 2] = (dy * cos_heading - dx * sin_heading) / sensors.neighbors_range_m
+        out[at + 3] = _unit((dvx * cos_heading + dvy * sin_heading) / SPEED_SCALE)
+        out[at + 4] = _unit((dvy * cos_heading - dvx * sin_heading) / SPEED_SCALE)
+        out[at + 5] = _unit(cos_other * cos_heading + sin_other * sin_heading)
+        out[at + 6] = _unit(sin_other * cos_heading - cos_other * sin_heading)
+
+
+@kernel
+def _gives_way(roads: RoadArrays, link: int, signal: int) -> bool:
+    """Whether a driver on this link has to give way to some other link now."""
+    if signal == SIGNAL_GREEN_MAJOR or signal == SIGNAL_OFF:
+        return False
+    first = roads.links[link]["first_conflict"]
+    for c in range(first, first + roads.links[link]["num_conflicts"]):
+        if roads.conflicts[c]["must_yield"]:
+            return True
+    return False
+
+
+@kernel
+def observe_signal(
+    roads: RoadArrays,
+    plans: NDArray[np.void],
+    controllers: NDArray[np.void],
+    row: np.void,
+    phase: NDArray[np.int32],
+    time: float,
+    tick_s: float,
+    sensors: Sensors,
+    out: NDArray[np.float32],
+) -> None:
+    """The next stop line on the way with a signal, or where another vehicle has the right of way.
+
+    `time` is that of the tick, in s since the world's reset.
+    """
+    at = sensors.signal_at
+    lane = row["lane"]
+    distance = -row["s"]
+    while True:
+        distance += roads.lanes[lane]["length_m"]
+        step = plans[row["goal"], lane]
+        if distance > sensors.signal_range_m or step["next"] < 0:
+            return
+        if step["link"] >= 0:
+            signal = link_signal(roads, step["link"], phase)
+            gives_way = _gives_way(roads, step["link"], signal)
+            if signal != SIGNAL_NONE or gives_way:
+                break
+        lane = step["next"]
+    out[at] = 1.0
+    out[at + 1] = distance / sensors.signal_range_m
+    if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW or signal == SIGNAL_STOP_THEN_GO:
+        out[at + 2] = 1.0
+    elif signal == SIGNAL_YELLOW_MINOR or signal == SIGNAL_YELLOW_MAJOR:
+        out[at + 3] = 1.0
+    elif signal == SIGNAL_GREEN_MAJOR or signal == SIGNAL_GREEN_MINOR:
+        out[at + 4] = 1.0
+    out[at + 5] = 1.0 if gives_way else 0.0
+    if sensors.signal_timing and signal != SIGNAL_NONE:
+        change = time_to_change(roads, controllers, step["link"], phase, time, tick_s)
+        out[at + 6] = _soonness(change)
+        out[at + 7] = _soonness(max(distance, 0.0) / max(row["speed"], SLOWEST_MPS))
+
+
+@kernel
+def observe_lidar(
+    rows: NDArray[np.void], i: int, grid: Grid, sensors: Sensors, out: NDArray[np.float32]
+) -> None:
+    """Distances along the rays, 1 where nothing is; then, if asked for, relative speeds."""
+    rays = sensors.lidar_rays
+    if rays == 0:
+        return
+    lidar(rows, i, grid, sensors.rays, sensors.lidar_range_m, sensors.echoes)
+    at = sensors.lidar_at
+    for k in range(rays):
+        echo = sensors.echoes[k]
+        # Most rays meet nothing: no division for these.
+        if echo["id"] < 0:
+            out[at + k] = 1.0
+            continue
+        out[at + k] = echo["distance"] / sensors.lidar_range_m
+        if sensors.lidar_speeds:
+            out[at + rays + k] = _unit(echo["speed"] / SPEED_SCALE)
 
 
 @kernel
@@ -40,17 +256,8 @@ def sense(
     does not end. `observe_optional` and `fill_stacks` complete the observations,
     `kernels.outputs` does what concerns the agents of all shards.
 
-    Args:
-        roads: the road arrays.
-        plans: PLAN (G, L), the ways of agents.
-        travel: the ways of all.
-        worlds: committed rows at the end of the step, ghosts among them.
-        grid: room for the spatial index of one world.
-        sensors: settings and room.
-        tick_s: seconds a tick.
-        ticks_per_step: ticks a step.
-        chosen: (W,) which worlds.
-        outputs: cleared where chosen; written at the indices of owned agents.
+    `worlds`: committed rows at the end of the step, ghosts among them. `outputs`: cleared where
+    chosen; written at the indices of owned agents.
     """
     step_s = tick_s * ticks_per_step
     for w in range(worlds.ticks.shape[0]):

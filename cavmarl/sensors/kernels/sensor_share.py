@@ -16,11 +16,8 @@ def gather_rows(
 ) -> None:
     """Put the owned rows of a zone behind those that are there.
 
-    Args:
-        worlds: committed rows.
-        of_agents: only those of agents; otherwise only the others.
-        rows: VEHICLE (W, C).
-        num_rows: (W,) how many there are.
+    `of_agents`: only those of agents; otherwise only the others. `num_rows`: (W,) how many there
+    are.
     """
     for w in range(worlds.ticks.size):
         at = num_rows[w]

@@ -10,7 +10,7 @@ from cavmarl.core.math.neighbors import Grid, cell_at, make_grid
 from cavmarl.core.records.codes import CLASS_PEDESTRIAN
 from cavmarl.roads.kernels.backdrop_pieces import Backdrop
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
-from cavmarl.sensors.kernels.semantics import SEMANTIC_OF_CLASS
+from cavmarl.sensors.kernels.panorama import SEMANTIC_OF_CLASS
 
 CELL_M = 32.0
 # Long straight strips are cut, so that what is near a vehicle is found by the middles of strips.
@@ -26,12 +26,9 @@ _CLASS_NAMES = {**dict(enumerate(VEHICLE_CLASSES)), CLASS_PEDESTRIAN: "pedestria
 def make_backdrop(network: RoadNetwork, types: NDArray[np.void]) -> Backdrop:
     """The backdrop of a map.
 
-    Args:
-        network: the roads and buildings.
-        types: VTYPE (num_types,) of the vehicles that can be seen.
+    `types`: VTYPE (num_types,) of the vehicles that can be seen.
 
-    Raises:
-        ConfigError: a class of vehicles that has no semantic class.
+    Raises ConfigError: a class of vehicles that has no semantic class.
     """
     strips, lined = lane_strips(network)
     walls, roofs = network.walls, network.roofs
@@ -79,9 +76,8 @@ def _index(corners: NDArray[np.float64]) -> tuple[Grid, NDArray[np.intp]]:
 def lane_strips(network: RoadNetwork) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The lanes of a map in convex pieces.
 
-    Returns:
-        (n, 4, 2) corners in m: right and left at the start, left and right at the end; pieces of
-        one lane share corners. (n,) 1 where the sides are lane lines, 0 inside junctions.
+    Returns (n, 4, 2) corners in m: right and left at the start, left and right at the end; pieces
+    of one lane share corners. (n,) 1 where the sides are lane lines, 0 inside junctions.
     """
     lanes, points = network.lanes, network.points
     of = np.repeat(np.arange(len(lanes)), lanes["num_points"])

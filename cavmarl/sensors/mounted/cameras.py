@@ -1,163 +1,131 @@
-"""Cameras: depth, classes and colours of what a pinhole camera shows."""
+"""Cameras: depth, classes and colours of what a pinhole camera shows; and the bird's-eye grid."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from cavmarl.config.rig import (
+    BevGridConfig,
     CameraConfig,
     DepthCameraConfig,
     RgbCameraConfig,
     SemanticCameraConfig,
 )
-from cavmarl.core.numba.repeated import repeated
-from cavmarl.sensors.kernels.camera_picture import make_camera, make_picture
-from cavmarl.sensors.kernels.panorama import make_panorama
-from cavmarl.sensors.kernels.pixels import colours
+from cavmarl.sensors.kernels.camera_picture import colours, make_camera, make_picture
+from cavmarl.sensors.kernels.faces import CameraPose
+from cavmarl.sensors.kernels.panorama import NUM_SEMANTICS
+from cavmarl.sensors.kernels.rig_frames import Due
 from cavmarl.sensors.kernels.rig_pictures import (
     camera_reach_m,
-    take_classes,
-    take_colours,
-    take_depths,
+    fill_grids,
+    make_birds_eye,
+    take_pictures,
 )
-from cavmarl.sensors.kernels.rig_schedule import Due
-from cavmarl.sensors.kernels.semantics import NUM_SEMANTICS
 from cavmarl.sensors.mounted.frames import SensorFrames
 from cavmarl.sensors.mounted.mount_transforms import mount_matrix
-from cavmarl.sensors.mounted.mounted_sensor import (
-    Bounds,
-    MountedSensor,
-    Platform,
-    SensedScene,
-    noise_of,
-)
+from cavmarl.sensors.mounted.mounted_sensor import Bounds, ImagingSensor, Platform, SensedScene
 
 C = TypeVar("C", bound=CameraConfig)
 
 
-class _Camera(MountedSensor[C]):
+def camera_of(config: CameraConfig) -> CameraPose:
+    """Where a camera is on its vehicle, and what it shows."""
+    fov_rad = math.radians(config.fov_deg)
+    return make_camera(mount_matrix(config), config.width, fov_rad, config.range_m)
+
+
+class _Camera(ImagingSensor[C]):
     """What all cameras have."""
+
+    kernel = take_pictures
+    written_as: ClassVar[DTypeLike] = np.uint8
+    _own: tuple[Any, ...]  # what is for its kind alone: room, the same as bits, palette, classes
 
     def __init__(self, name: str, config: C, platform: Platform) -> None:
         super().__init__(name, config, platform)
-        self._noise = noise_of(name, config)
-        self._camera = make_camera(
-            mount_matrix(config), config.width, math.radians(config.fov_deg), config.range_m
-        )
-        self._backdrop = platform.backdrop
-        self._panorama = make_panorama(platform.backdrop, platform.capacity)
+        self._camera = camera_of(config)
         self._picture = make_picture(config.width, config.height, self._panorama)
 
     @staticmethod
     def reach_m(config: C, largest_radius_m: float) -> float:
         """The range in the corners of the picture, to the nearest side of a body."""
-        camera = make_camera(
-            mount_matrix(config), config.width, math.radians(config.fov_deg), config.range_m
-        )
-        return camera_reach_m(camera, config.width, config.height) + largest_radius_m
+        reach_m = camera_reach_m(camera_of(config), config.width, config.height)
+        return reach_m + largest_radius_m
 
     @staticmethod
     def num_lines(config: C) -> int:
-        """The rows of the picture."""
         return config.height
+
+    def arguments(self, scene: SensedScene, due: Due, frames: SensorFrames) -> tuple[Any, ...]:
+        taken = (self._camera, self._panorama, self._picture, *self._own)
+        data = frames.data.view(self.written_as)
+        return (*self.view(scene, due), self.lines, self.noise, *taken, data)
 
 
 class DepthCamera(_Camera[DepthCameraConfig]):
     """Depth along the optical axis, as float16 in m."""
 
     dtype = np.float16
+    written_as = np.uint16
 
     def __init__(self, name: str, config: DepthCameraConfig, platform: Platform) -> None:
         super().__init__(name, config, platform)
-        self._room = np.zeros(self._picture.face.shape, np.float32)
-        self._take = repeated(take_depths)
+        room = np.zeros(self._picture.face.shape, np.float32)
+        self._own = (room, room.view(np.uint32), None, None)
 
     @staticmethod
     def bounds(config: DepthCameraConfig) -> Bounds:
-        """From 0 to the range."""
         return np.zeros(config.shape), np.full(config.shape, config.range_m)
-
-    def sense(self, scenes: Sequence[SensedScene], due: Due, frames: SensorFrames) -> None:
-        """Write what is due."""
-        for scene in scenes:
-            self._take(
-                scene.worlds,
-                scene.grid,
-                self._backdrop,
-                due,
-                self.lines,
-                self._noise,
-                self._camera,
-                self._panorama,
-                self._picture,
-                self._room,
-                self._room.view(np.uint32),
-                frames.data.view(np.uint16),
-            )
 
 
 class SemanticCamera(_Camera[SemanticCameraConfig]):
-    """The class of what each pixel shows; see `kernels.semantics`."""
+    """The class of what each pixel shows; see `kernels.panorama`."""
 
     dtype = np.uint8
-
-    def __init__(self, name: str, config: SemanticCameraConfig, platform: Platform) -> None:
-        super().__init__(name, config, platform)
-        self._take = repeated(take_classes)
+    _own = (None, None, None, True)
 
     @staticmethod
     def bounds(config: SemanticCameraConfig) -> Bounds:
-        """The classes."""
         return np.zeros(config.shape), np.full(config.shape, NUM_SEMANTICS - 1.0)
-
-    def sense(self, scenes: Sequence[SensedScene], due: Due, frames: SensorFrames) -> None:
-        """Write what is due."""
-        for scene in scenes:
-            self._take(
-                scene.worlds,
-                scene.grid,
-                self._backdrop,
-                due,
-                self.lines,
-                self._camera,
-                self._panorama,
-                self._picture,
-                frames.data,
-            )
 
 
 class RgbCamera(_Camera[RgbCameraConfig]):
     """The colour of each pixel: that of its class, in the light of its face and the haze."""
 
     dtype = np.uint8
-
-    def __init__(self, name: str, config: RgbCameraConfig, platform: Platform) -> None:
-        super().__init__(name, config, platform)
-        self._palette = colours()
-        self._take = repeated(take_colours)
+    _own = (None, None, colours(), None)
 
     @staticmethod
     def bounds(config: RgbCameraConfig) -> Bounds:
-        """From 0 to 255."""
         return np.zeros(config.shape), np.full(config.shape, 255.0)
 
-    def sense(self, scenes: Sequence[SensedScene], due: Due, frames: SensorFrames) -> None:
-        """Write what is due."""
-        for scene in scenes:
-            self._take(
-                scene.worlds,
-                scene.grid,
-                self._backdrop,
-                due,
-                self.lines,
-                self._noise,
-                self._camera,
-                self._panorama,
-                self._picture,
-                self._palette,
-                frames.data,
-            )
+
+class BevGrid(ImagingSensor[BevGridConfig]):
+    """The class of each cell's centre, seen from above; see `kernels.panorama`."""
+
+    dtype = np.uint8
+    kernel = fill_grids
+
+    def __init__(self, name: str, config: BevGridConfig, platform: Platform) -> None:
+        super().__init__(name, config, platform)
+        self._grid = make_birds_eye(
+            mount_matrix(config), config.ahead_m, config.aside_m, config.cell_m
+        )
+        self._reach_m = self.reach_m(config, 0.0)
+
+    @staticmethod
+    def bounds(config: BevGridConfig) -> Bounds:
+        return np.zeros(config.shape), np.full(config.shape, NUM_SEMANTICS - 1.0)
+
+    @staticmethod
+    def reach_m(config: BevGridConfig, largest_radius_m: float) -> float:
+        """To its farthest corner, and the nearest side of a body."""
+        farthest_m = math.hypot(max(config.ahead_m, config.behind_m), config.aside_m)
+        return farthest_m + math.hypot(config.x_m, config.y_m) + largest_radius_m
+
+    def arguments(self, scene: SensedScene, due: Due, frames: SensorFrames) -> tuple[Any, ...]:
+        return (*self.view(scene, due), self._grid, self._reach_m, self._panorama, frames.data)

@@ -41,9 +41,8 @@ class Geodesy(Protocol):
 def geodesy_of(network: RoadNetwork, config: GnssConfig) -> Geodesy:
     """Where a map lies: as it says itself, else where the sensor's settings put it.
 
-    Raises:
-        MissingExtraError: the map is projected, and pyproj is not installed.
-        MapError: PROJ does not know the projection.
+    Raises MissingExtraError: the map is projected, and pyproj is not installed; MapError: PROJ does
+    not know the projection.
     """
     if network.geo is not None:
         return ProjectedMap(network.geo, config.origin_height_m)
@@ -53,9 +52,7 @@ def geodesy_of(network: RoadNetwork, config: GnssConfig) -> Geodesy:
 class ProjectedMap:
     """A map with a projection.
 
-    Args:
-        geo: how it is projected.
-        height_m: of z = 0 above the ellipsoid.
+    `geo`: how it is projected. `height_m`: of z = 0 above the ellipsoid.
     """
 
     def __init__(self, geo: GeoReference, height_m: float) -> None:
@@ -84,10 +81,8 @@ class TangentPlane:
     By way of earth-centred coordinates (Hofmann-Wellenhof, Lichtenegger, Wasle: "GNSS", 2008,
     chapter 8).
 
-    Args:
-        latitude_deg: of the map's (0, 0).
-        longitude_deg: of the map's (0, 0).
-        height_m: of z = 0 there, above the ellipsoid.
+    `latitude_deg`: of the map's (0, 0). `longitude_deg`: of the map's (0, 0). `height_m`: of z = 0
+    there, above the ellipsoid.
     """
 
     def __init__(self, latitude_deg: float, longitude_deg: float, height_m: float) -> None:

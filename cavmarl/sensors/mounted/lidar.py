@@ -1,27 +1,21 @@
-"""Lidar: distances along rays, of one layer or of several."""
+"""Sensors that cast rays: lidar, of one layer or of several, and radar."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 
-from cavmarl.config.rig import LidarRigConfig
-from cavmarl.core.numba.repeated import repeated
-from cavmarl.sensors.kernels.panorama import make_panorama
+from cavmarl.config.rig import LidarRigConfig, RadarConfig
 from cavmarl.sensors.kernels.ray_fan import HIT, Fan, make_fan
-from cavmarl.sensors.kernels.rig_rays import measure_lidar
-from cavmarl.sensors.kernels.rig_schedule import Due
+from cavmarl.sensors.kernels.rig_frames import Due
+from cavmarl.sensors.kernels.rig_rays import TARGET, measure_lidar, measure_radar
 from cavmarl.sensors.mounted.frames import SensorFrames
 from cavmarl.sensors.mounted.mount_transforms import mount_matrix
-from cavmarl.sensors.mounted.mounted_sensor import (
-    Bounds,
-    MountedSensor,
-    Platform,
-    SensedScene,
-    noise_of,
-)
+from cavmarl.sensors.mounted.mounted_sensor import Bounds, ImagingSensor, Platform, SensedScene
+
+C = TypeVar("C", LidarRigConfig, RadarConfig)
 
 
 def azimuths(fov_deg: float, rays: int) -> tuple[float, float, int]:
@@ -36,7 +30,6 @@ def azimuths(fov_deg: float, rays: int) -> tuple[float, float, int]:
 
 
 def lidar_fan(config: LidarRigConfig) -> Fan:
-    """The rays of a lidar."""
     lowest, highest = math.radians(config.lower_deg), math.radians(config.upper_deg)
     layers = np.linspace(lowest, highest, config.layers) if config.layers > 1 else np.zeros(1)
     return make_fan(
@@ -44,47 +37,56 @@ def lidar_fan(config: LidarRigConfig) -> Fan:
     )
 
 
-class Lidar(MountedSensor[LidarRigConfig]):
-    """Distances to bodies, buildings and the ground, layer by layer from the lowest."""
-
-    dtype = np.float32
-
-    def __init__(self, name: str, config: LidarRigConfig, platform: Platform) -> None:
-        super().__init__(name, config, platform)
-        self._noise = noise_of(name, config)
-        self._fan = lidar_fan(config)
-        self._backdrop = platform.backdrop
-        self._panorama = make_panorama(platform.backdrop, platform.capacity)
-        self._hits = np.zeros((config.rays, config.layers), HIT)
-        self._measure = repeated(measure_lidar)
+class _Rays(ImagingSensor[C]):
+    """What lidar and radar have."""
 
     @staticmethod
-    def bounds(config: LidarRigConfig) -> Bounds:
-        """From 0 to the range."""
-        return np.zeros(config.shape), np.full(config.shape, config.range_m)
-
-    @staticmethod
-    def reach_m(config: LidarRigConfig, largest_radius_m: float) -> float:
+    def reach_m(config: C, largest_radius_m: float) -> float:
         """Its range, from where it is mounted to the nearest side of a body."""
         return config.range_m + math.hypot(config.x_m, config.y_m) + largest_radius_m
 
+
+class Lidar(_Rays[LidarRigConfig]):
+    """Distances to bodies, buildings and the ground, layer by layer from the lowest."""
+
+    dtype = np.float32
+    kernel = measure_lidar
+
+    def __init__(self, name: str, config: LidarRigConfig, platform: Platform) -> None:
+        super().__init__(name, config, platform)
+        self._fan = lidar_fan(config)
+        self._hits = np.zeros((config.rays, config.layers), HIT)
+
+    @staticmethod
+    def bounds(config: LidarRigConfig) -> Bounds:
+        return np.zeros(config.shape), np.full(config.shape, config.range_m)
+
     @staticmethod
     def num_lines(config: LidarRigConfig) -> int:
-        """The columns of rays."""
         return config.rays
 
-    def sense(self, scenes: Sequence[SensedScene], due: Due, frames: SensorFrames) -> None:
-        """Write what is due."""
-        for scene in scenes:
-            self._measure(
-                scene.worlds,
-                scene.grid,
-                self._backdrop,
-                due,
-                self.lines,
-                self._noise,
-                self._fan,
-                self._panorama,
-                self._hits,
-                frames.data,
-            )
+    def arguments(self, scene: SensedScene, due: Due, frames: SensorFrames) -> tuple[Any, ...]:
+        cast = (self._fan, self._panorama, self._hits)
+        return (*self.view(scene, due), self.lines, self.noise, *cast, frames.data)
+
+
+class Radar(_Rays[RadarConfig]):
+    """The nearest bodies and buildings, with range, azimuth and radial speed, nearest first.
+
+    The rest of the list is zeros.
+    """
+
+    dtype = np.float32
+    kernel = measure_radar
+
+    def __init__(self, name: str, config: RadarConfig, platform: Platform) -> None:
+        super().__init__(name, config, platform)
+        fan = azimuths(config.fov_deg, config.rays)
+        self._fan = make_fan(mount_matrix(config), fan, np.zeros(1), config.range_m)
+        self._hits = np.zeros((config.rays, 1), HIT)
+        self._targets = np.zeros(config.rays, TARGET)
+        self._order = np.zeros(config.rays, np.int32)
+
+    def arguments(self, scene: SensedScene, due: Due, frames: SensorFrames) -> tuple[Any, ...]:
+        cast = (self._fan, self._panorama, self._hits, self._targets, self._order)
+        return (*self.view(scene, due), self.noise, *cast, frames.data)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.rig import MountedConfig
 from cavmarl.core.errors import ConfigError
-from cavmarl.sensors.kernels.mount_poses import Mount, rotation
+from cavmarl.sensors.kernels.rig_frames import Mount, rotation
 
 WORLD_FRAME = "map"  # x east, y north, z up, as in `roads.network`
 VEHICLE_FRAME = "vehicle"
@@ -40,13 +40,9 @@ def mount_matrix(config: MountedConfig) -> NDArray[np.float64]:
 def check_place(name: str, config: MountedConfig, body: np.void) -> None:
     """Refuse a sensor outside of the body that it is mounted on.
 
-    Args:
-        name: of the sensor.
-        config: its settings.
-        body: VTYPE of agents' vehicles.
+    `body`: VTYPE of agents' vehicles.
 
-    Raises:
-        ConfigError: with the nearest place on the body.
+    Raises ConfigError: with the nearest place on the body.
     """
     half_m, half_width_m, height_m = 0.5 * body["length"], 0.5 * body["width"], body["height"]
     for key, low, high in (

@@ -1,10 +1,11 @@
-"""`MountedSensor`: what every type of sensor is made of; one file a type."""
+"""`MountedSensor`: what every type of sensor is made of."""
 
 from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -12,11 +13,12 @@ from numpy.typing import DTypeLike, NDArray
 
 from cavmarl.config.rig import MountedConfig, SampledConfig
 from cavmarl.core.math.neighbors import Grid
+from cavmarl.core.numba.repeated import repeated
 from cavmarl.core.records.arrays import LaneGrid, RoadArrays, Travel, Worlds
 from cavmarl.roads.kernels.backdrop_pieces import Backdrop
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.sensors.kernels.rig_noise import Noise
-from cavmarl.sensors.kernels.rig_schedule import Due
+from cavmarl.sensors.kernels.panorama import make_panorama
+from cavmarl.sensors.kernels.rig_frames import Due, Noise
 from cavmarl.sensors.mounted.frames import SensorFrames
 from cavmarl.sensors.mounted.mount_transforms import SENSOR_FRAME, check_place, mount_of
 
@@ -25,58 +27,32 @@ C = TypeVar("C", bound=MountedConfig)
 
 
 class SensedScene(NamedTuple):
-    """What the agents of one zone can see, in the present tick.
+    """What the agents of one zone can see, in the present tick."""
 
-    Attributes:
-        roads: of the whole map.
-        lane_grid: which lanes lie near a place.
-        plans: PLAN (G, L), the ways of agents.
-        travel: types of vehicles.
-        worlds: the committed rows: first the zone's own, then ghosts.
-        grid: room for the spatial index of one world; callers that ask it fill it.
-        before: POSE (W, A) of all agents in the tick before.
-    """
-
-    roads: RoadArrays
+    roads: RoadArrays  # of the whole map
     lane_grid: LaneGrid
     plans: NDArray[np.void]
-    travel: Travel
-    worlds: Worlds
-    grid: Grid
-    before: NDArray[np.void]
+    travel: Travel  # types of vehicles
+    worlds: Worlds  # the committed rows: first the zone's own, then ghosts
+    grid: Grid  # room for the spatial index of one world; callers that ask it fill it
+    before: NDArray[np.void]  # POSE (W, A) of all agents in the tick before
 
 
 class Platform(NamedTuple):
-    """What sensors are mounted on.
-
-    Attributes:
-        network: the roads.
-        body: VTYPE of agents' vehicles.
-        num_worlds: W.
-        num_agents: A.
-        sim_dt_s: seconds a tick.
-        ticks_per_step: ticks a step.
-        capacity: the most rows of a world.
-        backdrop: what cameras and rays meet of the map.
-    """
+    """What sensors are mounted on."""
 
     network: RoadNetwork
-    body: np.void
+    body: np.void  # VTYPE of agents' vehicles
     num_worlds: int
     num_agents: int
     sim_dt_s: float
     ticks_per_step: int
-    capacity: int
-    backdrop: Backdrop
+    capacity: int  # the most rows of a world
+    backdrop: Backdrop  # what cameras and rays meet of the map
 
 
 class MountedSensor(ABC, Generic[C]):
     """One sensor of the rig, on the vehicles of all agents of W worlds.
-
-    Args:
-        name: in the rig.
-        config: its settings.
-        platform: what it is mounted on.
 
     Attributes:
         name: in the rig.
@@ -88,6 +64,7 @@ class MountedSensor(ABC, Generic[C]):
     """
 
     dtype: ClassVar[DTypeLike]
+    kernel: ClassVar[Callable[..., None]]  # takes what `arguments` lists
     stamps_itself: ClassVar[bool] = False  # it has no rate: it also writes stamps and counts
 
     def __init__(self, name: str, config: C, platform: Platform) -> None:
@@ -98,20 +75,28 @@ class MountedSensor(ABC, Generic[C]):
         self.lines = np.zeros((platform.num_worlds, platform.num_agents, 2), dtype=np.int32)
         self.lines[..., 1] = self.num_lines(config)
         check_place(name, config, platform.body)
+        self._measure = repeated(type(self).kernel)
+
+    @cached_property
+    def noise(self) -> Noise:
+        """What kernels take of `noise` and `bias`, one number a channel."""
+        assert isinstance(self.config, SampledConfig)
+        channels = len(self.config.units)
+        noise, bias = np.array(self.config.noise), np.array(self.config.bias)
+        return Noise(
+            stream_of(self.name),
+            np.broadcast_to(noise, channels).copy(),
+            np.broadcast_to(bias, channels).copy(),
+        )
 
     @staticmethod
-    @abstractmethod
     def bounds(config: C) -> Bounds:
-        """The least and the largest value of the numbers of a sample, broadcast to its shape."""
+        """The least and the largest number of a sample, in its shape; none where noise is added."""
+        return np.full(config.shape, -np.inf), np.full(config.shape, np.inf)
 
     @staticmethod
     def reach_m(config: C, largest_radius_m: float) -> float:
-        """How far from the vehicle's centre the centre of another can be that it can tell.
-
-        Args:
-            config: its settings.
-            largest_radius_m: half the diagonal of the largest body.
-        """
+        """How far from the vehicle's centre the centre of another can be that it can tell."""
         return 0.0
 
     @staticmethod
@@ -120,29 +105,35 @@ class MountedSensor(ABC, Generic[C]):
         return 1
 
     @abstractmethod
+    def arguments(self, scene: SensedScene, due: Due, frames: SensorFrames) -> tuple[Any, ...]:
+        """What the kernel takes to write the data that are due, for the agents of a zone."""
+
     def sense(self, scenes: Sequence[SensedScene], due: Due, frames: SensorFrames) -> None:
         """Write the data of all samples that are due, for the agents that the scenes own.
 
         What is written may depend on the agent's row, the others' rows within reach and the tick,
         and on nothing else: not on how rows are ordered, nor on which zone asks.
 
-        Args:
-            scenes: one a zone.
-            due: how many samples, and to which slots.
-            frames: `data` is written; stamps, counts and losses are the rig's business.
+        `scenes`: one a zone. `due`: how many samples, and to which slots. `frames`: `data` is
+        written; stamps, counts and losses are the rig's business.
         """
+        for scene in scenes:
+            self._measure(*self.arguments(scene, due, frames))
+
+
+class ImagingSensor(MountedSensor[C]):
+    """A sensor that looks around: at bodies, and at what stands on the map."""
+
+    def __init__(self, name: str, config: C, platform: Platform) -> None:
+        super().__init__(name, config, platform)
+        self._backdrop = platform.backdrop
+        self._panorama = make_panorama(platform.backdrop, platform.capacity)
+
+    def view(self, scene: SensedScene, due: Due) -> tuple[Any, ...]:
+        """The first arguments of all their kernels."""
+        return scene.worlds, scene.grid, self._backdrop, due
 
 
 def stream_of(name: str) -> np.uint64:
     """The stream of a sensor's random numbers: of its name, whatever else is mounted."""
     return np.uint64(int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest()))
-
-
-def noise_of(name: str, config: SampledConfig) -> Noise:
-    """What kernels take of `noise` and `bias`, one number a channel."""
-    channels = len(config.units)
-    return Noise(
-        stream_of(name),
-        np.broadcast_to(np.array(config.noise), channels).copy(),
-        np.broadcast_to(np.array(config.bias), channels).copy(),
-    )

@@ -10,27 +10,27 @@ from numpy.typing import NDArray
 
 from cavmarl.config.rig import MountedConfig, SampledConfig, cadence
 from cavmarl.core.numba.repeated import repeated
-from cavmarl.sensors.kernels.rig_frames import POSE, call_roll, deliver, note_poses
-from cavmarl.sensors.kernels.rig_schedule import Due, SensorSchedule, call_due
-from cavmarl.sensors.mounted.catalogue import mount
+from cavmarl.sensors.kernels.rig_frames import (
+    POSE,
+    Due,
+    SensorSchedule,
+    call_due,
+    call_roll,
+    deliver,
+    note_poses,
+)
 from cavmarl.sensors.mounted.frames import Frames, SensorFrames
 from cavmarl.sensors.mounted.mounted_sensor import MountedSensor, Platform, SensedScene, stream_of
+from cavmarl.sensors.registry import mount
 
 
 class Turn(NamedTuple):
-    """What a sensor has to do in the present tick.
+    """What a sensor has to do in the present tick."""
 
-    Attributes:
-        place: its number in the rig.
-        sensor: itself.
-        due: how many samples, and to which slots.
-        frames: where they go.
-    """
-
-    place: int
-    sensor: MountedSensor[Any]
-    due: Due
-    frames: SensorFrames
+    place: int  # its number in the rig
+    sensor: MountedSensor[Any]  # itself
+    due: Due  # how many samples, and to which slots
+    frames: SensorFrames  # where they go
 
 
 Sense: TypeAlias = Callable[[Sequence[SensedScene], Sequence[Turn]], None]
@@ -46,11 +46,8 @@ def sense_here(scenes: Sequence[SensedScene], turns: Sequence[Turn]) -> None:
 class Rig:
     """The sensors of all agents of W worlds.
 
-    Args:
-        settings: of the sensors, by name.
-        platform: what they are mounted on.
-        frames: where their samples go.
-        ids: (W, A) int64, the vehicle whose samples each agent's are; kept from tick to tick.
+    `settings`: of the sensors, by name. `frames`: where their samples go. `ids`: (W, A) int64, the
+    vehicle whose samples each agent's are; kept from tick to tick.
 
     Attributes:
         sense: senses what is due.

@@ -1,9 +1,8 @@
-"""The sensors: what each adds to an observation, and how far it looks.
+"""The sensors that agents observe: what each adds to an observation, and how far it looks.
 
-One file a sensor; a new one of the package is a file here, a kernel that writes its numbers, which
+A new one of the package has its features here, a kernel that writes its numbers, which
 `kernels/sense` or, if most environments leave it off, `kernels/observe_optional` calls, and its
-line
-in `SENSORS`. Those from outside are registered, see `sensors.registry`.
+place in `SENSORS`. Those from outside are registered, see `sensors.registry`.
 """
 
 from __future__ import annotations
@@ -16,44 +15,23 @@ from cavmarl.core.extensions import REGISTERED_SENSORS
 from cavmarl.core.records.arrays import Sensors
 from cavmarl.rewards.kernels.terms import TTC_REACH_M
 from cavmarl.roads.network import RoadNetwork
+from cavmarl.sensors.kernels.lidar_fan import ECHO, ray_directions
 from cavmarl.sensors.kernels.sensor_arrays import OptionalSensors
-from cavmarl.sensors.observed import (
-    ego,
-    lidar_observation,
-    occupancy_grid,
-    roadgraph,
-    route,
-)
+from cavmarl.sensors.observed import ego_features as seen
 from cavmarl.sensors.observed import highway_kinematics as kinematics
-from cavmarl.sensors.observed import lane_neighbors as lanes
-from cavmarl.sensors.observed import lidar_rays as lidar
-from cavmarl.sensors.observed import nearest_vehicles as neighbors
-from cavmarl.sensors.observed import next_signal as signal
-from cavmarl.sensors.observed import received_messages as messages
-from cavmarl.sensors.observed.feature import Feature, Sensor
+from cavmarl.sensors.observed import lidar_observation, occupancy_grid, roadgraph
+from cavmarl.sensors.observed.feature import Sensor
 from cavmarl.sensors.observed.highway import goal_places
-
-__all__ = [
-    "SENSORS",
-    "Feature",
-    "Sensor",
-    "frame_size",
-    "largest_radius_m",
-    "layout",
-    "optional_arrays",
-    "sensing_reach_m",
-    "sensor_arrays",
-    "sensors_of",
-]
 
 # Those of the package, in the order of their features in a frame.
 SENSORS: tuple[Sensor, ...] = (
-    Sensor("ego", ego.features, ego.reach_m),
-    Sensor("route", route.features, route.reach_m),
-    Sensor("neighbors", neighbors.features, neighbors.reach_m),
-    Sensor("signal", signal.features, signal.reach_m),
-    Sensor("lanes", lanes.features, lanes.reach_m),
-    Sensor("lidar", lidar.features, lidar.reach_m, sees_bodies=True),
+    Sensor("ego", seen.ego),
+    Sensor("route", seen.route),
+    Sensor("neighbors", seen.neighbors, lambda c: c.neighbors.range_m * (c.neighbors.count > 0)),
+    Sensor("signal", seen.signal),
+    # Its range is that of gaps along lanes and of centres in the plane.
+    Sensor("lanes", seen.lanes, lambda c: c.lanes.range_m),
+    Sensor("lidar", seen.lidar, lambda c: c.lidar.range_m * (c.lidar.rays > 0), sees_bodies=True),
     Sensor("kinematics", kinematics.features, kinematics.reach_m, kinematics.shape),
     Sensor(
         "occupancy_grid",
@@ -68,8 +46,8 @@ SENSORS: tuple[Sensor, ...] = (
         lidar_observation.reach_m,
         lidar_observation.shape,
     ),
-    Sensor("roadgraph", roadgraph.features, roadgraph.reach_m, roadgraph.shape),
-    Sensor("messages", messages.features, messages.reach_m),
+    Sensor("roadgraph", roadgraph.features, shape=roadgraph.shape),
+    Sensor("messages", seen.messages),  # they come from the bus, which knows no zones
 )
 
 # Those that `observe_optional` writes.
@@ -114,10 +92,6 @@ def sensing_reach_m(config: SensorsConfig, largest_radius_m: float) -> float:
     Sensors that ask for centres reach as far as they look, `lanes` too: it takes none that is
     further away in the plane. Rays end at bodies, whose centres are up to half a diagonal behind.
     Of the terms, time to collision alone looks at others; it is always on.
-
-    Args:
-        config: the sensors.
-        largest_radius_m: half the diagonal of the largest body.
     """
     sensors = sensors_of(config)
     reaches = (sensor.reach_of_centres_m(config, largest_radius_m) for sensor in sensors)
@@ -155,22 +129,17 @@ def sensor_arrays(config: SensorsConfig) -> Sensors:
         lidar_rays=config.lidar.rays,
         lidar_range_m=config.lidar.range_m,
         lidar_speeds=config.lidar.speeds,
-        rays=lidar.directions(config),
-        echoes=lidar.room(config),
-        **neighbors.room(config),
+        rays=ray_directions(config.lidar.rays),
+        echoes=np.zeros(config.lidar.rays, dtype=ECHO),
+        near_body=np.zeros(config.neighbors.count, dtype=np.int32),
+        near_squared=np.zeros(config.neighbors.count, dtype=np.float64),
     )
 
 
 def optional_arrays(
     config: SensorsConfig, network: RoadNetwork, plans: NDArray[np.void]
 ) -> OptionalSensors | None:
-    """What `observe_optional` takes; None if all of its sensors are off.
-
-    Args:
-        config: the sensors.
-        network: the roads.
-        plans: PLAN (G, L).
-    """
+    """What `observe_optional` takes; None if all of its sensors are off."""
     if FURTHER.isdisjoint(layout(config)):
         return None
     starts = _starts(config)

@@ -14,21 +14,17 @@ from cavmarl.driving.agent_view import AgentView
 
 @dataclass(frozen=True)
 class Feature:
-    """One number of an observation.
+    """One number of an observation."""
 
-    Attributes:
-        name: unique within its sensor.
-        meaning: what it is, with frame and sign.
-        scale: the number that 1.0 stands for, with its unit; empty for flags.
-        low: smallest value.
-        high: largest value.
-    """
+    name: str  # unique within its sensor
+    meaning: str  # what it is, with frame and sign
+    scale: str = ""  # the number that 1.0 stands for, with its unit; empty for flags
+    low: float = -1.0  # smallest value
+    high: float = 1.0  # largest value
 
-    name: str
-    meaning: str
-    scale: str = ""
-    low: float = -1.0
-    high: float = 1.0
+
+def _nowhere(config: SensorsConfig) -> float:
+    return 0.0
 
 
 def _flat(config: SensorsConfig) -> tuple[int, ...]:
@@ -41,32 +37,21 @@ def _float32(config: SensorsConfig) -> DTypeLike:
 
 @dataclass(frozen=True)
 class Sensor:
-    """A sensor.
+    """A sensor."""
 
-    Attributes:
-        name: its key.
-        features: its features in order; none where it is switched off.
-        reach_m: how far it looks for others, in m.
-        shape: of its part of a Dict observation; -1 stands for all features.
-        dtype: of that part.
-        sees_bodies: whether it looks that far for any part of a body, and not for its centre.
-        sense: of a sensor from outside of the package: its numbers, of an agent's view.
-    """
-
-    name: str
+    name: str  # its key
+    # its features in order; none where it is switched off
     features: Callable[[SensorsConfig], list[Feature]]
-    reach_m: Callable[[SensorsConfig], float]
+    reach_m: Callable[[SensorsConfig], float] = _nowhere  # how far it looks for others, in m
+    # of its part of a Dict observation; -1 stands for all features
     shape: Callable[[SensorsConfig], tuple[int, ...]] = _flat
-    dtype: Callable[[SensorsConfig], DTypeLike] = _float32
+    dtype: Callable[[SensorsConfig], DTypeLike] = _float32  # of that part
+    # whether it looks that far for any part of a body, and not for its centre
     sees_bodies: bool = False
+    # of a sensor from outside of the package: its numbers, of an agent's view
     sense: Callable[[AgentView], ArrayLike] | None = None
 
     def reach_of_centres_m(self, config: SensorsConfig, largest_radius_m: float) -> float:
-        """How far away the centre of a vehicle can be that the sensor can tell, in m.
-
-        Args:
-            config: the sensors.
-            largest_radius_m: half the diagonal of the largest body.
-        """
+        """How far away the centre of a vehicle can be that the sensor can tell, in m."""
         reach_m = self.reach_m(config)
         return reach_m + largest_radius_m if reach_m > 0.0 and self.sees_bodies else reach_m

@@ -12,12 +12,7 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.kernels.kinematics_observation import PERCEPTION_M
 from cavmarl.sensors.kernels.sensor_arrays import KinematicsSensor
 from cavmarl.sensors.observed.feature import Feature
-from cavmarl.sensors.observed.highway import (
-    codes,
-    default_ranges,
-    range_table,
-    vehicle_feature,
-)
+from cavmarl.sensors.observed.highway import codes, default_ranges, range_table, vehicle_feature
 
 # The range of y is the map's; whatever it is, it becomes [-1, 1].
 _DEFAULT_RANGES = {

@@ -3,16 +3,6 @@
 from __future__ import annotations
 
 from cavmarl.traffic.demand.demand_file import DemandFile, read_demand
-from cavmarl.traffic.demand.demand_records import ELEMENT, ORDER, ROUTE, STOP, Choices
-from cavmarl.traffic.demand.demand_report import DemandReport
+from cavmarl.traffic.demand.demand_records import STOP, Choices
 
-__all__ = [
-    "ELEMENT",
-    "ORDER",
-    "ROUTE",
-    "STOP",
-    "Choices",
-    "DemandFile",
-    "DemandReport",
-    "read_demand",
-]
+__all__ = ["STOP", "Choices", "DemandFile", "read_demand"]

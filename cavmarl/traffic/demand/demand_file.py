@@ -15,7 +15,6 @@ from cavmarl.core.errors import DemandError
 from cavmarl.roads.network import RoadNetwork, content_of
 from cavmarl.traffic.demand.definition_collector import DefinitionCollector
 from cavmarl.traffic.demand.demand_records import ORDER, POS_GIVEN, Choices
-from cavmarl.traffic.demand.demand_report import DemandReport
 from cavmarl.traffic.demand.drawing import (
     DRAW_REROUTE,
     DRAW_ROUTE,
@@ -23,7 +22,7 @@ from cavmarl.traffic.demand.drawing import (
     chances,
     departures_ms,
 )
-from cavmarl.traffic.demand.element import MAX_TIME_MS
+from cavmarl.traffic.demand.element import MAX_TIME_MS, DemandReport
 from cavmarl.traffic.demand.map_index import MapIndex
 from cavmarl.traffic.demand.rerouters import Rerouters
 from cavmarl.traffic.demand.rerouting_device import DeviceOptions
@@ -46,50 +45,30 @@ _COPIED = (
 
 @dataclass(frozen=True, eq=False)
 class DemandFile:
-    """Vehicles that are to drive on a map; see `records` for the dtypes.
+    """Vehicles that are to drive on a map; see `records` for the dtypes."""
 
-    Attributes:
-        network: the roads that all rows point into.
-        types: VTYPE (num_types,).
-        type_ids: their names.
-        routes: ROUTE (num_routes,), equal routes once.
-        route_edges: EDGE rows that ROUTE points into.
-        route_ids: their names, "" for those inside vehicles.
-        stops: STOP (num_stops,) that ROUTE and ELEMENT point into.
-        elements: ELEMENT (num_elements,), in the order of the files.
-        element_ids: ids of vehicles, trips and flows.
-        type_choices: lists of VTYPE rows with probabilities.
-        route_choices: lists of ROUTE rows with probabilities.
-        bad_pairs: sorted keys type * num_routes + route of vehicles that cannot drive their route;
-            empty unless such were to be skipped.
-        rerouters: what sends vehicles another way on certain edges.
-        device: options of the rerouting device for all vehicles.
-        lane_table: (num_edges, n) LANE row by SUMO's index on the edge, -1 where there is none.
-        begin_ms: start of the simulation that the files are meant for.
-        end_ms: its end; `MAX_TIME_MS` if they name none.
-        step_ms: its step.
-        report: what was read and what was tolerated.
-    """
-
-    network: RoadNetwork
+    network: RoadNetwork  # the roads that all rows point into
     types: NDArray[np.void]
-    type_ids: tuple[str, ...]
-    routes: NDArray[np.void]
-    route_edges: NDArray[np.int32]
-    route_ids: tuple[str, ...]
-    stops: NDArray[np.void]
-    elements: NDArray[np.void]
-    element_ids: tuple[str, ...]
-    type_choices: Choices
-    route_choices: Choices
+    type_ids: tuple[str, ...]  # their names
+    routes: NDArray[np.void]  # ROUTE (num_routes,), equal routes once
+    route_edges: NDArray[np.int32]  # EDGE rows that ROUTE points into
+    route_ids: tuple[str, ...]  # their names, "" for those inside vehicles
+    stops: NDArray[np.void]  # STOP (num_stops,) that ROUTE and ELEMENT point into
+    elements: NDArray[np.void]  # ELEMENT (num_elements,), in the order of the files
+    element_ids: tuple[str, ...]  # ids of vehicles, trips and flows
+    type_choices: Choices  # lists of VTYPE rows with probabilities
+    route_choices: Choices  # lists of ROUTE rows with probabilities
+    # sorted keys type * num_routes + route of vehicles that cannot drive their route; empty unless
+    # such were to be skipped
     bad_pairs: NDArray[np.int64]
-    rerouters: Rerouters
-    device: DeviceOptions
+    rerouters: Rerouters  # what sends vehicles another way on certain edges
+    device: DeviceOptions  # options of the rerouting device for all vehicles
+    # (num_edges, n) LANE row by SUMO's index on the edge, -1 where there is none
     lane_table: NDArray[np.int32]
-    begin_ms: int
-    end_ms: int
+    begin_ms: int  # start of the simulation that the files are meant for
+    end_ms: int  # its end; `MAX_TIME_MS` if they name none
     step_ms: int
-    report: DemandReport
+    report: DemandReport  # what was read and what was tolerated
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -121,13 +100,10 @@ class DemandFile:
     def draw(self, key: int, until_s: float | None = None) -> NDArray[np.void]:
         """The orders of one episode: a pure function of the key.
 
-        Args:
-            key: of the world and episode, see `kernels.rng.world_key`.
-            until_s: no vehicle departs at or after this time; the end of the files' simulation if
-                None.
+        `key`: of the world and episode, see `kernels.rng.world_key`. `until_s`: no vehicle departs
+        at or after this time; the end of the files' simulation if None.
 
-        Returns:
-            ORDER (n,), sorted by departure, at one time in the order of the files.
+        Returns ORDER (n,), sorted by departure, at one time in the order of the files.
         """
         end_ms = self.end_ms if until_s is None else min(self.end_ms, round(until_s * 1000.0))
         rows, numbers, times = departures_ms(self.elements, key, self.begin_ms, end_ms)
@@ -164,11 +140,7 @@ class DemandFile:
         ) or (self.device.chance > 0.0 and len(self.elements) > 0)
 
     def _said(
-        self,
-        field: str,
-        element: NDArray[np.void],
-        types: NDArray[np.int32],
-        default: float,
+        self, field: str, element: NDArray[np.void], types: NDArray[np.int32], default: float
     ) -> NDArray[np.float64]:
         """What vehicles (n,) say of their device, else their types, else the configuration."""
         said: NDArray[np.float64] = self.types[field][types].astype(np.float64)

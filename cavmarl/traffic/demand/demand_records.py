@@ -12,6 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.records import record
+from cavmarl.traffic.demand.element import Element
+
 # Lanes: a LANE row (in an ORDER) or SUMO's index on the edge (in an ELEMENT), or one of these.
 LANE_FIRST = -1  # rightmost one that the class may use (SUMO's default)
 LANE_RANDOM = -2
@@ -92,67 +95,55 @@ _HOW = [
     ("speed_factor", np.float64),  # of this vehicle; NaN: drawn from its type
 ]
 
-ELEMENT = np.dtype(
-    [
-        ("file", np.int32),  # index in DemandReport.files
-        ("line", np.int32),
-        ("flow", np.bool_),  # its vehicles are called id.0, id.1, …
-        ("pattern", np.int8),  # FLOW_*
-        ("begin_ms", np.int64),  # departure of the first vehicle
-        ("end_ms", np.int64),  # no vehicle departs at or after it
-        ("period_ms", np.int64),  # of FLOW_REGULAR
-        ("number", np.int64),  # at most so many vehicles
-        ("rate", np.float64),  # 1/s of FLOW_EXPONENTIAL, chance a second of FLOW_PROBABILITY
-        ("types", np.int32),  # choice among VTYPE rows
-        ("routes", np.int32),  # choice among ROUTE rows
-        ("first_stop", np.int32),  # STOP rows [first_stop, first_stop + num_stops)
-        ("num_stops", np.int32),
-        ("reroute", np.float64),  # chance that the vehicle looks for its way itself; -1: its type's
-        ("reroute_period_ms", np.int64),  # how often; 0: once, -1: as its type
-        *_HOW,
-    ],
-    align=True,
+ELEMENT = record(
+    ("file", np.int32),  # index in DemandReport.files
+    ("line", np.int32),
+    ("flow", np.bool_),  # its vehicles are called id.0, id.1, …
+    ("pattern", np.int8),  # FLOW_*
+    ("begin_ms", np.int64),  # departure of the first vehicle
+    ("end_ms", np.int64),  # no vehicle departs at or after it
+    ("period_ms", np.int64),  # of FLOW_REGULAR
+    ("number", np.int64),  # at most so many vehicles
+    ("rate", np.float64),  # 1/s of FLOW_EXPONENTIAL, chance a second of FLOW_PROBABILITY
+    ("types", np.int32),  # choice among VTYPE rows
+    ("routes", np.int32),  # choice among ROUTE rows
+    ("first_stop", np.int32),  # STOP rows [first_stop, first_stop + num_stops)
+    ("num_stops", np.int32),
+    ("reroute", np.float64),  # chance that the vehicle looks for its way itself; -1: its type's
+    ("reroute_period_ms", np.int64),  # how often; 0: once, -1: as its type
+    *_HOW,
 )
 
-ORDER = np.dtype(
-    [
-        ("depart", np.float64),  # s
-        ("element", np.int32),  # ELEMENT row
-        ("number", np.int32),  # of the vehicle in its flow, from 0
-        ("vtype", np.int32),  # VTYPE row
-        ("route", np.int32),  # ROUTE row
-        ("first_stop", np.int32),  # STOP rows, in the order in which they are reached
-        ("num_stops", np.int32),
-        ("reroute", np.bool_),  # looks for its way itself when it has entered, …
-        ("reroute_period_ms", np.int64),  # … and then so often; 0: not again
-        *_HOW,
-    ],
-    align=True,
+ORDER = record(
+    ("depart", np.float64),  # s
+    ("element", np.int32),  # ELEMENT row
+    ("number", np.int32),  # of the vehicle in its flow, from 0
+    ("vtype", np.int32),  # VTYPE row
+    ("route", np.int32),  # ROUTE row
+    ("first_stop", np.int32),  # STOP rows, in the order in which they are reached
+    ("num_stops", np.int32),
+    ("reroute", np.bool_),  # looks for its way itself when it has entered, …
+    ("reroute_period_ms", np.int64),  # … and then so often; 0: not again
+    *_HOW,
 )
 
-ROUTE = np.dtype(
-    [
-        ("first_edge", np.int32),  # route_edges[first_edge : first_edge + num_edges]
-        ("num_edges", np.int32),
-        ("exact", np.bool_),  # False: edges to pass through, the way between them is to be found
-        ("first_stop", np.int32),  # STOP rows that all its vehicles make
-        ("num_stops", np.int32),
-    ],
-    align=True,
+ROUTE = record(
+    ("first_edge", np.int32),  # route_edges[first_edge : first_edge + num_edges]
+    ("num_edges", np.int32),
+    ("exact", np.bool_),  # False: edges to pass through, the way between them is to be found
+    ("first_stop", np.int32),  # STOP rows that all its vehicles make
+    ("num_stops", np.int32),
 )
 
-STOP = np.dtype(
-    [
-        ("lane", np.int32),  # LANE row
-        ("at_edge", np.int32),  # position of its edge in the route; -1 on routes to be found
-        ("start", np.float64),  # m on the lane (LANE["length_m"]), where the stop begins
-        ("end", np.float64),  # m on the lane, where the front bumper comes to rest
-        ("duration", np.float64),  # s at least
-        ("until", np.float64),  # s, not before; -1: none
-        ("until_from", np.int8),  # UNTIL_*: what `until` is counted from
-        ("parking", np.bool_),  # beside the road: others pass
-    ],
-    align=True,
+STOP = record(
+    ("lane", np.int32),  # LANE row
+    ("at_edge", np.int32),  # position of its edge in the route; -1 on routes to be found
+    ("start", np.float64),  # m on the lane (LANE["length_m"]), where the stop begins
+    ("end", np.float64),  # m on the lane, where the front bumper comes to rest
+    ("duration", np.float64),  # s at least
+    ("until", np.float64),  # s, not before; -1: none
+    ("until_from", np.int8),  # UNTIL_*: what `until` is counted from
+    ("parking", np.bool_),  # beside the road: others pass
 )
 
 
@@ -195,3 +186,37 @@ class Choices:
         place = np.searchsorted(self.upper, choices + chances, side="right")
         # A sum can round up to the next list's range.
         return self.rows[np.clip(place, self.start[choices], self.start[choices + 1] - 1)]
+
+
+MAX_WEIGHT = 1e9
+
+
+def listed(source: Element, key: str) -> list[tuple[str, float | None]]:
+    """Names in one attribute, their weights in another.
+
+    `key`: "vTypes" or "routes".
+
+    Returns pairs of name and weight; None where `probabilities` says nothing.
+    """
+    names = source.attrs.get(key, "").split()
+    texts = source.attrs.get("probabilities", "").split()
+    if texts and len(texts) != len(names):
+        raise source.error(
+            f"has {len(texts)} probabilities for {len(names)} {key}", "give one for each"
+        )
+    weights: list[float | None] = [
+        source.saying(probabilities=text).number("probabilities", 1.0, least=0.0, most=MAX_WEIGHT)
+        for text in texts
+    ]
+    return list(zip(names, weights or [None] * len(names), strict=True))
+
+
+def weighted(source: Element, found: Sequence[tuple[int, float]]) -> Options:
+    """What is found to choose from, without what is never chosen.
+
+    Raises DemandError: nothing is left.
+    """
+    kept = [(row, weight) for row, weight in found if weight > 0.0]
+    if not kept:
+        raise source.error("has nothing to choose from", "give it members with a probability")
+    return Options(tuple(row for row, _ in kept), tuple(weight for _, weight in kept))

@@ -8,10 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.math.rng import STREAM_DEMAND, fill_uniform
-from cavmarl.traffic.demand.demand_records import (
-    FLOW_PROBABILITY,
-    FLOW_REGULAR,
-)
+from cavmarl.traffic.demand.demand_records import FLOW_PROBABILITY, FLOW_REGULAR
 
 DRAW_TIME = STREAM_DEMAND
 DRAW_TYPE = STREAM_DEMAND + 1
@@ -38,8 +35,7 @@ def departures_ms(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """When vehicles of elements depart within [begin_ms, end_ms).
 
-    Returns:
-        Three arrays (n,): ELEMENT row, number of the vehicle in its flow, time in milliseconds.
+    Returns three arrays (n,): ELEMENT row, number of the vehicle in its flow, time in milliseconds.
     """
     regular = _regular(elements, begin_ms, end_ms)
     parts = [regular]

@@ -1,4 +1,7 @@
-"""`Element`: one XML element with its place, and the checked values of its attributes."""
+"""`Element`: one XML element with its place, and the checked values of its attributes.
+
+`DemandReport` counts what was found in demand files, and what was tolerated in them.
+"""
 
 from __future__ import annotations
 
@@ -40,21 +43,13 @@ def near(name: str, known: Iterable[str]) -> str:
 
 @dataclass(slots=True)
 class Element:
-    """An XML element.
+    """An XML element."""
 
-    Attributes:
-        name: of its tag.
-        attrs: its attributes as they stand.
-        path: of its file.
-        line: where it starts.
-        children: the elements inside, in order.
-    """
-
-    name: str
-    attrs: dict[str, str]
-    path: str
-    line: int
-    children: list[Element] = field(default_factory=list)
+    name: str  # of its tag
+    attrs: dict[str, str]  # its attributes as they stand
+    path: str  # of its file
+    line: int  # where it starts
+    children: list[Element] = field(default_factory=list)  # the elements inside, in order
 
     @property
     def place(self) -> str:
@@ -102,7 +97,6 @@ class Element:
         return value
 
     def whole(self, key: str, default: int, *, least: int) -> int:
-        """A whole number of at least `least`."""
         if key not in self.attrs:
             return default
         text = self.attrs[key].strip()
@@ -132,9 +126,51 @@ class Element:
         return value
 
     def params(self) -> dict[str, str]:
-        """The <param> children as a dictionary."""
         return {
             child.attrs.get("key", ""): child.attrs.get("value", "")
             for child in self.children
             if child.name == "param"
         }
+
+
+@dataclass
+class Tally:
+    """How often something was tolerated, and where first."""
+
+    count: int
+    first: str
+
+
+@dataclass
+class DemandReport:
+    """Counts of one reading."""
+
+    files: list[str] = field(default_factory=list)  # that were read, in order
+    # number of elements by what they are: "vehicle", "flow", "route", …
+    read: dict[str, int] = field(default_factory=dict)
+    # what was left out or taken for something near, by a sentence that says so
+    tolerated: dict[str, Tally] = field(default_factory=dict)
+
+    def count(self, kind: str) -> None:
+        self.read[kind] = self.read.get(kind, 0) + 1
+
+    def tolerate(self, what: str, place: str, count: int = 1) -> None:
+        """More occurrences of something that was let pass."""
+        tally = self.tolerated.setdefault(what, Tally(0, place))
+        tally.count += count
+
+    def lines(self) -> list[str]:
+        """What was tolerated: how often, what, and where first."""
+        return [
+            f"{tally.count:>8} {what} (first: {tally.first})"
+            for what, tally in sorted(self.tolerated.items())
+        ]
+
+    def to_report(self) -> str:
+        """Lines for a terminal: what was read, then what was tolerated and where first."""
+        lines = [f"read {path}" for path in self.files]
+        lines += [f"  {count:>8} {kind}" for kind, count in sorted(self.read.items())]
+        if self.tolerated:
+            lines.append("tolerated")
+        lines += [f"  {line}" for line in self.lines()]
+        return "\n".join(lines)

@@ -58,8 +58,7 @@ class MapIndex:
     def edge(self, name: str, element: Element) -> int:
         """The EDGE row of an id.
 
-        Raises:
-            DemandError: the map has no such edge.
+        Raises DemandError: the map has no such edge.
         """
         row = self.edge_row.get(name, -1)
         if row < 0:
@@ -90,8 +89,7 @@ class MapIndex:
     def lane(self, name: str, element: Element) -> int:
         """The LANE row of an id.
 
-        Raises:
-            DemandError: the map has no such lane.
+        Raises DemandError: the map has no such lane.
         """
         row = self.lane_row.get(name, -1)
         if row < 0 or name.startswith(":"):
@@ -118,10 +116,7 @@ class MapIndex:
     ) -> str | None:
         """Why a class cannot follow edges in a row: a clause, or None if it can.
 
-        Args:
-            edges: EDGE rows.
-            exact: whether each must lead straight to the next.
-            permissions: bits of the class.
+        `exact`: whether each must lead straight to the next. `permissions`: bits of the class.
         """
         names = self.network.edge_ids
         rows = [int(edge) for edge in edges]
@@ -140,7 +135,6 @@ class MapIndex:
         return None
 
     def route_error(self, element: Element, gap: str) -> CavmarlError:
-        """The error for a route that cannot be followed."""
         return element.error(
             f"cannot be driven: {gap}",
             "mend the route (duarouter --repair), or skip such (traffic.on_bad_route = skip)",

@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import CapacityError
+from cavmarl.core.records import record
 from cavmarl.driving.vehicle_types import ALL_PERMISSIONS, NEAREST_CLASS, NO_ROAD_CLASSES
 from cavmarl.roads.network import VEHICLE_CLASSES
-from cavmarl.traffic.demand.demand_records import Choices, Options
-from cavmarl.traffic.demand.demand_report import DemandReport
-from cavmarl.traffic.demand.distributions import MAX_WEIGHT, weighted
-from cavmarl.traffic.demand.element import MAX_TIME_MS, Element, near
+from cavmarl.traffic.demand.demand_records import MAX_WEIGHT, Choices, Options, weighted
+from cavmarl.traffic.demand.element import MAX_TIME_MS, DemandReport, Element, near
 from cavmarl.traffic.demand.map_index import MapIndex
 from cavmarl.traffic.demand.route_records import RouteTable
 
@@ -24,48 +23,34 @@ KEEP_DESTINATION = -1  # in place of an EDGE row
 _ACTED_ON = ("closingReroute", "destProbReroute", "routeProbReroute")
 _NOT_MODELLED = ("timeThreshold", "radius", "file")
 
-RULE = np.dtype(
-    [
-        ("begin_s", np.float64),  # clock
-        ("end_s", np.float64),
-        ("chance", np.float64),  # that a vehicle follows it
-        ("edge", np.int32),  # EDGE row on which it is asked
-        ("closes", np.bool_),  # it is about vehicles whose way leads over a closed edge
-        ("goals", np.int32),  # choice among EDGE rows or KEEP_DESTINATION; -1: none
-        ("routes", np.int32),  # choice among ROUTE rows; -1: none
-        ("interval", np.int32),  # equal for the edges of one interval: one draw for all
-    ],
-    align=True,
+RULE = record(
+    ("begin_s", np.float64),  # clock
+    ("end_s", np.float64),
+    ("chance", np.float64),  # that a vehicle follows it
+    ("edge", np.int32),  # EDGE row on which it is asked
+    ("closes", np.bool_),  # it is about vehicles whose way leads over a closed edge
+    ("goals", np.int32),  # choice among EDGE rows or KEEP_DESTINATION; -1: none
+    ("routes", np.int32),  # choice among ROUTE rows; -1: none
+    ("interval", np.int32),  # equal for the edges of one interval: one draw for all
 )
 
-CLOSING = np.dtype(
-    [
-        ("begin_s", np.float64),
-        ("end_s", np.float64),
-        ("edge", np.int32),  # EDGE row
-        ("classes", np.int64),  # bits of those that it is closed to
-    ],
-    align=True,
+CLOSING = record(
+    ("begin_s", np.float64),
+    ("end_s", np.float64),
+    ("edge", np.int32),  # EDGE row
+    ("classes", np.int64),  # bits of those that it is closed to
 )
 
 
 @dataclass(frozen=True, eq=False)
 class Rerouters:
-    """All rerouters of the files.
+    """All rerouters of the files."""
 
-    Attributes:
-        rules: RULE (n,), one for each interval and edge, in the order of the files.
-        types: (num_intervals, num_types) which VTYPE rows an interval is about.
-        closings: CLOSING (m,).
-        goals: what RULE["goals"] points into.
-        routes: what RULE["routes"] points into.
-    """
-
-    rules: NDArray[np.void]
-    types: NDArray[np.bool_]
-    closings: NDArray[np.void]
-    goals: Choices
-    routes: Choices
+    rules: NDArray[np.void]  # RULE (n,), one for each interval and edge, in the order of the files
+    types: NDArray[np.bool_]  # (num_intervals, num_types) which VTYPE rows an interval is about
+    closings: NDArray[np.void]  # CLOSING (m,)
+    goals: Choices  # what RULE["goals"] points into
+    routes: Choices  # what RULE["routes"] points into
 
     def __post_init__(self) -> None:
         for array in (self.rules, self.types, self.closings):
@@ -89,17 +74,12 @@ def read_rerouters(
 ) -> Rerouters:
     """The rerouters of files; what is not acted on is counted in `report`.
 
-    Args:
-        elements: <rerouter>s with what they hold.
-        index: of the map.
-        routes: gets the routes that they name.
-        type_ids: names by VTYPE row.
-        known_types: names of all types, those that drive on no road included.
-        report: of the reading.
+    `elements`: <rerouter>s with what they hold. `routes`: gets the routes that they name.
+    `type_ids`: names by VTYPE row. `known_types`: names of all types, those that drive on no road
+    included.
 
-    Raises:
-        DemandError: edges, routes, types, times or chances that cannot be.
-        CapacityError: more than `MAX_INTERVALS` intervals, or `MAX_RULES` times edges.
+    Raises DemandError: edges, routes, types, times or chances that cannot be; CapacityError: more
+    than `MAX_INTERVALS` intervals, or `MAX_RULES` times edges.
     """
     reader = _Reader(index, routes, type_ids, known_types, report)
     for element in elements:
@@ -166,11 +146,7 @@ class _Reader:
         return np.array([not names or name in names for name in self._type_ids], dtype=np.bool_)
 
     def _interval(
-        self,
-        interval: Element,
-        edges: Sequence[int],
-        chance: float,
-        types: NDArray[np.bool_],
+        self, interval: Element, edges: Sequence[int], chance: float, types: NDArray[np.bool_]
     ) -> None:
         begin_ms = interval.time_ms("begin", 0)
         end_ms = interval.time_ms("end", MAX_TIME_MS)

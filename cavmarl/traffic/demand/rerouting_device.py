@@ -33,26 +33,18 @@ def device(element: Element) -> tuple[float, int]:
 
 
 class DeviceOptions(NamedTuple):
-    """What a `.sumocfg` says of the device for all vehicles; the defaults are SUMO's.
+    """What a `.sumocfg` says of the device for all vehicles; the defaults are SUMO's."""
 
-    Attributes:
-        chance: of having it, where vehicle and type say nothing.
-        period_ms: between searches, likewise; 0: once.
-        adaptation_steps: how many samples of the edges' speeds are averaged.
-        adaptation_interval_ms: between samples.
-    """
-
-    chance: float = 0.0
-    period_ms: int = 0
-    adaptation_steps: int = 180
-    adaptation_interval_ms: int = 1000
+    chance: float = 0.0  # of having it, where vehicle and type say nothing
+    period_ms: int = 0  # between searches, likewise; 0: once
+    adaptation_steps: int = 180  # how many samples of the edges' speeds are averaged
+    adaptation_interval_ms: int = 1000  # between samples
 
     @classmethod
     def of(cls, options: Mapping[str, Element]) -> DeviceOptions:
         """From the options of a configuration, each an element with a `value`.
 
-        Raises:
-            DemandError: values that cannot be, or an average that is not kept here.
+        Raises DemandError: values that cannot be, or an average that is not kept here.
         """
         own = {
             key.removeprefix(_PREFIX): element.saying(**{key: element.attrs["value"]})

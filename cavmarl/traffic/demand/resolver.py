@@ -20,8 +20,7 @@ from cavmarl.traffic.demand.demand_records import (
 from cavmarl.traffic.demand.element import Element
 from cavmarl.traffic.demand.map_index import MapIndex
 from cavmarl.traffic.demand.rerouters import Rerouters, read_rerouters
-from cavmarl.traffic.demand.route_records import RouteTable
-from cavmarl.traffic.demand.stops import StopReader
+from cavmarl.traffic.demand.route_records import RouteTable, StopReader
 from cavmarl.traffic.demand.type_table import TypeTable
 
 # Classes with lanes of their own that road networks leave out: see `roads.selection`.
@@ -59,7 +58,6 @@ class Resolver:
         self._place_stops(list(collector.stops.values()))
 
     def elements(self) -> NDArray[np.void]:
-        """ELEMENT (num_elements,)."""
         return self._elements
 
     def type_choices(self) -> Choices:

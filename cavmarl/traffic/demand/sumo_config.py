@@ -25,23 +25,14 @@ _OPTIONS = {
 
 @dataclass(frozen=True)
 class SumoConfigFile:
-    """What a `.sumocfg` says of network, demand and time.
+    """What a `.sumocfg` says of network, demand and time."""
 
-    Attributes:
-        net_file: the road network; None if the file names none.
-        files: additional files, then route files, in SUMO's order of reading.
-        begin_ms: start of the simulation.
-        end_ms: its end; -1: when the demand has ended.
-        step_ms: length of its step.
-        rerouting: options of the rerouting device.
-    """
-
-    net_file: Path | None
-    files: tuple[Path, ...]
-    begin_ms: int
-    end_ms: int
-    step_ms: int
-    rerouting: DeviceOptions
+    net_file: Path | None  # the road network; None if the file names none
+    files: tuple[Path, ...]  # additional files, then route files, in SUMO's order of reading
+    begin_ms: int  # start of the simulation
+    end_ms: int  # its end; -1: when the demand has ended
+    step_ms: int  # length of its step
+    rerouting: DeviceOptions  # options of the rerouting device
 
 
 class _Handler(ContentHandler):
@@ -68,8 +59,7 @@ class _Handler(ContentHandler):
 def read_sumo_config(path: Path) -> SumoConfigFile:
     """Read a `.sumocfg`.
 
-    Raises:
-        DemandError: it is missing, is no SUMO configuration, or holds times that are none.
+    Raises DemandError: it is missing, is no SUMO configuration, or holds times that are none.
     """
     handler = _Handler(path)
     read_xml(path, handler, DemandError)

@@ -2,15 +2,161 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.driving.vehicle_types import DEFAULT_TYPES, VTYPE
-from cavmarl.traffic.demand.demand_records import Options
-from cavmarl.traffic.demand.demand_report import DemandReport
-from cavmarl.traffic.demand.distributions import MAX_WEIGHT, listed, weighted
-from cavmarl.traffic.demand.element import Element, near
-from cavmarl.traffic.demand.vehicle_type_reader import vtype_record
+from cavmarl.core.records.codes import MODEL_KRAUSS
+from cavmarl.driving.driver_models import NEAREST_MODEL, model_code, model_names
+from cavmarl.driving.vehicle_types import (
+    ALL_PERMISSIONS,
+    CLASS_DEFAULTS,
+    DEFAULT_TYPES,
+    NEAREST_CLASS,
+    NO_ROAD_CLASSES,
+    VTYPE,
+)
+from cavmarl.roads.network import VEHICLE_CLASSES
+from cavmarl.traffic.demand.demand_records import MAX_WEIGHT, Options, listed, weighted
+from cavmarl.traffic.demand.element import DemandReport, Element, near
+from cavmarl.traffic.demand.rerouting_device import device
+
+MIN_SPEED_FACTOR = 0.2  # SUMO's cuts of the distribution of speed factors
+MAX_SPEED_FACTOR = 2.0
+
+# (least, most) of what a road vehicle can have, in SI units; with room for what studies try out.
+_LIMITS = {
+    "length": (0.1, 100.0),
+    "width": (0.1, 10.0),
+    "height": (0.0, 20.0),
+    "minGap": (0.0, 100.0),
+    "accel": (0.01, 1000.0),
+    "decel": (0.01, 1000.0),
+    "emergencyDecel": (0.01, 1000.0),
+    "maxSpeed": (0.01, 1e5),
+    "desiredMaxSpeed": (0.01, 1e5),
+    "tau": (0.001, 1000.0),
+    "sigma": (0.0, 1.0),
+    "probability": (0.0, MAX_WEIGHT),
+}
+
+_SPEED_FACTOR = re.compile(r"normc?\(([^()]*)\)")
+_MODEL_PREFIX = "carFollowing-"
+
+# Attributes that change how a vehicle moves in SUMO and that are not modelled here.
+_UNUSED = frozenset(
+    "actionStepLength apparentDecel collisionMinGapFactor hasDriverState impatience "
+    "laneChangeModel latAlignment maxAccelProfile desAccelProfile maxSpeedLat minGapLat sigmaStep "
+    "speedFactorPremature startupDelay stepping timeToTeleport timeToTeleportBidi trainType delta "
+    "adaptTime adaptFactor tauLast apProb scale".split()
+)
+_UNUSED_PREFIXES = ("lc", "jm", "cc")
+
+
+def vehicle_class(element: Element) -> str:
+    """The class of a type, one of SUMO's."""
+    name = element.attrs.get("vClass", "passenger").strip()
+    if name not in NEAREST_CLASS and name not in NO_ROAD_CLASSES:
+        known = [*NEAREST_CLASS, *NO_ROAD_CLASSES]
+        raise element.error(f"has the unknown vClass '{name}'", near(name, known))
+    return name
+
+
+def vtype_record(element: Element, report: DemandReport) -> NDArray[np.void] | None:
+    """One VTYPE () from a <vType>; None for a class that drives on no road.
+
+    Raises DemandError: a vehicle of that type cannot exist.
+    """
+    attrs = dict(element.attrs)
+    for child in element.children:
+        if child.name.startswith(_MODEL_PREFIX):
+            attrs = {**child.attrs, **attrs}
+            attrs.setdefault("carFollowModel", child.name.removeprefix(_MODEL_PREFIX))
+    element = Element(element.name, attrs, element.path, element.line, element.children)
+    name = vehicle_class(element)
+    if name in NO_ROAD_CLASSES:
+        return None
+    _report_unused(element, name, report)
+    default = CLASS_DEFAULTS[name]
+    record = np.zeros((), dtype=VTYPE)
+    record["vclass"] = VEHICLE_CLASSES.index(NEAREST_CLASS[name])
+    record["permissions"] = ALL_PERMISSIONS if name == "ignoring" else 1 << int(record["vclass"])
+    record["model"] = model = _model(element, report)
+    for key in ("length", "width", "height", "accel", "decel"):
+        record[key] = _number(element, key, getattr(default, key))
+    record["min_gap"] = _number(element, "minGap", default.min_gap)
+    record["max_speed"] = _number(element, "maxSpeed", default.max_speed)
+    record["desired_max_speed"] = _number(element, "desiredMaxSpeed", default.desired_max_speed)
+    record["tau"] = _number(element, "tau", 1.0)
+    sigma = _number(element, "sigma", default.sigma)
+    record["sigma"] = sigma if model == MODEL_KRAUSS else 0.0
+    _number(element, "probability", 1.0)
+    decel = float(record["decel"])
+    record["emergency_decel"] = _number(
+        element, "emergencyDecel", max(default.emergency_decel, decel)
+    )
+    if record["emergency_decel"] < decel:
+        report.tolerate("emergencyDecel below decel is raised to it", element.place)
+        record["emergency_decel"] = decel
+    _set_speed_factor(record, element, default.speed_dev)
+    record["reroute"], record["reroute_period_ms"] = device(element)
+    return record
+
+
+def _number(element: Element, key: str, default: float) -> float:
+    least, most = _LIMITS[key]
+    return element.number(key, default, least=least, most=most)
+
+
+def _model(element: Element, report: DemandReport) -> int:
+    name = element.attrs.get("carFollowModel", "Krauss").strip()
+    # SUMO 0.x wrote carFollowing-Krauss here, too.
+    name = name.removeprefix(_MODEL_PREFIX)
+    known = (*model_names(), *NEAREST_MODEL)
+    if name not in known:
+        raise element.error(f"has the unknown carFollowModel '{name}'", near(name, known))
+    nearest = NEAREST_MODEL.get(name, name)
+    if nearest != name:
+        report.tolerate(f"carFollowModel {name} is taken for {nearest}", element.place)
+    return model_code(nearest)
+
+
+def _report_unused(element: Element, name: str, report: DemandReport) -> None:
+    if name != NEAREST_CLASS[name]:
+        report.tolerate(
+            f"vClass {name} has the permissions of "
+            + ("all classes" if name == "ignoring" else NEAREST_CLASS[name]),
+            element.place,
+        )
+    for key in element.attrs:
+        if key in _UNUSED or (key.startswith(_UNUSED_PREFIXES) and key[2:3].isupper()):
+            report.tolerate(f"attribute {key} of vType is not modelled", element.place)
+
+
+def _set_speed_factor(record: NDArray[np.void], element: Element, deviation: float) -> None:
+    """Mean, deviation and cuts from "1.1", "norm(m,d)" or "normc(m,d,min,max)" and speedDev."""
+    numbers = {"speedFactor": "1", "speedDev": element.attrs.get("speedDev", str(deviation))}
+    numbers["least"], numbers["most"] = str(MIN_SPEED_FACTOR), str(MAX_SPEED_FACTOR)
+    text = element.attrs.get("speedFactor", "1").strip()
+    drawn = _SPEED_FACTOR.fullmatch(text)
+    parts = [part.strip() for part in drawn[1].split(",")] if drawn else [text]
+    if len(parts) > 4 or (drawn and len(parts) < 2):
+        raise element.error(f"has speedFactor='{text}'", "write 1.1 or normc(1,0.1,0.2,2)")
+    if "speedDev" in element.attrs and len(parts) > 1:
+        parts[1] = numbers["speedDev"]
+    numbers.update(zip(("speedFactor", "speedDev", "least", "most"), parts, strict=False))
+    values = element.saying(**numbers)
+    record["speed_factor"] = mean = values.number("speedFactor", 1.0, above=0.0)
+    record["speed_dev"] = values.number("speedDev", deviation, least=0.0)
+    record["min_speed_factor"] = least = values.number("least", MIN_SPEED_FACTOR, least=0.0)
+    record["max_speed_factor"] = most = values.number("most", MAX_SPEED_FACTOR, above=0.0)
+    # A fixed factor may lie anywhere; of a distribution something has to be left between the cuts.
+    if record["speed_dev"] > 0.0 and not least <= mean <= most:
+        raise element.error(
+            f"has speedFactor='{text}', whose mean is not between {least:g} and {most:g}",
+            "set speedDev='0' or write normc(mean,deviation,min,max)",
+        )
 
 
 class TypeTable:
@@ -36,12 +182,9 @@ class TypeTable:
     def options(self, name: str, user: Element) -> Options | None:
         """The types to choose from under a name; None if vehicles of it drive on no road.
 
-        Args:
-            name: of a type or a distribution.
-            user: the element that names it.
+        `name`: of a type or a distribution. `user`: the element that names it.
 
-        Raises:
-            DemandError: there is neither, or nothing to choose from.
+        Raises DemandError: there is neither, or nothing to choose from.
         """
         if name in self._distributions:
             return self._distribution(self._distributions[name])

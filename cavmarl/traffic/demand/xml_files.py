@@ -9,8 +9,7 @@ from xml.sax.handler import ContentHandler
 
 from cavmarl.core.errors import DemandError
 from cavmarl.roads.sumo_net.xml_source import read_xml
-from cavmarl.traffic.demand.demand_report import DemandReport
-from cavmarl.traffic.demand.element import Element, near
+from cavmarl.traffic.demand.element import DemandReport, Element, near
 
 MAX_INCLUDES = 16  # files inside files
 MAX_CHILDREN = 100_000  # of one definition
@@ -128,10 +127,7 @@ class _Handler(ContentHandler):
 
 
 def _read(
-    path: Path,
-    report: DemandReport,
-    take: Callable[[Element], None],
-    including: tuple[Path, ...],
+    path: Path, report: DemandReport, take: Callable[[Element], None], including: tuple[Path, ...]
 ) -> None:
     if str(path) not in report.files:
         report.files.append(str(path))
@@ -143,12 +139,9 @@ def read_elements(path: Path, report: DemandReport, take: Callable[[Element], No
 
     Flows inside an <interval> get its begin and end. What is no demand is counted in `report`.
 
-    Args:
-        path: of a plain or gzipped file.
-        report: where files, elements and what is skipped are counted.
-        take: gets each <vType>, <route>, <vehicle>, … with its children, when it has ended.
+    `path`: of a plain or gzipped file. `report`: where files, elements and what is skipped are
+    counted. `take`: gets each <vType>, <route>, <vehicle>, … with its children, when it has ended.
 
-    Raises:
-        DemandError: the file is missing, is no XML, or has another root.
+    Raises DemandError: the file is missing, is no XML, or has another root.
     """
     _read(path, report, take, ())

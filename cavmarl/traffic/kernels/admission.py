@@ -34,7 +34,6 @@ ENTER_ROOM_M = 0.3  # free on all sides of a vehicle that enters
 
 @kernel
 def _zone_on(roads: RoadArrays, zones: ZoneArrays, lane: int, s: float) -> int:
-    """The zone of a place on a lane."""
     row = roads.lanes[lane]
     x, y, _, _, _, _ = lane_pose(roads.points, row["first_point"], row["num_points"], s)
     return zone_of(zones, x, y)
@@ -55,14 +54,8 @@ def rank_lanes(
     A departure behind the last vehicle of a lane gets its place from the zone where the lane
     starts: it alone sees all that could be the last.
 
-    Args:
-        roads: the road arrays.
-        travel: types and ways.
-        zones: of the partition.
-        zone: the shard's own.
-        gate: `ranks` and `last_s` are written where a place, or a lane's start, lies in this zone.
-        worlds: `next_rows` is read.
-        scratch: room.
+    `zone`: the shard's own. `gate`: `ranks` and `last_s` are written where a place, or a lane's
+    start, lies in this zone. `worlds`: `next_rows` is read.
     """
     for w in range(worlds.ticks.shape[0]):
         indexed = False
@@ -106,11 +99,7 @@ def assign_lanes(roads: RoadArrays, travel: Travel, gate: Gate, worlds: Worlds) 
 
     A lane is taken whether or not there is room: the one that waits longer goes first.
 
-    Args:
-        roads: the road arrays.
-        travel: types and ways.
-        gate: `tries` and `lane_taken` are written.
-        worlds: keys.
+    `gate`: `tries` and `lane_taken` are written.
     """
     for w in range(worlds.ticks.shape[0]):
         if gate.num_queue[w] == 0:
@@ -173,15 +162,8 @@ def propose(
 ) -> None:
     """Put the departures that find a safe gap in this zone into `gate.passing`.
 
-    Args:
-        demand: the generator's tables.
-        roads: the road arrays.
-        travel: types and ways.
-        zones: of the partition.
-        zone: the shard's own.
-        gate: `passing` and `places` are written.
-        worlds: `next_rows` is read.
-        scratch: room.
+    `demand`: the generator's tables. `zone`: the shard's own. `gate`: `passing` and `places` are
+    written. `worlds`: `next_rows` is read.
     """
     for w in range(worlds.ticks.shape[0]):
         if gate.num_queue[w] == 0:
@@ -226,10 +208,8 @@ def propose(
 def accept(gate: Gate, running: NDArray[np.int64], capacity: int) -> None:
     """Take the proposals in the order of the queue; the rest stays in it.
 
-    Args:
-        gate: `passing` keeps those taken; queue and counts are written.
-        running: (W,) vehicles of each world, in all zones.
-        capacity: most that a world can hold.
+    `gate`: `passing` keeps those taken; queue and counts are written. `running`: (W,) vehicles of
+    each world, in all zones. `capacity`: most that a world can hold.
     """
     for w in range(running.size):
         proposed = gate.num_passing[w]
@@ -274,12 +254,8 @@ def _take_from_queue(gate: Gate, w: int, taken: int) -> None:
 def admit(zones: ZoneArrays, halo: Halo, zone: int, gate: Gate, worlds: Worlds) -> None:
     """Write the accepted departures into `next_rows`: as owned in its zone, as ghost near it.
 
-    Args:
-        zones: of the partition.
-        halo: how far this zone sees.
-        zone: the shard's own.
-        gate: `passing` is read.
-        worlds: `next_rows` and how many they are.
+    `halo`: how far this zone sees. `zone`: the shard's own. `gate`: `passing` is read. `worlds`:
+    `next_rows` and how many they are.
     """
     for w in range(worlds.ticks.shape[0]):
         rows = worlds.next_rows[w]

@@ -38,9 +38,7 @@ from cavmarl.core.records.codes import (
 )
 from cavmarl.driving.kernels.motion import place_on_lane
 from cavmarl.driving.kernels.ways import own_step, way_left
-from cavmarl.traffic.kernels.entering import (
-    speed_at,
-)
+from cavmarl.traffic.kernels.entering import speed_at
 
 PLACE_TRIES = 24  # places tried for a vehicle at reset before it has to queue
 PLACE_GAP_M = 10.0  # m between bumpers of vehicles placed at reset
@@ -163,13 +161,8 @@ def populate(
 
     A vehicle for which `PLACE_TRIES` places were taken waits in the queue.
 
-    Args:
-        demand: the generator's tables.
-        roads: the road arrays.
-        travel: types and ways.
-        gate: written where chosen.
-        worlds: written where chosen; ticks and keys are already those of the new episode.
-        chosen: (W,) which worlds.
+    `demand`: the generator's tables. `worlds`: written where chosen; ticks and keys are already
+    those of the new episode.
     """
     half = 0.5 * demand.blank[0]["length"]
     for w in range(worlds.ticks.shape[0]):
@@ -312,12 +305,8 @@ def settle(demand: Demand, roads: RoadArrays, gate: Gate, worlds: Worlds, dt: fl
     They go in the order of their ids, so that those that follow get the same numbers wherever the
     rows lay.
 
-    Args:
-        demand: the generator's tables.
-        roads: the road arrays.
-        gate: counts, sums and queue are written; `passing` holds those that left, and is emptied.
-        worlds: keys and ticks.
-        dt: seconds of a tick.
+    `demand`: the generator's tables. `gate`: counts, sums and queue are written; `passing` holds
+    those that left, and is emptied.
     """
     for w in range(worlds.ticks.shape[0]):
         for n in range(gate.num_passing[w]):

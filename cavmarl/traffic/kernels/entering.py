@@ -69,13 +69,8 @@ def entry_lane(
     (`best`: from which its way goes on without a lane change, or with the fewest), the right one of
     two.
 
-    Args:
-        roads: the road arrays.
-        travel: types and ways.
-        key: of the world.
-        departure: that enters.
-        ranks: how crowded each lane of its edge is; read where traffic chooses.
-        taken: (L,) lanes on which another one tries in this tick.
+    `departure`: that enters. `ranks`: how crowded each lane of its edge is; read where traffic
+    chooses. `taken`: (L,) lanes on which another one tries in this tick.
     """
     code = departure["lane_code"]
     if code == LANE_GIVEN:

@@ -18,7 +18,6 @@ from cavmarl.zones.kernels.zone_lookup import note_outer
 
 @kernel
 def _is_through(row: np.void, driver: int, ticks_per_step: int) -> bool:
-    """Whether a vehicle of one kind of driver leaves now."""
     ending = EVENTS_THAT_END if driver == DRIVER_AGENT else EVENT_ARRIVED
     if row["driver"] != driver or not row["events"] & ending:
         return False
@@ -54,12 +53,9 @@ def leave(
     Background vehicles are through when they have arrived; agents that have acted also after a
     collision or off the road.
 
-    Args:
-        gate: `passing` is written.
-        worlds: how many rows there are is written.
-        rows: VEHICLE (W, C), the rows to take from.
-        driver: DRIVER_*.
-        ticks_per_step: ticks a step; agents that entered within the last of them have not acted.
+    `gate`: `passing` is written. `worlds`: how many rows there are is written. `rows`: VEHICLE (W,
+    C), the rows to take from. `ticks_per_step`: ticks a step; agents that entered within the last
+    of them have not acted.
     """
     for w in range(worlds.ticks.shape[0]):
         if driver == DRIVER_BACKGROUND and worlds.num_through[w] == 0:

@@ -48,18 +48,10 @@ def mirror(
 ) -> int:
     """Bring a world's mirrored rows, in all zones, to where SUMO says they are.
 
-    Args:
-        roads: the road arrays.
-        travel: types and ways.
-        paths: of the world.
-        seen: SEEN (n,) by rising numbers, with paths in the place of routes.
-        zoned: the owned rows of `side` are written; those that SUMO has no more have arrived.
-        side: 0 or 1.
-        w: which world.
-        dt: seconds of the tick.
+    `seen`: SEEN (n,) by rising numbers, with paths in the place of routes. `zoned`: the owned rows
+    of `side` are written; those that SUMO has no more have arrived. `side`: 0 or 1.
 
-    Returns:
-        how many have arrived.
+    Returns how many have arrived.
     """
     gone = 0
     for zone in range(zoned.num_owned.shape[0]):
@@ -101,18 +93,8 @@ def greet(
 ) -> None:
     """Put a row for each vehicle that SUMO has let in into `gate.passing`, with a new id.
 
-    Args:
-        roads: the road arrays.
-        travel: types and ways.
-        paths: of the world.
-        seen: as of `mirror`.
-        departed: their numbers, rising.
-        speed_factors: theirs.
-        blank: VEHICLE (1,).
-        gate: passing, ids and counts are written.
-        w: which world.
-        tick: that they enter in.
-        key: the root of all random numbers.
+    `seen`: as of `mirror`. `departed`: their numbers, rising. `gate`: passing, ids and counts are
+    written. `tick`: that they enter in. `key`: the root of all random numbers.
     """
     for n in range(departed.size):
         place = _find(seen, departed[n])
@@ -165,17 +147,10 @@ def send_on(
 
     A vehicle on no edge of its new route keeps the old one.
 
-    Args:
-        roads: the road arrays.
-        paths: of the world.
-        numbers: (n,) VEHICLE["order"] of the vehicles meant, rising.
-        chosen: (n,) their new paths.
-        zoned: the owned rows of `side` are written.
-        side: 0 or 1.
-        w: which world.
+    `numbers`: (n,) VEHICLE["order"] of the vehicles meant, rising. `chosen`: (n,) their new paths.
+    `zoned`: the owned rows of `side` are written. `side`: 0 or 1.
 
-    Returns:
-        how many have taken it.
+    Returns how many have taken it.
     """
     taken = 0
     for zone in range(zoned.num_owned.shape[0]):
@@ -212,7 +187,6 @@ def _find(seen: NDArray[np.void], number: int) -> int:
 
 @inlined_kernel
 def _stand_in(roads: RoadArrays, travel: Travel, paths: Paths, seen: np.void, row: np.void) -> None:
-    """Write where a vehicle is and how it moves."""
     half = 0.5 * row["length"]
     heading = wrap_angle(0.5 * math.pi - math.radians(seen["angle"]))
     row["heading"] = heading

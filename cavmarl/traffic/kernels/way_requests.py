@@ -2,6 +2,12 @@
 
 A way that was found while the world runs is kept in a slot: room for one way's steps at the end of
 `Travel.steps`. Slots belong to a world; which of them are free is seen from its vehicles.
+
+The speed on every edge is sampled, smoothed, and put in the place of the limits, as SUMO's
+rerouting device does it (Behrisch, Krajzewicz, Wang: "Comparing performance and quality of traffic
+assignment techniques for microscopic road traffic simulations", DTA 2008): the mean speed of an
+edge's vehicles, averaged over the last samples. Everything that is summed is whole millimetres a
+second, so that no result depends on the order of rows or of parts of a map.
 """
 
 from __future__ import annotations
@@ -13,7 +19,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.numba import kernel
 from cavmarl.core.records.arrays import RoadArrays, Travel
-from cavmarl.core.records.codes import DRIVER_BACKGROUND, EVENT_ARRIVED
+from cavmarl.core.records.codes import DRIVER_BACKGROUND, DRIVER_SCRIPTED, EVENT_ARRIVED
 from cavmarl.roads.kernels.plans import change_cost
 from cavmarl.roads.kernels.route_steps import follow_plan, plan_route
 
@@ -36,17 +42,10 @@ def find_asking(
     These are background vehicles of the demand on a road, without a stop to make, whose time to
     look has come or that have come to an edge with rerouters.
 
-    Args:
-        roads: the road arrays.
-        rows: VEHICLE.
-        num: how many of them count.
-        tick: of the world.
-        has_rules: (num_edges,) where rerouters stand.
-        looks: LOOK, by VEHICLE["order"]; edges without rerouters are noted as seen.
-        asking: room for their rows.
+    `has_rules`: (num_edges,) where rerouters stand. `looks`: LOOK, by VEHICLE["order"]; edges
+    without rerouters are noted as seen. `asking`: room for their rows.
 
-    Returns:
-        how many.
+    Returns how many.
     """
     found = 0
     for i in range(num):
@@ -113,11 +112,8 @@ def find_way(
 def time_left(roads: RoadArrays, steps: NDArray[np.void], way: int, lane: int) -> float:
     """Seconds from the start of a lane to the end of its way, lane changes counted in.
 
-    Args:
-        roads: the road arrays, with the speeds that count.
-        steps: PLAN, where the way lies.
-        way: VEHICLE["way"].
-        lane: LANE row.
+    `roads`: the road arrays, with the speeds that count. `steps`: PLAN, where the way lies. `way`:
+    VEHICLE["way"].
     """
     total: float = 0.0
     while True:
@@ -146,12 +142,8 @@ def has_room(
 ) -> bool:
     """Whether a vehicle can still follow another way from its lane on without braking hard.
 
-    Args:
-        roads: the road arrays.
-        travel: types, and the way that it has.
-        row: VEHICLE outside junctions.
-        steps: PLAN, where the other way lies.
-        way: where in it, as VEHICLE["way"].
+    `travel`: types, and the way that it has. `row`: VEHICLE outside junctions. `steps`: PLAN, where
+    the other way lies. `way`: where in it, as VEHICLE["way"].
     """
     step = steps[way + row["lane"]]
     present = travel.steps[row["way"] + row["lane"]]
@@ -175,13 +167,7 @@ def mark_slots(
 ) -> None:
     """Which slots of a world hold the way of a vehicle.
 
-    Args:
-        roads: the road arrays.
-        rows: VEHICLE.
-        num: how many of them count.
-        first_slot: PLAN row of the world's first slot.
-        slot_steps: steps of a slot.
-        used: (num_slots,), written.
+    `first_slot`: PLAN row of the world's first slot. `used`: (num_slots,), written.
     """
     used[:] = False
     for i in range(num):
@@ -213,17 +199,11 @@ def take_slot(
 ) -> bool:
     """Put the steps of a new way into a slot, and the vehicle on it.
 
-    Args:
-        roads: the road arrays.
-        travel: its steps from `first_slot` on are written.
-        row: VEHICLE, written.
-        found: PLAN, the steps; those of the vehicle's edge come first.
-        first_slot: PLAN row of the world's first slot.
-        slot_steps: steps of a slot.
-        used: (num_slots,) which are taken, written.
+    `travel`: its steps from `first_slot` on are written. `row`: VEHICLE, written. `found`: PLAN,
+    the steps; those of the vehicle's edge come first. `first_slot`: PLAN row of the world's first
+    slot. `used`: (num_slots,) which are taken, written.
 
-    Returns:
-        whether there was a slot.
+    Returns whether there was a slot.
     """
     slot = slot_of(roads, row, first_slot, slot_steps)
     if slot < 0:
@@ -246,3 +226,102 @@ def put_on_way(travel: Travel, row: np.void, way: int) -> None:
     row["way"] = way
     row["leg"] += 1
     row["to_go"] = travel.steps[way + row["lane"]]["to_go"] - row["s"]
+
+
+CLOSED_S = 1e9  # time to drive along a closed lane: any way around it is faster
+LEAST_MPS = 0.001  # nothing is slower, so that a jam has a travel time
+
+
+@kernel
+def _millimetres(speed: float) -> int:
+    return int(max(speed, 0.0) * 1000.0 + 0.5)
+
+
+@kernel
+def limit_speeds(roads: RoadArrays, past: NDArray[np.int32], speed_sums: NDArray[np.int64]) -> None:
+    """Let all samples be what an empty map has.
+
+    `past`: (N, num_edges) mm/s, written. `speed_sums`: (num_edges,) mm/s, written: the sums over
+    the N samples.
+    """
+    for edge in range(roads.edges.shape[0]):
+        row = roads.edges[edge]
+        total = 0
+        for lane in range(row["first_lane"], row["first_lane"] + row["num_lanes"]):
+            total += _millimetres(roads.lanes[lane]["speed_mps"])
+        mean = total // row["num_lanes"]
+        past[:, edge] = mean
+        speed_sums[edge] = mean * past.shape[0]
+
+
+@kernel
+def sample_speeds(
+    roads: RoadArrays,
+    rows: NDArray[np.void],
+    num: int,
+    number: int,
+    past: NDArray[np.int32],
+    speed_sums: NDArray[np.int64],
+    lane_counts: NDArray[np.int64],
+    lane_sums: NDArray[np.int64],
+) -> None:
+    """Sample the mean speed of every edge; the sample takes the place of the oldest one.
+
+    A lane without vehicles counts as one vehicle at its limit; vehicles that make a stop or follow
+    a script do not count.
+
+    `number`: of the sample, since the reset. `past`: (N, num_edges) the last samples in mm/s.
+    `speed_sums`: (num_edges,) their sums. `lane_counts`: (L,) room. `lane_sums`: (L,) room.
+    """
+    lane_counts[:] = 0
+    lane_sums[:] = 0
+    for i in range(num):
+        if rows[i]["stopped_s"] > 0.0 or rows[i]["driver"] == DRIVER_SCRIPTED:
+            continue
+        lane_counts[rows[i]["lane"]] += 1
+        lane_sums[rows[i]["lane"]] += _millimetres(rows[i]["speed"])
+    oldest = number % past.shape[0]
+    for edge in range(roads.edges.shape[0]):
+        row = roads.edges[edge]
+        total = 0
+        count = 0
+        for lane in range(row["first_lane"], row["first_lane"] + row["num_lanes"]):
+            if lane_counts[lane] == 0:
+                total += _millimetres(roads.lanes[lane]["speed_mps"])
+                count += 1
+            else:
+                total += lane_sums[lane]
+                count += lane_counts[lane]
+        mean = total // count
+        speed_sums[edge] += mean - past[oldest, edge]
+        past[oldest, edge] = mean
+
+
+@kernel
+def slow_lanes(
+    roads: RoadArrays,
+    speed_sums: NDArray[np.int64],
+    samples: int,
+    closed: NDArray[np.int64],
+    permission: int,
+    lanes: NDArray[np.void],
+) -> None:
+    """Write speeds into a copy of the lanes, so that plans over it see how traffic is now.
+
+    Args:
+        roads: the road arrays.
+        speed_sums: (num_edges,) mm/s, see `sample_speeds`.
+        samples: how many samples a sum has; 0: the limits are what counts.
+        closed: (num_edges,) bits of the classes that an edge is closed to.
+        permission: bits of the class that drives.
+        lanes: LANE (L,), of which "speed_mps" is written.
+    """
+    for lane in range(lanes.shape[0]):
+        row = roads.lanes[lane]
+        edge = row["edge"]
+        speed = row["speed_mps"]
+        if samples > 0:
+            speed = min(speed, max(speed_sums[edge] / (1000.0 * samples), LEAST_MPS))
+        if closed[edge] & permission == permission:
+            speed = row["length_m"] / CLOSED_S
+        lanes[lane]["speed_mps"] = speed

@@ -1,13 +1,17 @@
-"""`Cast`: the actors of a scene as rows of a world."""
+"""`Cast`: the actors of a scene as rows of a world.
+
+Of its agents the first begins in the conflict, the others behind it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.errors import ConfigError
 from cavmarl.core.math.geometry import lane_pose
 from cavmarl.core.records.arrays import Gate, RoadArrays, Scripts, Travel, Worlds
 from cavmarl.core.records.codes import COUNT_DEPARTED, DRIVER_SCRIPTED
@@ -15,35 +19,62 @@ from cavmarl.driving.kernels.scripted_rows import stand_at
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.traffic.departure_queue import DEPARTURE
 from cavmarl.traffic.kernels.demand_generator import enter
+from cavmarl.traffic.scenarios.motions import Ride
 from cavmarl.traffic.scenarios.movement_scripts import actor_types, bodies_of, compile_scripts
 from cavmarl.traffic.scenarios.scene import Scene, Seat
-from cavmarl.traffic.scenarios.seats import take_seats
 from cavmarl.traffic.scenarios.streets import Streets
+
+APART_M = 6.0  # between the centres of two agents, one behind the other,
+APART_S = 2.0  # and the way of this time
+START_M = 5.0  # of a lane on which no vehicle begins
+
+
+def take_seats(streets: Streets, scene: Scene, num: int) -> list[Seat]:
+    """The seats of `num` agents, that of the scene first.
+
+    The others come after it on its own approach, with the same speed and the same goal, on lanes
+    outside junctions along which no actor rides: actors react to no vehicle.
+
+    Raises ConfigError: there is no room for so many behind the first.
+    """
+    rides = [act for actor in scene.actors for act in actor.acts if isinstance(act, Ride)]
+    closed = {lane for ride in rides for lane in ride.lanes}
+    seats = [scene.seat]
+    lane, s = scene.seat.lane, scene.seat.s
+    while len(seats) < num:
+        s -= APART_M + APART_S * scene.seat.speed_mps
+        while s < START_M:
+            closed.add(lane)
+            before = streets.before(lane)
+            if before is None or before in closed:
+                raise ConfigError(
+                    f"population.agents = {num}: behind the agent of the scene at '{scene.place}' "
+                    f"on the map '{streets.network.name}' there is room for {len(seats) - 1} "
+                    f"more; ask for at most {len(seats)}, or name another scenario.place"
+                )
+            lane = before
+            s += streets.length_m(lane)
+        row = streets.network.lanes[lane]
+        if not row["internal"]:
+            speed_mps = min(scene.seat.speed_mps, float(row["speed_mps"]))
+            seats.append(replace(scene.seat, lane=lane, s=s, speed_mps=speed_mps))
+    return seats
+
 
 SEAT_CLEAR_M = 30.0  # around the seat of an agent that is not the first
 
 
 @dataclass(frozen=True)
 class Cast:
-    """The actors of a scene, ready to enter worlds.
-
-    Attributes:
-        scene: what is played.
-        scripts: its tables.
-        firsts: FRAME of each actor at the beginning.
-        types: VTYPE rows of all bodies.
-        vtypes: (n,) VTYPE row of each actor, among all types of a world.
-        seats: of the agents.
-        goal: of all of them, a row of the plans' table.
-    """
+    """The actors of a scene, ready to enter worlds."""
 
     scene: Scene
-    scripts: Scripts
-    firsts: list[int]
-    types: NDArray[np.void]
-    vtypes: list[int]
-    seats: list[Seat]
-    goal: int
+    scripts: Scripts  # its tables
+    firsts: list[int]  # FRAME of each actor at the beginning
+    types: NDArray[np.void]  # VTYPE rows of all bodies
+    vtypes: list[int]  # (n,) VTYPE row of each actor, among all types of a world
+    seats: list[Seat]  # of the agents
+    goal: int  # of all of them, a row of the plans' table
 
     @staticmethod
     def of(
@@ -56,16 +87,10 @@ class Cast:
     ) -> Cast:
         """The cast of a scene.
 
-        Args:
-            scene: what is played.
-            network: the roads.
-            goals: row of the plans' table by EDGE.
-            first_type: how many types of vehicles there are without the actors'.
-            dt: seconds a tick.
-            num_agents: of a world.
+        `goals`: row of the plans' table by EDGE. `first_type`: how many types of vehicles there are
+        without the actors'. `num_agents`: of a world.
 
-        Raises:
-            ConfigError: the scene has no room for so many agents.
+        Raises ConfigError: the scene has no room for so many agents.
         """
         seats = take_seats(Streets(network), scene, num_agents)
         scripts, firsts = compile_scripts(network, scene.actors, scene.cues, goals, dt)
@@ -87,13 +112,8 @@ class Cast:
         Other vehicles in the scene are left out. Agents keep their ids, actors get the next
         ones.
 
-        Args:
-            roads: the road arrays.
-            travel: types and ways.
-            gate: written.
-            worlds: the rows of world w are written; it is not divided yet.
-            w: which world.
-            blank: VEHICLE (1,), the record that every vehicle starts from.
+        `worlds`: the rows of world w are written; it is not divided yet. `blank`: VEHICLE (1,), the
+        record that every vehicle starts from.
         """
         rows = worlds.rows[w]
         others = rows[: worlds.num_owned[w]]

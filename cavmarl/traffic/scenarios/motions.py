@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.geometry import lane_pose
 from cavmarl.driving.kernels.announcing import announced_m
 from cavmarl.driving.kernels.approach import MAX_LINKS_AHEAD
 from cavmarl.roads.network import RoadNetwork
@@ -21,31 +20,20 @@ CREEP_MPS = 0.2  # on the last centimetres before they stand
 
 
 class Pose(NamedTuple):
-    """Where an actor is in one tick.
+    """Where an actor is in one tick."""
 
-    Attributes:
-        x, y: of its centre, m.
-        heading: rad.
-        speed: along it in m/s, negative backwards.
-        pitch: rad.
-        beside: LANE row on whose level it is.
-        on: lane, s and d of an actor that rides along lanes; None: it moves freely.
-        link: LINK row that it is on or has entered last.
-        claims: the distance to the stop line, and the LINK row, of each link that it is on or will
-            be on soon.
-        cue: that it waits for, or -1.
-    """
-
-    x: float
+    x: float  # of its centre, m
     y: float
     heading: float
-    speed: float
-    beside: int
+    speed: float  # along it in m/s, negative backwards
+    beside: int  # LANE row on whose level it is
     pitch: float = 0.0
+    # lane, s and d of an actor that rides along lanes; None: it moves freely
     on: tuple[int, float, float] | None = None
-    link: int = -1
+    link: int = -1  # LINK row that it is on or has entered last
+    # the distance to the stop line, and the LINK row, of each link that it is on or will be on soon
     claims: tuple[tuple[float, int], ...] = ()
-    cue: int = -1
+    cue: int = -1  # that it waits for, or -1
 
 
 @dataclass(frozen=True)
@@ -77,31 +65,22 @@ class Await:
 
 @dataclass(frozen=True)
 class Move:
-    """Move freely along a line, from standstill to standstill.
+    """Move freely along a line, from standstill to standstill."""
 
-    Attributes:
-        line: (n, 3) x, y and heading, close enough together that straight lines between them will
-            do; a single row is a place to stand at.
-        beside: LANE row of the road on which, or beside which, this is.
-        speed_mps: on the way.
-        backwards: whether a vehicle reverses.
-    """
-
+    # (n, 3) x, y and heading, close enough together that straight lines between them will do; a
+    # single row is a place to stand at
     line: NDArray[np.float64]
-    beside: int
-    speed_mps: float = 0.0
-    backwards: bool = False
+    beside: int  # LANE row of the road on which, or beside which, this is
+    speed_mps: float = 0.0  # on the way
+    backwards: bool = False  # whether a vehicle reverses
 
     def poses(
         self, network: RoadNetwork, length: float, last: Pose | None, dt: float
     ) -> Iterator[Pose]:
         """The poses of each tick.
 
-        Args:
-            network: the roads.
-            length: of the body, m.
-            last: the pose before; None: this one begins the script, with a pose of its own.
-            dt: seconds a tick.
+        `length`: of the body, m. `last`: the pose before; None: this one begins the script, with a
+        pose of its own.
         """
         line = self.line
         if last is None:
@@ -122,23 +101,14 @@ class Move:
 
 @dataclass(frozen=True)
 class Ride:
-    """Ride along the middle of lanes as built-in drivers do, but without reacting to others.
+    """Ride along the middle of lanes as built-in drivers do, but without reacting to others."""
 
-    Attributes:
-        lanes: LANE rows one after the other, those inside junctions among them.
-        start_m: of the centre, from the start of the first lane.
-        end_m: of the centre, from the start of the first lane.
-        speed_mps: on the way.
-        start_mps: at the beginning.
-        end_mps: at the end.
-    """
-
-    lanes: tuple[int, ...]
-    start_m: float
-    end_m: float
-    speed_mps: float
-    start_mps: float = 0.0
-    end_mps: float = 0.0
+    lanes: tuple[int, ...]  # LANE rows one after the other, those inside junctions among them
+    start_m: float  # of the centre, from the start of the first lane
+    end_m: float  # of the centre, from the start of the first lane
+    speed_mps: float  # on the way
+    start_mps: float = 0.0  # at the beginning
+    end_mps: float = 0.0  # at the end
 
     def poses(
         self, network: RoadNetwork, length: float, last: Pose | None, dt: float
@@ -152,7 +122,7 @@ class Ride:
     def _pose(self, network: RoadNetwork, length: float, u: float, speed: float) -> Pose:
         front, rear = (self._point(network, u + side * 0.5 * length) for side in (1.0, -1.0))
         lane, s = self._place(network, u)
-        _, _, _, _, _, slope = _lane_pose(network, lane, s)
+        _, _, _, _, _, slope = network.pose_on(lane, s)
         return Pose(
             0.5 * (front[0] + rear[0]),
             0.5 * (front[1] + rear[1]),
@@ -175,7 +145,7 @@ class Ride:
         return self.lanes[-1], u
 
     def _point(self, network: RoadNetwork, u: float) -> tuple[float, float]:
-        x, y, *_ = _lane_pose(network, *self._place(network, u))
+        x, y, *_ = network.pose_on(*self._place(network, u))
         return x, y
 
     def _entered(self, network: RoadNetwork, lane: int) -> int:
@@ -274,10 +244,3 @@ def _link_between(network: RoadNetwork, before: int, after: int) -> int:
         if network.links["next_lane"][link] == after:
             return int(link)
     return -1
-
-
-def _lane_pose(
-    network: RoadNetwork, lane: int, s: float
-) -> tuple[float, float, float, float, float, float]:
-    row = network.lanes[lane]
-    return lane_pose(network.points, row["first_point"], row["num_points"], s)

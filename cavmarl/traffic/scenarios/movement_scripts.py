@@ -4,10 +4,13 @@ An actor does one thing after the other: it moves along poses, rides along lanes
 or waits for a cue. Built-in drivers take a body for an occupant of every lane that any part of it
 covers, and of those that it will cover within `FORESIGHT_S` when it moves freely: it stands there
 for them, so that they brake for actors about to step onto their lane.
+
+`Shadows` finds which lanes a body covers, and which stretch of each.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -15,64 +18,159 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.records import record
 from cavmarl.core.records.arrays import Scripts
 from cavmarl.core.records.codes import CLASS_PEDESTRIAN, MODEL_IDM
 from cavmarl.driving.vehicle_types import CLASS_DEFAULTS, generated_types
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.roads.routing import lane_grid
 from cavmarl.traffic.scenarios.motions import Act, Pose
-from cavmarl.traffic.scenarios.shadows import Shadow, Shadows
+
+SAMPLE_M = 0.5  # between the points of a body that are looked at
+LEVEL_M = 4.0  # lanes that differ by more in height are one above the other
+FARTHEST_M = 200.0  # from an actor to a lane
+ON_ROAD = (1 << len(VEHICLE_CLASSES)) - 1
+
+
+class Shadow(NamedTuple):
+    """A stretch of a lane that a body covers."""
+
+    start: float  # in m along the lane
+    end: float  # in m along the lane
+    speed: float  # of the body along the lane in m/s, not below 0
+
+    def joined(self, other: Shadow) -> Shadow:
+        """The stretch from the start of the first to the end of the last."""
+        return Shadow(min(self.start, other.start), max(self.end, other.end), 0.0)
+
+
+class Shadows:
+    """Looks up lanes below bodies."""
+
+    def __init__(self, network: RoadNetwork) -> None:
+        self._network = network
+        self._grid = lane_grid(network)
+
+    def of(self, pose: Pose, length: float, width: float) -> dict[int, Shadow]:
+        """By LANE row, what a body of this size covers in its place."""
+        points = _outline(pose, length, width)
+        found = {}
+        for lane in self._near(points):
+            row = self._network.lanes[lane]
+            if not self._is_level(lane, pose.beside):
+                continue
+            places = [self._network.beside(lane, x, y)[:2] for x, y in points]
+            reach = 0.5 * float(row["width_m"])
+            length_m = float(row["length_m"])
+            covered = [s for s, d in places if abs(d) < reach and 0.0 <= s <= length_m]
+            if covered:
+                start, end = min(covered), max(covered)
+                _, _, _, cos, sin, _ = self._network.pose_on(lane, 0.5 * (start + end))
+                along = math.cos(pose.heading) * cos + math.sin(pose.heading) * sin
+                found[lane] = Shadow(start, end, max(pose.speed * along, 0.0))
+        return found
+
+    def nearest(self, pose: Pose) -> tuple[int, float, float]:
+        """The lane whose stretch is nearest to a place, and s and d there."""
+        best, best_off = (pose.beside, 0.0, 0.0), math.inf
+        for lane in self._around(pose.x, pose.y):
+            if not self._is_level(lane, pose.beside):
+                continue
+            s, d, _, _ = self._network.beside(lane, pose.x, pose.y)
+            length = float(self._network.lanes["length_m"][lane])
+            on = min(max(s, 0.0), length)
+            off = math.hypot(abs(s - on), d)
+            if off < best_off:
+                best, best_off = (lane, on, d), off
+        return best
+
+    def height_m(self, lane: int, s: float) -> float:
+        return self._network.pose_on(lane, s)[2]
+
+    def distance_m(self, lane: int, s: float, pose: Pose) -> float:
+        """From a place on a lane to an actor, in the plane."""
+        x, y, *_ = self._network.pose_on(lane, s)
+        return math.hypot(x - pose.x, y - pose.y)
+
+    def _is_level(self, lane: int, other: int) -> bool:
+        """Whether two lanes that are near each other can be on the same road."""
+        z = self._network.points["z"][self._network.lanes["first_point"][[lane, other]]]
+        return bool(abs(z[0] - z[1]) < LEVEL_M)
+
+    def _near(self, points: NDArray[np.float64]) -> list[int]:
+        cells = {self._cell(x, y) for x, y in points}
+        return sorted({lane for cell in cells for lane in self._members(cell)})
+
+    def _around(self, x: float, y: float) -> list[int]:
+        """Lanes of the nearest cells that have any, by rising rows."""
+        step = self._grid.cell_m
+        for ring in range(1, int(FARTHEST_M / step) + 1):
+            offsets = np.arange(-ring, ring + 1) * step
+            cells = {self._cell(x + dx, y + dy) for dx in offsets for dy in offsets}
+            if found := sorted({lane for cell in cells for lane in self._members(cell)}):
+                return found
+        return list(range(len(self._network.lanes)))
+
+    def _cell(self, x: float, y: float) -> int:
+        grid = self._grid
+        column = min(max(int((x - grid.min_x) // grid.cell_m), 0), grid.num_x - 1)
+        line = min(max(int((y - grid.min_y) // grid.cell_m), 0), grid.num_y - 1)
+        return line * grid.num_x + column
+
+    def _members(self, cell: int) -> list[int]:
+        start = self._grid.cell_start
+        lanes: list[int] = self._grid.cell_lanes[start[cell] : start[cell + 1]].tolist()
+        return [lane for lane in lanes if self._network.lanes["permissions"][lane] & ON_ROAD]
+
+
+def _outline(pose: Pose, length: float, width: float) -> NDArray[np.float64]:
+    """(n, 2) points all over a body, its corners among them."""
+    along = np.linspace(-0.5, 0.5, max(2, round(length / SAMPLE_M) + 1)) * length
+    across = np.linspace(-0.5, 0.5, max(2, round(width / SAMPLE_M) + 1)) * width
+    u, v = (grid.ravel() for grid in np.meshgrid(along, across))
+    cos, sin = math.cos(pose.heading), math.sin(pose.heading)
+    return np.stack([pose.x + u * cos - v * sin, pose.y + u * sin + v * cos], axis=1)
+
 
 FORESIGHT_S = 2.0  # drivers brake for actors that will be on their lane by then
 
-FRAME = np.dtype(
-    [
-        ("x", np.float64),  # as in VEHICLE
-        ("y", np.float64),
-        ("z", np.float64),
-        ("heading", np.float64),
-        ("pitch", np.float64),
-        ("speed", np.float64),
-        ("s", np.float64),  # on `lane`, which is the nearest one
-        ("d", np.float64),
-        ("lane", np.int32),
-        ("link", np.int32),
-        ("following", np.int32),  # FRAME of the next tick; the last one follows itself
-        ("cue", np.int32),  # CUE without which it stays; -1: it goes on by itself
-        ("released_to", np.int32),  # goal to which a built-in driver takes it from here, or -1
-        ("first_cover", np.int32),  # COVER rows
-        ("num_covers", np.int32),
-        ("first_claim", np.int32),  # CLAIM rows
-        ("num_claims", np.int32),
-    ],
-    align=True,
+FRAME = record(
+    ("x", np.float64),  # as in VEHICLE
+    ("y", np.float64),
+    ("z", np.float64),
+    ("heading", np.float64),
+    ("pitch", np.float64),
+    ("speed", np.float64),
+    ("s", np.float64),  # on `lane`, which is the nearest one
+    ("d", np.float64),
+    ("lane", np.int32),
+    ("link", np.int32),
+    ("following", np.int32),  # FRAME of the next tick; the last one follows itself
+    ("cue", np.int32),  # CUE without which it stays; -1: it goes on by itself
+    ("released_to", np.int32),  # goal to which a built-in driver takes it from here, or -1
+    ("first_cover", np.int32),  # COVER rows
+    ("num_covers", np.int32),
+    ("first_claim", np.int32),  # CLAIM rows
+    ("num_claims", np.int32),
 )
 
-COVER = np.dtype(
-    [
-        ("s", np.float64),  # middle of the covered part of the lane, m
-        ("half", np.float64),  # and half its length
-        ("speed", np.float64),  # m/s along the lane, not below 0
-        ("lane", np.int32),
-    ],
-    align=True,
+COVER = record(
+    ("s", np.float64),  # middle of the covered part of the lane, m
+    ("half", np.float64),  # and half its length
+    ("speed", np.float64),  # m/s along the lane, not below 0
+    ("lane", np.int32),
 )
 
-CLAIM = np.dtype(
-    [
-        ("dist", np.float64),  # of the centre to the stop line, m; negative beyond it
-        ("link", np.int32),
-    ],
-    align=True,
+CLAIM = record(
+    ("dist", np.float64),  # of the centre to the stop line, m; negative beyond it
+    ("link", np.int32),
 )
 
-CUE = np.dtype(
-    [
-        ("x", np.float64),  # an agent's centre is within `radius_m` of this place
-        ("y", np.float64),
-        ("radius_m", np.float64),
-        ("tick", np.int64),  # or this tick has come; -1: it does not matter
-    ],
-    align=True,
+CUE = record(
+    ("x", np.float64),  # an agent's centre is within `radius_m` of this place
+    ("y", np.float64),
+    ("radius_m", np.float64),
+    ("tick", np.int64),  # or this tick has come; -1: it does not matter
 )
 
 NO_SCRIPTS = Scripts(
@@ -108,16 +206,11 @@ class Cue(NamedTuple):
 
 @dataclass(frozen=True)
 class Actor:
-    """A road user that follows a script.
+    """A road user that follows a script."""
 
-    Attributes:
-        body: what it is: a name of `BODIES`.
-        acts: what it does, one after the other; each begins where the one before ends.
-        released_to: EDGE to which a built-in driver takes it in the end; None: it stays.
-    """
-
-    body: str
-    acts: Sequence[Act]
+    body: str  # what it is: a name of `BODIES`
+    acts: Sequence[Act]  # what it does, one after the other; each begins where the one before ends
+    # EDGE to which a built-in driver takes it in the end; None: it stays
     released_to: int | None = None
 
 
@@ -132,7 +225,6 @@ def actor_types() -> NDArray[np.void]:
 
 
 def bodies_of(actors: Sequence[Actor]) -> list[int]:
-    """Which of the rows of `actor_types` each actor has."""
     names = list(BODIES)
     return [names.index(actor.body) for actor in actors]
 
@@ -157,12 +249,8 @@ def compile_scripts(
 ) -> tuple[Scripts, list[int]]:
     """The frames of all actors, and the first one of each.
 
-    Args:
-        network: the roads.
-        actors: those that have a script.
-        cues: by the numbers that `Await` has.
-        goals: row of the plans' table by EDGE, for actors that are released.
-        dt: seconds a tick.
+    `actors`: those that have a script. `cues`: by the numbers that `Await` has. `goals`: row of the
+    plans' table by EDGE, for actors that are released.
     """
     tables = _Tables()
     shadows = Shadows(network)
@@ -185,7 +273,6 @@ def compile_scripts(
 
 
 def _poses(network: RoadNetwork, actor: Actor, dt: float) -> Iterator[Pose]:
-    """Where an actor is in each tick, from its first place on."""
     last: Pose | None = None
     for act in actor.acts:
         for pose in act.poses(network, BODIES[actor.body].length, last, dt):

@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.geometry import lane_pose, project
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.routing import lane_grid
 
@@ -20,41 +19,24 @@ LOOK_MARGIN_M = 0.3
 
 
 class Crossing(NamedTuple):
-    """Two movements over a junction that share an area.
+    """Two movements over a junction that share an area."""
 
-    Attributes:
-        link: LINK row of the one.
-        foe: LINK row of the other.
-        middle_m: of the area, from the stop line of the one.
-        foe_middle_m: of the area, from the stop line of the other.
-    """
-
-    link: int
-    foe: int
-    middle_m: float
-    foe_middle_m: float
+    link: int  # LINK row of the one
+    foe: int  # LINK row of the other
+    middle_m: float  # of the area, from the stop line of the one
+    foe_middle_m: float  # of the area, from the stop line of the other
 
 
 class Opposite(NamedTuple):
-    """The lane beside another one in the opposite direction.
-
-    Attributes:
-        lane: LANE row.
-        s: on it, m.
-        apart_m: between the middles of both.
-    """
+    """The lane beside another one in the opposite direction."""
 
     lane: int
-    s: float
-    apart_m: float
+    s: float  # on it, m
+    apart_m: float  # between the middles of both
 
 
 class Streets:
-    """Questions about a road network.
-
-    Args:
-        network: the roads.
-    """
+    """Questions about a road network."""
 
     def __init__(self, network: RoadNetwork) -> None:
         self.network = network
@@ -62,10 +44,7 @@ class Streets:
 
     def point(self, lane: int, s: float, d: float = 0.0) -> NDArray[np.float64]:
         """(3,) x, y and heading of a place on a lane, `d` m to the left of its middle."""
-        row = self.network.lanes[lane]
-        x, y, _, cos, sin, _ = lane_pose(
-            self.network.points, row["first_point"], row["num_points"], s
-        )
+        x, y, _, cos, sin, _ = self.network.pose_on(lane, s)
         return np.array([x - d * sin, y + d * cos, math.atan2(sin, cos)])
 
     def edge(self, lane: int) -> int:
@@ -105,11 +84,8 @@ class Streets:
         other = self._lane_at(np.array([x, y, heading]))
         if other < 0:
             return None
-        row = self.network.lanes[other]
         middle = self.point(lane, s)
-        place, d, cos, sin = project(
-            self.network.points, row["first_point"], row["num_points"], middle[0], middle[1]
-        )
+        place, d, cos, sin = self.network.beside(other, middle[0], middle[1])
         along = cos * math.cos(heading) + sin * math.sin(heading)
         if along > -0.99 or abs(d) > BESIDE_M:
             return None
@@ -118,10 +94,8 @@ class Streets:
     def crossings(self, directions: str, *, yields: bool, merges: bool) -> Iterator[Crossing]:
         """Pairs of movements of cars that share an area.
 
-        Args:
-            directions: SUMO's letters of the one, as `s` or `lL`.
-            yields: whether it has to give way to the other.
-            merges: whether both lead into one lane.
+        `directions`: SUMO's letters of the one, as `s` or `lL`. `yields`: whether it has to give
+        way to the other. `merges`: whether both lead into one lane.
         """
         links, conflicts, lanes = self.network.links, self.network.conflicts, self.network.lanes
         ends = lanes["permissions"][links["from_lane"]] & lanes["permissions"][links["to_lane"]]
@@ -205,9 +179,7 @@ class Streets:
         return self.network.lane_ids[lane]
 
     def _bend(self, lane: int) -> float:
-        row = self.network.lanes[lane]
-        points = self.network.points[row["first_point"] : row["first_point"] + row["num_points"]]
-        return float(np.ptp(np.unwrap(points["heading"])))
+        return float(np.ptp(np.unwrap(self.network.lane_points(lane)["heading"])))
 
     def _lane_at(self, place: NDArray[np.float64]) -> int:
         """The lane outside junctions that a place is on, or -1."""
@@ -220,7 +192,7 @@ class Streets:
             row = self.network.lanes[lane]
             if row["internal"]:
                 continue
-            s, d, _, _ = project(self.network.points, row["first_point"], row["num_points"], x, y)
+            s, d, _, _ = self.network.beside(lane, x, y)
             if abs(d) < 0.5 * row["width_m"] and 0.0 <= s <= row["length_m"]:
                 return int(lane)
         return -1

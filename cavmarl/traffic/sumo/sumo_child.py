@@ -141,8 +141,7 @@ class SumoSimulation:
     ) -> tuple[Sequence[str], NDArray[np.int32], NDArray[np.int32], list[list[Any]]]:
         """The vehicles that stand or drive on the map's lanes, and which of them have come now.
 
-        Returns:
-            names, numbers and LANE rows, and what is to be said of vehicles that have come.
+        Returns names, numbers and LANE rows, and what is to be said of vehicles that have come.
         """
         vehicle, nobody = self._vehicle, repeat(-1)
         names = vehicle.getIDList()

@@ -18,8 +18,7 @@ from cavmarl.core.records.codes import MODEL_KRAUSS
 from cavmarl.driving.vehicle_types import NEAREST_CLASS, NO_ROAD_CLASSES, VTYPE, generated_types
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.sumo_net.xml_source import read_bytes
-from cavmarl.traffic.sumo.sumo_input import SumoInput, read_input
-from cavmarl.traffic.sumo.sumo_options import command_words
+from cavmarl.traffic.sumo.sumo_input import SumoInput, command_words, read_input
 from cavmarl.traffic.sumo.sumo_process import SumoProcess, choose_interface
 
 _SAME_NAME = ("length", "width", "height", "min_gap", "accel", "decel", "emergency_decel", "tau",
@@ -28,35 +27,20 @@ _SAME_NAME = ("length", "width", "height", "min_gap", "accel", "decel", "emergen
 
 @dataclass(frozen=True, eq=False)
 class SumoDemand:
-    """What a SUMO of this environment is started with.
-
-    Attributes:
-        network: the roads.
-        map_file: the same, as SUMO reads them.
-        given: demand and options.
-        drives: SUMO moves its vehicles (`sumo-traffic`), and does not only order departures.
-        max_vehicles: that one world can hold.
-        replay_bytes: for what a world's SUMO is told in an episode.
-        dt_s: seconds a tick.
-        interface: `libsumo` or `traci`.
-        version: of SUMO.
-        types: VTYPE (num_types,) of its vehicles on roads.
-        type_ids: their names; of those on no road at the end.
-        content_hash: of all files.
-    """
+    """What a SUMO of this environment is started with."""
 
     network: RoadNetwork
-    map_file: Path
-    given: SumoInput
-    drives: bool
-    max_vehicles: int
-    replay_bytes: int
+    map_file: Path  # the same, as SUMO reads them
+    given: SumoInput  # demand and options
+    drives: bool  # SUMO moves its vehicles (`sumo-traffic`), and does not only order departures
+    max_vehicles: int  # that one world can hold
+    replay_bytes: int  # for what a world's SUMO is told in an episode
     dt_s: float
-    interface: str
-    version: str
-    types: NDArray[np.void]
-    type_ids: tuple[str, ...]
-    content_hash: str
+    interface: str  # `libsumo` or `traci`
+    version: str  # of SUMO
+    types: NDArray[np.void]  # VTYPE (num_types,) of its vehicles on roads
+    type_ids: tuple[str, ...]  # their names; of those on no road at the end
+    content_hash: str  # of all files
 
     def told(self) -> dict[str, Any]:
         """What its process is told once; types by VTYPE row of the world's table."""
@@ -78,15 +62,11 @@ def read_sumo_demand(
 ) -> SumoDemand:
     """Have SUMO read all files of an environment, and keep what it found.
 
-    Args:
-        config: the environment; its `traffic.source` is one of SUMO's.
-        network: the roads.
-        map_file: the same, as SUMO reads them.
-        files: one `.sumocfg`, or files of routes and additional files.
+    `config`: the environment; its `traffic.source` is one of SUMO's. `map_file`: the same, as SUMO
+    reads them. `files`: one `.sumocfg`, or files of routes and additional files.
 
-    Raises:
-        DemandError: SUMO refuses them on this map, with its words; or its signals are others.
-        MissingExtraError: SUMO is not installed.
+    Raises DemandError: SUMO refuses them on this map, with its words; or its signals are others;
+    MissingExtraError: SUMO is not installed.
     """
     given = read_input(files)
     interface = choose_interface(config.sumo.interface)

@@ -1,4 +1,7 @@
-"""What SUMO is given: a map, demand files, and the options of a `.sumocfg` that change traffic."""
+"""What SUMO is given: a map, demand files, and the options of a `.sumocfg` that change traffic.
+
+And its command line, the same wherever it is run.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ from xml.etree.ElementTree import Element, ParseError, tostring
 import defusedxml.ElementTree
 from defusedxml.common import DefusedXmlException
 
-from cavmarl.core.errors import ConfigError
+from cavmarl.core.errors import ConfigError, SumoError, require
 from cavmarl.roads.sumo_net.xml_source import read_bytes
 
 _INPUTS = {
@@ -58,21 +61,14 @@ _ASCII_BELOW = {"utf-8", "utf8", "ascii", "us-ascii", "iso-8859-1", "latin-1", "
 
 @dataclass(frozen=True)
 class SumoInput:
-    """Files and options.
+    """Files and options."""
 
-    Attributes:
-        route_files: demand that SUMO reads as it goes.
-        additional_files: types, stops, signal programs; read first.
-        begin_s: when the demand begins.
-        options: SUMO's own, of the configuration's sections that change what the traffic does.
-        net_file: the map that a configuration names.
-    """
-
-    route_files: tuple[Path, ...]
-    additional_files: tuple[Path, ...]
-    begin_s: float = 0.0
+    route_files: tuple[Path, ...]  # demand that SUMO reads as it goes
+    additional_files: tuple[Path, ...]  # types, stops, signal programs; read first
+    begin_s: float = 0.0  # when the demand begins
+    # SUMO's own, of the configuration's sections that change what the traffic does
     options: dict[str, str] = field(default_factory=dict)
-    net_file: Path | None = None
+    net_file: Path | None = None  # the map that a configuration names
 
 
 def read_input(demand: Sequence[Path]) -> SumoInput:
@@ -213,3 +209,53 @@ def _seconds(text: str, path: Path) -> float:
         raise ConfigError(f"{path}: begin = '{text}' is no time") from error
     weights = (86400.0, 3600.0, 60.0, 1.0)[-len(parts) :]
     return sum(part * weight for part, weight in zip(parts, weights, strict=True))
+
+
+def command_words(
+    map_file: Path,
+    demand: SumoInput,
+    folder: Path,
+    dt_s: float,
+    seed: int,
+    more: dict[str, str] | None = None,
+    additional: tuple[Path, ...] = (),
+) -> list[str]:
+    """The words behind the program's name.
+
+    `map_file`: a SUMO network. `folder`: for copies of additional files that write nothing. `seed`:
+    of SUMO's random numbers. `more`: options, which stand above those of the demand's
+    configuration. `additional`: further additional files.
+    """
+    copies = folder / "additional"
+    copies.mkdir(exist_ok=True)
+    files = [str(without_outputs(path, copies)) for path in demand.additional_files]
+    routes = [str(without_outputs(path, copies)) for path in demand.route_files]
+    options = demand.options | {
+        "net-file": str(map_file),
+        "route-files": ",".join(routes),
+        "additional-files": ",".join([*files, *map(str, additional)]),
+        "begin": str(demand.begin_s),
+        "step-length": repr(dt_s),
+        "seed": str(seed),
+        "no-step-log": "true",
+        "no-warnings": "true",
+        "duration-log.disable": "true",
+        "xml-validation": "never",
+        **(more or {}),
+    }
+    return [f"--{name}={value}" for name, value in options.items() if value]
+
+
+def free_libsumo() -> object:
+    """This process's libsumo, in which nothing runs.
+
+    Raises MissingExtraError: it is not installed; SumoError: a simulation runs in it: a second
+    start would silently replace it.
+    """
+    libsumo = require("libsumo", "sumo")
+    if libsumo.isLoaded():
+        raise SumoError(
+            "libsumo holds one simulation a process, and one runs in this one: close it, or start "
+            "the other one in a process of its own"
+        )
+    return libsumo

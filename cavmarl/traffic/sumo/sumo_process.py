@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError, MissingExtraError, SumoError
 from cavmarl.traffic.sumo import sumo_child as child
-from cavmarl.traffic.sumo.sumo_records import MOVED, SEEN
+from cavmarl.traffic.sumo.sumo_history import MOVED, SEEN
 
 ANSWER_S = 120.0  # a step that takes longer hangs
 END_S = 2.0  # for it to end by itself
@@ -31,24 +31,17 @@ HUGE_PAGES = "glibc.malloc.hugetlb=1"
 
 
 class SumoAnswer(NamedTuple):
-    """What a SUMO says after a step.
+    """What a SUMO says after a step."""
 
-    Attributes:
-        seen: SEEN (n,) by rising numbers.
-        letters: codes of characters, of all signals one after the other.
-        line: what is new: `departed`, `teleported`, `routes`.
-    """
-
-    seen: NDArray[np.void]
-    letters: bytes
-    line: dict[str, Any]
+    seen: NDArray[np.void]  # SEEN (n,) by rising numbers
+    letters: bytes  # codes of characters, of all signals one after the other
+    line: dict[str, Any]  # what is new: `departed`, `teleported`, `routes`
 
 
 def choose_interface(wanted: str) -> str:
     """`libsumo`, or `traci` where that is not installed, unless one is asked for.
 
-    Raises:
-        MissingExtraError: neither is there, or not the one that is wanted.
+    Raises MissingExtraError: neither is there, or not the one that is wanted.
     """
     choices = ("libsumo", "traci") if wanted == "auto" else (wanted,)
     for name in choices:
@@ -100,9 +93,7 @@ class SumoProcess:
     def look_up(self, words: list[str]) -> dict[str, Any]:
         """Begin with a command line, and say what its files have.
 
-        Raises:
-            ConfigError: SUMO refuses them.
-            SumoError: the process has ended.
+        Raises ConfigError: SUMO refuses them; SumoError: the process has ended.
         """
         self._send(child.LOOK_UP, {"words": words})
         return self._receive().line

@@ -13,41 +13,88 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from itertools import repeat
+from itertools import accumulate, pairwise, repeat
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import CapacityError
+from cavmarl.core.errors import CapacityError, SumoError
 from cavmarl.core.numba.repeated import repeated
 from cavmarl.core.records.arrays import Gate, RoadArrays, Travel, Worlds, Zoned
-from cavmarl.core.records.codes import (
-    COUNT_REROUTED,
-    LANE_GIVEN,
-    POS_GIVEN,
-    SPEED_MAX,
-)
-from cavmarl.roads.network import RoadNetwork
+from cavmarl.core.records.codes import COUNT_REROUTED, LANE_GIVEN, POS_GIVEN, SPEED_MAX
+from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
 from cavmarl.traffic.kernels.mirroring import greet, list_others, mirror, send_on
-from cavmarl.traffic.sumo.route_book import RouteBook
-from cavmarl.traffic.sumo.stop_book import StopBook
+from cavmarl.traffic.sumo.route_book import RouteBook, StopBook
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
-from cavmarl.traffic.sumo.sumo_history import ToldLog
-from cavmarl.traffic.sumo.sumo_records import MOVED
-from cavmarl.traffic.sumo.sumo_signals import ShownSignals
+from cavmarl.traffic.sumo.sumo_history import MOVED, ToldLog
 from cavmarl.traffic.sumo.sumo_worlds import SumoWorlds
+
+
+class _Shown(NamedTuple):
+    """What a world's signals have shown the last time."""
+
+    letters: NDArray[np.uint8]  # codes of characters, of all signals one after the other
+    phase: NDArray[np.int32]  # (num_signals,) PHASE rows
+
+
+class ShownSignals:
+    """Finds the phase of each signal that shows the same letters.
+
+    `network`: the roads, with all programs that SUMO has.
+    """
+
+    def __init__(self, network: RoadNetwork, num_worlds: int) -> None:
+        self._ids = network.signal_ids
+        num_letters = network.signals["num_links"]
+        self._signal_of = np.repeat(np.arange(len(num_letters)), num_letters)
+        self._last: list[_Shown | None] = [None] * num_worlds
+        bounds = accumulate(network.signals["num_links"].tolist(), initial=0)
+        self._parts = [slice(*pair) for pair in pairwise(bounds)]
+        self._rows: dict[tuple[int, bytes], int] = {}
+        for program in network.programs:
+            signal = int(program["signal"])
+            num = int(network.signals[signal]["num_links"])
+            first = int(program["first_phase"])
+            for row in range(first, first + int(program["num_phases"])):
+                state = int(network.phases[row]["first_state"])
+                codes = network.phase_states[state : state + num]
+                letters = "".join(SIGNAL_STATES[code] for code in codes).encode()
+                self._rows.setdefault((signal, letters), row)
+
+    def show(self, w: int, letters: bytes, phase: NDArray[np.int32]) -> None:
+        """Write the PHASE rows of a world's signals.
+
+        `letters`: of all signals, one after the other. `phase`: (num_signals,) is written.
+
+        Raises SumoError: a signal shows what no program of the map's has.
+        """
+        codes, last = np.frombuffer(letters, dtype=np.uint8), self._last[w]
+        if last is None:
+            changed, rows = np.arange(len(self._parts)), np.zeros(len(self._parts), dtype=np.int32)
+        else:  # most of them show what they have shown in the tick before
+            changed, rows = np.unique(self._signal_of[codes != last.letters]), last.phase
+        for signal in changed.tolist():
+            part = letters[self._parts[signal]]
+            row = self._rows.get((signal, part))
+            if row is None:
+                self._last[w] = None
+                raise SumoError(
+                    f"signal '{self._ids[signal]}' shows '{part.decode()}', which no "
+                    "phase of its programs does: give all of its programs as <tlLogic> in the map "
+                    "or in an additional file of the demand"
+                )
+            rows[signal] = row
+        self._last[w] = _Shown(codes, rows)
+        phase[:] = rows
 
 
 class SumoTraffic:
     """SUMO beside W worlds.
 
-    Args:
-        demand: what it runs.
-        network: the roads.
-        travel: types and ways, with room for its routes behind.
-        first_step: where that room begins.
-        zoned: the rows of all zones.
-        blank: VEHICLE (1,), the record that every vehicle starts from.
+    `travel`: types and ways, with room for its routes behind. `first_step`: where that room begins.
+    `zoned`: the rows of all zones. `blank`: VEHICLE (1,), the record that every vehicle starts
+    from.
 
     Attributes:
         drives: whether SUMO moves its vehicles.
@@ -104,8 +151,7 @@ class SumoTraffic:
     def catch_up(self, worlds: Worlds) -> None:
         """Bring SUMO to the worlds' ticks, from the beginning of their episodes.
 
-        Raises:
-            SumoError: SUMO has been told where ours are, and that is not on record.
+        Raises SumoError: SUMO has been told where ours are, and that is not on record.
         """
         for w, (key, tick) in enumerate(zip(worlds.keys, worlds.ticks.tolist(), strict=True)):
             told: Iterable[NDArray[np.void]] = repeat(np.zeros(0, dtype=MOVED), tick)
@@ -119,17 +165,14 @@ class SumoTraffic:
     def step(self, worlds: Worlds, side: int) -> None:
         """Let SUMO take its step; errors as of `SumoWorlds.step`.
 
-        Args:
-            worlds: of any shard.
-            side: where the next rows are.
+        `worlds`: of any shard. `side`: where the next rows are.
         """
         self.worlds.step(worlds.ticks.tolist(), lambda w: self._moved(w, side))
 
     def mirror(self, worlds: Worlds, side: int) -> int:
         """Bring SUMO's vehicles to where they are after its step; arguments as of `step`.
 
-        Returns:
-            how many vehicles leave, in all worlds.
+        Returns how many vehicles leave, in all worlds.
         """
         return sum(
             self._mirror(
@@ -155,8 +198,7 @@ class SumoTraffic:
     def let_in(self, gate: Gate, worlds: Worlds) -> bool:
         """Fill `gate.passing` with the vehicles that SUMO has let in; whether there are any.
 
-        Raises:
-            CapacityError: more than there is room for.
+        Raises CapacityError: more than there is room for.
         """
         for w in range(len(worlds.ticks)):
             now = self.worlds.at(w)
@@ -182,8 +224,7 @@ class SumoTraffic:
     def order(self, gate: Gate, worlds: Worlds) -> None:
         """Put the vehicles that SUMO has let in at the end of the queue, with routes of theirs.
 
-        Raises:
-            CapacityError: more wait than there is room for.
+        Raises CapacityError: more wait than there is room for.
         """
         for w in range(len(worlds.ticks)):
             now = self.worlds.at(w)
@@ -231,7 +272,6 @@ class SumoTraffic:
         self.worlds.stops.shift(rows, worlds)
 
     def close(self) -> None:
-        """End all processes."""
         self.worlds.close()
 
     def _moved(self, w: int, side: int) -> NDArray[np.void]:

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError, SumoError
 from cavmarl.traffic.kernels.mirroring import Paths
-from cavmarl.traffic.sumo.route_book import RouteBook
-from cavmarl.traffic.sumo.stop_book import StopBook
+from cavmarl.traffic.sumo.route_book import RouteBook, StopBook
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
 from cavmarl.traffic.sumo.sumo_history import ToldLog
 from cavmarl.traffic.sumo.sumo_process import SumoAnswer, SumoProcess
@@ -29,38 +28,23 @@ log = logging.getLogger(__name__)
 
 
 class SumoTick(NamedTuple):
-    """What SUMO says about one tick of one world.
+    """What SUMO says about one tick of one world."""
 
-    Attributes:
-        tick: that this is the state of.
-        seen: SEEN (n,) by rising numbers, with paths in the place of routes.
-        letters: of all signals.
-        departed: (m,) numbers of vehicles that have come, rising.
-        speed_factors: (m,) theirs.
-        stops: (m, 2) STOP rows [first, end) that they are to make, -1: none; (0, 2) where SUMO
-            moves them.
-        teleported: numbers of vehicles that have been lifted off the road.
-        rerouted: (r,) numbers of those on another route than a tick before, rising.
-    """
-
-    tick: int
-    seen: NDArray[np.void]
-    letters: bytes
-    departed: NDArray[np.int64]
-    speed_factors: NDArray[np.float64]
+    tick: int  # that this is the state of
+    seen: NDArray[np.void]  # SEEN (n,) by rising numbers, with paths in the place of routes
+    letters: bytes  # of all signals
+    departed: NDArray[np.int64]  # (m,) numbers of vehicles that have come, rising
+    speed_factors: NDArray[np.float64]  # (m,) theirs
+    # (m, 2) STOP rows [first, end) that they are to make, -1: none; (0, 2) where SUMO moves them
     stops: NDArray[np.int64]
-    teleported: tuple[int, ...]
-    rerouted: NDArray[np.int64]
+    teleported: tuple[int, ...]  # numbers of vehicles that have been lifted off the road
+    rerouted: NDArray[np.int64]  # (r,) numbers of those on another route than a tick before, rising
 
 
 class SumoWorlds:
     """The processes and what they have said last.
 
-    Args:
-        demand: what they run.
-        book: where their routes are written.
-        stops: where their stops are written.
-        num_worlds: W.
+    `book`: where their routes are written. `stops`: where their stops are written.
 
     Attributes:
         book: of their routes.
@@ -92,13 +76,9 @@ class SumoWorlds:
     def begin(self, w: int, key: int) -> None:
         """Start a world's SUMO anew, for an episode.
 
-        Args:
-            w: which world.
-            key: the root of its random numbers.
+        `key`: the root of its random numbers.
 
-        Raises:
-            ConfigError: SUMO refuses its files.
-            SumoError: the process ended.
+        Raises ConfigError: SUMO refuses its files; SumoError: the process ended.
         """
         process = self._processes[w]
         if process is None or not process.lives:

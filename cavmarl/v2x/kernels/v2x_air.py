@@ -1,4 +1,11 @@
-"""The packets of one tick on the air: by place, by sender, and how much of it they take."""
+"""The packets of one tick on the air: by place, by sender, and how much of it they take.
+
+Most packets are CAMs, one of every vehicle. What a receiver takes of them: all within reach are
+listed first. Their distances and random numbers are then taken in one loop over what lies together,
+which the compiler makes vector instructions of; only what is looked up in tables comes one by one.
+What takes whole bundles of arrays is inlined: handed over for every receiver, they would take
+longer than the rest.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +16,22 @@ from numpy.typing import NDArray
 
 from cavmarl.core.math.neighbors import cell_at, cell_columns, cell_rows
 from cavmarl.core.math.rng import mix
+from cavmarl.core.math.walls import is_cut
 from cavmarl.core.numba import inlined_kernel, kernel
-from cavmarl.v2x.kernels.v2x_channel import Channel, gets_access
-from cavmarl.v2x.kernels.v2x_records import COUNT_NO_ACCESS, KIND_CAM, Air, Mail, V2xScratch
+from cavmarl.v2x.kernels.v2x_channel import Channel, chance_at, draw, gets_access, is_heard
+from cavmarl.v2x.kernels.v2x_inbox import find, insert, is_better
+from cavmarl.v2x.kernels.v2x_records import (
+    BANDS_PER_M,
+    COUNT_NO_ACCESS,
+    COUNT_REACHABLE,
+    COUNT_RECEIVED,
+    KIND_CAM,
+    NUM_BANDS,
+    Air,
+    HeardCams,
+    Mail,
+    V2xScratch,
+)
 
 
 @kernel
@@ -90,7 +110,6 @@ def list_cams(room: V2xScratch, packets: NDArray[np.void], num: int) -> None:
 
 @inlined_kernel
 def find_cam(room: V2xScratch, packets: NDArray[np.void], sender: int) -> int:
-    """The CAM of a sender, or -1."""
     table = room.cam_of
     place = _place_of(sender, table.size)
     while table[place] >= 0 and packets[table[place]]["sender"] != sender:
@@ -121,3 +140,159 @@ def let_on_the_air(
     if not are_all_on:
         _fill_air(room.cams, packets, num, True, room.access)
         _fill_air(room.others, packets, num, False, room.access)
+
+
+@inlined_kernel
+def hears(
+    channel: Channel, me: np.void, level: int, word: np.uint64, x: float, y: float, squared: float
+) -> bool:
+    """Whether a receiver receives the packet of that word, sent within reach from (x, y)."""
+    if channel.sure:
+        return True
+    number = draw(me["word"], word)
+    return is_heard(channel, level, number, me["x"], me["y"], x, y, math.sqrt(squared))
+
+
+@inlined_kernel
+def band_of(distance_m: float) -> int:
+    """In which band of distance a packet is counted."""
+    return min(int(distance_m * BANDS_PER_M), NUM_BANDS - 1)
+
+
+@inlined_kernel
+def refresh_by_cams(
+    channel: Channel,
+    me: np.void,
+    level: int,
+    packets: NDArray[np.void],
+    reports: NDArray[np.void],
+    room: V2xScratch,
+    box: NDArray[np.void],
+    num: int,
+) -> None:
+    """Let those that a receiver knows tell the newest of themselves."""
+    limit = channel.reach_m * channel.reach_m
+    for k in range(num):
+        p = find_cam(room, packets, box[k]["subject"])
+        if p < 0:
+            continue
+        packet = packets[p]
+        dx = packet["x"] - me["x"]
+        dy = packet["y"] - me["y"]
+        squared = dx * dx + dy * dy
+        if squared <= limit and hears(
+            channel, me, level, packet["word"], packet["x"], packet["y"], squared
+        ):
+            report = reports[packet["first"]]
+            if is_better(report, box[k]):
+                box[k] = report
+
+
+@inlined_kernel
+def _list_within(
+    air: Air, own: int, x: float, y: float, reach_m: float, limit: float, heard: HeardCams
+) -> int:
+    """List the packets of others within a distance; returns how many."""
+    cells = air.cells
+    near = 0
+    first_column, last_column = cell_columns(cells, x, reach_m)
+    first_row, last_row = cell_rows(cells, y, reach_m)
+    for j in range(first_row, last_row + 1):
+        begin = cells.start[j * cells.num_x + first_column]
+        end = cells.start[j * cells.num_x + last_column + 1]
+        # Here and below a place is written in any case: whether it is in is unpredictable.
+        for b in range(begin, end):
+            dx = air.x[b] - x
+            dy = air.y[b] - y
+            squared = dx * dx + dy * dy
+            heard.place[near] = b
+            heard.squared[near] = squared
+            heard.word[near] = air.word[b]
+            near += (squared <= limit) & (air.sender[b] != own)
+    return near
+
+
+@inlined_kernel
+def _drop_lost(channel: Channel, me: np.void, level: int, room: V2xScratch, num: int) -> int:
+    """Of the first `num` in `room.heard` keep those that are received; returns how many."""
+    air = room.cams
+    place = room.heard.place
+    squared = room.heard.squared
+    words = room.heard.word
+    distances = room.heard.distance
+    numbers = room.heard.number
+    tally = room.tally
+    of_receiver = me["word"]
+    x = me["x"]
+    y = me["y"]
+    clear = channel.clear[level]
+    for k in range(num):
+        distances[k] = math.sqrt(squared[k])
+        numbers[k] = draw(of_receiver, words[k])
+    has_walls = channel.blocked.shape[0] > 0 and channel.walls.segments.shape[0] > 0
+    kept = 0
+    for k in range(num):
+        distance_m = distances[k]
+        is_received = numbers[k] < chance_at(clear, distance_m)
+        # What is received even behind a building needs no look whether one is there.
+        if (
+            has_walls
+            and is_received
+            and numbers[k] >= chance_at(channel.blocked[level], distance_m)
+        ):
+            b = place[k]
+            is_received = not is_cut(channel.walls, x, y, air.x[b], air.y[b])
+        tally[2 * band_of(distance_m) + is_received] += 1
+        place[kept] = place[k]
+        squared[kept] = squared[k]
+        kept += is_received
+    return kept
+
+
+@inlined_kernel
+def let_in_cams(
+    channel: Channel,
+    mail: Mail,
+    w: int,
+    me: np.void,
+    level: int,
+    packets: NDArray[np.void],
+    reports: NDArray[np.void],
+    room: V2xScratch,
+    box: NDArray[np.void],
+    num: int,
+) -> int:
+    """Let the nearest of those in that a receiver did not know; returns how many it knows then."""
+    air = room.cams
+    reach_m = channel.reach_m
+    limit = reach_m * reach_m
+    x = me["x"]
+    y = me["y"]
+    own = me["id"]
+    if channel.sure:
+        reachable = count_within(air, x, y, reach_m)
+        p = find_cam(room, packets, own)
+        if p >= 0:
+            dx = packets[p]["x"] - x
+            dy = packets[p]["y"] - y
+            reachable -= dx * dx + dy * dy <= limit
+        if num == box.size:
+            # Stations further away than all that it knows are left out.
+            limit = min(limit, room.squared[num - 1])
+            reach_m = math.sqrt(limit)
+        heard = _list_within(air, own, x, y, reach_m, limit, room.heard)
+        received = reachable
+    else:
+        reachable = _list_within(air, own, x, y, reach_m, limit, room.heard)
+        heard = _drop_lost(channel, me, level, room, reachable)
+        received = heard
+    mail.counts[w, COUNT_REACHABLE] += reachable
+    mail.counts[w, COUNT_RECEIVED] += received
+    for k in range(heard):
+        if num < box.size or room.heard.squared[k] <= room.squared[num - 1]:
+            b = room.heard.place[k]
+            # A CAM tells of its sender.
+            if find(box, num, air.sender[b]) < 0:
+                report = reports[packets[air.which[b]]["first"]]
+                num = insert(box, num, room.squared, report, x, y)
+    return num

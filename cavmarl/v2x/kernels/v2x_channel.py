@@ -46,9 +46,7 @@ class Channel(NamedTuple):
 def receiver_word(key: np.uint64, receiver: int) -> np.uint64:
     """A receiver's half of its random numbers.
 
-    Args:
-        key: of the world.
-        receiver: station.
+    `receiver`: station.
     """
     return mix(mix(np.uint64(key) + _GOLDEN) ^ (np.uint64(receiver) * _GOLDEN))
 
@@ -109,15 +107,8 @@ def is_heard(
 ) -> bool:
     """Whether a packet within reach is received.
 
-    Args:
-        channel: the air.
-        level: of `busy_level`.
-        number: of `draw`.
-        x: m, the receiver's place.
-        y: likewise.
-        from_x: m, the sender's.
-        from_y: likewise.
-        distance_m: between them.
+    `level`: of `busy_level`. `number`: of `draw`. `x`: m, the receiver's place. `from_x`: m, the
+    sender's. `distance_m`: between them.
     """
     if number >= chance_at(channel.clear[level], distance_m):
         return False

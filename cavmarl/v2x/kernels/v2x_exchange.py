@@ -1,19 +1,267 @@
-"""One tick of a bus of messages: stations send, packets travel, receivers keep what they hear."""
+"""One tick of a bus of messages: stations send, packets travel, receivers keep what they hear.
+
+What a receiver keeps does not depend on the order of packets: first the subjects that it knows get
+their newest reports, then the nearest others are let in.
+"""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.neighbors import fill_grid
-from cavmarl.core.numba import kernel
+from cavmarl.core.math.neighbors import cell_columns, cell_rows, fill_grid
+from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import Common, RoadArrays, Zoned
 from cavmarl.core.records.codes import DRIVER_AGENT
-from cavmarl.v2x.kernels.v2x_channel import Channel, receiver_word
-from cavmarl.v2x.kernels.v2x_inbox import empty
-from cavmarl.v2x.kernels.v2x_receiving import age, deliver, learn
-from cavmarl.v2x.kernels.v2x_records import FIRST_ROADSIDE_ID, Mail, Sending, V2xScratch
+from cavmarl.v2x.kernels.v2x_air import (
+    band_of,
+    hears,
+    let_in_cams,
+    let_on_the_air,
+    list_cams,
+    load_around,
+    refresh_by_cams,
+)
+from cavmarl.v2x.kernels.v2x_channel import Channel, busy_level, receiver_word
+from cavmarl.v2x.kernels.v2x_inbox import empty, find, forget, insert, is_better, sort_by_distance
+from cavmarl.v2x.kernels.v2x_records import (
+    COUNT_REACHABLE,
+    COUNT_RECEIVED,
+    FIRST_ROADSIDE_ID,
+    KIND_CAM,
+    KIND_CPM,
+    KIND_DENM,
+    KIND_SPAT,
+    NUM_BANDS,
+    Mail,
+    Sending,
+    V2xScratch,
+)
 from cavmarl.v2x.kernels.v2x_sending import gather, send_from_units, send_from_vehicles
+
+
+@kernel
+def _take_others(
+    channel: Channel,
+    mail: Mail,
+    w: int,
+    me: np.void,
+    level: int,
+    packets: NDArray[np.void],
+    reports: NDArray[np.void],
+    room: V2xScratch,
+    kind: int,
+    box: NDArray[np.void],
+    num: int,
+    new: bool,
+) -> int:
+    """Take the reports of packets of one kind: of subjects that are known, or of new ones."""
+    air = room.others
+    cells = air.cells
+    limit = channel.reach_m * channel.reach_m
+    first_column, last_column = cell_columns(cells, me["x"], channel.reach_m)
+    first_row, last_row = cell_rows(cells, me["y"], channel.reach_m)
+    for j in range(first_row, last_row + 1):
+        begin = cells.start[j * cells.num_x + first_column]
+        end = cells.start[j * cells.num_x + last_column + 1]
+        for b in range(begin, end):
+            dx = air.x[b] - me["x"]
+            dy = air.y[b] - me["y"]
+            squared = dx * dx + dy * dy
+            if not squared <= limit or air.sender[b] == me["id"]:
+                continue
+            packet = packets[air.which[b]]
+            if packet["kind"] != kind:
+                continue
+            is_received = hears(channel, me, level, air.word[b], air.x[b], air.y[b], squared)
+            if new:
+                mail.counts[w, COUNT_REACHABLE] += 1
+                mail.counts[w, COUNT_RECEIVED] += is_received
+                if not channel.sure:
+                    room.tally[2 * band_of(math.sqrt(squared)) + is_received] += 1
+            if not is_received:
+                continue
+            for k in range(packet["first"], packet["first"] + packet["count"]):
+                report = reports[k]
+                if report["subject"] == me["id"]:
+                    continue
+                place = find(box, num, report["subject"])
+                if place < 0 and new:
+                    num = insert(box, num, room.squared, report, me["x"], me["y"])
+                elif place >= 0 and is_better(report, box[place]):
+                    box[place] = report
+    return num
+
+
+@inlined_kernel
+def _receive_objects(
+    channel: Channel,
+    mail: Mail,
+    w: int,
+    slot: int,
+    me: np.void,
+    level: int,
+    with_seen: bool,
+    room: V2xScratch,
+    box: NDArray[np.void],
+    num: int,
+) -> int:
+    """Take what is told of vehicles, by themselves and by stations that see them."""
+    packets = mail.packets[w, slot]
+    reports = mail.reports[w, slot]
+    refresh_by_cams(channel, me, level, packets, reports, room, box, num)
+    if with_seen:
+        _take_others(channel, mail, w, me, level, packets, reports, room, KIND_CPM, box, num, False)
+    sort_by_distance(box, num, room.squared, me["x"], me["y"])
+    num = let_in_cams(channel, mail, w, me, level, packets, reports, room, box, num)
+    if with_seen:
+        num = _take_others(
+            channel, mail, w, me, level, packets, reports, room, KIND_CPM, box, num, True
+        )
+    return num
+
+
+@kernel
+def _receive_others(
+    channel: Channel,
+    mail: Mail,
+    w: int,
+    slot: int,
+    me: np.void,
+    level: int,
+    kind: int,
+    room: V2xScratch,
+    box: NDArray[np.void],
+    num: int,
+) -> int:
+    """Take what is told of events, or of signals."""
+    packets = mail.packets[w, slot]
+    reports = mail.reports[w, slot]
+    _take_others(channel, mail, w, me, level, packets, reports, room, kind, box, num, False)
+    sort_by_distance(box, num, room.squared, me["x"], me["y"])
+    return _take_others(channel, mail, w, me, level, packets, reports, room, kind, box, num, True)
+
+
+@inlined_kernel
+def _receive(
+    channel: Channel,
+    mail: Mail,
+    w: int,
+    slot: int,
+    r: int,
+    tick: int,
+    kinds: NDArray[np.int64],
+    room: V2xScratch,
+) -> None:
+    me = room.receivers[r]
+    level = 0
+    if channel.load > 0.0:
+        busy = min(load_around(channel, room, me["x"], me["y"]), 1.0)
+        mail.busy[w, 0] += busy
+        mail.busy[w, 1] += 1.0
+        mail.busy[w, 2] = max(mail.busy[w, 2], busy)
+        level = busy_level(channel, busy)
+    objects = mail.objects[w, r]
+    num = forget(objects, tick)
+    with_seen = kinds[KIND_CPM] > 0
+    num = _receive_objects(channel, mail, w, slot, me, level, with_seen, room, objects, num)
+    empty(objects, num)
+    events = mail.events[w, r]
+    num = forget(events, tick)
+    if num > 0 or kinds[KIND_DENM] > 0:
+        num = _receive_others(channel, mail, w, slot, me, level, KIND_DENM, room, events, num)
+    empty(events, num)
+    signals = mail.signals[w, r]
+    num = forget(signals, tick)
+    if num > 0 or kinds[KIND_SPAT] > 0:
+        num = _receive_others(channel, mail, w, slot, me, level, KIND_SPAT, room, signals, num)
+    empty(signals, num)
+
+
+@kernel
+def deliver(
+    channel: Channel,
+    mail: Mail,
+    w: int,
+    slot: int,
+    key: np.uint64,
+    tick: int,
+    latency: int,
+    room: V2xScratch,
+) -> None:
+    """Let all receivers of a world receive the packets of one slot.
+
+    `mail`: inboxes and counts are written. `slot`: of the packets that are received now. `latency`:
+    how many ticks ago they were sent. `room`: `receivers` filled.
+    """
+    kinds = room.kinds
+    kinds[:] = 0
+    for p in range(mail.num_packets[w, slot]):
+        kinds[mail.packets[w, slot, p]["kind"]] += 1
+    let_on_the_air(channel, mail, w, slot, key, room)
+    list_cams(room, mail.packets[w, slot], mail.num_packets[w, slot])
+    before = mail.counts[w, COUNT_RECEIVED]
+    room.tally[:] = 0
+    for r in range(room.receivers.size):
+        if room.receivers[r]["id"] >= 0:
+            _receive(channel, mail, w, slot, r, tick, kinds, room)
+    mail.delays[w, latency] += mail.counts[w, COUNT_RECEIVED] - before
+    for band in range(NUM_BANDS):
+        received = room.tally[2 * band + 1]
+        mail.bands[w, band, 0] += room.tally[2 * band] + received
+        mail.bands[w, band, 1] += received
+
+
+@kernel
+def _put_in_order(
+    box: NDArray[np.void], tick: int, squared: NDArray[np.float64], x: float, y: float
+) -> int:
+    num = forget(box, tick)
+    empty(box, num)
+    sort_by_distance(box, num, squared, x, y)
+    return num
+
+
+@kernel
+def age(mail: Mail, w: int, r: int, tick: int, room: V2xScratch) -> None:
+    """Take out of a receiver's inboxes what is too old, and put the rest in order."""
+    me = room.receivers[r]
+    _put_in_order(mail.objects[w, r], tick, room.squared, me["x"], me["y"])
+    _put_in_order(mail.events[w, r], tick, room.squared, me["x"], me["y"])
+    _put_in_order(mail.signals[w, r], tick, room.squared, me["x"], me["y"])
+
+
+@kernel
+def learn(mail: Mail, w: int, slot: int, p: int, r: int, delay: int, room: V2xScratch) -> None:
+    """Deliver one packet to one receiver, as a network simulator has decided.
+
+    `mail`: inboxes and counts are written. `r`: the receiver, which is there. `delay`: ticks since
+    it was sent. `room`: `receivers` filled.
+    """
+    me = room.receivers[r]
+    packet = mail.packets[w, slot, p]
+    if packet["kind"] == KIND_CAM or packet["kind"] == KIND_CPM:
+        box = mail.objects[w, r]
+    elif packet["kind"] == KIND_DENM:
+        box = mail.events[w, r]
+    else:
+        box = mail.signals[w, r]
+    tick = packet["tick"] + delay
+    num = _put_in_order(box, tick, room.squared, me["x"], me["y"])
+    for k in range(packet["first"], packet["first"] + packet["count"]):
+        report = mail.reports[w, slot, k]
+        if report["subject"] == me["id"] or report["expires"] < tick:
+            continue
+        place = find(box, num, report["subject"])
+        if place < 0:
+            num = insert(box, num, room.squared, report, me["x"], me["y"])
+        elif is_better(report, box[place]):
+            box[place] = report
+            sort_by_distance(box, num, room.squared, me["x"], me["y"])
+    mail.counts[w, COUNT_RECEIVED] += 1
+    mail.delays[w, delay] += 1
 
 
 @kernel
@@ -113,22 +361,13 @@ def exchange_messages(
 
 @kernel
 def hand_out(
-    receptions: NDArray[np.void],
-    tick: int,
-    latency: int,
-    mail: Mail,
-    w: int,
-    room: V2xScratch,
+    receptions: NDArray[np.void], tick: int, latency: int, mail: Mail, w: int, room: V2xScratch
 ) -> None:
     """Let receivers have what a network simulator says that they receive in this tick.
 
-    Args:
-        receptions: RECEPTION (n,), of packets that are in flight, by receivers that are there.
-        tick: of the world.
-        latency: the longest delay, in ticks.
-        mail: inboxes and counts are written.
-        w: which world.
-        room: `receivers` as `exchange_messages` has left them.
+    `receptions`: RECEPTION (n,), of packets that are in flight, by receivers that are there.
+    `latency`: the longest delay, in ticks. `mail`: inboxes and counts are written. `room`:
+    `receivers` as `exchange_messages` has left them.
     """
     for r in range(room.receivers.size):
         if room.receivers[r]["id"] >= 0:

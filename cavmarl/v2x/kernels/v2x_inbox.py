@@ -66,12 +66,8 @@ def sort_by_distance(
 ) -> None:
     """Put the first `num` reports in order: nearest first, then by subject.
 
-    Args:
-        box: REPORT (N,).
-        num: how many there are.
-        squared: (at least N,) their squared distances from (x, y) in m², overwritten.
-        x: m.
-        y: m.
+    `box`: REPORT (N,). `squared`: (at least N,) their squared distances from (x, y) in m²,
+    overwritten.
     """
     is_sorted = True
     for k in range(num):
@@ -133,13 +129,8 @@ def insert(
 ) -> int:
     """Put a report of a new subject in its place, if it is near enough; returns how many there are.
 
-    Args:
-        box: REPORT (N,), in order.
-        num: how many there are.
-        squared: their squared distances, in m².
-        report: of a subject that is not there.
-        x: m, where the receiver is.
-        y: m.
+    `box`: REPORT (N,), in order. `squared`: their squared distances, in m². `report`: of a subject
+    that is not there. `x`: m, where the receiver is.
     """
     distance = _squared(report, x, y)
     place = num

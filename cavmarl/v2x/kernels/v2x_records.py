@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.math.neighbors import Grid
+from cavmarl.core.records import record
 
 # PACKET["kind"], in the order in which one station sends them.
 KIND_CAM = 0
@@ -44,84 +45,66 @@ BAND_M = 25.0
 BANDS_PER_M = 1.0 / BAND_M
 MAX_NEAR = 64  # bodies that a station looks at, the nearest ones
 
-REPORT = np.dtype(
-    [
-        ("subject", np.int64),  # of the report: vehicle, SIGNAL row; of an event its sender
-        ("sender", np.int64),  # station; -1 where no report is
-        ("tick", np.int64),  # when it was so
-        ("expires", np.int64),  # the last tick for which a receiver keeps it
-        ("kind", np.int32),  # KIND_*
-        ("code", np.int32),  # of a vehicle its class, of an event the cause, of a signal PHASE row
-        ("x", np.float64),  # m, world frame
-        ("y", np.float64),
-        ("z", np.float64),
-        ("heading", np.float64),  # rad, counter-clockwise from east
-        ("speed", np.float64),  # m/s along the heading
-        ("accel", np.float64),  # m/s²
-        ("yaw_rate", np.float64),  # rad/s
-        ("length", np.float64),  # m
-        ("width", np.float64),  # m
-        ("left_s", np.float64),  # s until the phase of a signal ends, at the soonest
-    ],
-    align=True,
+REPORT = record(
+    ("subject", np.int64),  # of the report: vehicle, SIGNAL row; of an event its sender
+    ("sender", np.int64),  # station; -1 where no report is
+    ("tick", np.int64),  # when it was so
+    ("expires", np.int64),  # the last tick for which a receiver keeps it
+    ("kind", np.int32),  # KIND_*
+    ("code", np.int32),  # of a vehicle its class, of an event the cause, of a signal PHASE row
+    ("x", np.float64),  # m, world frame
+    ("y", np.float64),
+    ("z", np.float64),
+    ("heading", np.float64),  # rad, counter-clockwise from east
+    ("speed", np.float64),  # m/s along the heading
+    ("accel", np.float64),  # m/s²
+    ("yaw_rate", np.float64),  # rad/s
+    ("length", np.float64),  # m
+    ("width", np.float64),  # m
+    ("left_s", np.float64),  # s until the phase of a signal ends, at the soonest
 )
 
-PACKET = np.dtype(
-    [
-        ("sender", np.int64),
-        ("tick", np.int64),  # when it was sent
-        ("x", np.float64),  # m, where the sender was
-        ("y", np.float64),
-        ("word", np.uint64),  # of its random numbers
-        ("kind", np.int32),
-        ("first", np.int32),  # its reports
-        ("count", np.int64),
-    ],
-    align=True,
+PACKET = record(
+    ("sender", np.int64),
+    ("tick", np.int64),  # when it was sent
+    ("x", np.float64),  # m, where the sender was
+    ("y", np.float64),
+    ("word", np.uint64),  # of its random numbers
+    ("kind", np.int32),
+    ("first", np.int32),  # its reports
+    ("count", np.int64),
 )
 
 # Stations that can send or receive in this tick.
-STATION = np.dtype(
-    [
-        ("id", np.int64),
-        ("zone", np.int32),  # where its row lies
-        ("row", np.int32),
-    ],
-    align=True,
+STATION = record(
+    ("id", np.int64),
+    ("zone", np.int32),  # where its row lies
+    ("row", np.int32),
 )
 
-LAST_CAM = np.dtype(
-    [
-        ("id", np.int64),
-        ("tick", np.int64),
-        ("x", np.float64),
-        ("y", np.float64),
-        ("heading", np.float64),
-        ("speed", np.float64),
-    ],
-    align=True,
+LAST_CAM = record(
+    ("id", np.int64),
+    ("tick", np.int64),
+    ("x", np.float64),
+    ("y", np.float64),
+    ("heading", np.float64),
+    ("speed", np.float64),
 )
 
 # A roadside unit.
-UNIT = np.dtype(
-    [
-        ("signal", np.int32),  # SIGNAL row
-        ("x", np.float64),  # m
-        ("y", np.float64),
-        ("z", np.float64),
-    ],
-    align=True,
+UNIT = record(
+    ("signal", np.int32),  # SIGNAL row
+    ("x", np.float64),  # m
+    ("y", np.float64),
+    ("z", np.float64),
 )
 
 # Where a receiver is.
-RECEIVER = np.dtype(
-    [
-        ("id", np.int64),  # -1: there is none
-        ("x", np.float64),
-        ("y", np.float64),
-        ("word", np.uint64),  # of its random numbers
-    ],
-    align=True,
+RECEIVER = record(
+    ("id", np.int64),  # -1: there is none
+    ("x", np.float64),
+    ("y", np.float64),
+    ("word", np.uint64),  # of its random numbers
 )
 
 

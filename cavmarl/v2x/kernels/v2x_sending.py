@@ -47,12 +47,8 @@ def gather(
 ) -> int:
     """List the vehicles of all zones of a world by id; returns how many.
 
-    Args:
-        zoned: the rows.
-        side: on which of their sides they are.
-        w: which world.
-        stations: STATION (C,), overwritten.
-        spare: as large, overwritten.
+    `side`: on which of their sides they are. `stations`: STATION (C,), overwritten. `spare`: as
+    large, overwritten.
     """
     num = 0
     for zone in range(zoned.num_owned.shape[0]):
@@ -136,15 +132,8 @@ def _open(
 
 @kernel
 def _tell(
-    report: np.void,
-    row: np.void,
-    sender: int,
-    kind: int,
-    code: int,
-    tick: int,
-    expires: int,
+    report: np.void, row: np.void, sender: int, kind: int, code: int, tick: int, expires: int
 ) -> None:
-    """Write what is said of a vehicle."""
     report["subject"] = row["id"]
     report["sender"] = sender
     report["tick"] = tick
@@ -183,7 +172,6 @@ def _is_due(tick: int, station: int, period: int) -> bool:
 
 @kernel
 def _has_changed(row: np.void, last: np.void, tick: int, dt: float) -> bool:
-    """Whether a CAM is worth while, by the last one."""
     dx = row["x"] - last["x"]
     dy = row["y"] - last["y"]
     return bool(
@@ -239,7 +227,6 @@ def _send_seen(
     room: V2xScratch,
     tick: int,
 ) -> None:
-    """Tell of those that `room.seen` names."""
     if num == 0:
         return
     first = _open(mail, w, slot, sender, tick, x, y, KIND_CPM, num)

@@ -12,10 +12,9 @@ import pytest
 from cavmarl.driving.vehicle_types import CLASS_DEFAULTS
 from cavmarl.roads.sumo_net.reader import read_network
 from cavmarl.traffic.demand import DemandFile, read_demand
-from cavmarl.traffic.demand.demand_report import DemandReport
-from cavmarl.traffic.demand.element import Element
+from cavmarl.traffic.demand.element import DemandReport, Element
 from cavmarl.traffic.demand.sumo_config import read_sumo_config
-from cavmarl.traffic.demand.vehicle_type_reader import vtype_record
+from cavmarl.traffic.demand.type_table import vtype_record
 from tests.traffic.demand.conftest import Reader, sumo_binary
 
 VEHICLE = re.compile(

@@ -26,11 +26,8 @@ from cavmarl.config.scenario import ScenarioConfig
 from cavmarl.core.errors import ConfigError, ScenarioError
 from cavmarl.core.math.rng import STREAM_PLACE, below, world_key
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.traffic.scenarios.scenario_parameters import checked
-from cavmarl.traffic.scenarios.scene import Scene
+from cavmarl.traffic.scenarios.scene import Scene, checked
 from cavmarl.traffic.scenarios.streets import Streets
-
-__all__ = ["load_scenario", "plan_scene", "scenario_names", "summary_of"]
 
 PARTS = ("NEEDS", "Parameters", "places", "stage")
 
@@ -88,10 +85,8 @@ def summary_of(name: str) -> str:
 def plan_scene(config: ScenarioConfig, network: RoadNetwork) -> Scene | None:
     """What is played on a map; None without a scenario.
 
-    Raises:
-        ConfigError: no such scenario, or no such place on the map; a parameter that it does not
-            have, or a value out of range.
-        ScenarioError: the map has none at all.
+    Raises ConfigError: no such scenario, or no such place on the map; a parameter that it does not
+    have, or a value out of range; ScenarioError: the map has none at all.
     """
     if not config.name:
         return None

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from cavmarl.traffic.scenarios.motions import ACCEL_MPS2, Act, Await, Move, Wait, arc
 from cavmarl.traffic.scenarios.movement_scripts import Actor, Cue
-from cavmarl.traffic.scenarios.scenario_parameters import setting
-from cavmarl.traffic.scenarios.scene import Scene, Seat
+from cavmarl.traffic.scenarios.scene import Scene, Seat, setting
 from cavmarl.traffic.scenarios.streets import Opposite, Streets
 
 NEEDS = "a straight road of 85 m or more with one lane for the other direction right beside it"

@@ -6,10 +6,8 @@ from dataclasses import dataclass
 
 from cavmarl.traffic.scenarios.motions import Act, Await, Ride, Wait, path_of
 from cavmarl.traffic.scenarios.movement_scripts import Actor, Cue
-from cavmarl.traffic.scenarios.scenario_parameters import setting
-from cavmarl.traffic.scenarios.scene import Scene
+from cavmarl.traffic.scenarios.scene import FREE_M, Scene, approach, setting
 from cavmarl.traffic.scenarios.streets import Crossing, Streets
-from cavmarl.traffic.stream import FREE_M, approach
 
 NEEDS = "a junction where a way straight on crosses another one, with 65 m of road before it"
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from cavmarl.traffic.scenarios.scenario_parameters import setting
-from cavmarl.traffic.scenarios.scene import Scene
-from cavmarl.traffic.scenarios.streets import Crossing, Streets
-from cavmarl.traffic.stream import meet_stream
+from cavmarl.traffic.scenarios.scene import Meeting, Scene, meetings, setting
+from cavmarl.traffic.scenarios.streets import Streets
 
 NEEDS = "a movement that gives way to another one into the same lane, with 45 m of road before it"
 
@@ -27,32 +25,12 @@ class Parameters:
     )
 
 
-def places(streets: Streets, parameters: Parameters) -> dict[str, Crossing]:
+def places(streets: Streets, parameters: Parameters) -> dict[str, Meeting]:
     """Movements that have to give way to one that goes straight on into the same lane."""
-    found: dict[str, Crossing] = {}
-    for crossing in streets.crossings("slLrR", yields=True, merges=True):
-        lane = int(streets.network.links["from_lane"][crossing.link])
-        name = streets.name(lane)
-        if name not in found and _staged(streets, crossing, parameters) is not None:
-            found[name] = crossing
-    return found
+    crossings = streets.crossings("slLrR", yields=True, merges=True)
+    return meetings(streets, crossings, FAR_M, parameters.passing_mps, parameters)
 
 
-def stage(streets: Streets, place: Crossing, parameters: Parameters) -> Scene:
+def stage(streets: Streets, place: Meeting, parameters: Parameters) -> Scene:
     """The first car meets an agent that keeps its speed where both ways join."""
-    scene = _staged(streets, place, parameters)
-    assert scene is not None, "a place that `places` has not found"
-    return scene
-
-
-def _staged(streets: Streets, place: Crossing, parameters: Parameters) -> Scene | None:
-    return meet_stream(
-        streets,
-        place,
-        FAR_M,
-        parameters.speed_mps,
-        parameters.passing_mps,
-        cars=parameters.cars,
-        gap_s=parameters.gap_s,
-        lead_s=parameters.lead_s,
-    )
+    return place[1]

@@ -12,8 +12,7 @@ import numpy as np
 
 from cavmarl.traffic.scenarios.motions import ACCEL_MPS2, Await, Move
 from cavmarl.traffic.scenarios.movement_scripts import Actor, Cue
-from cavmarl.traffic.scenarios.scenario_parameters import setting, switch
-from cavmarl.traffic.scenarios.scene import Scene, Seat
+from cavmarl.traffic.scenarios.scene import Scene, Seat, setting, switch
 from cavmarl.traffic.scenarios.streets import Streets
 
 NEEDS = "a straight road for cars of 85 m or more"

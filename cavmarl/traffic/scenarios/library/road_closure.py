@@ -10,10 +10,8 @@ from dataclasses import dataclass, replace
 
 from cavmarl.traffic.scenarios.motions import Act, Await, Move, Ride, Wait
 from cavmarl.traffic.scenarios.movement_scripts import Actor, Cue
-from cavmarl.traffic.scenarios.scenario_parameters import setting
-from cavmarl.traffic.scenarios.scene import Scene
+from cavmarl.traffic.scenarios.scene import FREE_M, Scene, approach, setting
 from cavmarl.traffic.scenarios.streets import Streets
-from cavmarl.traffic.stream import FREE_M, approach
 
 NEEDS = (
     "a way straight on into a road of 80 m or more that leads on to another one, with 45 m of "

@@ -7,10 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from cavmarl.traffic.scenarios.scenario_parameters import setting
-from cavmarl.traffic.scenarios.scene import Outage, Scene
+from cavmarl.traffic.scenarios.scene import Meeting, Outage, Scene, meetings, setting
 from cavmarl.traffic.scenarios.streets import Crossing, Streets
-from cavmarl.traffic.stream import meet_stream
 
 NEEDS = (
     "a signal, and a way straight on that gives way to another one where it is off, with 55 m of "
@@ -34,36 +32,26 @@ class Parameters:
     dark_s: float = setting(1.0, 0.0, 10.0, "s", "when the signals go dark")
 
 
-def places(streets: Streets, parameters: Parameters) -> dict[str, Crossing]:
+def places(streets: Streets, parameters: Parameters) -> dict[str, Meeting]:
     """Ways straight on that another one crosses, which goes first where the signal is off."""
-    found: dict[str, Crossing] = {}
-    for crossing in streets.crossings("s", yields=True, merges=False):
-        one, other = streets.network.links[[crossing.link, crossing.foe]]
-        if one["signal"] < 0 or one["signal"] != other["signal"] or one["state"] != ord("o"):
-            continue
-        name = streets.name(int(one["from_lane"]))
-        if name not in found and _staged(streets, crossing, parameters) is not None:
-            found[name] = crossing
-    return found
+    crossings = (
+        crossing
+        for crossing in streets.crossings("s", yields=True, merges=False)
+        if _loses_its_signal(streets, crossing)
+    )
+    return meetings(streets, crossings, FAR_M, parameters.passing_mps, parameters)
 
 
-def stage(streets: Streets, place: Crossing, parameters: Parameters) -> Scene:
+def _loses_its_signal(streets: Streets, crossing: Crossing) -> bool:
+    one, other = streets.network.links[[crossing.link, crossing.foe]]
+    return bool(
+        one["signal"] >= 0 and one["signal"] == other["signal"] and one["state"] == ord("o")
+    )
+
+
+def stage(streets: Streets, place: Meeting, parameters: Parameters) -> Scene:
     """The first car meets an agent that keeps its speed in the dark junction."""
-    scene = _staged(streets, place, parameters)
-    assert scene is not None, "a place that `places` has not found"
-    signal = int(streets.network.links["signal"][place.link])
+    crossing, scene = place
+    signal = int(streets.network.links["signal"][crossing.link])
     outage = Outage(streets.network.signal_ids[signal], parameters.dark_s)
     return replace(scene, outages=(outage,))
-
-
-def _staged(streets: Streets, place: Crossing, parameters: Parameters) -> Scene | None:
-    return meet_stream(
-        streets,
-        place,
-        FAR_M,
-        parameters.speed_mps,
-        parameters.passing_mps,
-        cars=parameters.cars,
-        gap_s=parameters.gap_s,
-        lead_s=parameters.lead_s,
-    )

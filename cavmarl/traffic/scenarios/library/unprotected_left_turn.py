@@ -7,10 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from cavmarl.traffic.scenarios.scenario_parameters import setting
-from cavmarl.traffic.scenarios.scene import Scene
-from cavmarl.traffic.scenarios.streets import Crossing, Streets
-from cavmarl.traffic.stream import meet_stream
+from cavmarl.traffic.scenarios.scene import Meeting, Scene, meetings, setting
+from cavmarl.traffic.scenarios.streets import Streets
 
 NEEDS = "a left turn across an oncoming lane, with 45 m of road before it"
 
@@ -31,33 +29,16 @@ class Parameters:
     )
 
 
-def places(streets: Streets, parameters: Parameters) -> dict[str, Crossing]:
+def places(streets: Streets, parameters: Parameters) -> dict[str, Meeting]:
     """Left turns that have to give way to a lane that comes from the opposite side."""
-    found: dict[str, Crossing] = {}
-    for crossing in streets.crossings("lL", yields=True, merges=False):
-        if streets.turn_rad(crossing.link, crossing.foe) > OPPOSITE_RAD:
-            lane = int(streets.network.links["from_lane"][crossing.link])
-            name = streets.name(lane)
-            if name not in found and _staged(streets, crossing, parameters) is not None:
-                found[name] = crossing
-    return found
-
-
-def stage(streets: Streets, place: Crossing, parameters: Parameters) -> Scene:
-    """The first car meets an agent that keeps its speed where both ways cross."""
-    scene = _staged(streets, place, parameters)
-    assert scene is not None, "a place that `places` has not found"
-    return scene
-
-
-def _staged(streets: Streets, place: Crossing, parameters: Parameters) -> Scene | None:
-    return meet_stream(
-        streets,
-        place,
-        FAR_M,
-        parameters.speed_mps,
-        parameters.oncoming_mps,
-        cars=parameters.cars,
-        gap_s=parameters.gap_s,
-        lead_s=parameters.lead_s,
+    crossings = (
+        crossing
+        for crossing in streets.crossings("lL", yields=True, merges=False)
+        if streets.turn_rad(crossing.link, crossing.foe) > OPPOSITE_RAD
     )
+    return meetings(streets, crossings, FAR_M, parameters.oncoming_mps, parameters)
+
+
+def stage(streets: Streets, place: Meeting, parameters: Parameters) -> Scene:
+    """The first car meets an agent that keeps its speed where both ways cross."""
+    return place[1]
