@@ -12,7 +12,7 @@ import typer
 from rich.console import Console
 
 from cavmarl.cli.evaluate import evaluate_showing, report_table
-from cavmarl.cli.output import JsonPath, Seed, make_folder, write_json
+from cavmarl.cli.output import JsonPath, Seed, about, make_folder, write_json
 from cavmarl.cli.view import record
 from cavmarl.core.errors import ConfigError
 
@@ -25,9 +25,9 @@ EPISODES = 32
 
 
 def demo(
-    minutes: Annotated[float, typer.Option(help="Minutes of training.")] = 2.0,
-    seconds: Annotated[float, typer.Option(help="Simulated seconds in each video.")] = 60.0,
-    out: Annotated[Path, typer.Option(help="Output folder.")] = Path("runs/demo"),
+    minutes: Annotated[float, about("Minutes of training.")] = 2.0,
+    seconds: Annotated[float, about("Simulated seconds in each video.")] = 60.0,
+    out: Annotated[Path, about("Output folder.")] = Path("runs/demo"),
     seed: Seed = 0,
     json_path: JsonPath = None,
 ) -> None:

@@ -22,6 +22,7 @@ from cavmarl.cli.output import (
     JsonPath,
     Seed,
     Settings,
+    about,
     make_folder,
     number,
     parse_settings,
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
     from cavmarl.ownership.transfer_summary import TransferSummary
 
 HtmlPath = Annotated[
-    Path | None, typer.Option("--html", help="Write a page with tables, plots and the map here.")
+    Path | None, about("Write a page with tables, plots and the map here.", "--html")
 ]
 
 
@@ -44,24 +45,23 @@ def evaluate(
     env: Environment,
     policy: Annotated[
         list[str] | None,
-        typer.Option(
+        about(
+            "A name of `cavmarl list`, or a path; repeat it to compare with the first. "
+            "Default: idm.",
             "--policy",
             "-p",
-            help="A name of `cavmarl list`, or a path; repeat it to compare with the first. "
-            "Default: idm.",
         ),
     ] = None,
-    episodes: Annotated[int, typer.Option("--episodes", "-n", help="Episodes of each run.")] = 32,
+    episodes: Annotated[int, about("Episodes of each run.", "--episodes", "-n")] = 32,
     repeats: Annotated[
-        int, typer.Option("--repeats", "-r", help="Independent runs, each in a fresh process.")
+        int, about("Independent runs, each in a fresh process.", "--repeats", "-r")
     ] = 1,
     seed: Seed = 0,
     agents: Agents = None,
     background: Background = None,
     settings: Settings = None,
     out: Annotated[
-        Path | None,
-        typer.Option(help="Folder of manifest and raw results; default: a new one in runs/."),
+        Path | None, about("Folder of manifest and raw results; default: a new one in runs/.")
     ] = None,
     html: HtmlPath = None,
     json_path: JsonPath = None,
@@ -181,9 +181,7 @@ def difference_table(found: EvaluationReport) -> Table:
     return table
 
 
-def _transfer_rows(
-    found: Sequence[TransferSummary | None],
-) -> Iterator[tuple[str, list[str]]]:
+def _transfer_rows(found: Sequence[TransferSummary | None]) -> Iterator[tuple[str, list[str]]]:
     """Title and cells of what is told of changes of owner; nothing of undivided worlds."""
     summaries = [summary for summary in found if summary is not None]
     if not summaries:

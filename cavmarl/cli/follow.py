@@ -4,29 +4,25 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-import typer
 from rich.console import Console
 from rich.table import Table
 
 from cavmarl.cli.lead import DEFAULT_PLACE, address_of
-from cavmarl.cli.output import Environment, JsonPath, write_json
+from cavmarl.cli.output import Environment, JsonPath, about, write_json
 from cavmarl.core.errors import ConfigError
 
 
 def follow(
     env: Environment,
     at: Annotated[
-        str, typer.Option("--at", metavar="ADDRESS", help="Where the world listens.")
+        str, about("Where the world listens.", "--at", metavar="ADDRESS")
     ] = DEFAULT_PLACE,
-    vehicles: Annotated[str, typer.Option(metavar="NAME,…", help="Agents to drive.")] = "car_0",
-    name: Annotated[str, typer.Option(help="Name shown in messages.")] = "reference",
+    vehicles: Annotated[str, about("Agents to drive.", metavar="NAME,…")] = "car_0",
+    name: Annotated[str, about("Name shown in messages.")] = "reference",
     stage: Annotated[
-        list[str] | None,
-        typer.Option(metavar="STAGE=NAME", help="A stage of the stack to replace."),
+        list[str] | None, about("A stage of the stack to replace.", metavar="STAGE=NAME")
     ] = None,
-    joins_s: Annotated[
-        float, typer.Option(help="Seconds that the world may take to answer.")
-    ] = 60.0,
+    joins_s: Annotated[float, about("Seconds that the world may take to answer.")] = 60.0,
     json_path: JsonPath = None,
 ) -> None:
     """Drive agents of a world that `cavmarl lead` runs, from their sensors and the map of ENV."""

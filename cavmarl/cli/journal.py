@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cavmarl.cli.output import JsonPath, write_json
+from cavmarl.cli.output import JsonPath, about, write_json
 
 if TYPE_CHECKING:
     from cavmarl.handoff.coordinator.journal_summary import JournalSummary
@@ -23,9 +23,7 @@ def journal(
         Path,
         typer.Argument(metavar="FILE", help="A journal of a run.", exists=True, dir_okay=False),
     ],
-    at: Annotated[
-        int | None, typer.Option(metavar="TICK", help="Print the owners at this tick.")
-    ] = None,
+    at: Annotated[int | None, about("Print the owners at this tick.", metavar="TICK")] = None,
     json_path: JsonPath = None,
 ) -> None:
     """Replay the log of a divided run: hand-offs, hosts, and the owners at its end or at a tick."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from contextlib import closing
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import typer
 from rich.console import Console
 from rich.table import Table
 
@@ -16,6 +15,7 @@ from cavmarl.cli.output import (
     JsonPath,
     Seed,
     Settings,
+    about,
     parse_settings,
     write_json,
 )
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 DEFAULT_PLACE = "cavmarl.sock"
 
 Place = Annotated[
-    str, typer.Option("--at", metavar="ADDRESS", help="A socket's path, or a port of this machine.")
+    str, about("A socket's path, or a port of this machine.", "--at", metavar="ADDRESS")
 ]
 
 
@@ -39,33 +39,25 @@ def address_of(text: str) -> str | int:
 def lead(
     env: Environment,
     at: Place = DEFAULT_PLACE,
-    followers: Annotated[
-        int, typer.Option(help="Followers that have to join before the first step.")
-    ] = 1,
-    steps: Annotated[int | None, typer.Option(help="Most steps; default: one episode.")] = None,
-    timeout_s: Annotated[
-        float, typer.Option(help="Seconds that a step waits for its followers.")
-    ] = 10.0,
-    joins_s: Annotated[
-        float, typer.Option(help="Seconds that followers may take to join.")
-    ] = 600.0,
+    followers: Annotated[int, about("Followers that have to join before the first step.")] = 1,
+    steps: Annotated[int | None, about("Most steps; default: one episode.")] = None,
+    timeout_s: Annotated[float, about("Seconds that a step waits for its followers.")] = 10.0,
+    joins_s: Annotated[float, about("Seconds that followers may take to join.")] = 600.0,
     own_ticks: Annotated[
-        Literal["refuse", "ignore"], typer.Option(help="How to treat a follower's own ticks.")
+        Literal["refuse", "ignore"], about("How to treat a follower's own ticks.")
     ] = "refuse",
     bad_controls: Annotated[
-        Literal["error", "hold"], typer.Option(help="How to treat invalid controls.")
+        Literal["error", "hold"], about("How to treat invalid controls.")
     ] = "error",
     pace: Annotated[
-        float | None, typer.Option(help="Simulated seconds a second; default: as fast as possible.")
+        float | None, about("Simulated seconds a second; default: as fast as possible.")
     ] = None,
     rig: Annotated[
         Literal["none", "reference"],
-        typer.Option(help="Mount the sensors that the reference stack drives with."),
+        about("Mount the sensors that the reference stack drives with."),
     ] = "none",
-    zones: Annotated[int | None, typer.Option(help="Shadows zones.count.")] = None,
-    workers: Annotated[
-        int, typer.Option(help="Worker processes; 0: the master's own process.")
-    ] = 0,
+    zones: Annotated[int | None, about("Shadows zones.count.")] = None,
+    workers: Annotated[int, about("Worker processes; 0: the master's own process.")] = 0,
     agents: Agents = None,
     background: Background = None,
     seed: Seed = 0,
@@ -86,12 +78,7 @@ def lead(
     if rig == "reference":
         overrides = {"clock.ctrl_dt_s": 0.05, "rig": REFERENCE_RIG} | overrides
     made = parallel_env(
-        env,
-        zones=zones,
-        workers=workers,
-        agents=agents,
-        background=background,
-        overrides=overrides,
+        env, zones=zones, workers=workers, agents=agents, background=background, overrides=overrides
     )
     with (
         closing(made),

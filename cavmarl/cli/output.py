@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial, wraps
+from inspect import Parameter, Signature, signature
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 from rich.console import Console
 from rich.text import Text
 
+from cavmarl.bench.harness import check_positive
+from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.seeds import check_seed
 
@@ -40,25 +44,86 @@ def _unwritable(path: Path, error: OSError) -> ConfigError:
     return ConfigError(f"{path}: cannot be written ({error.strerror or error})")
 
 
+def _check_bound(value: float | None) -> float | None:
+    check_positive("--at-least", value)
+    return value
+
+
+def about(text: str, *names: str, **more: Any) -> Any:
+    """An option with a help text."""
+    return typer.Option(*names, help=text, **more)
+
+
 Environment = Annotated[
     str, typer.Argument(metavar="ENV", help="Environment: a name, folder or map file.")
 ]
+OptionalEnvironment = Annotated[
+    str, typer.Argument(metavar="[ENV]", help="Name, folder or map file of an environment.")
+]
+MapName = Annotated[
+    str, typer.Argument(metavar="MAP", help="A map file, or an environment's name or folder.")
+]
 PolicyName = Annotated[
-    str, typer.Option("--policy", "-p", help="A name of `cavmarl list`, or the path of a policy.")
+    str, about("A name of `cavmarl list`, or a policy's path.", "--policy", "-p")
 ]
-Seed = Annotated[int, typer.Option(help="Root of all random numbers.", callback=check_seed)]
-Agents = Annotated[int | None, typer.Option(help="Agents a world; default: the environment's.")]
-Background = Annotated[
-    int | None, typer.Option(help="Background vehicles a world; default: the environment's.")
-]
+Seed = Annotated[int, about("Root of all random numbers.", callback=check_seed)]
+Agents = Annotated[int | None, about("Agents a world; default: the environment's.")]
+Background = Annotated[int | None, about("Background vehicles a world; default: likewise.")]
 Settings = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Any key of env.yaml; may be repeated."),
+    list[str] | None, about("Any key of env.yaml; may be repeated.", "--set", metavar="KEY=VALUE")
 ]
 JsonPath = Annotated[
-    Path | None,
-    typer.Option("--json", help="Write the result here as JSON.", callback=writable),
+    Path | None, about("Write the result here as JSON.", "--json", callback=writable)
 ]
+AtLeast = Annotated[
+    float | None, about("Exit with 1 if it is not so many times as fast.", callback=_check_bound)
+]
+
+
+def end_below(at_least: float | None, ratio: float | None) -> None:
+    """End the command with exit code 1 if a ratio is below what `--at-least` asks for."""
+    if at_least is not None and ratio is not None and ratio < at_least:
+        raise typer.Exit(1)
+
+
+def with_world(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Makes a command of a function that takes a `world: WorldSpec`.
+
+    In its place stand the options that make one: all, or the environment and those of these names.
+    Where the function has one of them, too, it says how it is given, and gets it.
+    """
+    chosen = names or ("agents", "background", "seed", "settings")
+    return partial(_with_world, ("env", *chosen))
+
+
+def _with_world(names: tuple[str, ...], command: Callable[..., None]) -> Callable[..., None]:
+    own = dict(signature(command).parameters)
+    hints = get_type_hints(command, include_extras=True)
+    shared = {
+        "env": (Environment, Parameter.empty),
+        "seed": (Seed, 0),
+        "agents": (Agents, None),
+        "background": (Background, None),
+        "settings": (Settings, None),
+    }
+    wanted = {
+        name: Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=kind)
+        for name, (kind, default) in shared.items()
+        if name in names
+    }
+    del own["world"]
+    for name, one in own.items():
+        wanted[name] = one.replace(annotation=hints[name], kind=Parameter.KEYWORD_ONLY)
+
+    @wraps(command)
+    def program(**options: Any) -> None:
+        keys = {name: options[name] for name in names if name != "settings"}
+        spec = WorldSpec(overrides=parse_settings(options["settings"]), **keys)
+        command(spec, **{name: options[name] for name in own})
+
+    program.__annotations__ = {name: one.annotation for name, one in wanted.items()}
+    vars(program)["__signature__"] = Signature(list(wanted.values()))
+    return program
 
 
 def parse_settings(settings: Sequence[str] | None) -> dict[str, Any]:

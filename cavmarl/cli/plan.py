@@ -14,6 +14,7 @@ from cavmarl.cli.output import (
     JsonPath,
     Seed,
     Settings,
+    about,
     parse_settings,
     print_error,
     write_json,
@@ -36,35 +37,31 @@ def plan(
         str | None,
         typer.Argument(metavar="[ENV]", help="Name, folder or map file; not with --again."),
     ] = None,
-    zones: Annotated[int, typer.Option(help="Zones of each world.")] = 9,
-    workers: Annotated[int, typer.Option(help="Workers that shards are placed on.")] = 3,
-    worlds: Annotated[int, typer.Option(min=1, help="Number of parallel worlds.")] = 1,
-    layout: Annotated[
-        str, typer.Option(help=f"{', '.join(ZONE_LAYOUTS)}, or a zone file.")
-    ] = "bisection",
+    zones: Annotated[int, about("Zones of each world.")] = 9,
+    workers: Annotated[int, about("Workers that shards are placed on.")] = 3,
+    worlds: Annotated[int, about("Number of parallel worlds.", min=1)] = 1,
+    layout: Annotated[str, about(f"{', '.join(ZONE_LAYOUTS)}, or a zone file.")] = "bisection",
     snapshot: Annotated[
         str,
-        typer.Option(
-            help=f"How busy workers are: {NOW} as this machine is, {IDLE}, or the plan of a file."
-        ),
+        about(f"How busy workers are: {NOW} as this machine is, {IDLE}, or the plan of a file."),
     ] = NOW,
-    steps: Annotated[int, typer.Option(help="Measured steps of each world.")] = 50,
-    before: Annotated[int, typer.Option(help="Unmeasured steps of each world, first.")] = 50,
-    tolerance: Annotated[float, typer.Option(help="Imbalance below which nothing moves.")] = 0.1,
+    steps: Annotated[int, about("Measured steps of each world.")] = 50,
+    before: Annotated[int, about("Unmeasured steps of each world, first.")] = 50,
+    tolerance: Annotated[float, about("Imbalance below which nothing moves.")] = 0.1,
     again: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Make a stored plan, or those of a run's manifest, once more from what they say; "
+        about(
+            "Make a stored plan, or those of a run's manifest, once more from what they say; "
             "exit code 1 if one is another.",
+            metavar="FILE",
         ),
     ] = None,
     cut: Annotated[
         Path | None,
-        typer.Option(
+        about(
+            "Extension: write a zone file here that shares out what was measured.",
             "--cut-anew",
             metavar="FILE",
-            help="Extension: write a zone file here that shares out what was measured.",
         ),
     ] = None,
     agents: Agents = None,

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Column, Table
 
-from cavmarl.cli.output import JsonPath, Seed, Settings, number, parse_settings, write_json
+from cavmarl.cli.output import JsonPath, Seed, Settings, about, number, parse_settings, write_json
 from cavmarl.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -54,29 +54,25 @@ def list_scenarios(json_path: JsonPath = None) -> None:
 def run(
     name: Annotated[str, typer.Argument(metavar="NAME", help="A scenario, or a .py file.")],
     map_name: Annotated[
-        str, typer.Option("--map", help="Name, folder or map file of an environment.")
+        str, about("Name, folder or map file of an environment.", "--map")
     ] = "grid4x4",
-    place: Annotated[str, typer.Option(help="Place on the map; default: drawn by the seed.")] = "",
+    place: Annotated[str, about("Place on the map; default: drawn by the seed.")] = "",
     param: Annotated[
         list[str] | None,
-        typer.Option(
-            "--param", metavar="KEY=VALUE", help="A parameter of the scenario; may be repeated."
-        ),
+        about("A parameter of the scenario; may be repeated.", "--param", metavar="KEY=VALUE"),
     ] = None,
-    driver: Annotated[str, typer.Option(help="Driver of the agents: a name, or a path.")] = "idm",
+    driver: Annotated[str, about("Driver of the agents: a name, or a path.")] = "idm",
     agents: Annotated[
-        int, typer.Option(min=1, help="Number of agents: one in the conflict, the others behind.")
+        int, about("Number of agents: one in the conflict, the others behind.", min=1)
     ] = 1,
-    density: Annotated[str, typer.Option(help="Other traffic: none, low or high.")] = "none",
+    density: Annotated[str, about("Other traffic: none, low or high.")] = "none",
     zones: Annotated[
-        int | None, typer.Option(help="Background vehicles; default: as the environment says.")
+        int | None, about("Background vehicles; default: as the environment says.")
     ] = None,
     seed: Seed = 0,
     settings: Settings = None,
-    picture: Annotated[
-        Path | None, typer.Option(help="Write a .png of the closest moment here.")
-    ] = None,
-    video: Annotated[Path | None, typer.Option(help="Write an .mp4 of the run here.")] = None,
+    picture: Annotated[Path | None, about("Write a .png of the closest moment here.")] = None,
+    video: Annotated[Path | None, about("Write an .mp4 of the run here.")] = None,
     json_path: JsonPath = None,
 ) -> None:
     """Play a scenario to a driver; exit code 1 unless all come through and hurt no one."""
@@ -114,14 +110,13 @@ def sweep(
         list[str] | None, typer.Argument(metavar="[NAME]...", help="Scenarios; default: all.")
     ] = None,
     map_names: Annotated[
-        list[str] | None,
-        typer.Option("--map", help="An environment's map; may be repeated. Default: grid4x4."),
+        list[str] | None, about("An environment's map; may be repeated. Default: grid4x4.", "--map")
     ] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds, from 0 on.")] = 5,
-    passes: Annotated[str, typer.Option(help="The driver that is to pass all.")] = "idm",
-    fails: Annotated[str, typer.Option(help="The one that is to pass none.")] = "never_yield",
-    density: Annotated[str, typer.Option(help="Other traffic: none, low or high.")] = "none",
-    agents: Annotated[int, typer.Option(min=1, help="Agents in each world.")] = 1,
+    seeds: Annotated[int, about("Number of seeds, from 0 on.", min=1)] = 5,
+    passes: Annotated[str, about("The driver that is to pass all.")] = "idm",
+    fails: Annotated[str, about("The one that is to pass none.")] = "never_yield",
+    density: Annotated[str, about("Other traffic: none, low or high.")] = "none",
+    agents: Annotated[int, about("Agents in each world.", min=1)] = 1,
     json_path: JsonPath = None,
 ) -> None:
     """Play scenarios on maps to two drivers; exit code 1 unless one passes all, the other none."""

@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from cavmarl.cli.evaluate import report_cell
-from cavmarl.cli.output import JsonPath, Seed, make_folder, write_json
+from cavmarl.cli.output import JsonPath, Seed, about, make_folder, write_json
 
 if TYPE_CHECKING:
     from cavmarl.evaluate import EvaluationReport
@@ -24,19 +24,14 @@ def suite(
     name: Annotated[
         str, typer.Argument(metavar="SUITE", help="A name in configs/suites/, or a .yaml.")
     ] = "standard",
-    maps: Annotated[Path, typer.Option(help="Folder of the map files.")] = Path("maps"),
+    maps: Annotated[Path, about("Folder of the map files.")] = Path("maps"),
     policy: Annotated[
-        list[str] | None,
-        typer.Option("--policy", "-p", help="A driver; may be repeated. Default: idm."),
+        list[str] | None, about("A driver; may be repeated. Default: idm.", "--policy", "-p")
     ] = None,
-    episodes: Annotated[int, typer.Option("--episodes", "-n", help="Episodes of each run.")] = 4,
-    repeats: Annotated[
-        int, typer.Option("--repeats", "-r", help="Number of independent runs.")
-    ] = 5,
+    episodes: Annotated[int, about("Episodes of each run.", "--episodes", "-n")] = 4,
+    repeats: Annotated[int, about("Number of independent runs.", "--repeats", "-r")] = 5,
     seed: Seed = 0,
-    out: Annotated[Path, typer.Option(help="Folder of the results, one folder a world.")] = Path(
-        "runs/suite"
-    ),
+    out: Annotated[Path, about("Folder of the results, one folder a world.")] = Path("runs/suite"),
     json_path: JsonPath = None,
 ) -> None:
     """Evaluate drivers in every world of a suite; `cavmarl report` shows any of them whole."""

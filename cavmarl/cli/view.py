@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
 from rich.console import Console
 
 from cavmarl.cli.evaluate import progress_bar
@@ -19,6 +18,7 @@ from cavmarl.cli.output import (
     PolicyName,
     Seed,
     Settings,
+    about,
     parse_settings,
     write_json,
 )
@@ -31,16 +31,14 @@ if TYPE_CHECKING:
 def view(
     env: Environment,
     policy: PolicyName = "idm",
-    seconds: Annotated[float, typer.Option(help="Seconds of simulated time.")] = 30.0,
-    video: Annotated[
-        Path | None, typer.Option(help="Write an .mp4 here; default: show a window.")
-    ] = None,
+    seconds: Annotated[float, about("Seconds of simulated time.")] = 30.0,
+    video: Annotated[Path | None, about("Write an .mp4 here; default: show a window.")] = None,
     seed: Seed = 0,
     agents: Agents = None,
     background: Background = None,
     settings: Settings = None,
     ghosts_of: Annotated[
-        int | None, typer.Option(help="Outline the ghosts of this zone of a divided world.")
+        int | None, about("Outline the ghosts of this zone of a divided world.")
     ] = None,
     json_path: JsonPath = None,
 ) -> None:

@@ -139,11 +139,23 @@ def load_config(
         raw = dataclasses.asdict(config)
         for key, value in shadows.items():
             is_named = key == "rig" and isinstance(value, str)
-            _shadow(raw, key, load_rig(str(value), base_dir) if is_named else value)
+            shadow(raw, key, load_rig(str(value), base_dir) if is_named else value)
         if max_cycles is not None:
             raw["horizon_s"] = _horizon_s(max_cycles, raw)
         config = validate(EnvConfig, with_current_names(raw), f"{where}, overridden")
     return config, base_dir
+
+
+def find_settings(what: str, name: str) -> Path:
+    """The file that `name` means: a path, or a name in `configs/`: a `rig` or a `suite`."""
+    if Path(name).is_file():
+        return Path(name)
+    for place in places("configs"):
+        path = place / f"{what}s" / f"{name}.yaml"
+        if path.is_file():
+            return path
+    usual = {"rig": "ten_sensors", "suite": "standard"}[what]
+    raise ConfigError(f"no {what} or file '{name}': give '{usual}' or the path of a .yaml")
 
 
 def load_rig(name: str, base_dir: Path | None = None) -> dict[str, Any]:
@@ -275,7 +287,7 @@ def _map_name(path: Path) -> str:
     return path.name.removesuffix(ending)
 
 
-def _shadow(raw: dict[str, Any], key: str, value: object) -> None:
+def shadow(raw: dict[str, Any], key: str, value: object) -> None:
     """Put `value` at a dotted key of nested mappings."""
     *parents, last = key.split(".")
     inner: Any = raw

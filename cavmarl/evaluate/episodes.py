@@ -62,43 +62,28 @@ class EpisodeJob:
 
 @dataclass(frozen=True)
 class Speed:
-    """How fast a run went; not repeatable.
+    """How fast a run went; not repeatable."""
 
-    Attributes:
-        step_ms: milliseconds of simulation for one step of one world.
-        policy_ms: milliseconds of the policy for one step of one world.
-        agent_steps_per_s: decisions a second, simulation and policy.
-        worlds: how many were stepped together.
-        zone_time_imbalance: of divided worlds: the slowest zone's part of a tick over the mean of
-            all zones, by the processor's time, all worlds together; None: not measured.
-    """
-
-    step_ms: float
-    policy_ms: float
-    agent_steps_per_s: float
-    worlds: int
+    step_ms: float  # milliseconds of simulation for one step of one world
+    policy_ms: float  # milliseconds of the policy for one step of one world
+    agent_steps_per_s: float  # decisions a second, simulation and policy
+    worlds: int  # how many were stepped together
+    # of divided worlds: the slowest zone's part of a tick over the mean of all zones, by the
+    # processor's time, all worlds together; None: not measured
     zone_time_imbalance: float | None = None
 
 
 @dataclass(frozen=True)
 class RunData:
-    """What a policy did in one run.
+    """What a policy did in one run."""
 
-    Attributes:
-        trips: TRIP records of all trips.
-        episodes: EPISODE records.
-        tracks: TRACK records of the agents of the first episode.
-        speed: how fast it ran.
-        transfers: TRANSFER records of the changes of owner; none in undivided worlds.
-        transfer_counts: of a `TransferLog`, summed over the episodes.
-    """
-
-    trips: NDArray[np.void]
-    episodes: NDArray[np.void]
-    tracks: NDArray[np.void]
-    speed: Speed
+    trips: NDArray[np.void]  # TRIP records of all trips
+    episodes: NDArray[np.void]  # EPISODE records
+    tracks: NDArray[np.void]  # TRACK records of the agents of the first episode
+    speed: Speed  # how fast it ran
+    # TRANSFER records of the changes of owner; none in undivided worlds
     transfers: NDArray[np.void]
-    transfer_counts: Mapping[str, int]
+    transfer_counts: Mapping[str, int]  # of a `TransferLog`, summed over the episodes
 
 
 def worlds_at_once(episodes: int, vehicles: int) -> int:

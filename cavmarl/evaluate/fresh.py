@@ -9,14 +9,22 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import asdict
+from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from cavmarl.core import errors
 from cavmarl.evaluate.episodes import EpisodeJob, Progress, RunData, Speed, drive_run
+
+Given = TypeVar("Given")
+Found = TypeVar("Found")
 
 PROGRAM = "from cavmarl.evaluate.fresh import main; main()"
 
@@ -49,7 +57,7 @@ def drive_in_fresh_process(
         for line in program.stdout:
             told = json.loads(line)
             if "error" in told:
-                raise _told_error(told["error"], told["message"])
+                raise told_error(told["error"], told["message"])
             if progress is not None:
                 progress(told["policy"], told["steps"], told["most"])
     if program.returncode:
@@ -63,7 +71,36 @@ def drive_in_fresh_process(
         path.unlink()
 
 
-def _told_error(kind: str, message: str) -> errors.CavmarlError:
+@contextmanager
+def fresh_process(died: errors.CavmarlError) -> Iterator[ProcessPoolExecutor]:
+    """A process of its own; what is submitted runs there. `died` is raised if it ends by itself."""
+    with ProcessPoolExecutor(1, get_context("spawn")) as process:
+        try:
+            yield process
+        except BrokenProcessPool as error:
+            raise died from error
+
+
+def call_in_fresh_process(
+    call: Callable[[Given], Found], given: Given, died: errors.CavmarlError
+) -> Found:
+    """Call a function in a process of its own; errors that it raises on purpose are raised here."""
+    with fresh_process(died) as process:
+        found, error = process.submit(_call, call, given).result()
+    if error is not None:
+        raise told_error(*error)
+    result: Found = found
+    return result
+
+
+def _call(call: Callable[[Given], Found], given: Given) -> tuple[Any, tuple[str, str] | None]:
+    try:
+        return call(given), None
+    except errors.CavmarlError as error:
+        return None, (type(error).__name__, str(error))
+
+
+def told_error(kind: str, message: str) -> errors.CavmarlError:
     """The error of another process; what it was made of, beside its words, has stayed there."""
     found: type[errors.CavmarlError] = getattr(errors, kind)
     return found.__new__(found, message)

@@ -14,29 +14,17 @@ from cavmarl.evaluate.tables import reward_column
 
 @dataclass(frozen=True)
 class Metric:
-    """One number of interest.
+    """One number of interest."""
 
-    Attributes:
-        name: its key in a report, and its column.
-        label: its name in tables.
-        unit: of the values times `scale`; empty for plain numbers.
-        per: a run has one value for each of these.
-        share: the values are yes or no, and their mean is a share.
-        arrived: only trips that arrived have a value.
-        scale: values are shown times this.
-        better: which way is better; None where neither is.
-        meaning: one line.
-    """
-
-    name: str
-    label: str
-    unit: str
-    per: Literal["trip", "episode"]
-    meaning: str
-    share: bool = False
-    arrived: bool = False
-    scale: float = 1.0
-    better: Literal["more", "less"] | None = None
+    name: str  # its key in a report, and its column
+    label: str  # its name in tables
+    unit: str  # of the values times `scale`; empty for plain numbers
+    per: Literal["trip", "episode"]  # a run has one value for each of these
+    meaning: str  # one line
+    share: bool = False  # the values are yes or no, and their mean is a share
+    arrived: bool = False  # only trips that arrived have a value
+    scale: float = 1.0  # values are shown times this
+    better: Literal["more", "less"] | None = None  # which way is better; None where neither is
 
 
 def _share(name: str, label: str, meaning: str, better: Literal["more", "less"]) -> Metric:

@@ -18,31 +18,20 @@ PARTS = 5
 
 @dataclass(frozen=True)
 class MeasuredRound:
-    """Some steps of one world.
+    """Some steps of one world."""
 
-    Attributes:
-        costs_s: (k,) seconds a tick of each zone.
-        ids: (n,) vehicles after the last step.
-        places: (n, 2) where they are, m.
-        agents: (n,) which of them agents drive.
-    """
-
-    costs_s: NDArray[np.float64]
-    ids: NDArray[np.int64]
-    places: NDArray[np.float64]
-    agents: NDArray[np.bool_]
+    costs_s: NDArray[np.float64]  # (k,) seconds a tick of each zone
+    ids: NDArray[np.int64]  # (n,) vehicles after the last step
+    places: NDArray[np.float64]  # (n, 2) where they are, m
+    agents: NDArray[np.bool_]  # (n,) which of them agents drive
 
 
 @dataclass(frozen=True)
 class MeasuredWorlds:
-    """Worlds of one environment.
+    """Worlds of one environment."""
 
-    Attributes:
-        costs: of their shards.
-        places: (n, 2) where the vehicles of all worlds are after the last step, m.
-    """
-
-    costs: tuple[ShardCost, ...]
+    costs: tuple[ShardCost, ...]  # of their shards
+    # (n, 2) where the vehicles of all worlds are after the last step, m
     places: NDArray[np.float64]
 
     def zone_costs_s(self) -> list[float]:

@@ -26,19 +26,12 @@ S = TypeVar("S", bound="DataclassInstance")
 
 @dataclass(frozen=True)
 class RunState:
-    """How far a run has come.
+    """How far a run has come."""
 
-    Attributes:
-        args: its settings, by name.
-        agent_steps: decisions that it learned from.
-        updates: of the network.
-        seconds: spent on them.
-    """
-
-    args: dict[str, Any]
-    agent_steps: int = 0
-    updates: int = 0
-    seconds: float = 0.0
+    args: dict[str, Any]  # its settings, by name
+    agent_steps: int = 0  # decisions that it learned from
+    updates: int = 0  # of the network
+    seconds: float = 0.0  # spent on them
 
     def settings(self, kind: type[S]) -> S:
         """The settings as what they were made of.

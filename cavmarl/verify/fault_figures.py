@@ -68,35 +68,30 @@ class HandOverClock:
 
 @dataclass(frozen=True)
 class FaultFigures:
-    """Figures of one run, or of several that were added up.
+    """Figures of one run, or of several that were added up."""
 
-    Attributes:
-        zone_deaths: point → hosts of zones that died there.
-        coordinator_deaths: point → coordinators that died there.
-        messages: (kind, fault) → messages that it struck.
-        stale: (kind, reason) → messages or entries that came late or from elsewhere and did not
-            count.
-        hand_overs: `failed`, `switched`, `forced`, `deferred` (ticks), `late` (vehicles), `asked`,
-            `refused`, `aborted`.
-        resent: phase → messages that were sent again for want of an answer, as of
-            `MessageCoordinator`.
-        recovery_ms: of each death, until its tick began again.
-        repeats: of each tick with a death, how often it was begun again.
-        waited_ticks: of each hand-over, from the crossing to the switch.
-        latency_ms: the same in ms, with the tick of the switch.
-        state_bytes: of each hand-over whose state was sent ahead.
-    """
-
+    # point → hosts of zones that died there
     zone_deaths: Counter[str] = field(default_factory=Counter)
+    # point → coordinators that died there
     coordinator_deaths: Counter[str] = field(default_factory=Counter)
+    # (kind, fault) → messages that it struck
     messages: Counter[tuple[str, str]] = field(default_factory=Counter)
+    # (kind, reason) → messages or entries that came late or from elsewhere and did not count
     stale: Counter[tuple[str, str]] = field(default_factory=Counter)
+    # `failed`, `switched`, `forced`, `deferred` (ticks), `late` (vehicles), `asked`, `refused`,
+    # `aborted`
     hand_overs: Counter[str] = field(default_factory=Counter)
+    # phase → messages that were sent again for want of an answer, as of `MessageCoordinator`
     resent: Counter[str] = field(default_factory=Counter)
+    # of each death, until its tick began again
     recovery_ms: list[float] = field(default_factory=list)
+    # of each tick with a death, how often it was begun again
     repeats: list[int] = field(default_factory=list)
+    # of each hand-over, from the crossing to the switch
     waited_ticks: list[int] = field(default_factory=list)
+    # the same in ms, with the tick of the switch
     latency_ms: list[float] = field(default_factory=list)
+    # of each hand-over whose state was sent ahead
     state_bytes: list[int] = field(default_factory=list)
 
     @classmethod

@@ -11,8 +11,18 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from cavmarl.bench.harness import check_positive, make_table, measuring, numbers_of
-from cavmarl.cli.output import JsonPath, Seed, Settings, parse_settings, write_json
+from cavmarl.bench.harness import make_table, measuring, numbers_of
+from cavmarl.cli.output import (
+    AtLeast,
+    JsonPath,
+    OptionalEnvironment,
+    about,
+    end_below,
+    with_world,
+    write_json,
+)
+from cavmarl.config.registry import find_settings
+from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -22,35 +32,22 @@ if TYPE_CHECKING:
     from cavmarl.parallel.sensor_workers.sensor_shares import Shares
 
 
+@with_world()
 def sensors(
-    env: Annotated[
-        str, typer.Argument(metavar="[ENV]", help="Name, folder or map file of an environment.")
-    ] = "town",
+    world: WorldSpec,
+    env: OptionalEnvironment = "town",
     workers: Annotated[
-        str, typer.Option(metavar="N,…", help="Numbers of sensor workers to compare.")
+        str, about("Numbers of sensor workers to compare.", metavar="N,…")
     ] = "1,2,3,4",
-    warmup: Annotated[int, typer.Option(help="Steps before the measured ones.")] = 40,
-    steps: Annotated[int, typer.Option(help="Measured steps of each run.")] = 150,
-    repeats: Annotated[int, typer.Option(help="Runs of each number of sensor workers.")] = 5,
-    rig: Annotated[
-        str, typer.Option(help="Sensors: a name in configs/rigs/, or a .yaml.")
-    ] = "ten_sensors",
-    agents: Annotated[int, typer.Option(help="Vehicles with sensors.")] = 1,
-    background: Annotated[int, typer.Option(help="Vehicles without sensors.")] = 0,
-    seed: Seed = 0,
-    settings: Settings = None,
-    csv_path: Annotated[
-        Path | None, typer.Option("--csv", help="Write every step of every run here.")
-    ] = None,
-    plot: Annotated[
-        Path | None, typer.Option(help="Write the figure here (.png, .svg, .pdf).")
-    ] = None,
-    at_least: Annotated[
-        float | None,
-        typer.Option(
-            help="Exit with 1 if the second number is not so many times faster than the first."
-        ),
-    ] = None,
+    warmup: Annotated[int, about("Steps before the measured ones.")] = 40,
+    steps: Annotated[int, about("Measured steps of each run.")] = 150,
+    repeats: Annotated[int, about("Runs of each number of sensor workers.")] = 5,
+    rig: Annotated[str, about("Sensors: a name in configs/rigs/, or a .yaml.")] = "ten_sensors",
+    agents: Annotated[int, about("Vehicles with sensors.")] = 1,
+    background: Annotated[int, about("Vehicles without sensors.")] = 0,
+    csv_path: Annotated[Path | None, about("Write every step of every run here.", "--csv")] = None,
+    plot: Annotated[Path | None, about("Write the figure here (.png, .svg, .pdf).")] = None,
+    at_least: AtLeast = None,
     json_path: JsonPath = None,
 ) -> None:
     """One vehicle and its sensors, with each number of sensor workers, in processes anew.
@@ -58,26 +55,15 @@ def sensors(
     Exit code 1: states or frames differed between runs, or --at-least did not hold.
     """
     from cavmarl.bench.sensor_bench import measure_sensor_workers
-    from cavmarl.bench.sensor_figure import plot_sensor_workers
-    from cavmarl.bench.sensor_rig import find_rig, load_rig
+    from cavmarl.bench.sensor_run import load_rig
+    from cavmarl.bench.sensor_scaling import plot_sensor_workers
 
-    check_positive("--at-least", at_least)
     numbers = numbers_of("--workers", workers)
+    counts = {"warmup": warmup, "steps": steps, "repeats": repeats}
     console = Console()
     with measuring(console) as say:
-        found = measure_sensor_workers(
-            env,
-            load_rig(find_rig(rig)),
-            workers=numbers,
-            warmup=warmup,
-            steps=steps,
-            repeats=repeats,
-            agents=agents,
-            background=background,
-            seed=seed,
-            overrides=parse_settings(settings),
-            say=say,
-        )
+        mounted = load_rig(find_settings("rig", rig))
+        found = measure_sensor_workers(world, mounted, workers=numbers, say=say, **counts)
     rows = found.rows
     for table in (_sensors(found), _scaling(found, rows), _parts(found), _resources(found)):
         console.print(table)
@@ -88,9 +74,9 @@ def sensors(
     if plot is not None:
         title = f"{Path(env).stem}: {len(found.costs_ms)} sensors, {found.sensing_ms:.1f} ms a tick"
         plot_sensor_workers(rows, title, plot)
-    is_slow = at_least is not None and len(rows) > 1 and rows[1].speedup < at_least
-    if is_slow or not found.is_same:
+    if not found.is_same:
         raise typer.Exit(1)
+    end_below(at_least, rows[1].speedup if len(rows) > 1 else None)
 
 
 def _sensors(found: SensorBench) -> Table:
@@ -99,9 +85,8 @@ def _sensors(found: SensorBench) -> Table:
     plans = [found.shares(number) for number in shared]
     homes = [{name: _homes(plan) for name, plan in both.items()} for both in plans]
     rows: list[tuple[str, ...] | None] = []
-    for place, (sensor, cost_ms) in enumerate(
-        zip(found.turns[0].run.sensors, found.costs_ms, strict=True)
-    ):
+    sensors = zip(found.turns[0].run.sensors, found.costs_ms, strict=True)
+    for place, (sensor, cost_ms) in enumerate(sensors):
         at = sensor["placement"]
         rows.append(
             (
@@ -229,11 +214,7 @@ def _say(console: Console, found: SensorBench, rows: list[ScalingRow]) -> None:
 
 
 def _write_csv(path: Path, found: SensorBench) -> None:
-    """One line a step: the raw series.
-
-    Raises:
-        ConfigError: the path cannot be written.
-    """
+    """One line a step: the raw series."""
     parts = list(found.turns[0].run.parts_ms)
     try:
         with path.open("w", newline="", encoding="utf-8") as file:

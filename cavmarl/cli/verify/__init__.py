@@ -19,6 +19,7 @@ from cavmarl.cli.output import (
     PolicyName,
     Seed,
     Settings,
+    about,
     make_folder,
     parse_settings,
     say_difference,
@@ -46,68 +47,58 @@ def verify(
     ] = None,
     zones: Annotated[
         str | None,
-        typer.Option(
+        about(
+            "Numbers of zones; default: 1,2,4,9, or what a zone file has; of a campaign 4,9.",
             metavar="K,K,…",
-            help="Numbers of zones; default: 1,2,4,9, or what a zone file has; of a campaign 4,9.",
         ),
     ] = None,
     steps: Annotated[
-        int | None, typer.Option(help="Compared steps; default: 200, of a campaign 40 a run.")
+        int | None, about("Compared steps; default: 200, of a campaign 40 a run.")
     ] = None,
     seed: Seed = 0,
     layout: Annotated[
-        str | None,
-        typer.Option(
-            help=f"{', '.join(ZONE_LAYOUTS)}, or a zone file; default: the environment's."
-        ),
+        str | None, about(f"{', '.join(ZONE_LAYOUTS)}, or a zone file; default: the environment's.")
     ] = None,
     policy: PolicyName = "idm",
     worlds: Annotated[
-        int | None,
-        typer.Option(help="Number of parallel worlds; default: 1, with --kill two a worker."),
+        int | None, about("Number of parallel worlds; default: 1, with --kill two a worker.")
     ] = None,
     agents: Agents = None,
     background: Background = None,
     settings: Settings = None,
     faults: Annotated[
         str | None,
-        typer.Option(
-            metavar="PLAN",
-            help="JSON file of faults in the divided worlds, see docs/faults.md; `campaign`: "
+        about(
+            "JSON file of faults in the divided worlds, see docs/faults.md; `campaign`: "
             "the whole matrix.",
+            metavar="PLAN",
         ),
     ] = None,
-    seeds: Annotated[
-        int, typer.Option(help="Of a campaign: runs in which any process dies at any time.")
-    ] = 12,
+    seeds: Annotated[int, about("Of a campaign: runs in which any process dies at any time.")] = 12,
     kill: Annotated[
         int | None,
-        typer.Option(
+        about(
+            "Kill or stop N workers at random times instead of dividing worlds, and compare.",
             metavar="N",
-            help="Kill or stop N workers at random times instead of dividing worlds, and compare.",
         ),
     ] = None,
-    workers: Annotated[int, typer.Option(help="With --kill: workers that run the worlds.")] = 2,
+    workers: Annotated[int, about("With --kill: workers that run the worlds.")] = 2,
     hosts: Annotated[
         str | None,
-        typer.Option(
-            metavar="ray",
-            help="With --kill: the workers are actors of a Ray cluster on this machine.",
+        about(
+            "With --kill: the workers are actors of a Ray cluster on this machine.", metavar="ray"
         ),
     ] = None,
-    check: Annotated[
-        bool, typer.Option("--check", help="Check the invariants of ownership, too.")
-    ] = False,
+    check: Annotated[bool, about("Check the invariants of ownership, too.", "--check")] = False,
     journal: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Folder for the journals of the divided worlds."),
+        Path | None, about("Folder for the journals of the divided worlds.", metavar="DIR")
     ] = None,
     replay: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Run a tick again that every host of a zone died of, see docs/faults.md; beside "
+        about(
+            "Run a tick again that every host of a zone died of, see docs/faults.md; beside "
             "it goes ENV only, where the map is found.",
+            metavar="FILE",
         ),
     ] = None,
     json_path: JsonPath = None,

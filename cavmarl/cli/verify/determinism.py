@@ -16,6 +16,7 @@ from cavmarl.cli.output import (
     PolicyName,
     Seed,
     Settings,
+    about,
     parse_settings,
     say_difference,
     write_json,
@@ -25,7 +26,7 @@ from cavmarl.cli.output import (
 def verify_determinism(
     env: Environment,
     policy: PolicyName = "idm",
-    steps: Annotated[int, typer.Option(help="Compared steps.")] = 600,
+    steps: Annotated[int, about("Compared steps.")] = 600,
     seed: Seed = 0,
     agents: Agents = None,
     background: Background = None,

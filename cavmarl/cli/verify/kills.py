@@ -31,10 +31,7 @@ def verify_with_kills(
     with progress_bar(console) as bar:
         task = bar.add_task(f"{kills} workers of {env} are killed or stopped")
         found = verify_kills(
-            env,
-            kills,
-            progress=lambda k, n: bar.update(task, completed=k, total=n),
-            **arguments,
+            env, kills, progress=lambda k, n: bar.update(task, completed=k, total=n), **arguments
         )
     write_json(json_path, found.to_dict())
     _print(console, found)

@@ -48,49 +48,30 @@ VERDICTS = {
 
 @dataclass(frozen=True)
 class ScenarioRun:
-    """What became of one run.
+    """What became of one run."""
 
-    Attributes:
-        scenario: its name.
-        environment: whose map it was played on.
-        place: where.
-        driver: of the agents.
-        seed: of place and traffic.
-        zones: into which the world was divided.
-        agents: how many.
-        background: vehicles beside the agents and the actors.
-        verdict: `passed` (all through, and none hurt), or what became of the worst of the
-            agents: `collided`, `off road`, or `stuck`.
-        verdicts: of each agent, that to which the scene is played first.
-        min_ttc_s: least time to collision of an agent with an actor, 0 after a collision with
-            one; None: they were never about to.
-        pet_s: least post-encroachment time likewise; None: no place was used by both.
-        collisions: vehicles and actors that began to touch another one, agents among them.
-        red_lights: steps in which an agent entered a junction at red.
-        delay_s: of the first agent, above what its way takes at the speed that it started with.
-        longest_wait_s: for which any other vehicle had stood when the run was over.
-        time_s: the run took.
-        state_hash: of the world at the end.
-    """
-
-    scenario: str
-    environment: str
-    place: str
-    driver: str
-    seed: int
-    zones: int
-    agents: int
-    background: int
+    scenario: str  # its name
+    environment: str  # whose map it was played on
+    place: str  # where
+    driver: str  # of the agents
+    seed: int  # of place and traffic
+    zones: int  # into which the world was divided
+    agents: int  # how many
+    background: int  # vehicles beside the agents and the actors
+    # `passed` (all through, and none hurt), or what became of the worst of the agents: `collided`,
+    # `off road`, or `stuck`
     verdict: str
-    verdicts: tuple[str, ...]
+    verdicts: tuple[str, ...]  # of each agent, that to which the scene is played first
+    # least time to collision of an agent with an actor, 0 after a collision with one; None: they
+    # were never about to
     min_ttc_s: float | None
-    pet_s: float | None
-    collisions: int
-    red_lights: int
-    delay_s: float
-    longest_wait_s: float
-    time_s: float
-    state_hash: str
+    pet_s: float | None  # least post-encroachment time likewise; None: no place was used by both
+    collisions: int  # vehicles and actors that began to touch another one, agents among them
+    red_lights: int  # steps in which an agent entered a junction at red
+    delay_s: float  # of the first agent, above what its way takes at the speed that it started with
+    longest_wait_s: float  # for which any other vehicle had stood when the run was over
+    time_s: float  # the run took
+    state_hash: str  # of the world at the end
 
     @property
     def passed(self) -> bool:

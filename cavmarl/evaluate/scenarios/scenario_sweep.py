@@ -17,19 +17,13 @@ from cavmarl.evaluate.scenarios.scenario_runs import ScenarioRun, make_scenario,
 
 
 class SweepRow(NamedTuple):
-    """One scenario on one map.
+    """One scenario on one map."""
 
-    Attributes:
-        scenario: its name.
-        environment: name, folder or map file.
-        passing: runs of the driver that is to pass; none where the map has no place for it.
-        failing: runs of the one that is not.
-    """
-
-    scenario: str
-    environment: str
+    scenario: str  # its name
+    environment: str  # name, folder or map file
+    # runs of the driver that is to pass; none where the map has no place for it
     passing: list[ScenarioRun]
-    failing: list[ScenarioRun]
+    failing: list[ScenarioRun]  # runs of the one that is not
 
     @property
     def holds(self) -> bool:

@@ -72,12 +72,8 @@ def make_world(
     return simulation
 
 
-def advance(simulation: Simulation, commands: Commands) -> None:
-    simulation.step(commands)
-
-
 def idle_commands(simulation: Simulation) -> Commands:
-    """Room for the commands of `advance`."""
+    """Commands of a step in which no agent does anything."""
     shape = simulation.outputs.present.shape
     return Commands(np.zeros((*shape, 2)), np.full(shape, ACTION_IDLE, dtype=np.int64))
 
@@ -93,7 +89,7 @@ def run_native(simulation: Simulation, seconds: int) -> TrafficRun:
     commands = idle_commands(simulation)
     ticks_per_s = round(1.0 / simulation.config.clock.sim_dt_s)
     for tick in range(1, seconds * ticks_per_s + 1):
-        advance(simulation, commands)
+        simulation.step(commands)
         rows = simulation.vehicles()
         meter.see(rows)
         if tick % ticks_per_s == 0:

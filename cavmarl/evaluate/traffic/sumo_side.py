@@ -10,10 +10,8 @@ import math
 import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +22,7 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import ConfigError, require
 from cavmarl.core.records.codes import SIGNAL_NONE
 from cavmarl.driving.vehicles import VEHICLE, blank_vehicle
+from cavmarl.evaluate.fresh import fresh_process
 from cavmarl.evaluate.traffic.traffic_metrics import TrafficCounts, TrafficMeter, TrafficRun
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
@@ -33,23 +32,15 @@ from cavmarl.traffic.sumo.sumo_options import command_words, free_libsumo
 
 @dataclass(frozen=True)
 class SumoJob:
-    """One run.
+    """One run."""
 
-    Attributes:
-        map_file: a SUMO network.
-        demand: what drives on it.
-        seconds: how long, from `demand.begin_s`.
-        dt_s: step length.
-        seed: of SUMO's random numbers.
-        teleports: whether SUMO may put vehicles elsewhere that stand for too long (300 s unless
-            the demand's configuration says otherwise).
-    """
-
-    map_file: Path
-    demand: SumoInput
-    seconds: int
-    dt_s: float
-    seed: int
+    map_file: Path  # a SUMO network
+    demand: SumoInput  # what drives on it
+    seconds: int  # how long, from `demand.begin_s`
+    dt_s: float  # step length
+    seed: int  # of SUMO's random numbers
+    # whether SUMO may put vehicles elsewhere that stand for too long (300 s unless the demand's
+    # configuration says otherwise)
     teleports: bool = True
 
 
@@ -66,18 +57,11 @@ def run_sumo(job: SumoJob) -> TrafficRun:
 
 @contextmanager
 def sumo_process(job: SumoJob) -> Iterator[ProcessPoolExecutor]:
-    """A fresh process for one simulation of SUMO's; what is submitted runs there.
-
-    Raises:
-        ConfigError: SUMO ended the process.
-        MissingExtraError: SUMO is not installed.
-    """
+    """A fresh process for one simulation of SUMO's; what is submitted runs there."""
     require("libsumo", "sumo")
-    with ProcessPoolExecutor(1, get_context("spawn")) as process:
-        try:
-            yield process
-        except BrokenProcessPool as error:
-            raise ConfigError(f"{job.map_file}: SUMO ended its process on this demand") from error
+    died = ConfigError(f"{job.map_file}: SUMO ended its process on this demand")
+    with fresh_process(died) as process:
+        yield process
 
 
 def start_sumo(job: SumoJob, folder: Path, *more: str) -> Any:

@@ -35,52 +35,32 @@ EDGE_MINUTE = np.dtype(
 
 @dataclass(frozen=True)
 class TrafficCounts:
-    """What only the simulator itself can count, from the beginning to the end.
+    """What only the simulator itself can count, from the beginning to the end."""
 
-    Attributes:
-        departed: vehicles that have entered.
-        waiting: vehicles whose time to depart has come and that have not entered.
-        arrived: vehicles that reached the end of their trip.
-        mean_delay_s: over the arrived ones, time above that of the same way at the speed which the
-            driver wants there; None where none arrived.
-        teleports: vehicles that were put elsewhere because they stood for too long.
-    """
-
-    departed: int
-    waiting: int
-    arrived: int
+    departed: int  # vehicles that have entered
+    waiting: int  # vehicles whose time to depart has come and that have not entered
+    arrived: int  # vehicles that reached the end of their trip
+    # over the arrived ones, time above that of the same way at the speed which the driver wants
+    # there; None where none arrived
     mean_delay_s: float | None
-    teleports: int = 0
+    teleports: int = 0  # vehicles that were put elsewhere because they stood for too long
 
 
 @dataclass(frozen=True)
 class TrafficFigures:
-    """One simulator's row of the table.
+    """One simulator's row of the table."""
 
-    Attributes:
-        departed: see `TrafficCounts`.
-        waiting: see `TrafficCounts`.
-        arrived: see `TrafficCounts`.
-        mean_delay_s: see `TrafficCounts`.
-        teleports: see `TrafficCounts`.
-        mean_speed_mps: over all vehicles of all samples; None where there was none.
-        queue: vehicles that stand (below 0.1 m/s) on lanes that end at a signal, mean of the
-            samples.
-        contacts: pairs of vehicles whose rectangles began to overlap on the same level.
-        longest_lock_s: the longest lock of any junction, see `JunctionLocks`.
-        locked_junction: whose that was; empty where no junction was ever locked.
-    """
-
-    departed: int
-    waiting: int
-    arrived: int
-    mean_speed_mps: float | None
-    mean_delay_s: float | None
+    departed: int  # see `TrafficCounts`
+    waiting: int  # see `TrafficCounts`
+    arrived: int  # see `TrafficCounts`
+    mean_speed_mps: float | None  # over all vehicles of all samples; None where there was none
+    mean_delay_s: float | None  # see `TrafficCounts`
+    # vehicles that stand (below 0.1 m/s) on lanes that end at a signal, mean of the samples
     queue: float
-    contacts: int
-    longest_lock_s: float
-    locked_junction: str
-    teleports: int
+    contacts: int  # pairs of vehicles whose rectangles began to overlap on the same level
+    longest_lock_s: float  # the longest lock of any junction, see `JunctionLocks`
+    locked_junction: str  # whose that was; empty where no junction was ever locked
+    teleports: int  # see `TrafficCounts`
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -88,17 +68,11 @@ class TrafficFigures:
 
 @dataclass(frozen=True)
 class TrafficRun:
-    """What came out of one run.
+    """What came out of one run."""
 
-    Attributes:
-        figures: the row of the table.
-        locks_s: junction → its longest lock in seconds, of those that had one.
-        edge_minutes: EDGE_MINUTE rows of all edges and minutes with a vehicle.
-    """
-
-    figures: TrafficFigures
-    locks_s: dict[str, float]
-    edge_minutes: NDArray[np.void]
+    figures: TrafficFigures  # the row of the table
+    locks_s: dict[str, float]  # junction → its longest lock in seconds, of those that had one
+    edge_minutes: NDArray[np.void]  # EDGE_MINUTE rows of all edges and minutes with a vehicle
 
 
 class TrafficMeter:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +50,11 @@ def plot_fundamental_diagram(found: TrafficComparison, path: Path) -> None:
         axes.legend(frameon=False)
     edges = f"each edge of {LEAST_EDGE_M:g} m or more, each minute"
     figure.suptitle(f"{found.map_name}, {found.seconds} s, step {found.dt_s:g} s: {edges}")
+    save_figure(figure, path)
+
+
+def save_figure(figure: Any, path: Path) -> None:
+    """Write a figure where `--plot` asks for it."""
     try:
         figure.savefig(path, dpi=150)
     except (OSError, ValueError) as error:
