@@ -138,8 +138,16 @@ def rows_of(master: list[int], follower: list[int], dt_s: float) -> tuple[DriftR
     rows = []
     for step in [*marks, last]:
         elapsed, seen = master[step], follower[step] - follower[0]
-        times_s = (ticks * dt_s for ticks in (elapsed, follower[step], seen, seen - elapsed))
-        rows.append(DriftRow(step, *times_s, float(Fraction(seen, elapsed))))
+        rows.append(
+            DriftRow(
+                step=step,
+                master_s=elapsed * dt_s,
+                follower_s=follower[step] * dt_s,
+                normalised_s=seen * dt_s,
+                delta_s=(seen - elapsed) * dt_s,
+                ratio=float(Fraction(seen, elapsed)),
+            )
+        )
     return tuple(rows)
 
 

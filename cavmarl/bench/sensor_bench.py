@@ -16,7 +16,7 @@ from cavmarl.bench.worker_speed import CoreCeiling, measure_ceiling
 from cavmarl.config.env import EnvConfig
 from cavmarl.config.registry import load_config
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
-from cavmarl.core.errors import ConfigError, EvaluationError
+from cavmarl.core.errors import ConfigError
 from cavmarl.evaluate.fresh import call_in_fresh_process
 from cavmarl.evaluate.provenance.machine import describe_code, describe_hardware, describe_software
 from cavmarl.parallel.processes.process_barrier import usable_cores
@@ -193,7 +193,7 @@ def _ceiling(spec: WorldSpec, workers: Sequence[int], say: Say) -> CoreCeiling |
     if programs == 1:
         return None
     say(f"{programs} programs that share nothing")
-    counts = {"worlds": programs, "programs": programs}
+    counts: dict[str, Any] = {"worlds": programs, "programs": programs}
     return measure_ceiling(spec, **counts, steps=CEILING_STEPS, repeats=CEILING_TURNS, alike=True)
 
 
@@ -215,7 +215,5 @@ def job_config(job: SensorJob) -> EnvConfig:
 
 def run_job(job: SensorJob) -> SensorRun:
     """A run in processes of its own."""
-    died = EvaluationError(
-        f"a run with {job.sensor_workers} sensor workers has died; its own message is above"
-    )
-    return call_in_fresh_process(run_sensors, job, died=died)
+    what = f"a run with {job.sensor_workers} sensor workers"
+    return call_in_fresh_process(what, run_sensors, job)

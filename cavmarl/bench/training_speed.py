@@ -201,7 +201,7 @@ class _Side:
         self._decisions.append(decisions)
         if counts:
             self._rates.append(decisions / (time.perf_counter() - began))
-            self._spent_s.update(spent_s)  # type: ignore[arg-type]
+            self._spent_s.update(spent_s)
 
     def row(self) -> TrainingRow:
         """What was found."""

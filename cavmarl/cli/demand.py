@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cavmarl.cli.output import JsonPath, Seed, about, write_json
+from cavmarl.cli.output import JsonPath, MapName, Seed, about, write_json
 
 app = typer.Typer(help="Make files of demand.", no_args_is_help=True)
 
@@ -19,9 +19,7 @@ def _group() -> None:
 
 @app.command()
 def random(
-    map_name: Annotated[
-        str, typer.Argument(metavar="MAP", help="A map file, or an environment's name or folder.")
-    ],
+    map_name: MapName,
     out: Annotated[Path, about("The .rou.xml to write.", "--out", "-o")],
     vehicles: Annotated[int, about("Number of cars.")] = 1000,
     within: Annotated[float, about("Seconds in which they depart, evenly.")] = 60.0,

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cavmarl.cli.lead import DEFAULT_PLACE, address_of
-from cavmarl.cli.output import Environment, JsonPath, about, write_json
+from cavmarl.cli.output import Environment, JsonPath, about, grid, write_json
 from cavmarl.core.errors import ConfigError
 
 
@@ -47,11 +47,7 @@ def follow(
 
 
 def _stages(words: list[str], known: tuple[str, ...]) -> dict[str, str]:
-    """`perception=blind` and the like.
-
-    Raises:
-        ConfigError: no such stage.
-    """
+    """`perception=blind` and the like."""
     chosen = {}
     for word in words:
         stage, equals, name = word.partition("=")
@@ -62,9 +58,8 @@ def _stages(words: list[str], known: tuple[str, ...]) -> dict[str, str]:
 
 
 def _table(found: dict[str, Any]) -> Table:
-    table = Table(title=f"{found['steps']} steps")
-    for column in ("stage", "mean, ms", "worst, ms"):
-        table.add_column(column, justify="left" if column == "stage" else "right")
-    for stage, row in found["stages"].items():
-        table.add_row(stage, f"{row['mean_wall_ms']:.2f}", f"{row['worst_wall_ms']:.2f}")
-    return table
+    rows = (
+        (stage, f"{row['mean_wall_ms']:.2f}", f"{row['worst_wall_ms']:.2f}")
+        for stage, row in found["stages"].items()
+    )
+    return grid(("stage", "mean, ms", "worst, ms"), rows, f"{found['steps']} steps")

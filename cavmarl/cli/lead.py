@@ -3,22 +3,14 @@
 from __future__ import annotations
 
 from contextlib import closing
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from rich.console import Console
 from rich.table import Table
 
-from cavmarl.cli.output import (
-    Agents,
-    Background,
-    Environment,
-    JsonPath,
-    Seed,
-    Settings,
-    about,
-    parse_settings,
-    write_json,
-)
+from cavmarl.cli.output import JsonPath, about, grid, with_world, write_json
+from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -36,8 +28,9 @@ def address_of(text: str) -> str | int:
     return int(text) if text.isdecimal() else text
 
 
+@with_world()
 def lead(
-    env: Environment,
+    world: WorldSpec,
     at: Place = DEFAULT_PLACE,
     followers: Annotated[int, about("Followers that have to join before the first step.")] = 1,
     steps: Annotated[int | None, about("Most steps; default: one episode.")] = None,
@@ -58,10 +51,6 @@ def lead(
     ] = "none",
     zones: Annotated[int | None, about("Shadows zones.count.")] = None,
     workers: Annotated[int, about("Worker processes; 0: the master's own process.")] = 0,
-    agents: Agents = None,
-    background: Background = None,
-    seed: Seed = 0,
-    settings: Settings = None,
     json_path: JsonPath = None,
 ) -> None:
     """Run a world as its time master; followers that join over a socket drive its agents."""
@@ -74,12 +63,10 @@ def lead(
         raise ConfigError("--followers must be 0 or more, --steps 1 or more")
     console = Console()
     pacer = None if pace is None else RealTime(pace)
-    overrides = parse_settings(settings)
     if rig == "reference":
-        overrides = {"clock.ctrl_dt_s": 0.05, "rig": REFERENCE_RIG} | overrides
-    made = parallel_env(
-        env, zones=zones, workers=workers, agents=agents, background=background, overrides=overrides
-    )
+        given = {"clock.ctrl_dt_s": 0.05, "rig": REFERENCE_RIG, **world.overrides}
+        world = replace(world, overrides=given)
+    made = parallel_env(world.env, zones=zones, workers=workers, **world.keywords)
     with (
         closing(made),
         FollowedWorld(
@@ -89,11 +76,11 @@ def lead(
             own_ticks=own_ticks,
             bad_controls=bad_controls,
             pacer=pacer,
-        ) as world,
+        ) as led,
     ):
-        console.print(f"waiting for {followers} followers at {world.address}", highlight=False)
-        world.wait_for(followers, joins_s)
-        found = _run(world, seed, steps)
+        console.print(f"waiting for {followers} followers at {led.address}", highlight=False)
+        led.wait_for(followers, joins_s)
+        found = _run(led, world.seed, steps)
         if pacer is not None:
             found["lateness"] = vars(pacer.lateness)
         console.print(_table(found))
@@ -132,14 +119,14 @@ def _run(world: FollowedWorld, seed: int, steps: int | None) -> dict[str, Any]:
 
 
 def _table(found: dict[str, Any]) -> Table:
-    table = Table(title=f"{found['steps']} steps, {found['time_s']:g} s", show_header=True)
-    for column in ("follower", "answers", "late", "bad", "waited for, s", "slowest in"):
-        table.add_column(column)
-    for row in found["barrier"]:
-        table.add_row(
+    rows = (
+        (
             row["name"],
             *(str(row[name]) for name in ("answers", "late", "bad")),
             f"{row['wait_wall_s']:.2f}",
             str(row["slowest_in"]),
         )
-    return table
+        for row in found["barrier"]
+    )
+    heads = ("follower", "answers", "late", "bad", "waited for, s", "slowest in")
+    return grid(heads, rows, f"{found['steps']} steps, {found['time_s']:g} s")

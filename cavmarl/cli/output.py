@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial, wraps
 from inspect import Parameter, Signature, signature
 from pathlib import Path
@@ -11,7 +11,9 @@ from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
+from rich import box
 from rich.console import Console
+from rich.table import Table
 from rich.text import Text
 
 from cavmarl.bench.harness import check_positive
@@ -118,6 +120,7 @@ def _with_world(names: tuple[str, ...], command: Callable[..., None]) -> Callabl
     @wraps(command)
     def program(**options: Any) -> None:
         keys = {name: options[name] for name in names if name != "settings"}
+        keys["env"] = keys["env"] or ""
         spec = WorldSpec(overrides=parse_settings(options["settings"]), **keys)
         command(spec, **{name: options[name] for name in own})
 
@@ -127,11 +130,7 @@ def _with_world(names: tuple[str, ...], command: Callable[..., None]) -> Callabl
 
 
 def parse_settings(settings: Sequence[str] | None) -> dict[str, Any]:
-    """`sensors.lidar.rays=32` and the like as overrides; a value is JSON, else text.
-
-    Raises:
-        ConfigError: no `=`, no key, no value, or a key twice.
-    """
+    """`sensors.lidar.rays=32` and the like as overrides; a value is JSON, else text."""
     overrides: dict[str, Any] = {}
     for setting in settings or ():
         key, equals, text = setting.partition("=")
@@ -149,11 +148,7 @@ def parse_settings(settings: Sequence[str] | None) -> dict[str, Any]:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder that files can be written into, or see that it is one.
-
-    Raises:
-        ConfigError: it cannot be made or written into.
-    """
+    """Make a folder that files can be written into, or see that it is one."""
     try:
         path.mkdir(parents=True, exist_ok=True)
         with TemporaryFile(dir=path):
@@ -163,11 +158,7 @@ def make_folder(path: Path) -> None:
 
 
 def write_json(path: Path | None, document: dict[str, Any]) -> None:
-    """Write `document` where `--json` asks for it.
-
-    Raises:
-        ConfigError: the path cannot be written.
-    """
+    """Write `document` where `--json` asks for it."""
     if path is None:
         return
     try:
@@ -179,6 +170,34 @@ def write_json(path: Path | None, document: dict[str, Any]) -> None:
 def number(value: float | None, scale: float = 1.0) -> str:
     """A number for a table, times `scale`; a dash where there is none."""
     return "-" if value is None else f"{scale * value:.2f}"
+
+
+def grid(
+    heads: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    title: str | None = None,
+    caption: str | None = None,
+    lefts: int = 1,
+    wraps: bool = False,
+) -> Table:
+    """A table without a frame; all columns but the first `lefts` are right-aligned numbers."""
+    table = Table(title=title, caption=caption, box=box.SIMPLE_HEAD, pad_edge=False)
+    for place, head in enumerate(heads):
+        if place < lefts:
+            table.add_column(head, overflow="fold")
+        else:
+            table.add_column(head, justify="right", no_wrap=not wraps)
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def pairs_grid(rows: Iterable[tuple[str, str]]) -> Table:
+    """Names and what is told of them, without a head."""
+    table = Table.grid(padding=(0, 2))
+    for row in rows:
+        table.add_row(*row)
+    return table
 
 
 def say_difference(difference: Difference, sides: tuple[str, str]) -> str:

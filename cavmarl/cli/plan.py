@@ -8,18 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from cavmarl.cli.output import (
-    Agents,
-    Background,
-    JsonPath,
-    Seed,
-    Settings,
-    about,
-    parse_settings,
-    print_error,
-    write_json,
-)
+from cavmarl.cli.output import JsonPath, about, print_error, with_world, write_json
 from cavmarl.config.env import ZONE_LAYOUTS
+from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError, NoAdmissibleWorkerError
 
 if TYPE_CHECKING:
@@ -32,7 +23,9 @@ NOW, IDLE = "now", "idle"
 LASTING_S = 3600  # of the worlds: longer than any measurement
 
 
+@with_world()
 def plan(
+    world: WorldSpec,
     env: Annotated[
         str | None,
         typer.Argument(metavar="[ENV]", help="Name, folder or map file; not with --again."),
@@ -64,10 +57,6 @@ def plan(
             metavar="FILE",
         ),
     ] = None,
-    agents: Agents = None,
-    background: Background = None,
-    seed: Seed = 0,
-    settings: Settings = None,
     json_path: JsonPath = None,
 ) -> None:
     """Measure what each zone costs, place the shards, and print the plan; nothing is started."""
@@ -88,17 +77,8 @@ def plan(
     seen = _snapshot(snapshot, workers)
     console = Console()
     with console.status("measuring"):
-        make = world_maker(
-            env,
-            layout=layout,
-            seconds=LASTING_S,
-            seed=seed,
-            agents=agents,
-            background=background,
-            overrides=parse_settings(settings),
-        )
-        simulation = make(zones)
-        measured = measure_shards(simulation, worlds, seed, steps=steps, before=before)
+        simulation = world_maker(world, layout=layout, seconds=LASTING_S)(zones)
+        measured = measure_shards(simulation, worlds, world.seed, steps=steps, before=before)
     partition = simulation.partition
     try:
         made = make_plan(Problem(measured.costs, partition.side_neighbors, seen, rule))

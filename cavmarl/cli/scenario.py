@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -76,8 +77,6 @@ def run(
     json_path: JsonPath = None,
 ) -> None:
     """Play a scenario to a driver; exit code 1 unless all come through and hurt no one."""
-    from contextlib import ExitStack
-
     from cavmarl.evaluate.scenarios.scenario_films import ScenarioCamera
     from cavmarl.evaluate.scenarios.scenario_runs import make_scenario, run_scenario
 
@@ -152,11 +151,7 @@ def sweep(
 
 
 def _params(given: list[str] | None) -> dict[str, bool | float]:
-    """`walk_mps=2` and the like.
-
-    Raises:
-        ConfigError: no `=`, or a value that is neither a number nor true or false.
-    """
+    """`walk_mps=2` and the like."""
     params: dict[str, bool | float] = {}
     for text in given or ():
         key, _, value = text.partition("=")

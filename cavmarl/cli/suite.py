@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from cavmarl.cli.evaluate import report_cell
-from cavmarl.cli.output import JsonPath, Seed, about, make_folder, write_json
+from cavmarl.cli.output import JsonPath, Seed, about, grid, make_folder, write_json
+from cavmarl.config.registry import find_settings
 
 if TYPE_CHECKING:
     from cavmarl.evaluate import EvaluationReport
@@ -35,9 +35,9 @@ def suite(
     json_path: JsonPath = None,
 ) -> None:
     """Evaluate drivers in every world of a suite; `cavmarl report` shows any of them whole."""
-    from cavmarl.evaluate.suite import find_suite, load_suite, run_suite, worlds_of
+    from cavmarl.evaluate.suite import load_suite, run_suite, worlds_of
 
-    loaded = load_suite(find_suite(name))
+    loaded = load_suite(find_settings("suite", name))
     worlds = worlds_of(loaded, maps)
     make_folder(out)
     console = Console()
@@ -61,14 +61,10 @@ def _table(reports: dict[str, EvaluationReport]) -> Table:
     from cavmarl.evaluate.metrics import METRICS
 
     metrics = [metric for metric in METRICS if metric.name in SHOWN]
-    heads = (f"{metric.label}, {metric.unit}" for metric in metrics)
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    table.add_column("map, agents", overflow="fold")
-    table.add_column("driver", overflow="fold")
-    for head in heads:
-        table.add_column(head, justify="right", no_wrap=True)
+    rows = []
     for label, found in reports.items():
         for driver, results in found.policies.items():
             cells = (report_cell(metric, results[metric.name]) for metric in metrics)
-            table.add_row(escape(label), escape(Path(driver).name), *cells)
-    return table
+            rows.append((escape(label), escape(Path(driver).name), *cells))
+    heads = ("map, agents", "driver", *(metric.title for metric in metrics))
+    return grid(heads, rows, lefts=2)

@@ -97,6 +97,12 @@ def check(holds: bool, key: str, value: object, expected: str) -> None:
         raise ConfigError(f"{key} = {value!r}: {expected}")
 
 
+def check_count(key: str, value: Any, most: int) -> None:
+    """Raise a ConfigError unless `value` is a whole number from 1 to `most`."""
+    whole = isinstance(value, int) and not isinstance(value, bool)
+    check(whole and 1 <= value <= most, key, value, Whole(1, most).expected)
+
+
 def check_finite(key: str, value: float, low: float, high: float) -> None:
     """Raise a ConfigError unless `value` is a finite number from `low` to `high`."""
     check(math.isfinite(value) and low <= value <= high, key, value, Within(low, high).expected)

@@ -26,6 +26,11 @@ class Metric:
     scale: float = 1.0  # values are shown times this
     better: Literal["more", "less"] | None = None  # which way is better; None where neither is
 
+    @property
+    def title(self) -> str:
+        """Label and unit."""
+        return f"{self.label}, {self.unit}" if self.unit else self.label
+
 
 def _share(name: str, label: str, meaning: str, better: Literal["more", "less"]) -> Metric:
     return Metric(name, label, "%", "trip", meaning, share=True, scale=100.0, better=better)

@@ -44,17 +44,7 @@ class MeasuredWorlds:
 def measure_rounds(
     simulation: Simulation, rounds: int, steps: int, *, before: int
 ) -> Iterator[MeasuredRound]:
-    """Drive one world on from its reset and measure its zones.
-
-    Args:
-        simulation: one world, reset.
-        rounds: that are measured.
-        steps: of each.
-        before: steps that are driven first.
-
-    Raises:
-        ConfigError: a number out of range, or hosts that die by plan.
-    """
+    """Drive one world on from its reset and measure its zones."""
     for name, value in (("rounds", rounds), ("steps", steps), ("before", before)):
         if value < 1:
             raise ConfigError(f"{name} = {value}: must be at least 1")
@@ -83,16 +73,6 @@ def measure_shards(
 
     Of each zone the median of `PARTS` parts of the steps counts: what happens once, as a kernel
     that is loaded, is no cost of a zone.
-
-    Args:
-        simulation: one world.
-        worlds: how many.
-        seed: root of all random numbers.
-        steps: that are measured of each world.
-        before: steps that are driven first.
-
-    Raises:
-        ConfigError: too few steps, or hosts that die by plan.
     """
     if steps < PARTS:
         raise ConfigError(f"steps = {steps}: must be at least {PARTS}")

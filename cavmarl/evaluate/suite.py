@@ -39,20 +39,12 @@ class SuiteWorld:
 
 
 def load_suite(path: Path) -> Suite:
-    """Read a suite.
-
-    Raises:
-        ConfigError: not YAML, an unknown key, or a value that cannot work.
-    """
+    """Read a suite."""
     return validate(Suite, read_yaml(path), str(path))
 
 
 def worlds_of(suite: Suite, maps: Path) -> list[SuiteWorld]:
-    """Every map with every number of agents.
-
-    Raises:
-        ConfigError: a map is neither an environment nor a file below `maps`, or two have one name.
-    """
+    """Every map with every number of agents."""
     found = {Path(name).name.split(".")[0]: env for name, env in _found(suite, maps)}
     if len(found) < len(suite.maps):
         raise ConfigError(f"maps = {suite.maps!r}: two have one name; rename a file")
@@ -101,9 +93,6 @@ def run_suite(
         repeats: independent runs.
         seed: of the first run.
         began: called before each world.
-
-    Raises:
-        CavmarlError: as `evaluate`.
     """
     reports = {}
     for world in worlds:

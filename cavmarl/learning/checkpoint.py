@@ -34,20 +34,12 @@ class RunState:
     seconds: float = 0.0  # spent on them
 
     def settings(self, kind: type[S]) -> S:
-        """The settings as what they were made of.
-
-        Raises:
-            ConfigError: they are another program's, or broken.
-        """
+        """The settings as what they were made of."""
         return validate(kind, self.args, STATE_FILE)
 
 
 def read_state(folder: Path) -> RunState:
-    """What `save_checkpoint` noted of a run.
-
-    Raises:
-        ConfigError: no checkpoint there, or a broken one.
-    """
+    """What `save_checkpoint` noted of a run."""
     path = folder / STATE_FILE
     try:
         raw = json.loads(path.read_text(encoding="utf-8"))
@@ -78,11 +70,7 @@ def save_checkpoint(
 def load_checkpoint(
     folder: Path, network: ActorCritic, optimizer: torch.optim.Optimizer, config: NetworkConfig
 ) -> None:
-    """Put a run's weights and its optimiser's state into others.
-
-    Raises:
-        PolicyError: a broken file, or a run on an environment that has changed since.
-    """
+    """Put a run's weights and its optimiser's state into others."""
     loaded, saved = load_network(folder)
     if replace(saved, agent_steps=0) != config:
         raise PolicyError(

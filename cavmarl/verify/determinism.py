@@ -21,8 +21,9 @@ from typing import Any, Unpack
 
 import numpy as np
 
+from cavmarl.config.checks import check_count
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
-from cavmarl.core.errors import ConfigError, EvaluationError
+from cavmarl.core.errors import EvaluationError
 from cavmarl.core.seeds import check_seed
 from cavmarl.evaluate.fresh import told_error
 from cavmarl.verify.differences import Arrays, Difference, find_difference
@@ -76,7 +77,8 @@ def verify_determinism(
     """
     spec = WorldSpec.of(env, **keys)
     check_seed(spec.seed)
-    job = {"spec": asdict(spec), "policy": str(policy), "steps": check_steps(steps)}
+    check_count("steps", steps, MAX_STEPS)
+    job = {"spec": asdict(spec), "policy": str(policy), "steps": steps}
     with ExitStack() as stack:
         room = Path(stack.enter_context(TemporaryDirectory()))
         programs = [stack.enter_context(_Program(job, HASH_SEEDS[0]))]
@@ -99,13 +101,6 @@ def verify_determinism(
             found = find_difference(step, told[0]["tick"], *states)
             difference = FirstDifference(**vars(found), processes=(0, odd))
         return Determinism(step, told[0]["tick"], HASH_SEEDS, told[0]["state"], difference)
-
-
-def check_steps(steps: int) -> int:
-    """A number of steps that can be compared; others are refused."""
-    if isinstance(steps, bool) or not isinstance(steps, int) or not 1 <= steps <= MAX_STEPS:
-        raise ConfigError(f"steps = {steps!r}: must be a whole number from 1 to {MAX_STEPS}")
-    return steps
 
 
 class _Program:

@@ -14,20 +14,15 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.config.checks import check_count
 from cavmarl.config.env import MAX_ZONES, ZONE_FILE_SUFFIXES
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError, ProtocolError
 from cavmarl.core.seeds import check_seed
 from cavmarl.env.vector import make_vec
 from cavmarl.handoff.fault_injection.fault_plan import read_faults
-from cavmarl.verify.determinism import check_steps
-from cavmarl.verify.differences import (
-    Difference,
-    DrivenRun,
-    find_difference,
-    same_bytes,
-    snapshot,
-)
+from cavmarl.verify.determinism import MAX_STEPS
+from cavmarl.verify.differences import Difference, DrivenRun, find_difference, same_bytes, snapshot
 from cavmarl.verify.fault_figures import FaultFigures, HandOverClock
 from cavmarl.zones.kernels.zone_lookup import zones_of
 from cavmarl.zones.partition.zone_file import read_zones
@@ -106,7 +101,7 @@ def verify_zones(
         JournalError: a journal that cannot be begun.
         PolicyError: the policy cannot be loaded or does not fit.
     """
-    check_steps(steps)
+    check_count("steps", steps, MAX_STEPS)
     spec = WorldSpec.of(env, **keys)
     check_seed(spec.seed)
     divided = _divided(spec, layout, faults, check)

@@ -13,6 +13,7 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.config.checks import check_count
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError, EvaluationError, LostTickError, ProtocolError
 from cavmarl.core.seeds import check_seed
@@ -23,7 +24,7 @@ from cavmarl.handoff.fault_injection.injected_faults import FaultyCoordinator
 from cavmarl.handoff.fault_injection.reproducer_file import read_reproducer
 from cavmarl.ownership.messages import Begin, Message, Record
 from cavmarl.ownership.transport import check_whole
-from cavmarl.verify.determinism import check_steps
+from cavmarl.verify.determinism import MAX_STEPS
 from cavmarl.verify.differences import Arrays, DrivenRun, first_results, single_arrays, step_results
 from cavmarl.verify.fault_figures import FaultFigures, HandOverClock, spread
 from cavmarl.verify.fault_matrix import MatrixLine, Rehearsal, matrix
@@ -106,7 +107,7 @@ class Campaign:
 
 
 def run_campaign(
-    env: str | Path | None = None,
+    env: str | Path | WorldSpec | None = None,
     zones: Sequence[int] | None = None,
     *,
     steps: int = 40,
@@ -126,18 +127,18 @@ def run_campaign(
         progress: called after each run with its number and how many there are.
         keys: of the world.
     """
-    check_steps(steps)
+    check_count("steps", steps, MAX_STEPS)
     check_whole("seeds", seeds, 0)
     counts = ZONES if zones is None else tuple(dict.fromkeys(zones))
     if not counts or min(counts) < 2:
         raise ConfigError(f"zones = {list(counts)}: a campaign needs numbers of 2 or more")
-    spec = WorldSpec.of(ENV if env is None else env, **keys)
+    spec = WorldSpec.of("" if env is None else env, **keys)
     check_seed(spec.seed)
-    if env is None:
+    if not spec.env:
         given = {"population.agents": spec.agents, "population.background": spec.background}
         named = {key: value for key, value in given.items() if value is not None}
         overrides = {**BUSY, **spec.overrides, **named}
-        spec = replace(spec, agents=None, background=None, overrides=overrides)
+        spec = replace(spec, env=ENV, agents=None, background=None, overrides=overrides)
     campaign = Campaign(spec.env, counts, steps)
     with TemporaryDirectory() as folder:
         _run_matrix(_Stage(spec, steps, policy, folder), campaign, seeds, progress)

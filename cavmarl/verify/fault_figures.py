@@ -96,12 +96,7 @@ class FaultFigures:
 
     @classmethod
     def of(cls, simulation: Simulation, clocks: Sequence[HandOverClock]) -> FaultFigures:
-        """What a simulation's worlds went through.
-
-        Args:
-            simulation: a divided one.
-            clocks: one a world, that have watched it.
-        """
+        """What a simulation's worlds went through."""
         found = cls()
         for revival in simulation.revivals:
             deaths = found.coordinator_deaths if revival.zone is None else found.zone_deaths

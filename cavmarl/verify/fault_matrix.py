@@ -91,13 +91,7 @@ class MatrixLine:
 
 
 def matrix(seen: Rehearsal, seed: int, seeds: int) -> list[MatrixLine]:
-    """All lines that apply to one process.
-
-    Args:
-        seen: the run that faults are planned for.
-        seed: of the plans.
-        seeds: runs of the last line.
-    """
+    """All lines that apply to one process."""
     return [*_host_lines(seen), *_coordinator_lines(seen), *_message_lines(seed, seen.ticks),
             _random_line(seed, seeds)]  # fmt: skip
 

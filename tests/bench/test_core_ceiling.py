@@ -12,9 +12,7 @@ from cavmarl.core.errors import WorkerError
 
 
 def test_all_programs_step_and_end() -> None:
-    found = measure_ceiling(
-        "ring", worlds=3, programs=2, steps=2, repeats=2, agents=2, alike=True
-    )
+    found = measure_ceiling("ring", worlds=3, programs=2, steps=2, repeats=2, agents=2, alike=True)
     assert found.programs == 2
     assert len(found.alone_ms) == len(found.together_ms) == 2
     assert min(found.alone_ms + found.together_ms) > 0.0

@@ -30,13 +30,13 @@ def test_a_load_is_found_beyond_which_sensors_take_much_longer_at_once(
 
     def run(job: SensorJob) -> SimpleNamespace:
         found = costs_ms(job.spec.overrides["rig"])
-        return SimpleNamespace(parts_ms={"sensor compute": [found]}, costs_ms=[found / (job.spec.agents or 1)])
+        return SimpleNamespace(
+            parts_ms={"sensor compute": [found]}, costs_ms=[found / (job.spec.agents or 1)]
+        )
 
     monkeypatch.setattr(rig_load, "run_job", run)
     said: list[str] = []
-    spec = WorldSpec(
-        env="grid4x4", overrides={"rig": {"lidar": LIDAR}}, agents=2, background=3
-    )
+    spec = WorldSpec(env="grid4x4", overrides={"rig": {"lidar": LIDAR}}, agents=2, background=3)
     job = SensorJob(spec, 1, 2, 6)
     loaded = rig_load.loaded(job, 20.0, said.append)
     assert 24.0 <= costs_ms(loaded.spec.overrides["rig"]) <= 30.0

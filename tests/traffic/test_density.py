@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from cavmarl.config.registry import find_settings
 from cavmarl.driving.vehicles import STATE_FIELDS
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import load_world
-from cavmarl.config.registry import find_settings
 from cavmarl.evaluate.suite import load_suite
 from cavmarl.verify.equivalence import verify_zones
 from cavmarl.zones.partition.zone_statistics import imbalance, zone_statistics

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -59,7 +59,7 @@ def sensors(
     from cavmarl.bench.sensor_scaling import plot_sensor_workers
 
     numbers = numbers_of("--workers", workers)
-    counts = {"warmup": warmup, "steps": steps, "repeats": repeats}
+    counts: dict[str, Any] = {"warmup": warmup, "steps": steps, "repeats": repeats}
     console = Console()
     with measuring(console) as say:
         mounted = load_rig(find_settings("rig", rig))

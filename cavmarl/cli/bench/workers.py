@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from rich.console import Console
 from rich.table import Table
@@ -38,7 +38,7 @@ def workers(
     from cavmarl.bench.worker_speed import measure_ceiling, measure_workers
 
     console = Console()
-    turns = {"worlds": worlds, "steps": steps, "repeats": repeats}
+    turns: dict[str, Any] = {"worlds": worlds, "steps": steps, "repeats": repeats}
     with measuring(console) as say:
         found = measure_workers(world, workers=count, say=say, **turns)
         say("stepping worlds in programs of their own")

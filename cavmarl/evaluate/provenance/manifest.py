@@ -102,13 +102,7 @@ def open_manifest(folder: Path, document: Mapping[str, Any]) -> Document:
 def close_manifest(
     folder: Path, files: list[str], document: Mapping[str, Any] | None = None
 ) -> Document:
-    """Mark the manifest as closed.
-
-    Args:
-        folder: of the results.
-        files: that lie beside it; their hashes are put down.
-        document: what is only known now.
-    """
+    """Mark the manifest as closed."""
     path = folder / MANIFEST_FILE
     closed: Document = {
         **_read(path),

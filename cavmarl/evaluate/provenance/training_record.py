@@ -55,13 +55,7 @@ def begin_training(
 
 
 def end_training(folder: Path, files: Sequence[str], plans: Sequence[Plan] = ()) -> None:
-    """Close the record.
-
-    Args:
-        folder: of the run.
-        files: that the run left there; their hashes are put down.
-        plans: which worker hosted what at the end.
-    """
+    """Close the record."""
     placement = {PLACEMENT_AT_END: [plan.to_dict() for plan in plans]}
     close_manifest(folder, list(files), placement)
 

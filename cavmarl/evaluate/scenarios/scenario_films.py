@@ -32,9 +32,6 @@ class ScenarioCamera:
         picture: where the moment goes in which an agent was closest to an actor that has moved;
             None: nowhere.
         video: where everything goes; None: nowhere.
-
-    Raises:
-        ConfigError: a picture that is no `.png`, or a path that cannot be written.
     """
 
     def __init__(self, vec: CavVectorEnv, picture: Path | None, video: Path | None) -> None:

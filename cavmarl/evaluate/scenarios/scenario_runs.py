@@ -146,14 +146,7 @@ def run_scenario(
     seed: int = 0,
     look: Callable[[], None] | None = None,
 ) -> ScenarioRun:
-    """Play the scenario of a world once, from its reset to its end.
-
-    Args:
-        vec: as `make_scenario` returns it, run in this process.
-        driver: a name or a path of a policy.
-        seed: of the reset, and of a driver that draws.
-        look: called after each step, while an agent is there.
-    """
+    """Play the scenario of a world once, from its reset to its end; `look` is called each step."""
     policy = load_policy(driver, vec)
     observations, infos = vec.reset(seed=seed)
     policy.reset(seed)

@@ -10,8 +10,10 @@ import math
 import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +24,6 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import ConfigError, require
 from cavmarl.core.records.codes import SIGNAL_NONE
 from cavmarl.driving.vehicles import VEHICLE, blank_vehicle
-from cavmarl.evaluate.fresh import fresh_process
 from cavmarl.evaluate.traffic.traffic_metrics import TrafficCounts, TrafficMeter, TrafficRun
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
@@ -45,12 +46,7 @@ class SumoJob:
 
 
 def run_sumo(job: SumoJob) -> TrafficRun:
-    """Run and measure it in a process of its own.
-
-    Raises:
-        ConfigError: SUMO refuses the demand on this map; the message is SUMO's.
-        MissingExtraError: SUMO is not installed.
-    """
+    """Run and measure it in a process of its own."""
     with sumo_process(job) as process:
         return process.submit(_measure, job).result()
 
@@ -59,9 +55,11 @@ def run_sumo(job: SumoJob) -> TrafficRun:
 def sumo_process(job: SumoJob) -> Iterator[ProcessPoolExecutor]:
     """A fresh process for one simulation of SUMO's; what is submitted runs there."""
     require("libsumo", "sumo")
-    died = ConfigError(f"{job.map_file}: SUMO ended its process on this demand")
-    with fresh_process(died) as process:
-        yield process
+    with ProcessPoolExecutor(1, get_context("spawn")) as process:
+        try:
+            yield process
+        except BrokenProcessPool as error:
+            raise ConfigError(f"{job.map_file}: SUMO ended its process on this demand") from error
 
 
 def start_sumo(job: SumoJob, folder: Path, *more: str) -> Any:
@@ -71,10 +69,6 @@ def start_sumo(job: SumoJob, folder: Path, *more: str) -> Any:
         job: what to run.
         folder: for SUMO's log and for copies of additional files.
         more: options.
-
-    Raises:
-        ConfigError: SUMO refuses it.
-        SumoError: a simulation runs in this process.
     """
     libsumo: Any = free_libsumo()
     log = folder / "errors.log"

@@ -12,13 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.math.neighbors import make_grid
+from cavmarl.driving.kernels.contacts import find_contacts
 from cavmarl.evaluate.traffic.junction_locks import JunctionLocks
-from cavmarl.evaluate.traffic.touching import TouchCounter
 from cavmarl.roads.network import RoadNetwork
 
 STANDING_MPS = 0.1  # slower is standing, as in SUMO's waiting time
 SAMPLES_PER_S = 1
 MINUTE_S = 60
+CELL_M = 10.0  # of the grid in which vehicles that touch are looked for
 
 EDGE_MINUTE = np.dtype(
     [
@@ -75,12 +77,42 @@ class TrafficRun:
     edge_minutes: NDArray[np.void]  # EDGE_MINUTE rows of all edges and minutes with a vehicle
 
 
-class TrafficMeter:
-    """Measures one world on one map.
+class TouchCounter:
+    """Counts the pairs that began to touch, tick by tick.
+
+    Of several that touch one vehicle at once, only its pair with the lowest id counts.
 
     Args:
-        network: the map that the vehicles' `lane` speaks of.
+        bounds: min_x, min_y, max_x, max_y of the map in m.
+
+    Attributes:
+        count: pairs so far; one that parts and touches again counts again.
     """
+
+    def __init__(self, bounds: tuple[float, float, float, float]) -> None:
+        self.count = 0
+        self._bounds = bounds
+        self._make_room(0)
+        self._touching: set[tuple[int, int]] = set()
+
+    def see(self, rows: NDArray[np.void]) -> None:
+        """Look at VEHICLE (num_vehicles,) of the next tick."""
+        if len(rows) > len(self._hit):
+            self._make_room(2 * len(rows))
+        find_contacts(rows, len(rows), self._grid, self._hit)
+        hitting = np.flatnonzero(self._hit[: len(rows)] >= 0)
+        ids, others = rows["id"][hitting].tolist(), self._hit[hitting].tolist()
+        touching = {(min(pair), max(pair)) for pair in zip(ids, others, strict=True)}
+        self.count += len(touching - self._touching)
+        self._touching = touching
+
+    def _make_room(self, capacity: int) -> None:
+        self._grid = make_grid(self._bounds, CELL_M, capacity)
+        self._hit = np.zeros(capacity, dtype=np.int64)
+
+
+class TrafficMeter:
+    """Measures one world on one map."""
 
     def __init__(self, network: RoadNetwork) -> None:
         self._network = network
@@ -97,11 +129,7 @@ class TrafficMeter:
         self._metres: list[NDArray[np.float64]] = []
 
     def see(self, rows: NDArray[np.void]) -> None:
-        """Look for contacts after a tick.
-
-        Args:
-            rows: VEHICLE (num_vehicles,).
-        """
+        """Look for contacts of VEHICLE (num_vehicles,) after a tick."""
         self._touches.see(rows)
 
     def sample(self, rows: NDArray[np.void], codes: NDArray[np.uint8]) -> None:

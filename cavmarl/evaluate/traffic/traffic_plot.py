@@ -23,10 +23,6 @@ def plot_fundamental_diagram(found: TrafficComparison, path: Path) -> None:
     Args:
         found: both runs.
         path: a picture; its ending says of which kind (.png, .svg, .pdf).
-
-    Raises:
-        ConfigError: the picture cannot be written.
-        MissingExtraError: matplotlib is not installed.
     """
     figure = require("matplotlib.figure", "report").Figure(
         figsize=(10.0, 4.2), layout="constrained"
