@@ -152,7 +152,6 @@ def rows_of(master: list[int], follower: list[int], dt_s: float) -> tuple[DriftR
 
 
 def write_rows(path: Path, rows: tuple[DriftRow, ...]) -> None:
-    """Write the table as CSV."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(asdict(rows[0])))
         writer.writeheader()

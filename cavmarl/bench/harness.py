@@ -50,7 +50,6 @@ class Result:
     DERIVED: ClassVar[tuple[str, ...]] = ()  # properties that are written, too
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
         derived = {name: getattr(self, name) for name in self.DERIVED}
         return {**asdict(self), **derived}  # type: ignore[call-overload]
 
@@ -110,7 +109,6 @@ def numbers_of(option: str, text: str) -> list[int]:
 
 @contextmanager
 def measuring(console: Console) -> Iterator[Say]:
-    """A status line on the terminal while something is measured; `say` changes its text."""
     with console.status("") as status:
         yield status.update
 
@@ -134,5 +132,4 @@ def make_table(
 
 
 def hardware_line(hardware: Mapping[str, Any]) -> str:
-    """The processor, and how many cores may be used."""
     return f"{hardware['cpu']}, {hardware['usable_cores']} cores"

@@ -48,7 +48,6 @@ class HighwayRows(VecEnvWrapper):
         self.venv.step_async(actions.reshape(-1, self._agents))
 
     def step_wait(self) -> Any:
-        """What the processes send back."""
         observations, rewards, done, infos = self.venv.step_wait()
         self.simulated_s += time.perf_counter() - self._began
         each = self._agents

@@ -66,12 +66,10 @@ class SensorBench(Result):
 
     @property
     def numbers(self) -> list[int]:
-        """Of sensor workers."""
         return sorted({turn.workers for turn in self.turns})
 
     @property
     def rows(self) -> list[ScalingRow]:
-        """Every derived figure."""
         series = {
             workers: [Series(run.step_ms, run.wait_ms) for run in self.of(workers)]
             for workers in self.numbers
@@ -84,7 +82,6 @@ class SensorBench(Result):
         return len({turn.run.digests for turn in self.turns}) == 1
 
     def parts_ms(self, workers: int) -> dict[str, float]:
-        """The mean of each part of a step."""
         runs = self.of(workers)
         return {name: fmean(fmean(run.parts_ms[name]) for run in runs) for name in PARTS}
 
@@ -122,7 +119,6 @@ class SensorBench(Result):
         return list(self.of(workers)[-1].windows)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
         numbers = self.numbers
         shares = {
             number: {name: asdict(found) for name, found in self.shares(number).items()}
@@ -209,7 +205,6 @@ def first_job(spec: WorldSpec, rig: Rig, steps: tuple[int, int]) -> SensorJob:
 
 
 def job_config(job: SensorJob) -> EnvConfig:
-    """The environment of a run."""
     return load_config(job.spec.env, **job.spec.keywords)[0]
 
 

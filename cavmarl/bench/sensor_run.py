@@ -148,13 +148,11 @@ class _Timed:
         self.clear()
 
     def clear(self) -> None:
-        """Forget what there was."""
         self._step_ms: list[float] = []
         self._wait_ms: list[float] = []
         self._parts_ms: dict[str, list[float]] = {name: [] for name in PARTS}
 
     def window(self, steps: int) -> Window:
-        """Some steps, and what they have taken."""
         pool = self._farm.pool
         assert pool is not None
         before, began = copy.copy(self._farm.times), pool.processor_s()
@@ -206,7 +204,6 @@ class _Timed:
         self._digests.append(self._vec.state_hash())
 
     def run(self, windows: tuple[Window, ...]) -> SensorRun:
-        """All that was found."""
         config = self._vec.config
         return SensorRun(
             tuple(self._step_ms),

@@ -27,7 +27,6 @@ class Stopwatch:
         self.clear()
 
     def clear(self) -> None:
-        """Back to zero."""
         self.spent.clear()
         self.calls.clear()
 

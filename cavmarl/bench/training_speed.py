@@ -90,7 +90,6 @@ class TrainingSpeed(Result):
 
     @property
     def is_crowded(self) -> bool:
-        """More workers than cores."""
         return self.workers > (self.hardware["usable_cores"] or 1)
 
     def _over(self, one: str, other: str) -> float:
@@ -98,7 +97,6 @@ class TrainingSpeed(Result):
         return paired_ratio(rates[one], rates[other])
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON; each benchmark says of which kind it is."""
         plain = super().to_dict()
         return {
             **plain,
@@ -152,7 +150,6 @@ def measure_training(
 
 
 def _settings(folder: Path, agents: int, worlds: int, workers: int) -> PpoSettings:
-    """Of a run on a road as long as theirs."""
     from cavmarl.learning.ppo_settings import PpoSettings
 
     road_m = length_m(highway_env(agents, THEIR_KINEMATICS))
@@ -195,7 +192,6 @@ class _Side:
         self._spent_s: Counter[str] = Counter()
 
     def update(self, counts: bool) -> None:
-        """Collect and learn."""
         began = time.perf_counter()
         decisions, spent_s = self._update()
         self._decisions.append(decisions)
@@ -204,7 +200,6 @@ class _Side:
             self._spent_s.update(spent_s)
 
     def row(self) -> TrainingRow:
-        """What was found."""
         total_s = sum(self._spent_s.values())
         shares = {phase: seconds / total_s for phase, seconds in self._spent_s.items()}
         decisions = sum(self._decisions) // len(self._decisions)
@@ -212,7 +207,6 @@ class _Side:
 
 
 def _ours(who: str, run: Run) -> _Side:
-    """A run of our PPO."""
     from cavmarl.learning.collector import PHASES
 
     def update() -> _Update:
@@ -224,7 +218,6 @@ def _ours(who: str, run: Run) -> _Side:
 
 
 def _theirs(rows: HighwayRows, worlds: int, num_steps: int) -> _Side:
-    """stable-baselines3's PPO on highway-env."""
     from stable_baselines3 import PPO
 
     decisions = num_steps * rows.num_envs

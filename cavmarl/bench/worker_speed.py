@@ -77,7 +77,6 @@ class WorkerSpeed(Result):
 
     @property
     def is_crowded(self) -> bool:
-        """More workers than cores."""
         return self.rows[2].workers > (self.hardware["usable_cores"] or 1)
 
 
@@ -160,7 +159,6 @@ class Measured:
             self._busy_s += self._processor_s() - before
 
     def row(self, steps: int) -> Row:
-        """What has been found in so many steps."""
         busiest = 1000.0 * float(self._busy_s.max()) / steps if self._workers else None
         return Row(self._workers, self._made_s, tuple(self._step_ms), busiest)
 

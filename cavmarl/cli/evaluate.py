@@ -191,7 +191,6 @@ def _show(
 
 
 def _new_folder(env: str) -> Path:
-    """An unused folder in runs/."""
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S-%f")
     return Path("runs/evaluate") / f"{Path(env).name}-{stamp}"
 
@@ -237,7 +236,6 @@ def _change(metric: Metric, found: PairedDifference) -> str:
 
 
 def _figure(value: float) -> str:
-    """Three digits or so."""
     decimals = 2 if abs(value) < 10.0 else 1 if abs(value) < 100.0 else 0
     return f"{value:.{decimals}f}"
 

@@ -47,7 +47,6 @@ def follow(
 
 
 def _stages(words: list[str], known: tuple[str, ...]) -> dict[str, str]:
-    """`perception=blind` and the like."""
     chosen = {}
     for word in words:
         stage, equals, name = word.partition("=")

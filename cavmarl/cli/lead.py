@@ -88,7 +88,6 @@ def lead(
 
 
 def _run(world: FollowedWorld, seed: int, steps: int | None) -> dict[str, Any]:
-    """One episode; what came of it."""
     world.reset(seed)
     done = 0
     while not world.is_over and done != steps:

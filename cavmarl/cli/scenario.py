@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -98,7 +99,7 @@ def run(
             look = stack.enter_context(ScenarioCamera(vec, picture, video)).look
         found = run_scenario(vec, driver, seed, look)
     Console().print(_table(found))
-    write_json(json_path, found.to_dict())
+    write_json(json_path, asdict(found))
     if not found.passed:
         raise typer.Exit(1)
 
@@ -151,7 +152,6 @@ def sweep(
 
 
 def _params(given: list[str] | None) -> dict[str, bool | float]:
-    """`walk_mps=2` and the like."""
     params: dict[str, bool | float] = {}
     for text in given or ():
         key, _, value = text.partition("=")

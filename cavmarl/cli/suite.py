@@ -57,7 +57,6 @@ def suite(
 
 
 def _table(reports: dict[str, EvaluationReport]) -> Table:
-    """One row a world and driver."""
     from cavmarl.evaluate.metrics import METRICS
 
     metrics = [metric for metric in METRICS if metric.name in SHOWN]

@@ -190,26 +190,12 @@ def _find_rig(name: str, base_dir: Path) -> Path:
 
 
 def resolve_map(config: EnvConfig, base_dir: Path) -> Path:
-    """The file that `map.source` means.
-
-    Args:
-        config: of the environment.
-        base_dir: the folder that a relative source starts from.
-
-    Raises:
-        MapError: no such file.
-        MissingExtraError: the source lies in the eclipse-sumo wheel, which is not installed.
-    """
+    """The file that `map.source` means."""
     return _resolve("map.source", config.map.source, base_dir, MapError)
 
 
 def resolve_demand(config: EnvConfig, base_dir: Path) -> list[Path]:
-    """The files that `traffic.demand` means; as `resolve_map`.
-
-    Raises:
-        DemandError: no such file.
-        MissingExtraError: a file lies in the eclipse-sumo wheel, which is not installed.
-    """
+    """The files that `traffic.demand` means, as `map.source` is resolved."""
     return [
         _resolve("traffic.demand", source, base_dir, DemandError)
         for source in config.traffic.demand

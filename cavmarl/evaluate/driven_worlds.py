@@ -30,7 +30,6 @@ class DrivenWorld:
         self._decoder = ActionDecoder(simulation.config.action, 1, names)
 
     def commands(self) -> Commands:
-        """Of the next step."""
         if not self._num_agents:
             return self._decoder.idle()
         outputs = self.simulation.outputs

@@ -73,7 +73,6 @@ def worlds_at_once(episodes: int, vehicles: int) -> int:
 
 
 def drive_run(job: EpisodeJob, progress: Progress | None = None) -> dict[str, RunData]:
-    """Drive every policy of a job through its episodes."""
     world = load_world(job.env, **job.keywords)
     population = world.config.population
     num_envs = worlds_at_once(job.episodes, population.agents + population.background)
@@ -143,7 +142,6 @@ class _Part:
 
     @property
     def tracks(self) -> NDArray[np.void]:
-        """TRACK records of the first world's agents."""
         return np.concatenate(self._tracks)
 
     def drive(

@@ -256,7 +256,6 @@ def _deaf(policy: str, steps: int, most: int) -> None:
 
 
 def _all(runs: Sequence[dict[str, RunData]], policy: str, table: str) -> Rows:
-    """The records of a policy in all runs."""
     return np.concatenate([getattr(run[policy], table) for run in runs])
 
 

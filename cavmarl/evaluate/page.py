@@ -133,7 +133,6 @@ def _runs(report: EvaluationReport) -> list[dict[str, Any]]:
 
 
 def _facts(manifest: Mapping[str, Any]) -> dict[str, str]:
-    """The manifest's main lines."""
     hardware, software, code, world = (
         manifest[key] for key in ("hardware", "software", "code", "world")
     )

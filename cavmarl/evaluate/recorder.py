@@ -25,12 +25,7 @@ class Recorder:
     A trip counts if it began in the first half of its episode: so each had at least half an episode
     to end, and which trips count does not depend on how they end.
 
-    Args:
-        num_worlds: W.
-        num_agents: A.
-        max_steps: steps of an episode.
-        step_s: seconds a step.
-        weights: (T,) of the terms in the reward.
+    `weights` (T,) are those of the terms in the reward.
     """
 
     def __init__(

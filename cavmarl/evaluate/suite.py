@@ -39,12 +39,10 @@ class SuiteWorld:
 
 
 def load_suite(path: Path) -> Suite:
-    """Read a suite."""
     return validate(Suite, read_yaml(path), str(path))
 
 
 def worlds_of(suite: Suite, maps: Path) -> list[SuiteWorld]:
-    """Every map with every number of agents."""
     found = {Path(name).name.split(".")[0]: env for name, env in _found(suite, maps)}
     if len(found) < len(suite.maps):
         raise ConfigError(f"maps = {suite.maps!r}: two have one name; rename a file")

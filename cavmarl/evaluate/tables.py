@@ -20,7 +20,6 @@ TOLERANCE_M = 0.5  # that a line of the map may leave its lane's centre by
 
 
 def reward_column(term: str) -> str:
-    """The column of EPISODE with a term's part of the return."""
     return f"reward_{term}"
 
 

@@ -13,14 +13,10 @@ from cavmarl.ownership.transfers import Transfer, TransferLog
 
 
 class TransferRecorder:
-    """Follows the worlds of an undivided or divided simulation through one episode of each.
-
-    Attributes:
-        counts: sums of the logs' counts over the episodes.
-    """
+    """Follows the worlds of an undivided or divided simulation through one episode of each."""
 
     def __init__(self, logs: Sequence[TransferLog]) -> None:
-        self.counts: Counter[str] = Counter()
+        self.counts: Counter[str] = Counter()  # sums of the logs' counts over the episodes
         self._logs = tuple(logs)
         self._before = [Counter(log.counts) for log in logs]
         self._episodes = [log.episode for log in logs]

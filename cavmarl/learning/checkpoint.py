@@ -34,12 +34,10 @@ class RunState:
     seconds: float = 0.0  # spent on them
 
     def settings(self, kind: type[S]) -> S:
-        """The settings as what they were made of."""
         return validate(kind, self.args, STATE_FILE)
 
 
 def read_state(folder: Path) -> RunState:
-    """What `save_checkpoint` noted of a run."""
     path = folder / STATE_FILE
     try:
         raw = json.loads(path.read_text(encoding="utf-8"))

@@ -51,7 +51,6 @@ class Log:
             self._board = board.SummaryWriter(str(folder))
 
     def write(self, row: dict[str, float]) -> None:
-        """One update's numbers by name."""
         if self._writer is None:
             self._writer = csv.DictWriter(self._file, list(row))
             if self._with_header:

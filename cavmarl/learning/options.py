@@ -54,7 +54,6 @@ def given_options(
 
 
 def settings_of(kind: type[S], given: Mapping[str, Any]) -> S:
-    """Whole settings from those that are given."""
     options = dict(given)
     path = options.pop("config", None)
     settings = validate(kind, read_yaml(path), str(path)) if path else kind()
@@ -62,7 +61,6 @@ def settings_of(kind: type[S], given: Mapping[str, Any]) -> S:
 
 
 def check_at_least(settings: object, least: Mapping[str, float]) -> None:
-    """Refuse settings below the given numbers, and infinite ones."""
     for name, bound in least.items():
         value = getattr(settings, name)
         if not bound <= value < float("inf"):
@@ -70,7 +68,6 @@ def check_at_least(settings: object, least: Mapping[str, float]) -> None:
 
 
 def check_above_zero(settings: object, names: Iterable[str]) -> None:
-    """Refuse settings of these names that are not positive numbers."""
     for name in names:
         value = getattr(settings, name)
         if not 0.0 < value < float("inf"):
@@ -78,7 +75,6 @@ def check_above_zero(settings: object, names: Iterable[str]) -> None:
 
 
 def check_shares(settings: object, names: Iterable[str]) -> None:
-    """Refuse settings of these names that are not from 0 to 1."""
     for name in names:
         value = getattr(settings, name)
         if not 0.0 <= value <= 1.0:

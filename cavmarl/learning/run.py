@@ -25,7 +25,6 @@ from cavmarl.policies.networks import CONFIG_FILE, WEIGHTS_FILE, ActorCritic, Ne
 
 
 def make_worlds(settings: PpoSettings) -> CavVectorEnv:
-    """The worlds that a run learns in."""
     central = settings.central_critic
     return make_vec(
         settings.env,

@@ -49,9 +49,6 @@ class Determinism:
     state_hash: str  # of the first process at the end
     difference: FirstDifference | None  # None if all were equal
 
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
-
 
 def verify_determinism(
     env: str | Path | WorldSpec,

@@ -48,7 +48,6 @@ def step_results(result: StepResult, actions: NDArray[Any]) -> Arrays:
 
 
 def first_results(vec: CavVectorEnv, seed: int) -> Arrays:
-    """What the reset of some worlds returned, by name."""
     observations, infos = vec.reset(seed=seed)
     return {"observations": observations, "infos mask": infos["mask"]}
 

@@ -137,7 +137,6 @@ def verify_zones(
 def _divided(
     spec: WorldSpec, layout: str | Path | None, faults: str | Path | None, check: bool
 ) -> dict[str, Any]:
-    """The settings of the divided worlds."""
     settings = dict(spec.overrides)
     for name, given in (("layout", layout), ("faults", faults)):
         if given is not None:

@@ -17,19 +17,15 @@ from cavmarl.ownership.transport import Network
 
 
 class HandOverClock:
-    """A watcher of one world that measures how long hand-overs take.
-
-    Attributes:
-        latency_ms: of each that is committed, from the BEGIN that found its vehicle over the border
-            to the COMMIT.
-        failed: hand-overs that were decided, and neither committed nor still under way.
-        late: vehicles that were over the border before their target was ready.
-        asked: states that a target had not, and asked for.
-    """
+    """A watcher of one world that measures how long hand-overs take."""
 
     def __init__(self) -> None:
+        # of each that is committed, from the BEGIN that found its vehicle over the border to the
+        # COMMIT
         self.latency_ms: list[float] = []
-        self.failed = self.late = self.asked = 0
+        self.failed = 0  # hand-overs that were decided, and neither committed nor still under way
+        self.late = 0  # vehicles that were over the border before their target was ready
+        self.asked = 0  # states that a target had not, and asked for
         self._since: dict[int, float] = {}
         self._plan: Begin | None = None
 

@@ -58,7 +58,6 @@ def replay_tick(kept: Reproducer, world: World, *, faults: bool = True) -> str:
 
 
 def changed_versions(kept: Reproducer) -> list[str]:
-    """What is not as it was when the tick was run, in words."""
     here = made_with()
     return [
         f"{name} {there}, here {here.get(name)}"

@@ -80,7 +80,6 @@ def sensors(
 
 
 def _sensors(found: SensorBench) -> Table:
-    """What was sensed, what it costs, and which worker does it either way."""
     shared = [number for number in found.numbers if number > 1]
     plans = [found.shares(number) for number in shared]
     homes = [{name: _homes(plan) for name, plan in both.items()} for both in plans]
@@ -148,7 +147,6 @@ def _scaling(found: SensorBench, rows: list[ScalingRow]) -> Table:
 
 
 def _parts(found: SensorBench) -> Table:
-    """Where a step goes."""
     columns = [(found.parts_ms(row.workers), row.step_ms) for row in found.rows]
     rows: list[tuple[str, ...] | None] = [
         (name, *(f"{parts[name]:.3f}" for parts, _ in columns))
@@ -173,7 +171,6 @@ _RESOURCES: dict[str, Callable[[Window], float]] = {
 
 
 def _resources(found: SensorBench) -> Table:
-    """What all processes took a step, in the last run of each number."""
     last = [found.windows(number)[-1] for number in found.numbers]
     rows = [
         (name, *(f"{value(window):,.1f}" for window in last)) for name, value in _RESOURCES.items()

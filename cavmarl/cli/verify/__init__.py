@@ -24,10 +24,9 @@ from cavmarl.cli.output import (
 )
 from cavmarl.cli.verify.faults import check_campaign, print_figures, verify_campaign
 from cavmarl.cli.verify.kills import verify_with_kills
-from cavmarl.cli.verify.replay import run_again
 from cavmarl.config.env import ZONE_LAYOUTS
 from cavmarl.config.world_spec import WorldSpec
-from cavmarl.core.errors import ConfigError
+from cavmarl.core.errors import ConfigError, LostTickError
 
 if TYPE_CHECKING:
     from cavmarl.verify.equivalence import Equivalence, ZoneResult
@@ -110,7 +109,7 @@ def verify(
         given += (world.agents, world.background, world.overrides or None)
         if check or any(value is not None for value in given):
             raise ConfigError("--replay: all else stands in the file; beside it goes ENV only")
-        run_again(replay, env, json_path)
+        _run_again(replay, env, json_path)
         return
     counts = None if zones is None else _counts(zones)
     console = Console()
@@ -175,10 +174,38 @@ def verify(
     console.print(f"state after tick {found.ticks}: {hashes}", highlight=False, soft_wrap=True)
 
 
+def _run_again(path: Path, env: str | None, json_path: Path | None) -> None:
+    """As it was, then without the faults of its plan; exit code 1 if it fails as it was.
+
+    What a zone's code raises without faults is not caught: its traceback is what one looks for.
+    """
+    from cavmarl.handoff.fault_injection.reproducer_file import read_reproducer
+    from cavmarl.verify.replay import changed_versions, replay_tick, world_of
+
+    console = Console(soft_wrap=True, highlight=False, markup=False)
+    kept = read_reproducer(path)
+    world = world_of(kept, env)
+    console.print(f"{kept.config['name']}, tick {kept.tick} of the run, on record: {kept.cause}")
+    for change in changed_versions(kept):
+        console.print(f"note: {change}")
+    found = {"recorded": kept.cause, "failure": "", "state_hash": ""}
+    try:
+        found["state_hash"] = replay_tick(kept, world)
+        console.print(f"as it was: reached, state {found['state_hash']}")
+    except LostTickError as error:
+        found["failure"] = str(error)
+        console.print(f"as it was: {error}")
+    write_json(json_path, found)
+    if found["failure"]:
+        found["state_hash"] = replay_tick(kept, world, faults=False)
+        console.print(f"without faults: reached, state {found['state_hash']}")
+        write_json(json_path, found)
+        raise typer.Exit(1)
+
+
 def _refuse_with_kill(
     env: str | None, counts: list[int] | None, others: dict[str, str | Path | None]
 ) -> None:
-    """Refuse what does not go with `--kill`."""
     if env is None:
         raise ConfigError("--kill: name an environment")
     if counts is not None and len(counts) > 1:
@@ -189,7 +216,6 @@ def _refuse_with_kill(
 
 
 def _counts(text: str) -> list[int]:
-    """The numbers of `--zones`."""
     try:
         return [int(word) for word in text.split(",")]
     except ValueError:

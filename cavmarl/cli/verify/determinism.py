@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Annotated
 
 import typer
@@ -25,7 +26,7 @@ def verify_determinism(
     console = Console()
     with counting(console, f"three times {policy} in {world.env}") as progress:
         found = verify(world, policy, steps=steps, progress=progress)
-    write_json(json_path, found.to_dict())
+    write_json(json_path, asdict(found))
     if found.difference is not None:
         one, other = (f"in process {number}" for number in found.difference.processes)
         said = say_difference(found.difference, (one, other))

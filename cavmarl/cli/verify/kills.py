@@ -76,7 +76,6 @@ def _spreads(found: KillReport) -> Table:
 
 
 def _histogram(kills: tuple[Kill, ...]) -> Table:
-    """How many were noticed, and recovered from, how fast."""
     names = ("noticed_ms", "recovered_ms")
     counts = {name: [0] * (len(BOUNDS_MS) + 1) for name in names}
     for kill in kills:

@@ -55,7 +55,6 @@ def begin_training(
 
 
 def end_training(folder: Path, files: Sequence[str], plans: Sequence[Plan] = ()) -> None:
-    """Close the record."""
     placement = {PLACEMENT_AT_END: [plan.to_dict() for plan in plans]}
     close_manifest(folder, list(files), placement)
 

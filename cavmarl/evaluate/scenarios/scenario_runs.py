@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -77,9 +77,6 @@ class ScenarioRun:
     def passed(self) -> bool:
         """Whether all agents came through and hurt no one."""
         return self.verdict == "passed"
-
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 def make_scenario(

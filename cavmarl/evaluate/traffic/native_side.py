@@ -41,7 +41,6 @@ def load_demand(
 def make_world(
     map_file: Path, demand: Sequence[Path], seconds: int, seed: int, dt_s: float
 ) -> Simulation:
-    """The world of `load_demand` at the start of an episode."""
     config, network, file, partition = load_demand(map_file, demand, seconds, dt_s)
     simulation = Simulation(config, network, demand=file, partition=partition)
     simulation.seed(seed)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +41,7 @@ class TrafficComparison:
     def to_dict(self) -> dict[str, Any]:
         sides = {
             name: {
-                "figures": run.figures.to_dict(),
+                "figures": asdict(run.figures),
                 "locks_s": run.locks_s,
                 "edge_minutes": {
                     key: run.edge_minutes[key].tolist() for key in EDGE_MINUTE.names or ()

@@ -7,7 +7,6 @@ for everything else. Definitions stand with the fields of `TrafficFigures`.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,9 +62,6 @@ class TrafficFigures:
     longest_lock_s: float  # the longest lock of any junction, see `JunctionLocks`
     locked_junction: str  # whose that was; empty where no junction was ever locked
     teleports: int  # see `TrafficCounts`
-
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 @dataclass(frozen=True)

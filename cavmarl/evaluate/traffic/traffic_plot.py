@@ -50,7 +50,6 @@ def plot_fundamental_diagram(found: TrafficComparison, path: Path) -> None:
 
 
 def save_figure(figure: Any, path: Path) -> None:
-    """Write a figure where `--plot` asks for it."""
     try:
         figure.savefig(path, dpi=150)
     except (OSError, ValueError) as error:
