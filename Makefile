@@ -26,6 +26,9 @@ FUZZ_TARGETS ?= network programs buildings map cached zones demand sumocfg entry
     plan message log follower
 MAPS := envs/ring/map/map.net.xml envs/merge/map/map.net.xml envs/grid4x4/map/map.net.xml
 
+# Tests start many processes: none is to parse the sources anew.
+export PYTHONDONTWRITEBYTECODE :=
+
 .PHONY: help demo test quick ray check bench bounds soak model fuzz oldest libraries maps pictures clean
 .DEFAULT_GOAL := help
 

@@ -14,6 +14,7 @@ import sys
 from dataclasses import asdict, dataclass
 from fractions import Fraction
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, ClassVar, Unpack
 
 from cavmarl.bench.harness import Result, check_range
@@ -81,13 +82,16 @@ def measure_drift(
     made = parallel_env(spec.env, overrides=settings)
     dt_s = made.config.clock.sim_dt_s
     settings |= {"clock.ctrl_dt_s": dt_s, "horizon_s": dt_s * (BEFORE + 2 * steps + 1)}
-    with FollowedWorld(
-        parallel_env(spec.env, overrides=settings),
-        0,
-        timeout_s=TIMEOUT_S,
-        own_ticks=answer,
-        on_drift="record",
-    ) as world:
+    with (
+        TemporaryDirectory() as folder,
+        FollowedWorld(
+            parallel_env(spec.env, overrides=settings),
+            Path(folder) / "clock.sock",
+            timeout_s=TIMEOUT_S,
+            own_ticks=answer,
+            on_drift="record",
+        ) as world,
+    ):
         world.reset(spec.seed)
         for _ in range(BEFORE):
             world.step()

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from rich.console import Console
 from rich.table import Table
 
-from cavmarl.cli.lead import DEFAULT_PLACE, address_of
+from cavmarl.cli.lead import DEFAULT_PLACE, SecretFile, address_of, read_secret
 from cavmarl.cli.output import Environment, JsonPath, about, grid, write_json
 from cavmarl.core.errors import ConfigError
 
@@ -23,6 +23,7 @@ def follow(
         list[str] | None, about("A stage of the stack to replace.", metavar="STAGE=NAME")
     ] = None,
     joins_s: Annotated[float, about("Seconds that the world may take to answer.")] = 60.0,
+    secret_file: SecretFile = None,
     json_path: JsonPath = None,
 ) -> None:
     """Drive agents of a world that `cavmarl lead` runs, from their sensors and the map of ENV."""
@@ -35,7 +36,8 @@ def follow(
     config = StackConfig(**_stages(stage or [], tuple(STAGES)))
     network = load_roads(*load_config(env))
     steps = 0
-    with Follower(address_of(at), vehicles.split(","), name, joins_s) as follower:
+    secret = read_secret(secret_file)
+    with Follower(address_of(at), vehicles.split(","), name, joins_s, secret) as follower:
         driver = StackDriver(network, follower.welcome, config)
         for sight in follower:
             if not sight.snapshot.is_over:

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from secrets import token_hex
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
-from cavmarl.cli.output import JsonPath, about, grid, with_world, write_json
+from cavmarl.cli.output import JsonPath, about, grid, print_error, with_world, write_json
 from cavmarl.config.world_spec import WorldSpec
-from cavmarl.core.errors import ConfigError
+from cavmarl.core.errors import ConfigError, FollowerError
 
 if TYPE_CHECKING:
     from cavmarl.cosim.followers.followed_world import FollowedWorld
@@ -21,6 +27,28 @@ DEFAULT_PLACE = "cavmarl.sock"
 Place = Annotated[
     str, about("A socket's path, or a port of this machine.", "--at", metavar="ADDRESS")
 ]
+
+
+SecretFile = Annotated[
+    Path | None,
+    about("File with the secret of a world at a port; `lead` makes it if there is none."),
+]
+
+
+def read_secret(path: Path | None, may_make: bool = False) -> str:
+    """The secret of a file, which no other user can read; none without a file."""
+    if path is None:
+        return ""
+    try:
+        if may_make and not path.exists():
+            with open(path, "x", opener=partial(os.open, mode=0o600), encoding="ascii") as file:
+                file.write(token_hex(32) + "\n")
+        secret = path.read_text("utf-8").strip()
+    except (OSError, UnicodeError) as error:
+        raise ConfigError(f"--secret-file {path}: {error}") from error
+    if not secret:
+        raise ConfigError(f"--secret-file {path}: is empty; delete it, and `lead` makes another")
+    return secret
 
 
 def address_of(text: str) -> str | int:
@@ -36,6 +64,10 @@ def lead(
     steps: Annotated[int | None, about("Most steps; default: one episode.")] = None,
     timeout_s: Annotated[float, about("Seconds that a step waits for its followers.")] = 10.0,
     joins_s: Annotated[float, about("Seconds that followers may take to join.")] = 600.0,
+    secret_file: SecretFile = None,
+    on_lost: Annotated[
+        Literal["go-on", "end"], about("What a follower's fault ends: itself, or the run.")
+    ] = "go-on",
     own_ticks: Annotated[
         Literal["refuse", "ignore"], about("How to treat a follower's own ticks.")
     ] = "refuse",
@@ -72,6 +104,7 @@ def lead(
         FollowedWorld(
             made,
             address_of(at),
+            secret=read_secret(secret_file, may_make=True),
             timeout_s=timeout_s,
             own_ticks=own_ticks,
             bad_controls=bad_controls,
@@ -80,24 +113,36 @@ def lead(
     ):
         console.print(f"waiting for {followers} followers at {led.address}", highlight=False)
         led.wait_for(followers, joins_s)
-        found = _run(led, world.seed, steps)
+        found = _run(led, world.seed, steps, on_lost)
         if pacer is not None:
             found["lateness"] = vars(pacer.lateness)
         console.print(_table(found))
     write_json(json_path, found)
 
 
-def _run(world: FollowedWorld, seed: int, steps: int | None) -> dict[str, Any]:
-    world.reset(seed)
-    done = 0
-    while not world.is_over and done != steps:
-        world.step()
-        done += 1
-    master = world.master
+def _run(world: FollowedWorld, seed: int, steps: int | None, on_lost: str) -> dict[str, Any]:
+    """One episode; what came of it."""
+    master, lost = world.master, []
+
+    def go_on(act: Callable[[], object]) -> None:
+        try:
+            act()
+        except FollowerError as error:
+            if on_lost == "end":
+                raise
+            print_error(f"{error} (the built-in driver takes its vehicles)")
+            lost.append(str(error))
+
+    go_on(partial(world.reset, seed))
+    first, per_step = master.tick, world.env.config.clock.ticks_per_step
+    while not world.is_over and (done := (master.tick - first) // per_step) != steps:
+        go_on(world.step)
+    done = (master.tick - first) // per_step
     waited = sum(seat.wait_wall_s for seat in world.seats)
     return {
         **world.manifest(),
         "steps": done,
+        "lost": lost,
         "time_s": master.time_s,
         "own_ticks": master.own_ticks,
         "state_hash": world.env.state_hash(),
@@ -120,7 +165,7 @@ def _run(world: FollowedWorld, seed: int, steps: int | None) -> dict[str, Any]:
 def _table(found: dict[str, Any]) -> Table:
     rows = (
         (
-            row["name"],
+            escape(row["name"]),
             *(str(row[name]) for name in ("answers", "late", "bad")),
             f"{row['wait_wall_s']:.2f}",
             str(row["slowest_in"]),

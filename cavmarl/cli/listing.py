@@ -5,10 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from cavmarl.cli.output import JsonPath, write_json
 from cavmarl.config.registry import agent_entries, entries, load_config
+from cavmarl.core.errors import ConfigError
 
 
 def list_entries(json_path: JsonPath = None) -> None:
@@ -17,20 +19,24 @@ def list_entries(json_path: JsonPath = None) -> None:
     environments = Table("environment", "population", "background", "action", "folder")
     names = {}
     for name, folder in entries().items():
-        config, _ = load_config(folder)
+        names[name] = str(folder)
+        try:
+            config, _ = load_config(folder)
+        except ConfigError as error:
+            environments.add_row(escape(name), "broken", "", "", escape(str(error)))
+            continue
         population = config.population
         environments.add_row(
-            name,
+            escape(name),
             f"{population.agents} {population.mode}",
             str(population.background),
             config.action.kind,
             _shown(folder),
         )
-        names[name] = str(folder)
     drivers = Table("driver", "kind", "path")
     paths = {}
     for name, path in agent_entries().items():
-        drivers.add_row(name, _kind(path), _shown(path))
+        drivers.add_row(escape(name), _kind(path), _shown(path))
         paths[name] = str(path)
     console.print(environments)
     console.print(drivers)
@@ -42,4 +48,4 @@ def _kind(path: Path) -> str:
 
 
 def _shown(path: Path) -> str:
-    return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)
+    return escape(str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path))

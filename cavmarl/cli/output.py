@@ -211,5 +211,6 @@ def say_difference(difference: Difference, sides: tuple[str, str]) -> str:
 
 
 def print_error(message: str) -> None:
-    """Say on stderr, in red, what went wrong."""
-    Console(stderr=True).print(Text(f"error: {message}", style="red"), soft_wrap=True)
+    """Say on stderr, in red, what went wrong; what would steer the terminal is spelled out."""
+    shown = "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in message)
+    Console(stderr=True).print(Text(f"error: {shown}", style="red"), soft_wrap=True)

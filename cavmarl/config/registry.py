@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from os.path import isdir, isfile
 from pathlib import Path
 from typing import Any
@@ -44,8 +44,23 @@ def entries() -> dict[str, Path]:
 
 
 def agent_entries() -> dict[str, Path]:
-    """Every driver that can take a seat: name → `NAME.py`, or the folder of a trained one."""
-    return _collect("agents", _agent_name)
+    """Every driver that a name can mean: name → `NAME.py`, or the folder of a trained one.
+
+    In the working directory's `agents/` these are trained ones with names of their own: a script
+    that lies there is run by its path alone.
+    """
+    own = {name: path for name, path in _collect("agents", _agent_name).items() if path.is_dir()}
+    ours = places("agents")[-1:]
+    return dict(sorted((own | _named(ours, _agent_name)).items()))
+
+
+def agent_here(name: str) -> Path | None:
+    """What lies under the name of a driver in the working directory, if it is not that driver."""
+    for path in (Path.cwd() / "agents" / f"{name}.py", Path.cwd() / "agents" / name):
+        is_driver = isfile(path) if path.suffix == ".py" else _agent_name(path) is not None
+        if is_driver and agent_entries().get(name) != path:
+            return path
+    return None
 
 
 def find_entry(env: str | Path) -> Path:
@@ -115,6 +130,7 @@ def load_config(
         keys = read_yaml(found / "env.yaml")
         if isinstance(keys, dict) and isinstance(keys.get("rig"), str):
             keys["rig"] = load_rig(keys["rig"], base_dir)
+        _refuse_code(keys, where)
         config = validate(EnvConfig, with_current_names(keys), where)
     else:
         base_dir, where = found.parent, str(found)
@@ -156,6 +172,17 @@ def find_settings(what: str, name: str) -> Path:
             return path
     usual = {"rig": "ten_sensors", "suite": "standard"}[what]
     raise ConfigError(f"no {what} or file '{name}': give '{usual}' or the path of a .yaml")
+
+
+def _refuse_code(keys: object, where: str) -> None:
+    """A folder of data does not run code: only the caller can name a file of it."""
+    scenario = keys.get("scenario") if isinstance(keys, dict) else None
+    name = scenario.get("name") if isinstance(scenario, dict) else None
+    if isinstance(name, str) and name.endswith(".py"):
+        raise ConfigError(
+            f"{where}: scenario.name = {name!r}: is code, which a folder of data does not run; if "
+            f"you trust it, say so: overrides={{'scenario.name': {name!r}}}, or --set scenario.name"
+        )
 
 
 def load_rig(name: str, base_dir: Path | None = None) -> dict[str, Any]:
@@ -241,23 +268,34 @@ def _resolve(key: str, source: str, base_dir: Path, failure: type[CavmarlError])
 
 def _collect(kind: str, name_of: Callable[[Path], str | None]) -> dict[str, Path]:
     """Name → path of all entries of `kind`, sorted by name; of equal names the first place wins."""
-    found = {
+    return dict(sorted(_named(reversed(places(kind)), name_of).items()))
+
+
+def _named(folders: Iterable[Path], name_of: Callable[[Path], str | None]) -> dict[str, Path]:
+    return {
         name: path
-        for place in reversed(places(kind))
-        for path in place.iterdir()
+        for place in folders
+        for path in _listed(place)
         if (name := name_of(path)) is not None
     }
-    return dict(sorted(found.items()))
+
+
+def _listed(place: Path) -> list[Path]:
+    """What lies in a folder and can be named; nothing of one that cannot be read."""
+    try:
+        return [path for path in place.iterdir() if path.name.isprintable()]
+    except OSError:
+        return []
 
 
 def _environment_name(path: Path) -> str | None:
-    return path.name if (path / "env.yaml").is_file() else None
+    return path.name if isfile(path / "env.yaml") else None
 
 
 def _agent_name(path: Path) -> str | None:
     if path.suffix == ".py" and not path.name.startswith("_"):
         return path.stem
-    return path.name if (path / "model.safetensors").is_file() else None
+    return path.name if isfile(path / "model.safetensors") else None
 
 
 def _advice(env: str | Path, known: Mapping[str, Path]) -> str:

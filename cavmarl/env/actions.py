@@ -63,6 +63,15 @@ class ActionDecoder:
         self.held = np.zeros(num_worlds, dtype=np.int64)
         self.ignored = np.zeros(num_worlds, dtype=np.int64)
 
+    @property
+    def memory(self) -> tuple[NDArray[Any], ...]:
+        """What later actions depend on, and what `tolerated` counts."""
+        return self._last, self.clipped, self.held, self.ignored
+
+    @memory.setter
+    def memory(self, memory: tuple[NDArray[Any], ...]) -> None:
+        self._last, self.clipped, self.held, self.ignored = memory
+
     def tolerated(self, world: int = 0) -> dict[str, int]:
         """How many actions of a world's episode were tolerated, by the names of traffic_stats."""
         return {

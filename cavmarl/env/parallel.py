@@ -28,6 +28,7 @@ from cavmarl.engine.spaces import (
 from cavmarl.engine.world_setup import check_agents, make_world
 from cavmarl.env.actions import ActionDecoder
 from cavmarl.env.declared_events import DeclaredEvents
+from cavmarl.env.world_copies import CopiedWithWorlds
 from cavmarl.parallel.backends import check_hosts, keeps_state, make_worlds
 from cavmarl.parallel.step_arrays import SteppedWorlds
 from cavmarl.render.world_view import WorldView
@@ -122,7 +123,7 @@ def _flags(agents: list[str], flags: NDArray[np.bool_]) -> dict[str, bool]:
     return dict(zip(agents, flags.tolist(), strict=True))
 
 
-class CavEnv(ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is not typed
+class CavEnv(CopiedWithWorlds, ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is not typed
     """One world.
 
     Observations, actions and rewards are described in docs/environments.md. The infos of each agent

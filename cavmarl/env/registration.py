@@ -20,6 +20,8 @@ from pettingzoo.utils.env import AECEnv
 from cavmarl.config.registry import entries
 from cavmarl.env.parallel import CavEnv, parallel_env
 
+_ID = re.compile(r"[A-Za-z0-9][\w.-]*", re.ASCII)
+
 
 class CheckedActions(wrappers.OrderEnforcingWrapper):  # type: ignore[misc] # not typed
     """The AEC form that refuses a wrong action at once: kept for later, it would spoil the step.
@@ -58,8 +60,13 @@ def env(env: str | Path = "merge", **arguments: Any) -> AECEnv[str, Any, Any]:
 
 
 def register_all() -> None:
-    """Register every entry with Gymnasium and, where it has a registry, with PettingZoo."""
+    """Register every entry with Gymnasium and, where it has a registry, with PettingZoo.
+
+    Entries whose name cannot be an id (letters, digits, `_`, `-` and `.`) have none.
+    """
     for name, folder in entries().items():
+        if not _ID.fullmatch(name):
+            continue
         version = _version(folder)
         one, rows = f"cavmarl/{name}-v{version}", f"cavmarl/{name}Agents-v{version}"
         gymnasium.register(
@@ -84,5 +91,9 @@ def register_all() -> None:
 
 def _version(folder: Path) -> int:
     """The entry's version, read without the parsers that would make the import slow."""
-    found = re.search(r"^version: *(\d+)", (folder / "env.yaml").read_text("utf-8"), re.MULTILINE)
+    try:
+        text = (folder / "env.yaml").read_bytes()
+    except OSError:
+        return 0  # what is wrong with it is said when it is used
+    found = re.search(rb"^version: *(\d{1,9})", text, re.MULTILINE)
     return int(found[1]) if found else 0

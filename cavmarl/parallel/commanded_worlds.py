@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 import cavmarl.core.errors
 from cavmarl.balance.balance_plan import Plan
 from cavmarl.balance.plan_text import describe_plan
-from cavmarl.core.errors import CavmarlError, WorkerDeathError, WorkerFailureError
+from cavmarl.core.errors import CavmarlError, ConfigError, WorkerDeathError, WorkerFailureError
 from cavmarl.parallel.driven_vehicles import Driven
 from cavmarl.parallel.mover import Mover
 from cavmarl.parallel.step_arrays import StepArrays
@@ -76,6 +76,9 @@ class OrderedWorlds(ABC):
             world: its number; numbers from the end count as they do for arrays.
             more: than the world that the worker has to know.
         """
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        raise uncopied()
 
     def reset(self, seed: int | None, first_world: int) -> None:
         """Begin an episode in the worlds of `chosen`."""
@@ -141,6 +144,14 @@ class OrderedWorlds(ABC):
         except WorkerDeathError as death:
             death.add_note(f"in step {self._steps + 1} since the reset")
             raise
+
+
+def uncopied() -> ConfigError:
+    """What a copy or a pickle of worlds in other processes ends in."""
+    return ConfigError(
+        "workers: worlds that worker processes run cannot be copied; use workers=0, or make the "
+        "environment once more, with the same seed"
+    )
 
 
 def own_error(failure: WorkerFailureError) -> CavmarlError:

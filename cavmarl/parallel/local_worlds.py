@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.balance.balance_plan import Plan
+from cavmarl.core.errors import ConfigError
+from cavmarl.core.extensions import extension_modules, load_extensions
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.memory import Zeros
 from cavmarl.core.numba.repeated import repeated
@@ -219,6 +221,38 @@ class LocalWorlds:
         self._steps[:], self._waiting[:] = saved[:2]
         self.simulation.load(saved[2:])
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """What a copy is made of: the worlds' parts, their state, and what is to be read of it.
+
+        Raises:
+            ConfigError: the worlds have processes or files of their own, or what is registered
+                could not be registered where a pickle is read.
+        """
+        config = self.world.config
+        zones = config.zones
+        for is_so, key in (
+            (self.simulation.sumo is not None, "traffic.source = sumo…"),
+            (self.farm is not None, "workers.sensors"),
+            (bool(zones.journal), "zones.journal"),
+            (bool(zones.faults), "zones.faults"),
+            (bool(zones.reproducers), "zones.reproducers"),
+        ):
+            if is_so:
+                raise ConfigError(
+                    f"{key}: worlds with processes or files of their own cannot be copied; make "
+                    "the environment once more, with the same seed"
+                )
+        saved = [array.copy() for array in self.save()]
+        shown = [array.copy() for array in _every_array(self.arrays)]
+        modules = extension_modules(config.registered)
+        return _made_again, (modules, self.world, self.in_next_step, saved, shown)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> LocalWorlds:
+        """With the same map and settings, which never change."""
+        make, parts = self.__reduce__()
+        copied: LocalWorlds = make(*parts)
+        return copied
+
     def keep_logs(self) -> tuple[ToldLog, ...]:
         """Keep what SUMO is told, which `load` needs: one log a world; see `SumoTraffic`."""
         sumo = self.simulation.sumo
@@ -256,6 +290,29 @@ class LocalWorlds:
         if self.farm is not None:
             self.farm.close()
         self.simulation.close()
+
+
+def _made_again(
+    modules: list[str],
+    world: World,
+    in_next_step: bool,
+    saved: list[NDArray[Any]],
+    shown: list[NDArray[Any]],
+) -> LocalWorlds:
+    load_extensions(modules)
+    worlds = LocalWorlds(world, len(saved[0]), in_next_step=in_next_step)
+    worlds.load(saved)
+    for array, before in zip(_every_array(worlds.arrays), shown, strict=True):
+        array[...] = before
+    return worlds
+
+
+def _every_array(arrays: StepArrays) -> Iterator[NDArray[Any]]:
+    *plain, frames, final_frames = arrays
+    yield from plain
+    for rig in (frames, final_frames):
+        for sensor in rig.values():
+            yield from sensor
 
 
 def _own_arrays(simulation: Simulation, num_worlds: int) -> StepArrays:

@@ -17,6 +17,7 @@ from cavmarl.parallel.checkpoint.checkpoint_log import make_segments
 from cavmarl.parallel.checkpoint.moving_memory import MovingMemory
 from cavmarl.parallel.commanded_worlds import OrderedWorlds, own_error
 from cavmarl.parallel.journaled_worlds import check_watched, is_watched, runs_as_text, unwatched
+from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.mover import Mover
 from cavmarl.parallel.processes.process_barrier import usable_cores
 from cavmarl.parallel.processes.shared_memory import Segment, arrays_in, size_of
@@ -80,8 +81,7 @@ class PooledWorlds(OrderedWorlds):
                 stacklevel=4,
             )
         if not compiled_before():
-            plain = unwatched(world)
-            Simulation(plain.config, world.network, 1, world.demand, world.partition, warm=True)
+            LocalWorlds(unwatched(world), 1, warm=True)
         capacity = world.capacity
         layout = layout_of(config, capacity, num_worlds)
         segment = Segment.make(size_of(layout))

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
 from cavmarl.config.env import EnvConfig, SensorsConfig
-from cavmarl.config.registry import agent_entries
+from cavmarl.config.registry import agent_entries, agent_here
 from cavmarl.core.errors import PolicyError, require
 from cavmarl.engine.spaces import flat_observation, flat_observation_space, observation_parts
 from cavmarl.env.parallel import CavEnv
@@ -154,7 +154,12 @@ def _find(policy: str | Path) -> Path:
     if not isinstance(policy, str | Path):
         raise PolicyError(f"policy = {policy!r}: must be the name of a driver, or a path")
     known = agent_entries()
+    here = agent_here(policy) if isinstance(policy, str) else None
     if isinstance(policy, str) and policy in known:
+        if here is not None:
+            raise PolicyError(
+                f"policy '{policy}': is a driver of cavmarl, and {here} is there, too; give a path"
+            )
         return known[policy]
     path = Path(policy)
     if isdir(path):  # unlike Path's, it takes names that no folder can have
@@ -165,6 +170,8 @@ def _find(policy: str | Path) -> Path:
         raise PolicyError(
             f"{path}: no policy; give a folder with model.safetensors, or a .py with make_policy"
         )
+    if here is not None:
+        raise PolicyError(f"policy '{policy}': {here} is code of this folder; give its path")
     close = difflib.get_close_matches(str(policy), known, n=3)
     meant = f"did you mean {' or '.join(close)}? " if close else ""
     raise PolicyError(

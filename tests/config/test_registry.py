@@ -175,7 +175,18 @@ def test_agents_are_single_files_and_folders_with_weights(here: Path) -> None:
         (place / name).parent.mkdir(parents=True, exist_ok=True)
         (place / name).touch()
     found = {name: path for name, path in agent_entries().items() if path.is_relative_to(here)}
-    assert found == {"cruise": place / "cruise.py", "mine": place / "mine"}
+    assert found == {"mine": place / "mine"}, "scripts of the working directory have no name"
+    assert {"idm", "merge_ippo"} <= agent_entries().keys()
+
+
+def test_a_folder_of_data_runs_no_code(here: Path) -> None:
+    entry = make_entry(
+        here / "mine", "name: mine\nmap: {source: m.net.xml}\nscenario: {name: cool/play.py}\n"
+    )
+    with pytest.raises(ConfigError, match=r"mine/env\.yaml: scenario\.name.*is code.*overrides"):
+        load_config(entry)
+    config, _ = load_config("ring", overrides={"scenario.name": "cool/play.py"})
+    assert config.scenario.name == "cool/play.py", "the caller has named it"
 
 
 def test_the_finder_does_not_load_pydantic() -> None:

@@ -71,11 +71,13 @@ def drive(address: Any, vehicles: list[str], name: str = "driver") -> list[Follo
     return seen
 
 
-def seated(world: FollowedWorld, vehicles: list[str], name: str = "driver") -> Follower:
+def seated(
+    world: FollowedWorld, vehicles: list[str], name: str = "driver", secret: str = ""
+) -> Follower:
     """A follower of this process, which has joined."""
     found: list[Follower] = []
     caller = threading.Thread(
-        target=lambda: found.append(Follower(world.address, vehicles, name, 10.0))
+        target=lambda: found.append(Follower(world.address, vehicles, name, 10.0, secret))
     )
     caller.start()
     world.wait_for(len(world.seats) + 1, 10.0)

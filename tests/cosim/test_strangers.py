@@ -11,9 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cavmarl.core.errors import FollowerError
+from cavmarl.core.errors import ConfigError, FollowerError, FollowerLostError
 from cavmarl.cosim.followers import reception
 from cavmarl.cosim.followers.followed_world import FollowedWorld
+from cavmarl.cosim.followers.follower_client import Follower
 from cavmarl.cosim.followers.follower_connection import FollowerConnection
 from cavmarl.cosim.followers.follower_messages import (
     FOLLOWERS,
@@ -202,10 +203,48 @@ def test_arrays_that_cannot_be_are_refused(
         world.close()
 
 
+def test_a_port_needs_a_secret_that_callers_know() -> None:
+    with pytest.raises(ConfigError, match=r"every user.*--secret-file"):
+        FollowedWorld(make_env(), 0)
+    with FollowedWorld(make_env(), 0, secret="of this world") as world:
+        for wrong in ("", "of this World", "€"):
+            refused: list[str] = []
+
+            def join(secret: str = wrong, refused: list[str] = refused) -> None:
+                with pytest.raises(FollowerError) as error:
+                    Follower(world.address, [], "x", 10.0, secret)
+                refused.append(str(error.value))
+
+            caller = threading.Thread(target=join)
+            caller.start()
+            with pytest.raises(FollowerLostError):
+                world.wait_for(1, 0.5)
+            caller.join(10.0)
+            assert "does not know the secret" in refused[0]
+        assert world.seats == ()
+
+
+def test_a_name_that_steers_the_terminal_is_refused(address: Path) -> None:
+    with FollowedWorld(make_env(), address) as world:
+        caller = threading.Thread(target=lambda: said.append(refusal_of(world)))
+        said: list[str] = []
+        caller.start()
+        with pytest.raises(FollowerLostError):
+            world.wait_for(1, 0.5)
+        caller.join(10.0)
+        assert "cannot be printed" in said[0]
+
+
+def refusal_of(world: FollowedWorld) -> str:
+    with pytest.raises(FollowerError) as error:
+        Follower(world.address, [], "\x1b[2J", 10.0)
+    return str(error.value)
+
+
 def test_a_port_of_this_machine_will_do_too() -> None:
-    with FollowedWorld(make_env(), 0) as world:
+    with FollowedWorld(make_env(), 0, secret="of this world") as world:
         assert isinstance(world.address, int)
-        follower = seated(world, ["car_0"])
+        follower = seated(world, ["car_0"], secret="of this world")
         caller = threading.Thread(target=lambda: [follower.wait(), follower.leave()])
         caller.start()
         world.reset(seed=0)

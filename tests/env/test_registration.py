@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import gymnasium
 import numpy as np
 import pettingzoo
@@ -86,3 +91,28 @@ def test_keys_of_overrides_are_text() -> None:
 def test_a_horizon_is_a_whole_number_of_steps() -> None:
     with pytest.raises(cavmarl.ConfigError, match=r"horizon_s = 1\.04.*try 1$"):
         cavmarl.parallel_env("ring", overrides={"horizon_s": 1.04})
+
+
+def test_odd_folders_beside_fail_no_import(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They lie in the user's `envs`; what can be named can be used, and has an id if it can."""
+    odd = [b"a space", b"not\xffutf8", b"two\nlines", b"-dash", b"latin", b"fine"]
+    for name in odd:
+        folder = Path(os.fsdecode(bytes(tmp_path) + b"/envs/" + name))
+        folder.mkdir(parents=True)
+        (folder / "env.yaml").write_bytes(b"name: \xe9\nversion: 99999999999999999999\n")
+    (tmp_path / "envs" / "hollow" / "env.yaml").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    command = [sys.executable, "-W", "error", "-m", "cavmarl", "list"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "a space" in done.stdout
+    assert "not" not in {name[:3] for name in entries()}
+    assert {"a space", "-dash", "latin", "fine", "ring"} <= set(entries())
+    told = "import gymnasium, cavmarl; print('\\n'.join(gymnasium.registry))"
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", told], capture_output=True, text=True, check=True
+    )
+    ids = set(done.stdout.splitlines())
+    assert {"cavmarl/fine-v999999999", "cavmarl/ring-v0"} <= ids
+    assert not any(" " in name or "-dash" in name for name in ids)
+    with pytest.raises(cavmarl.ConfigError, match="latin"):
+        cavmarl.parallel_env("latin")

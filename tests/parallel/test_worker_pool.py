@@ -441,6 +441,49 @@ def test_a_fork_of_the_pools_process_leaves_the_workers_alone(make: Make) -> Non
     assert totals(pool) == [[3.0, MORE]]
 
 
+def test_a_fork_of_the_pools_process_cannot_order_its_workers(make: Make) -> None:
+    pool = make(workers=1)
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            pool.run(ADD)
+            said = b"it was let"
+        except WorkerError as error:
+            said = str(error).encode()
+        os.write(writing, said)
+        os._exit(0)
+    os.waitpid(child, 0)
+    said = os.read(reading, 1000).decode()
+    os.close(reading)
+    os.close(writing)
+    assert f"process {os.getpid()}" in said
+    assert "make the environment here" in said
+    pool.run(ADD)
+    assert totals(pool) == [[3.0, MORE]]
+
+
+def test_more_descriptors_than_select_takes(make: Make) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if hard != resource.RLIM_INFINITY and hard < 1300:
+        pytest.skip(f"the system allows {hard} open files")
+    resource.setrlimit(resource.RLIMIT_NOFILE, (1300, hard))
+    taken = [os.open("/dev/null", os.O_RDONLY) for _ in range(1030)]
+    try:
+        pool = make(workers=2)
+        pool.run(ADD)
+        os.kill(pool.pids[0], signal.SIGKILL)
+        pool.run(ADD)
+        assert totals(pool) == [[6.0, 2 * MORE]] * 2
+        pids = [*pool.pids, pool.server_pid]
+        pool.close()
+        assert gone(pids)
+    finally:
+        for descriptor in taken:
+            os.close(descriptor)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
 def test_a_thread_may_start_workers_and_end(make: Make) -> None:
     pools: list[Pool] = []
     thread = threading.Thread(target=lambda: pools.append(make(workers=1)))

@@ -272,3 +272,25 @@ def test_scripted_drivers_load_no_torch() -> None:
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "False"
+
+
+def test_code_of_the_working_directory_runs_by_its_path_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A folder that was fetched from elsewhere cannot take the place of a driver."""
+    trap = "raise SystemExit('it was run')\n"
+    (tmp_path / "agents").mkdir()
+    for name in ("idm.py", "mine.py"):
+        (tmp_path / "agents" / name).write_text(trap)
+    monkeypatch.chdir(tmp_path)
+    env = parallel_env("ring", agents=1)
+    with pytest.raises(PolicyError, match=r"'idm': is a driver of cavmarl, and .*agents/idm\.py"):
+        load_policy("idm", env)
+    with pytest.raises(PolicyError, match=r"'mine': .*agents/mine\.py is code.*give its path"):
+        load_policy("mine", env)
+    with pytest.raises(SystemExit, match="it was run"):
+        load_policy("agents/mine.py", env)
+    (tmp_path / "agents" / "merge_ippo").mkdir()
+    (tmp_path / "agents" / "merge_ippo" / "model.safetensors").touch()
+    with pytest.raises(PolicyError, match=r"'merge_ippo': is a driver of cavmarl, and"):
+        load_policy("merge_ippo", env)

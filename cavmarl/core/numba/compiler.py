@@ -21,6 +21,7 @@ import gc
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from functools import cache
 from typing import Any
 
 from llvmlite import ir
@@ -362,10 +363,14 @@ class _PartDispatcher(_Dispatcher):  # type: ignore[misc]
 
 def call_as_part(kernel: Any) -> None:
     """Let other kernels take in the code of this one, and not what Python calls."""
-    part = _PartDispatcher(
-        kernel.py_func,
-        targetoptions={**kernel.targetoptions, "no_cpython_wrapper": True},
-        pipeline_class=KernelCompiler,
-    )
-    kernel.get_call_template = part.get_call_template
-    kernel.get_overload = part.get_overload
+
+    @cache
+    def part() -> Any:
+        return _PartDispatcher(
+            kernel.py_func,
+            targetoptions={**kernel.targetoptions, "no_cpython_wrapper": True},
+            pipeline_class=KernelCompiler,
+        )
+
+    kernel.get_call_template = lambda args, kws: part().get_call_template(args, kws)
+    kernel.get_overload = lambda signature: part().get_overload(signature)

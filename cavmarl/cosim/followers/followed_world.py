@@ -44,6 +44,7 @@ class FollowedWorld:
     Args:
         env: the world, in this process or run by workers; it is mastered until `close`.
         address: path of a Unix socket, or a port of this machine, 0: any.
+        secret: that followers have to say; a port needs one, for all users can call it.
         timeout_s: for so long a step waits for its followers, by the wall clock.
         own_ticks: what becomes of a follower's own tick; see `TimeMaster`.
         on_drift: see `TimeMaster`.
@@ -58,7 +59,8 @@ class FollowedWorld:
         address: where followers call.
 
     Raises:
-        ConfigError: nobody can listen there, or a trace of a world that workers run.
+        ConfigError: no process can listen there, a port without a secret, or a trace of a world
+            that workers run.
         ClockError: the environment has a master.
     """
 
@@ -67,6 +69,7 @@ class FollowedWorld:
         env: CavEnv,
         address: Address,
         *,
+        secret: str = "",
         timeout_s: float = 10.0,
         own_ticks: OwnTicks = "refuse",
         on_drift: Literal["error", "record"] = "error",
@@ -77,7 +80,7 @@ class FollowedWorld:
         if not 0.0 < timeout_s < float("inf"):
             raise ConfigError(f"timeout_s = {timeout_s}: must be a number above 0")
         self.env = env
-        self._reception = Reception(address)
+        self._reception = Reception(address, secret)
         self.address = self._reception.address
         try:
             self.master = TimeMaster(

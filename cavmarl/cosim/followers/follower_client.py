@@ -68,6 +68,7 @@ class Follower:
         name: for people.
         joins_s: how long the world may take to welcome us, which it does between two steps; None:
             for ever.
+        secret: of the world, if it listens at a port.
 
     Attributes:
         welcome: how time goes in that world.
@@ -83,10 +84,11 @@ class Follower:
         vehicles: Sequence[str] = (),
         name: str = "follower",
         joins_s: float | None = 60.0,
+        secret: str = "",
     ) -> None:
         self._line = call(address, CALL_S)
         try:
-            self._line.say(Say.HELLO, Hello(name, list(vehicles)), within_s=CALL_S)
+            self._line.say(Say.HELLO, Hello(name, list(vehicles), secret), within_s=CALL_S)
             self.welcome = read_letter(Welcome, self._expect(joins_s, Say.WELCOME).letter)
         except BaseException:
             self._line.close()

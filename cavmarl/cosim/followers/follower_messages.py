@@ -70,10 +70,12 @@ class Hello:
     Attributes:
         name: for people.
         vehicles: agents that it wants to drive; none: it follows the clock only.
+        secret: of the world, if it listens at a port.
     """
 
     name: StrictStr
     vehicles: list[StrictStr] = field(default_factory=list)
+    secret: StrictStr = ""
 
 
 @with_config(_CLOSED)

@@ -6,8 +6,9 @@ import selectors
 import time
 from collections.abc import Iterator
 from contextlib import suppress
+from hmac import compare_digest
 
-from cavmarl.core.errors import FollowerError
+from cavmarl.core.errors import ConfigError, FollowerError
 from cavmarl.cosim.followers.follower_connection import Address, FollowerConnection, listen
 from cavmarl.cosim.followers.follower_messages import (
     MAX_VEHICLES,
@@ -31,6 +32,7 @@ class Reception:
 
     Args:
         address: path of a Unix socket, or a port of this machine.
+        secret: that callers have to say; empty: none.
 
     Attributes:
         address: where it listens; the port that was found, where any would do.
@@ -40,7 +42,13 @@ class Reception:
         ConfigError: the socket cannot be opened.
     """
 
-    def __init__(self, address: Address) -> None:
+    def __init__(self, address: Address, secret: str = "") -> None:
+        if isinstance(address, int) and not secret:
+            raise ConfigError(
+                f"address = {address}: every user of this machine can call a port; give a secret "
+                "(cavmarl lead --secret-file), or the path of a Unix socket"
+            )
+        self._secret = secret.encode()
         self._listener = listen(address)
         self._listener.setblocking(False)
         name = self._listener.getsockname()
@@ -99,6 +107,10 @@ class Reception:
             raise FollowerError(f"a caller begins with {heard.kind.name}: HELLO comes first")
         line.skip(heard)
         hello = read_letter(Hello, heard.letter)
+        if self._secret and not compare_digest(hello.secret.encode(), self._secret):
+            raise FollowerError("a caller does not know the secret of this world")
+        if not hello.name.isprintable():
+            raise FollowerError("a caller's name has characters that cannot be printed")
         if len(hello.vehicles) > MAX_VEHICLES:
             raise FollowerError(f"a caller wants {len(hello.vehicles)} vehicles")
         line.name = f"follower '{hello.name[:80]}'"

@@ -24,7 +24,8 @@ from cavmarl.parallel.hosts.host_commands import Arrays, HostProgram
 from cavmarl.parallel.hosts.host_pool import HostPool
 from cavmarl.parallel.hosts.hosted_worlds_job import code_stamp, host_worlds, inputs_of, results_of
 from cavmarl.parallel.hosts.ray_actors import RayActors
-from cavmarl.parallel.journaled_worlds import refuse_watched
+from cavmarl.parallel.journaled_worlds import refuse_watched, unwatched
+from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.mover import Mover
 from cavmarl.parallel.processes.worker_pool import Death
 from cavmarl.parallel.step_arrays import StepArrays, layout_of
@@ -85,7 +86,7 @@ class RemoteWorlds(OrderedWorlds):
                 "the machine of the worlds; leave it 0, or leave out the hosts"
             )
         if not compiled_before():
-            Simulation(config, world.network, 1, world.demand, world.partition, warm=True)
+            LocalWorlds(unwatched(world), 1, warm=True)
         layout = layout_of(config, world.capacity, num_worlds).items()
         self.arrays = StepArrays.of({name: np.zeros(shape, kind) for name, (kind, shape) in layout})
         recipe = {

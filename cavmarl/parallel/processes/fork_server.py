@@ -10,7 +10,7 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,6 +27,17 @@ END_S = 1.0  # for all to end by themselves
 _ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
 )
+
+
+def has_ended(pidfds: Iterable[int], limit_s: float | None) -> bool:
+    """Whether one of some processes has ended, after a while at most; None: as long as it takes.
+
+    By `poll`: `select` takes no descriptor above 1,023.
+    """
+    waiting = select.poll()
+    for pidfd in pidfds:
+        waiting.register(pidfd, select.POLLIN)
+    return bool(waiting.poll(None if limit_s is None else 1000.0 * limit_s))
 
 
 class ServerGoneError(Exception):
@@ -71,7 +82,7 @@ class Process:
         """See to it that it is dead, whatever it was doing."""
         with suppress(ProcessLookupError):
             signal.pidfd_send_signal(self.pidfd, signal.SIGKILL)
-        select.select([self.pidfd], [], [])
+        has_ended([self.pidfd], None)
 
     def release(self) -> None:
         os.close(self.pidfd)

@@ -10,6 +10,7 @@ reads the same, so it does the same.
 from __future__ import annotations
 
 import json
+import os
 import time
 import weakref
 from dataclasses import dataclass
@@ -76,6 +77,7 @@ class Pool:
         self._stale = [False] * len(program.parts)  # whose memory is not what is committed
         self._ordered_s = 0.0
         self._lasted: dict[int, float] = {}  # how long each task has taken the last time, s
+        self._pid = os.getpid()
         self._crew = WorkerProcesses(program)
         self._finalizer = weakref.finalize(self, self._crew.release)
 
@@ -133,6 +135,11 @@ class Pool:
     ) -> list[Any]:
         if not self._finalizer.alive:
             raise WorkerError("the workers are closed: make the environment anew")
+        if os.getpid() != self._pid:
+            raise WorkerError(
+                f"the workers are those of process {self._pid}, and this is a fork of it: make the "
+                "environment here, after the fork"
+            )
         if self._open:
             self._settle()
         mail = None if letter is None else MAIL + json.dumps(letter).encode()

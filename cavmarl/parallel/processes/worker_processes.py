@@ -14,7 +14,12 @@ import numpy as np
 
 from cavmarl.core.errors import WorkerError
 from cavmarl.parallel.processes.core_placement import keep_apart
-from cavmarl.parallel.processes.fork_server import ForkServer, Process, ServerGoneError
+from cavmarl.parallel.processes.fork_server import (
+    ForkServer,
+    Process,
+    ServerGoneError,
+    has_ended,
+)
 from cavmarl.parallel.processes.process_barrier import (
     NUMBER,
     WORDS,
@@ -216,7 +221,7 @@ class WorkerProcesses:
     def settle(self, k: int, limit_s: float) -> bool:
         """Whether a worker has carried out its command or has died of it, after a while at most."""
         process = self.processes[k]
-        if select.select([process.pidfd], [], [], 0.0 if self.has(k) else limit_s)[0]:
+        if has_ended([process.pidfd], 0.0 if self.has(k) else limit_s):
             self._statuses[k][NUMBER] = self.number(k)  # its writer is dead
         process.collect()
         process.mail.clear()
@@ -225,7 +230,7 @@ class WorkerProcesses:
     def is_left_alone(self, k: int) -> bool:
         """Whether a process is dead without which a worker cannot go on."""
         others = [self.processes[j].pidfd for j in self._program.team_of(k) if j != k]
-        return bool(select.select(others, [], [], 0.0)[0])
+        return has_ended(others, 0.0)
 
     def keep_apart(self) -> None:
         """Give workers that shared a core different ones, unless each has its own for good."""

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from cavmarl.core.extensions import extension_modules
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
 from cavmarl.handoff.coordinator.coordinator_setup import check_faults
-from cavmarl.parallel.commanded_worlds import own_error
+from cavmarl.parallel.commanded_worlds import own_error, uncopied
 from cavmarl.parallel.driven_vehicles import Driven
 from cavmarl.parallel.hosts.host_commands import HostProgram
 from cavmarl.parallel.hosts.host_pool import HostPool
@@ -111,6 +112,9 @@ class DividedWorlds:
         except WorkerFailureError as failure:
             raise own_error(failure) from failure
         self.leader.let_work(self.pool)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        raise uncopied()
 
     @property
     def simulation(self) -> Simulation:

@@ -1,0 +1,129 @@
+"""`cavmarl lead` goes on, whatever a follower says or does not say."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cavmarl.cli import main
+from cavmarl.cosim.followers.follower_client import Follower
+from cavmarl.cosim.followers.follower_messages import Control, Say
+
+STEPS = 6
+
+
+def answering(address: str, controls: Any, name: str = "bad") -> None:
+    with Follower(address, ["car_0"], name) as follower:
+        for sight in follower:
+            if not sight.snapshot.is_over:
+                follower.answer(controls)
+
+
+def dying(address: str) -> None:
+    Follower(address, ["car_0"]).__dict__["_line"].close()
+
+
+def silent(address: str) -> None:
+    with Follower(address, ["car_0"]):
+        time.sleep(2.0)
+
+
+def babbling(address: str) -> None:
+    with Follower(address, ["car_0"]) as follower:
+        follower.wait()
+        follower.__dict__["_line"].say(Say.CONTROL, Control(99, {}))
+        time.sleep(1.0)
+
+
+def shouting(address: str) -> None:
+    """Joins, and then sends what is no frame."""
+    with Follower(address, ["car_0"]) as follower:
+        os.write(follower.__dict__["_line"].fileno(), b"\x00" * 64)
+        time.sleep(1.0)
+
+
+FAULTS: dict[str, Callable[[str], None]] = {
+    "not a number": lambda address: answering(address, {"car_0": [float("nan"), 0.0]}),
+    "out of range": lambda address: answering(address, {"car_0": [7.0, 0.0]}),
+    "another agent": lambda address: answering(address, {"car_9": [0.0, 0.0]}),
+    "an odd name": lambda address: answering(address, {"car_0": [2.0, 0.0]}, "[/x]"),
+    "dying": dying,
+    "silent": silent,
+    "a frame to come": babbling,
+    "no frame": shouting,
+}
+
+
+def led(address: Path, fault: Callable[[str], None], *words: str) -> int:
+    def follow() -> None:
+        while True:
+            try:
+                return fault(str(address))
+            except Exception as error:  # it was told why, or came before the world
+                if "does not answer (" not in str(error):
+                    return None
+            time.sleep(0.01)
+
+    caller = threading.Thread(target=follow)
+    caller.start()
+    try:
+        main(["lead", "ring", "--at", str(address), "--timeout-s", "1", "--steps", str(STEPS),
+              "--agents", "2", "--background", "2", *words])  # fmt: skip
+    except SystemExit as end:
+        return int(end.code or 0)
+    finally:
+        caller.join(20.0)
+    return 0
+
+
+@pytest.mark.parametrize("fault", FAULTS.values(), ids=FAULTS)
+def test_a_followers_fault_ends_that_follower(
+    tmp_path: Path, fault: Callable[[str], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = tmp_path / "found.json"
+    assert led(tmp_path / "s", fault, "--json", str(found)) == 0
+    result = json.loads(found.read_text())
+    assert result["steps"] == STEPS
+    assert len(result["lost"]) == 1
+    assert "built-in driver" in capsys.readouterr().err
+
+
+def test_the_run_may_end_with_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert led(tmp_path / "s", FAULTS["dying"], "--on-lost", "end") == 2
+    assert "error" in capsys.readouterr().err
+
+
+def test_a_name_with_markup_is_shown_as_it_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fault = lambda address: answering(address, {"car_0": [0.1, 0.0]}, "[/x]")  # noqa: E731
+    assert led(tmp_path / "s", fault, "--json", str(tmp_path / "found.json")) == 0
+    assert "[/x]" in capsys.readouterr().out
+    assert json.loads((tmp_path / "found.json").read_text())["lost"] == []
+
+
+def test_a_port_needs_a_file_with_a_secret(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["lead", "ring", "--at", "0", "--followers", "0", "--steps", "1"]
+    with pytest.raises(SystemExit):
+        main(words)
+    assert "--secret-file" in capsys.readouterr().err
+    file = tmp_path / "secret"
+    with pytest.raises(SystemExit) as end:
+        main([*words, "--secret-file", str(file)])
+    assert not end.value.code
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    assert len(file.read_text().strip()) == 64
+    file.write_text("")
+    with pytest.raises(SystemExit):
+        main([*words, "--secret-file", str(file)])
+    assert "is empty" in capsys.readouterr().err

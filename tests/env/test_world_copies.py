@@ -1,0 +1,162 @@
+"""A copy or a pickle of an environment is a world of its own, and goes on bit for bit."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+import cavmarl
+
+COPIES: dict[str, Callable[[Any], Any]] = {
+    "copy": copy.copy,
+    "deepcopy": copy.deepcopy,
+    "pickle": lambda env: pickle.loads(pickle.dumps(env)),
+}
+RIG = {"rig": "highway", "observation.mode": "sensors"}
+WORLDS: dict[str, dict[str, Any]] = {
+    "ring": {"env": "ring"},
+    "open": {"env": "merge", "overrides": {"population.mode": "open", "population.budget": 30}},
+    "respawn": {"env": "grid4x4", "agents": 6, "overrides": {"population.mode": "respawn"}},
+    "zones": {"env": "grid4x4", "agents": 6, "background": 40, "zones": 4},
+    "v2x": {"env": "grid4x4", "agents": 4, "background": 10, "overrides": {"v2x.enabled": True}},
+    "stacked": {"env": "merge", "overrides": {"sensors.stack": 3}},
+}
+
+
+def actions_of(env: cavmarl.CavEnv, step: int) -> dict[str, np.ndarray]:
+    return {
+        agent: np.array([0.4 * np.sin(step + k), 0.02 * np.cos(step - k)], dtype=np.float32)
+        for k, agent in enumerate(env.agents)
+    }
+
+
+def drive(env: cavmarl.CavEnv, first: int, steps: int) -> list[Any]:
+    """All that comes out, and the state at the end."""
+    seen: list[Any] = []
+    for step in range(first, first + steps):
+        if not env.agents:
+            env.reset()
+        seen.append(repr(env.step(actions_of(env, step))))
+    return [*seen, env.simulation.state_hash()]
+
+
+@pytest.mark.parametrize("how", COPIES)
+@pytest.mark.parametrize("name", WORLDS)
+def test_a_copy_goes_on_as_the_first_one(name: str, how: str) -> None:
+    np.set_printoptions(threshold=sys.maxsize, floatmode="unique")
+    env = cavmarl.parallel_env(**WORLDS[name])
+    env.reset(seed=3)
+    drive(env, 0, 15)
+    other = COPIES[how](env)
+    assert other.simulation is not env.simulation
+    assert other.agents == env.agents
+    first = drive(env, 15, 12)
+    assert drive(other, 15, 12) == first
+    assert repr(other.reset()) == repr(env.reset()), "the next episode is the same, too"
+
+
+@pytest.mark.parametrize("how", COPIES)
+def test_what_one_does_is_nothing_to_the_other(how: str) -> None:
+    env = cavmarl.parallel_env("ring")
+    env.reset(seed=1)
+    other = COPIES[how](env)
+    before = env.simulation.state_hash()
+    drive(other, 0, 5)
+    other.reset(seed=9)
+    assert env.simulation.state_hash() == before
+
+
+@pytest.mark.parametrize("how", COPIES)
+def test_a_copy_before_the_first_reset(how: str) -> None:
+    env = cavmarl.parallel_env("ring", seed=5)
+    other = COPIES[how](env)
+    with pytest.raises(cavmarl.EpisodeError):
+        other.step({})
+    assert repr(other.reset()) == repr(env.reset())
+    assert drive(other, 0, 5) == drive(env, 0, 5)
+
+
+@pytest.mark.parametrize("copied", [True, False])
+@pytest.mark.parametrize("how", COPIES)
+def test_a_batch_of_worlds(how: str, copied: bool) -> None:
+    def step(vec: cavmarl.CavVectorEnv, number: int) -> tuple[bytes, ...]:
+        actions = np.full(vec.action_space.shape, 0.1 * (number % 5), dtype=np.float32)
+        observations, rewards, ended, cut, infos = vec.step(actions)
+        parts = (observations, rewards, ended, cut, *infos.values())
+        return tuple(np.asarray(part).tobytes() for part in parts)
+
+    vec = cavmarl.make_vec("merge", num_envs=3, max_cycles=20, copy=copied)
+    vec.reset(seed=2)
+    for number in range(15):
+        step(vec, number)
+    other = COPIES[how](vec)
+    for number in range(15, 30):  # over the end of an episode
+        assert step(other, number) == step(vec, number)
+    assert not np.shares_memory(other.worlds.arrays.observations, vec.worlds.arrays.observations)
+
+
+def test_one_vehicle_and_agents_in_turn() -> None:
+    one = gymnasium.make("cavmarl/merge-v0")
+    one.reset(seed=4)
+    one.step(np.zeros(2, np.float32))
+    other = copy.deepcopy(one)
+    for _ in range(5):
+        assert repr(other.step(np.zeros(2, np.float32))) == repr(one.step(np.zeros(2, np.float32)))
+    turns = cavmarl.env("ring", agents=2)
+    turns.reset(seed=4)
+    turns.step(np.zeros(2))
+    later = copy.deepcopy(turns)
+    for _ in range(5):
+        for env in (turns, later):
+            env.step(np.zeros(2))
+        assert repr(later.last()) == repr(turns.last())
+
+
+def test_a_world_that_is_sent_to_another_process() -> None:
+    env = cavmarl.parallel_env("ring")
+    env.reset(seed=3)
+    drive(env, 0, 5)
+    sent = pickle.dumps(env)
+    program = (
+        "import pickle, sys; from tests.env.test_world_copies import drive; "
+        "print(drive(pickle.loads(sys.stdin.buffer.read()), 5, 5)[-1])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], input=sent, stdout=-1, check=True)
+    assert done.stdout.decode().strip() == drive(env, 5, 5)[-1]
+
+
+@pytest.mark.parametrize("how", COPIES)
+def test_worlds_with_processes_or_files_are_refused(how: str, tmp_path: Any) -> None:
+    env = cavmarl.parallel_env("grid4x4", agents=2, zones=2, workers=2)
+    with pytest.raises(cavmarl.ConfigError, match="workers=0"):
+        COPIES[how](env)
+    env.close()
+    journal = {"zones.journal": str(tmp_path / "journal")}
+    env = cavmarl.parallel_env("grid4x4", agents=2, zones=2, overrides=journal)
+    with pytest.raises(cavmarl.ConfigError, match=r"zones\.journal"):
+        COPIES[how](env)
+
+
+class Named(cavmarl.CavEnv):
+    """A user's own, made in another way."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(cavmarl.parallel_env("ring").worlds)
+        self.name = name
+
+
+def test_a_users_own_class_is_copied_whole() -> None:
+    env = Named("first")
+    env.reset(seed=0)
+    other = copy.deepcopy(env)
+    assert type(other) is Named
+    assert other.name == "first"
+    assert drive(other, 0, 3) == drive(env, 0, 3)
