@@ -46,7 +46,8 @@ def _unwritable(path: Path, error: OSError) -> ConfigError:
     return ConfigError(f"{path}: cannot be written ({error.strerror or error})")
 
 
-def _check_bound(value: float | None) -> float | None:
+def check_bound(value: float | None) -> float | None:
+    """Refuse a value of `--at-least` that nothing can be measured against."""
     check_positive("--at-least", value)
     return value
 
@@ -78,7 +79,7 @@ JsonPath = Annotated[
     Path | None, about("Write the result here as JSON.", "--json", callback=writable)
 ]
 AtLeast = Annotated[
-    float | None, about("Exit with 1 if it is not so many times as fast.", callback=_check_bound)
+    float | None, about("Exit with 1 if it is not so many times as fast.", callback=check_bound)
 ]
 
 

@@ -15,7 +15,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Column, Table
 
-from cavmarl.cli.output import JsonPath, Seed, Settings, about, number, parse_settings, write_json
+from cavmarl.cli.output import JsonPath, about, number, with_world, write_json
+from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -53,11 +54,11 @@ def list_scenarios(json_path: JsonPath = None) -> None:
 
 
 @app.command("run")
+@with_world("agents", "seed", "settings")
 def run(
+    world: WorldSpec,
     name: Annotated[str, typer.Argument(metavar="NAME", help="A scenario, or a .py file.")],
-    map_name: Annotated[
-        str, about("Name, folder or map file of an environment.", "--map")
-    ] = "grid4x4",
+    env: Annotated[str, about("Name, folder or map file of an environment.", "--map")] = "grid4x4",
     place: Annotated[str, about("Place on the map; default: drawn by the seed.")] = "",
     param: Annotated[
         list[str] | None,
@@ -69,10 +70,8 @@ def run(
     ] = 1,
     density: Annotated[str, about("Other traffic: none, low or high.")] = "none",
     zones: Annotated[
-        int | None, about("Background vehicles; default: as the environment says.")
+        int | None, about("Zones of the world; default: as the environment says.")
     ] = None,
-    seed: Seed = 0,
-    settings: Settings = None,
     picture: Annotated[Path | None, about("Write a .png of the closest moment here.")] = None,
     video: Annotated[Path | None, about("Write an .mp4 of the run here.")] = None,
     json_path: JsonPath = None,
@@ -83,21 +82,13 @@ def run(
 
     with ExitStack() as stack:
         vec = make_scenario(
-            name,
-            map_name,
-            params=_params(param),
-            place=place,
-            density=density,
-            seed=seed,
-            zones=zones,
-            agents=agents,
-            overrides=parse_settings(settings),
+            name, world, params=_params(param), place=place, density=density, zones=zones
         )
         stack.callback(vec.close)
         look: Callable[[], None] | None = None
         if picture is not None or video is not None:
             look = stack.enter_context(ScenarioCamera(vec, picture, video)).look
-        found = run_scenario(vec, driver, seed, look)
+        found = run_scenario(vec, driver, world.seed, look)
     Console().print(_table(found))
     write_json(json_path, asdict(found))
     if not found.passed:

@@ -13,10 +13,10 @@ from rich.table import Table
 
 from cavmarl.bench.harness import make_table, measuring, numbers_of
 from cavmarl.cli.output import (
-    AtLeast,
     JsonPath,
     OptionalEnvironment,
     about,
+    check_bound,
     end_below,
     with_world,
     write_json,
@@ -47,7 +47,12 @@ def sensors(
     background: Annotated[int, about("Vehicles without sensors.")] = 0,
     csv_path: Annotated[Path | None, about("Write every step of every run here.", "--csv")] = None,
     plot: Annotated[Path | None, about("Write the figure here (.png, .svg, .pdf).")] = None,
-    at_least: AtLeast = None,
+    at_least: Annotated[
+        float | None,
+        about(
+            "Exit with 1 if the second number is not so many times faster.", callback=check_bound
+        ),
+    ] = None,
     json_path: JsonPath = None,
 ) -> None:
     """One vehicle and its sensors, with each number of sensor workers, in processes anew.

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cavmarl.bench.harness import make_table, measuring
-from cavmarl.cli.output import AtLeast, JsonPath, about, end_below, write_json
+from cavmarl.cli.output import JsonPath, about, check_bound, end_below, write_json
 
 if TYPE_CHECKING:
     from cavmarl.bench.step_speed import StepSpeed
@@ -28,7 +28,9 @@ def step(
     agents: Annotated[int, about("Controlled vehicles in each world.")] = 100,
     worlds: Annotated[int, about("Number of parallel worlds.")] = 16,
     repeats: Annotated[int, about("Number of measurements of each row.")] = 5,
-    at_least: AtLeast = None,
+    at_least: Annotated[
+        float | None, about("Exit with 1 if the ratio with a lidar is below.", callback=check_bound)
+    ] = None,
     json_path: JsonPath = None,
 ) -> None:
     """Agent-steps a second next to highway-env's: same road, vehicles and rates; one core."""

@@ -7,11 +7,12 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.records.codes import (
     DRIVER_BACKGROUND,
@@ -81,59 +82,57 @@ class ScenarioRun:
 
 def make_scenario(
     scenario: str,
-    env: str | Path = "grid4x4",
+    env: str | Path | WorldSpec = "grid4x4",
     *,
     params: Mapping[str, bool | float] | None = None,
     place: str = "",
     density: str = "none",
-    seed: int = 0,
     zones: int | None = None,
-    agents: int = 1,
-    overrides: Mapping[str, Any] | None = None,
+    **keys: Unpack[WorldKeys],
 ) -> CavVectorEnv:
     """One world in which a scenario is played to its agents, which steer and accelerate.
 
     Args:
         scenario: name, or path of a file.
-        env: name, folder or map file of an environment.
+        env: as in `make_vec`, like the other keywords.
         params: of the scenario.
-        place: where; empty: drawn by the seed.
+        place: where; empty: drawn by the seed, which is that of the first reset, too.
         density: of the other traffic, of `DENSITIES`.
-        seed: draws the place, and is that of the first reset.
         zones: into which the world is divided; None: as the environment says.
-        agents: how many: the first is in the conflict, the others come after it.
-        overrides: values for any other key.
+        keys: of the world; of the agents, by default 1, the first is in the conflict, the others
+            come after it.
 
     Raises:
         ConfigError: no such scenario, no place for it on the map, or no room for the agents; a
             parameter, a density or a key that cannot work.
     """
+    spec = WorldSpec.of(env, **keys)
     if density not in DENSITIES:
         raise ConfigError(f"density = {density!r}: must be one of {', '.join(DENSITIES)}")
     background = 0
     if density != "none":
-        lanes = load_world(env, agents=1, background=0).network.lanes
+        lanes = load_world(spec.env, agents=1, background=0).network.lanes
         lane_km = float(lanes["length_m"][~lanes["internal"]].sum()) / 1000.0
         background = round(DENSITIES[density] * lane_km)
-    keys: dict[str, Any] = {
+    settings: dict[str, Any] = {
         "scenario.name": scenario,
         "scenario.place": place,
-        "scenario.seed": seed,
+        "scenario.seed": spec.seed,
         "scenario.params": dict(params or {}),
         "population.mode": "closed",
         "population.budget": None,
         "action.kind": "continuous",
         "horizon_s": HORIZON_S,
-        **(overrides or {}),
+        **spec.overrides,
     }
     return make_vec(
-        env,
+        spec.env,
         zones=zones,
-        agents=agents,
+        agents=1 if spec.agents is None else spec.agents,
         background=background,
-        seed=seed,
+        seed=spec.seed,
         autoreset_mode="NextStep",
-        overrides=keys,
+        overrides=settings,
     )
 
 
