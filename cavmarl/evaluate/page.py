@@ -20,12 +20,7 @@ NOTHING = "-"
 
 
 def write_page(folder: Path, path: Path) -> None:
-    """Write the page of the results in a folder.
-
-    Args:
-        folder: that `evaluate` left.
-        path: of the HTML file.
-    """
+    """Write the page of the results in a folder that `evaluate` left."""
     require("matplotlib", "report")
     jinja2 = require("jinja2", "report")
     report = load_report(folder)

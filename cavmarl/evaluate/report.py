@@ -112,13 +112,9 @@ def make_report(
     manifest: Mapping[str, Any],
     transfers: Mapping[str, TransferSummary],
 ) -> EvaluationReport:
-    """Reduce raw tables to a report.
+    """Reduce raw tables, by policy TRIP and EPISODE records of all runs, to a report.
 
-    Args:
-        tables: by policy, TRIP and EPISODE records of all runs.
-        speeds: by policy, of each run.
-        manifest: of the same results.
-        transfers: by policy, between zones; empty where worlds are undivided.
+    `speeds` are of each run; `transfers` are those between zones, empty where worlds are undivided.
     """
     seeds = tuple(manifest["seeds"])
     found = {

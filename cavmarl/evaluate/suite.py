@@ -80,17 +80,8 @@ def run_suite(
 ) -> dict[str, EvaluationReport]:
     """Evaluate the policies in every world, each into its own folder of `out`.
 
-    Agents enter as long as the episode lasts (seats), so that their number holds.
-
-    Args:
-        suite: what holds for all worlds.
-        worlds: from `worlds_of`.
-        policies: as in `evaluate`, like episodes, repeats and seed.
-        out: folder of the folders.
-        episodes: of each run.
-        repeats: independent runs.
-        seed: of the first run.
-        began: called before each world.
+    Agents enter as long as the episode lasts (respawn), so that their number holds. `began` is
+    called before each world; policies, episodes, repeats and seed are as in `evaluate`.
     """
     reports = {}
     for world in worlds:

@@ -25,12 +25,7 @@ class TransferRecorder:
             log.take()
 
     def collect(self, worlds: Iterable[int], over: NDArray[np.bool_]) -> None:
-        """After a step: take the rows of worlds in their episode.
-
-        Args:
-            worlds: that were in it during the step.
-            over: (W,) whose episode has ended with it.
-        """
+        """After a step: take the rows of worlds that were in it; `over` (W,) have ended."""
         if not self._logs:
             return
         for w in worlds:

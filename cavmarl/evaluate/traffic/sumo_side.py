@@ -63,12 +63,9 @@ def sumo_process(job: SumoJob) -> Iterator[ProcessPoolExecutor]:
 
 
 def start_sumo(job: SumoJob, folder: Path, *more: str) -> Any:
-    """Load the job into this process's libsumo and return it.
+    """Load the job into this process's libsumo and return it; `more` are options of SUMO.
 
-    Args:
-        job: what to run.
-        folder: for SUMO's log and for copies of additional files.
-        more: options.
+    Its log, and copies of additional files, go into the folder.
     """
     libsumo: Any = free_libsumo()
     log = folder / "errors.log"

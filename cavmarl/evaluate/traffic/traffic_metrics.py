@@ -74,19 +74,13 @@ class TrafficRun:
 
 
 class TouchCounter:
-    """Counts the pairs that began to touch, tick by tick.
+    """Counts the pairs that began to touch, tick by tick, on a map of these bounds (m).
 
     Of several that touch one vehicle at once, only its pair with the lowest id counts.
-
-    Args:
-        bounds: min_x, min_y, max_x, max_y of the map in m.
-
-    Attributes:
-        count: pairs so far; one that parts and touches again counts again.
     """
 
     def __init__(self, bounds: tuple[float, float, float, float]) -> None:
-        self.count = 0
+        self.count = 0  # pairs so far; one that parts and touches again counts again
         self._bounds = bounds
         self._make_room(0)
         self._touching: set[tuple[int, int]] = set()

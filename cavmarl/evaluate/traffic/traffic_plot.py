@@ -18,12 +18,7 @@ COLORS = {"SUMO": "#d1793b", "cavmarl": "#2f6db5"}
 
 
 def plot_fundamental_diagram(found: TrafficComparison, path: Path) -> None:
-    """Write flow and speed over density; a point is an edge of 50 m or more in a minute.
-
-    Args:
-        found: both runs.
-        path: a picture; its ending says of which kind (.png, .svg, .pdf).
-    """
+    """Write flow and speed over density; a point is an edge of 50 m or more in a minute."""
     figure = require("matplotlib.figure", "report").Figure(
         figsize=(10.0, 4.2), layout="constrained"
     )
