@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypedDict, Unpack
 
+from cavmarl.core.seeds import check_seed
+
 
 class WorldKeys(TypedDict, total=False):
     """Keywords of functions that take a world; as the fields of `WorldSpec`."""
@@ -28,6 +30,9 @@ class WorldSpec:
     max_cycles: int | None = None  # shadows horizon_s, in steps
     seed: int = 0  # root of all random numbers
     overrides: Mapping[str, Any] = field(default_factory=dict)  # values for any other key
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "seed", check_seed(self.seed))
 
     @classmethod
     def of(cls, env: str | Path | WorldSpec, **keys: Unpack[WorldKeys]) -> WorldSpec:

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from cavmarl.config.checks import check_count
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError, JournalError, PolicyError
-from cavmarl.core.seeds import check_seed
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.evaluate.episodes import (
@@ -104,7 +103,6 @@ def evaluate(
     check_count("episodes", episodes, MAX_EPISODES)
     check_count("repeats", repeats, MAX_REPEATS)
     spec = WorldSpec.of(env, **keys)
-    check_seed(spec.seed)
     job = EpisodeJob(**vars(spec), policies=_named(policies), episodes=episodes)
     with TemporaryDirectory() as room:
         folder = Path(room) if out is None else out

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from cavmarl.config.checks import check_count
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError, EvaluationError, LostTickError, ProtocolError
-from cavmarl.core.seeds import check_seed
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.handoff.fault_injection.fault_plan import PHASES, Crash, Faults
@@ -133,7 +132,6 @@ def run_campaign(
     if not counts or min(counts) < 2:
         raise ConfigError(f"zones = {list(counts)}: a campaign needs numbers of 2 or more")
     spec = WorldSpec.of("" if env is None else env, **keys)
-    check_seed(spec.seed)
     if not spec.env:
         given = {"population.agents": spec.agents, "population.background": spec.background}
         named = {key: value for key, value in given.items() if value is not None}

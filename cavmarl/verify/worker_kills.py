@@ -16,7 +16,6 @@ from typing import Any, Literal, Unpack
 
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError, EvaluationError
-from cavmarl.core.seeds import check_seed
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.evaluate.provenance.machine import describe_hardware
 from cavmarl.parallel.hosts.host_pool import HostPool
@@ -102,7 +101,7 @@ def verify_kills(
         WorkerError: workers died that were not killed.
     """
     spec = WorldSpec.of(env, **keys)
-    seed = check_seed(spec.seed)
+    seed = spec.seed
     steps = 3 * kills + FIRST_STEPS if steps is None else steps
     if kills < 1 or workers < 1:
         raise ConfigError(f"{kills} kills of {workers} workers: must be at least 1 of each")
