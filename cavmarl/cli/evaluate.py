@@ -74,7 +74,7 @@ def report(
 
 
 def evaluate_showing(
-    console: Console, world: WorldSpec, policies: Any, *, out: Path, **counts: int
+    console: Console, world: WorldSpec, policies: Any, *, out: Path, **counts: Any
 ) -> EvaluationReport:
     """`cavmarl.evaluate.evaluate` into a folder, with a progress bar."""
     from cavmarl.evaluate import evaluate as run
@@ -177,7 +177,7 @@ def _show(
     html: Path | None,
     json_path: Path | None,
 ) -> None:
-    plain = {"markup": False, "highlight": False, "soft_wrap": True}
+    plain: dict[str, Any] = {"markup": False, "highlight": False, "soft_wrap": True}
     console.print(report_table(found))
     if len(found.policies) > 1:
         console.print(difference_table(found))

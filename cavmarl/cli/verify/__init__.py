@@ -106,8 +106,8 @@ def verify(
         raise ConfigError(f"--hosts {hosts}: goes with --kill only")
     if replay is not None:
         given = (zones, steps, layout, faults, journal, kill, worlds)
-        given += (world.agents, world.background, world.overrides or None)
-        if check or any(value is not None for value in given):
+        shadows = (world.agents, world.background, world.overrides or None)
+        if check or any(value is not None for value in (*given, *shadows)):
             raise ConfigError("--replay: all else stands in the file; beside it goes ENV only")
         _run_again(replay, env, json_path)
         return
