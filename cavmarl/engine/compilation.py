@@ -11,6 +11,7 @@ from typing import Any
 import numba.core.config
 from numba.core import event
 
+from cavmarl.core.cache_folder import tell_unwritable
 from cavmarl.core.numba import kernel_cache_dir
 
 _Listener: Any = event.Listener
@@ -75,6 +76,9 @@ def compiling_all() -> Iterator[None]:
     started = time.perf_counter()
     _ANNOUNCER.has_told = True
     yield
-    kernel_cache_dir().mkdir(parents=True, exist_ok=True)
-    (kernel_cache_dir() / "complete").touch()
+    try:
+        kernel_cache_dir().mkdir(parents=True, exist_ok=True)
+        (kernel_cache_dir() / "complete").touch()
+    except OSError as error:
+        tell_unwritable(error)
     print(f" done in {time.perf_counter() - started:.0f} s", file=sys.stderr, flush=True)

@@ -288,6 +288,7 @@ class ActionDecoder:
         decoded = self._decoded
         if self._continuous:
             np.multiply(batch, self._scale, out=decoded.controls)
+            np.add(decoded.controls, 0.0, out=decoded.controls)  # of -0.0 too, 0.0
         else:
             decoded.meta_actions[:] = batch
         return decoded

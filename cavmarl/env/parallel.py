@@ -163,7 +163,7 @@ class CavEnv(CopiedWithWorlds, ParallelEnv[str, Any, Any]):  # type: ignore[misc
         self._rows: NDArray[np.intp]
         self._listed: NDArray[np.intp] | slice  # the same
         self._list(np.zeros(0, dtype=np.intp))
-        self.max_cycles = config.max_steps
+        self._max_cycles = config.max_steps
         one_observation, one_action = observation_space(config), action_space(config.action)
         self.observation_spaces = dict.fromkeys(self.possible_agents, one_observation)
         self.action_spaces = dict.fromkeys(self.possible_agents, one_action)
@@ -183,6 +183,25 @@ class CavEnv(CopiedWithWorlds, ParallelEnv[str, Any, Any]):  # type: ignore[misc
         self._first_seed = seed
         self._steps = -1
         self._view: WorldView | None = None
+
+    @property
+    def max_cycles(self) -> int:
+        """Steps until truncation; it can be set to fewer than the environment was made for.
+
+        Raises:
+            ConfigError: it is set to another number.
+        """
+        return self._max_cycles
+
+    @max_cycles.setter
+    def max_cycles(self, steps: int) -> None:
+        most = self.config.max_steps
+        if not isinstance(steps, int | np.integer) or not 1 <= steps <= most:
+            raise ConfigError(
+                f"max_cycles = {steps!r}: must be a whole number from 1 to {most}, for which the "
+                "environment was made; for more, pass max_cycles to parallel_env"
+            )
+        self._max_cycles = int(steps)
 
     @property
     def step_s(self) -> float:
@@ -307,7 +326,7 @@ class CavEnv(CopiedWithWorlds, ParallelEnv[str, Any, Any]):  # type: ignore[misc
     def _wait_for_agents(self) -> None:
         """Let an empty world go on until an agent enters; ends without one at the horizon."""
         arrays = self.worlds.arrays
-        while not arrays.episode_over[0]:
+        while not arrays.episode_over[0] and self._steps < self._max_cycles:
             self.worlds.step(self._decoder.idle())
             self._steps += 1
             if arrays.mask.any():

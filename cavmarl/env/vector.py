@@ -180,7 +180,6 @@ class CavVectorEnv(CopiedWithWorlds):
         self.action_space = batch_space(
             batch_space(self.single_action_space, self.num_agents), num_envs
         )
-        self.max_cycles = config.max_steps
         self.metadata = {
             "name": f"cavmarl/{config.name}-v{config.version}",
             "autoreset_mode": (
@@ -198,6 +197,11 @@ class CavVectorEnv(CopiedWithWorlds):
         self._copy = copy
         self._ready = False
         self.simulated_s = 0.0
+
+    @property
+    def max_cycles(self) -> int:
+        """Steps until truncation."""
+        return self.config.max_steps
 
     @property
     def step_s(self) -> float:

@@ -17,8 +17,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from cavmarl.core.cache_folder import cache_dir
 from cavmarl.core.errors import ConfigError, MapError, require
-from cavmarl.core.numba import cache_dir
 from cavmarl.maps.build_log import BuildLog
 from cavmarl.maps.formats import MapKind, map_kind
 from cavmarl.roads.sumo_net.reader import map_name, read_network, source_hash
@@ -114,7 +114,10 @@ def build_network(
         try:
             log = _build(kind, source, place, chosen, timeout_s)
         except OSError as error:
-            raise MapError(f"{place}: cannot be written ({error.strerror or error})") from error
+            cure = "name another target" if target else "set CAVMARL_CACHE_DIR to another folder"
+            raise MapError(
+                f"{place}: cannot be written ({error.strerror or error}); {cure}"
+            ) from error
     return BuildResult(
         path=place,
         source=source,

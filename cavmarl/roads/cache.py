@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.numba import cache_dir
+from cavmarl.core.cache_folder import cache_dir, tell_unwritable
 from cavmarl.roads.network import (
     CONFLICT,
     DETECTOR,
@@ -68,7 +68,10 @@ def load_network(path: str | Path) -> RoadNetwork:
     network = _restore(entry, map_name(path), digest)
     if network is None:
         network = read_network(path)
-        _store(entry, network)
+        try:
+            _store(entry, network)
+        except OSError as error:
+            tell_unwritable(error)
     return network
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from numba.core import config
 
+from cavmarl.core.cache_folder import cache_dir
 from cavmarl.core.numba import kernel_cache as kernels
 
 SOURCES = kernels._sources()
@@ -109,3 +110,42 @@ def test_what_is_damaged_is_compiled_anew(tmp_path: Path, harm: bytes | None) ->
         )
     assert run() == [first[0], "1" if harm is None else "0"]
     assert run() == [first[0], "1"]
+
+
+FIRST = """
+from cavmarl import parallel_env
+from cavmarl.core.math.bearings import rough_atan2
+parallel_env("ring", agents=1, background=0)
+print(rough_atan2(1.0, 2.0))
+"""
+
+
+@pytest.mark.skipif(config.DISABLE_JIT, reason="nothing is compiled")
+@pytest.mark.parametrize("how", ["no folder", "a file"])
+def test_a_folder_that_cannot_be_written_is_named_once(tmp_path: Path, how: str) -> None:
+    place = tmp_path / "cache" if how == "a file" else Path("/proc/cavmarl")
+    if how == "a file":
+        place.touch()
+    told = subprocess.run(
+        [sys.executable, "-c", FIRST],
+        env={**os.environ, "CAVMARL_CACHE_DIR": str(place), "PYTHONPATH": str(PACKAGE.parent)},
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    assert float(told.stdout) == pytest.approx(0.46, abs=0.01)
+    assert told.stderr.count(f"{place} cannot be written") == 1
+    assert "CAVMARL_CACHE_DIR" in told.stderr
+    assert not list(PACKAGE.rglob("*.nbi")), "nothing beside the sources"
+
+
+def test_where_the_cache_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("CAVMARL_CACHE_DIR", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    assert cache_dir() == Path.home() / ".cache" / "cavmarl"
+    monkeypatch.setenv("XDG_CACHE_HOME", "relative")
+    assert cache_dir() == Path.home() / ".cache" / "cavmarl"
+    monkeypatch.setenv("XDG_CACHE_HOME", "/var/shared")
+    assert cache_dir() == Path("/var/shared/cavmarl")
+    monkeypatch.setenv("CAVMARL_CACHE_DIR", "/own")
+    assert cache_dir() == Path("/own")

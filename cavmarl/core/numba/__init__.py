@@ -3,7 +3,7 @@
 `kernel` is the one place for compiler flags: no fastmath (results must not depend on how a world is
 divided), serial (processes give the parallelism), GIL released, cached on disk.
 
-`kernel_cache` says where. Set `CAVMARL_CACHE_DIR` to move it (default: `~/.cache/cavmarl`).
+`kernel_cache` and `core/cache_folder.py` say where.
 With `NUMBA_DISABLE_JIT=1` every kernel is plain Python.
 """
 
@@ -16,9 +16,9 @@ import numba
 import numba.core.config
 
 from cavmarl.core.numba.compiler import KernelCompiler, call_as_part
-from cavmarl.core.numba.kernel_cache import KernelCache, cache_dir, kernel_cache_dir
+from cavmarl.core.numba.kernel_cache import KernelCache, kernel_cache_dir
 
-__all__ = ["allocating_kernel", "cache_dir", "inlined_kernel", "kernel", "kernel_cache_dir"]
+__all__ = ["allocating_kernel", "inlined_kernel", "kernel", "kernel_cache_dir"]
 
 P = ParamSpec("P")
 R = TypeVar("R")

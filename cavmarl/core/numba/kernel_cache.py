@@ -9,7 +9,6 @@ What is read back is compared with its checksum; a damaged file is compiled anew
 from __future__ import annotations
 
 import hashlib
-import os
 import pickle
 import re
 from collections.abc import Callable
@@ -21,6 +20,8 @@ import numba
 import numba.core.config
 from numba.core import caching as numba_caching
 
+from cavmarl.core.cache_folder import cache_dir, tell_unwritable
+
 caching: Any = numba_caching  # has no types
 
 # Every import of one file of kernels by another; a test holds that there is no other form of it.
@@ -28,12 +29,6 @@ _IMPORT = re.compile(rb"^from cavmarl\.([\w.]+) import ", re.MULTILINE)
 _PACKAGE = Path(__file__).parents[2]
 _SHARED = ("core.numba", "core.numba.compiler", "core.numba.kernel_cache")  # concern all kernels
 _DIGEST_BYTES = 32
-
-
-def cache_dir() -> Path:
-    """The folder for everything cavmarl keeps between runs (compiled kernels, converted maps)."""
-    home = os.environ.get("CAVMARL_CACHE_DIR")
-    return Path(home) if home else Path.home() / ".cache" / "cavmarl"
 
 
 @cache
@@ -152,3 +147,10 @@ class KernelCache(caching.FunctionCache):  # type: ignore[misc]
         stamp = self._impl.locator.get_source_stamp()
         file = _CheckedFile(self.cache_path, self._impl.filename_base, stamp)
         self._cache_file: Any = file
+
+    def save_overload(self, signature: Any, data: Any) -> None:
+        """Keep what was compiled; where that cannot be, it is used all the same."""
+        try:
+            super().save_overload(signature, data)
+        except OSError as error:
+            tell_unwritable(error)

@@ -44,8 +44,8 @@ def decode_pairs(
             throttle = 0.0
             steering = 0.0
             if mask[w, agent]:
-                throttle = float(actions[w, agent, 0])
-                steering = float(actions[w, agent, 1])
+                throttle = float(actions[w, agent, 0]) + 0.0  # of -0.0 too, 0.0
+                steering = float(actions[w, agent, 1]) + 0.0
             last[w, agent, 0] = throttle
             last[w, agent, 1] = steering
             controls[w, agent, 0] = throttle * acceleration_mps2

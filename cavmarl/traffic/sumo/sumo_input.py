@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from io import BytesIO
 from os.path import isfile
 from pathlib import Path
-from xml.etree.ElementTree import Element, ParseError
+from xml.etree.ElementTree import Element, ParseError, tostring
 
 import defusedxml.ElementTree
 from defusedxml.common import DefusedXmlException
@@ -30,11 +30,30 @@ _INPUTS = {
     "a": "additional-files",
 }
 _DROPPED_SECTIONS = ("input", "output", "report", "gui_only", "time", "traci_server")
-_OUTPUT = re.compile(
-    rb"<(?:e[123]Detector|inductionLoop|instantInductionLoop|laneAreaDetector|entryExitDetector|"
-    rb"edgeData|laneData|routeProbe|vTypeProbe|timedEvent)\b[^>]*>"
+# Options that change traffic and name no file. What only reports is left out; the rest is refused.
+_CHANGES_TRAFFIC = re.compile(
+    r"step-method\.ballistic|extrapolate-departpos|no-internal-links|junction-taz|lateral-resolution"
+    r"|scale|scale-suffix|max-num-[a-z]+|max-depart-delay|random-depart-offset|route-steps"
+    r"|waiting-time-memory|startup-wait-threshold|[a-z]+-insert|insertion-checks|keep-after-arrival"
+    r"|lanechange\.(duration|overtake-right)|slope-centered|parking\.maneuver|use-stop-[a-z]+"
+    r"|ride\.stop-tolerance|routing-algorithm|replay-rerouting|railway\.max-train-length|random"
+    r"|seed|thread-rngs|threads|pedestrian\.(model|timegap-crossing|striping\.[\w.-]+)"
+    r"|(ignore-|time-to-|meso|railsignal)[\w.-]*"
+    r"|(collision|intermodal-collision|tls|default|emergencydecel|mapmatch|weights|persontrip"
+    r"|overhead-wire)\.[\w.-]+"
+    r"|device\.(rerouting|bluelight|driverstate|friction|glosa|toc|battery|stationfinder|taxi)"
+    r"\.(?!file$|.*output$)[\w.-]+|person-device\.rerouting\.[\w.-]+"
 )
-_DESTINATION = re.compile(rb"\b(file|dest)=(\"[^\"]*\"|'[^']*')")
+_REPORTS = re.compile(
+    r".*(output|log|\.file$).*|device\.(ssm|fcd|tripinfo|vehroute|emissions|elechybrid|example)\..*"
+    r"|no-warnings|verbose|aggregate-warnings|xml-validation.*"
+)
+# A file without these names nothing that SUMO writes. A reference to a character may hide them.
+_MAY_WRITE = re.compile(rb"\bfile\b|dest|output|&#|include", re.IGNORECASE)
+_READ_FILES = {"rerouter", "variableSpeedSign"}  # elements whose `file` is read
+_NOWHERE = "NUL"  # as SUMO calls it
+_ENCODING = re.compile(rb"""<\?xml[^>]*?encoding\s*=\s*["']([\w.:-]+)["']""")
+_ASCII_BELOW = {"utf-8", "utf8", "ascii", "us-ascii", "iso-8859-1", "latin-1", "windows-1252"}
 
 
 @dataclass(frozen=True)
@@ -85,14 +104,42 @@ def read_input(demand: Sequence[Path]) -> SumoInput:
 
 
 def without_outputs(path: Path, folder: Path) -> Path:
-    """An additional file whose detectors write nothing: a copy in `folder` where there are any."""
+    """A demand file by which SUMO writes nothing: a copy in `folder` where it would.
+
+    Raises:
+        ConfigError: it includes another file, or its encoding cannot be searched.
+    """
     content = read_bytes(path)
-    silenced = _OUTPUT.sub(lambda tag: _DESTINATION.sub(rb'\1="NUL"', tag[0]), content)
-    if silenced == content:
+    given = _ENCODING.match(content)
+    encoding = given[1].decode().lower() if given else "utf-8"
+    if encoding not in _ASCII_BELOW or 0 in content[:4]:  # UTF-16 and 32 begin with such a byte
+        raise ConfigError(f"{path}: encoded as {encoding} or UTF-16: save it as UTF-8")
+    if not _MAY_WRITE.search(content):
+        return path
+    root = _root(path)
+    changes = [_silence(element, path) for element in root.iter()]
+    if not any(changes):
         return path
     copy = folder / f"{len(list(folder.iterdir()))}_{path.name.removesuffix('.gz')}"
-    copy.write_bytes(silenced)
+    copy.write_bytes(tostring(root, encoding="utf-8", xml_declaration=True))
     return copy
+
+
+def _silence(element: Element, path: Path) -> bool:
+    """Send nowhere what SUMO would write by an element; whether it would write something."""
+    if element.tag == "include":
+        raise ConfigError(f"{path}: <include> is not followed: put the content into the file")
+    changes = {}
+    for name, value in element.attrib.items():
+        if name == "file" and element.tag in _READ_FILES:
+            changes[name] = str((path.parent / value).resolve())
+        elif name in ("file", "dest", "output"):
+            changes[name] = _NOWHERE
+    key = element.get("key", "")
+    if element.tag == "param" and (key == "file" or key.endswith(".file") or "output" in key):
+        changes["value"] = _NOWHERE
+    element.attrib.update(changes)
+    return bool(changes)
 
 
 def _read_config(path: Path) -> SumoInput:
@@ -107,8 +154,14 @@ def _read_config(path: Path) -> SumoInput:
                 files[_INPUTS[option.tag]] += [path.parent / name for name in names if name]
             elif section.tag == "time" and option.tag in ("begin", "b"):
                 begin = value
-            elif section.tag not in _DROPPED_SECTIONS:
+            elif section.tag in _DROPPED_SECTIONS or _REPORTS.fullmatch(option.tag):
+                continue
+            elif _CHANGES_TRAFFIC.fullmatch(option.tag):
                 options[option.tag] = value
+            else:
+                raise ConfigError(
+                    f"{path}: <{option.tag}>: is no option that changes traffic: take it out"
+                )
     missing = [name for group in files.values() for name in group if not isfile(name)]
     if missing:
         raise ConfigError(f"{path}: names {missing[0]}, which is not there")
@@ -144,6 +197,8 @@ def _readable(path: Path) -> Iterator[None]:
         raise ConfigError(f"{path}, line {error.position[0]}: broken XML ({error})") from error
     except DefusedXmlException as error:
         raise ConfigError(f"{path}: declares a document type or entities: remove them") from error
+    except (ValueError, LookupError) as error:
+        raise ConfigError(f"{path}: cannot be decoded ({error}): save it as UTF-8") from error
     except (gzip.BadGzipFile, EOFError) as error:
         raise ConfigError(f"{path}: broken gzip ({error}): make the file again") from error
     except OSError as error:

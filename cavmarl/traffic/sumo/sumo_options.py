@@ -31,9 +31,10 @@ def command_words(
     copies = folder / "additional"
     copies.mkdir(exist_ok=True)
     files = [str(without_outputs(path, copies)) for path in demand.additional_files]
+    routes = [str(without_outputs(path, copies)) for path in demand.route_files]
     options = demand.options | {
         "net-file": str(map_file),
-        "route-files": ",".join(map(str, demand.route_files)),
+        "route-files": ",".join(routes),
         "additional-files": ",".join([*files, *map(str, additional)]),
         "begin": str(demand.begin_s),
         "step-length": repr(dt_s),
