@@ -29,7 +29,7 @@ from cavmarl.bench.harness import (
     spread,
     take_turns,
 )
-from cavmarl.cli.output import JsonPath, print_error, write_json
+from cavmarl.cli.output import JsonPath, about, print_error, write_json
 from cavmarl.core.errors import CavmarlError
 from cavmarl.evaluate.provenance.machine import describe_hardware
 
@@ -54,11 +54,6 @@ __all__ = [
 Env = Annotated[
     str, typer.Argument(metavar="[ENV]", help="Name, folder or map file of an environment.")
 ]
-
-
-def about(text: str, *names: str, **more: Any) -> Any:
-    """An option with a help text."""
-    return typer.Option(*names, help=text, **more)
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,12 @@ import yaml
 
 from benchmarks.harness import Env, Report, Say, about, run, silent
 from cavmarl.bench.sensor_bench import first_job, job_config, run_job
-from cavmarl.bench.sensor_rig import Rig, find_rig, load_rig
-from cavmarl.bench.sensor_run import SensorJob
+from cavmarl.bench.sensor_run import Rig, SensorJob, load_rig
 from cavmarl.cli.output import Seed, Settings, parse_settings
 from cavmarl.config.env import EnvConfig
+from cavmarl.config.registry import find_settings
 from cavmarl.config.rig import MAX_SAMPLE_NUMBERS, MountedConfig
+from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
 
 TRIES = 8  # to find a load
@@ -49,12 +50,12 @@ def measure(
     """Find resolutions at which a rig takes so long a tick, and write it as a file."""
     if not 0.0 < load <= 1e4:
         raise ConfigError(f"load {load:g} ms: must be above 0 and at most 10000")
-    sensors, vehicles = load_rig(find_rig(rig)), (agents, background)
-    steps = (TRIED_STEPS, TRIED_STEPS)
-    job = first_job(env, sensors, parse_settings(settings), vehicles, steps, seed)
+    keys = {"agents": agents, "background": background, "seed": seed}
+    spec = WorldSpec(env=env, overrides=parse_settings(settings), **keys)
+    job = first_job(spec, load_rig(find_settings("rig", rig)), (TRIED_STEPS, TRIED_STEPS))
     found = loaded(job, load, say)
     try:
-        out.write_text(yaml.safe_dump(_plain(found.overrides["rig"])), encoding="utf-8")
+        out.write_text(yaml.safe_dump(_plain(found.spec.overrides["rig"])), encoding="utf-8")
     except OSError as error:
         raise ConfigError(f"--out {out}: cannot be written ({error.strerror})") from error
     config = job_config(found)
@@ -65,7 +66,7 @@ def measure(
         {"sensor": "name", "sample": "shape"},
         rows,
         notes=[f"cavmarl bench sensors {env} --rig {out} --set clock.ctrl_dt_s={dt_s:g}"],
-        facts={"load_ms": load, "rig": _plain(found.overrides["rig"])},
+        facts={"load_ms": load, "rig": _plain(found.spec.overrides["rig"])},
     )
 
 
@@ -86,7 +87,7 @@ def loaded(job: SensorJob, load_ms: float, say: Say) -> SensorJob:
     even, found_ms = _evened(job, load_ms, say), 0.0
     scale, light, heavy = 1.0, 0.0, math.inf
     for _ in range(TRIES):
-        tried = _scaled_by(even, dict.fromkeys(even.overrides["rig"], scale))
+        tried = _scaled_by(even, dict.fromkeys(even.spec.overrides["rig"], scale))
         found_ms, _ = _tried(tried, load_ms, say)
         if load_ms <= found_ms <= TOO_MUCH * load_ms:
             return tried
@@ -105,8 +106,8 @@ def loaded(job: SensorJob, load_ms: float, say: Say) -> SensorJob:
 def _evened(job: SensorJob, load_ms: float, say: Say) -> SensorJob:
     """The job with each sensor due in every tick, and taking about its share of a load."""
     dt_s = job_config(job).clock.sim_dt_s
-    even = replace(job, overrides={**job.overrides, "clock.ctrl_dt_s": dt_s})
-    factors = dict.fromkeys(job.overrides["rig"], 1.0)
+    even = _changed(job, {"clock.ctrl_dt_s": dt_s})
+    factors = dict.fromkeys(job.spec.overrides["rig"], 1.0)
     share_ms = load_ms / len(factors)
     for grown in (False, True):  # what a sensor takes at a low resolution says little
         even = _scaled_by(even, factors)
@@ -114,14 +115,18 @@ def _evened(job: SensorJob, load_ms: float, say: Say) -> SensorJob:
         if grown:  # some cannot take their share: the others get what is left of it
             share_ms *= MARGIN * load_ms / found_ms
         for name, cost_ms in zip(factors, costs_ms, strict=True):
-            factors[name] = share_ms / (cost_ms * job.agents) if cost_ms else 1.0
+            factors[name] = share_ms / (cost_ms * (job.spec.agents or 1)) if cost_ms else 1.0
     return _scaled_by(even, factors)
+
+
+def _changed(job: SensorJob, values: Mapping[str, Any]) -> SensorJob:
+    return replace(job, spec=replace(job.spec, overrides={**job.spec.overrides, **values}))
 
 
 def _scaled_by(job: SensorJob, factors: Mapping[str, float]) -> SensorJob:
     config = job_config(job)
     rig = scaled(config, factors, 1.0 / config.clock.sim_dt_s)
-    return replace(job, overrides={**job.overrides, "rig": rig})
+    return _changed(job, {"rig": rig})
 
 
 def _tried(job: SensorJob, load_ms: float, say: Say) -> tuple[float, Sequence[float]]:

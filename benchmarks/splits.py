@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
+from dataclasses import replace
 from statistics import median
 from typing import Annotated, Any
 
@@ -11,6 +11,7 @@ from benchmarks.harness import Env, Report, Say, about, numbers_of, paired_ratio
 from cavmarl.bench.worker_speed import Measured
 from cavmarl.cli.output import Agents, Background, Seed, Settings, parse_settings
 from cavmarl.config.registry import load_config
+from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError, EvaluationError
 
 
@@ -37,18 +38,18 @@ def measure(
             f"{workers} workers, {steps} steps, {repeats} turns: must be at least 2, 1 and 1"
         )
     numbers = numbers_of("--vehicles", vehicles) if vehicles else [None]
-    overrides = parse_settings(settings)
+    spec = WorldSpec(env=env, agents=agents, seed=seed, overrides=parse_settings(settings))
     rows = []
     for number in numbers:
         say(f"splitting one world of {'its' if number is None else number} vehicles")
         others = background
         if number is not None:
-            config, _ = load_config(env, agents=agents, overrides=overrides)
+            config, _ = load_config(env, **spec.keywords)
             others = number - config.population.agents
             if others < 0:
                 raise ConfigError(f"{number} vehicles: agents alone are {config.population.agents}")
-        wanted = {"agents": agents, "background": others, "overrides": overrides}
-        rows.append(_measured(env, zones or workers, workers, steps, repeats, seed, wanted))
+        wanted = replace(spec, background=others)
+        rows.append(_measured(wanted, zones or workers, workers, steps, repeats))
     line = split_line([(row["vehicles"], row["ratio"]) for row in rows])
     return Report(
         f"{env}: one world undivided, and in {zones or workers} zones over one and {workers} "
@@ -81,18 +82,12 @@ def split_line(found: Sequence[tuple[int, float]]) -> int | None:
 
 
 def _measured(
-    env: str | Path,
-    zones: int,
-    workers: int,
-    steps: int,
-    repeats: int,
-    seed: int,
-    wanted: Mapping[str, Any],
+    spec: WorldSpec, zones: int, workers: int, steps: int, repeats: int
 ) -> dict[str, Any]:
     measured: list[Measured] = []
     try:
         for count, parts in ((0, 1), (1, zones), (workers, zones)):
-            measured.append(Measured(env, count, seed, {**wanted, "zones": parts}))
+            measured.append(Measured(spec, count, zones=parts))
         for _ in range(repeats):
             for one in measured:
                 one.count_turn(steps)
@@ -102,7 +97,7 @@ def _measured(
         for one in measured:
             one.vec.close()
     if len(hashes) > 1:
-        raise EvaluationError(f"{env}: the worlds in {zones} zones are not the undivided one")
+        raise EvaluationError(f"{spec.env}: the worlds in {zones} zones are not the undivided one")
     undivided, whole, split = (one.row(repeats * steps).step_ms for one in measured)
     return {
         "vehicles": running,

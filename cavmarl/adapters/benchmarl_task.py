@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from cavmarl.adapters.decided import refuse_decided
+from cavmarl.adapters.observations import refuse_decided
 from cavmarl.adapters.torchrl_env import GROUP, CavTorchRLEnv
 from cavmarl.core.errors import missing
 

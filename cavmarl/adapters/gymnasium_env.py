@@ -7,7 +7,7 @@ from typing import Any
 
 import gymnasium
 
-from cavmarl.adapters.decided import refuse_decided
+from cavmarl.adapters.observations import refuse_decided
 from cavmarl.config.registry import load_config
 from cavmarl.env.parallel import CavEnv, parallel_env
 

@@ -11,8 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from cavmarl.adapters.decided import refuse_decided
-from cavmarl.adapters.observations import ObservationForm, Observations
+from cavmarl.adapters.observations import ObservationForm, Observations, refuse_decided
 from cavmarl.config.registry import load_config
 from cavmarl.core.errors import ConfigError
 from cavmarl.env.vector import CavVectorEnv, make_vec

@@ -1,7 +1,8 @@
-"""What agents observe, in the form that `observation.kind` asks for."""
+"""What the views share: observations in the form of `observation.kind`, keys that views decide."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,15 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.engine.spaces import named_observation, observation_parts, observation_space
 
 Observations = NDArray[np.float32] | dict[str, NDArray[Any]]
+
+
+def refuse_decided(keys: Iterable[str], *given: Mapping[str, Any] | None) -> None:
+    """Refuse keywords and overrides of a caller that hold keys which the view decides."""
+    for key in keys:
+        if any(key in mapping for mapping in given if mapping is not None):
+            raise ConfigError(
+                f"{key}: this view decides it; cavmarl.parallel_env and make_vec leave it to you"
+            )
 
 
 class ObservationForm:

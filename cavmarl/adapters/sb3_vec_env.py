@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.adapters.decided import refuse_decided
-from cavmarl.adapters.observations import ObservationForm, Observations
+from cavmarl.adapters.observations import ObservationForm, Observations, refuse_decided
 from cavmarl.config.env import TERMS
 from cavmarl.core.errors import missing
 from cavmarl.env.vector import make_vec

@@ -15,8 +15,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from cavmarl.adapters.decided import refuse_decided
-from cavmarl.adapters.observations import ObservationForm
+from cavmarl.adapters.observations import ObservationForm, refuse_decided
 from cavmarl.core.errors import missing
 from cavmarl.core.seeds import check_seed
 from cavmarl.env.vector import CavVectorEnv, make_vec

@@ -1,24 +1,25 @@
 """How far the clock of a follower in another process drifts from its master's: Table II.
 
-The table of the co-simulation paper has, at some steps, the time of the master, that of the
-follower, the same from when it has joined on, their difference and their ratio. Both clocks are
-read where they are: the master's here, the follower's in its own process, from what it is sent.
+The table is that of the co-simulation paper. Both clocks are read where they are: the master's
+here, the follower's in its own process, from what it is sent.
 """
 
 from __future__ import annotations
 
 import csv
 import json
+import math
 import subprocess
 import sys
 from dataclasses import asdict, dataclass
 from fractions import Fraction
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Unpack
 
-from cavmarl.bench.harness import Result
-from cavmarl.core.errors import ConfigError, EvaluationError
+from cavmarl.bench.harness import Result, check_range
+from cavmarl.config.world_spec import WorldKeys, WorldSpec
+from cavmarl.core.errors import EvaluationError
 from cavmarl.cosim.followers.followed_world import FollowedWorld
 from cavmarl.cosim.time_master import OwnTicks
 from cavmarl.env.parallel import parallel_env
@@ -56,9 +57,7 @@ class ClockDrift(Result):
     own_ticks: int  # how often it did, by its own count
     counted: int  # the same by the master's
     drift_events: int  # how often the master has noticed that the world had gone on without it
-    # ticks of the master from the first such tick until it noticed; None: there was none, or it did
-    # not notice
-    noticed_ticks: int | None
+    noticed_ticks: int | None  # of the master, from the first such tick on; None: it did not
 
     @property
     def holds(self) -> bool:
@@ -69,56 +68,39 @@ class ClockDrift(Result):
 
 
 def measure_drift(
-    env: str,
+    env: str | Path | WorldSpec,
     *,
     steps: int,
     rogue: float = 0.0,
     answer: OwnTicks = "obey",
-    seed: int = 0,
-    overrides: dict[str, Any] | None = None,
+    **keys: Unpack[WorldKeys],
 ) -> ClockDrift:
     """Run a world as master, with a follower in a process of its own that reads its clock."""
-    if steps < 1:
-        raise ConfigError(f"steps = {steps}: must be at least 1")
-    if not 0.0 <= rogue <= 1.0:
-        raise ConfigError(f"rogue = {rogue}: must be a share, from 0 to 1")
-    settings = {"population.mode": "respawn", **(overrides or {})}
-    made = parallel_env(env, overrides=settings)
+    check_range(steps=(steps, 1, math.inf), rogue=(rogue, 0.0, 1.0))
+    spec = WorldSpec.of(env, **keys)
+    settings = {"population.mode": "respawn", **spec.overrides}
+    made = parallel_env(spec.env, overrides=settings)
     dt_s = made.config.clock.sim_dt_s
     settings |= {"clock.ctrl_dt_s": dt_s, "horizon_s": dt_s * (BEFORE + 2 * steps + 1)}
     with (
         TemporaryDirectory() as folder,
         FollowedWorld(
-            parallel_env(env, overrides=settings),
+            parallel_env(spec.env, overrides=settings),
             Path(folder) / "clock.sock",
             timeout_s=TIMEOUT_S,
             own_ticks=answer,
             on_drift="record",
         ) as world,
     ):
-        world.reset(seed)
+        world.reset(spec.seed)
         for _ in range(BEFORE):
             world.step()
-        command = [sys.executable, "-m", PROGRAM, str(world.address), str(rogue)]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-            try:
-                world.wait_for(1, JOINS_S)
-                joined = world.master.tick
-                clock = [0]
-                for _ in range(steps):
-                    world.step()
-                    clock.append(world.master.tick - joined)
-                master = world.master
-                master.look_for_drift()
-                world.close()
-                told, _ = process.communicate(timeout=ENDS_S)
-            finally:
-                process.kill()
-        if process.returncode:
-            raise EvaluationError(f"{PROGRAM} ended with {process.returncode}; see its own words")
-    read = json.loads(told)
-    own = [event.tick for event in master.events if event.kind == "own_tick"]
-    drifts = [event.tick for event in master.events if event.kind == "drift"]
+        clock, read = _followed(world, steps, rogue)
+        master = world.master
+    own, drifts = (
+        [event.tick for event in master.events if event.kind == kind]
+        for kind in ("own_tick", "drift")
+    )
     return ClockDrift(
         environment=made.metadata["name"],
         dt_s=dt_s,
@@ -130,6 +112,27 @@ def measure_drift(
         drift_events=master.drifts,
         noticed_ticks=drifts[0] - own[0] if own and drifts else None,
     )
+
+
+def _followed(world: FollowedWorld, steps: int, rogue: float) -> tuple[list[int], dict[str, Any]]:
+    """The master's ticks after each step since the follower has joined, and what that has read."""
+    command = [sys.executable, "-m", PROGRAM, str(world.address), str(rogue)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            world.wait_for(1, JOINS_S)
+            joined = world.master.tick
+            clock = [0]
+            for _ in range(steps):
+                world.step()
+                clock.append(world.master.tick - joined)
+            world.master.look_for_drift()
+            world.close()
+            told, _ = process.communicate(timeout=ENDS_S)
+        finally:
+            process.kill()
+    if process.returncode:
+        raise EvaluationError(f"{PROGRAM} ended with {process.returncode}; see its own words")
+    return clock, json.loads(told)
 
 
 def rows_of(master: list[int], follower: list[int], dt_s: float) -> tuple[DriftRow, ...]:
@@ -153,7 +156,6 @@ def rows_of(master: list[int], follower: list[int], dt_s: float) -> tuple[DriftR
 
 
 def write_rows(path: Path, rows: tuple[DriftRow, ...]) -> None:
-    """Write the table as CSV."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(asdict(rows[0])))
         writer.writeheader()

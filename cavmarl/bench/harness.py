@@ -45,16 +45,11 @@ def spread(values: Iterable[float]) -> Spread:
 
 
 class Result:
-    """A dataclass whose derived figures stand in its JSON beside its fields.
+    """A dataclass whose derived figures stand in its JSON beside its fields."""
 
-    Attributes:
-        DERIVED: names of the properties that are written, too.
-    """
-
-    DERIVED: ClassVar[tuple[str, ...]] = ()
+    DERIVED: ClassVar[tuple[str, ...]] = ()  # properties that are written, too
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
         derived = {name: getattr(self, name) for name in self.DERIVED}
         return {**asdict(self), **derived}  # type: ignore[call-overload]
 
@@ -62,13 +57,7 @@ class Result:
 def take_turns(
     sides: Mapping[Key, Callable[[], Taken]], repeats: int, say: Say = silent
 ) -> dict[Key, tuple[Taken, ...]]:
-    """Measure every side once a turn, all sides one after the other.
-
-    Args:
-        sides: by name; a call measures one turn and returns what it took.
-        repeats: number of turns.
-        say: told which turn it is.
-    """
+    """Call every side once a turn, all sides one after the other; what each turn took, by side."""
     found: dict[Key, list[Taken]] = {name: [] for name in sides}
     for turn in range(1, repeats + 1):
         say(f"measuring, {turn} of {repeats}")
@@ -97,11 +86,7 @@ def one_core() -> Iterator[None]:
 
 
 def check_range(**limits: tuple[float, float, float]) -> None:
-    """Refuse numbers that are not from the second to the third of their limits.
-
-    Raises:
-        ConfigError: a number out of range.
-    """
+    """Refuse numbers that are not from the second to the third of their limits."""
     for name, (value, least, most) in limits.items():
         if not least <= value <= most:
             bounds = f"at least {least:g}" if math.isinf(most) else f"from {least:g} to {most:.15g}"
@@ -109,21 +94,13 @@ def check_range(**limits: tuple[float, float, float]) -> None:
 
 
 def check_positive(option: str, value: float | None) -> None:
-    """Refuse a bound that nothing can be measured against; None: there is no bound.
-
-    Raises:
-        ConfigError: not a finite number above 0.
-    """
+    """Refuse a bound that nothing can be measured against; None: there is no bound."""
     if value is not None and not 0.0 < value < math.inf:
         raise ConfigError(f"{option} {value:g}: must be a number above 0")
 
 
 def numbers_of(option: str, text: str) -> list[int]:
-    """The whole numbers of an option such as `--zones 1,4,9`.
-
-    Raises:
-        ConfigError: something else.
-    """
+    """The whole numbers of an option such as `--zones 1,4,9`."""
     try:
         return [int(word) for word in text.split(",")]
     except ValueError:
@@ -132,7 +109,6 @@ def numbers_of(option: str, text: str) -> list[int]:
 
 @contextmanager
 def measuring(console: Console) -> Iterator[Say]:
-    """A status line on the terminal while something is measured; `say` changes its text."""
     with console.status("") as status:
         yield status.update
 
@@ -143,14 +119,7 @@ def make_table(
     rows: Iterable[Sequence[str] | None],
     caption: str | None = None,
 ) -> Table:
-    """A table whose first column is text and whose others are numbers.
-
-    Args:
-        title: above it.
-        columns: the head.
-        rows: cells; None: a line between.
-        caption: below it.
-    """
+    """A table whose first column is text and whose others are numbers; row None: a line between."""
     table = Table(title=escape(title), caption=caption)
     for place, column in enumerate(columns):
         table.add_column(column, justify="right" if place else "left", no_wrap=not place)
@@ -163,5 +132,4 @@ def make_table(
 
 
 def hardware_line(hardware: Mapping[str, Any]) -> str:
-    """The processor, and how many cores may be used."""
     return f"{hardware['cpu']}, {hardware['usable_cores']} cores"

@@ -19,14 +19,8 @@ from cavmarl.core.errors import require
 class HighwayRows(VecEnvWrapper):
     """Each controlled vehicle is a row; the rows of a world end together, and are paid alike.
 
-    Args:
-        worlds: one process each.
-        agents: controlled vehicles of a world; there are no others.
-        observation: of each, as highway-env's settings say it.
-        horizon_s: after which a world begins anew.
-
-    Attributes:
-        simulated_s: time that all steps have taken, with what goes between the processes.
+    A world is a process; it has no other vehicles, and begins anew after `horizon_s`. `observation`
+    is as highway-env's settings say it.
     """
 
     def __init__(
@@ -42,7 +36,7 @@ class HighwayRows(VecEnvWrapper):
         )
         self._agents = agents
         self.num_envs = worlds * agents
-        self.simulated_s = 0.0
+        self.simulated_s = 0.0  # of all steps, with what goes between the processes
 
     def reset(self) -> NDArray[np.float32]:
         """Begin all worlds; observations (W · A, D)."""
@@ -54,17 +48,15 @@ class HighwayRows(VecEnvWrapper):
         self.venv.step_async(actions.reshape(-1, self._agents))
 
     def step_wait(self) -> Any:
-        """What the processes send back."""
         observations, rewards, done, infos = self.venv.step_wait()
         self.simulated_s += time.perf_counter() - self._began
         each = self._agents
         told: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for world in np.flatnonzero(done).tolist():
             info = infos[world]
+            cut = {"TimeLimit.truncated": info["TimeLimit.truncated"]}
             for k, last in enumerate(info["terminal_observation"]):
-                cut = info["TimeLimit.truncated"]
-                row = {"terminal_observation": last, "TimeLimit.truncated": cut}
-                told[world * each + k] = row
+                told[world * each + k] = {"terminal_observation": last, **cut}
         return self._rows(observations), rewards.repeat(each), done.repeat(each), told
 
     def _rows(self, observations: Any) -> NDArray[np.float32]:

@@ -63,14 +63,8 @@ def highway_env(agents: int, observation: dict[str, Any]) -> Any:
         "simulation_frequency": SIM_HZ,
         "policy_frequency": CONTROL_HZ,
         "offscreen_rendering": True,
-        "action": {
-            "type": "MultiAgentAction",
-            "action_config": {"type": "DiscreteMetaAction"},
-        },
-        "observation": {
-            "type": "MultiAgentObservation",
-            "observation_config": observation,
-        },
+        "action": {"type": "MultiAgentAction", "action_config": {"type": "DiscreteMetaAction"}},
+        "observation": {"type": "MultiAgentObservation", "observation_config": observation},
     }
     env = gymnasium.make("highway-v0", config=config).unwrapped
     env.reset(seed=0)
@@ -85,18 +79,17 @@ def length_m(env: Any) -> float:
 
 
 def straight_road(folder: Path, road_m: float) -> Path:
-    """Write a SUMO net: a straight `road`, and an `end` that nobody reaches while it is measured.
-
-    Returns:
-        the file, named after its length.
-    """
+    """Write a SUMO net: a straight `road`, and an `end` that is not reached in a measurement."""
     whole_m = road_m + RUN_OUT_M
+
+    # Of the lanes' centres; lane 0 is the rightmost, driving to the east.
+    ys = [f"{(k - LANES) * LANE_WIDTH_M:.2f}" for k in range(LANES)]
 
     def lanes(edge: str, begin_m: float, end_m: float) -> str:
         return "".join(
             f'<lane id="{edge}_{k}" index="{k}" speed="{SPEED_MPS}" length="{end_m - begin_m:.2f}" '
-            f'shape="{begin_m:.2f},{_lane_y(k):.2f} {end_m:.2f},{_lane_y(k):.2f}"/>'
-            for k in range(LANES)
+            f'shape="{begin_m:.2f},{y} {end_m:.2f},{y}"/>'
+            for k, y in enumerate(ys)
         )
 
     incoming = {edge: " ".join(f"{edge}_{k}" for k in range(LANES)) for edge in ("road", "end")}
@@ -121,8 +114,3 @@ def straight_road(folder: Path, road_m: float) -> Path:
         encoding="utf-8",
     )
     return path
-
-
-def _lane_y(index: int) -> float:
-    """Of a lane's centre; lane 0 is the rightmost, driving to the east."""
-    return (index - LANES) * LANE_WIDTH_M

@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
-import json
-import os
 import random
-import signal
-import statistics
-import subprocess
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from statistics import fmean, median
+from typing import Any, ClassVar, Unpack
 
-from cavmarl.bench.core_ceiling import CoreCeiling, measure_ceiling
 from cavmarl.bench.harness import Result, Say, silent
-from cavmarl.bench.sensor_rig import Rig
-from cavmarl.bench.sensor_run import PARTS, SensorJob, SensorRun, Window
+from cavmarl.bench.sensor_run import PARTS, Rig, SensorJob, SensorRun, Window, run_sensors
 from cavmarl.bench.sensor_scaling import ScalingRow, Series, scaling_table, summarize
+from cavmarl.bench.worker_speed import CoreCeiling, measure_ceiling
 from cavmarl.config.env import EnvConfig
 from cavmarl.config.registry import load_config
-from cavmarl.core import errors
-from cavmarl.core.errors import ConfigError, EvaluationError
-from cavmarl.evaluate.provenance.machine import describe_code, describe_hardware, describe_software
+from cavmarl.config.world_spec import WorldKeys, WorldSpec
+from cavmarl.core.errors import ConfigError
+from cavmarl.evaluate.fresh import call_in_fresh_process
+from cavmarl.evaluate.provenance.machine import describe_machine
 from cavmarl.parallel.processes.process_barrier import usable_cores
 from cavmarl.parallel.sensor_workers.line_costs import LineCosts
 from cavmarl.parallel.sensor_workers.sensor_shares import (
@@ -35,7 +30,6 @@ from cavmarl.parallel.sensor_workers.sensor_shares import (
 )
 
 MAX_WORKERS = 64
-PROGRAM = "cavmarl.bench.sensor_run"
 CEILING_STEPS, CEILING_TURNS = 10, 7
 
 
@@ -63,8 +57,7 @@ class SensorBench(Result):
     seed: int  # of every run, and of their order
     placement: str  # how sensors were shared out: by `cost` or `in_turn`
     turns: tuple[Turn, ...]  # all runs, in their order
-    # how much faster programs that share nothing do the same sensing side by side, as many as the
-    # most workers for which there are cores; None: only one
+    # of as many programs with the same sensing as the most workers that have a core; None: one
     ceiling: CoreCeiling | None
 
     def of(self, workers: int) -> list[SensorRun]:
@@ -73,12 +66,10 @@ class SensorBench(Result):
 
     @property
     def numbers(self) -> list[int]:
-        """Of sensor workers."""
         return sorted({turn.workers for turn in self.turns})
 
     @property
     def rows(self) -> list[ScalingRow]:
-        """Every derived figure."""
         series = {
             workers: [Series(run.step_ms, run.wait_ms) for run in self.of(workers)]
             for workers in self.numbers
@@ -91,25 +82,19 @@ class SensorBench(Result):
         return len({turn.run.digests for turn in self.turns}) == 1
 
     def parts_ms(self, workers: int) -> dict[str, float]:
-        """The mean of each part of a step."""
         runs = self.of(workers)
-        return {
-            name: statistics.fmean(statistics.fmean(run.parts_ms[name]) for run in runs)
-            for name in PARTS
-        }
+        return {name: fmean(fmean(run.parts_ms[name]) for run in runs) for name in PARTS}
 
     @property
     def sensing_ms(self) -> float:
         """What the sensors take in a tick where the fewest workers share them."""
-        runs = self.of(self.numbers[0])
-        compute = statistics.fmean(statistics.fmean(run.parts_ms["sensor compute"]) for run in runs)
-        return compute / runs[0].ticks_per_step
+        least = self.numbers[0]
+        return self.parts_ms(least)["sensor compute"] / self.of(least)[0].ticks_per_step
 
     @property
     def costs_ms(self) -> list[float]:
         """Of one frame of each sensor, median of all runs."""
-        columns = zip(*(turn.run.costs_ms for turn in self.turns), strict=True)
-        return [statistics.median(column) for column in columns]
+        return [median(of) for of in zip(*(turn.run.costs_ms for turn in self.turns), strict=True)]
 
     def shares(self, workers: int) -> dict[str, Shares]:
         """Both ways to share out all sensors of one vehicle, by what they have cost.
@@ -134,7 +119,6 @@ class SensorBench(Result):
         return list(self.of(workers)[-1].windows)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
         numbers = self.numbers
         shares = {
             number: {name: asdict(found) for name, found in self.shares(number).items()}
@@ -146,71 +130,26 @@ class SensorBench(Result):
             "sd": "sd_within_run is the sample standard deviation (n - 1) of steps within a run",
             "parts_ms": {number: self.parts_ms(number) for number in numbers},
             "shares": shares,
-            "hardware": describe_hardware(),
-            "software": describe_software(),
-            "code": describe_code(),
+            **describe_machine(),
         }
 
 
 def measure_sensor_workers(
-    env: str | Path,
+    env: str | Path | WorldSpec,
     rig: Rig,
     *,
     workers: Sequence[int] = (1, 2, 3, 4),
     warmup: int = 40,
     steps: int = 150,
     repeats: int = 5,
-    agents: int = 1,
-    background: int = 0,
-    seed: int = 0,
-    overrides: Mapping[str, Any] | None = None,
     say: Say = silent,
+    **keys: Unpack[WorldKeys],
 ) -> SensorBench:
     """Run the same world with each number of sensor workers, in a random order.
 
-    Every run has processes of its own, which share nothing with those of another but files.
+    Every run has processes of its own, which share nothing with those of another but files. By
+    default one agent has the rig, and there are no other vehicles.
     """
-    _check(workers, warmup, steps, repeats)
-    job = first_job(env, rig, overrides or {}, (agents, background), (warmup, steps), seed)
-    order = [(repeat, number) for repeat in range(1, repeats + 1) for number in workers]
-    random.Random(seed).shuffle(order)
-    turns = []
-    for place, (repeat, number) in enumerate(order, 1):
-        say(f"run {place} of {len(order)}: {number} sensor workers")
-        run = run_job(replace(job, sensor_workers=number))
-        turns.append(Turn(repeat, place, number, run))
-    return SensorBench(
-        env=str(env),
-        agents=agents,
-        background=background,
-        warmup=warmup,
-        steps=steps,
-        seed=seed,
-        placement=job_config(job).workers.sensor_placement,
-        turns=tuple(turns),
-        ceiling=_ceiling(job, workers, say),
-    )
-
-
-def _ceiling(job: SensorJob, workers: Sequence[int], say: Say) -> CoreCeiling | None:
-    """What the machine allows with as many workers as it has cores for; see `SensorBench`."""
-    programs = max((number for number in workers if number <= len(usable_cores())), default=1)
-    if programs == 1:
-        return None
-    say(f"{programs} programs that share nothing")
-    return measure_ceiling(
-        job.env,
-        worlds=programs,
-        programs=programs,
-        steps=CEILING_STEPS,
-        repeats=CEILING_TURNS,
-        seed=job.seed,
-        wanted={name: getattr(job, name) for name in ("agents", "background", "overrides")},
-        alike=True,
-    )
-
-
-def _check(workers: Sequence[int], warmup: int, steps: int, repeats: int) -> None:
     if not workers or len(set(workers)) < len(workers) or not 1 <= min(workers) <= max(workers):
         raise ConfigError(f"workers {list(workers)}: must be numbers from 1, each once")
     if max(workers) > MAX_WORKERS:
@@ -220,67 +159,54 @@ def _check(workers: Sequence[int], warmup: int, steps: int, repeats: int) -> Non
             f"{warmup} steps of warm-up, {steps} steps, {repeats} repeats: must be at least 0, 2 "
             "and 1"
         )
+    job = first_job(WorldSpec.of(env, **keys), rig, (warmup, steps))
+    spec = job.spec
+    order = [(repeat, number) for repeat in range(1, repeats + 1) for number in workers]
+    random.Random(spec.seed).shuffle(order)
+    turns = []
+    for place, (repeat, number) in enumerate(order, 1):
+        say(f"run {place} of {len(order)}: {number} sensor workers")
+        run = run_job(replace(job, sensor_workers=number))
+        turns.append(Turn(repeat, place, number, run))
+    return SensorBench(
+        env=spec.env,
+        agents=spec.agents or 0,
+        background=spec.background or 0,
+        warmup=warmup,
+        steps=steps,
+        seed=spec.seed,
+        placement=job_config(job).workers.sensor_placement,
+        turns=tuple(turns),
+        ceiling=_ceiling(spec, workers, say),
+    )
 
 
-def first_job(
-    env: str | Path,
-    rig: Rig,
-    overrides: Mapping[str, Any],
-    vehicles: tuple[int, int],
-    steps: tuple[int, int],
-    seed: int,
-) -> SensorJob:
+def _ceiling(spec: WorldSpec, workers: Sequence[int], say: Say) -> CoreCeiling | None:
+    """What the machine allows with as many workers as it has cores for; see `SensorBench`."""
+    programs = max((number for number in workers if number <= len(usable_cores())), default=1)
+    if programs == 1:
+        return None
+    say(f"{programs} programs that share nothing")
+    counts: dict[str, Any] = {"worlds": programs, "programs": programs}
+    return measure_ceiling(spec, **counts, steps=CEILING_STEPS, repeats=CEILING_TURNS, alike=True)
+
+
+def first_job(spec: WorldSpec, rig: Rig, steps: tuple[int, int]) -> SensorJob:
     """The run with one sensor worker; no episode ends in it, whatever a step is.
 
-    Args:
-        env: as in `make_vec`.
-        rig: sensors of each agent, by name.
-        overrides: values for any other key.
-        vehicles: agents, which have the sensors, and others.
-        steps: of the warm-up, and those that count.
-        seed: root of all random numbers.
+    `steps` are those of the warm-up, and those that count.
     """
-    given = {"horizon_s": float(10 * (sum(steps) + 1)), **overrides, "rig": rig}
-    return SensorJob(str(env), given, *vehicles, 1, *steps, seed)
+    given = {"horizon_s": float(10 * (sum(steps) + 1)), **spec.overrides, "rig": rig}
+    agents = 1 if spec.agents is None else spec.agents
+    wanted = replace(spec, agents=agents, background=spec.background or 0, overrides=given)
+    return SensorJob(wanted, 1, *steps)
 
 
 def job_config(job: SensorJob) -> EnvConfig:
-    """The environment of a run."""
-    config, _ = load_config(
-        job.env, agents=job.agents, background=job.background, overrides=job.overrides
-    )
-    return config
+    return load_config(job.spec.env, **job.spec.keywords)[0]
 
 
 def run_job(job: SensorJob) -> SensorRun:
-    """A run in a group of processes of its own."""
-    program = subprocess.Popen(
-        [sys.executable, "-W", "ignore", "-m", PROGRAM],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        process_group=0,
-    )
-    try:
-        said, _ = program.communicate(json.dumps(asdict(job)))
-    except BaseException:
-        os.killpg(program.pid, signal.SIGKILL)
-        program.wait()
-        raise
-    if program.returncode:
-        raise EvaluationError(
-            f"a run with {job.sensor_workers} sensor workers ended with exit code "
-            f"{program.returncode}; its own message is above"
-        )
-    told = json.loads(said)
-    if "error" in told:
-        kind: type[errors.CavmarlError] = getattr(errors, told["error"])
-        raise kind.__new__(kind, told["message"])
-    return SensorRun(
-        **{key: tuple(value) if isinstance(value, list) else value for key, value in told.items()}
-        | {
-            "windows": tuple(Window(**window) for window in told["windows"]),
-            "parts_ms": {name: tuple(values) for name, values in told["parts_ms"].items()},
-            "sensors": told["sensors"],
-        }
-    )
+    """A run in processes of its own."""
+    what = f"a run with {job.sensor_workers} sensor workers"
+    return call_in_fresh_process(what, run_sensors, job)

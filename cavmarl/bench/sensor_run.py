@@ -1,27 +1,29 @@
-"""One run of a world with sensor workers, step by step: a program, and what it gives.
+"""One run of a world with sensor workers, step by step, and what it gives.
 
-It reads a job as JSON from standard input and writes a run as JSON to standard output. What is in
-no part has not been timed: the parts are not made to sum up.
+What is in no part has not been timed: the parts are not made to sum up.
 """
 
 from __future__ import annotations
 
 import copy
-import json
 import os
-import sys
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cavmarl.bench.sensor_rig import describe_rig
 from cavmarl.bench.stopwatch import Stopwatch
-from cavmarl.core import errors
+from cavmarl.config.env import EnvConfig
+from cavmarl.config.io import read_yaml
+from cavmarl.config.world_spec import WorldSpec
+from cavmarl.core.errors import ConfigError
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.sensor_workers.sensor_pool import SensorWorkers, SensorWorkerTimes
+from cavmarl.sensors.registry import type_of
+
+Rig = dict[str, dict[str, Any]]
 
 WINDOW = 25  # steps
 
@@ -39,18 +41,42 @@ _PART_OF = {
 }
 
 
+_PLACE = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
+
+
+def load_rig(path: Path) -> Rig:
+    """The sensors in a file, as they stand under `rig` of an env.yaml."""
+    found = read_yaml(path)
+    if not isinstance(found, Mapping) or not all(
+        isinstance(sensor, Mapping) for sensor in found.values()
+    ):
+        raise ConfigError(f"{path}: must be sensors by name, as under rig of an env.yaml")
+    return {name: dict(sensor) for name, sensor in found.items()}
+
+
+def describe_rig(config: EnvConfig) -> list[dict[str, Any]]:
+    """Type, resolution, lines, rate and placement of each sensor of an environment."""
+    return [
+        {
+            "name": name,
+            "type": getattr(sensor, "type", type(sensor).__name__),
+            "resolution": list(sensor.shape),
+            "lines": type_of(name, sensor).num_lines(sensor),
+            "rate_hz": getattr(sensor, "rate_hz", None),
+            "placement": {key: getattr(sensor, key) for key in _PLACE},
+        }
+        for name, sensor in config.rig.items()
+    ]
+
+
 @dataclass(frozen=True)
 class SensorJob:
     """What to run."""
 
-    env: str  # as in `make_vec`
-    overrides: Mapping[str, Any]  # of its settings
-    agents: int  # each with a rig
-    background: int  # vehicles that are sensed
+    spec: WorldSpec  # each agent has a rig; background vehicles are sensed
     sensor_workers: int  # how many
     warmup: int  # steps that do not count
     steps: int  # that do
-    seed: int  # root of all random numbers
 
 
 @dataclass(frozen=True)
@@ -71,31 +97,23 @@ class Window:
 class SensorRun:
     """What was found."""
 
-    # of each step, tick and sensors; checking actions and copying results among it
-    step_ms: tuple[float, ...]
+    step_ms: tuple[float, ...]  # of each step, tick and sensors, all that `step` does among it
     wait_ms: tuple[float, ...]  # of that, waiting for sensor workers
     parts_ms: dict[str, tuple[float, ...]]  # of each step, by the names of `PARTS`
     windows: tuple[Window, ...]  # resources
     costs_ms: tuple[float, ...]  # processor time of one agent's frame of each sensor
     sensors: list[dict[str, Any]]  # type, resolution, rate and placement of each
-    # of the state, all frames among it, after each step of the warm-up and the last one
-    digests: tuple[str, ...]
-    ticks_per_step: int  # ticks of a step
+    digests: tuple[str, ...]  # of the state with all frames, after the warm-up's steps and the last
+    ticks_per_step: int
     deaths: int  # sensor workers that had to be replaced
 
 
 def run_sensors(job: SensorJob) -> SensorRun:
     """Run a job in this process; agents are driven by the built-in driver, which is not timed."""
-    vec = make_vec(
-        job.env,
-        agents=job.agents,
-        background=job.background,
-        sensor_workers=job.sensor_workers,
-        overrides=job.overrides,
-        copy=False,
-    )
+    spec = job.spec
+    vec = make_vec(spec.env, sensor_workers=job.sensor_workers, copy=False, **spec.keywords)
     try:
-        vec.reset(seed=job.seed)
+        vec.reset(seed=spec.seed)
         timed = _Timed(vec)
         for _ in range(job.warmup):
             timed.step()
@@ -130,13 +148,11 @@ class _Timed:
         self.clear()
 
     def clear(self) -> None:
-        """Forget what there was."""
         self._step_ms: list[float] = []
         self._wait_ms: list[float] = []
         self._parts_ms: dict[str, list[float]] = {name: [] for name in PARTS}
 
     def window(self, steps: int) -> Window:
-        """Some steps, and what they have taken."""
         pool = self._farm.pool
         assert pool is not None
         before, began = copy.copy(self._farm.times), pool.processor_s()
@@ -188,7 +204,6 @@ class _Timed:
         self._digests.append(self._vec.state_hash())
 
     def run(self, windows: tuple[Window, ...]) -> SensorRun:
-        """All that was found."""
         config = self._vec.config
         return SensorRun(
             tuple(self._step_ms),
@@ -207,17 +222,3 @@ def _resident_mb(pid: int) -> float:
     """Memory of a process that is in use."""
     pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-
-def main() -> None:
-    """The program."""
-    job = SensorJob(**json.load(sys.stdin))
-    try:
-        told = asdict(run_sensors(job))
-    except errors.CavmarlError as error:
-        told = {"error": type(error).__name__, "message": str(error)}
-    json.dump(told, sys.stdout)
-
-
-if __name__ == "__main__":
-    main()

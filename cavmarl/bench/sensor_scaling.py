@@ -1,4 +1,4 @@
-"""What follows from step times over several numbers of sensor workers.
+"""What follows from step times over several numbers of sensor workers, and its figure.
 
 Every figure of such a table is made here, from raw series, and nowhere else. A standard deviation
 within a run is that of its steps, by n - 1; it says nothing about another run. What another run
@@ -10,21 +10,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from decimal import ROUND_HALF_UP, Decimal
-from typing import Any
+from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cavmarl.core.errors import ConfigError
+from cavmarl.bench.harness import Result
+from cavmarl.core.errors import ConfigError, require
 from cavmarl.evaluate.statistics import Interval, mean_interval
+from cavmarl.evaluate.traffic.traffic_plot import save_figure
 
 MIN_RUNS = 5  # from so many on there is an interval between runs
-
-_PLACES = Decimal("0.01")
-_Values = NDArray[np.float64]
-_Rounding = Callable[[float], float]
+FPS, STEP = "#2f6db5", "#d1793b"
+HEADROOM = 1.1  # over the largest value
 
 
 @dataclass(frozen=True)
@@ -43,20 +42,19 @@ class Measured:
     step_ms: float  # T, tick and sensors
     sd_within_run: float  # sample standard deviation of the steps of a run, ms
     wait_ms: float  # of T, waiting for sensors
-    # of T, from the means of independent runs; None: too few
-    ci95_between_runs: Interval | None = None
+    ci95_between_runs: Interval | None = None  # of T, from independent runs; None: too few
 
 
 @dataclass(frozen=True)
-class ScalingRow:
+class ScalingRow(Result):
     """What was measured with n sensor workers, and what follows from it."""
 
-    workers: int  # n
-    step_ms: float  # T, tick and sensors
+    workers: int
+    step_ms: float
     fps: float  # 1000 / T
-    sd_within_run: float  # of the steps of a run, ms
-    ci95_between_runs: Interval | None  # of T; None: too few runs
-    wait_ms: float  # of T, waiting for sensors
+    sd_within_run: float
+    ci95_between_runs: Interval | None
+    wait_ms: float
     speedup: float  # T of the fewest workers / T
     efficiency_pct: float  # speedup / n, times the fewest workers
     cv_pct: float  # coefficient of variation, standard deviation / T
@@ -66,10 +64,6 @@ class ScalingRow:
     step_gain_pct: float  # T above that of the fewest workers; negative where it is shorter
     is_best: bool  # the shortest T of those that were measured
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
-        return asdict(self)
-
 
 def summarize(runs: Mapping[int, Sequence[Series]]) -> list[Measured]:
     """Means of independent runs, by the number of sensor workers.
@@ -77,13 +71,22 @@ def summarize(runs: Mapping[int, Sequence[Series]]) -> list[Measured]:
     The standard deviation is the root of the runs' mean variance, so that what lies between the
     runs is not in it.
     """
-    lengths = {len(part) for of in runs.values() for run in of for part in _parts(run)}
+    series = [run for of in runs.values() for run in of]
+    lengths = {len(part) for run in series for part in (run.step_ms, run.wait_ms)}
     if len(lengths) != 1 or min(lengths) < 2 or not all(runs.values()):
         raise ConfigError(
             f"runs of {sorted(lengths)} steps: every number of workers needs runs, all of one "
             "length, of at least 2 steps"
         )
-    return [_measured(workers, of) for workers, of in sorted(runs.items())]
+    found = []
+    for workers, of in sorted(runs.items()):
+        steps = np.array([run.step_ms for run in of])
+        means = steps.mean(axis=1)
+        deviation = float(np.sqrt(steps.var(axis=1, ddof=1).mean()))
+        wait_ms = float(np.array([run.wait_ms for run in of]).mean())
+        interval = mean_interval(means) if len(of) >= MIN_RUNS else None
+        found.append(Measured(workers, float(means.mean()), deviation, wait_ms, interval))
+    return found
 
 
 def scaling_table(
@@ -98,37 +101,19 @@ def scaling_table(
             raise ConfigError(
                 f"{one.workers} sensor workers: {one.wait_ms:g} ms of {one.step_ms:g} ms cannot be"
             )
-    rounded: _Rounding = _to_two_places if paper_rounding else float
-    first = measured[0]
+    rounded: Callable[[float], float] = _to_two_places if paper_rounding else float
     best = min(measured, key=lambda one: one.step_ms)
-    return [_row(one, first, one is best, rounded) for one in measured]
+    return [_row(one, measured[0], one is best, rounded) for one in measured]
 
 
-def _measured(workers: int, runs: Sequence[Series]) -> Measured:
-    steps, waits = (
-        np.array([getattr(run, name) for run in runs], dtype=np.float64)
-        for name in ("step_ms", "wait_ms")
-    )
-    means: _Values = steps.mean(axis=1)
-    return Measured(
-        workers,
-        float(means.mean()),
-        float(np.sqrt(steps.var(axis=1, ddof=1).mean())),
-        float(waits.mean()),
-        mean_interval(means) if len(runs) >= MIN_RUNS else None,
-    )
-
-
-def _row(one: Measured, first: Measured, is_best: bool, rounded: _Rounding) -> ScalingRow:
+def _row(
+    one: Measured, first: Measured, is_best: bool, rounded: Callable[[float], float]
+) -> ScalingRow:
     fps = rounded(1000.0 / one.step_ms)
     speedup = rounded(first.step_ms / one.step_ms)
     return ScalingRow(
-        workers=one.workers,
-        step_ms=one.step_ms,
+        **vars(one),
         fps=fps,
-        sd_within_run=one.sd_within_run,
-        ci95_between_runs=one.ci95_between_runs,
-        wait_ms=one.wait_ms,
         speedup=speedup,
         efficiency_pct=rounded(100.0 * speedup * first.workers / one.workers),
         cv_pct=rounded(100.0 * one.sd_within_run / one.step_ms),
@@ -140,10 +125,33 @@ def _row(one: Measured, first: Measured, is_best: bool, rounded: _Rounding) -> S
     )
 
 
-def _parts(run: Series) -> tuple[Sequence[float], Sequence[float]]:
-    return run.step_ms, run.wait_ms
-
-
 def _to_two_places(value: float) -> float:
     """Halves up, of the number as it is written in decimal."""
-    return float(Decimal(repr(value)).quantize(_PLACES, ROUND_HALF_UP))
+    return float(Decimal(repr(value)).quantize(Decimal("0.01"), ROUND_HALF_UP))
+
+
+def plot_sensor_workers(rows: Sequence[ScalingRow], title: str, path: Path) -> None:
+    """Write FPS and the time of a step over the number of sensor workers; the best is marked."""
+    figure = require("matplotlib.figure", "report").Figure(figsize=(7.0, 4.2), layout="constrained")
+    left = figure.subplots()
+    right = left.twinx()
+    numbers = [row.workers for row in rows]
+    left.plot(numbers, [row.fps for row in rows], "o-", color=FPS)
+    steps_ms, deviations = [row.step_ms for row in rows], [row.sd_within_run for row in rows]
+    right.errorbar(numbers, steps_ms, yerr=deviations, fmt="s--", capsize=3.0, color=STEP)
+    (best,) = (row for row in rows if row.is_best)
+    left.annotate(
+        "best", (best.workers, best.fps), (0.0, 8.0), textcoords="offset points", ha="center",
+        color=FPS, weight="bold",
+    )  # fmt: skip
+    for axes, label, color in (
+        (left, "frames a second", FPS),
+        (right, "tick and sensors, ms (± SD within a run)", STEP),
+    ):
+        axes.set_ylabel(label, color=color)
+        axes.tick_params(axis="y", colors=color)
+        axes.set_ylim(0.0, HEADROOM * axes.get_ylim()[1])
+    left.set_xlabel("sensor workers")
+    left.set_xticks(numbers)
+    figure.suptitle(title)
+    save_figure(figure, path)

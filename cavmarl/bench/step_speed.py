@@ -82,8 +82,7 @@ class StepSpeed(Result):
     ratio: float  # with a lidar, `batched` over `highway_env`
     ratio_kinematics: float  # without, `batched` over `highway_env`'s default observation
     ratio_kinematics_raw: float  # the same over its observation without normalisation
-    # what an agent costs among `MORE` times as many, over what it costs `batched`
-    cost_of_more: float
+    cost_of_more: float  # of an agent among `MORE` times as many, over what it costs `batched`
     dict_us: float  # what the dict API adds for each agent and step to `single`, in µs
 
 
@@ -128,12 +127,11 @@ def _compare(road_m: float, repeats: int, rows: list[Row]) -> StepSpeed:
     )
 
 
-_Sides = dict[tuple[str, str], tuple[int, int, Callable[[], float]]]
-
-
-def _our_sides(folder: Path, road_m: float, agents: int, worlds: int) -> _Sides:
-    """Ours, each stepped twice before anything is measured."""
-    sides: _Sides = {}
+def _our_sides(
+    folder: Path, road_m: float, agents: int, worlds: int
+) -> dict[tuple[str, str], tuple[int, int, Callable[[], float]]]:
+    """Agents, worlds and rate of each of ours, stepped twice before anything is measured."""
+    sides: dict[tuple[str, str], tuple[int, int, Callable[[], float]]] = {}
     for sensors, who, times, is_batched in OURS:
         count, together = times * agents, worlds if is_batched else 1
         vec = make_vec(

@@ -11,11 +11,7 @@ CALIBRATION = 20_000  # empty calls
 
 
 class Stopwatch:
-    """Adds up the time of named calls, less what it takes itself.
-
-    Args:
-        clock: in ns; by default the processor's time of this process.
-    """
+    """Adds up the time of named calls, less what it takes itself; `clock` is in ns."""
 
     def __init__(self, clock: Callable[[], int] = time.process_time_ns) -> None:
         self._clock = clock
@@ -31,7 +27,6 @@ class Stopwatch:
         self.clear()
 
     def clear(self) -> None:
-        """Back to zero."""
         self.spent.clear()
         self.calls.clear()
 

@@ -26,7 +26,7 @@ from cavmarl.bench.harness import (
 from cavmarl.core.errors import ConfigError, require
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import find_map
-from cavmarl.evaluate.traffic.native_side import advance, idle_commands, make_world
+from cavmarl.evaluate.traffic.native_side import idle_commands, make_world
 from cavmarl.evaluate.traffic.sumo_side import SumoJob, start_sumo, sumo_process
 from cavmarl.traffic.sumo.sumo_input import read_input
 
@@ -88,33 +88,38 @@ def measure_traffic_speed(
     rates = {
         name: spread(turn.vehicle_steps / turn.cpu_s for turn in own) for name, own in turns.items()
     }
-    vehicles = {
-        name: sum(turn.vehicle_steps for turn in own) / (repeats * steps)
-        for name, own in turns.items()
-    }
     if not rates["sumo"].median > 0.0:
         raise ConfigError(f"no vehicle drives after {after_s} s: another --after, or more demand")
+    our_vehicles, sumo_vehicles = (
+        sum(turn.vehicle_steps for turn in turns[name]) / (repeats * steps) for name in sides
+    )
     return TrafficSpeed(
-        map_name=simulation.network.name,
-        dt_s=dt_s,
-        after_s=after_s,
-        repeats=repeats,
-        our_vehicles=vehicles["ours"],
-        sumo_vehicles=vehicles["sumo"],
-        ours=rates["ours"],
-        sumo=rates["sumo"],
+        simulation.network.name,
+        dt_s,
+        after_s,
+        repeats,
+        our_vehicles,
+        sumo_vehicles,
+        **rates,
         ratio=rates["ours"].median / rates["sumo"].median,
     )
 
 
+def _timed(steps: int, step: Callable[[], int]) -> Turn:
+    """A turn of so many steps; `step` returns how many vehicles it has moved."""
+    began, began_s = time.perf_counter(), time.process_time()
+    vehicle_steps = sum(step() for _ in range(steps))
+    return Turn(vehicle_steps, time.process_time() - began_s, time.perf_counter() - began)
+
+
 def _our_turn(simulation: Simulation, steps: int) -> Turn:
     commands = idle_commands(simulation)
-    vehicle_steps = 0
-    began, began_s = time.perf_counter(), time.process_time()
-    for _ in range(steps):
-        advance(simulation, commands)
-        vehicle_steps += len(simulation.vehicles())
-    return Turn(vehicle_steps, time.process_time() - began_s, time.perf_counter() - began)
+
+    def step() -> int:
+        simulation.step(commands)
+        return len(simulation.vehicles())
+
+    return _timed(steps, step)
 
 
 def load_sumo(job: SumoJob, folder: str) -> None:
@@ -125,9 +130,9 @@ def load_sumo(job: SumoJob, folder: str) -> None:
 def turn_of_sumo(steps: int) -> Turn:
     """Steps of the SUMO that is loaded in this process."""
     libsumo = require("libsumo", "sumo")
-    vehicle_steps = 0
-    began, began_s = time.perf_counter(), time.process_time()
-    for _ in range(steps):
+
+    def step() -> int:
         libsumo.simulationStep()
-        vehicle_steps += libsumo.vehicle.getIDCount()
-    return Turn(vehicle_steps, time.process_time() - began_s, time.perf_counter() - began)
+        return int(libsumo.vehicle.getIDCount())
+
+    return _timed(steps, step)

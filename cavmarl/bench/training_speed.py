@@ -10,7 +10,9 @@ from __future__ import annotations
 import math
 import tempfile
 import time
-from contextlib import ExitStack
+from collections import Counter
+from collections.abc import Callable
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,6 +28,7 @@ from cavmarl.bench.highway_worlds import (
     overrides,
     straight_road,
 )
+from cavmarl.config.registry import shadow
 from cavmarl.core.errors import ConfigError, require
 from cavmarl.evaluate.provenance.machine import describe_hardware
 
@@ -33,6 +36,8 @@ if TYPE_CHECKING:
     from cavmarl.bench.highway_rows import HighwayRows
     from cavmarl.learning.ppo_settings import PpoSettings
     from cavmarl.learning.run import Run
+
+_Update = tuple[int, dict[str, float]]
 
 HORIZON_S = 40.0
 OUR_STEPS = 32  # of a world between two updates
@@ -57,10 +62,8 @@ class TrainingRow:
     who: str  # `cavmarl` or `stable_baselines3`; `cavmarl_overlap` collects while it learns
     worlds: int  # stepped together
     decisions: int  # of an update
-    # agent-steps a second of each turn: one update, collecting and learning
-    rates: tuple[float, ...]
-    # of the time, by phase, over all turns. Theirs of `simulation` is with what goes between the
-    # processes, which ours do not send.
+    rates: tuple[float, ...]  # agent-steps a second of each turn: one update, learning among it
+    # of the time, by phase; theirs of `simulation` is with what goes between the processes
     shares: dict[str, float]
 
 
@@ -72,8 +75,7 @@ class TrainingSpeed(Result):
     workers: int  # of each side
     numbers: int  # in an observation
     end_to_end: tuple[TrainingRow, ...]  # PPO, collecting and learning
-    # agent-steps a second of our worlds and sensors alone, of each turn; nothing learns or decides
-    stepping: tuple[float, ...]
+    stepping: tuple[float, ...]  # agent-steps a second of our worlds and sensors alone, by turns
     hardware: dict[str, Any]  # that it ran on
 
     @property
@@ -88,7 +90,6 @@ class TrainingSpeed(Result):
 
     @property
     def is_crowded(self) -> bool:
-        """More workers than cores."""
         return self.workers > (self.hardware["usable_cores"] or 1)
 
     def _over(self, one: str, other: str) -> float:
@@ -96,7 +97,6 @@ class TrainingSpeed(Result):
         return paired_ratio(rates[one], rates[other])
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON; each benchmark says of which kind it is."""
         plain = super().to_dict()
         return {
             **plain,
@@ -112,11 +112,7 @@ class TrainingSpeed(Result):
 
 
 def measure_training(
-    agents: int = 20,
-    worlds: int = 16,
-    workers: int = 2,
-    repeats: int = 3,
-    say: Say = silent,
+    agents: int = 20, worlds: int = 16, workers: int = 2, repeats: int = 3, say: Say = silent
 ) -> TrainingSpeed:
     """Update by turns, after an update of each that does not count."""
     check_range(
@@ -127,31 +123,33 @@ def measure_training(
     needs = {"torch": "torch", "highway_env": "highway", "stable_baselines3": "sb3"}
     for module, extra in needs.items():
         require(module, extra)
+    from cavmarl.bench.highway_rows import HighwayRows
+    from cavmarl.learning.run import Run
+
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         say("starting theirs")
-        theirs = _Theirs(agents, workers, OUR_STEPS * worlds // workers)
-        stack.callback(theirs.close)
+        rows = HighwayRows(workers, agents, THEIR_KINEMATICS, HORIZON_S)
+        stack.callback(rows.close)
+        theirs = _theirs(rows, workers, OUR_STEPS * worlds // workers)
         settings = _settings(folder, agents, worlds, workers)
         say("starting ours")
-        ours = [_Ours("cavmarl", settings)]
-        stack.callback(ours[0].close)
-        ours.append(_Ours("cavmarl_overlap", replace(settings, overlap=True, name="overlap")))
-        stack.callback(ours[1].close)
-        sides: list[_Theirs | _Ours] = [*ours, theirs]
+        plain = stack.enter_context(closing(Run(settings)))
+        overlap = replace(settings, overlap=True, name="overlap")
+        other = stack.enter_context(closing(Run(overlap)))
+        sides = [_ours("cavmarl", plain), _ours("cavmarl_overlap", other), theirs]
         stepping = []
         for turn in range(repeats + 1):
             for side in sides:
                 say(f"update {turn} of {repeats}: {side.who}")
                 side.update(counts=turn > 0)
-            stepping.append(_stepping(ours[0].run))
-        rows = tuple(side.row() for side in sides)
-        size = ours[0].run.config.observation_size
-    return TrainingSpeed(agents, workers, size, rows, tuple(stepping[1:]), describe_hardware())
+            stepping.append(_stepping(plain))
+        found = tuple(side.row() for side in sides)
+        size = plain.config.observation_size
+    return TrainingSpeed(agents, workers, size, found, tuple(stepping[1:]), describe_hardware())
 
 
 def _settings(folder: Path, agents: int, worlds: int, workers: int) -> PpoSettings:
-    """Of a run on a road as long as theirs."""
     from cavmarl.learning.ppo_settings import PpoSettings
 
     road_m = length_m(highway_env(agents, THEIR_KINEMATICS))
@@ -161,11 +159,7 @@ def _settings(folder: Path, agents: int, worlds: int, workers: int) -> PpoSettin
         "horizon_s": HORIZON_S,
     }
     for key, value in (overrides(OUR_SENSORS, agents) | {"population.mode": "respawn"}).items():
-        *parents, name = key.split(".")
-        place = entry
-        for parent in parents:
-            place = place.setdefault(parent, {})
-        place[name] = value
+        shadow(entry, key, value)
     (folder / "env.yaml").write_text(yaml.safe_dump(entry), encoding="utf-8")
     return PpoSettings(
         env=str(folder),
@@ -183,89 +177,72 @@ def _settings(folder: Path, agents: int, worlds: int, workers: int) -> PpoSettin
     )
 
 
-class _Ours:
-    """A run of our PPO."""
+class _Side:
+    """A side of the comparison: what its updates brought, and where their time went.
 
-    def __init__(self, who: str, settings: PpoSettings) -> None:
-        from cavmarl.learning.run import Run
+    `update` collects and learns; it returns decisions and seconds by phase.
+    """
 
+    def __init__(self, who: str, worlds: int, update: Callable[[], _Update]) -> None:
         self.who = who
-        self.run = Run(settings)
-        self._rates: list[float] = []
-        self._spent_s: dict[str, float] = {}
-
-    def update(self, counts: bool) -> None:
-        """Collect and learn."""
-        from cavmarl.learning.run_clock import PHASES
-
-        began, before = time.perf_counter(), self.run.agent_steps
-        row = self.run.update()
-        rate = (self.run.agent_steps - before) / (time.perf_counter() - began)
-        if counts:
-            self._rates.append(rate)
-            for phase in PHASES:
-                self._spent_s[phase] = self._spent_s.get(phase, 0.0) + row[f"{phase}_s"]
-
-    def row(self) -> TrainingRow:
-        """What was found."""
-        settings, updates = self.run.settings, self.run.updates
-        decisions = self.run.agent_steps // updates
-        shares = _shares(self._spent_s)
-        return TrainingRow(self.who, settings.num_envs, decisions, tuple(self._rates), shares)
-
-    def close(self) -> None:
-        """End its workers."""
-        self.run.close()
-
-
-class _Theirs:
-    """stable-baselines3's PPO on highway-env."""
-
-    who = "stable_baselines3"
-
-    def __init__(self, agents: int, worlds: int, num_steps: int) -> None:
-        from stable_baselines3 import PPO
-
-        from cavmarl.bench.highway_rows import HighwayRows
-
-        self._rows: HighwayRows = HighwayRows(worlds, agents, THEIR_KINEMATICS, HORIZON_S)
         self._worlds = worlds
-        self._decisions = num_steps * self._rows.num_envs
-        self._model = PPO(
-            "MlpPolicy",
-            self._rows,
-            n_steps=num_steps,
-            batch_size=self._decisions // MINIBATCHES,
-            n_epochs=EPOCHS,
-            policy_kwargs={"net_arch": [HIDDEN, HIDDEN]},
-            seed=0,
-            device="cpu",
-        )
+        self._update = update
+        self._decisions: list[int] = []
         self._rates: list[float] = []
-        self._spent_s = dict.fromkeys(("simulation", "inference", "learning"), 0.0)
+        self._spent_s: Counter[str] = Counter()
 
     def update(self, counts: bool) -> None:
-        """Collect and learn."""
-        simulated_s = self._rows.simulated_s
-        watch = _watch()
         began = time.perf_counter()
-        self._model.learn(self._decisions, watch, reset_num_timesteps=False)
-        now = time.perf_counter()
+        decisions, spent_s = self._update()
+        self._decisions.append(decisions)
         if counts:
-            simulated_s = self._rows.simulated_s - simulated_s
-            self._rates.append(self._decisions / (now - began))
-            self._spent_s["simulation"] += simulated_s
-            self._spent_s["inference"] += watch.collected_s - began - simulated_s
-            self._spent_s["learning"] += now - watch.collected_s
+            self._rates.append(decisions / (time.perf_counter() - began))
+            self._spent_s.update(spent_s)
 
     def row(self) -> TrainingRow:
-        """What was found."""
-        rates, shares = tuple(self._rates), _shares(self._spent_s)
-        return TrainingRow(self.who, self._worlds, self._decisions, rates, shares)
+        total_s = sum(self._spent_s.values())
+        shares = {phase: seconds / total_s for phase, seconds in self._spent_s.items()}
+        decisions = sum(self._decisions) // len(self._decisions)
+        return TrainingRow(self.who, self._worlds, decisions, tuple(self._rates), shares)
 
-    def close(self) -> None:
-        """End its processes."""
-        self._rows.close()
+
+def _ours(who: str, run: Run) -> _Side:
+    from cavmarl.learning.collector import PHASES
+
+    def update() -> _Update:
+        before = run.agent_steps
+        row = run.update()
+        return run.agent_steps - before, {phase: row[f"{phase}_s"] for phase in PHASES}
+
+    return _Side(who, run.settings.num_envs, update)
+
+
+def _theirs(rows: HighwayRows, worlds: int, num_steps: int) -> _Side:
+    from stable_baselines3 import PPO
+
+    decisions = num_steps * rows.num_envs
+    model = PPO(
+        "MlpPolicy",
+        rows,
+        n_steps=num_steps,
+        batch_size=decisions // MINIBATCHES,
+        n_epochs=EPOCHS,
+        policy_kwargs={"net_arch": [HIDDEN, HIDDEN]},
+        seed=0,
+        device="cpu",
+    )
+
+    def update() -> _Update:
+        before_s, watch, began = rows.simulated_s, _watch(), time.perf_counter()
+        model.learn(decisions, watch, reset_num_timesteps=False)
+        simulated_s = rows.simulated_s - before_s
+        return decisions, {
+            "simulation": simulated_s,
+            "inference": watch.collected_s - began - simulated_s,
+            "learning": time.perf_counter() - watch.collected_s,
+        }
+
+    return _Side("stable_baselines3", worlds, update)
 
 
 def _watch() -> Any:
@@ -282,11 +259,6 @@ def _watch() -> Any:
             self.collected_s = time.perf_counter()
 
     return Watch()
-
-
-def _shares(spent_s: dict[str, float]) -> dict[str, float]:
-    total_s = sum(spent_s.values())
-    return {phase: seconds / total_s for phase, seconds in spent_s.items()}
 
 
 def _stepping(run: Run) -> float:

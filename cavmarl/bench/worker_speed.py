@@ -1,19 +1,29 @@
-"""How much faster worlds are over several workers, and what it costs to have workers at all."""
+"""How much faster worlds are over several workers, what workers cost, and what the machine allows.
+
+The machine's ceiling is how much faster programs are side by side that share nothing. No number of
+workers can do better. It is less than the number of cores where cores share memory, caches or
+clocks, and where other programs run.
+"""
 
 from __future__ import annotations
 
 import math
+import multiprocessing
 import time
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.bench.harness import Result, Say, paired_ratio, silent
-from cavmarl.core.errors import ConfigError
+from cavmarl.config.world_spec import WorldKeys, WorldSpec
+from cavmarl.core.errors import ConfigError, WorkerError
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.evaluate.provenance.machine import describe_hardware
 from cavmarl.parallel.pooled_worlds import PooledWorlds
@@ -22,6 +32,7 @@ from cavmarl.parallel.processes.worker_pool import Pool
 WARM_STEPS = 20
 PINGS = 2000  # a turn
 IDLE_S = 1.0
+START_S = 300.0  # that a program may take until its worlds can be stepped
 
 
 @dataclass(frozen=True)
@@ -44,8 +55,7 @@ class WorkerSpeed(Result):
     worlds: int  # that were stepped together
     steps: int  # of a turn
     rows: tuple[Row, ...]  # no worker, one, and those that were asked for
-    # of each empty command to all workers, µs: quantiles 5, 50, 95 and 99 %
-    barrier_us: tuple[float, float, float, float]
+    barrier_us: tuple[float, ...]  # of empty commands to all workers: quantiles 5, 50, 95 and 99 %
     idle_s: float  # processor time that idle workers took in a second, s
     hardware: dict[str, Any]  # that it ran on
 
@@ -67,19 +77,16 @@ class WorkerSpeed(Result):
 
     @property
     def is_crowded(self) -> bool:
-        """More workers than cores."""
         return self.rows[2].workers > (self.hardware["usable_cores"] or 1)
 
 
 def measure_workers(
-    env: str | Path,
+    spec: WorldSpec,
     *,
     worlds: int = 16,
     workers: int = 2,
     steps: int = 20,
     repeats: int = 7,
-    seed: int = 0,
-    wanted: Mapping[str, Any] | None = None,
     say: Say = silent,
 ) -> WorkerSpeed:
     """Step the same worlds without workers, with one, and with several, by turns.
@@ -95,8 +102,7 @@ def measure_workers(
     try:
         for count in (0, 1, workers):
             say(f"making worlds over {count} workers")
-            made = {"num_envs": worlds, "copy": False, **(wanted or {})}
-            measured.append(Measured(env, count, seed, made))
+            measured.append(Measured(spec, count, num_envs=worlds, copy=False))
         pool = measured[-1].pool
         assert pool is not None
         pings: list[float] = []
@@ -104,41 +110,43 @@ def measure_workers(
             say(f"turn {n + 1} of {repeats}")
             for one in measured:
                 one.count_turn(steps)
-            pings += _pings(pool)
-        idle_s = _idle_s(pool)
+            pings += (1e6 * _timed_s(pool.ping) for _ in range(PINGS))
+        before = sum(pool.processor_s())
+        time.sleep(IDLE_S)
+        idle_s = (sum(pool.processor_s()) - before) / IDLE_S
     finally:
         for one in measured:
             one.vec.close()
     rows = tuple(one.row(repeats * steps) for one in measured)
-    low, middle, high, highest = (float(np.quantile(pings, q)) for q in (0.05, 0.5, 0.95, 0.99))
-    quantiles = (low, middle, high, highest)
-    return WorkerSpeed(str(env), worlds, steps, rows, quantiles, idle_s, describe_hardware())
+    quantiles = tuple(np.quantile(pings, (0.05, 0.5, 0.95, 0.99)).tolist())
+    return WorkerSpeed(spec.env, worlds, steps, rows, quantiles, idle_s, describe_hardware())
+
+
+def _timed_s(call: Callable[[], object]) -> float:
+    began = time.perf_counter()
+    call()
+    return time.perf_counter() - began
 
 
 def drive_ms(vec: CavVectorEnv, steps: int) -> float:
     """Milliseconds a step; what the built-in driver decides for agents is not timed."""
-    spent = 0.0
-    for _ in range(steps):
-        actions = vec.suggest_actions()
-        began = time.perf_counter()
-        vec.step(actions)
-        spent += time.perf_counter() - began
-    return 1000.0 * spent / steps
+    spent_s = sum(_timed_s(partial(vec.step, vec.suggest_actions())) for _ in range(steps))
+    return 1000.0 * spent_s / steps
 
 
 class Measured:
     """Worlds over some number of workers, reset and warm, and what their turns have taken."""
 
-    def __init__(self, env: str | Path, workers: int, seed: int, wanted: Mapping[str, Any]) -> None:
+    def __init__(self, spec: WorldSpec, workers: int, **more: Any) -> None:
         began = time.perf_counter()
-        self.vec = make_vec(env, workers=workers, **wanted)
+        self.vec = make_vec(spec.env, workers=workers, **spec.keywords, **more)
         self._made_s = time.perf_counter() - began
         worlds = self.vec.worlds
-        self.pool = worlds.pool if isinstance(worlds, PooledWorlds) else None
+        self.pool: Pool | None = worlds.pool if isinstance(worlds, PooledWorlds) else None
         self._workers = workers
         self._step_ms: list[float] = []
         self._busy_s = np.zeros(workers)
-        self.vec.reset(seed=seed)
+        self.vec.reset(seed=spec.seed)
         drive_ms(self.vec, WARM_STEPS)
 
     def count_turn(self, steps: int) -> None:
@@ -151,7 +159,6 @@ class Measured:
             self._busy_s += self._processor_s() - before
 
     def row(self, steps: int) -> Row:
-        """What has been found in so many steps."""
         busiest = 1000.0 * float(self._busy_s.max()) / steps if self._workers else None
         return Row(self._workers, self._made_s, tuple(self._step_ms), busiest)
 
@@ -159,18 +166,89 @@ class Measured:
         return np.array([] if self.pool is None else self.pool.processor_s())
 
 
-def _pings(pool: Pool) -> list[float]:
-    """Microseconds of empty commands, one after the other."""
-    found: list[float] = []
-    for _ in range(PINGS):
-        began = time.perf_counter()
-        pool.ping()
-        found.append(1e6 * (time.perf_counter() - began))
-    return found
+@dataclass(frozen=True)
+class CoreCeiling(Result):
+    """Programs of their own that step worlds, one at a time and all at once."""
+
+    DERIVED: ClassVar = ("ratio",)
+
+    programs: int  # how many
+    alone_ms: tuple[float, ...]  # of each turn, ms a step of all worlds, one program after another
+    together_ms: tuple[float, ...]  # of each turn, ms a step of the slowest program while all run
+
+    @property
+    def ratio(self) -> float:
+        """How many times faster all at once are; median of the turns."""
+        return paired_ratio(self.alone_ms, self.together_ms)
 
 
-def _idle_s(pool: Pool) -> float:
-    """Processor time of idle workers a second."""
-    before = sum(pool.processor_s())
-    time.sleep(IDLE_S)
-    return (sum(pool.processor_s()) - before) / IDLE_S
+def measure_ceiling(
+    env: str | Path | WorldSpec,
+    *,
+    worlds: int = 16,
+    programs: int = 2,
+    steps: int = 20,
+    repeats: int = 7,
+    alike: bool = False,
+    **keys: Unpack[WorldKeys],
+) -> CoreCeiling:
+    """Let programs step as many worlds as workers would, without any command."""
+    if not 1 <= programs <= worlds:
+        raise ConfigError(f"{programs} programs, {worlds} worlds: must be at least one world each")
+    spec = WorldSpec.of(env, **keys)
+    bounds = [worlds * n // programs for n in range(programs + 1)]
+    context = multiprocessing.get_context("spawn")
+    wires: list[Connection] = []
+    processes = []
+    try:
+        for first, last in pairwise(bounds):
+            ours, theirs = context.Pipe()
+            given = (theirs, spec, last - first, 0 if alike else first)
+            processes.append(context.Process(target=_serve, args=given, daemon=True))
+            processes[-1].start()
+            theirs.close()
+            wires.append(ours)
+        for wire in wires:
+            _hear(wire)
+        alone, together = [], []
+        for _ in range(repeats):
+            alone.append(sum(_turn([wire], steps)[0] for wire in wires))
+            together.append(max(_turn(wires, steps)))
+    finally:
+        for wire in wires:
+            wire.close()
+        for process in processes:
+            process.join()
+    return CoreCeiling(programs, tuple(alone), tuple(together))
+
+
+def _turn(wires: list[Connection], steps: int) -> list[float]:
+    """Milliseconds a step of each program, all at once."""
+    for wire in wires:
+        wire.send(steps)
+    return [_hear(wire) for wire in wires]
+
+
+def _hear(wire: Connection) -> float:
+    try:
+        if wire.poll(START_S):
+            return float(wire.recv())
+    except EOFError as error:
+        raise WorkerError(
+            "a program that steps worlds by itself has ended; what it printed stands on standard "
+            "error"
+        ) from error
+    raise WorkerError(f"a program that steps worlds by itself said nothing for {START_S:g} s")
+
+
+def _serve(wire: Connection, spec: WorldSpec, worlds: int, first: int) -> None:
+    """One program: as many steps as it is told, until the connection is closed."""
+    vec = make_vec(spec.env, num_envs=worlds, copy=False, **spec.keywords)
+    vec.reset(seed=spec.seed, options={"first_world": first})
+    steps = WARM_STEPS
+    while True:
+        try:
+            wire.send(drive_ms(vec, steps))
+            steps = wire.recv()
+        except (EOFError, BrokenPipeError, ConnectionResetError):
+            return

@@ -25,7 +25,7 @@ from cavmarl.cli import (
     verify,
     view,
 )
-from cavmarl.cli.output import print_error
+from cavmarl.cli.output import about, print_error
 from cavmarl.cli.verify import determinism as verify_determinism
 from cavmarl.core.errors import CavmarlError
 
@@ -64,8 +64,7 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _exit_codes(
     _version: Annotated[
-        bool,
-        typer.Option("--version", help="Show the version.", callback=_print_version, is_eager=True),
+        bool, about("Show the version.", "--version", callback=_print_version, is_eager=True)
     ] = False,
 ) -> None:
     """Exit codes: 0 success; 1 a check failed; 2 wrong use or bad input."""

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cavmarl.cli.output import JsonPath, Seed, write_json
+from cavmarl.cli.output import JsonPath, MapName, Seed, about, write_json
 
 app = typer.Typer(help="Make files of demand.", no_args_is_help=True)
 
@@ -19,13 +19,11 @@ def _group() -> None:
 
 @app.command()
 def random(
-    map_name: Annotated[
-        str, typer.Argument(metavar="MAP", help="A map file, or an environment's name or folder.")
-    ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The .rou.xml to write.")],
-    vehicles: Annotated[int, typer.Option(help="Number of cars.")] = 1000,
-    within: Annotated[float, typer.Option(help="Seconds in which they depart, evenly.")] = 60.0,
-    route: Annotated[float, typer.Option(help="Shortest route, in metres.")] = 10_000.0,
+    map_name: MapName,
+    out: Annotated[Path, about("The .rou.xml to write.", "--out", "-o")],
+    vehicles: Annotated[int, about("Number of cars.")] = 1000,
+    within: Annotated[float, about("Seconds in which they depart, evenly.")] = 60.0,
+    route: Annotated[float, about("Shortest route, in metres.")] = 10_000.0,
     seed: Seed = 0,
     json_path: JsonPath = None,
 ) -> None:

@@ -12,9 +12,10 @@ import typer
 from rich.console import Console
 
 from cavmarl.cli.evaluate import evaluate_showing, report_table
-from cavmarl.cli.output import JsonPath, Seed, make_folder, write_json
+from cavmarl.cli.output import JsonPath, Seed, about, make_folder, write_json
 from cavmarl.cli.view import record
-from cavmarl.core.errors import ConfigError
+from cavmarl.config.world_spec import WorldSpec
+from cavmarl.core.errors import ConfigError, require
 
 _CHECKOUT = Path(__file__).resolve().parents[2]
 _SCRIPT = _CHECKOUT / "train" / "ippo_torch.py"
@@ -25,14 +26,13 @@ EPISODES = 32
 
 
 def demo(
-    minutes: Annotated[float, typer.Option(help="Minutes of training.")] = 2.0,
-    seconds: Annotated[float, typer.Option(help="Simulated seconds in each video.")] = 60.0,
-    out: Annotated[Path, typer.Option(help="Output folder.")] = Path("runs/demo"),
+    minutes: Annotated[float, about("Minutes of training.")] = 2.0,
+    seconds: Annotated[float, about("Simulated seconds in each video.")] = 60.0,
+    out: Annotated[Path, about("Output folder.")] = Path("runs/demo"),
     seed: Seed = 0,
     json_path: JsonPath = None,
 ) -> None:
     """Train on `merge`, evaluate beside `idm` and `random_actions`, drive `town`, leave videos."""
-    from cavmarl.core.errors import require
     from cavmarl.env.parallel import parallel_env
 
     if not _SCRIPT.is_file():
@@ -51,27 +51,22 @@ def demo(
 
     console.print("[bold]2. evaluate[/] on merge, on other seeds")
     drivers = {"trained": str(trained), "idm": "idm", "random_actions": "random_actions"}
-    found = evaluate_showing(
-        console,
-        "merge",
-        drivers,
-        episodes=EPISODES,
-        seed=EVALUATION_SEED,
-        out=out / f"evaluation-{datetime.now():%Y%m%d-%H%M%S-%f}",
-    )
+    world = WorldSpec(env="merge", seed=EVALUATION_SEED)
+    folder = out / f"evaluation-{datetime.now():%Y%m%d-%H%M%S-%f}"
+    found = evaluate_showing(console, world, drivers, out=folder, episodes=EPISODES)
     console.print(report_table(found))
 
     console.print(f"[bold]3. drive[/] {seconds:g} s")
     videos = {"merge": str(trained), "town": "idm"}
     stats = {}
     for env, policy in videos.items():
-        world = parallel_env(env, render_mode="rgb_array")
+        made = parallel_env(env, render_mode="rgb_array")
         video = out / f"{env}.mp4"
-        stats[env] = record(world, policy, seconds, EVALUATION_SEED, video, console)
+        stats[env] = record(made, policy, seconds, EVALUATION_SEED, video, console)
         console.print(f"{Path(policy).name} in {env}: {_traffic(stats[env])}")
     console.print("[bold]made:[/]")
-    for made in (trained, *(out / f"{env}.mp4" for env in videos)):
-        console.print(f"  {made}", highlight=False)
+    for path in (trained, *(out / f"{env}.mp4" for env in videos)):
+        console.print(f"  {path}", highlight=False)
     write_json(
         json_path,
         {

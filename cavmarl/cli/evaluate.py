@@ -3,30 +3,20 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from cavmarl.cli.output import (
-    Agents,
-    Background,
-    Environment,
-    JsonPath,
-    Seed,
-    Settings,
-    make_folder,
-    number,
-    parse_settings,
-    write_json,
-)
+from cavmarl.cli.output import JsonPath, about, grid, make_folder, number, with_world, write_json
+from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import require
 
 if TYPE_CHECKING:
@@ -36,53 +26,38 @@ if TYPE_CHECKING:
     from cavmarl.ownership.transfer_summary import TransferSummary
 
 HtmlPath = Annotated[
-    Path | None, typer.Option("--html", help="Write a page with tables, plots and the map here.")
+    Path | None, about("Write a page with tables, plots and the map here.", "--html")
 ]
 
 
+@with_world()
 def evaluate(
-    env: Environment,
+    world: WorldSpec,
     policy: Annotated[
         list[str] | None,
-        typer.Option(
+        about(
+            "A name of `cavmarl list`, or a path; repeat it to compare with the first. "
+            "Default: idm.",
             "--policy",
             "-p",
-            help="A name of `cavmarl list`, or a path; repeat it to compare with the first. "
-            "Default: idm.",
         ),
     ] = None,
-    episodes: Annotated[int, typer.Option("--episodes", "-n", help="Episodes of each run.")] = 32,
+    episodes: Annotated[int, about("Episodes of each run.", "--episodes", "-n")] = 32,
     repeats: Annotated[
-        int, typer.Option("--repeats", "-r", help="Independent runs, each in a fresh process.")
+        int, about("Independent runs, each in a fresh process.", "--repeats", "-r")
     ] = 1,
-    seed: Seed = 0,
-    agents: Agents = None,
-    background: Background = None,
-    settings: Settings = None,
     out: Annotated[
-        Path | None,
-        typer.Option(help="Folder of manifest and raw results; default: a new one in runs/."),
+        Path | None, about("Folder of manifest and raw results; default: a new one in runs/.")
     ] = None,
     html: HtmlPath = None,
     json_path: JsonPath = None,
 ) -> None:
     """Drive seeded episodes and show success, safety, comfort, delay, throughput and fairness."""
-    overrides = parse_settings(settings)
     _check_page(html)
     console = Console()
-    folder = out or _new_folder(env)
-    found = evaluate_showing(
-        console,
-        env,
-        policy or ["idm"],
-        episodes=episodes,
-        repeats=repeats,
-        seed=seed,
-        out=folder,
-        agents=agents,
-        background=background,
-        overrides=overrides,
-    )
+    folder = out or _new_folder(world.env)
+    counts = {"episodes": episodes, "repeats": repeats}
+    found = evaluate_showing(console, world, policy or ["idm"], out=folder, **counts)
     _show(console, found, folder, html, json_path)
 
 
@@ -99,18 +74,19 @@ def report(
 
 
 def evaluate_showing(
-    console: Console, env: str, policies: Any, *, out: Path, **settings: Any
+    console: Console, world: WorldSpec, policies: Any, *, out: Path, **counts: Any
 ) -> EvaluationReport:
     """`cavmarl.evaluate.evaluate` into a folder, with a progress bar."""
     from cavmarl.evaluate import evaluate as run
 
     with progress_bar(console) as bar:
-        task = bar.add_task(env)
+        task = bar.add_task(world.env)
 
         def progress(policy: str, steps: int, most: int) -> None:
-            bar.update(task, description=f"{policy} drives {env}", completed=steps, total=most)
+            what = f"{policy} drives {world.env}"
+            bar.update(task, description=what, completed=steps, total=most)
 
-        return run(env, policies, out=out, progress=progress, **settings)
+        return run(world, policies, out=out, progress=progress, **counts)
 
 
 def progress_bar(console: Console) -> Progress:
@@ -124,76 +100,74 @@ def progress_bar(console: Console) -> Progress:
     )
 
 
+@contextmanager
+def counting(console: Console, what: str) -> Iterator[Callable[[int, int], None]]:
+    """A bar while something is done; it moves when it is told how much of how much is."""
+    with progress_bar(console) as bar:
+        task = bar.add_task(what)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
 def report_table(found: EvaluationReport) -> Table:
     """Drivers side by side."""
-    from cavmarl.evaluate.metrics import METRICS
-
-    world = found.manifest["world"]["environment"]
-    runs = f"{found.repeats} runs of " if found.repeats > 1 else ""
-    # Narrow enough for three drivers on eighty columns.
-    table = Table(
-        "",
-        title=escape(f"{world}, {runs}{found.episodes} episodes, seed {found.seeds[0]}"),
-        caption=_caption(found.repeats),
-        box=box.SIMPLE_HEAD,
-        pad_edge=False,
-    )
-    for name in found.policies:
-        table.add_column(escape(Path(name).name), justify="right")
     drivers = found.policies.values()
-    table.add_row("trips", *(str(driver.trips) for driver in drivers))
-    for metric in METRICS:
-        cells = [report_cell(metric, driver[metric.name]) for driver in drivers]
-        if not metric.name.startswith("reward_") and set(cells) != {number(None)}:
-            table.add_row(_title(metric), *cells)
-    for title, cells in _transfer_rows([driver.transfers for driver in drivers]):
-        table.add_row(title, *cells)
-    table.add_row("world step, ms", *(_least(driver, "step_ms") for driver in drivers))
-    table.add_row("policy, ms", *(_least(driver, "policy_ms") for driver in drivers))
+    rows = [["trips", *(str(driver.trips) for driver in drivers)]]
+    rows += _metric_rows(
+        lambda metric: [report_cell(metric, driver[metric.name]) for driver in drivers]
+    )
+    rows += _transfer_rows([driver.transfers for driver in drivers])
+    rows.append(["world step, ms", *(_least(driver, "step_ms") for driver in drivers)])
+    rows.append(["policy, ms", *(_least(driver, "policy_ms") for driver in drivers)])
     uneven = [
         [run.zone_time_imbalance for run in driver.speed if run.zone_time_imbalance is not None]
         for driver in drivers
     ]
     if all(uneven):
         means = (f"{statistics.fmean(runs):.2f}" for runs in uneven)
-        table.add_row("time of zones, max / mean", *means)
-    return table
+        rows.append(["time of zones, max / mean", *means])
+    world = found.manifest["world"]["environment"]
+    runs = f"{found.repeats} runs of " if found.repeats > 1 else ""
+    title = f"{world}, {runs}{found.episodes} episodes, seed {found.seeds[0]}"
+    # Narrow enough for three drivers on eighty columns.
+    return grid(_heads(found.policies), rows, escape(title), _caption(found.repeats), wraps=True)
 
 
 def difference_table(found: EvaluationReport) -> Table:
     """Each further driver minus the first one, on the same episodes."""
+    first, *others = found.policies
+    rows = _metric_rows(
+        lambda metric: [_change(metric, found[name].minus_first[metric.name]) for name in others]
+    )
+    title = escape(f"minus {Path(first).name}, paired by seed")
+    caption = "mean of the runs ± 95 % interval between runs; *: 0 lies outside"
+    return grid(_heads(others), rows, title, caption, wraps=True)
+
+
+def _heads(names: Iterable[str]) -> list[str]:
+    return ["", *(escape(Path(name).name) for name in names)]
+
+
+def _metric_rows(cells_of: Callable[[Metric], list[str]]) -> Iterator[list[str]]:
+    """Title and cells of each metric that has any, but for parts of the reward."""
     from cavmarl.evaluate.metrics import METRICS
 
-    first, *others = found.policies
-    table = Table(
-        "",
-        title=escape(f"minus {Path(first).name}, paired by seed"),
-        caption="mean of the runs ± 95 % interval between runs; *: 0 lies outside",
-        box=box.SIMPLE_HEAD,
-        pad_edge=False,
-    )
-    for name in others:
-        table.add_column(escape(Path(name).name), justify="right")
     for metric in METRICS:
-        cells = [_change(metric, found[name].minus_first[metric.name]) for name in others]
+        cells = cells_of(metric)
         if not metric.name.startswith("reward_") and set(cells) != {number(None)}:
-            table.add_row(_title(metric), *cells)
-    return table
+            yield [metric.title, *cells]
 
 
-def _transfer_rows(
-    found: Sequence[TransferSummary | None],
-) -> Iterator[tuple[str, list[str]]]:
+def _transfer_rows(found: Sequence[TransferSummary | None]) -> Iterator[list[str]]:
     """Title and cells of what is told of changes of owner; nothing of undivided worlds."""
     summaries = [summary for summary in found if summary is not None]
     if not summaries:
         return
-    yield "transfers, forced", [f"{each.transfers}, {each.forced}" for each in summaries]
+    yield ["transfers, forced", *(f"{each.transfers}, {each.forced}" for each in summaries)]
     for title, spreads in (
         ("p50, p95, max ticks", [each.latency_ticks for each in summaries]),
         ("p50, p95, max ms", [each.latency_ms for each in summaries]),
     ):
-        yield title, [", ".join(map(number, spread)) for spread in spreads]
+        yield [title, *(", ".join(map(number, spread)) for spread in spreads)]
 
 
 def _show(
@@ -203,6 +177,7 @@ def _show(
     html: Path | None,
     json_path: Path | None,
 ) -> None:
+    plain: dict[str, Any] = {"markup": False, "highlight": False, "soft_wrap": True}
     console.print(report_table(found))
     if len(found.policies) > 1:
         console.print(difference_table(found))
@@ -211,17 +186,11 @@ def _show(
         from cavmarl.evaluate.page import write_page
 
         write_page(folder, html)
-        console.print(f"page: {html}", markup=False, highlight=False, soft_wrap=True)
-    console.print(
-        f"results: {folder} (`cavmarl report` shows them again)",
-        markup=False,
-        highlight=False,
-        soft_wrap=True,
-    )
+        console.print(f"page: {html}", **plain)
+    console.print(f"results: {folder} (`cavmarl report` shows them again)", **plain)
 
 
 def _new_folder(env: str) -> Path:
-    """An unused folder in runs/."""
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S-%f")
     return Path("runs/evaluate") / f"{Path(env).name}-{stamp}"
 
@@ -239,10 +208,6 @@ def _caption(repeats: int) -> str:
     if repeats > 1:
         return "mean of the runs, ± or [95 % interval between runs], (SD within a run)"
     return "shares [Wilson's 95 %], means (SD within the run); one run: no interval of means"
-
-
-def _title(metric: Metric) -> str:
-    return f"{metric.label}, {metric.unit}" if metric.unit else metric.label
 
 
 def report_cell(metric: Metric, found: Found) -> str:
@@ -271,7 +236,6 @@ def _change(metric: Metric, found: PairedDifference) -> str:
 
 
 def _figure(value: float) -> str:
-    """Three digits or so."""
     decimals = 2 if abs(value) < 10.0 else 1 if abs(value) < 100.0 else 0
     return f"{value:.{decimals}f}"
 

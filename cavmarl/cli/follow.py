@@ -4,29 +4,25 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-import typer
 from rich.console import Console
 from rich.table import Table
 
 from cavmarl.cli.lead import DEFAULT_PLACE, SecretFile, address_of, read_secret
-from cavmarl.cli.output import Environment, JsonPath, write_json
+from cavmarl.cli.output import Environment, JsonPath, about, grid, write_json
 from cavmarl.core.errors import ConfigError
 
 
 def follow(
     env: Environment,
     at: Annotated[
-        str, typer.Option("--at", metavar="ADDRESS", help="Where the world listens.")
+        str, about("Where the world listens.", "--at", metavar="ADDRESS")
     ] = DEFAULT_PLACE,
-    vehicles: Annotated[str, typer.Option(metavar="NAME,…", help="Agents to drive.")] = "car_0",
-    name: Annotated[str, typer.Option(help="Name shown in messages.")] = "reference",
+    vehicles: Annotated[str, about("Agents to drive.", metavar="NAME,…")] = "car_0",
+    name: Annotated[str, about("Name shown in messages.")] = "reference",
     stage: Annotated[
-        list[str] | None,
-        typer.Option(metavar="STAGE=NAME", help="A stage of the stack to replace."),
+        list[str] | None, about("A stage of the stack to replace.", metavar="STAGE=NAME")
     ] = None,
-    joins_s: Annotated[
-        float, typer.Option(help="Seconds that the world may take to answer.")
-    ] = 60.0,
+    joins_s: Annotated[float, about("Seconds that the world may take to answer.")] = 60.0,
     secret_file: SecretFile = None,
     json_path: JsonPath = None,
 ) -> None:
@@ -53,11 +49,6 @@ def follow(
 
 
 def _stages(words: list[str], known: tuple[str, ...]) -> dict[str, str]:
-    """`perception=blind` and the like.
-
-    Raises:
-        ConfigError: no such stage.
-    """
     chosen = {}
     for word in words:
         stage, equals, name = word.partition("=")
@@ -68,9 +59,8 @@ def _stages(words: list[str], known: tuple[str, ...]) -> dict[str, str]:
 
 
 def _table(found: dict[str, Any]) -> Table:
-    table = Table(title=f"{found['steps']} steps")
-    for column in ("stage", "mean, ms", "worst, ms"):
-        table.add_column(column, justify="left" if column == "stage" else "right")
-    for stage, row in found["stages"].items():
-        table.add_row(stage, f"{row['mean_wall_ms']:.2f}", f"{row['worst_wall_ms']:.2f}")
-    return table
+    rows = (
+        (stage, f"{row['mean_wall_ms']:.2f}", f"{row['worst_wall_ms']:.2f}")
+        for stage, row in found["stages"].items()
+    )
+    return grid(("stage", "mean, ms", "worst, ms"), rows, f"{found['steps']} steps")

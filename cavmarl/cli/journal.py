@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cavmarl.cli.output import JsonPath, write_json
+from cavmarl.cli.output import JsonPath, about, grid, pairs_grid, write_json
 
 if TYPE_CHECKING:
     from cavmarl.handoff.coordinator.journal_summary import JournalSummary
@@ -23,9 +22,7 @@ def journal(
         Path,
         typer.Argument(metavar="FILE", help="A journal of a run.", exists=True, dir_okay=False),
     ],
-    at: Annotated[
-        int | None, typer.Option(metavar="TICK", help="Print the owners at this tick.")
-    ] = None,
+    at: Annotated[int | None, about("Print the owners at this tick.", metavar="TICK")] = None,
     json_path: JsonPath = None,
 ) -> None:
     """Replay the log of a divided run: hand-offs, hosts, and the owners at its end or at a tick."""
@@ -55,45 +52,31 @@ def _rows(table: OwnerTable) -> list[list[int]]:
     ]
 
 
-def _grid(*heads: str) -> Table:
-    grid = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for head in heads:
-        grid.add_column(head, justify="right", no_wrap=True)
-    return grid
-
-
 def _owners(table: OwnerTable) -> Table:
-    grid = _grid("vehicle", "zone", "epoch", "ticks late")
-    for row in _rows(table):
-        grid.add_row(*map(str, row))
-    return grid
+    rows = (list(map(str, row)) for row in _rows(table))
+    return grid(("vehicle", "zone", "epoch", "ticks late"), rows, lefts=0)
 
 
 def _counts(summary: JournalSummary) -> Table:
-    grid = Table.grid(padding=(0, 2))
     span = f", {summary.first_tick} to {summary.last_tick}" if summary.ticks else ""
-    for name, text in (
-        ("run", summary.run),
-        ("lines", f"{summary.lines}"),
-        ("episodes", f"{summary.episodes}"),
-        ("ticks", f"{summary.ticks}{span}"),
-        ("vehicles", f"{summary.births} entered, {summary.removals} left"),
-        (
-            "hand-offs",
-            f"{summary.switches}, {summary.forced} of them forced; "
-            f"{summary.deferrals} deferred by a tick",
-        ),
-        ("hosts", f"{summary.hosts} named, {summary.fences} fenced"),
-    ):
-        grid.add_row(name, text)
-    return grid
+    moved = f"{summary.switches}, {summary.forced} of them forced; {summary.deferrals} deferred"
+    rows = {
+        "run": summary.run,
+        "lines": f"{summary.lines}",
+        "episodes": f"{summary.episodes}",
+        "ticks": f"{summary.ticks}{span}",
+        "vehicles": f"{summary.births} entered, {summary.removals} left",
+        "hand-offs": f"{moved} by a tick",
+        "hosts": f"{summary.hosts} named, {summary.fences} fenced",
+    }
+    return pairs_grid(rows.items())
 
 
 def _zones(table: OwnerTable) -> Table:
     """The host of each zone at the end, and how many vehicles it owns."""
-    grid = _grid("zone", "vehicles", "worker", "incarnation", "state")
     owned = [zone for zone, _ in table.owners.values()]
-    for zone, (worker, incarnation) in table.hosts.items():
-        state = table.states[zone].name.lower()
-        grid.add_row(str(zone), str(owned.count(zone)), str(worker), str(incarnation), state)
-    return grid
+    rows = [
+        (*map(str, (zone, owned.count(zone), *host)), table.states[zone].name.lower())
+        for zone, host in table.hosts.items()
+    ]
+    return grid(("zone", "vehicles", "worker", "incarnation", "state"), rows, lefts=0)

@@ -5,27 +5,18 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from secrets import token_hex
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cavmarl.cli.output import (
-    Agents,
-    Background,
-    Environment,
-    JsonPath,
-    Seed,
-    Settings,
-    parse_settings,
-    print_error,
-    write_json,
-)
+from cavmarl.cli.output import JsonPath, about, grid, print_error, with_world, write_json
+from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError, FollowerError
 
 if TYPE_CHECKING:
@@ -34,24 +25,18 @@ if TYPE_CHECKING:
 DEFAULT_PLACE = "cavmarl.sock"
 
 Place = Annotated[
-    str, typer.Option("--at", metavar="ADDRESS", help="A socket's path, or a port of this machine.")
+    str, about("A socket's path, or a port of this machine.", "--at", metavar="ADDRESS")
 ]
 
 
 SecretFile = Annotated[
     Path | None,
-    typer.Option(
-        help="File with the secret of a world at a port; `lead` makes it if there is none."
-    ),
+    about("File with the secret of a world at a port; `lead` makes it if there is none."),
 ]
 
 
 def read_secret(path: Path | None, may_make: bool = False) -> str:
-    """The secret of a file, which no other user can read; none without a file.
-
-    Raises:
-        ConfigError: it cannot be read or made, or is empty.
-    """
+    """The secret of a file, which no other user can read; none without a file."""
     if path is None:
         return ""
     try:
@@ -71,45 +56,33 @@ def address_of(text: str) -> str | int:
     return int(text) if text.isdecimal() else text
 
 
+@with_world()
 def lead(
-    env: Environment,
+    world: WorldSpec,
     at: Place = DEFAULT_PLACE,
-    followers: Annotated[
-        int, typer.Option(help="Followers that have to join before the first step.")
-    ] = 1,
-    steps: Annotated[int | None, typer.Option(help="Most steps; default: one episode.")] = None,
-    timeout_s: Annotated[
-        float, typer.Option(help="Seconds that a step waits for its followers.")
-    ] = 10.0,
-    joins_s: Annotated[
-        float, typer.Option(help="Seconds that followers may take to join.")
-    ] = 600.0,
+    followers: Annotated[int, about("Followers that have to join before the first step.")] = 1,
+    steps: Annotated[int | None, about("Most steps; default: one episode.")] = None,
+    timeout_s: Annotated[float, about("Seconds that a step waits for its followers.")] = 10.0,
+    joins_s: Annotated[float, about("Seconds that followers may take to join.")] = 600.0,
     secret_file: SecretFile = None,
     on_lost: Annotated[
-        Literal["go-on", "end"],
-        typer.Option(help="What a follower's fault ends: itself, or the run."),
+        Literal["go-on", "end"], about("What a follower's fault ends: itself, or the run.")
     ] = "go-on",
     own_ticks: Annotated[
-        Literal["refuse", "ignore"], typer.Option(help="How to treat a follower's own ticks.")
+        Literal["refuse", "ignore"], about("How to treat a follower's own ticks.")
     ] = "refuse",
     bad_controls: Annotated[
-        Literal["error", "hold"], typer.Option(help="How to treat invalid controls.")
+        Literal["error", "hold"], about("How to treat invalid controls.")
     ] = "error",
     pace: Annotated[
-        float | None, typer.Option(help="Simulated seconds a second; default: as fast as possible.")
+        float | None, about("Simulated seconds a second; default: as fast as possible.")
     ] = None,
     rig: Annotated[
         Literal["none", "reference"],
-        typer.Option(help="Mount the sensors that the reference stack drives with."),
+        about("Mount the sensors that the reference stack drives with."),
     ] = "none",
-    zones: Annotated[int | None, typer.Option(help="Shadows zones.count.")] = None,
-    workers: Annotated[
-        int, typer.Option(help="Worker processes; 0: the master's own process.")
-    ] = 0,
-    agents: Agents = None,
-    background: Background = None,
-    seed: Seed = 0,
-    settings: Settings = None,
+    zones: Annotated[int | None, about("Shadows zones.count.")] = None,
+    workers: Annotated[int, about("Worker processes; 0: the master's own process.")] = 0,
     json_path: JsonPath = None,
 ) -> None:
     """Run a world as its time master; followers that join over a socket drive its agents."""
@@ -122,17 +95,10 @@ def lead(
         raise ConfigError("--followers must be 0 or more, --steps 1 or more")
     console = Console()
     pacer = None if pace is None else RealTime(pace)
-    overrides = parse_settings(settings)
     if rig == "reference":
-        overrides = {"clock.ctrl_dt_s": 0.05, "rig": REFERENCE_RIG} | overrides
-    made = parallel_env(
-        env,
-        zones=zones,
-        workers=workers,
-        agents=agents,
-        background=background,
-        overrides=overrides,
-    )
+        given = {"clock.ctrl_dt_s": 0.05, "rig": REFERENCE_RIG, **world.overrides}
+        world = replace(world, overrides=given)
+    made = parallel_env(world.env, zones=zones, workers=workers, **world.keywords)
     with (
         closing(made),
         FollowedWorld(
@@ -143,11 +109,11 @@ def lead(
             own_ticks=own_ticks,
             bad_controls=bad_controls,
             pacer=pacer,
-        ) as world,
+        ) as led,
     ):
-        console.print(f"waiting for {followers} followers at {world.address}", highlight=False)
-        world.wait_for(followers, joins_s)
-        found = _run(world, seed, steps, on_lost)
+        console.print(f"waiting for {followers} followers at {led.address}", highlight=False)
+        led.wait_for(followers, joins_s)
+        found = _run(led, world.seed, steps, on_lost)
         if pacer is not None:
             found["lateness"] = vars(pacer.lateness)
         console.print(_table(found))
@@ -197,14 +163,14 @@ def _run(world: FollowedWorld, seed: int, steps: int | None, on_lost: str) -> di
 
 
 def _table(found: dict[str, Any]) -> Table:
-    table = Table(title=f"{found['steps']} steps, {found['time_s']:g} s", show_header=True)
-    for column in ("follower", "answers", "late", "bad", "waited for, s", "slowest in"):
-        table.add_column(column)
-    for row in found["barrier"]:
-        table.add_row(
+    rows = (
+        (
             escape(row["name"]),
             *(str(row[name]) for name in ("answers", "late", "bad")),
             f"{row['wait_wall_s']:.2f}",
             str(row["slowest_in"]),
         )
-    return table
+        for row in found["barrier"]
+    )
+    heads = ("follower", "answers", "late", "bad", "waited for, s", "slowest in")
+    return grid(heads, rows, f"{found['steps']} steps, {found['time_s']:g} s")

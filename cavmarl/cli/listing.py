@@ -48,5 +48,4 @@ def _kind(path: Path) -> str:
 
 
 def _shown(path: Path) -> str:
-    """The path as one would write it here."""
     return escape(str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path))

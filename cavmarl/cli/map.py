@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from cavmarl.cli import map_zones
-from cavmarl.cli.output import Environment, JsonPath, write_json
+from cavmarl.cli.output import Environment, JsonPath, about, write_json
 from cavmarl.engine.world_setup import find_map
 from cavmarl.maps.check import MapReport, check_map
 from cavmarl.maps.netconvert import Box, BuildResult, build_network
@@ -39,16 +39,12 @@ _SHOWN_WARNINGS = 12
 def build(
     source: Source,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Default: NAME.net.xml in this folder.")
+        Path | None, about("Default: NAME.net.xml in this folder.", "--out", "-o")
     ] = None,
-    tolerant: Annotated[
-        bool, typer.Option(help="Leave out what netconvert cannot use, and list it.")
-    ] = False,
+    tolerant: Annotated[bool, about("Leave out what netconvert cannot use, and list it.")] = False,
     bbox: Annotated[
         str | None,
-        typer.Option(
-            help="Keep roads within min,min,max,max: degrees lon,lat for OSM, else metres."
-        ),
+        about("Keep roads within min,min,max,max: degrees lon,lat for OSM, else metres."),
     ] = None,
     json_path: JsonPath = None,
 ) -> None:

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from cavmarl.cli.output import Environment, JsonPath, write_json
+from cavmarl.cli.output import Environment, JsonPath, about, write_json
 from cavmarl.config.env import ZONE_LAYOUTS
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import find_map
@@ -26,24 +26,18 @@ from cavmarl.zones.partition.zone_statistics import ZoneStatistics, zone_statist
 def zones(
     env: Environment,
     count: Annotated[
-        int | None, typer.Option(help="Number of zones; default: 4, or as many as a zone file has.")
+        int | None, about("Number of zones; default: 4, or as many as a zone file has.")
     ] = None,
-    layout: Annotated[
-        str, typer.Option(help=f"{', '.join(ZONE_LAYOUTS)}, or a zone file.")
-    ] = "bisection",
+    layout: Annotated[str, about(f"{', '.join(ZONE_LAYOUTS)}, or a zone file.")] = "bisection",
     avoid_junctions: Annotated[
-        bool, typer.Option("--avoid-junctions", help="Move cuts aside to keep junctions whole.")
+        bool, about("Move cuts aside to keep junctions whole.", "--avoid-junctions")
     ] = False,
     weight: Annotated[
-        str, typer.Option(help="What bisection shares out: lane_length, or uniform for area.")
+        str, about("What bisection shares out: lane_length, or uniform for area.")
     ] = "lane_length",
-    halo: Annotated[
-        float, typer.Option(min=0.0, help="How far zones see over their borders, m.")
-    ] = 100.0,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Write a zone file here.")] = None,
-    picture: Annotated[
-        Path | None, typer.Option(help="Draw the map with its zones here, a .png.")
-    ] = None,
+    halo: Annotated[float, about("How far zones see over their borders, m.", min=0.0)] = 100.0,
+    out: Annotated[Path | None, about("Write a zone file here.", "--out", "-o")] = None,
+    picture: Annotated[Path | None, about("Draw the map with its zones here, a .png.")] = None,
     json_path: JsonPath = None,
 ) -> None:
     """Divide a map into zones; print what is in each, and how evenly lanes are shared out."""

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial, wraps
+from inspect import Parameter, Signature, signature
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
+from rich import box
 from rich.console import Console
+from rich.table import Table
 from rich.text import Text
 
+from cavmarl.bench.harness import check_positive
+from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.seeds import check_seed
 
@@ -40,33 +46,92 @@ def _unwritable(path: Path, error: OSError) -> ConfigError:
     return ConfigError(f"{path}: cannot be written ({error.strerror or error})")
 
 
+def check_bound(value: float | None) -> float | None:
+    """Refuse a value of `--at-least` that nothing can be measured against."""
+    check_positive("--at-least", value)
+    return value
+
+
+def about(text: str, *names: str, **more: Any) -> Any:
+    """An option with a help text."""
+    return typer.Option(*names, help=text, **more)
+
+
 Environment = Annotated[
     str, typer.Argument(metavar="ENV", help="Environment: a name, folder or map file.")
 ]
+OptionalEnvironment = Annotated[
+    str, typer.Argument(metavar="[ENV]", help="Name, folder or map file of an environment.")
+]
+MapName = Annotated[
+    str, typer.Argument(metavar="MAP", help="A map file, or an environment's name or folder.")
+]
 PolicyName = Annotated[
-    str, typer.Option("--policy", "-p", help="A name of `cavmarl list`, or the path of a policy.")
+    str, about("A name of `cavmarl list`, or a policy's path.", "--policy", "-p")
 ]
-Seed = Annotated[int, typer.Option(help="Root of all random numbers.", callback=check_seed)]
-Agents = Annotated[int | None, typer.Option(help="Agents a world; default: the environment's.")]
-Background = Annotated[
-    int | None, typer.Option(help="Background vehicles a world; default: the environment's.")
-]
+Seed = Annotated[int, about("Root of all random numbers.", callback=check_seed)]
+Agents = Annotated[int | None, about("Agents a world; default: the environment's.")]
+Background = Annotated[int | None, about("Background vehicles a world; default: likewise.")]
 Settings = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Any key of env.yaml; may be repeated."),
+    list[str] | None, about("Any key of env.yaml; may be repeated.", "--set", metavar="KEY=VALUE")
 ]
 JsonPath = Annotated[
-    Path | None,
-    typer.Option("--json", help="Write the result here as JSON.", callback=writable),
+    Path | None, about("Write the result here as JSON.", "--json", callback=writable)
 ]
+AtLeast = Annotated[
+    float | None, about("Exit with 1 if it is not so many times as fast.", callback=check_bound)
+]
+
+
+def end_below(at_least: float | None, ratio: float | None) -> None:
+    """End the command with exit code 1 if a ratio is below what `--at-least` asks for."""
+    if at_least is not None and ratio is not None and ratio < at_least:
+        raise typer.Exit(1)
+
+
+def with_world(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Makes a command of a function that takes a `world: WorldSpec`.
+
+    In its place stand the options that make one: all, or the environment and those of these names.
+    Where the function has one of them, too, it says how it is given, and gets it.
+    """
+    chosen = names or ("agents", "background", "seed", "settings")
+    return partial(_with_world, ("env", *chosen))
+
+
+def _with_world(names: tuple[str, ...], command: Callable[..., None]) -> Callable[..., None]:
+    own = dict(signature(command).parameters)
+    hints = get_type_hints(command, include_extras=True)
+    shared = {
+        "env": (Environment, Parameter.empty),
+        "seed": (Seed, 0),
+        "agents": (Agents, None),
+        "background": (Background, None),
+        "settings": (Settings, None),
+    }
+    wanted = {
+        name: Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=kind)
+        for name, (kind, default) in shared.items()
+        if name in names
+    }
+    del own["world"]
+    for name, one in own.items():
+        wanted[name] = one.replace(annotation=hints[name], kind=Parameter.KEYWORD_ONLY)
+
+    @wraps(command)
+    def program(**options: Any) -> None:
+        keys = {name: options[name] for name in names if name != "settings"}
+        keys["env"] = keys["env"] or ""
+        spec = WorldSpec(overrides=parse_settings(options["settings"]), **keys)
+        command(spec, **{name: options[name] for name in own})
+
+    program.__annotations__ = {name: one.annotation for name, one in wanted.items()}
+    vars(program)["__signature__"] = Signature(list(wanted.values()))
+    return program
 
 
 def parse_settings(settings: Sequence[str] | None) -> dict[str, Any]:
-    """`sensors.lidar.rays=32` and the like as overrides; a value is JSON, else text.
-
-    Raises:
-        ConfigError: no `=`, no key, no value, or a key twice.
-    """
+    """`sensors.lidar.rays=32` and the like as overrides; a value is JSON, else text."""
     overrides: dict[str, Any] = {}
     for setting in settings or ():
         key, equals, text = setting.partition("=")
@@ -84,11 +149,7 @@ def parse_settings(settings: Sequence[str] | None) -> dict[str, Any]:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder that files can be written into, or see that it is one.
-
-    Raises:
-        ConfigError: it cannot be made or written into.
-    """
+    """Make a folder that files can be written into, or see that it is one."""
     try:
         path.mkdir(parents=True, exist_ok=True)
         with TemporaryFile(dir=path):
@@ -98,11 +159,7 @@ def make_folder(path: Path) -> None:
 
 
 def write_json(path: Path | None, document: dict[str, Any]) -> None:
-    """Write `document` where `--json` asks for it.
-
-    Raises:
-        ConfigError: the path cannot be written.
-    """
+    """Write `document` where `--json` asks for it."""
     if path is None:
         return
     try:
@@ -114,6 +171,34 @@ def write_json(path: Path | None, document: dict[str, Any]) -> None:
 def number(value: float | None, scale: float = 1.0) -> str:
     """A number for a table, times `scale`; a dash where there is none."""
     return "-" if value is None else f"{scale * value:.2f}"
+
+
+def grid(
+    heads: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    title: str | None = None,
+    caption: str | None = None,
+    lefts: int = 1,
+    wraps: bool = False,
+) -> Table:
+    """A table without a frame; all columns but the first `lefts` are right-aligned numbers."""
+    table = Table(title=title, caption=caption, box=box.SIMPLE_HEAD, pad_edge=False)
+    for place, head in enumerate(heads):
+        if place < lefts:
+            table.add_column(head, overflow="fold")
+        else:
+            table.add_column(head, justify="right", no_wrap=not wraps)
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def pairs_grid(rows: Iterable[tuple[str, str]]) -> Table:
+    """Names and what is told of them, without a head."""
+    table = Table.grid(padding=(0, 2))
+    for row in rows:
+        table.add_row(*row)
+    return table
 
 
 def say_difference(difference: Difference, sides: tuple[str, str]) -> str:

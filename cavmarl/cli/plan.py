@@ -8,17 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from cavmarl.cli.output import (
-    Agents,
-    Background,
-    JsonPath,
-    Seed,
-    Settings,
-    parse_settings,
-    print_error,
-    write_json,
-)
+from cavmarl.cli.output import JsonPath, about, print_error, with_world, write_json
 from cavmarl.config.env import ZONE_LAYOUTS
+from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError, NoAdmissibleWorkerError
 
 if TYPE_CHECKING:
@@ -31,46 +23,40 @@ NOW, IDLE = "now", "idle"
 LASTING_S = 3600  # of the worlds: longer than any measurement
 
 
+@with_world()
 def plan(
+    world: WorldSpec,
     env: Annotated[
         str | None,
         typer.Argument(metavar="[ENV]", help="Name, folder or map file; not with --again."),
     ] = None,
-    zones: Annotated[int, typer.Option(help="Zones of each world.")] = 9,
-    workers: Annotated[int, typer.Option(help="Workers that shards are placed on.")] = 3,
-    worlds: Annotated[int, typer.Option(min=1, help="Number of parallel worlds.")] = 1,
-    layout: Annotated[
-        str, typer.Option(help=f"{', '.join(ZONE_LAYOUTS)}, or a zone file.")
-    ] = "bisection",
+    zones: Annotated[int, about("Zones of each world.")] = 9,
+    workers: Annotated[int, about("Workers that shards are placed on.")] = 3,
+    worlds: Annotated[int, about("Number of parallel worlds.", min=1)] = 1,
+    layout: Annotated[str, about(f"{', '.join(ZONE_LAYOUTS)}, or a zone file.")] = "bisection",
     snapshot: Annotated[
         str,
-        typer.Option(
-            help=f"How busy workers are: {NOW} as this machine is, {IDLE}, or the plan of a file."
-        ),
+        about(f"How busy workers are: {NOW} as this machine is, {IDLE}, or the plan of a file."),
     ] = NOW,
-    steps: Annotated[int, typer.Option(help="Measured steps of each world.")] = 50,
-    before: Annotated[int, typer.Option(help="Unmeasured steps of each world, first.")] = 50,
-    tolerance: Annotated[float, typer.Option(help="Imbalance below which nothing moves.")] = 0.1,
+    steps: Annotated[int, about("Measured steps of each world.")] = 50,
+    before: Annotated[int, about("Unmeasured steps of each world, first.")] = 50,
+    tolerance: Annotated[float, about("Imbalance below which nothing moves.")] = 0.1,
     again: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Make a stored plan, or those of a run's manifest, once more from what they say; "
+        about(
+            "Make a stored plan, or those of a run's manifest, once more from what they say; "
             "exit code 1 if one is another.",
+            metavar="FILE",
         ),
     ] = None,
     cut: Annotated[
         Path | None,
-        typer.Option(
+        about(
+            "Extension: write a zone file here that shares out what was measured.",
             "--cut-anew",
             metavar="FILE",
-            help="Extension: write a zone file here that shares out what was measured.",
         ),
     ] = None,
-    agents: Agents = None,
-    background: Background = None,
-    seed: Seed = 0,
-    settings: Settings = None,
     json_path: JsonPath = None,
 ) -> None:
     """Measure what each zone costs, place the shards, and print the plan; nothing is started."""
@@ -91,17 +77,8 @@ def plan(
     seen = _snapshot(snapshot, workers)
     console = Console()
     with console.status("measuring"):
-        make = world_maker(
-            env,
-            layout=layout,
-            seconds=LASTING_S,
-            seed=seed,
-            agents=agents,
-            background=background,
-            overrides=parse_settings(settings),
-        )
-        simulation = make(zones)
-        measured = measure_shards(simulation, worlds, seed, steps=steps, before=before)
+        simulation = world_maker(world, layout=layout, seconds=LASTING_S)(zones)
+        measured = measure_shards(simulation, worlds, world.seed, steps=steps, before=before)
     partition = simulation.partition
     try:
         made = make_plan(Problem(measured.costs, partition.side_neighbors, seen, rule))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,7 +15,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Column, Table
 
-from cavmarl.cli.output import JsonPath, Seed, Settings, number, parse_settings, write_json
+from cavmarl.cli.output import JsonPath, about, number, with_world, write_json
+from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -51,59 +54,43 @@ def list_scenarios(json_path: JsonPath = None) -> None:
 
 
 @app.command("run")
+@with_world("agents", "seed", "settings")
 def run(
+    world: WorldSpec,
     name: Annotated[str, typer.Argument(metavar="NAME", help="A scenario, or a .py file.")],
-    map_name: Annotated[
-        str, typer.Option("--map", help="Name, folder or map file of an environment.")
-    ] = "grid4x4",
-    place: Annotated[str, typer.Option(help="Place on the map; default: drawn by the seed.")] = "",
+    env: Annotated[str, about("Name, folder or map file of an environment.", "--map")] = "grid4x4",
+    place: Annotated[str, about("Place on the map; default: drawn by the seed.")] = "",
     param: Annotated[
         list[str] | None,
-        typer.Option(
-            "--param", metavar="KEY=VALUE", help="A parameter of the scenario; may be repeated."
-        ),
+        about("A parameter of the scenario; may be repeated.", "--param", metavar="KEY=VALUE"),
     ] = None,
-    driver: Annotated[str, typer.Option(help="Driver of the agents: a name, or a path.")] = "idm",
+    driver: Annotated[str, about("Driver of the agents: a name, or a path.")] = "idm",
     agents: Annotated[
-        int, typer.Option(min=1, help="Number of agents: one in the conflict, the others behind.")
+        int, about("Number of agents: one in the conflict, the others behind.", min=1)
     ] = 1,
-    density: Annotated[str, typer.Option(help="Other traffic: none, low or high.")] = "none",
+    density: Annotated[str, about("Other traffic: none, low or high.")] = "none",
     zones: Annotated[
-        int | None, typer.Option(help="Background vehicles; default: as the environment says.")
+        int | None, about("Zones of the world; default: as the environment says.")
     ] = None,
-    seed: Seed = 0,
-    settings: Settings = None,
-    picture: Annotated[
-        Path | None, typer.Option(help="Write a .png of the closest moment here.")
-    ] = None,
-    video: Annotated[Path | None, typer.Option(help="Write an .mp4 of the run here.")] = None,
+    picture: Annotated[Path | None, about("Write a .png of the closest moment here.")] = None,
+    video: Annotated[Path | None, about("Write an .mp4 of the run here.")] = None,
     json_path: JsonPath = None,
 ) -> None:
     """Play a scenario to a driver; exit code 1 unless all come through and hurt no one."""
-    from contextlib import ExitStack
-
     from cavmarl.evaluate.scenarios.scenario_films import ScenarioCamera
     from cavmarl.evaluate.scenarios.scenario_runs import make_scenario, run_scenario
 
     with ExitStack() as stack:
         vec = make_scenario(
-            name,
-            map_name,
-            params=_params(param),
-            place=place,
-            density=density,
-            seed=seed,
-            zones=zones,
-            agents=agents,
-            overrides=parse_settings(settings),
+            name, world, params=_params(param), place=place, density=density, zones=zones
         )
         stack.callback(vec.close)
         look: Callable[[], None] | None = None
         if picture is not None or video is not None:
             look = stack.enter_context(ScenarioCamera(vec, picture, video)).look
-        found = run_scenario(vec, driver, seed, look)
+        found = run_scenario(vec, driver, world.seed, look)
     Console().print(_table(found))
-    write_json(json_path, found.to_dict())
+    write_json(json_path, asdict(found))
     if not found.passed:
         raise typer.Exit(1)
 
@@ -114,14 +101,13 @@ def sweep(
         list[str] | None, typer.Argument(metavar="[NAME]...", help="Scenarios; default: all.")
     ] = None,
     map_names: Annotated[
-        list[str] | None,
-        typer.Option("--map", help="An environment's map; may be repeated. Default: grid4x4."),
+        list[str] | None, about("An environment's map; may be repeated. Default: grid4x4.", "--map")
     ] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds, from 0 on.")] = 5,
-    passes: Annotated[str, typer.Option(help="The driver that is to pass all.")] = "idm",
-    fails: Annotated[str, typer.Option(help="The one that is to pass none.")] = "never_yield",
-    density: Annotated[str, typer.Option(help="Other traffic: none, low or high.")] = "none",
-    agents: Annotated[int, typer.Option(min=1, help="Agents in each world.")] = 1,
+    seeds: Annotated[int, about("Number of seeds, from 0 on.", min=1)] = 5,
+    passes: Annotated[str, about("The driver that is to pass all.")] = "idm",
+    fails: Annotated[str, about("The one that is to pass none.")] = "never_yield",
+    density: Annotated[str, about("Other traffic: none, low or high.")] = "none",
+    agents: Annotated[int, about("Agents in each world.", min=1)] = 1,
     json_path: JsonPath = None,
 ) -> None:
     """Play scenarios on maps to two drivers; exit code 1 unless one passes all, the other none."""
@@ -157,11 +143,6 @@ def sweep(
 
 
 def _params(given: list[str] | None) -> dict[str, bool | float]:
-    """`walk_mps=2` and the like.
-
-    Raises:
-        ConfigError: no `=`, or a value that is neither a number nor true or false.
-    """
     params: dict[str, bool | float] = {}
     for text in given or ():
         key, _, value = text.partition("=")

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from cavmarl.cli.evaluate import report_cell
-from cavmarl.cli.output import JsonPath, Seed, make_folder, write_json
+from cavmarl.cli.output import JsonPath, Seed, about, grid, make_folder, write_json
+from cavmarl.config.registry import find_settings
 
 if TYPE_CHECKING:
     from cavmarl.evaluate import EvaluationReport
@@ -24,25 +24,20 @@ def suite(
     name: Annotated[
         str, typer.Argument(metavar="SUITE", help="A name in configs/suites/, or a .yaml.")
     ] = "standard",
-    maps: Annotated[Path, typer.Option(help="Folder of the map files.")] = Path("maps"),
+    maps: Annotated[Path, about("Folder of the map files.")] = Path("maps"),
     policy: Annotated[
-        list[str] | None,
-        typer.Option("--policy", "-p", help="A driver; may be repeated. Default: idm."),
+        list[str] | None, about("A driver; may be repeated. Default: idm.", "--policy", "-p")
     ] = None,
-    episodes: Annotated[int, typer.Option("--episodes", "-n", help="Episodes of each run.")] = 4,
-    repeats: Annotated[
-        int, typer.Option("--repeats", "-r", help="Number of independent runs.")
-    ] = 5,
+    episodes: Annotated[int, about("Episodes of each run.", "--episodes", "-n")] = 4,
+    repeats: Annotated[int, about("Number of independent runs.", "--repeats", "-r")] = 5,
     seed: Seed = 0,
-    out: Annotated[Path, typer.Option(help="Folder of the results, one folder a world.")] = Path(
-        "runs/suite"
-    ),
+    out: Annotated[Path, about("Folder of the results, one folder a world.")] = Path("runs/suite"),
     json_path: JsonPath = None,
 ) -> None:
     """Evaluate drivers in every world of a suite; `cavmarl report` shows any of them whole."""
-    from cavmarl.evaluate.suite import find_suite, load_suite, run_suite, worlds_of
+    from cavmarl.evaluate.suite import load_suite, run_suite, worlds_of
 
-    loaded = load_suite(find_suite(name))
+    loaded = load_suite(find_settings("suite", name))
     worlds = worlds_of(loaded, maps)
     make_folder(out)
     console = Console()
@@ -62,18 +57,13 @@ def suite(
 
 
 def _table(reports: dict[str, EvaluationReport]) -> Table:
-    """One row a world and driver."""
     from cavmarl.evaluate.metrics import METRICS
 
     metrics = [metric for metric in METRICS if metric.name in SHOWN]
-    heads = (f"{metric.label}, {metric.unit}" for metric in metrics)
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    table.add_column("map, agents", overflow="fold")
-    table.add_column("driver", overflow="fold")
-    for head in heads:
-        table.add_column(head, justify="right", no_wrap=True)
+    rows = []
     for label, found in reports.items():
         for driver, results in found.policies.items():
             cells = (report_cell(metric, results[metric.name]) for metric in metrics)
-            table.add_row(escape(label), escape(Path(driver).name), *cells)
-    return table
+            rows.append((escape(label), escape(Path(driver).name), *cells))
+    heads = ("map, agents", "driver", *(metric.title for metric in metrics))
+    return grid(heads, rows, lefts=2)

@@ -4,43 +4,29 @@ from __future__ import annotations
 
 import os
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
 from rich.console import Console
 
 from cavmarl.cli.evaluate import progress_bar
-from cavmarl.cli.output import (
-    Agents,
-    Background,
-    Environment,
-    JsonPath,
-    PolicyName,
-    Seed,
-    Settings,
-    parse_settings,
-    write_json,
-)
+from cavmarl.cli.output import JsonPath, PolicyName, about, with_world, write_json
+from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from cavmarl.env.parallel import CavEnv
 
 
+@with_world()
 def view(
-    env: Environment,
+    world: WorldSpec,
     policy: PolicyName = "idm",
-    seconds: Annotated[float, typer.Option(help="Seconds of simulated time.")] = 30.0,
-    video: Annotated[
-        Path | None, typer.Option(help="Write an .mp4 here; default: show a window.")
-    ] = None,
-    seed: Seed = 0,
-    agents: Agents = None,
-    background: Background = None,
-    settings: Settings = None,
+    seconds: Annotated[float, about("Seconds of simulated time.")] = 30.0,
+    video: Annotated[Path | None, about("Write an .mp4 here; default: show a window.")] = None,
     ghosts_of: Annotated[
-        int | None, typer.Option(help="Outline the ghosts of this zone of a divided world.")
+        int | None, about("Outline the ghosts of this zone of a divided world.")
     ] = None,
     json_path: JsonPath = None,
 ) -> None:
@@ -51,27 +37,18 @@ def view(
         raise ConfigError(f"--seconds {seconds:g}: must be above 0 and at most 3600")
     if video is None:
         _check_display()
-    world = parallel_env(
-        env,
-        agents=agents,
-        background=background,
-        render_mode="human" if video is None else "rgb_array",
-        overrides=parse_settings(settings),
-    )
-    world.ghosts_of = ghosts_of
+    mode = "human" if video is None else "rgb_array"
+    made = parallel_env(world.env, render_mode=mode, **world.keywords)
+    made.ghosts_of = ghosts_of
     console = Console()
-    stats = record(world, policy, seconds, seed, video, console)
+    stats = record(made, policy, seconds, world.seed, video, console)
     if video is not None:
         console.print(f"video: {video}", markup=False)
     write_json(json_path, {"video": str(video) if video else None, "traffic": stats})
 
 
 def _check_display() -> None:
-    """Refuse a window where SDL would draw it nowhere and say nothing.
-
-    Raises:
-        ConfigError: Linux without a display.
-    """
+    """Refuse a window where SDL would draw it nowhere and say nothing: Linux without a display."""
     shows = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
     if sys.platform == "linux" and not any(os.environ.get(name) for name in shows):
         raise ConfigError("there is no display for a window: use --video FILE")
@@ -80,13 +57,10 @@ def _check_display() -> None:
 def record(
     world: CavEnv, policy: str, seconds: float, seed: int, video: Path | None, console: Console
 ) -> dict[str, float]:
-    """Drive `world` for some seconds, episode after episode, and film it where `video` is a path.
+    """Drive `world` for some seconds, and film it where `video` is a path.
 
-    Returns:
-        the traffic of the last episode.
+    Episodes follow one another; the traffic of the last one is returned.
     """
-    from contextlib import ExitStack
-
     from cavmarl.policies.policy import load_policy
     from cavmarl.render.video import VideoWriter
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache
+from operator import attrgetter
 from typing import Any, ClassVar, get_args, get_type_hints
 
 from cavmarl.core.errors import ConfigError
@@ -60,17 +61,14 @@ class Section:
     def __post_init__(self) -> None:
         check_ranges(self.section, self)
 
+    def need(self, name: str, holds: bool, expected: str) -> None:
+        """Refuse the value at a dotted name of this section unless `holds`."""
+        key = f"{self.section}.{name}" if self.section else name
+        check(holds, key, attrgetter(name)(self), expected)
+
 
 def check_ranges(section: str, holder: object) -> None:
-    """Refuse values outside the ranges in the types of a dataclass's fields; None passes.
-
-    Args:
-        section: key of the whole.
-        holder: the dataclass.
-
-    Raises:
-        ConfigError: key, value and range of the first.
-    """
+    """Refuse values outside the ranges in the types of a dataclass's fields; None passes."""
     kind: Any = type(holder)
     for name, bounds in _ranges(kind):
         value = getattr(holder, name)
@@ -95,6 +93,13 @@ def check(holds: bool, key: str, value: object, expected: str) -> None:
     """Raise a ConfigError that names key, value and expectation unless `holds`."""
     if not holds:
         raise ConfigError(f"{key} = {value!r}: {expected}")
+
+
+def check_count(key: str, value: Any, most: int) -> None:
+    """Raise a ConfigError unless `value` is a whole number from 1 to `most`."""
+    whole = isinstance(value, int) and not isinstance(value, bool)
+    check(whole, key, value, "must be a whole number")
+    check(1 <= value <= most, key, value, f"must be from 1 to {most}")
 
 
 def check_finite(key: str, value: float, low: float, high: float) -> None:

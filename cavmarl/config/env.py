@@ -17,30 +17,10 @@ from cavmarl.config.checks import check as _check
 from cavmarl.config.checks import check_finite as _check_finite
 from cavmarl.config.rig import Rig, check_rig
 from cavmarl.config.scenario import ScenarioConfig
-from cavmarl.config.sensors import SensorsConfig
+from cavmarl.config.sensors import SensorsConfig as SensorsConfig
 from cavmarl.config.sumo import SumoConfig
 from cavmarl.config.v2x import V2xConfig
 from cavmarl.core.extensions import REGISTERED_TERMS
-
-__all__ = [
-    "MAX_ZONES",
-    "TERMS",
-    "ZONE_FILE_SUFFIXES",
-    "ZONE_LAYOUTS",
-    "ActionConfig",
-    "ClockConfig",
-    "EnvConfig",
-    "MapConfig",
-    "ObservationConfig",
-    "PopulationConfig",
-    "ScenarioConfig",
-    "SensorsConfig",
-    "SumoConfig",
-    "TermsConfig",
-    "TrafficConfig",
-    "WorkersConfig",
-    "ZonesConfig",
-]
 
 # The named terms of one step, in the order of every terms array (`rewards/kernels/terms.py`).
 TERMS = (
@@ -65,7 +45,7 @@ MAX_IDS = 1_000_000  # of agents in one episode: each has its space and its rows
 
 
 @dataclass(frozen=True)
-class MapConfig:
+class MapConfig(Section, key="map"):
     """Where the roads come from.
 
     Attributes:
@@ -84,8 +64,8 @@ class MapConfig:
     buildings: str = ""
 
     def __post_init__(self) -> None:
-        _check(bool(self.source), "map.source", self.source, "must name a map file")
-        _check(all(self.programs), "map.programs", self.programs, "must name files")
+        self.need("source", bool(self.source), "must name a map file")
+        self.need("programs", all(self.programs), "must name files")
 
 
 @dataclass(frozen=True)
@@ -105,10 +85,9 @@ class ClockConfig(Section, key="clock"):
     def __post_init__(self) -> None:
         super().__post_init__()
         ticks = self.ctrl_dt_s / self.sim_dt_s
-        _check(
+        self.need(
+            "ctrl_dt_s",
             round(ticks) >= 1 and abs(ticks - round(ticks)) < 1e-9,
-            "clock.ctrl_dt_s",
-            self.ctrl_dt_s,
             f"must be a whole number of ticks of clock.sim_dt_s = {self.sim_dt_s:g}; "
             f"try {max(1, round(ticks)) * self.sim_dt_s:g}",
         )
@@ -173,29 +152,25 @@ class ZonesConfig(Section, key="zones"):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check(
+        self.need(
+            "layout",
             self.layout in ZONE_LAYOUTS or self.layout.endswith(ZONE_FILE_SUFFIXES),
-            "zones.layout",
-            self.layout,
             f"must be {', '.join(ZONE_LAYOUTS)}, or a zone file ({', '.join(ZONE_FILE_SUFFIXES)})",
         )
-        _check(
+        self.need(
+            "policy",
             self.policy not in ("hold", "reroute"),
-            "zones.policy",
-            self.policy,
             "would change what vehicles do, and then the divided world is not the undivided one, "
             "bit for bit; use extend, which lets them drive on, or force",
         )
-        _check(
+        self.need(
+            "grace_ticks",
             (self.policy == "extend") == (self.grace_ticks > 0),
-            "zones.grace_ticks",
-            self.grace_ticks,
             "must be 1 or more with zones.policy = extend, and 0 with force",
         )
-        _check(
+        self.need(
+            "repartition_steps",
             not (self.repartition_steps and (self.faults or self.reproducers)),
-            "zones.repartition_steps",
-            self.repartition_steps,
             "vehicles that change their zone must not be late: leave out zones.faults and "
             "zones.reproducers, or let zones stay",
         )
@@ -261,10 +236,9 @@ class PopulationConfig(Section, key="population"):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.budget is not None and self.mode == "open":
-            _check(
+            self.need(
+                "budget",
                 self.agents <= self.budget <= MAX_IDS,
-                "population.budget",
-                self.budget,
                 f"must be at least population.agents = {self.agents}, and at most {MAX_IDS}",
             )
 
@@ -311,16 +285,14 @@ class TrafficConfig(Section, key="traffic"):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check(
+        self.need(
+            "source",
             self.source == "native" or bool(self.demand),
-            "traffic.source",
-            self.source,
             "needs traffic.demand: a .sumocfg, or files of routes",
         )
-        _check(
+        self.need(
+            "max_trip_m",
             self.max_trip_m == 0.0 or self.max_trip_m > self.min_trip_m,
-            "traffic.max_trip_m",
-            self.max_trip_m,
             f"must be 0 (no limit) or above traffic.min_trip_m = {self.min_trip_m:g}",
         )
 
@@ -351,12 +323,11 @@ class ActionConfig(Section, key="action"):
     def __post_init__(self) -> None:
         super().__post_init__()
         speeds = self.target_speeds_mps
-        _check(
+        self.need(
+            "target_speeds_mps",
             len(speeds) >= 2
             and all(math.isfinite(v) and 0.0 <= v <= 60.0 for v in speeds)
             and all(a < b for a, b in pairwise(speeds)),
-            "action.target_speeds_mps",
-            speeds,
             "must be at least two rising speeds from 0 to 60",
         )
 
@@ -430,7 +401,7 @@ class TermsConfig(Section, key="terms"):
 
 
 @dataclass(frozen=True)
-class EnvConfig:
+class EnvConfig(Section, key=""):
     """The whole decision process of one environment: the keys of `env.yaml`.
 
     Attributes:
@@ -459,32 +430,28 @@ class EnvConfig:
     horizon_s: float = 60.0
 
     def __post_init__(self) -> None:
-        _check(self.version >= 0, "version", self.version, "must be 0 or more")
+        self.need("version", self.version >= 0, "must be 0 or more")
         _check_finite("horizon_s", self.horizon_s, self.clock.ctrl_dt_s, 1e6)
         check_rig(self.rig, self.clock.sim_dt_s, self.clock.ticks_per_step)
-        _check(
-            not self.workers.sensors or bool(self.rig),
+        self.need(
             "workers.sensors",
-            self.workers.sensors,
+            not self.workers.sensors or bool(self.rig),
             "there is no rig whose sensors they could share; name some under rig, or leave it 0",
         )
-        _check(
-            self.observation.mode != "sensors" or bool(self.rig),
+        self.need(
             "observation.mode",
-            self.observation.mode,
+            self.observation.mode != "sensors" or bool(self.rig),
             "there is no sensor under rig; mount one",
         )
-        _check(
-            not self.scenario.name or self.population.agents >= 1,
+        self.need(
             "population.agents",
-            self.population.agents,
+            not self.scenario.name or self.population.agents >= 1,
             "must be 1 or more where there is a scenario: it is played to agents",
         )
         steps = self.horizon_s / self.clock.ctrl_dt_s
-        _check(
-            abs(steps - round(steps)) < 1e-6 * steps,
+        self.need(
             "horizon_s",
-            self.horizon_s,
+            abs(steps - round(steps)) < 1e-6 * steps,
             f"must be a whole number of steps of clock.ctrl_dt_s = {self.clock.ctrl_dt_s:g}; "
             f"try {max(1, round(steps)) * self.clock.ctrl_dt_s:g}",
         )
@@ -499,10 +466,9 @@ class EnvConfig:
     def _keep_what_is_told(self) -> None:
         """Switch the sensors off that look at others."""
         told = self.sensors.messages
-        _check(
-            bool(told.objects or told.events or told.signal),
+        self.need(
             "observation.mode",
-            self.observation.mode,
+            bool(told.objects or told.events or told.signal),
             "no messages are observed: set sensors.messages.objects",
         )
         object.__setattr__(self, "sensors", self.sensors.without_sight())
@@ -529,10 +495,9 @@ class EnvConfig:
     def _check_sumo(self) -> None:
         """Refuse what cannot be together with SUMO as global traffic."""
         source, tick_ms = self.traffic.source, self.clock.sim_dt_s * 1000.0
-        _check(
-            abs(tick_ms - round(tick_ms)) < 1e-9,
+        self.need(
             "clock.sim_dt_s",
-            self.clock.sim_dt_s,
+            abs(tick_ms - round(tick_ms)) < 1e-9,
             f"must be whole milliseconds with traffic.source = {source}: SUMO counts in them",
         )
         _check(
@@ -541,10 +506,9 @@ class EnvConfig:
             self.map.programs or self.map.program,
             f"traffic.source = {source}: SUMO has the signals; name such files in its .sumocfg",
         )
-        _check(
-            source == "sumo-demand" or self.workers.balance_steps == 0,
+        self.need(
             "workers.balance_steps",
-            self.workers.balance_steps,
+            source == "sumo-demand" or self.workers.balance_steps == 0,
             f"traffic.source = {source}: a process that takes up a SUMO has to run it again from "
             "the beginning of the episode; leave it 0",
         )
@@ -554,10 +518,9 @@ class EnvConfig:
             True,
             f"traffic.source = {source}: nobody knows when SUMO's signals change; leave it out",
         )
-        _check(
-            not self.scenario.name,
+        self.need(
             "scenario.name",
-            self.scenario.name,
+            not self.scenario.name,
             f"traffic.source = {source}: scenes are for native traffic; leave one out",
         )
 

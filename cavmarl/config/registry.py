@@ -155,11 +155,23 @@ def load_config(
         raw = dataclasses.asdict(config)
         for key, value in shadows.items():
             is_named = key == "rig" and isinstance(value, str)
-            _shadow(raw, key, load_rig(str(value), base_dir) if is_named else value)
+            shadow(raw, key, load_rig(str(value), base_dir) if is_named else value)
         if max_cycles is not None:
             raw["horizon_s"] = _horizon_s(max_cycles, raw)
         config = validate(EnvConfig, with_current_names(raw), f"{where}, overridden")
     return config, base_dir
+
+
+def find_settings(what: str, name: str) -> Path:
+    """The file that `name` means: a path, or a name in `configs/`: a `rig` or a `suite`."""
+    if Path(name).is_file():
+        return Path(name)
+    for place in places("configs"):
+        path = place / f"{what}s" / f"{name}.yaml"
+        if path.is_file():
+            return path
+    usual = {"rig": "ten_sensors", "suite": "standard"}[what]
+    raise ConfigError(f"no {what} or file '{name}': give '{usual}' or the path of a .yaml")
 
 
 def _refuse_code(keys: object, where: str) -> None:
@@ -205,26 +217,12 @@ def _find_rig(name: str, base_dir: Path) -> Path:
 
 
 def resolve_map(config: EnvConfig, base_dir: Path) -> Path:
-    """The file that `map.source` means.
-
-    Args:
-        config: of the environment.
-        base_dir: the folder that a relative source starts from.
-
-    Raises:
-        MapError: no such file.
-        MissingExtraError: the source lies in the eclipse-sumo wheel, which is not installed.
-    """
+    """The file that `map.source` means."""
     return _resolve("map.source", config.map.source, base_dir, MapError)
 
 
 def resolve_demand(config: EnvConfig, base_dir: Path) -> list[Path]:
-    """The files that `traffic.demand` means; as `resolve_map`.
-
-    Raises:
-        DemandError: no such file.
-        MissingExtraError: a file lies in the eclipse-sumo wheel, which is not installed.
-    """
+    """The files that `traffic.demand` means, as `map.source` is resolved."""
     return [
         _resolve("traffic.demand", source, base_dir, DemandError)
         for source in config.traffic.demand
@@ -313,7 +311,7 @@ def _map_name(path: Path) -> str:
     return path.name.removesuffix(ending)
 
 
-def _shadow(raw: dict[str, Any], key: str, value: object) -> None:
+def shadow(raw: dict[str, Any], key: str, value: object) -> None:
     """Put `value` at a dotted key of nested mappings."""
     *parents, last = key.split(".")
     inner: Any = raw

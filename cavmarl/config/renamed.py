@@ -29,9 +29,6 @@ def with_current_names(raw: object) -> object:
     """The same keys and values as of an env.yaml, by the names that they have now.
 
     An old name warns (`FutureWarning`) and takes the place of the new one.
-
-    Args:
-        raw: nested mappings, from outside; what is no mapping is handed back.
     """
     if not isinstance(raw, Mapping):
         return raw

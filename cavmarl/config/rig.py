@@ -66,8 +66,8 @@ class MountedConfig:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of one sample."""
-        raise NotImplementedError
+        """Of one sample; by default one number a channel."""
+        return (len(self.units),)
 
     def check(self, key: str) -> None:
         """Refuse values that cannot work.
@@ -345,11 +345,6 @@ class GnssConfig(SampledConfig):
     origin_height_m: Annotated[float, Within(-500.0, 10_000.0)] = 0.0
     units: ClassVar[tuple[str, ...]] = ("m east", "m north", "m up")
 
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """(3,)."""
-        return (3,)
-
 
 @dataclass(frozen=True, kw_only=True)
 class ImuConfig(SampledConfig):
@@ -359,11 +354,6 @@ class ImuConfig(SampledConfig):
     units: ClassVar[tuple[str, ...]] = ("m/s²", "m/s²", "m/s²", "rad/s", "rad/s", "rad/s")
     in_batches: ClassVar[bool] = True
 
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """(6,)."""
-        return (6,)
-
 
 @dataclass(frozen=True, kw_only=True)
 class OdometryConfig(SampledConfig):
@@ -372,11 +362,6 @@ class OdometryConfig(SampledConfig):
     type: Literal["odometry"] = "odometry"
     units: ClassVar[tuple[str, ...]] = ("m/s", "rad/s", "m")
     in_batches: ClassVar[bool] = True
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """(3,)."""
-        return (3,)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -394,11 +379,6 @@ class LaneBoundaryConfig(SampledConfig):
     lookahead_m: Annotated[float, Within(1.0, 100.0)] = 10.0
     units: ClassVar[tuple[str, ...]] = ("m", "m", "m", "rad", "1/m")
 
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """(5,)."""
-        return (5,)
-
 
 @dataclass(frozen=True, kw_only=True)
 class CollisionConfig(MountedConfig):
@@ -406,11 +386,6 @@ class CollisionConfig(MountedConfig):
 
     type: Literal["collision"] = "collision"
     units: ClassVar[tuple[str, ...]] = ("bits", "id")
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """(2,)."""
-        return (2,)
 
 
 RigSensor = (
@@ -431,16 +406,7 @@ Rig = dict[str, Annotated[RigSensor, ByType()]]
 
 
 def check_rig(rig: Mapping[str, MountedConfig], sim_dt_s: float, ticks_per_step: int) -> None:
-    """Refuse a rig that cannot work.
-
-    Args:
-        rig: the sensors by name.
-        sim_dt_s: seconds of a tick.
-        ticks_per_step: ticks of a step.
-
-    Raises:
-        ConfigError: which key, and what can work.
-    """
+    """Refuse a rig that cannot work."""
     check(len(rig) <= MAX_SENSORS, "rig", len(rig), f"must be {MAX_SENSORS} sensors at most")
     for name, sensor in rig.items():
         key = f"rig.{name}"

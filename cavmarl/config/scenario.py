@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from cavmarl.config.checks import check
+from cavmarl.config.checks import Section
 
 
 @dataclass(frozen=True)
-class ScenarioConfig:
+class ScenarioConfig(Section, key="scenario"):
     """One scripted conflict for the agents of each world; docs/scenarios.md.
 
     Attributes:
@@ -25,10 +25,9 @@ class ScenarioConfig:
     params: dict[str, bool | float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        check(self.seed >= 0, "scenario.seed", self.seed, "must be 0 or more")
-        check(
+        self.need("seed", self.seed >= 0, "must be 0 or more")
+        self.need(
+            "name",
             bool(self.name) or not (self.place or self.params),
-            "scenario.name",
-            self.name,
             "must name a scenario where scenario.place or scenario.params is given",
         )

@@ -150,13 +150,13 @@ class KinematicsConfig(Section, key="sensors.kinematics"):
     def __post_init__(self) -> None:
         super().__post_init__()
         key = "sensors.kinematics"
-        check(bool(self.features), f"{key}.features", self.features, "must name at least one")
+        self.need("features", bool(self.features), "must name at least one")
         _check_features(f"{key}.features", self.features, VEHICLE_FEATURES)
         _check_ranges(f"{key}.features_range", self.features_range)
 
 
 @dataclass(frozen=True)
-class OccupancyGridConfig:
+class OccupancyGridConfig(Section, key="sensors.occupancy_grid"):
     """highway-env's `OccupancyGrid`: layers of cells around the vehicle.
 
     Attributes:
@@ -183,35 +183,25 @@ class OccupancyGridConfig:
         key = "sensors.occupancy_grid"
         _check_features(f"{key}.features", self.features, GRID_FEATURES)
         _check_ranges(f"{key}.features_range", self.features_range)
-        check(
+        self.need(
+            "grid_size_m",
             len(self.grid_size_m) == 2 and all(_is_range(axis) for axis in self.grid_size_m),
-            f"{key}.grid_size_m",
-            self.grid_size_m,
             "must be [[min x, max x], [min y, max y]], both rising",
         )
         for axis in self.grid_size_m:
             for bound in axis:
                 check_finite(f"{key}.grid_size_m", bound, -300.0, 300.0)
-        check(
-            len(self.grid_step_m) == 2,
-            f"{key}.grid_step_m",
-            self.grid_step_m,
-            "must be [x, y], the sides of a cell",
-        )
+        self.need("grid_step_m", len(self.grid_step_m) == 2, "must be [x, y], the sides of a cell")
         for step in self.grid_step_m:
             check_finite(f"{key}.grid_step_m", step, 0.1, 300.0)
         columns, rows = self.shape
-        check(
-            columns >= 1 and rows >= 1,
-            f"{key}.grid_step_m",
-            self.grid_step_m,
-            "must fit into grid_size_m at least once",
+        self.need(
+            "grid_step_m", columns >= 1 and rows >= 1, "must fit into grid_size_m at least once"
         )
         numbers = len(self.features) * columns * rows
-        check(
+        self.need(
+            "grid_size_m",
             numbers <= MAX_GRID_NUMBERS,
-            f"{key}.grid_size_m",
-            self.grid_size_m,
             f"{len(self.features)} layers of {columns} by {rows} cells are {numbers} numbers, more "
             f"than {MAX_GRID_NUMBERS}; use larger grid_step_m or a smaller grid_size_m",
         )
@@ -319,7 +309,7 @@ class SensorsConfig(Section, key="sensors"):
             there = name in REGISTERED_SENSORS
             check(there, "sensors.registered", name, REGISTERED_SENSORS.advice())
         once = len(set(self.registered)) == len(self.registered)
-        check(once, "sensors.registered", self.registered, "must name each sensor once")
+        self.need("registered", once, "must name each sensor once")
         check(any(counts), "sensors", "all off", "an agent must observe something; switch one on")
 
     def without_sight(self) -> SensorsConfig:

@@ -79,17 +79,12 @@ class RoadsideConfig(Section, key="v2x.roadside"):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        key = "v2x.roadside"
-        check(
-            len(set(self.signals)) == len(self.signals),
-            f"{key}.signals",
-            self.signals,
-            "must name each signal once",
+        self.need(
+            "signals", len(set(self.signals)) == len(self.signals), "must name each signal once"
         )
-        check(
+        self.need(
+            "signals",
             EVERY_SIGNAL not in self.signals or len(self.signals) == 1,
-            f"{key}.signals",
-            self.signals,
             f"'{EVERY_SIGNAL}' stands alone",
         )
 
@@ -126,18 +121,15 @@ class ChannelConfig(Section, key="v2x.channel"):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        key = "v2x.channel"
         exponent = self.path_loss_exponent
-        check(
+        self.need(
+            "path_loss_exponent",
             exponent == 0.0 or 1.0 <= exponent <= 6.0,
-            f"{key}.path_loss_exponent",
-            exponent,
             "must be 0 (off), or from 1 to 6",
         )
-        check(
+        self.need(
+            "building_db",
             self.building_db == 0.0 or exponent > 0.0,
-            f"{key}.building_db",
-            self.building_db,
             "buildings weaken what the path-loss model gives: set path_loss_exponent, too",
         )
 
@@ -181,11 +173,7 @@ class V2xConfig(Section, key="v2x"):
     inbox: InboxConfig = field(default_factory=InboxConfig)
 
     def check_clock(self, sim_dt_s: float) -> None:
-        """Refuse rates that are no whole number of ticks of `sim_dt_s`.
-
-        Raises:
-            ConfigError: such a rate.
-        """
+        """Refuse rates that are no whole number of ticks of `sim_dt_s`."""
         for key, rate_hz in (
             ("cam.rate_hz", self.cam.rate_hz),
             ("denm.rate_hz", self.denm.rate_hz),

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Unpack
 
 import numpy as np
 
+from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import find_map, load_world
 from cavmarl.env.actions import ActionDecoder
@@ -20,11 +21,7 @@ UNDIVIDED = "bisection"  # of one zone: all layouts are the same
 
 
 class DrivenWorld:
-    """A world whose agents do what the built-in driver would.
-
-    Args:
-        simulation: one world, reset.
-    """
+    """A world whose agents do what the built-in driver would."""
 
     def __init__(self, simulation: Simulation) -> None:
         self.simulation = simulation
@@ -33,7 +30,6 @@ class DrivenWorld:
         self._decoder = ActionDecoder(simulation.config.action, 1, names)
 
     def commands(self) -> Commands:
-        """Of the next step."""
         if not self._num_agents:
             return self._decoder.idle()
         outputs = self.simulation.outputs
@@ -50,42 +46,28 @@ class DrivenWorld:
 
 
 def world_maker(
-    env: str | Path,
+    env: str | Path | WorldSpec,
     demand: Sequence[Path] = (),
     *,
     layout: str = UNDIVIDED,
     seconds: int,
-    seed: int = 0,
-    agents: int | None = None,
-    background: int | None = None,
-    overrides: Mapping[str, Any] | None = None,
+    **keys: Unpack[WorldKeys],
 ) -> Callable[[int], Simulation]:
     """What makes the same world in k zones, reset.
 
     Args:
-        env: name, folder or map file of an environment.
+        env: as in `make_vec`, like the other keywords.
         demand: what drives on its map instead of the environment's vehicles, ticks of `TICK_S`.
         layout: how zones are cut, or a zone file.
         seconds: how long the world is needed.
-        seed: root of all random numbers.
-        agents: of a world without `demand`; default: the environment's.
-        background: the same.
-        overrides: values for other keys.
-
-    Raises:
-        ConfigError: a key, a value or a demand that cannot work.
-        DemandError: a demand that cannot be, or not on this map.
-        MapError: the map cannot be driven.
+        keys: of the world; with `demand` numbers of vehicles are not read.
     """
+    spec = WorldSpec.of(env, **keys)
     if demand:
-        world = load_demand(find_map(env), demand, seconds, TICK_S, overrides)
+        world = load_demand(find_map(spec.env), demand, seconds, TICK_S, spec.overrides)
     else:
-        world = load_world(
-            env,
-            agents=agents,
-            background=background,
-            overrides={"horizon_s": float(seconds), **(overrides or {})},
-        )
+        lasting = {"horizon_s": float(seconds), **spec.overrides}
+        world = load_world(spec.env, **spec.keywords | {"overrides": lasting})
     config, network, file, _ = world
 
     def make(zones: int) -> Simulation:
@@ -97,7 +79,7 @@ def world_maker(
             weight=config.zones.weight,
         )
         simulation = Simulation(config, network, demand=file, partition=partition)
-        simulation.seed(seed)
+        simulation.seed(spec.seed)
         simulation.reset()
         return simulation
 

@@ -1,4 +1,4 @@
-"""`EncounterWatch`: after each step, the places and near misses of agents."""
+"""What is noted after each step: places and near misses of agents, and counts of messages."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.evaluate.kernels.watching import locate_agents, watch_encroachments
-from cavmarl.evaluate.recorder import Recorder
+from cavmarl.evaluate.recorder import MESSAGE_COLUMNS, Recorder
 from cavmarl.roads.network import RoadNetwork
 
 
@@ -15,8 +15,7 @@ def mirrored_conflicts(network: RoadNetwork) -> NDArray[np.int32]:
     """(num_conflicts,) the row of the same area as seen from the foe's path, -1 where paths merge.
 
     A vehicle that follows another out of a merge shares its lane from then on: that is following,
-        which time
-    to collision measures, and no encroachment.
+    which time to collision measures, and no encroachment.
     """
     links, conflicts = network.links, network.conflicts
     link = np.repeat(np.arange(len(links)), links["num_conflicts"])
@@ -31,12 +30,7 @@ def mirrored_conflicts(network: RoadNetwork) -> NDArray[np.int32]:
 
 
 class EncounterWatch:
-    """Writes places and least post-encroachment times of the agents into a recorder.
-
-    Args:
-        vec: the worlds, looked at between their steps.
-        recorder: of the same worlds.
-    """
+    """Writes places and least post-encroachment times of the agents into a recorder."""
 
     def __init__(self, vec: CavVectorEnv, recorder: Recorder) -> None:
         self._vec = vec
@@ -70,3 +64,24 @@ class EncounterWatch:
             self._seen_agent,
             self._recorder.least_pet_s,
         )
+
+
+class MessageRecord:
+    """Keeps the counts of each world up to the last step before its episode is over, if any."""
+
+    def __init__(self, vec: CavVectorEnv) -> None:
+        self._bus = vec.simulation.messages if vec.config.v2x.enabled else None
+        self._values = np.full((vec.num_envs, len(MESSAGE_COLUMNS)), np.nan)
+
+    def add(self, running: NDArray[np.bool_]) -> None:
+        """Note the worlds (W,) whose episode goes on."""
+        if self._bus is None:
+            return
+        for world in np.flatnonzero(running).tolist():
+            found = self._bus.statistics(world).to_dict()
+            self._values[world] = [found[name] for name in MESSAGE_COLUMNS]
+
+    def write(self, episodes: NDArray[np.void]) -> None:
+        """Fill the columns of EPISODE (n,), of the first n worlds; NaN: there are no messages."""
+        for column, name in enumerate(MESSAGE_COLUMNS):
+            episodes[name] = self._values[: len(episodes), column]

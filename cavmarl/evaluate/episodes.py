@@ -6,20 +6,19 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.config.world_spec import WorldSpec
 from cavmarl.engine.shard_clock import ShardClock
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
-from cavmarl.evaluate.encounters import EncounterWatch
-from cavmarl.evaluate.message_record import MessageRecord
+from cavmarl.evaluate.encounters import EncounterWatch, MessageRecord
 from cavmarl.evaluate.recorder import Recorder
-from cavmarl.evaluate.tables import EPISODE, TRACK, TRIP
-from cavmarl.evaluate.transfer_rows import TRANSFER, TransferRecorder
+from cavmarl.evaluate.tables import EPISODE, TRACK, TRANSFER, TRIP
+from cavmarl.evaluate.transfer_rows import TransferRecorder
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.policies.policy import Policy, load_policy
 from cavmarl.zones.partition.zone_statistics import imbalance
@@ -28,77 +27,43 @@ MAX_VEHICLES = 100_000  # of the worlds that are stepped together
 MAX_WORLDS = 128
 TRACK_S = 0.5  # between the points of a track
 TIMED_TICKS = 16  # of so many ticks one is timed, zone by zone
-_HALF = np.uint64(1)  # a seed has 63 bits
 
 Progress = Callable[[str, int, int], None]  # policy, steps done, most steps there can be
 
 
-@dataclass(frozen=True)
-class EpisodeJob:
-    """One run: some policies, each over the same episodes.
+@dataclass(frozen=True, kw_only=True)
+class EpisodeJob(WorldSpec):
+    """One run: some policies, each over the same episodes; the seed is the policies', too."""
 
-    Attributes:
-        env, agents, background, max_cycles, overrides: as in `make_vec`.
-        policies: as in `load_policy`, by the name that results have.
-        episodes: how many; episode e is the first one of world e of `seed`.
-        seed: root of all random numbers, also the policies'.
-        run: its number.
-    """
-
-    env: str
-    policies: Mapping[str, str]
-    episodes: int
-    seed: int
-    run: int = 0
-    agents: int | None = None
-    background: int | None = None
-    max_cycles: int | None = None
-    overrides: Mapping[str, Any] = field(default_factory=dict)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON; `EpisodeJob(**…)` is the way back."""
-        return asdict(self)
+    policies: Mapping[str, str]  # as in `load_policy`, by the name that results have
+    episodes: int  # how many; episode e is the first one of world e of the seed
+    run: int = 0  # its number
 
 
 @dataclass(frozen=True)
 class Speed:
-    """How fast a run went; not repeatable.
+    """How fast a run went; not repeatable."""
 
-    Attributes:
-        step_ms: milliseconds of simulation for one step of one world.
-        policy_ms: milliseconds of the policy for one step of one world.
-        agent_steps_per_s: decisions a second, simulation and policy.
-        worlds: how many were stepped together.
-        zone_time_imbalance: of divided worlds: the slowest zone's part of a tick over the mean of
-            all zones, by the processor's time, all worlds together; None: not measured.
-    """
-
-    step_ms: float
-    policy_ms: float
-    agent_steps_per_s: float
-    worlds: int
+    step_ms: float  # milliseconds of simulation for one step of one world
+    policy_ms: float  # milliseconds of the policy for one step of one world
+    agent_steps_per_s: float  # decisions a second, simulation and policy
+    worlds: int  # how many were stepped together
+    # of divided worlds: the slowest zone's part of a tick over the mean of all zones, by the
+    # processor's time, all worlds together; None: not measured
     zone_time_imbalance: float | None = None
 
 
 @dataclass(frozen=True)
 class RunData:
-    """What a policy did in one run.
+    """What a policy did in one run."""
 
-    Attributes:
-        trips: TRIP records of all trips.
-        episodes: EPISODE records.
-        tracks: TRACK records of the agents of the first episode.
-        speed: how fast it ran.
-        transfers: TRANSFER records of the changes of owner; none in undivided worlds.
-        transfer_counts: of a `TransferLog`, summed over the episodes.
-    """
-
-    trips: NDArray[np.void]
-    episodes: NDArray[np.void]
-    tracks: NDArray[np.void]
-    speed: Speed
+    trips: NDArray[np.void]  # TRIP records of all trips
+    episodes: NDArray[np.void]  # EPISODE records
+    tracks: NDArray[np.void]  # TRACK records of the agents of the first episode
+    speed: Speed  # how fast it ran
+    # TRANSFER records of the changes of owner; none in undivided worlds
     transfers: NDArray[np.void]
-    transfer_counts: Mapping[str, int]
+    transfer_counts: Mapping[str, int]  # of a `TransferLog`, summed over the episodes
 
 
 def worlds_at_once(episodes: int, vehicles: int) -> int:
@@ -108,19 +73,7 @@ def worlds_at_once(episodes: int, vehicles: int) -> int:
 
 
 def drive_run(job: EpisodeJob, progress: Progress | None = None) -> dict[str, RunData]:
-    """Drive every policy of a job through its episodes.
-
-    Raises:
-        ConfigError: a key or a value that cannot work.
-        PolicyError: a policy cannot be loaded or does not fit.
-    """
-    world = load_world(
-        job.env,
-        agents=job.agents,
-        background=job.background,
-        max_cycles=job.max_cycles,
-        overrides=job.overrides,
-    )
+    world = load_world(job.env, **job.keywords)
     population = world.config.population
     num_envs = worlds_at_once(job.episodes, population.agents + population.background)
     vec = CavVectorEnv(LocalWorlds(world, num_envs))
@@ -142,11 +95,12 @@ def _drive(
                 progress(name, before * most + steps, count * most)
 
         part = _Part(vec, min(vec.num_envs, job.episodes - first), tracked=k == 0)
-        part.drive(driver, job.seed, first, _policy_seed(job.seed, k), step_done)
+        part.drive(driver, job.seed, first, derived_seed(job.seed, k), step_done)
         parts.append(part)
-    trips = np.concatenate([np.zeros(0, TRIP), *(part.trips for part in parts)])
-    episodes = np.concatenate([np.zeros(0, EPISODE), *(part.episodes for part in parts)])
-    transfers = np.concatenate([np.zeros(0, TRANSFER), *(part.transfers for part in parts)])
+    trips, episodes, transfers = (
+        np.concatenate([getattr(part, table) for part in parts])
+        for table in ("trips", "episodes", "transfers")
+    )
     counts: Counter[str] = Counter()
     for part in parts:
         counts.update(part.transfer_counts)
@@ -156,21 +110,15 @@ def _drive(
     return RunData(trips, episodes, parts[0].tracks, speed, transfers, dict(counts))
 
 
-def _policy_seed(seed: int, part: int) -> int:
-    """The seed of a policy's own random numbers in one part; that of the first is the run's."""
-    if part == 0:
+def derived_seed(seed: int, number: int) -> int:
+    """The seed of a further run, or of a policy in a further part; that of the first is `seed`."""
+    if number == 0:
         return seed
-    return int(np.random.SeedSequence((seed, part)).generate_state(1, np.uint64)[0] >> _HALF)
+    return int(np.random.SeedSequence((seed, number)).generate_state(1, np.uint64)[0]) >> 1
 
 
 class _Part:
-    """The episodes of the worlds that are stepped together.
-
-    Args:
-        vec: the worlds.
-        count: how many of them count, from the first.
-        tracked: whether to keep where the agents of the first world drive.
-    """
+    """The episodes of the worlds that are stepped together; the first `count` of them count."""
 
     def __init__(self, vec: CavVectorEnv, count: int, *, tracked: bool) -> None:
         self._vec = vec
@@ -194,7 +142,6 @@ class _Part:
 
     @property
     def tracks(self) -> NDArray[np.void]:
-        """TRACK records of the first world's agents."""
         return np.concatenate(self._tracks)
 
     def drive(
@@ -258,11 +205,7 @@ class _Part:
 
 
 class _Imbalance:
-    """How unevenly vehicles are shared out among zones, world by world.
-
-    Args:
-        vec: the worlds.
-    """
+    """How unevenly vehicles are shared out among zones, world by world."""
 
     def __init__(self, vec: CavVectorEnv) -> None:
         self._simulation = vec.simulation

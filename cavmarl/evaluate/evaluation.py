@@ -8,13 +8,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.config.checks import check_count
+from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError, JournalError, PolicyError
-from cavmarl.core.seeds import check_seed
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.evaluate.episodes import (
@@ -22,11 +23,11 @@ from cavmarl.evaluate.episodes import (
     Progress,
     RunData,
     Speed,
+    derived_seed,
     drive_run,
     worlds_at_once,
 )
-from cavmarl.evaluate.fresh import drive_in_fresh_process
-from cavmarl.evaluate.map_outline import map_outline
+from cavmarl.evaluate.fresh import call_in_fresh_process
 from cavmarl.evaluate.provenance.manifest import (
     close_manifest,
     describe_policies,
@@ -36,14 +37,23 @@ from cavmarl.evaluate.provenance.manifest import (
     write_text,
 )
 from cavmarl.evaluate.report import EvaluationReport, make_report
-from cavmarl.evaluate.tables import EPISODE, TRACK, TRIP, read_table, write_table
-from cavmarl.evaluate.transfer_rows import TRANSFER, transfers_of
+from cavmarl.evaluate.tables import (
+    EPISODE,
+    TRACK,
+    TRANSFER,
+    TRIP,
+    map_outline,
+    read_table,
+    write_table,
+)
+from cavmarl.evaluate.transfer_rows import transfers_of
 from cavmarl.handoff.coordinator.coordinator_setup import journal_path
 from cavmarl.ownership.transfer_summary import TransferSummary
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.policies.policy import load_policy
 
 Rows = NDArray[np.void]
+Policies = str | Path | Sequence[str | Path] | Mapping[str, str | Path]
 
 MAX_EPISODES = 100_000
 MAX_REPEATS = 1000
@@ -60,18 +70,14 @@ TRANSFER_FILES = [TRANSFERS_FILE, TRANSFER_COUNTS_FILE]  # of divided worlds
 
 
 def evaluate(
-    env: str | Path,
-    policies: str | Path | Sequence[str | Path] | Mapping[str, str | Path],
+    env: str | Path | WorldSpec,
+    policies: Policies,
     *,
     episodes: int = 32,
-    seed: int = 0,
     repeats: int = 1,
     out: Path | None = None,
-    agents: int | None = None,
-    background: int | None = None,
-    max_cycles: int | None = None,
-    overrides: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
+    **keys: Unpack[WorldKeys],
 ) -> EvaluationReport:
     """Let policies drive `repeats` runs of `episodes` seeded episodes, each counted once.
 
@@ -82,15 +88,11 @@ def evaluate(
         env: as in `make_vec`, like the other keywords that are not explained here.
         policies: as in `load_policy`: one, several, or names for them in the results.
         episodes: of each run.
-        seed: of the first run; those of the others follow from it (`run_seeds`).
         repeats: independent runs.
         out: folder for manifest and raw results; None keeps nothing but the report.
-        agents: shadows population.agents.
-        background: shadows population.background.
-        max_cycles: shadows horizon_s.
-        overrides: values for any other key.
         progress: called after every step of a run with the policy's name, the steps that it has
             done in this run, and the most there can be.
+        keys: of the world; the seed is that of the first run, from which the others' follow.
 
     Raises:
         ConfigError: a number or a key that cannot work, or `out` cannot be made.
@@ -98,18 +100,10 @@ def evaluate(
         ManifestError: `out` holds results already.
         JournalError: a journal is there already.
     """
-    _check_count("episodes", episodes, MAX_EPISODES)
-    _check_count("repeats", repeats, MAX_REPEATS)
-    job = EpisodeJob(
-        env=str(env),
-        policies=_named(policies),
-        episodes=episodes,
-        seed=check_seed(seed),
-        agents=agents,
-        background=background,
-        max_cycles=max_cycles,
-        overrides=dict(overrides or {}),
-    )
+    check_count("episodes", episodes, MAX_EPISODES)
+    check_count("repeats", repeats, MAX_REPEATS)
+    spec = WorldSpec.of(env, **keys)
+    job = EpisodeJob(**vars(spec), policies=_named(policies), episodes=episodes)
     with TemporaryDirectory() as room:
         folder = Path(room) if out is None else out
         jobs, is_divided = _prepare(folder, job, repeats)
@@ -167,23 +161,10 @@ def load_map(folder: Path) -> dict[str, Any]:
 
 def run_seeds(seed: int, repeats: int) -> list[int]:
     """The seeds of the runs: the first is `seed`, the others are hashes of (seed, run)."""
-    hashes = [
-        int(np.random.SeedSequence((seed, run)).generate_state(1, np.uint64)[0]) >> 1
-        for run in range(1, repeats)
-    ]
-    return [seed, *hashes]
+    return [derived_seed(seed, run) for run in range(repeats)]
 
 
-def _check_count(name: str, value: Any, most: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise ConfigError(f"{name} = {value!r}: must be a whole number")
-    if not 1 <= value <= most:
-        raise ConfigError(f"{name} = {value}: must be from 1 to {most}")
-
-
-def _named(
-    policies: str | Path | Sequence[str | Path] | Mapping[str, str | Path],
-) -> dict[str, str]:
+def _named(policies: Policies) -> dict[str, str]:
     if isinstance(policies, Mapping):
         named = {name: str(policy) for name, policy in policies.items()}
     else:
@@ -199,16 +180,9 @@ def _named(
 def _prepare(folder: Path, job: EpisodeJob, repeats: int) -> tuple[list[EpisodeJob], bool]:
     """Refuse early what cannot work, then put everything on record.
 
-    Returns:
-        the runs, and whether worlds have zones.
+    Returns the runs, and whether worlds have zones.
     """
-    world = load_world(
-        job.env,
-        agents=job.agents,
-        background=job.background,
-        max_cycles=job.max_cycles,
-        overrides=job.overrides,
-    )
+    world = load_world(job.env, **job.keywords)
     policies = describe_policies(job.policies)
     config, network, demand, partition = world
     unlogged = replace(config, zones=replace(config.zones, journal=""))
@@ -222,31 +196,22 @@ def _prepare(folder: Path, job: EpisodeJob, repeats: int) -> tuple[list[EpisodeJ
     worlds = worlds_at_once(job.episodes, config.population.agents + config.population.background)
     seeds = run_seeds(job.seed, repeats)
     jobs = _runs(job, seeds, config.zones.journal, worlds)
-    plan = {
-        "processes": "this one" if repeats == 1 else "a fresh one for each run, one at a time",
-        "worlds_at_once": worlds,
+    processes = "this one" if repeats == 1 else "a fresh one for each run, one at a time"
+    document = {
+        "policies": policies,
+        "episodes": job.episodes,
+        "seeds": seeds,
+        "job": asdict(job),
+        "plan": {"processes": processes, "worlds_at_once": worlds},
+        "world": describe_world(config, network, demand, partition),
     }
-    open_manifest(
-        folder,
-        {
-            "policies": policies,
-            "episodes": job.episodes,
-            "seeds": seeds,
-            "job": job.to_dict(),
-            "plan": plan,
-            "world": describe_world(config, network, demand, partition),
-        },
-    )
+    open_manifest(folder, document)
     write_text(folder / MAP_FILE, json.dumps(map_outline(network)))
     return jobs, partition.count > 1
 
 
 def _runs(job: EpisodeJob, seeds: list[int], journal: str, worlds: int) -> list[EpisodeJob]:
-    """The runs of a job; of several, each has journals of its own: `run.jsonl`, `run.run-1.jsonl`.
-
-    Raises:
-        JournalError: a journal is there already.
-    """
+    """The runs of a job, each with journals of its own: `run.jsonl`, `run.run-1.jsonl`."""
     jobs = []
     for run, seed in enumerate(seeds):
         overrides = dict(job.overrides)
@@ -269,15 +234,13 @@ def _drive_all(
         if len(jobs) == 1:
             runs.append(drive_run(job, progress))
         else:
-            runs.append(drive_in_fresh_process(job, folder, progress))
+            what = f"run {job.run} (seed {job.seed})"
+            runs.append(call_in_fresh_process(what, drive_run, job, hear=progress or _deaf))
     names = list(jobs[0].policies)
-    trips = {name: np.concatenate([run[name].trips for run in runs]) for name in names}
-    episodes = {name: np.concatenate([run[name].episodes for run in runs]) for name in names}
-    tracks = {name: runs[0][name].tracks for name in names}
     speeds = {name: [asdict(run[name].speed) for run in runs] for name in names}
-    write_table(folder / TRIPS_FILE, trips, TRIP)
-    write_table(folder / EPISODES_FILE, episodes, EPISODE)
-    write_table(folder / TRACKS_FILE, tracks, TRACK)
+    write_table(folder / TRIPS_FILE, {n: _all(runs, n, "trips") for n in names}, TRIP)
+    write_table(folder / EPISODES_FILE, {n: _all(runs, n, "episodes") for n in names}, EPISODE)
+    write_table(folder / TRACKS_FILE, {name: runs[0][name].tracks for name in names}, TRACK)
     write_text(folder / SPEED_FILE, json.dumps(speeds, indent=2))
     files = list(RESULT_FILES)
     if is_divided:
@@ -286,11 +249,19 @@ def _drive_all(
     close_manifest(folder, files)
 
 
+def _deaf(policy: str, steps: int, most: int) -> None:
+    """Progress of which nothing is to be told."""
+
+
+def _all(runs: Sequence[dict[str, RunData]], policy: str, table: str) -> Rows:
+    return np.concatenate([getattr(run[policy], table) for run in runs])
+
+
 def _write_transfers(folder: Path, names: list[str], runs: list[dict[str, RunData]]) -> None:
-    transfers = {name: np.concatenate([run[name].transfers for run in runs]) for name in names}
     counts: dict[str, Counter[str]] = {name: Counter() for name in names}
     for run in runs:
         for name in names:
             counts[name].update(run[name].transfer_counts)
+    transfers = {name: _all(runs, name, "transfers") for name in names}
     write_table(folder / TRANSFERS_FILE, transfers, TRANSFER)
     write_text(folder / TRANSFER_COUNTS_FILE, json.dumps(counts, indent=2))

@@ -1,111 +1,81 @@
-"""Evaluates one run in a process of its own: the caller's side, and the program.
+"""Calls functions in processes of their own, which share nothing but the files on disk.
 
-The program reads a job as JSON from standard input, tells its progress line by line on standard
-output, and leaves arrays in a file. A run shares nothing with another but the files on disk.
+A call is pickled to a program's standard input; the program pickles what it tells and what it
+returns to standard output. Unlike `multiprocessing`, it does not run the caller's script again.
 """
 
 from __future__ import annotations
 
-import json
+import pickle
 import subprocess
 import sys
-from dataclasses import asdict
-from pathlib import Path
-from typing import Any
-
-import numpy as np
+from collections.abc import Callable
+from functools import partial
+from typing import Any, BinaryIO, TypeVar
 
 from cavmarl.core import errors
-from cavmarl.evaluate.episodes import EpisodeJob, Progress, RunData, Speed, drive_run
+
+Found = TypeVar("Found")
+Tell = Callable[..., None]
 
 PROGRAM = "from cavmarl.evaluate.fresh import main; main()"
 
 
-def drive_in_fresh_process(
-    job: EpisodeJob, folder: Path, progress: Progress | None = None
-) -> dict[str, RunData]:
-    """`drive_run` in a new interpreter.
+def call_in_fresh_process(
+    what: str, call: Callable[..., Found], *given: Any, hear: Tell | None = None
+) -> Found:
+    """What `call(*given)` returns in a new interpreter, or raises on purpose.
 
-    Args:
-        job: what to drive.
-        folder: for its file, which is gone again afterwards.
-        progress: as in `drive_run`.
-
-    Raises:
-        CavmarlError: what `drive_run` raises there, and a process that died.
+    With `hear`, `call` gets a last argument, too: what that is called with is told to `hear`. If
+    the process dies, an `EvaluationError` says `what` that was.
     """
-    path = folder / f"run_{job.run}.npz"
     program = subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, str(path)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
+        [sys.executable, "-c", PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     )
     assert program.stdin is not None
     assert program.stdout is not None
-    with program:
-        program.stdin.write(json.dumps(job.to_dict()))
-        program.stdin.close()
-        for line in program.stdout:
-            told = json.loads(line)
-            if "error" in told:
-                raise _told_error(told["error"], told["message"])
-            if progress is not None:
-                progress(told["policy"], told["steps"], told["most"])
-    if program.returncode:
-        raise errors.EvaluationError(
-            f"run {job.run} (seed {job.seed}) ended with exit code {program.returncode}; "
-            "its own message is above"
-        )
     try:
-        return _read(path, list(job.policies))
+        pickle.dump((call, given, hear is not None), program.stdin)
+        program.stdin.close()
+        while True:
+            kind, *told = pickle.load(program.stdout)
+            if kind == "found":
+                result: Found = told[0]
+                return result
+            if kind == "error":
+                raise told_error(*told)
+            if hear is not None:
+                hear(*told)
+    except (EOFError, BrokenPipeError):
+        raise errors.EvaluationError(
+            f"{what} ended with exit code {program.wait()}; its own message is above"
+        ) from None
+    except BaseException:
+        program.kill()
+        raise
     finally:
-        path.unlink()
+        program.stdout.close()
+        program.wait()
 
 
-def _told_error(kind: str, message: str) -> errors.CavmarlError:
+def told_error(kind: str, message: str) -> errors.CavmarlError:
     """The error of another process; what it was made of, beside its words, has stayed there."""
     found: type[errors.CavmarlError] = getattr(errors, kind)
     return found.__new__(found, message)
 
 
-def _read(path: Path, policies: list[str]) -> dict[str, RunData]:
-    with np.load(path) as arrays:
-        return {
-            name: RunData(
-                arrays[f"trips_{k}"],
-                arrays[f"episodes_{k}"],
-                arrays[f"tracks_{k}"],
-                Speed(**json.loads(str(arrays[f"speed_{k}"]))),
-                arrays[f"transfers_{k}"],
-                json.loads(str(arrays[f"transfer_counts_{k}"])),
-            )
-            for k, name in enumerate(policies)
-        }
-
-
-def _write(path: Path, found: dict[str, RunData]) -> None:
-    arrays: dict[str, Any] = {}
-    for k, data in enumerate(found.values()):
-        arrays[f"trips_{k}"] = data.trips
-        arrays[f"episodes_{k}"] = data.episodes
-        arrays[f"tracks_{k}"] = data.tracks
-        arrays[f"speed_{k}"] = json.dumps(asdict(data.speed))
-        arrays[f"transfers_{k}"] = data.transfers
-        arrays[f"transfer_counts_{k}"] = json.dumps(data.transfer_counts)
-    np.savez(path, **arrays)
-
-
-def _tell(**what: Any) -> None:
-    print(json.dumps(what), flush=True)
-
-
 def main() -> None:
-    """The program: a job from standard input."""
-    job = EpisodeJob(**json.load(sys.stdin))
+    """The program: a call from standard input."""
+    out, sys.stdout = sys.stdout.buffer, sys.stderr
+    call, given, tells = pickle.load(sys.stdin.buffer)
     try:
-        found = drive_run(job, lambda name, k, n: _tell(policy=name, steps=k, most=n))
+        found = call(*given, partial(_tell, out, "told")) if tells else call(*given)
     except errors.CavmarlError as error:
-        _tell(error=type(error).__name__, message=str(error))
-        return
-    _write(Path(sys.argv[1]), found)
+        _tell(out, "error", type(error).__name__, str(error))
+    else:
+        _tell(out, "found", found)
+
+
+def _tell(out: BinaryIO, *what: Any) -> None:
+    pickle.dump(what, out)
+    out.flush()

@@ -11,195 +11,92 @@ from numpy.typing import NDArray
 from cavmarl.config.env import TERMS
 from cavmarl.evaluate.tables import reward_column
 
+Per = Literal["trip", "episode"]
+Better = Literal["more", "less"] | None
+
 
 @dataclass(frozen=True)
 class Metric:
-    """One number of interest.
+    """One number of interest."""
 
-    Attributes:
-        name: its key in a report, and its column.
-        label: its name in tables.
-        unit: of the values times `scale`; empty for plain numbers.
-        per: a run has one value for each of these.
-        share: the values are yes or no, and their mean is a share.
-        arrived: only trips that arrived have a value.
-        scale: values are shown times this.
-        better: which way is better; None where neither is.
-        meaning: one line.
-    """
+    name: str  # its key in a report, and its column
+    label: str  # its name in tables
+    unit: str  # of the values times `scale`; empty for plain numbers
+    per: Per  # a run has one value for each of these
+    meaning: str  # one line
+    better: Better = None  # which way is better; None where neither is
+    share: bool = False  # the values are yes or no, and their mean is a share
+    arrived: bool = False  # only trips that arrived have a value
+    scale: float = 1.0  # values are shown times this
 
-    name: str
-    label: str
-    unit: str
-    per: Literal["trip", "episode"]
-    meaning: str
-    share: bool = False
-    arrived: bool = False
-    scale: float = 1.0
-    better: Literal["more", "less"] | None = None
+    @property
+    def title(self) -> str:
+        return f"{self.label}, {self.unit}" if self.unit else self.label
 
 
-def _share(name: str, label: str, meaning: str, better: Literal["more", "less"]) -> Metric:
-    return Metric(name, label, "%", "trip", meaning, share=True, scale=100.0, better=better)
+def _share(name: str, label: str, meaning: str, better: Better) -> Metric:
+    return Metric(name, label, "%", "trip", meaning, better, share=True, scale=100.0)
+
+
+def _arrived(name: str, label: str, meaning: str, better: Better = None) -> Metric:
+    told = f"{meaning}, of trips that arrived"
+    return Metric(name, label, "s", "trip", told, better, arrived=True)
+
+
+def _percent(name: str, label: str, per: Per, meaning: str, better: Better) -> Metric:
+    return Metric(name, label, "%", per, meaning, better, scale=100.0)
 
 
 METRICS = (
-    Metric(
-        "episode_return",
-        "return",
-        "",
-        "episode",
-        "sum of rewards of an agent id over an episode, mean over the ids",
-        better="more",
-    ),
+    Metric("episode_return", "return", "", "episode",
+           "sum of rewards of an agent id over an episode, mean over the ids", "more"),
     _share("success", "success", "trips that arrived", "more"),
     _share("collision", "collision", "trips that ended by touching a vehicle", "less"),
     _share("off_road", "off road", "trips that ended off the road", "less"),
     _share("unfinished", "unfinished", "trips that the horizon cut", "less"),
     _share("red_light", "red light", "trips that passed a red light", "less"),
     _share("wrong_way", "wrong way", "trips that drove against a lane", "less"),
-    Metric(
-        "agent_arrivals_per_h",
-        "agents arriving",
-        "1/h",
-        "episode",
-        "agents that arrived in an hour of simulated time",
-        better="more",
-    ),
-    Metric(
-        "background_arrivals_per_h",
-        "others arriving",
-        "1/h",
-        "episode",
-        "background vehicles that arrived in an hour of simulated time",
-        better="more",
-    ),
-    Metric(
-        "delay_s",
-        "delay",
-        "s",
-        "trip",
-        "time lost against driving at the limit, of trips that arrived",
-        arrived=True,
-        better="less",
-    ),
-    Metric(
-        "duration_s",
-        "duration",
-        "s",
-        "trip",
-        "from the first decision to the goal, of trips that arrived",
-        arrived=True,
-    ),
+    Metric("agent_arrivals_per_h", "agents arriving", "1/h", "episode",
+           "agents that arrived in an hour of simulated time", "more"),
+    Metric("background_arrivals_per_h", "others arriving", "1/h", "episode",
+           "background vehicles that arrived in an hour of simulated time", "more"),
+    _arrived("delay_s", "delay", "time lost against driving at the limit", "less"),
+    _arrived("duration_s", "duration", "from the first decision to the goal"),
     Metric("mean_speed_mps", "speed", "m/s", "trip", "way made towards the goal over time"),
-    Metric(
-        "mean_speeding",
-        "speeding",
-        "%",
-        "trip",
-        "mean speed above the limit, as a share of it",
-        scale=100.0,
-        better="less",
-    ),
-    Metric("mean_jerk_mps3", "jerk", "m/s³", "trip", "mean |jerk|", better="less"),
-    Metric(
-        "least_ttc_s",
-        "least TTC",
-        "s",
-        "trip",
-        "least time to collision of a trip; 4 stands for that and above",
-        better="more",
-    ),
-    Metric(
-        "short_ttc_share",
-        "TTC < 1.5 s",
-        "% time",
-        "trip",
-        "share of a trip with a time to collision below 1.5 s",
-        scale=100.0,
-        better="less",
-    ),
-    Metric(
-        "least_pet_s",
-        "least PET",
-        "s",
-        "trip",
-        "least post-encroachment time of a trip that met crossing traffic within 10 s",
-        better="more",
-    ),
-    Metric(
-        "jain_speed",
-        "speeds, Jain",
-        "",
-        "episode",
-        "Jain's index of the agents' mean speeds: 1 is even",
-        better="more",
-    ),
-    Metric(
-        "gini_delay",
-        "delays, Gini",
-        "",
-        "episode",
-        "Gini's coefficient of the agents' delays a kilometre: 0 is even",
-        better="less",
-    ),
-    Metric(
-        "zone_imbalance",
-        "zone imbalance",
-        "",
-        "episode",
-        "vehicles of the fullest zone over those of a mean one, mean over the steps: 1 is even",
-        better="less",
-    ),
-    Metric(
-        "v2x_reception_ratio",
-        "packets received",
-        "%",
-        "episode",
-        "share of the packets within reach of a receiver that it received",
-        scale=100.0,
-        better="more",
-    ),
-    Metric(
-        "v2x_latency_s",
-        "latency of packets",
-        "s",
-        "episode",
-        "mean time from sending to receiving",
-        better="less",
-    ),
-    Metric(
-        "v2x_busy_ratio",
-        "channel busy ratio",
-        "%",
-        "episode",
-        "share of the time in which receivers hear others send",
-        scale=100.0,
-        better="less",
-    ),
+    _percent("mean_speeding", "speeding", "trip",
+             "mean speed above the limit, as a share of it", "less"),
+    Metric("mean_jerk_mps3", "jerk", "m/s³", "trip", "mean |jerk|", "less"),
+    Metric("least_ttc_s", "least TTC", "s", "trip",
+           "least time to collision of a trip; 4 stands for that and above", "more"),
+    Metric("short_ttc_share", "TTC < 1.5 s", "% time", "trip",
+           "share of a trip with a time to collision below 1.5 s", "less", scale=100.0),
+    Metric("least_pet_s", "least PET", "s", "trip",
+           "least post-encroachment time of a trip that met crossing traffic within 10 s", "more"),
+    Metric("jain_speed", "speeds, Jain", "", "episode",
+           "Jain's index of the agents' mean speeds: 1 is even", "more"),
+    Metric("gini_delay", "delays, Gini", "", "episode",
+           "Gini's coefficient of the agents' delays a kilometre: 0 is even", "less"),
+    Metric("zone_imbalance", "zone imbalance", "", "episode",
+           "vehicles of the fullest zone over those of a mean one, mean over the steps: 1 is even",
+           "less"),
+    _percent("v2x_reception_ratio", "packets received", "episode",
+             "share of the packets within reach of a receiver that it received", "more"),
+    Metric("v2x_latency_s", "latency of packets", "s", "episode",
+           "mean time from sending to receiving", "less"),
+    _percent("v2x_busy_ratio", "channel busy ratio", "episode",
+             "share of the time in which receivers hear others send", "less"),
     *(
-        Metric(
-            reward_column(term),
-            f"return from {term.replace('_', ' ')}",
-            "",
-            "episode",
-            f"that part of the return: weight · sum of `{term}`",
-        )
+        Metric(reward_column(term), f"return from {term.replace('_', ' ')}", "", "episode",
+               f"that part of the return: weight · sum of `{term}`")
         for term in TERMS
     ),
-)
+)  # fmt: skip
 
 
 def metric_values(
     metric: Metric, trips: NDArray[np.void], episodes: NDArray[np.void]
 ) -> NDArray[np.float64]:
-    """The values (N,) of a metric; NaN is no value.
-
-    Args:
-        metric: which.
-        trips: TRIP records; only those that count are looked at.
-        episodes: EPISODE records.
-    """
+    """The values (N,) of a metric; NaN is no value. Of trips only those that count are read."""
     if metric.per == "episode":
         return np.asarray(episodes[metric.name], dtype=np.float64)
     rows = trips[trips["counted"]]

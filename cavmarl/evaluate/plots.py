@@ -111,7 +111,7 @@ def plot_metrics(report: EvaluationReport) -> str:
 
 
 def _plot_metric(axes: Axes, metric: Metric, report: EvaluationReport) -> None:
-    axes.set_title(f"{metric.label}, {metric.unit}" if metric.unit else metric.label)
+    axes.set_title(metric.title)
     axes.grid(visible=False, axis="y")
     for row, policy in enumerate(report.policies.values()):
         found, color = policy[metric.name], color_of(row)
@@ -140,7 +140,7 @@ def plot_distributions(tables: Mapping[str, tuple[Rows, Rows]]) -> str:
                 axes.step(
                     values, shares, where="post", color=color_of(row), linewidth=1.6, label=policy
                 )
-            axes.set(title=f"{metric.label}, {metric.unit}", ylim=(0.0, 101.0))
+            axes.set(title=metric.title, ylim=(0.0, 101.0))
         panels[0].set_ylabel("% of the trips at or below")
         lines, names = panels[0].get_legend_handles_labels()
         figure.legend(lines, names, loc="outside upper right", ncols=len(tables))

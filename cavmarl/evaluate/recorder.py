@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import TERMS
-from cavmarl.evaluate.message_record import MESSAGE_COLUMNS
 from cavmarl.evaluate.statistics import gini_coefficient, jain_index
 from cavmarl.evaluate.tables import EPISODE, TRIP, reward_column
 from cavmarl.rewards.kernels.terms import TTC_HORIZON_S
@@ -15,6 +14,7 @@ SHORT_TTC_S = 1.5  # below this a driver has no time left to react (Hayward 1972
 PET_HORIZON_S = 10.0  # a later pass after another is no encounter
 MIN_DISTANCE_M = 1.0  # of a trip whose delay a kilometre is compared
 JERK_UNIT_MPS3 = 10.0  # of the term `comfort`
+MESSAGE_COLUMNS = ("v2x_reception_ratio", "v2x_latency_s", "v2x_busy_ratio")
 
 _TERM = {name: k for k, name in enumerate(TERMS)}
 
@@ -25,12 +25,7 @@ class Recorder:
     A trip counts if it began in the first half of its episode: so each had at least half an episode
     to end, and which trips count does not depend on how they end.
 
-    Args:
-        num_worlds: W.
-        num_agents: A.
-        max_steps: steps of an episode.
-        step_s: seconds a step.
-        weights: (T,) of the terms in the reward.
+    `weights` (T,) are those of the terms in the reward.
     """
 
     def __init__(

@@ -24,18 +24,13 @@ NO_INTERVAL = "not available: one run says nothing about the next; use --repeats
 
 @dataclass(frozen=True)
 class Found:
-    """One metric of one policy.
+    """One metric of one policy."""
 
-    Attributes:
-        mean: of the run means; None without data.
-        between_run_ci95: interval of that mean over independent runs, by Student's t; None with
-            fewer than two runs that have the metric.
-        within_run: each run's own mean and spread, in the order of the runs.
-    """
-
-    mean: float | None
+    mean: float | None  # of the run means; None without data
+    # interval of that mean over independent runs, by Student's t; None with fewer than two runs
+    # that have the metric
     between_run_ci95: Interval | None
-    within_run: tuple[Within, ...]
+    within_run: tuple[Within, ...]  # each run's own mean and spread, in the order of the runs
 
     @property
     def interval(self) -> Interval | None:
@@ -53,18 +48,12 @@ class Found:
 
 @dataclass(frozen=True)
 class PairedDifference:
-    """A policy minus the first one, run by run on the same seeds.
+    """A policy minus the first one, run by run on the same seeds."""
 
-    Attributes:
-        mean: of the differences of run means; None without data.
-        between_run_ci95: interval of that mean by Student's t for paired samples; None with fewer
-            than two runs.
-        runs: the differences; None where one of the two has no value.
-    """
-
-    mean: float | None
+    mean: float | None  # of the differences of run means; None without data
+    # interval of that mean by Student's t for paired samples; None with fewer than two runs
     between_run_ci95: Interval | None
-    runs: tuple[float | None, ...]
+    runs: tuple[float | None, ...]  # the differences; None where one of the two has no value
 
     @property
     def distinct(self) -> bool:
@@ -75,21 +64,14 @@ class PairedDifference:
 
 @dataclass(frozen=True)
 class PolicyReport:
-    """Everything about one policy.
+    """Everything about one policy."""
 
-    Attributes:
-        trips: that count, in all runs.
-        metrics: by the names of `metrics.METRICS`.
-        minus_first: by metric, paired differences from the first policy; empty for itself.
-        speed: of each run; not repeatable.
-        transfers: between zones, in all runs; None in undivided worlds. Milliseconds are not
-            repeatable.
-    """
-
-    trips: int
-    metrics: Mapping[str, Found]
+    trips: int  # that count, in all runs
+    metrics: Mapping[str, Found]  # by the names of `metrics.METRICS`
+    # by metric, paired differences from the first policy; empty for itself
     minus_first: Mapping[str, PairedDifference]
-    speed: tuple[Speed, ...]
+    speed: tuple[Speed, ...]  # of each run; not repeatable
+    # between zones, in all runs; None in undivided worlds. Milliseconds are not repeatable.
     transfers: TransferSummary | None = None
 
     def __getitem__(self, metric: str) -> Found:
@@ -98,21 +80,13 @@ class PolicyReport:
 
 @dataclass(frozen=True)
 class EvaluationReport:
-    """The results of some policies over the same episodes.
+    """The results of some policies over the same episodes."""
 
-    Attributes:
-        policies: by name, in the order in which they were given.
-        repeats: independent runs.
-        episodes: of each run.
-        seeds: of the runs.
-        manifest: the closed manifest of the results.
-    """
-
-    policies: Mapping[str, PolicyReport]
-    repeats: int
-    episodes: int
-    seeds: tuple[int, ...]
-    manifest: Mapping[str, Any]
+    policies: Mapping[str, PolicyReport]  # by name, in the order in which they were given
+    repeats: int  # independent runs
+    episodes: int  # of each run
+    seeds: tuple[int, ...]  # of the runs
+    manifest: Mapping[str, Any]  # the closed manifest of the results
 
     def __getitem__(self, policy: str) -> PolicyReport:
         return self.policies[policy]
@@ -138,13 +112,9 @@ def make_report(
     manifest: Mapping[str, Any],
     transfers: Mapping[str, TransferSummary],
 ) -> EvaluationReport:
-    """Reduce raw tables to a report.
+    """Reduce raw tables, by policy TRIP and EPISODE records of all runs, to a report.
 
-    Args:
-        tables: by policy, TRIP and EPISODE records of all runs.
-        speeds: by policy, of each run.
-        manifest: of the same results.
-        transfers: by policy, between zones; empty where worlds are undivided.
+    `speeds` are of each run; `transfers` are those between zones, empty where worlds are undivided.
     """
     seeds = tuple(manifest["seeds"])
     found = {

@@ -18,31 +18,20 @@ PARTS = 5
 
 @dataclass(frozen=True)
 class MeasuredRound:
-    """Some steps of one world.
+    """Some steps of one world."""
 
-    Attributes:
-        costs_s: (k,) seconds a tick of each zone.
-        ids: (n,) vehicles after the last step.
-        places: (n, 2) where they are, m.
-        agents: (n,) which of them agents drive.
-    """
-
-    costs_s: NDArray[np.float64]
-    ids: NDArray[np.int64]
-    places: NDArray[np.float64]
-    agents: NDArray[np.bool_]
+    costs_s: NDArray[np.float64]  # (k,) seconds a tick of each zone
+    ids: NDArray[np.int64]  # (n,) vehicles after the last step
+    places: NDArray[np.float64]  # (n, 2) where they are, m
+    agents: NDArray[np.bool_]  # (n,) which of them agents drive
 
 
 @dataclass(frozen=True)
 class MeasuredWorlds:
-    """Worlds of one environment.
+    """Worlds of one environment."""
 
-    Attributes:
-        costs: of their shards.
-        places: (n, 2) where the vehicles of all worlds are after the last step, m.
-    """
-
-    costs: tuple[ShardCost, ...]
+    costs: tuple[ShardCost, ...]  # of their shards
+    # (n, 2) where the vehicles of all worlds are after the last step, m
     places: NDArray[np.float64]
 
     def zone_costs_s(self) -> list[float]:
@@ -55,17 +44,7 @@ class MeasuredWorlds:
 def measure_rounds(
     simulation: Simulation, rounds: int, steps: int, *, before: int
 ) -> Iterator[MeasuredRound]:
-    """Drive one world on from its reset and measure its zones.
-
-    Args:
-        simulation: one world, reset.
-        rounds: that are measured.
-        steps: of each.
-        before: steps that are driven first.
-
-    Raises:
-        ConfigError: a number out of range, or hosts that die by plan.
-    """
+    """Drive one world on from its reset and measure its zones."""
     for name, value in (("rounds", rounds), ("steps", steps), ("before", before)):
         if value < 1:
             raise ConfigError(f"{name} = {value}: must be at least 1")
@@ -94,16 +73,6 @@ def measure_shards(
 
     Of each zone the median of `PARTS` parts of the steps counts: what happens once, as a kernel
     that is loaded, is no cost of a zone.
-
-    Args:
-        simulation: one world.
-        worlds: how many.
-        seed: root of all random numbers.
-        steps: that are measured of each world.
-        before: steps that are driven first.
-
-    Raises:
-        ConfigError: too few steps, or hosts that die by plan.
     """
     if steps < PARTS:
         raise ConfigError(f"steps = {steps}: must be at least {PARTS}")

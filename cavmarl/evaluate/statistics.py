@@ -25,20 +25,14 @@ class Interval:
 
 @dataclass(frozen=True)
 class Within:
-    """The values of one run: what they are in the mean and how they differ among themselves.
+    """The values of one run: what they are in the mean and how they differ among themselves."""
 
-    Attributes:
-        n: how many trips or episodes.
-        mean: None without any.
-        sd: sample standard deviation; None with fewer than two. It is the spread of trips or
-            episodes and says nothing about how another run would come out.
-        wilson95: shares only, of independent trips of one run (Wilson 1927).
-    """
-
-    n: int
-    mean: float | None
+    n: int  # how many trips or episodes
+    mean: float | None  # None without any
+    # sample standard deviation; None with fewer than two. It is the spread of trips or episodes and
+    # says nothing about how another run would come out.
     sd: float | None
-    wilson95: Interval | None
+    wilson95: Interval | None  # shares only, of independent trips of one run (Wilson 1927)
 
 
 def within_run(values: Values, *, share: bool) -> Within:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cavmarl.config.io import read_yaml, validate
-from cavmarl.config.registry import entries, places
+from cavmarl.config.registry import entries
 from cavmarl.core.errors import ConfigError
 from cavmarl.evaluate.evaluation import evaluate
 from cavmarl.evaluate.report import EvaluationReport
@@ -15,19 +15,12 @@ from cavmarl.evaluate.report import EvaluationReport
 
 @dataclass(frozen=True)
 class Suite:
-    """What a suite drives: every map with every number of agents.
+    """What a suite drives: every map with every number of agents."""
 
-    Attributes:
-        maps: names of environments, or map files below the folder of maps.
-        agents: numbers of agents.
-        background: background vehicles of every world.
-        horizon_s: of every episode.
-    """
-
-    maps: tuple[str, ...]
-    agents: tuple[int, ...]
-    background: int = 100
-    horizon_s: float = 300.0
+    maps: tuple[str, ...]  # names of environments, or map files below the folder of maps
+    agents: tuple[int, ...]  # numbers of agents
+    background: int = 100  # background vehicles of every world
+    horizon_s: float = 300.0  # of every episode
 
     def __post_init__(self) -> None:
         for name in ("maps", "agents"):
@@ -38,49 +31,18 @@ class Suite:
 
 @dataclass(frozen=True)
 class SuiteWorld:
-    """One world of a suite.
+    """One world of a suite."""
 
-    Attributes:
-        label: its name in results, and its folder.
-        env: as in `make_vec`.
-        agents: how many.
-    """
-
-    label: str
-    env: str
-    agents: int
-
-
-def find_suite(suite: str) -> Path:
-    """The file that `suite` means: a path, or a name in `configs/suites/`.
-
-    Raises:
-        ConfigError: there is none.
-    """
-    if Path(suite).is_file():
-        return Path(suite)
-    for place in places("configs"):
-        path = place / "suites" / f"{suite}.yaml"
-        if path.is_file():
-            return path
-    raise ConfigError(f"no suite or file '{suite}': give 'standard' or the path of a .yaml")
+    label: str  # its name in results, and its folder
+    env: str  # as in `make_vec`
+    agents: int  # how many
 
 
 def load_suite(path: Path) -> Suite:
-    """Read a suite.
-
-    Raises:
-        ConfigError: not YAML, an unknown key, or a value that cannot work.
-    """
     return validate(Suite, read_yaml(path), str(path))
 
 
 def worlds_of(suite: Suite, maps: Path) -> list[SuiteWorld]:
-    """Every map with every number of agents.
-
-    Raises:
-        ConfigError: a map is neither an environment nor a file below `maps`, or two have one name.
-    """
     found = {Path(name).name.split(".")[0]: env for name, env in _found(suite, maps)}
     if len(found) < len(suite.maps):
         raise ConfigError(f"maps = {suite.maps!r}: two have one name; rename a file")
@@ -118,20 +80,8 @@ def run_suite(
 ) -> dict[str, EvaluationReport]:
     """Evaluate the policies in every world, each into its own folder of `out`.
 
-    Agents enter as long as the episode lasts (seats), so that their number holds.
-
-    Args:
-        suite: what holds for all worlds.
-        worlds: from `worlds_of`.
-        policies: as in `evaluate`, like episodes, repeats and seed.
-        out: folder of the folders.
-        episodes: of each run.
-        repeats: independent runs.
-        seed: of the first run.
-        began: called before each world.
-
-    Raises:
-        CavmarlError: as `evaluate`.
+    Agents enter as long as the episode lasts (respawn), so that their number holds. `began` is
+    called before each world; policies, episodes, repeats and seed are as in `evaluate`.
     """
     reports = {}
     for world in worlds:

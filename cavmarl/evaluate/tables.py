@@ -1,21 +1,25 @@
-"""The raw values of an evaluation as records, and their CSV files."""
+"""The raw values of an evaluation as records, their CSV files, and the outline of the map."""
 
 from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import TERMS
+from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 
 Rows = NDArray[np.void]
 
+PASSENGER = 1 << VEHICLE_CLASSES.index("passenger")
+TOLERANCE_M = 0.5  # that a line of the map may leave its lane's centre by
+
 
 def reward_column(term: str) -> str:
-    """The column of EPISODE with a term's part of the return."""
     return f"reward_{term}"
 
 
@@ -71,6 +75,29 @@ TRACK = np.dtype(
 )
 
 
+TRANSFER = np.dtype(
+    [
+        ("run", np.int64),
+        ("episode", np.int64),
+        ("tick", np.int64),  # of the whole run of its world: resets do not turn it back
+        ("vehicle", np.int64),
+        ("source", np.int64),
+        ("target", np.int64),
+        ("epoch", np.int64),
+        ("forced", np.bool_),  # the state rode along, since the target was not ready in time
+        ("removed", np.bool_),  # it left the world in that tick
+        ("approached", np.int64),  # tick of the first state at the target; -1: none
+        ("waited", np.int64),  # ticks behind the border
+        ("offers", np.int64),  # states that arrived
+        ("state_bytes", np.int64),
+        ("prepare_depth_m", np.float64),  # outside of the source's zone at the first state
+        ("switch_depth_m", np.float64),  # at the switch
+        ("release_depth_m", np.float64),  # when the switch was committed
+        ("ms", np.float64),  # from the first state until the target had confirmed; not repeatable
+    ]
+)
+
+
 def write_table(path: Path, tables: dict[str, Rows], dtype: np.dtype[np.void]) -> None:
     """Write the records of several policies into one CSV file, the policy in the first column."""
     with path.open("w", newline="", encoding="utf-8") as file:
@@ -111,3 +138,41 @@ def _records(lines: Sequence[Sequence[str]], dtype: np.dtype[np.void]) -> Rows:
         else:
             rows[name] = [int(text) for text in texts]
     return rows
+
+
+def map_outline(network: RoadNetwork) -> dict[str, Any]:
+    """Centre lines of the lanes open to cars, in metres to a decimetre, and their mean width."""
+    lanes = network.lanes
+    open_lanes = np.flatnonzero(lanes["permissions"] & PASSENGER != 0)
+    lines = [_simplified(network.lane_polyline(int(lane))[:, :2]) for lane in open_lanes]
+    return {
+        "name": network.name,
+        "extent_m": list(network.extent_m),
+        "lane_width_m": float(lanes["width_m"][open_lanes].mean()),
+        "lines": [np.round(line, 1).tolist() for line in lines],
+    }
+
+
+def _simplified(line: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A polyline (n, 2) without the points that it can do without (Douglas and Peucker 1973)."""
+    keep = np.zeros(len(line), dtype=np.bool_)
+    keep[[0, -1]] = True
+    stretches = [(0, len(line) - 1)]
+    while stretches:
+        first, last = stretches.pop()
+        if last - first < 2:
+            continue
+        chord = line[last] - line[first]
+        inner = line[first + 1 : last] - line[first]
+        length = float(np.hypot(*chord))
+        off = (
+            np.abs(inner[:, 0] * chord[1] - inner[:, 1] * chord[0]) / length
+            if length > 0.0
+            else np.hypot(*inner.T)
+        )
+        worst = int(off.argmax())
+        if off[worst] > TOLERANCE_M:
+            middle = first + 1 + worst
+            keep[middle] = True
+            stretches += [(first, middle), (middle, last)]
+    return line[keep]

@@ -8,43 +8,15 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.evaluate.tables import TRANSFER
 from cavmarl.ownership.transfers import Transfer, TransferLog
-
-TRANSFER = np.dtype(
-    [
-        ("run", np.int64),
-        ("episode", np.int64),
-        ("tick", np.int64),  # of the whole run of its world: resets do not turn it back
-        ("vehicle", np.int64),
-        ("source", np.int64),
-        ("target", np.int64),
-        ("epoch", np.int64),
-        ("forced", np.bool_),  # the state rode along, since the target was not ready in time
-        ("removed", np.bool_),  # it left the world in that tick
-        ("approached", np.int64),  # tick of the first state at the target; -1: none
-        ("waited", np.int64),  # ticks behind the border
-        ("offers", np.int64),  # states that arrived
-        ("state_bytes", np.int64),
-        ("prepare_depth_m", np.float64),  # outside of the source's zone at the first state
-        ("switch_depth_m", np.float64),  # at the switch
-        ("release_depth_m", np.float64),  # when the switch was committed
-        ("ms", np.float64),  # from the first state until the target had confirmed; not repeatable
-    ]
-)
 
 
 class TransferRecorder:
-    """Follows the worlds of an undivided or divided simulation through one episode of each.
-
-    Args:
-        logs: one a world; none where worlds are undivided.
-
-    Attributes:
-        counts: sums of the logs' counts over the episodes.
-    """
+    """Follows the worlds of an undivided or divided simulation through one episode of each."""
 
     def __init__(self, logs: Sequence[TransferLog]) -> None:
-        self.counts: Counter[str] = Counter()
+        self.counts: Counter[str] = Counter()  # sums of the logs' counts over the episodes
         self._logs = tuple(logs)
         self._before = [Counter(log.counts) for log in logs]
         self._episodes = [log.episode for log in logs]
@@ -53,12 +25,7 @@ class TransferRecorder:
             log.take()
 
     def collect(self, worlds: Iterable[int], over: NDArray[np.bool_]) -> None:
-        """After a step: take the rows of worlds in their episode.
-
-        Args:
-            worlds: that were in it during the step.
-            over: (W,) whose episode has ended with it.
-        """
+        """After a step: take the rows of worlds that were in it; `over` (W,) have ended."""
         if not self._logs:
             return
         for w in worlds:

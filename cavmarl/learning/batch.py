@@ -10,30 +10,18 @@ from torch import Tensor
 
 @dataclass
 class Batch:
-    """What one round of `num_steps` steps brought; T steps, W worlds, A agents.
+    """What one round of `num_steps` steps brought; T steps, W worlds, A agents."""
 
-    Attributes:
-        observations: (T, W, A, D).
-        states: (T, W, S) of the worlds; S is 0 where the critic does not see them.
-        actions: (T, W, A, …) as sampled.
-        log_probs: (T, W, A) of them.
-        values: (T, W, A).
-        rewards: (T, W, A).
-        acted: (T, W, A) which entries are decisions.
-        next_values: (T, W, A) what was to be expected after the step; 0 where a vehicle ended.
-        goes_on: (T, W, A) whether entry t + 1 is of the same vehicle and episode.
-        suggested: (T, W, A, …) what the built-in driver would have done, while it is imitated.
-    """
-
-    observations: Tensor
-    states: Tensor
-    actions: Tensor
-    log_probs: Tensor
-    values: Tensor
-    rewards: Tensor
-    acted: Tensor
-    next_values: Tensor
-    goes_on: Tensor
+    observations: Tensor  # (T, W, A, D)
+    states: Tensor  # (T, W, S) of the worlds; S is 0 where the critic does not see them
+    actions: Tensor  # (T, W, A, …) as sampled
+    log_probs: Tensor  # (T, W, A) of them
+    values: Tensor  # (T, W, A)
+    rewards: Tensor  # (T, W, A)
+    acted: Tensor  # (T, W, A) which entries are decisions
+    next_values: Tensor  # (T, W, A) what was to be expected after the step; 0 where a vehicle ended
+    goes_on: Tensor  # (T, W, A) whether entry t + 1 is of the same vehicle and episode
+    # (T, W, A, …) what the built-in driver would have done, while it is imitated
     suggested: Tensor | None = None
 
     def advantages(self, gamma: float, gae_lambda: float) -> Tensor:

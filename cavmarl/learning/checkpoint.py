@@ -26,35 +26,18 @@ S = TypeVar("S", bound="DataclassInstance")
 
 @dataclass(frozen=True)
 class RunState:
-    """How far a run has come.
+    """How far a run has come."""
 
-    Attributes:
-        args: its settings, by name.
-        agent_steps: decisions that it learned from.
-        updates: of the network.
-        seconds: spent on them.
-    """
-
-    args: dict[str, Any]
-    agent_steps: int = 0
-    updates: int = 0
-    seconds: float = 0.0
+    args: dict[str, Any]  # its settings, by name
+    agent_steps: int = 0  # decisions that it learned from
+    updates: int = 0  # of the network
+    seconds: float = 0.0  # spent on them
 
     def settings(self, kind: type[S]) -> S:
-        """The settings as what they were made of.
-
-        Raises:
-            ConfigError: they are another program's, or broken.
-        """
         return validate(kind, self.args, STATE_FILE)
 
 
 def read_state(folder: Path) -> RunState:
-    """What `save_checkpoint` noted of a run.
-
-    Raises:
-        ConfigError: no checkpoint there, or a broken one.
-    """
     path = folder / STATE_FILE
     try:
         raw = json.loads(path.read_text(encoding="utf-8"))
@@ -85,11 +68,7 @@ def save_checkpoint(
 def load_checkpoint(
     folder: Path, network: ActorCritic, optimizer: torch.optim.Optimizer, config: NetworkConfig
 ) -> None:
-    """Put a run's weights and its optimiser's state into others.
-
-    Raises:
-        PolicyError: a broken file, or a run on an environment that has changed since.
-    """
+    """Put a run's weights and its optimiser's state into others."""
     loaded, saved = load_network(folder)
     if replace(saved, agent_steps=0) != config:
         raise PolicyError(

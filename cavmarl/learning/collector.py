@@ -3,35 +3,80 @@
 from __future__ import annotations
 
 import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from cavmarl.config.env import TERMS
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.learning.batch import Batch
-from cavmarl.learning.run_clock import RunClock
-from cavmarl.learning.trips import Trips
+from cavmarl.learning.log import WINDOW
 from cavmarl.policies.networks import ActorCritic
+
+# Worlds that step; what goes between them and the tensors; what the network decides; the updates.
+PHASES = ("simulation", "transfer", "inference", "learning")
+ARRIVAL, COLLISION, OFF_ROAD = (TERMS.index(t) for t in ("arrival", "collision", "off_road"))
+
+
+class RunClock:
+    """Adds up wall time by phase."""
+
+    def __init__(self) -> None:
+        self.spent_s = dict.fromkeys(PHASES, 0.0)
+
+    @contextmanager
+    def phase(self, name: str) -> Iterator[None]:
+        """The time of a block goes to this phase; not to be nested."""
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.spent_s[name] += time.perf_counter() - began
+
+    def take(self) -> dict[str, float]:
+        """What has been spent since this was last asked."""
+        taken, self.spent_s = self.spent_s, dict.fromkeys(PHASES, 0.0)
+        return taken
+
+
+class Trips:
+    """Returns and ends of the last `WINDOW` trips, and those under way in W worlds, A agents."""
+
+    def __init__(self, num_envs: int, num_agents: int) -> None:
+        self._returns = np.zeros((num_envs, num_agents))
+        self._ended: deque[list[float]] = deque(maxlen=WINDOW)
+        self._count = 0
+
+    def add(
+        self, rewards: NDArray[Any], done: NDArray[Any], cut: NDArray[Any], terms: NDArray[Any]
+    ) -> None:
+        """Take in one step; `done` (W, A) ends trips, `cut` (W, A) forgets them."""
+        self._returns += rewards
+        ends = terms[done][:, [ARRIVAL, COLLISION, OFF_ROAD]]
+        self._ended.extend(np.column_stack([self._returns[done], ends]).tolist())
+        self._count += len(ends)
+        self._returns[done | cut] = 0.0
+
+    def means(self) -> dict[str, float]:
+        """Of the last trips; and how many there have been."""
+        names = ("trip_return", "success", "collision", "off_road")
+        columns = np.array(self._ended).mean(axis=0) if self._ended else np.full(4, np.nan)
+        return {"trips": self._count, **dict(zip(names, columns.tolist(), strict=True))}
 
 
 class Collector:
     """Drives the worlds with a network and keeps what comes of it.
 
     What worlds see lies in memory that they share with torch, and is copied once, into the batch.
-
-    Args:
-        vec: the worlds. If the critic sees their states, they begin anew in the next step: the
-            last state of an episode is gone when they do so in the same.
-        network: that decides. Others of the same shape can take its place between two batches.
-        num_steps: of a batch.
-        seed: of the worlds.
-        generator: of the random actions; None: torch's own.
-
-    Attributes:
-        vec: the worlds.
-        network: that decides.
-        trips: how the last ones went.
-        clock: where the time went.
+    If the critic sees their states, they begin anew in the next step: the last state of an episode
+    is gone when they do so in the same. Other networks of the same shape can take the place of
+    `network` between two batches. Random actions are drawn by `generator`; None: by torch's own.
     """
 
     def __init__(
@@ -76,18 +121,13 @@ class Collector:
         actions = torch.zeros((*shape, 2)) if continuous else torch.zeros(shape, dtype=torch.int64)
         log_probs, values, rewards, next_values = (torch.zeros(shape) for _ in range(4))
         acted, goes_on = (torch.zeros(shape, dtype=torch.bool) for _ in range(2))
+        observations = torch.zeros((*shape, self._observations.shape[-1]))
+        states = torch.zeros((self._num_steps, *self._states.shape))
+        suggested = torch.zeros_like(actions) if with_suggested else None
         return Batch(
-            torch.zeros((*shape, self._observations.shape[-1])),
-            torch.zeros((self._num_steps, *self._states.shape)),
-            actions,
-            log_probs,
-            values,
-            rewards,
-            acted,
-            next_values,
-            goes_on,
-            torch.zeros_like(actions) if with_suggested else None,
-        )
+            observations, states, actions, log_probs, values, rewards, acted, next_values, goes_on,
+            suggested,
+        )  # fmt: skip
 
     def _step(self, batch: Batch, t: int) -> None:
         """Let the network decide, and write down what is entry `t` of a batch."""

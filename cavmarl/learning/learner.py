@@ -12,6 +12,7 @@ from cavmarl.learning.batch import Batch
 from cavmarl.learning.ppo_settings import PpoSettings
 from cavmarl.policies.networks import ActorCritic
 
+LEAST_DEVIATION = 0.02  # of an observation; those that hardly change are not blown up
 NUMBERS = ("policy_loss", "value_loss", "entropy", "kl", "clipped")
 
 
@@ -29,12 +30,7 @@ class _Decisions(NamedTuple):
 
 
 class Learner:
-    """The network, its optimiser, and PPO's update (Schulman et al. 2017).
-
-    Args:
-        network: that learns.
-        settings: of the run.
-    """
+    """The network, its optimiser, and PPO's update (Schulman et al. 2017)."""
 
     def __init__(self, network: ActorCritic, settings: PpoSettings) -> None:
         self.network = network
@@ -113,3 +109,29 @@ class Learner:
             clipped = ((ratio - 1.0).abs() > settings.clip).float().mean()
             found = (policy_loss, value_loss, entropy.mean(), kl, clipped)
             return {name: number.item() for name, number in zip(NUMBERS, found, strict=True)}
+
+
+class Scales:
+    """Keeps the network's mean and deviation of observations: of all decisions of a run so far.
+
+    They are of `count` decisions already.
+    """
+
+    def __init__(self, network: ActorCritic, count: int) -> None:
+        self._network = network
+        self._count = count
+        self._squares = network.deviation.square() * count
+
+    def add(self, observations: Tensor) -> None:
+        """Take in the observations (N, D) of new decisions (Chan et al. 1979)."""
+        network, new = self._network, observations.shape[0]
+        if new == 0:
+            return
+        mean = observations.mean(0)
+        apart = mean - network.mean
+        total = self._count + new
+        self._squares += (observations - mean).square().sum(0)
+        self._squares += apart.square() * (self._count * new / total)
+        network.mean += apart * (new / total)
+        network.deviation.copy_((self._squares / total).sqrt().clamp(min=LEAST_DEVIATION))
+        self._count = total

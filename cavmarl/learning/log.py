@@ -39,13 +39,7 @@ def curve_row(
 
 
 class Log:
-    """Writes the numbers of every update to CSV, and to TensorBoard where asked for.
-
-    Args:
-        folder: of the run.
-        goes_on: the run has written there before.
-        tensorboard: write TensorBoard's files, too.
-    """
+    """Writes the numbers of every update to CSV, and to TensorBoard where asked for."""
 
     def __init__(self, folder: Path, goes_on: bool = False, tensorboard: bool = False) -> None:
         self._file = (folder / CSV_FILE).open("a" if goes_on else "w", encoding="utf-8", newline="")
@@ -57,7 +51,6 @@ class Log:
             self._board = board.SummaryWriter(str(folder))
 
     def write(self, row: dict[str, float]) -> None:
-        """One update's numbers by name."""
         if self._writer is None:
             self._writer = csv.DictWriter(self._file, list(row))
             if self._with_header:

@@ -29,13 +29,8 @@ def parse_settings(kind: type[S], words: Sequence[str] | None, text: str | None)
 
     `--config FILE` is a YAML file of the same settings, which options shadow.
 
-    Args:
-        kind: the dataclass of the settings.
-        words: of the command line; None: this process's.
-        text: what the program is; its first line is shown.
-
-    Raises:
-        ConfigError: a file or a value that cannot be.
+    `words` are those of the command line; None: this process's. The first line of `text`, which
+    says what the program is, is shown.
     """
     return settings_of(kind, given_options(kind, words, text))
 
@@ -59,7 +54,6 @@ def given_options(
 
 
 def settings_of(kind: type[S], given: Mapping[str, Any]) -> S:
-    """Whole settings from those that are given; raises as `parse_settings`."""
     options = dict(given)
     path = options.pop("config", None)
     settings = validate(kind, read_yaml(path), str(path)) if path else kind()
@@ -67,11 +61,6 @@ def settings_of(kind: type[S], given: Mapping[str, Any]) -> S:
 
 
 def check_at_least(settings: object, least: Mapping[str, float]) -> None:
-    """Refuse settings below the given numbers, and infinite ones.
-
-    Raises:
-        ConfigError: names the option.
-    """
     for name, bound in least.items():
         value = getattr(settings, name)
         if not bound <= value < float("inf"):
@@ -79,7 +68,6 @@ def check_at_least(settings: object, least: Mapping[str, float]) -> None:
 
 
 def check_above_zero(settings: object, names: Iterable[str]) -> None:
-    """Refuse settings of these names that are not positive numbers; raises as above."""
     for name in names:
         value = getattr(settings, name)
         if not 0.0 < value < float("inf"):
@@ -87,7 +75,6 @@ def check_above_zero(settings: object, names: Iterable[str]) -> None:
 
 
 def check_shares(settings: object, names: Iterable[str]) -> None:
-    """Refuse settings of these names that are not from 0 to 1; raises as above."""
     for name in names:
         value = getattr(settings, name)
         if not 0.0 <= value <= 1.0:

@@ -98,11 +98,7 @@ S = TypeVar("S", bound=PpoSettings)
 
 
 def parse_ppo(kind: type[S], words: Sequence[str] | None, text: str | None) -> S:
-    """As `options.parse_settings`; of a resumed run, the settings that it began with.
-
-    Raises:
-        ConfigError: a file or a value that cannot be, or one that a resumed run may not change.
-    """
+    """As `options.parse_settings`; of a resumed run, the settings that it began with."""
     given = given_options(kind, words, text)
     if not given.get("resume"):
         return settings_of(kind, given)

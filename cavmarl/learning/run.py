@@ -18,19 +18,13 @@ from cavmarl.evaluate.provenance.training_record import begin_training, end_trai
 from cavmarl.learning.batch import Batch
 from cavmarl.learning.checkpoint import RunState, load_checkpoint, read_state, save_checkpoint
 from cavmarl.learning.collector import Collector
-from cavmarl.learning.learner import Learner
+from cavmarl.learning.learner import Learner, Scales
 from cavmarl.learning.log import CSV_FILE, Log, describe, progress_bar
 from cavmarl.learning.ppo_settings import PpoSettings
-from cavmarl.learning.scales import Scales
 from cavmarl.policies.networks import CONFIG_FILE, WEIGHTS_FILE, ActorCritic, NetworkConfig
 
 
 def make_worlds(settings: PpoSettings) -> CavVectorEnv:
-    """The worlds that a run learns in.
-
-    Raises:
-        CavmarlError: as `make_vec`.
-    """
     central = settings.central_critic
     return make_vec(
         settings.env,
@@ -46,14 +40,7 @@ def make_worlds(settings: PpoSettings) -> CavVectorEnv:
 
 
 class Run:
-    """A run of PPO: where it stands and how it goes on.
-
-    Args:
-        settings: of the run.
-
-    Raises:
-        CavmarlError: settings, environment or checkpoint that cannot work.
-    """
+    """A run of PPO: where it stands and how it goes on."""
 
     def __init__(self, settings: PpoSettings) -> None:
         folder = settings.folder
@@ -163,11 +150,7 @@ def _network_config(settings: PpoSettings, vec: CavVectorEnv) -> NetworkConfig:
 
 
 def train(settings: PpoSettings, console: Console) -> Path:
-    """Run PPO until its decisions or its minutes are used up; returns the folder of the run.
-
-    Raises:
-        CavmarlError: settings, environment or checkpoint that cannot work.
-    """
+    """Run PPO until its decisions or its minutes are used up; returns the folder of the run."""
     run = Run(settings)
     if run.vec.plans:
         console.print(run.vec.plan_text(), highlight=False)

@@ -62,9 +62,6 @@ class Policy(ABC):
         """Actions of the agents of a `CavEnv`, from what its `reset` or `step` returned.
 
         Agents that have just left are among the observations and get no action.
-
-        Args:
-            observations: by agent, flat or by sensor.
         """
         env = self.env
         if not isinstance(env, CavEnv):
@@ -89,12 +86,7 @@ class Policy(ABC):
 
 
 class NetworkPolicy(Policy):
-    """A trained network, driving by its most likely actions.
-
-    Args:
-        env: where it drives.
-        network: maps flat observations to actions.
-    """
+    """A trained network, driving by its most likely actions."""
 
     def __init__(self, env: Environment, network: ActorCritic) -> None:
         super().__init__(env)
@@ -142,12 +134,7 @@ def load_policy(policy: str | Path, env: Environment) -> Policy:
 
 
 def policy_files(policy: str | Path) -> tuple[Path, ...]:
-    """The files that make a policy what it is: its script, or its weights and their description.
-
-    Raises:
-        PolicyError: nothing of that name, or a folder without them.
-        MissingExtraError: a network, without torch.
-    """
+    """The files that make a policy what it is: its script, or its weights and their description."""
     path = _find(policy)
     if not path.is_dir():
         return (path,)

@@ -12,18 +12,19 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
-from cavmarl.core import errors
-from cavmarl.core.errors import ConfigError, EvaluationError
-from cavmarl.core.seeds import check_seed
+from cavmarl.config.checks import check_count
+from cavmarl.config.world_spec import WorldKeys, WorldSpec
+from cavmarl.core.errors import EvaluationError
+from cavmarl.evaluate.fresh import told_error
 from cavmarl.verify.differences import Arrays, Difference, find_difference
 
 HASH_SEEDS = ("0", "1", "4294967295")  # of the three processes
@@ -32,76 +33,47 @@ MAX_STEPS = 10_000_000
 
 @dataclass(frozen=True)
 class FirstDifference(Difference):
-    """Where two processes first differ.
+    """Where two processes first differ."""
 
-    Attributes:
-        processes: the numbers of the two; the tick is that of the first.
-    """
-
-    processes: tuple[int, int]
+    processes: tuple[int, int]  # the numbers of the two; the tick is that of the first
 
 
 @dataclass(frozen=True)
 class Determinism:
-    """What was found.
+    """What was found."""
 
-    Attributes:
-        steps: that were compared.
-        ticks: of the world at the end.
-        hash_seeds: `PYTHONHASHSEED` of the processes.
-        state_hash: of the first process at the end.
-        difference: None if all were equal.
-    """
-
-    steps: int
-    ticks: int
-    hash_seeds: tuple[str, ...]
-    state_hash: str
-    difference: FirstDifference | None
-
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
+    steps: int  # that were compared
+    ticks: int  # of the world at the end
+    hash_seeds: tuple[str, ...]  # `PYTHONHASHSEED` of the processes
+    state_hash: str  # of the first process at the end
+    difference: FirstDifference | None  # None if all were equal
 
 
 def verify_determinism(
-    env: str | Path,
+    env: str | Path | WorldSpec,
     policy: str | Path = "idm",
     *,
     steps: int = 600,
-    seed: int = 0,
-    agents: int | None = None,
-    background: int | None = None,
-    overrides: Mapping[str, Any] | None = None,
     progress: Callable[[int, int], None] | None = None,
+    **keys: Unpack[WorldKeys],
 ) -> Determinism:
     """Drive one world in three processes and compare everything after each step.
 
     Args:
-        env: as in `make_vec`, like the other keywords that are not explained here.
+        env: as in `make_vec`, like the other keywords; the seed is the policy's, too.
         policy: as in `load_policy`.
         steps: how many; episodes follow one another.
-        seed: root of all random numbers, also the policy's.
-        agents: shadows population.agents.
-        background: shadows population.background.
-        overrides: values for any other key.
         progress: called after each step with its number and `steps`.
+        keys: of the world.
 
     Raises:
         ConfigError: a number or a key that cannot work.
         PolicyError: the policy cannot be loaded or does not fit.
         EvaluationError: a process died.
     """
-    job = {
-        "env": str(env),
-        "policy": str(policy),
-        "steps": check_steps(steps),
-        "seed": check_seed(seed),
-        "world": {
-            "agents": agents,
-            "background": background,
-            "overrides": dict(overrides or {}),
-        },
-    }
+    spec = WorldSpec.of(env, **keys)
+    check_count("steps", steps, MAX_STEPS)
+    job = {"spec": asdict(spec), "policy": str(policy), "steps": steps}
     with ExitStack() as stack:
         room = Path(stack.enter_context(TemporaryDirectory()))
         programs = [stack.enter_context(_Program(job, HASH_SEEDS[0]))]
@@ -126,24 +98,8 @@ def verify_determinism(
         return Determinism(step, told[0]["tick"], HASH_SEEDS, told[0]["state"], difference)
 
 
-def check_steps(steps: int) -> int:
-    """A number of steps that can be compared.
-
-    Raises:
-        ConfigError: it is none.
-    """
-    if isinstance(steps, bool) or not isinstance(steps, int) or not 1 <= steps <= MAX_STEPS:
-        raise ConfigError(f"steps = {steps!r}: must be a whole number from 1 to {MAX_STEPS}")
-    return steps
-
-
 class _Program:
-    """One of the processes; a context manager that ends it.
-
-    Args:
-        job: for `lockstep`.
-        hash_seed: its PYTHONHASHSEED.
-    """
+    """One of the processes, with a job for `lockstep`; a context manager that ends it."""
 
     def __init__(self, job: dict[str, Any], hash_seed: str) -> None:
         self._hash_seed = hash_seed
@@ -185,7 +141,7 @@ class _Program:
         line, self._line = self._line, ""
         told: dict[str, Any] = json.loads(line)
         if "error" in told:
-            raise getattr(errors, told["error"])(told["message"])
+            raise told_error(told["error"], told["message"])
         return told
 
     def dump(self, path: Path) -> Arrays:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,30 +15,23 @@ from numpy.typing import NDArray
 
 from cavmarl.driving.vehicles import STATE_FIELDS
 from cavmarl.env.vector import CavVectorEnv, StepResult
+from cavmarl.policies.policy import load_policy
 
 Arrays = dict[str, NDArray[Any]]
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Where two runs first differ.
+    """Where two runs first differ."""
 
-    Attributes:
-        step: number of the step, 0 is the reset.
-        tick: the world's tick at its end.
-        what: `vehicle`, the name of another array, or `hidden state`: what hashes cover and
-            neither has (queue and random keys).
-        vehicle: id of the vehicle, the smallest that differs; None where it is none.
-        field: of its record, the first that differs; or the place in the array.
-        values: in the two; None where a vehicle is missing.
-    """
-
-    step: int
-    tick: int
+    step: int  # number of the step, 0 is the reset
+    tick: int  # the world's tick at its end
+    # `vehicle`, the name of another array, or `hidden state`: what hashes cover and neither has
+    # (queue and random keys)
     what: str
-    vehicle: int | None
-    field: str
-    values: tuple[Any, Any]
+    vehicle: int | None  # id of the vehicle, the smallest that differs; None where it is none
+    field: str  # of its record, the first that differs; or the place in the array
+    values: tuple[Any, Any]  # in the two; None where a vehicle is missing
 
 
 def step_results(result: StepResult, actions: NDArray[Any]) -> Arrays:
@@ -51,6 +45,27 @@ def step_results(result: StepResult, actions: NDArray[Any]) -> Arrays:
         **{f"infos {name}": array for name, array in infos.items()},
         "actions": actions,
     }
+
+
+def first_results(vec: CavVectorEnv, seed: int) -> Arrays:
+    observations, infos = vec.reset(seed=seed)
+    return {"observations": observations, "infos mask": infos["mask"]}
+
+
+class DrivenRun:
+    """Some worlds and their driver, from the reset on; the seed is that of both."""
+
+    def __init__(self, vec: CavVectorEnv, policy: str | Path, seed: int) -> None:
+        self.vec = vec
+        self._driver = load_policy(policy, vec)
+        self.results = first_results(vec, seed)
+        self._driver.reset(seed)
+
+    def step(self) -> Arrays:
+        seen, mask = self.results["observations"], self.results["infos mask"]
+        actions = self._driver.act_batch(seen, mask)
+        self.results = step_results(self.vec.step(actions), actions)
+        return self.results
 
 
 def single_arrays(results: Mapping[str, Any]) -> Iterator[tuple[str, NDArray[Any]]]:
@@ -84,13 +99,9 @@ def same_bytes(one: Mapping[str, NDArray[Any]], other: Mapping[str, NDArray[Any]
 
 
 def find_difference(step: int, tick: int, one: Arrays, other: Arrays) -> Difference:
-    """The smallest id, and of its record the first field; else the first other array and place.
+    """Of two snapshots the smallest id that differs, and the first field of its record.
 
-    Args:
-        step: number of the step.
-        tick: of the world.
-        one: a snapshot.
-        other: another one; both have the same names.
+    Else the first other array and place.
     """
 
     def found(what: str, vehicle: int | None, field: str, values: tuple[Any, Any]) -> Difference:

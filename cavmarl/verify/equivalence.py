@@ -9,26 +9,19 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.config.checks import check_count
 from cavmarl.config.env import MAX_ZONES, ZONE_FILE_SUFFIXES
+from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError, ProtocolError
-from cavmarl.core.seeds import check_seed
-from cavmarl.env.vector import CavVectorEnv, make_vec
+from cavmarl.env.vector import make_vec
 from cavmarl.handoff.fault_injection.fault_plan import read_faults
-from cavmarl.policies.policy import load_policy
-from cavmarl.verify.determinism import check_steps
-from cavmarl.verify.differences import (
-    Arrays,
-    Difference,
-    find_difference,
-    same_bytes,
-    snapshot,
-    step_results,
-)
+from cavmarl.verify.determinism import MAX_STEPS
+from cavmarl.verify.differences import Difference, DrivenRun, find_difference, same_bytes, snapshot
 from cavmarl.verify.fault_figures import FaultFigures, HandOverClock
 from cavmarl.zones.kernels.zone_lookup import zones_of
 from cavmarl.zones.partition.zone_file import read_zones
@@ -38,25 +31,15 @@ ZONES = (1, 2, 4, 9)
 
 @dataclass(frozen=True)
 class ZoneResult:
-    """What came of one number of zones.
+    """What came of one number of zones."""
 
-    Attributes:
-        zones: how many.
-        steps: that were compared.
-        crossings: how often a vehicle was in another zone than a step before, in all worlds.
-        vehicles: in all worlds, on average over the steps.
-        world: the first that differs; None if all were equal.
-        difference: in it; None if all were equal.
-        figures: hand-overs, and what faults did to them.
-    """
-
-    zones: int
-    steps: int
-    crossings: int
-    vehicles: float
-    world: int | None
-    difference: Difference | None
-    figures: FaultFigures
+    zones: int  # how many
+    steps: int  # that were compared
+    crossings: int  # how often a vehicle was in another zone than a step before, in all worlds
+    vehicles: float  # in all worlds, on average over the steps
+    world: int | None  # the first that differs; None if all were equal
+    difference: Difference | None  # in it; None if all were equal
+    figures: FaultFigures  # hand-overs, and what faults did to them
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(replace(self, figures=FaultFigures())) | {"figures": self.figures.to_dict()}
@@ -64,23 +47,14 @@ class ZoneResult:
 
 @dataclass(frozen=True)
 class Equivalence:
-    """What was found.
+    """What was found."""
 
-    Attributes:
-        env: of which environment.
-        worlds: how many were stepped together.
-        steps: that were asked for.
-        ticks: of the first world's episode at the end.
-        state_hashes: of the undivided worlds at the end.
-        results: one for each number of zones.
-    """
-
-    env: str
-    worlds: int
-    steps: int
-    ticks: int
-    state_hashes: tuple[str, ...]
-    results: tuple[ZoneResult, ...]
+    env: str  # of which environment
+    worlds: int  # how many were stepped together
+    steps: int  # that were asked for
+    ticks: int  # of the first world's episode at the end
+    state_hashes: tuple[str, ...]  # of the undivided worlds at the end
+    results: tuple[ZoneResult, ...]  # one for each number of zones
 
     @property
     def holds(self) -> bool:
@@ -92,21 +66,18 @@ class Equivalence:
 
 
 def verify_zones(
-    env: str | Path,
+    env: str | Path | WorldSpec,
     zones: Sequence[int] | None = None,
     *,
     steps: int = 200,
-    seed: int = 0,
     layout: str | Path | None = None,
     policy: str | Path = "idm",
     worlds: int = 1,
-    agents: int | None = None,
-    background: int | None = None,
-    overrides: Mapping[str, Any] | None = None,
     faults: str | Path | None = None,
     check: bool = False,
     journals: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
+    **keys: Unpack[WorldKeys],
 ) -> Equivalence:
     """Drive divided worlds beside the undivided ones and compare everything after each step.
 
@@ -114,17 +85,14 @@ def verify_zones(
         env: as in `make_vec`, like the other keywords that are not explained here.
         zones: numbers of zones; default: as many as a zone file has, otherwise `ZONES`.
         steps: how many; episodes follow one another.
-        seed: root of all random numbers, also the policy's.
         layout: shadows zones.layout; a zone file is named from the working directory.
-        policy: as in `load_policy`.
+        policy: as in `load_policy`; its random numbers have the root of the worlds'.
         worlds: stepped together.
-        agents: shadows population.agents.
-        background: shadows population.background.
-        overrides: values for any other key; those of `zones` count for the divided worlds.
-        faults: what is done to the divided worlds, as `runtime.fault_plan.read_faults` takes it.
+        faults: what is done to the divided worlds, as `fault_plan.read_faults` takes it.
         check: watch the invariants of ownership in the divided worlds.
         journals: folder for the journals of the divided worlds, one for each number of zones.
         progress: called after each step with its number and `steps`.
+        keys: of the worlds; overrides of `zones` count for the divided ones.
 
     Raises:
         ConfigError: a number or a key that cannot work; more zones than the map can hold, or a zone
@@ -132,27 +100,16 @@ def verify_zones(
         JournalError: a journal that cannot be begun.
         PolicyError: the policy cannot be loaded or does not fit.
     """
-    check_steps(steps)
-    check_seed(seed)
-    divided = dict(overrides or {})
-    if layout is not None:
-        _shadow(divided, "zones.layout", _layout(layout), "layout")
-    if faults is not None:
-        _shadow(divided, "zones.faults", read_faults(str(faults)).to_json(), "faults")
-    if check:
-        divided["zones.check_invariants"] = True
+    check_count("steps", steps, MAX_STEPS)
+    spec = WorldSpec.of(env, **keys)
+    divided = _divided(spec, layout, faults, check)
     plain = {key: value for key, value in divided.items() if not key.startswith("zones.")}
 
-    def run(count: int, settings: Mapping[str, Any]) -> _Run:
-        vec = make_vec(
-            env,
-            num_envs=worlds,
-            zones=count,
-            agents=agents,
-            background=background,
-            overrides=settings,
+    def run(count: int, settings: Mapping[str, Any]) -> DrivenRun:
+        wanted = spec.keywords | {"overrides": settings}
+        return DrivenRun(
+            make_vec(spec.env, num_envs=worlds, zones=count, **wanted), policy, spec.seed
         )
-        return _Run(vec, policy, seed)
 
     whole = run(1, plain)
     # A world of one zone is as plain as the first: whose hosts die has to be divided.
@@ -169,21 +126,25 @@ def verify_zones(
             progress(step, steps)
         if all(other.difference is not None for other in compared):
             break
-    vec = whole.vec
-    return Equivalence(
-        str(env),
-        worlds,
-        steps,
-        int(vec.simulation.ticks()[0]),
-        tuple(vec.state_hash(w) for w in range(worlds)),
-        tuple(other.result() for other in compared),
-    )
+    ticks = int(whole.vec.simulation.ticks()[0])
+    hashes = tuple(whole.vec.state_hash(w) for w in range(worlds))
+    results = tuple(other.result() for other in compared)
+    return Equivalence(spec.env, worlds, steps, ticks, hashes, results)
 
 
-def _shadow(settings: dict[str, Any], key: str, value: Any, name: str) -> None:
-    if key in settings:
-        raise ConfigError(f"{key} stands in overrides and is given as {name}; use one")
-    settings[key] = value
+def _divided(
+    spec: WorldSpec, layout: str | Path | None, faults: str | Path | None, check: bool
+) -> dict[str, Any]:
+    settings = dict(spec.overrides)
+    for name, given in (("layout", layout), ("faults", faults)):
+        if given is not None:
+            key = f"zones.{name}"
+            if key in settings:
+                raise ConfigError(f"{key} stands in overrides and is given as {name}; use one")
+            settings[key] = (
+                _layout(str(given)) if name == "layout" else read_faults(str(given)).to_json()
+            )
+    return settings | ({"zones.check_invariants": True} if check else {})
 
 
 def _journal(folder: Path | None, count: int) -> dict[str, str]:
@@ -192,17 +153,12 @@ def _journal(folder: Path | None, count: int) -> dict[str, str]:
     return {"zones.journal": str(folder / f"zones-{count}.jsonl")}
 
 
-def _layout(layout: str | Path) -> str:
-    path = str(layout)
+def _layout(path: str) -> str:
     return str(Path(path).resolve()) if path.endswith(ZONE_FILE_SUFFIXES) else path
 
 
 def _counts(zones: Sequence[int] | None, settings: Mapping[str, Any]) -> list[int]:
-    """The numbers of zones, each once.
-
-    Raises:
-        ConfigError: one that cannot be, or none.
-    """
+    """The numbers of zones, each once; those that cannot be are refused."""
     if zones is None:
         layout = str(settings.get("zones.layout", ""))
         zones = (read_zones(layout).count,) if layout.endswith(ZONE_FILE_SUFFIXES) else ZONES
@@ -214,36 +170,10 @@ def _counts(zones: Sequence[int] | None, settings: Mapping[str, Any]) -> list[in
     return list(dict.fromkeys(zones))
 
 
-class _Run:
-    """Some worlds and their driver, from the reset on.
-
-    Args:
-        vec: the worlds.
-        policy: drives the agents.
-        seed: of both.
-    """
-
-    def __init__(self, vec: CavVectorEnv, policy: str | Path, seed: int) -> None:
-        self.vec = vec
-        self._driver = load_policy(policy, vec)
-        observations, infos = vec.reset(seed=seed)
-        self._driver.reset(seed)
-        self.results: Arrays = {"observations": observations, "infos mask": infos["mask"]}
-
-    def step(self) -> None:
-        seen, mask = self.results["observations"], self.results["infos mask"]
-        actions = self._driver.act_batch(seen, mask)
-        self.results = step_results(self.vec.step(actions), actions)
-
-
 class _Compared:
-    """One division beside the undivided worlds, up to the first difference.
+    """One division beside the undivided worlds, up to the first difference."""
 
-    Args:
-        run: the divided worlds.
-    """
-
-    def __init__(self, run: _Run) -> None:
+    def __init__(self, run: DrivenRun) -> None:
         self._run = run
         self._clocks = [HandOverClock() for _ in run.vec.simulation.coordinators]
         for coordinator, clock in zip(run.vec.simulation.coordinators, self._clocks, strict=True):
@@ -255,7 +185,7 @@ class _Compared:
         self._world: int | None = None
         self.difference: Difference | None = None
 
-    def follow(self, step: int, whole: _Run) -> None:
+    def follow(self, step: int, whole: DrivenRun) -> None:
         """Take the step that the undivided worlds have taken, and compare."""
         if self.difference is not None:
             return
@@ -283,7 +213,7 @@ class _Compared:
             FaultFigures.of(simulation, self._clocks),
         )
 
-    def _compare(self, step: int, whole: _Run) -> None:
+    def _compare(self, step: int, whole: DrivenRun) -> None:
         mine, theirs = self._run, whole
         same = same_bytes(theirs.results, mine.results)
         for w in range(mine.vec.num_envs):

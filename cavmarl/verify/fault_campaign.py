@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from hashlib import blake2b
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.config.checks import check_count
+from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError, EvaluationError, LostTickError, ProtocolError
-from cavmarl.core.seeds import check_seed
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.handoff.fault_injection.fault_plan import PHASES, Crash, Faults
@@ -22,9 +23,8 @@ from cavmarl.handoff.fault_injection.injected_faults import FaultyCoordinator
 from cavmarl.handoff.fault_injection.reproducer_file import read_reproducer
 from cavmarl.ownership.messages import Begin, Message, Record
 from cavmarl.ownership.transport import check_whole
-from cavmarl.policies.policy import load_policy
-from cavmarl.verify.determinism import check_steps
-from cavmarl.verify.differences import Arrays, single_arrays, step_results
+from cavmarl.verify.determinism import MAX_STEPS
+from cavmarl.verify.differences import Arrays, DrivenRun, first_results, single_arrays, step_results
 from cavmarl.verify.fault_figures import FaultFigures, HandOverClock, spread
 from cavmarl.verify.fault_matrix import MatrixLine, Rehearsal, matrix
 from cavmarl.verify.replay import replay_tick, world_of
@@ -47,29 +47,18 @@ NEVER = 1 << 40  # a tick that no run comes to
 
 @dataclass
 class LineResult:
-    """What came of a line of the matrix, with one number of zones.
+    """What came of a line of the matrix, with one number of zones."""
 
-    Attributes:
-        name: of the line.
-        points: where it strikes.
-        zones: how many.
-        runs: how many.
-        survived: faults of the runs that were equal to the end.
-        unmet: points not reached.
-        missed: deaths that were planned and did not happen.
-        failures: of each run that was not as it has to be, what was wrong, and its plan.
-        figures: of all runs.
-    """
-
-    name: str
-    points: str
-    zones: int
-    runs: int = 0
-    survived: int = 0
-    unmet: tuple[str, ...] = ()
-    missed: int = 0
+    name: str  # of the line
+    points: str  # where it strikes
+    zones: int  # how many
+    runs: int = 0  # how many
+    survived: int = 0  # faults of the runs that were equal to the end
+    unmet: tuple[str, ...] = ()  # points not reached
+    missed: int = 0  # deaths that were planned and did not happen
+    # of each run that was not as it has to be, what was wrong, and its plan
     failures: list[dict[str, Any]] = field(default_factory=list)
-    figures: FaultFigures = field(default_factory=FaultFigures)
+    figures: FaultFigures = field(default_factory=FaultFigures)  # of all runs
 
     def to_dict(self) -> dict[str, Any]:
         return {**vars(self), "injected": self.figures.injected, "figures": self.figures.to_dict()}
@@ -77,25 +66,15 @@ class LineResult:
 
 @dataclass
 class Campaign:
-    """All lines.
+    """All lines."""
 
-    Attributes:
-        env: of which environment.
-        zones: numbers of zones.
-        steps: of each run.
-        ticks: of each run.
-        lines: results.
-        calm_ms: of each step without a death.
-        stricken_ms: of each step with a death.
-    """
-
-    env: str
-    zones: tuple[int, ...]
-    steps: int
-    ticks: int = 0
-    lines: list[LineResult] = field(default_factory=list)
-    calm_ms: list[float] = field(default_factory=list)
-    stricken_ms: list[float] = field(default_factory=list)
+    env: str  # of which environment
+    zones: tuple[int, ...]  # numbers of zones
+    steps: int  # of each run
+    ticks: int = 0  # of each run
+    lines: list[LineResult] = field(default_factory=list)  # results
+    calm_ms: list[float] = field(default_factory=list)  # of each step without a death
+    stricken_ms: list[float] = field(default_factory=list)  # of each step with a death
 
     @property
     def holds(self) -> bool:
@@ -127,42 +106,40 @@ class Campaign:
 
 
 def run_campaign(
-    env: str | Path | None = None,
+    env: str | Path | WorldSpec | None = None,
     zones: Sequence[int] | None = None,
     *,
     steps: int = 40,
-    seed: int = 0,
     seeds: int = 12,
     policy: str | Path = "idm",
-    overrides: Mapping[str, Any] | None = None,
     progress: Callable[[int, int], None] | None = None,
+    **keys: Unpack[WorldKeys],
 ) -> Campaign:
     """Run the whole matrix; each run is compared with the undivided world after every step.
 
     Args:
-        env: as in `make_vec`; None: a small busy world.
+        env: as in `make_vec`, like the other keywords; None: a small busy world.
         zones: numbers of them, 2 or more; default: `ZONES`.
         steps: of each run, in `EPISODES` episodes.
-        seed: root of all random numbers.
         seeds: runs in which any process dies at any time.
         policy: as in `load_policy`.
-        overrides: values for any key of the environment.
         progress: called after each run with its number and how many there are.
-
-    Raises:
-        ConfigError: a number or a key that cannot work.
+        keys: of the world.
     """
-    check_steps(steps)
-    check_seed(seed)
+    check_count("steps", steps, MAX_STEPS)
     check_whole("seeds", seeds, 0)
     counts = ZONES if zones is None else tuple(dict.fromkeys(zones))
     if not counts or min(counts) < 2:
         raise ConfigError(f"zones = {list(counts)}: a campaign needs numbers of 2 or more")
-    settings = (dict(BUSY) if env is None else {}) | dict(overrides or {})
-    campaign = Campaign(str(ENV if env is None else env), counts, steps)
+    spec = WorldSpec.of("" if env is None else env, **keys)
+    if not spec.env:
+        given = {"population.agents": spec.agents, "population.background": spec.background}
+        named = {key: value for key, value in given.items() if value is not None}
+        overrides = {**BUSY, **spec.overrides, **named}
+        spec = replace(spec, env=ENV, agents=None, background=None, overrides=overrides)
+    campaign = Campaign(spec.env, counts, steps)
     with TemporaryDirectory() as folder:
-        stage = _Stage(ENV if env is None else env, settings, steps, seed, policy, folder)
-        _run_matrix(stage, campaign, seeds, progress)
+        _run_matrix(_Stage(spec, steps, policy, folder), campaign, seeds, progress)
     return campaign
 
 
@@ -188,51 +165,28 @@ def _run_matrix(
 class _Stage:
     """The undivided run, recorded, and divided ones that are held against it.
 
-    Args:
-        env: as in `make_vec`.
-        settings: values for its keys.
-        steps: of each run.
-        seed: of the world and its driver.
-        policy: as in `load_policy`.
-        folder: for reproducers of ticks that cannot be finished.
+    Reproducers of ticks that cannot be finished go into `folder`.
     """
 
-    def __init__(
-        self,
-        env: str | Path,
-        settings: Mapping[str, Any],
-        steps: int,
-        seed: int,
-        policy: str | Path,
-        folder: str,
-    ) -> None:
-        self.env = env
+    def __init__(self, spec: WorldSpec, steps: int, policy: str | Path, folder: str) -> None:
+        self.env, self.seed = spec.env, spec.seed
         self._folder = folder
-        self.seed = seed
-        clock = load_world(env, overrides=dict(settings))[0].clock
+        clock = load_world(spec.env, **spec.keywords)[0].clock
         episode_s = clock.ctrl_dt_s * max(1, steps // EPISODES)
-        self._settings = {"horizon_s": episode_s, **settings}
+        self._settings = {"horizon_s": episode_s, **spec.overrides}
         plain = {k: v for k, v in self._settings.items() if not k.startswith("zones.")}
-        whole = make_vec(env, num_envs=1, overrides=plain)
-        driver = load_policy(policy, whole)
-        observations, infos = whole.reset(seed=seed)
-        driver.reset(seed)
+        self._keywords = spec.keywords
+        whole = make_vec(spec.env, num_envs=1, **self._keywords | {"overrides": plain})
+        run = DrivenRun(whole, policy, spec.seed)
         self._actions: list[NDArray[Any]] = []
-        self._prints = [_fingerprint(whole, {"observations": observations})]
-        seen, mask = observations, infos["mask"]
+        self._prints = [_fingerprint(whole, run.results)]
         for _ in range(steps):
-            actions = driver.act_batch(seen, mask).copy()
-            results = step_results(whole.step(actions), actions)
-            seen, mask = results["observations"], results["infos mask"]
-            self._actions.append(actions)
+            results = run.step()
+            self._actions.append(results["actions"].copy())
             self._prints.append(_fingerprint(whole, results))
 
     def rehearse(self, count: int) -> Rehearsal:
-        """A divided run without faults.
-
-        Raises:
-            EvaluationError: it is not the undivided one.
-        """
+        """A divided run without faults; an error if it is not the undivided one."""
         vec = self._divided(count, Faults(crashes=(Crash(NEVER, PHASES[0], 0),)))
         coordinator = vec.simulation.coordinators[0]
         assert isinstance(coordinator, FaultyCoordinator)
@@ -300,15 +254,15 @@ class _Stage:
         return f"tick {error.tick} is reached when it is run again"
 
     def _divided(self, count: int, plan: Faults) -> CavVectorEnv:
-        faults = {"zones.faults": plan.to_json()}
+        settings = self._settings | {"zones.faults": plan.to_json()}
         if plan.may_crash:
-            faults["zones.reproducers"] = self._folder
-        return make_vec(self.env, num_envs=1, zones=count, overrides=self._settings | faults)
+            settings["zones.reproducers"] = self._folder
+        wanted = self._keywords | {"overrides": settings}
+        return make_vec(self.env, num_envs=1, zones=count, **wanted)
 
     def _drive(self, vec: CavVectorEnv) -> Iterator[tuple[int, bool]]:
         """Each step's number, and whether all is as in the undivided world."""
-        observations, _ = vec.reset(seed=self.seed)
-        yield 0, _fingerprint(vec, {"observations": observations}) == self._prints[0]
+        yield 0, _fingerprint(vec, first_results(vec, self.seed)) == self._prints[0]
         for step, actions in enumerate(self._actions, start=1):
             results = step_results(vec.step(actions), actions)
             yield step, _fingerprint(vec, results) == self._prints[step]
@@ -317,16 +271,11 @@ class _Stage:
 class _Healing:
     """A watcher that sees that hand-overs which were open when faults ended are done in time.
 
-    Args:
-        until: the first tick without faults; None: there is none.
-        deferral: ticks for which a hand-over may be put off.
-
-    Attributes:
-        wrong: what is not so.
+    Faults end in tick `until`; for `deferral` ticks more a hand-over may be put off.
     """
 
     def __init__(self, until: int | None, deferral: int) -> None:
-        self.wrong = ""
+        self.wrong = ""  # what is not so
         self._until = until
         self._last = None if until is None else until + deferral + 2
 

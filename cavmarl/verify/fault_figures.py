@@ -17,19 +17,15 @@ from cavmarl.ownership.transport import Network
 
 
 class HandOverClock:
-    """A watcher of one world that measures how long hand-overs take.
-
-    Attributes:
-        latency_ms: of each that is committed, from the BEGIN that found its vehicle over the border
-            to the COMMIT.
-        failed: hand-overs that were decided, and neither committed nor still under way.
-        late: vehicles that were over the border before their target was ready.
-        asked: states that a target had not, and asked for.
-    """
+    """A watcher of one world that measures how long hand-overs take."""
 
     def __init__(self) -> None:
+        # of each that is committed, from the BEGIN that found its vehicle over the border to the
+        # COMMIT
         self.latency_ms: list[float] = []
-        self.failed = self.late = self.asked = 0
+        self.failed = 0  # hand-overs that were decided, and neither committed nor still under way
+        self.late = 0  # vehicles that were over the border before their target was ready
+        self.asked = 0  # states that a target had not, and asked for
         self._since: dict[int, float] = {}
         self._plan: Begin | None = None
 
@@ -68,45 +64,35 @@ class HandOverClock:
 
 @dataclass(frozen=True)
 class FaultFigures:
-    """Figures of one run, or of several that were added up.
+    """Figures of one run, or of several that were added up."""
 
-    Attributes:
-        zone_deaths: point → hosts of zones that died there.
-        coordinator_deaths: point → coordinators that died there.
-        messages: (kind, fault) → messages that it struck.
-        stale: (kind, reason) → messages or entries that came late or from elsewhere and did not
-            count.
-        hand_overs: `failed`, `switched`, `forced`, `deferred` (ticks), `late` (vehicles), `asked`,
-            `refused`, `aborted`.
-        resent: phase → messages that were sent again for want of an answer, as of
-            `MessageCoordinator`.
-        recovery_ms: of each death, until its tick began again.
-        repeats: of each tick with a death, how often it was begun again.
-        waited_ticks: of each hand-over, from the crossing to the switch.
-        latency_ms: the same in ms, with the tick of the switch.
-        state_bytes: of each hand-over whose state was sent ahead.
-    """
-
+    # point → hosts of zones that died there
     zone_deaths: Counter[str] = field(default_factory=Counter)
+    # point → coordinators that died there
     coordinator_deaths: Counter[str] = field(default_factory=Counter)
+    # (kind, fault) → messages that it struck
     messages: Counter[tuple[str, str]] = field(default_factory=Counter)
+    # (kind, reason) → messages or entries that came late or from elsewhere and did not count
     stale: Counter[tuple[str, str]] = field(default_factory=Counter)
+    # `failed`, `switched`, `forced`, `deferred` (ticks), `late` (vehicles), `asked`, `refused`,
+    # `aborted`
     hand_overs: Counter[str] = field(default_factory=Counter)
+    # phase → messages that were sent again for want of an answer, as of `MessageCoordinator`
     resent: Counter[str] = field(default_factory=Counter)
+    # of each death, until its tick began again
     recovery_ms: list[float] = field(default_factory=list)
+    # of each tick with a death, how often it was begun again
     repeats: list[int] = field(default_factory=list)
+    # of each hand-over, from the crossing to the switch
     waited_ticks: list[int] = field(default_factory=list)
+    # the same in ms, with the tick of the switch
     latency_ms: list[float] = field(default_factory=list)
+    # of each hand-over whose state was sent ahead
     state_bytes: list[int] = field(default_factory=list)
 
     @classmethod
     def of(cls, simulation: Simulation, clocks: Sequence[HandOverClock]) -> FaultFigures:
-        """What a simulation's worlds went through.
-
-        Args:
-            simulation: a divided one.
-            clocks: one a world, that have watched it.
-        """
+        """What a simulation's worlds went through."""
         found = cls()
         for revival in simulation.revivals:
             deaths = found.coordinator_deaths if revival.zone is None else found.zone_deaths

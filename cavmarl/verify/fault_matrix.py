@@ -45,19 +45,12 @@ Option = tuple[Crash, ...]
 
 @dataclass(frozen=True)
 class Rehearsal:
-    """What a divided run without faults came to.
+    """What a divided run without faults came to."""
 
-    Attributes:
-        zones: how many.
-        ticks: of the run.
-        visits: zones at each point in each tick.
-        switches: (tick, source, target) of each hand-over.
-    """
-
-    zones: int
-    ticks: int
-    visits: frozenset[Visit]
-    switches: tuple[tuple[int, int, int], ...]
+    zones: int  # how many
+    ticks: int  # of the run
+    visits: frozenset[Visit]  # zones at each point in each tick
+    switches: tuple[tuple[int, int, int], ...]  # (tick, source, target) of each hand-over
 
     def meet(self, point: str, role: str) -> list[tuple[int, int]]:
         """(tick, zone) in which a zone of that role in a hand-over is at a point."""
@@ -88,31 +81,17 @@ class Rehearsal:
 
 @dataclass(frozen=True)
 class MatrixLine:
-    """A line of the matrix.
+    """A line of the matrix."""
 
-    Attributes:
-        name: what happens.
-        points: where, or how often.
-        plans: one a run.
-        unmet: points that nobody came to in that role.
-        poison: whether it has to end in `LostTickError`.
-    """
-
-    name: str
-    points: str
-    plans: tuple[Faults, ...]
-    unmet: tuple[str, ...] = ()
-    poison: bool = False
+    name: str  # what happens
+    points: str  # where, or how often
+    plans: tuple[Faults, ...]  # one a run
+    unmet: tuple[str, ...] = ()  # points that nobody came to in that role
+    poison: bool = False  # whether it has to end in `LostTickError`
 
 
 def matrix(seen: Rehearsal, seed: int, seeds: int) -> list[MatrixLine]:
-    """All lines that apply to one process.
-
-    Args:
-        seen: the run that faults are planned for.
-        seed: of the plans.
-        seeds: runs of the last line.
-    """
+    """All lines that apply to one process."""
     return [*_host_lines(seen), *_coordinator_lines(seen), *_message_lines(seed, seen.ticks),
             _random_line(seed, seeds)]  # fmt: skip
 

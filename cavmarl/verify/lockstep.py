@@ -14,14 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core import errors
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.parallel.local_worlds import LocalWorlds
-from cavmarl.policies.policy import load_policy
-from cavmarl.verify.differences import Arrays, single_arrays, snapshot, step_results
-
-__all__: list[str] = []
+from cavmarl.verify.differences import Arrays, DrivenRun, single_arrays, snapshot
 
 
 def _main() -> None:
@@ -35,26 +33,23 @@ def _main() -> None:
 
 def _steps(job: dict[str, Any]) -> Iterator[dict[str, Any]]:
     """Drive; what is told after the reset and after each step, until a dump is asked for."""
-    vec = CavVectorEnv(LocalWorlds(load_world(job["env"], **job["world"]), 1))
-    driver = load_policy(job["policy"], vec)
-    observations, infos = vec.reset(seed=job["seed"])
-    driver.reset(job["seed"])
-    results = {"observations": observations}
+    spec = WorldSpec(**job["spec"])
+    vec = CavVectorEnv(LocalWorlds(load_world(spec.env, **spec.keywords), 1))
+    run = DrivenRun(vec, job["policy"], spec.seed)
     for step in range(job["steps"] + 1):
         yield {
             "step": step,
             "tick": int(vec.simulation.ticks()[0]),
             "state": vec.state_hash(),
-            "seen": _digest(results),
+            "seen": _digest(run.results),
         }
         wanted = sys.stdin.readline().strip()
         if wanted:
-            _dump(wanted, vec, results)
+            arrays: dict[str, Any] = snapshot(vec, run.results)
+            np.savez(wanted, **arrays)
+            yield {"dumped": wanted}
             return
-        actions = driver.act_batch(observations, infos["mask"])
-        told = vec.step(actions)
-        results = step_results(told, actions)
-        observations, infos = told[0], told[-1]
+        run.step()
 
 
 def _digest(arrays: Arrays) -> str:
@@ -62,12 +57,6 @@ def _digest(arrays: Arrays) -> str:
     for _, array in single_arrays(arrays):
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
-
-
-def _dump(path: str, vec: CavVectorEnv, results: Arrays) -> None:
-    arrays: dict[str, Any] = snapshot(vec, results)
-    np.savez(path, **arrays)
-    print(json.dumps({"dumped": path}), flush=True)
 
 
 if __name__ == "__main__":

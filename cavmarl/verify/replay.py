@@ -18,16 +18,9 @@ from cavmarl.handoff.fault_injection.reproducer_recording import made_with, sour
 
 
 def world_of(kept: Reproducer, env: str | Path | None = None) -> World:
-    """The world that a reproducer is of.
+    """The world that a reproducer is of; other roads, demand or zones are refused.
 
-    Args:
-        kept: the reproducer.
-        env: where its roads and its demand are found, as `make_vec` takes it; None: under the name
-            of its environment.
-
-    Raises:
-        JournalError: other roads, another demand or other zones than it was made with.
-        CavmarlError: as of `load_world`.
+    They are found where `env` says, as `make_vec` takes it; None: by its environment's name.
     """
     config = validate(EnvConfig, kept.config, "the reproducer")
     found = find_entry(config.name if env is None else env)
@@ -45,15 +38,11 @@ def world_of(kept: Reproducer, env: str | Path | None = None) -> World:
 def replay_tick(kept: Reproducer, world: World, *, faults: bool = True) -> str:
     """Run the tick again in this process, and tell the hash of the state that it leads to.
 
-    Args:
-        kept: the tick.
-        world: of `world_of`.
-        faults: with those of its plan, if it had one.
+    With `faults` those of its plan strike, if it had one. Without them, whatever a zone's code
+    raises is raised from where it is.
 
     Raises:
         LostTickError: every host of a zone, or every coordinator, dies of it again.
-        JournalError: it is of another layout.
-        Exception: without faults whatever a zone's code raises, from where it does.
     """
     config = world.config
     if faults:  # hosts may die as they did, wherever the folder was; nothing is written
@@ -69,7 +58,6 @@ def replay_tick(kept: Reproducer, world: World, *, faults: bool = True) -> str:
 
 
 def changed_versions(kept: Reproducer) -> list[str]:
-    """What is not as it was when the tick was run, in words."""
     here = made_with()
     return [
         f"{name} {there}, here {here.get(name)}"

@@ -8,14 +8,14 @@ import signal
 import socket
 import statistics
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from threading import Timer
-from typing import Any, Literal
+from typing import Any, Literal, Unpack
 
+from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError, EvaluationError
-from cavmarl.core.seeds import check_seed
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.evaluate.provenance.machine import describe_hardware
 from cavmarl.parallel.hosts.host_pool import HostPool
@@ -23,8 +23,7 @@ from cavmarl.parallel.hosts.remote_worlds import RemoteWorlds
 from cavmarl.parallel.pooled_worlds import PooledWorlds
 from cavmarl.parallel.processes.worker_pool import Death, Pool
 from cavmarl.parallel.split_hosts.divided_worlds import DividedWorlds
-from cavmarl.policies.policy import Policy, load_policy
-from cavmarl.verify.differences import same_bytes, step_results
+from cavmarl.verify.differences import Arrays, DrivenRun, same_bytes
 
 FIRST_STEPS = 10  # before any is killed, to know how long a step takes
 PINGS = 500
@@ -34,57 +33,33 @@ STOPS = 0.25  # share of those that are not killed but stopped
 
 @dataclass(frozen=True)
 class Kill:
-    """One signal and what became of it.
+    """One signal and what became of it."""
 
-    Attributes:
-        signal: its name.
-        worker: that got it.
-        step: after which it was noticed.
-        idle: the worker had nothing to do; it was missed when it was to work again.
-        cause: of the death, as the pool saw it.
-        noticed_ms: from the signal, or from the next command to one that was idle, until the pool
-            knew.
-        replaced_ms: from then until the successor had its order.
-        recovered_ms: from when the pool knew until the successor had done what was asked for.
-    """
-
-    signal: str
-    worker: int
-    step: int
-    idle: bool
-    cause: str
+    signal: str  # its name
+    worker: int  # that got it
+    step: int  # after which it was noticed
+    idle: bool  # the worker had nothing to do; it was missed when it was to work again
+    cause: str  # of the death, as the pool saw it
+    # from the signal, or from the next command to one that was idle, until the pool knew
     noticed_ms: float
-    replaced_ms: float
-    recovered_ms: float
+    replaced_ms: float  # from then until the successor had its order
+    recovered_ms: float  # from when the pool knew until the successor had done what was asked for
 
 
 @dataclass(frozen=True)
 class KillReport:
-    """What was found.
+    """What was found."""
 
-    Attributes:
-        env: of which environment.
-        worlds: that were stepped together.
-        workers: over which they were shared out.
-        steps: that were compared.
-        different: the first step after which anything differed; None: none.
-        kills: all of them.
-        step_ms: median of the steps without a death.
-        ping_us: median of an empty command to all workers, before the first death.
-        state_hashes: of the undisturbed worlds at the end.
-        hardware: that it ran on.
-    """
-
-    env: str
-    worlds: int
-    workers: int
-    steps: int
-    different: int | None
-    kills: tuple[Kill, ...]
-    step_ms: float
-    ping_us: float
-    state_hashes: tuple[str, ...]
-    hardware: dict[str, Any]
+    env: str  # of which environment
+    worlds: int  # that were stepped together
+    workers: int  # over which they were shared out
+    steps: int  # that were compared
+    different: int | None  # the first step after which anything differed; None: none
+    kills: tuple[Kill, ...]  # all of them
+    step_ms: float  # median of the steps without a death
+    ping_us: float  # median of an empty command to all workers, before the first death
+    state_hashes: tuple[str, ...]  # of the undisturbed worlds at the end
+    hardware: dict[str, Any]  # that it ran on
 
     @property
     def holds(self) -> bool:
@@ -95,60 +70,50 @@ class KillReport:
 
 
 def verify_kills(
-    env: str | Path,
+    env: str | Path | WorldSpec,
     kills: int,
     *,
     workers: int = 2,
     hosts: Literal["ray"] | None = None,
     worlds: int | None = None,
     steps: int | None = None,
-    seed: int = 0,
     policy: str | Path = "idm",
     zones: int | None = None,
-    agents: int | None = None,
-    background: int | None = None,
-    overrides: Mapping[str, Any] | None = None,
     progress: Callable[[int, int], None] | None = None,
+    **keys: Unpack[WorldKeys],
 ) -> KillReport:
     """Kill and stop workers at random times and compare everything with undisturbed worlds.
 
     Args:
-        env: as in `make_vec`.
+        env: as in `make_vec`, like the other keywords; the seed is that of the kills, too.
         kills: how many signals; three in four are SIGKILL, the others SIGSTOP.
         workers: over which the worlds are shared out.
         hosts: "ray": they are actors of a Ray cluster, all on this machine.
         worlds: stepped together; default: two a worker.
         steps: how many; default: three a kill.
-        seed: root of all random numbers, those of the kills, too.
         policy: as in `load_policy`.
         zones: shadows zones.count.
-        agents: shadows population.agents.
-        background: shadows population.background.
-        overrides: values for any other key.
         progress: called with steps done and steps in all.
+        keys: of the worlds.
 
     Raises:
         ConfigError: numbers that cannot be.
         WorkerError: workers died that were not killed.
     """
-    check_seed(seed)
+    spec = WorldSpec.of(env, **keys)
+    seed = spec.seed
     steps = 3 * kills + FIRST_STEPS if steps is None else steps
     if kills < 1 or workers < 1:
         raise ConfigError(f"{kills} kills of {workers} workers: must be at least 1 of each")
     if steps < kills + FIRST_STEPS:
         raise ConfigError(f"{steps} steps: {kills} kills need at least {kills + FIRST_STEPS}")
     worlds = 2 * workers if worlds is None else worlds
-    wanted: dict[str, Any] = {
-        "num_envs": worlds,
-        "zones": zones,
-        "agents": agents,
-        "background": background,
-        "overrides": overrides,
-    }
-    whole, parted = make_vec(env, **wanted), make_vec(env, workers=workers, hosts=hosts, **wanted)
+    wanted = {"num_envs": worlds, "zones": zones, **spec.keywords}
+    whole = make_vec(spec.env, **wanted)
+    parted = make_vec(spec.env, workers=workers, hosts=hosts, **wanted)
     try:
         killer = _Killer(_pool(parted), random.Random(seed))
-        runs = [_Run(vec, load_policy(policy, vec), seed) for vec in (whole, parted)]
+        runs = [DrivenRun(vec, policy, seed) for vec in (whole, parted)]
         _refuse_elsewhere(killer.pool)
         ping_us = _ping_us(killer.pool)
         struck = set(killer.random.sample(range(FIRST_STEPS, steps), kills))
@@ -170,7 +135,7 @@ def verify_kills(
     finally:
         parted.close()
     return KillReport(
-        str(env), worlds, workers, steps, different, tuple(killer.found), killer.step_ms(), ping_us,
+        spec.env, worlds, workers, steps, different, tuple(killer.found), killer.step_ms(), ping_us,
         hashes, describe_hardware(),
     )  # fmt: skip
 
@@ -191,11 +156,7 @@ def _ping_us(pool: Pool | HostPool) -> float:
 
 
 def _refuse_elsewhere(pool: Pool | HostPool) -> None:
-    """Only processes of this machine can be killed.
-
-    Raises:
-        ConfigError: one is elsewhere.
-    """
+    """Only processes of this machine can be killed."""
     if isinstance(pool, HostPool) and {*pool.machines} != {socket.gethostname()}:
         raise ConfigError(
             f"hosts on {', '.join(sorted({*pool.machines}))}: processes are killed on this machine "
@@ -203,30 +164,8 @@ def _refuse_elsewhere(pool: Pool | HostPool) -> None:
         )
 
 
-class _Run:
-    """Worlds and the policy that drives in them."""
-
-    def __init__(self, vec: CavVectorEnv, driver: Policy, seed: int) -> None:
-        self._vec = vec
-        self._driver = driver
-        self._observations, infos = vec.reset(seed=seed)
-        self._mask = infos["mask"]
-        driver.reset(seed)
-
-    def step(self) -> dict[str, Any]:
-        actions = self._driver.act_batch(self._observations, self._mask)
-        result = self._vec.step(actions)
-        self._observations, self._mask = result[0], result[4]["mask"]
-        return step_results(result, actions)
-
-
 class _Killer:
-    """Sends the signals and finds out what became of them.
-
-    Args:
-        pool: whose workers get them.
-        random: says whose and when.
-    """
+    """Sends the signals to workers of a pool and finds out what became of them."""
 
     def __init__(self, pool: Pool | HostPool, random: random.Random) -> None:
         self.random = random
@@ -240,7 +179,7 @@ class _Killer:
         """Median of the steps without a death, ms."""
         return 1000.0 * statistics.median(self._calm_s)
 
-    def watch(self, run: Callable[[], dict[str, Any]], step: int, strikes: bool) -> dict[str, Any]:
+    def watch(self, run: Callable[[], Arrays], step: int, strikes: bool) -> Arrays:
         timer = None
         if strikes:
             if isinstance(self.pool, HostPool):  # one death at a time: Ray takes seconds for a host
@@ -276,11 +215,7 @@ class _Killer:
             del self._sent[worker]
 
     def _match(self, step: int) -> None:
-        """Say of each new death what it was.
-
-        Raises:
-            EvaluationError: a worker died that was not killed.
-        """
+        """Say of each new death what it was; one of itself is an error."""
         deaths = self.pool.deaths
         for death in deaths[self._seen :]:
             if death.worker not in self._sent:

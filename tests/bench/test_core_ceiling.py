@@ -7,14 +7,12 @@ import multiprocessing
 import pytest
 
 from cavmarl import ConfigError
-from cavmarl.bench.core_ceiling import CoreCeiling, measure_ceiling
+from cavmarl.bench.worker_speed import CoreCeiling, measure_ceiling
 from cavmarl.core.errors import WorkerError
 
 
 def test_all_programs_step_and_end() -> None:
-    found = measure_ceiling(
-        "ring", worlds=3, programs=2, steps=2, repeats=2, wanted={"agents": 2}, alike=True
-    )
+    found = measure_ceiling("ring", worlds=3, programs=2, steps=2, repeats=2, agents=2, alike=True)
     assert found.programs == 2
     assert len(found.alone_ms) == len(found.together_ms) == 2
     assert min(found.alone_ms + found.together_ms) > 0.0

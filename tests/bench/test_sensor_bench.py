@@ -11,10 +11,9 @@ import pytest
 from typer.testing import CliRunner
 
 from cavmarl.bench.sensor_bench import SensorBench, measure_sensor_workers
-from cavmarl.bench.sensor_rig import describe_rig, find_rig, load_rig
-from cavmarl.bench.sensor_run import PARTS
+from cavmarl.bench.sensor_run import PARTS, describe_rig, load_rig
 from cavmarl.cli import app
-from cavmarl.config.registry import load_config
+from cavmarl.config.registry import find_settings, load_config
 from cavmarl.core.errors import ConfigError
 from cavmarl.parallel.processes.process_barrier import usable_cores
 from tests.support.sumo_worlds import MODES, tiny_file
@@ -106,7 +105,7 @@ def test_the_result_is_json_with_every_sensor(found: SensorBench) -> None:
 
 
 def test_the_rig_of_ten_lists_what_it_is() -> None:
-    rig = load_rig(find_rig("ten_sensors"))
+    rig = load_rig(find_settings("rig", "ten_sensors"))
     config, _ = load_config("grid4x4", overrides={"rig": rig})
     told = describe_rig(config)
     assert len(told) == 10
@@ -151,7 +150,7 @@ def test_numbers_that_cannot_be_are_refused(numbers: dict[str, Any]) -> None:
 
 def test_a_rig_that_is_none_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no rig or file 'nothing'"):
-        find_rig("nothing")
+        find_settings("rig", "nothing")
     (tmp_path / "list.yaml").write_text("wheels: 20\n")
     with pytest.raises(ConfigError, match="must be sensors by name"):
         load_rig(tmp_path / "list.yaml")

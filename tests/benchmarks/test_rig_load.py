@@ -11,9 +11,9 @@ import pytest
 
 from benchmarks import rig_load
 from benchmarks.rig_load import scaled
-from cavmarl.bench.sensor_rig import find_rig, load_rig
-from cavmarl.bench.sensor_run import SensorJob
-from cavmarl.config.registry import load_config
+from cavmarl.bench.sensor_run import SensorJob, load_rig
+from cavmarl.config.registry import find_settings, load_config
+from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
 
 LIDAR = {"type": "lidar", "rate_hz": 10, "rays": 30, "z_m": 1.6}
@@ -29,14 +29,17 @@ def test_a_load_is_found_beyond_which_sensors_take_much_longer_at_once(
         return rays / 100.0 if rays <= 1000 else 2.4 * rays / 100.0
 
     def run(job: SensorJob) -> SimpleNamespace:
-        found = costs_ms(job.overrides["rig"])
-        return SimpleNamespace(parts_ms={"sensor compute": [found]}, costs_ms=[found / job.agents])
+        found = costs_ms(job.spec.overrides["rig"])
+        return SimpleNamespace(
+            parts_ms={"sensor compute": [found]}, costs_ms=[found / (job.spec.agents or 1)]
+        )
 
     monkeypatch.setattr(rig_load, "run_job", run)
     said: list[str] = []
-    job = SensorJob("grid4x4", {"rig": {"lidar": LIDAR}}, 2, 3, 1, 2, 6, 0)
+    spec = WorldSpec(env="grid4x4", overrides={"rig": {"lidar": LIDAR}}, agents=2, background=3)
+    job = SensorJob(spec, 1, 2, 6)
     loaded = rig_load.loaded(job, 20.0, said.append)
-    assert 24.0 <= costs_ms(loaded.overrides["rig"]) <= 30.0
+    assert 24.0 <= costs_ms(loaded.spec.overrides["rig"]) <= 30.0
     tries = [float(text.split()[-2]) for text in said[2:]]
     assert min(tries) < 20.0, "one was too light,"
     assert max(tries) > 30.0, "another too heavy"
@@ -44,7 +47,7 @@ def test_a_load_is_found_beyond_which_sensors_take_much_longer_at_once(
 
 @pytest.mark.parametrize("factor", [0.1, 1.0, 3.0, 1e3, 1e6])
 def test_rigs_of_any_load_can_be(factor: float) -> None:
-    rig = load_rig(find_rig("ten_sensors"))
+    rig = load_rig(find_settings("rig", "ten_sensors"))
     plain, _ = load_config("grid4x4", overrides={"rig": rig, "clock.ctrl_dt_s": 0.05})
     heavy = scaled(plain, dict.fromkeys(rig, factor), 20.0)
     config, _ = load_config("grid4x4", overrides={"rig": heavy, "clock.ctrl_dt_s": 0.05})
@@ -58,7 +61,7 @@ def test_a_loaded_rig_is_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     monkeypatch.setattr(rig_load, "loaded", lambda job, load_ms, say: job)
     out = tmp_path / "rig.yaml"
     found = rig_load.measure("grid4x4", 5.0, out)
-    assert load_rig(out) == load_rig(find_rig("ten_sensors"))
+    assert load_rig(out) == load_rig(find_settings("rig", "ten_sensors"))
     assert len(found.rows) == 10
     assert f"--rig {out}" in found.notes[0]
 

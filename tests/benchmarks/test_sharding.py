@@ -152,11 +152,11 @@ def test_the_command_refuses(
 
 
 def _at_end(make: Callable[[int], Simulation], seconds: int, zones: int = 1) -> Simulation:
-    from cavmarl.evaluate.traffic.native_side import advance, idle_commands
+    from cavmarl.evaluate.traffic.native_side import idle_commands
 
     simulation = make(zones)
     for _ in range(seconds * 10):
-        advance(simulation, idle_commands(simulation))
+        simulation.step(idle_commands(simulation))
     return simulation
 
 

@@ -6,21 +6,22 @@ from pathlib import Path
 
 import pytest
 
+from cavmarl.config.registry import find_settings
 from cavmarl.core.errors import ConfigError
 from cavmarl.evaluate import load_report
-from cavmarl.evaluate.suite import find_suite, load_suite, run_suite, worlds_of
+from cavmarl.evaluate.suite import load_suite, run_suite, worlds_of
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_the_standard_suite_has_the_maps_and_numbers_that_it_should() -> None:
-    suite = load_suite(find_suite("standard"))
+    suite = load_suite(find_settings("suite", "standard"))
     assert len(suite.maps) >= 4
     assert suite.agents == (1, 25, 50, 100)
 
 
 def test_its_maps_are_there_and_each_world_has_its_own_name(shared_maps: Path) -> None:
-    suite = load_suite(find_suite("standard"))
+    suite = load_suite(find_settings("suite", "standard"))
     labels = [world.label for world in worlds_of(suite, shared_maps)]
     assert len(set(labels)) == len(suite.maps) * len(suite.agents)
 
@@ -30,7 +31,7 @@ def test_every_map_is_driven_with_every_number_of_agents(tmp_path: Path) -> None
     file.write_text(
         "maps: [ring, merge/map/map.net.xml]\nagents: [1, 2]\nbackground: 2\nhorizon_s: 2\n"
     )
-    suite = load_suite(find_suite(str(file)))
+    suite = load_suite(find_settings("suite", str(file)))
     worlds = worlds_of(suite, ROOT / "envs")
     begun: list[str] = []
     reports = run_suite(

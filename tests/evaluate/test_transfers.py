@@ -13,8 +13,8 @@ from cavmarl.core.errors import JournalError
 from cavmarl.engine.world_setup import load_world
 from cavmarl.evaluate import EvaluationReport, evaluate, load_report
 from cavmarl.evaluate.evaluation import EPISODES_FILE, TRANSFERS_FILE
-from cavmarl.evaluate.tables import EPISODE, read_table
-from cavmarl.evaluate.transfer_rows import TRANSFER, transfers_of
+from cavmarl.evaluate.tables import EPISODE, TRANSFER, read_table
+from cavmarl.evaluate.transfer_rows import transfers_of
 from cavmarl.handoff.coordinator.journal_summary import summarize
 from cavmarl.zones.partition.zone_file import write_zones
 from cavmarl.zones.partition.zone_partition import ZonePartition

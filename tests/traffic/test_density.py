@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from cavmarl.config.registry import find_settings
 from cavmarl.driving.vehicles import STATE_FIELDS
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import load_world
-from cavmarl.evaluate.suite import find_suite, load_suite
+from cavmarl.evaluate.suite import load_suite
 from cavmarl.verify.equivalence import verify_zones
 from cavmarl.zones.partition.zone_statistics import imbalance, zone_statistics
 from tests.support.driving import drive, start
@@ -62,7 +63,7 @@ def first_minute(simulation: Simulation) -> Iterator[None]:
 
 @pytest.mark.parametrize("seed", [0, 77])
 def test_the_first_vehicles_are_the_same_in_all_densities(seed: int) -> None:
-    suite = load_suite(find_suite("density"))
+    suite = load_suite(find_settings("suite", "density"))
     assert suite.maps == ("rush",)
     assert suite.agents == (*DENSITIES, 200, 400)
     first = by_id(world(LOW, seed))

@@ -4,15 +4,10 @@ from __future__ import annotations
 
 import typer
 
-from cavmarl.cli.bench.clock import clock
-from cavmarl.cli.bench.sensors import sensors
-from cavmarl.cli.bench.step import step
-from cavmarl.cli.bench.traffic import traffic
-from cavmarl.cli.bench.train import train
-from cavmarl.cli.bench.workers import workers
-
-__all__ = ["app"]
+from cavmarl.cli.bench import clock, sensors, step, traffic, train, workers
 
 app = typer.Typer(help="How fast it is, measured side by side.", no_args_is_help=True)
-for _command in (step, traffic, workers, sensors, clock, train):
+for _command in (
+    step.step, traffic.traffic, workers.workers, sensors.sensors, clock.clock, train.train,
+):  # fmt: skip
     app.command()(_command)

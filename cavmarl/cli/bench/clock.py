@@ -12,35 +12,32 @@ from rich.table import Table
 from cavmarl.bench.harness import make_table, measuring
 from cavmarl.cli.output import (
     JsonPath,
-    Seed,
-    Settings,
-    parse_settings,
+    OptionalEnvironment,
+    about,
+    with_world,
     writable,
     write_json,
 )
+from cavmarl.config.world_spec import WorldSpec
 
 if TYPE_CHECKING:
     from cavmarl.bench.clock_drift import ClockDrift
 
 
+@with_world("seed", "settings")
 def clock(
-    env: Annotated[
-        str, typer.Argument(metavar="[ENV]", help="Name, folder or map file of an environment.")
-    ] = "ring",
-    steps: Annotated[
-        int, typer.Option(help="Steps of the master; a step is one tick here.")
-    ] = 5000,
+    world: WorldSpec,
+    env: OptionalEnvironment = "ring",
+    steps: Annotated[int, about("Steps of the master; a step is one tick here.")] = 5000,
     rogue: Annotated[
-        float, typer.Option(help="Share of steps in which the follower also ticks by itself.")
+        float, about("Share of steps in which the follower also ticks by itself.")
     ] = 0.0,
     own_ticks: Annotated[
         Literal["obey", "refuse", "ignore"],
-        typer.Option(help="What the master does with such a tick; obey: the world really ticks."),
+        about("What the master does with such a tick; obey: the world really ticks."),
     ] = "obey",
-    seed: Seed = 0,
-    settings: Settings = None,
     csv_path: Annotated[
-        Path | None, typer.Option("--csv", help="Write the table here.", callback=writable)
+        Path | None, about("Write the table here.", "--csv", callback=writable)
     ] = None,
     json_path: JsonPath = None,
 ) -> None:
@@ -50,14 +47,7 @@ def clock(
     console = Console()
     with measuring(console) as say:
         say(f"{steps} steps")
-        found = measure_drift(
-            env,
-            steps=steps,
-            rogue=rogue,
-            answer=own_ticks,
-            seed=seed,
-            overrides=parse_settings(settings),
-        )
+        found = measure_drift(world, steps=steps, rogue=rogue, answer=own_ticks)
     console.print(_table(found))
     console.print(_verdict(found), highlight=False)
     if csv_path is not None:
@@ -72,11 +62,8 @@ def _table(found: ClockDrift) -> Table:
     for row in found.rows:
         seconds = (row.master_s, row.follower_s, row.normalised_s, row.delta_s)
         rows.append((str(row.step), *(f"{time_s:.1f}" for time_s in seconds), f"{row.ratio:.2f}"))
-    return make_table(
-        f"{found.environment}, {1000.0 * found.dt_s:g} ms a step",
-        ("step", "master, s", "follower, s", "normalised, s", "Δ, s", "ratio"),
-        rows,
-    )
+    heads = ("step", "master, s", "follower, s", "normalised, s", "Δ, s", "ratio")
+    return make_table(f"{found.environment}, {1000.0 * found.dt_s:g} ms a step", heads, rows)
 
 
 def _verdict(found: ClockDrift) -> str:

@@ -5,14 +5,24 @@ from __future__ import annotations
 import csv
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from cavmarl.bench.harness import check_positive, make_table, measuring, numbers_of
-from cavmarl.cli.output import JsonPath, Seed, Settings, parse_settings, write_json
+from cavmarl.bench.harness import make_table, measuring, numbers_of
+from cavmarl.cli.output import (
+    JsonPath,
+    OptionalEnvironment,
+    about,
+    check_bound,
+    end_below,
+    with_world,
+    write_json,
+)
+from cavmarl.config.registry import find_settings
+from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -22,33 +32,25 @@ if TYPE_CHECKING:
     from cavmarl.parallel.sensor_workers.sensor_shares import Shares
 
 
+@with_world()
 def sensors(
-    env: Annotated[
-        str, typer.Argument(metavar="[ENV]", help="Name, folder or map file of an environment.")
-    ] = "town",
+    world: WorldSpec,
+    env: OptionalEnvironment = "town",
     workers: Annotated[
-        str, typer.Option(metavar="N,…", help="Numbers of sensor workers to compare.")
+        str, about("Numbers of sensor workers to compare.", metavar="N,…")
     ] = "1,2,3,4",
-    warmup: Annotated[int, typer.Option(help="Steps before the measured ones.")] = 40,
-    steps: Annotated[int, typer.Option(help="Measured steps of each run.")] = 150,
-    repeats: Annotated[int, typer.Option(help="Runs of each number of sensor workers.")] = 5,
-    rig: Annotated[
-        str, typer.Option(help="Sensors: a name in configs/rigs/, or a .yaml.")
-    ] = "ten_sensors",
-    agents: Annotated[int, typer.Option(help="Vehicles with sensors.")] = 1,
-    background: Annotated[int, typer.Option(help="Vehicles without sensors.")] = 0,
-    seed: Seed = 0,
-    settings: Settings = None,
-    csv_path: Annotated[
-        Path | None, typer.Option("--csv", help="Write every step of every run here.")
-    ] = None,
-    plot: Annotated[
-        Path | None, typer.Option(help="Write the figure here (.png, .svg, .pdf).")
-    ] = None,
+    warmup: Annotated[int, about("Steps before the measured ones.")] = 40,
+    steps: Annotated[int, about("Measured steps of each run.")] = 150,
+    repeats: Annotated[int, about("Runs of each number of sensor workers.")] = 5,
+    rig: Annotated[str, about("Sensors: a name in configs/rigs/, or a .yaml.")] = "ten_sensors",
+    agents: Annotated[int, about("Vehicles with sensors.")] = 1,
+    background: Annotated[int, about("Vehicles without sensors.")] = 0,
+    csv_path: Annotated[Path | None, about("Write every step of every run here.", "--csv")] = None,
+    plot: Annotated[Path | None, about("Write the figure here (.png, .svg, .pdf).")] = None,
     at_least: Annotated[
         float | None,
-        typer.Option(
-            help="Exit with 1 if the second number is not so many times faster than the first."
+        about(
+            "Exit with 1 if the second number is not so many times faster.", callback=check_bound
         ),
     ] = None,
     json_path: JsonPath = None,
@@ -58,26 +60,15 @@ def sensors(
     Exit code 1: states or frames differed between runs, or --at-least did not hold.
     """
     from cavmarl.bench.sensor_bench import measure_sensor_workers
-    from cavmarl.bench.sensor_figure import plot_sensor_workers
-    from cavmarl.bench.sensor_rig import find_rig, load_rig
+    from cavmarl.bench.sensor_run import load_rig
+    from cavmarl.bench.sensor_scaling import plot_sensor_workers
 
-    check_positive("--at-least", at_least)
     numbers = numbers_of("--workers", workers)
+    counts: dict[str, Any] = {"warmup": warmup, "steps": steps, "repeats": repeats}
     console = Console()
     with measuring(console) as say:
-        found = measure_sensor_workers(
-            env,
-            load_rig(find_rig(rig)),
-            workers=numbers,
-            warmup=warmup,
-            steps=steps,
-            repeats=repeats,
-            agents=agents,
-            background=background,
-            seed=seed,
-            overrides=parse_settings(settings),
-            say=say,
-        )
+        mounted = load_rig(find_settings("rig", rig))
+        found = measure_sensor_workers(world, mounted, workers=numbers, say=say, **counts)
     rows = found.rows
     for table in (_sensors(found), _scaling(found, rows), _parts(found), _resources(found)):
         console.print(table)
@@ -88,20 +79,18 @@ def sensors(
     if plot is not None:
         title = f"{Path(env).stem}: {len(found.costs_ms)} sensors, {found.sensing_ms:.1f} ms a tick"
         plot_sensor_workers(rows, title, plot)
-    is_slow = at_least is not None and len(rows) > 1 and rows[1].speedup < at_least
-    if is_slow or not found.is_same:
+    if not found.is_same:
         raise typer.Exit(1)
+    end_below(at_least, rows[1].speedup if len(rows) > 1 else None)
 
 
 def _sensors(found: SensorBench) -> Table:
-    """What was sensed, what it costs, and which worker does it either way."""
     shared = [number for number in found.numbers if number > 1]
     plans = [found.shares(number) for number in shared]
     homes = [{name: _homes(plan) for name, plan in both.items()} for both in plans]
     rows: list[tuple[str, ...] | None] = []
-    for place, (sensor, cost_ms) in enumerate(
-        zip(found.turns[0].run.sensors, found.costs_ms, strict=True)
-    ):
+    sensors = zip(found.turns[0].run.sensors, found.costs_ms, strict=True)
+    for place, (sensor, cost_ms) in enumerate(sensors):
         at = sensor["placement"]
         rows.append(
             (
@@ -163,7 +152,6 @@ def _scaling(found: SensorBench, rows: list[ScalingRow]) -> Table:
 
 
 def _parts(found: SensorBench) -> Table:
-    """Where a step goes."""
     columns = [(found.parts_ms(row.workers), row.step_ms) for row in found.rows]
     rows: list[tuple[str, ...] | None] = [
         (name, *(f"{parts[name]:.3f}" for parts, _ in columns))
@@ -188,7 +176,6 @@ _RESOURCES: dict[str, Callable[[Window], float]] = {
 
 
 def _resources(found: SensorBench) -> Table:
-    """What all processes took a step, in the last run of each number."""
     last = [found.windows(number)[-1] for number in found.numbers]
     rows = [
         (name, *(f"{value(window):,.1f}" for window in last)) for name, value in _RESOURCES.items()
@@ -229,11 +216,7 @@ def _say(console: Console, found: SensorBench, rows: list[ScalingRow]) -> None:
 
 
 def _write_csv(path: Path, found: SensorBench) -> None:
-    """One line a step: the raw series.
-
-    Raises:
-        ConfigError: the path cannot be written.
-    """
+    """One line a step: the raw series."""
     parts = list(found.turns[0].run.parts_ms)
     try:
         with path.open("w", newline="", encoding="utf-8") as file:

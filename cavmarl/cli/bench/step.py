@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated
 
-import typer
 from rich.console import Console
 from rich.table import Table
 
-from cavmarl.bench.harness import check_positive, make_table, measuring
-from cavmarl.cli.output import JsonPath, write_json
+from cavmarl.bench.harness import make_table, measuring
+from cavmarl.cli.output import JsonPath, about, check_bound, end_below, write_json
 
 if TYPE_CHECKING:
     from cavmarl.bench.step_speed import StepSpeed
@@ -26,18 +25,17 @@ _SIDES = {
 
 
 def step(
-    agents: Annotated[int, typer.Option(help="Controlled vehicles in each world.")] = 100,
-    worlds: Annotated[int, typer.Option(help="Number of parallel worlds.")] = 16,
-    repeats: Annotated[int, typer.Option(help="Number of measurements of each row.")] = 5,
+    agents: Annotated[int, about("Controlled vehicles in each world.")] = 100,
+    worlds: Annotated[int, about("Number of parallel worlds.")] = 16,
+    repeats: Annotated[int, about("Number of measurements of each row.")] = 5,
     at_least: Annotated[
-        float | None, typer.Option(help="Exit with 1 if the ratio with a lidar is below this.")
+        float | None, about("Exit with 1 if the ratio with a lidar is below.", callback=check_bound)
     ] = None,
     json_path: JsonPath = None,
 ) -> None:
     """Agent-steps a second next to highway-env's: same road, vehicles and rates; one core."""
     from cavmarl.bench.step_speed import measure_step_speed
 
-    check_positive("--at-least", at_least)
     console = Console()
     with measuring(console) as say:
         found = measure_step_speed(agents, worlds, repeats, say)
@@ -50,23 +48,23 @@ def step(
         f"dicts add [bold]{found.dict_us:.2f} µs[/] an agent and step"
     )
     write_json(json_path, found.to_dict())
-    if at_least is not None and found.ratio < at_least:
-        raise typer.Exit(1)
+    end_below(at_least, found.ratio)
 
 
 def _table(found: StepSpeed) -> Table:
-    return make_table(
+    rows = [
+        (
+            _SENSORS[row.sensors],
+            _SIDES[row.who],
+            str(row.worlds),
+            *(f"{value:,.0f}" for value in (row.agents, row.low, row.median, row.high)),
+        )
+        for row in sorted(found.rows, key=lambda row: list(_SENSORS).index(row.sensors))
+    ]
+    title = (
         f"agent-steps/s of one core: {found.rows[0].agents} controlled vehicles on "
         f"{found.road_m / 1000.0:.1f} km of four lanes,\n"
-        f"two ticks a step; ours with 16 neighbours too; {found.repeats} turns",
-        ("observation", "side", "worlds", "agents", "min", "median", "max"),
-        [
-            (
-                _SENSORS[row.sensors],
-                _SIDES[row.who],
-                str(row.worlds),
-                *(f"{value:,.0f}" for value in (row.agents, row.low, row.median, row.high)),
-            )
-            for row in sorted(found.rows, key=lambda row: list(_SENSORS).index(row.sensors))
-        ],
+        f"two ticks a step; ours with 16 neighbours too; {found.repeats} turns"
     )
+    heads = ("observation", "side", "worlds", "agents", "min", "median", "max")
+    return make_table(title, heads, rows)

@@ -5,12 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
 from rich.console import Console
 from rich.table import Table
 
 from cavmarl.bench.harness import make_table, measuring
-from cavmarl.cli.output import JsonPath, Seed, number, write_json
+from cavmarl.cli.output import JsonPath, MapName, Seed, about, number, write_json
 from cavmarl.core.errors import ConfigError, require
 
 if TYPE_CHECKING:
@@ -32,56 +31,41 @@ _ROWS = {
 
 
 def traffic(
-    map_name: Annotated[
-        str, typer.Argument(metavar="MAP", help="A map file, or an environment's name or folder.")
-    ],
+    map_name: MapName,
     demand: Annotated[
-        list[Path],
-        typer.Option("--demand", "-d", help="A .rou.xml, .add.xml or .sumocfg; may be repeated."),
+        list[Path], about("A .rou.xml, .add.xml or .sumocfg; may be repeated.", "--demand", "-d")
     ],
-    seconds: Annotated[
-        int, typer.Option(help="Simulated seconds, from the demand's beginning.")
-    ] = 900,
-    dt: Annotated[float, typer.Option(help="Step length of both, in seconds.")] = 0.1,
+    seconds: Annotated[int, about("Simulated seconds, from the demand's beginning.")] = 900,
+    dt: Annotated[float, about("Step length of both, in seconds.")] = 0.1,
     seed: Seed = 0,
-    teleports: Annotated[
-        bool, typer.Option(help="Let SUMO teleport vehicles that stand for too long.")
-    ] = True,
+    teleports: Annotated[bool, about("Let SUMO teleport vehicles that stand for too long.")] = True,
     plot: Annotated[
-        Path | None, typer.Option(help="Draw the fundamental diagram here (.png, .svg, .pdf).")
+        Path | None, about("Draw the fundamental diagram here (.png, .svg, .pdf).")
     ] = None,
     speed: Annotated[
-        bool, typer.Option("--speed", help="Measure how fast both are, not what they do.")
+        bool, about("Measure how fast both are, not what they do.", "--speed")
     ] = False,
-    after: Annotated[
-        int, typer.Option(help="With --speed: simulated seconds before the first turn.")
-    ] = 120,
-    repeats: Annotated[
-        int, typer.Option(help="With --speed: turns of 10 simulated seconds of each side.")
-    ] = 5,
+    after: Annotated[int, about("With --speed: simulated seconds before the first turn.")] = 120,
+    repeats: Annotated[int, about("With --speed: turns of 10 simulated seconds of each side.")] = 5,
     json_path: JsonPath = None,
 ) -> None:
     """Our traffic beside SUMO's own run: same map, demand, seed and step length."""
     from cavmarl.bench.traffic_speed import measure_traffic_speed
     from cavmarl.evaluate.traffic.traffic_comparison import compare_traffic
+    from cavmarl.evaluate.traffic.traffic_plot import plot_fundamental_diagram
 
     if speed and plot is not None:
         raise ConfigError("--plot: draws flow and density, which --speed does not measure; use one")
     if plot is not None:
         require("matplotlib", "report")
     console = Console()
+    found: TrafficComparison | TrafficSpeed
+    tolerated: tuple[str, ...] = ()
     with measuring(console) as say:
-        found: TrafficComparison | TrafficSpeed
-        tolerated: tuple[str, ...] = ()
         if speed:
+            turns = {"after_s": after, "repeats": repeats}
             found = measure_traffic_speed(
-                map_name,
-                demand,
-                dt_s=dt,
-                seed=seed,
-                after_s=after,
-                repeats=repeats,
-                progress=say,
+                map_name, demand, dt_s=dt, seed=seed, progress=say, **turns
             )
             table = _speeds(found)
         else:
@@ -96,17 +80,11 @@ def traffic(
             )
             table, tolerated = _figures(found), found.tolerated
             if plot is not None:
-                _draw(found, plot)
+                plot_fundamental_diagram(found, plot)
     console.print(table)
     if tolerated:
         console.print("tolerated in our reading of the demand:", *tolerated, sep="\n")
     write_json(json_path, found.to_dict())
-
-
-def _draw(found: TrafficComparison, path: Path) -> None:
-    from cavmarl.evaluate.traffic.traffic_plot import plot_fundamental_diagram
-
-    plot_fundamental_diagram(found, path)
 
 
 def _figures(found: TrafficComparison) -> Table:
@@ -119,21 +97,17 @@ def _figures(found: TrafficComparison) -> Table:
 
 
 def _speeds(found: TrafficSpeed) -> Table:
-    sides = (
-        ("cavmarl", found.our_vehicles, found.ours),
-        ("libsumo", found.sumo_vehicles, found.sumo),
-    )
     rows = [
         (name, *(f"{value:,.0f}" for value in (vehicles, rates.low, rates.median, rates.high)))
-        for name, vehicles, rates in sides
+        for name, vehicles, rates in (
+            ("cavmarl", found.our_vehicles, found.ours),
+            ("libsumo", found.sumo_vehicles, found.sumo),
+        )
     ]
-    return make_table(
-        f"{found.map_name}, step {found.dt_s:g} s, one core, {found.repeats} turns of each, "
-        f"after {found.after_s} s",
-        ("vehicle-steps/s", "vehicles", "min", "median", "max"),
-        rows,
-        f"ratio of the medians: {found.ratio:.1f}",
-    )
+    title = f"{found.map_name}, step {found.dt_s:g} s, one core, {found.repeats} turns of each"
+    heads = ("vehicle-steps/s", "vehicles", "min", "median", "max")
+    ratio = f"ratio of the medians: {found.ratio:.1f}"
+    return make_table(f"{title}, after {found.after_s} s", heads, rows, ratio)
 
 
 def _cell(value: float | str | None) -> str:

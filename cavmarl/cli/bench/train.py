@@ -5,12 +5,11 @@ from __future__ import annotations
 from statistics import median
 from typing import TYPE_CHECKING, Annotated
 
-import typer
 from rich.console import Console
 from rich.table import Table
 
-from cavmarl.bench.harness import check_positive, hardware_line, make_table, measuring
-from cavmarl.cli.output import JsonPath, write_json
+from cavmarl.bench.harness import hardware_line, make_table, measuring
+from cavmarl.cli.output import AtLeast, JsonPath, about, end_below, write_json
 
 if TYPE_CHECKING:
     from cavmarl.bench.training_speed import TrainingSpeed
@@ -24,15 +23,13 @@ _PHASES = ("simulation", "transfer", "inference", "learning")
 
 
 def train(
-    agents: Annotated[int, typer.Option(help="Agents in each world, on both sides.")] = 20,
+    agents: Annotated[int, about("Agents in each world, on both sides.")] = 20,
     worlds: Annotated[
-        int, typer.Option(help="Number of our parallel worlds; highway-env has one a worker.")
+        int, about("Number of our parallel worlds; highway-env has one a worker.")
     ] = 16,
-    workers: Annotated[int, typer.Option(help="Worker processes of each side.")] = 2,
-    repeats: Annotated[int, typer.Option(help="Number of measured updates of each side.")] = 3,
-    at_least: Annotated[
-        float | None, typer.Option(help="Exit with 1 if ours is not so many times as fast.")
-    ] = None,
+    workers: Annotated[int, about("Worker processes of each side.")] = 2,
+    repeats: Annotated[int, about("Number of measured updates of each side.")] = 3,
+    at_least: AtLeast = None,
     json_path: JsonPath = None,
 ) -> None:
     """PPO from end to end next to stable-baselines3's on highway-env, and where the time goes.
@@ -42,7 +39,6 @@ def train(
     """
     from cavmarl.bench.training_speed import measure_training
 
-    check_positive("--at-least", at_least)
     console = Console()
     with measuring(console) as say:
         found = measure_training(agents, worlds, workers, repeats, say)
@@ -56,8 +52,7 @@ def train(
     )
     if found.is_crowded:
         console.print("note: more workers than cores", style="yellow")
-    if at_least is not None and found.ratio < at_least:
-        raise typer.Exit(1)
+    end_below(at_least, found.ratio)
 
 
 def _table(found: TrainingSpeed) -> Table:
@@ -69,12 +64,10 @@ def _table(found: TrainingSpeed) -> Table:
     for name, of in (("min", min), ("median", median), ("max", max)):
         rows.append((f"agent-steps/s: {name}", *(f"{of(side.rates):,.0f}" for side in sides)))
     for phase in _PHASES:
-        shares = (side.shares.get(phase) for side in sides)
-        cells = ("-" if share is None else f"{share:.0%}" for share in shares)
+        cells = (f"{side.shares[phase]:.0%}" if phase in side.shares else "-" for side in sides)
         rows.append((f"{phase}, of the time", *cells))
-    return make_table(
+    title = (
         f"PPO, {found.agents} agents a world, {found.numbers} numbers each, {found.workers} "
-        f"workers\n{hardware_line(found.hardware)}",
-        ("end to end", *(_SIDES[side.who] for side in sides)),
-        rows,
+        f"workers\n{hardware_line(found.hardware)}"
     )
+    return make_table(title, ("end to end", *(_SIDES[side.who] for side in sides)), rows)

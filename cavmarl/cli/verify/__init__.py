@@ -2,33 +2,31 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cavmarl.cli.evaluate import progress_bar
+from cavmarl.cli.evaluate import counting
 from cavmarl.cli.output import (
-    Agents,
-    Background,
     JsonPath,
     PolicyName,
-    Seed,
-    Settings,
+    about,
+    grid,
     make_folder,
-    parse_settings,
     say_difference,
+    with_world,
     write_json,
 )
-from cavmarl.cli.verify.faults import check_campaign, print_campaign, print_figures
+from cavmarl.cli.verify.faults import check_campaign, print_figures, verify_campaign
 from cavmarl.cli.verify.kills import verify_with_kills
-from cavmarl.cli.verify.replay import run_again
 from cavmarl.config.env import ZONE_LAYOUTS
-from cavmarl.core.errors import ConfigError
+from cavmarl.config.world_spec import WorldSpec
+from cavmarl.core.errors import ConfigError, LostTickError
 
 if TYPE_CHECKING:
     from cavmarl.verify.equivalence import Equivalence, ZoneResult
@@ -36,7 +34,9 @@ if TYPE_CHECKING:
 __all__ = ["verify"]
 
 
+@with_world()
 def verify(
+    world: WorldSpec,
     env: Annotated[
         str | None,
         typer.Argument(
@@ -46,68 +46,54 @@ def verify(
     ] = None,
     zones: Annotated[
         str | None,
-        typer.Option(
+        about(
+            "Numbers of zones; default: 1,2,4,9, or what a zone file has; of a campaign 4,9.",
             metavar="K,K,…",
-            help="Numbers of zones; default: 1,2,4,9, or what a zone file has; of a campaign 4,9.",
         ),
     ] = None,
     steps: Annotated[
-        int | None, typer.Option(help="Compared steps; default: 200, of a campaign 40 a run.")
+        int | None, about("Compared steps; default: 200, of a campaign 40 a run.")
     ] = None,
-    seed: Seed = 0,
     layout: Annotated[
-        str | None,
-        typer.Option(
-            help=f"{', '.join(ZONE_LAYOUTS)}, or a zone file; default: the environment's."
-        ),
+        str | None, about(f"{', '.join(ZONE_LAYOUTS)}, or a zone file; default: the environment's.")
     ] = None,
     policy: PolicyName = "idm",
     worlds: Annotated[
-        int | None,
-        typer.Option(help="Number of parallel worlds; default: 1, with --kill two a worker."),
+        int | None, about("Number of parallel worlds; default: 1, with --kill two a worker.")
     ] = None,
-    agents: Agents = None,
-    background: Background = None,
-    settings: Settings = None,
     faults: Annotated[
         str | None,
-        typer.Option(
-            metavar="PLAN",
-            help="JSON file of faults in the divided worlds, see docs/faults.md; `campaign`: "
+        about(
+            "JSON file of faults in the divided worlds, see docs/faults.md; `campaign`: "
             "the whole matrix.",
+            metavar="PLAN",
         ),
     ] = None,
-    seeds: Annotated[
-        int, typer.Option(help="Of a campaign: runs in which any process dies at any time.")
-    ] = 12,
+    seeds: Annotated[int, about("Of a campaign: runs in which any process dies at any time.")] = 12,
     kill: Annotated[
         int | None,
-        typer.Option(
+        about(
+            "Kill or stop N workers at random times instead of dividing worlds, and compare.",
             metavar="N",
-            help="Kill or stop N workers at random times instead of dividing worlds, and compare.",
         ),
     ] = None,
-    workers: Annotated[int, typer.Option(help="With --kill: workers that run the worlds.")] = 2,
+    workers: Annotated[int, about("With --kill: workers that run the worlds.")] = 2,
     hosts: Annotated[
         str | None,
-        typer.Option(
-            metavar="ray",
-            help="With --kill: the workers are actors of a Ray cluster on this machine.",
+        about(
+            "With --kill: the workers are actors of a Ray cluster on this machine.", metavar="ray"
         ),
     ] = None,
-    check: Annotated[
-        bool, typer.Option("--check", help="Check the invariants of ownership, too.")
-    ] = False,
+    check: Annotated[bool, about("Check the invariants of ownership, too.", "--check")] = False,
     journal: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Folder for the journals of the divided worlds."),
+        Path | None, about("Folder for the journals of the divided worlds.", metavar="DIR")
     ] = None,
     replay: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Run a tick again that every host of a zone died of, see docs/faults.md; beside "
+        about(
+            "Run a tick again that every host of a zone died of, see docs/faults.md; beside "
             "it goes ENV only, where the map is found.",
+            metavar="FILE",
         ),
     ] = None,
     json_path: JsonPath = None,
@@ -119,42 +105,42 @@ def verify(
     if hosts is not None and kill is None:
         raise ConfigError(f"--hosts {hosts}: goes with --kill only")
     if replay is not None:
-        given = (zones, steps, layout, agents, background, settings, faults, journal, kill, worlds)
-        if check or any(value is not None for value in given):
+        given = (zones, steps, layout, faults, journal, kill, worlds)
+        shadows = (world.agents, world.background, world.overrides or None)
+        if check or any(value is not None for value in (*given, *shadows)):
             raise ConfigError("--replay: all else stands in the file; beside it goes ENV only")
-        run_again(replay, env, json_path)
+        _run_again(replay, env, json_path)
         return
-    overrides = parse_settings(settings)
     counts = None if zones is None else _counts(zones)
     console = Console()
+    checked = {"zones.check_invariants": True} if check else {}
+    strict = replace(world, overrides={**world.overrides, **checked})
     if kill is not None:
         _refuse_with_kill(
             env, counts, {"--faults": faults, "--layout": layout, "--journal": journal}
         )
         verify_with_kills(
             console,
-            str(env),
+            strict,
             kill,
             json_path,
             workers=workers,
             hosts=hosts,
             worlds=worlds,
             steps=steps,
-            seed=seed,
             policy=policy,
             zones=None if counts is None else counts[0],
-            agents=agents,
-            background=background,
-            overrides=overrides | ({"zones.check_invariants": True} if check else {}),
         )
         return
-    worlds = 1 if worlds is None else worlds
     if faults == "campaign":
-        check_campaign(layout, worlds, journal)
-        named = {"population.agents": agents, "population.background": background}
-        overrides |= {key: value for key, value in named.items() if value is not None}
-        overrides |= {"zones.check_invariants": True} if check else {}
-        _campaign(console, env, counts, steps, seed, seeds, policy, overrides, json_path)
+        check_campaign(layout, 1 if worlds is None else worlds, journal)
+        runs = {
+            "zones": counts,
+            "steps": 40 if steps is None else steps,
+            "seeds": seeds,
+            "policy": policy,
+        }
+        verify_campaign(console, strict, json_path, **runs)
         return
     if env is None:
         raise ConfigError("verify: name an environment; without one goes --faults campaign only")
@@ -162,26 +148,21 @@ def verify(
         make_folder(journal)
     from cavmarl.verify.equivalence import verify_zones
 
-    with progress_bar(console) as bar:
-        task = bar.add_task(f"{policy} drives {env}, undivided and divided")
+    with counting(console, f"{policy} drives {env}, undivided and divided") as progress:
         found = verify_zones(
-            env,
+            world,
             counts,
             steps=200 if steps is None else steps,
-            seed=seed,
             layout=layout,
             policy=policy,
-            worlds=worlds,
-            agents=agents,
-            background=background,
-            overrides=overrides,
+            worlds=1 if worlds is None else worlds,
             faults=faults,
             check=check,
             journals=journal,
-            progress=lambda k, n: bar.update(task, completed=k, total=n),
+            progress=progress,
         )
     write_json(json_path, found.to_dict())
-    console.print(_table(found, seed))
+    console.print(_table(found, world.seed))
     if faults is not None:
         print_figures(console, found)
     for result in found.results:
@@ -193,46 +174,38 @@ def verify(
     console.print(f"state after tick {found.ticks}: {hashes}", highlight=False, soft_wrap=True)
 
 
-def _campaign(
-    console: Console,
-    env: str | None,
-    counts: list[int] | None,
-    steps: int | None,
-    seed: int,
-    seeds: int,
-    policy: str,
-    overrides: dict[str, Any],
-    json_path: Path | None,
-) -> None:
-    """The whole matrix of faults; exit code 1 if a run is not as it has to be."""
-    from cavmarl.verify.fault_campaign import run_campaign
+def _run_again(path: Path, env: str | None, json_path: Path | None) -> None:
+    """As it was, then without the faults of its plan; exit code 1 if it fails as it was.
 
-    with progress_bar(console) as bar:
-        task = bar.add_task("faults beside the undivided world")
-        campaign = run_campaign(
-            env,
-            counts,
-            steps=40 if steps is None else steps,
-            seed=seed,
-            seeds=seeds,
-            policy=policy,
-            overrides=overrides,
-            progress=lambda k, n: bar.update(task, completed=k, total=n),
-        )
-    write_json(json_path, campaign.to_dict())
-    print_campaign(console, campaign, seed)
-    if not campaign.holds:
+    What a zone's code raises without faults is not caught: its traceback is what one looks for.
+    """
+    from cavmarl.handoff.fault_injection.reproducer_file import read_reproducer
+    from cavmarl.verify.replay import changed_versions, replay_tick, world_of
+
+    console = Console(soft_wrap=True, highlight=False, markup=False)
+    kept = read_reproducer(path)
+    world = world_of(kept, env)
+    console.print(f"{kept.config['name']}, tick {kept.tick} of the run, on record: {kept.cause}")
+    for change in changed_versions(kept):
+        console.print(f"note: {change}")
+    found = {"recorded": kept.cause, "failure": "", "state_hash": ""}
+    try:
+        found["state_hash"] = replay_tick(kept, world)
+        console.print(f"as it was: reached, state {found['state_hash']}")
+    except LostTickError as error:
+        found["failure"] = str(error)
+        console.print(f"as it was: {error}")
+    write_json(json_path, found)
+    if found["failure"]:
+        found["state_hash"] = replay_tick(kept, world, faults=False)
+        console.print(f"without faults: reached, state {found['state_hash']}")
+        write_json(json_path, found)
         raise typer.Exit(1)
 
 
 def _refuse_with_kill(
     env: str | None, counts: list[int] | None, others: dict[str, str | Path | None]
 ) -> None:
-    """Refuse what does not go with `--kill`.
-
-    Raises:
-        ConfigError: one of it was given, or no environment.
-    """
     if env is None:
         raise ConfigError("--kill: name an environment")
     if counts is not None and len(counts) > 1:
@@ -243,11 +216,6 @@ def _refuse_with_kill(
 
 
 def _counts(text: str) -> list[int]:
-    """The numbers of `--zones`.
-
-    Raises:
-        ConfigError: something else.
-    """
     try:
         return [int(word) for word in text.split(",")]
     except ValueError:
@@ -256,24 +224,18 @@ def _counts(text: str) -> list[int]:
 
 def _table(found: Equivalence, seed: int) -> Table:
     many = "a world" if found.worlds == 1 else f"{found.worlds} worlds"
-    table = Table(
-        title=escape(f"{Path(found.env).name}, {many}, seed {seed}: beside the undivided"),
-        box=box.SIMPLE_HEAD,
-        pad_edge=False,
-    )
-    for heading in ("zones", "steps", "vehicles", "crossings"):
-        table.add_column(heading, justify="right")
-    table.add_column("")
-    for result in found.results:
-        equal = result.difference is None
-        table.add_row(
+    rows = (
+        (
             str(result.zones),
             str(result.steps),
             f"{result.vehicles:,.0f}",
             f"{result.crossings:,}",
-            "[green]equal[/]" if equal else "[red]different[/]",
+            "[green]equal[/]" if result.difference is None else "[red]different[/]",
         )
-    return table
+        for result in found.results
+    )
+    title = escape(f"{Path(found.env).name}, {many}, seed {seed}: beside the undivided")
+    return grid(("zones", "steps", "vehicles", "crossings", ""), rows, title, lefts=0)
 
 
 def _sentence(result: ZoneResult, worlds: int) -> str:

@@ -2,54 +2,31 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Annotated
 
 import typer
 from rich.console import Console
 
-from cavmarl.cli.evaluate import progress_bar
-from cavmarl.cli.output import (
-    Agents,
-    Background,
-    Environment,
-    JsonPath,
-    PolicyName,
-    Seed,
-    Settings,
-    parse_settings,
-    say_difference,
-    write_json,
-)
+from cavmarl.cli.evaluate import counting
+from cavmarl.cli.output import JsonPath, PolicyName, about, say_difference, with_world, write_json
+from cavmarl.config.world_spec import WorldSpec
 
 
+@with_world()
 def verify_determinism(
-    env: Environment,
+    world: WorldSpec,
     policy: PolicyName = "idm",
-    steps: Annotated[int, typer.Option(help="Compared steps.")] = 600,
-    seed: Seed = 0,
-    agents: Agents = None,
-    background: Background = None,
-    settings: Settings = None,
+    steps: Annotated[int, about("Compared steps.")] = 600,
     json_path: JsonPath = None,
 ) -> None:
     """Drive one world in three fresh processes; exit code 1 and where they first differ."""
     from cavmarl.verify.determinism import verify_determinism as verify
 
-    overrides = parse_settings(settings)
     console = Console()
-    with progress_bar(console) as bar:
-        task = bar.add_task(f"three times {policy} in {env}")
-        found = verify(
-            env,
-            policy,
-            steps=steps,
-            seed=seed,
-            agents=agents,
-            background=background,
-            overrides=overrides,
-            progress=lambda k, n: bar.update(task, completed=k, total=n),
-        )
-    write_json(json_path, found.to_dict())
+    with counting(console, f"three times {policy} in {world.env}") as progress:
+        found = verify(world, policy, steps=steps, progress=progress)
+    write_json(json_path, asdict(found))
     if found.difference is not None:
         one, other = (f"in process {number}" for number in found.difference.processes)
         said = say_difference(found.difference, (one, other))

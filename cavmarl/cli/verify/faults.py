@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import typer
 from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from cavmarl.cli.evaluate import counting
+from cavmarl.cli.output import pairs_grid, write_json
+from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -20,11 +24,7 @@ if TYPE_CHECKING:
 
 
 def check_campaign(layout: str | None, worlds: int, journal: Path | None) -> None:
-    """Refuse what a campaign cannot take.
-
-    Raises:
-        ConfigError: one of it was given.
-    """
+    """Refuse what a campaign cannot take."""
     if layout is not None:
         raise ConfigError("--layout: a campaign takes --set zones.layout=… instead")
     if worlds != 1:
@@ -41,15 +41,25 @@ def print_figures(console: Console, found: Equivalence) -> None:
             console.print(_figures(result.figures))
 
 
-def print_campaign(console: Console, campaign: Campaign, seed: int) -> None:
-    """A table by line of the matrix, then what it took."""
-    console.print(_lines(campaign, seed))
-    total = campaign.total()
-    console.print(_figures(total))
+def verify_campaign(
+    console: Console, world: WorldSpec, json_path: Path | None, **runs: Any
+) -> None:
+    """The whole matrix of faults: a table by line, then what it took; exit code 1 if one fails."""
+    from cavmarl.verify.fault_campaign import run_campaign
+    from cavmarl.verify.fault_matrix import ELSEWHERE
+
+    with counting(console, "faults beside the undivided world") as progress:
+        campaign = run_campaign(world, progress=progress, **runs)
+    write_json(json_path, campaign.to_dict())
+    console.print(_lines(campaign, world.seed))
+    console.print(_figures(campaign.total()))
     console.print(_steps(campaign))
     for line in campaign.lines:
         _print_notes(console, line)
-    _print_elsewhere(console)
+    for what, where in ELSEWHERE:
+        console.print(f"not counted here: {what} ({where})", soft_wrap=True, highlight=False)
+    if not campaign.holds:
+        raise typer.Exit(1)
 
 
 def _lines(campaign: Campaign, seed: int) -> Table:
@@ -89,9 +99,8 @@ def _line(lines: list[LineResult]) -> tuple[str, ...]:
 
 
 def _figures(figures: FaultFigures) -> Table:
-    grid = Table.grid(padding=(0, 2))
     moved, resent = figures.hand_overs, figures.resent
-    for name, text in (
+    rows = (
         ("deaths", f"{figures.zone_deaths.total():,} of zones' hosts, "
                    f"{figures.coordinator_deaths.total():,} of coordinators"),
         ("messages", _pairs(figures.messages)),
@@ -109,16 +118,13 @@ def _figures(figures: FaultFigures) -> Table:
         ("migration", f"{_spread(figures.waited_ticks, 'ticks')} from the crossing; "
                       f"{_spread(figures.latency_ms, 'ms')}"),
         ("state", _spread(figures.state_bytes, "bytes a transfer")),
-    ):  # fmt: skip
-        grid.add_row(name, escape(text))
-    return grid
+    )  # fmt: skip
+    return pairs_grid((name, escape(text)) for name, text in rows)
 
 
 def _steps(campaign: Campaign) -> Table:
-    grid = Table.grid(padding=(0, 2))
-    grid.add_row("step", _spread(campaign.calm_ms, "ms without a death"))
-    grid.add_row("", _spread(campaign.stricken_ms, "ms with a death"))
-    return grid
+    calm = _spread(campaign.calm_ms, "ms without a death")
+    return pairs_grid((("step", calm), ("", _spread(campaign.stricken_ms, "ms with a death"))))
 
 
 def _print_notes(console: Console, line: LineResult) -> None:
@@ -130,13 +136,6 @@ def _print_notes(console: Console, line: LineResult) -> None:
     for failure in line.failures:
         text = f"{where}: {failure['wrong']}; plan {failure['plan']}"
         console.print(text, markup=False, soft_wrap=True, style="red")
-
-
-def _print_elsewhere(console: Console) -> None:
-    from cavmarl.verify.fault_matrix import ELSEWHERE
-
-    for what, where in ELSEWHERE:
-        console.print(f"not counted here: {what} ({where})", soft_wrap=True, highlight=False)
 
 
 def _pairs(counts: Counter[tuple[str, str]]) -> str:

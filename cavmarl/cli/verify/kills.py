@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
-from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cavmarl.cli.evaluate import progress_bar
-from cavmarl.cli.output import write_json
+from cavmarl.cli.evaluate import counting
+from cavmarl.cli.output import grid, write_json
+from cavmarl.config.world_spec import WorldSpec
 
 if TYPE_CHECKING:
     from cavmarl.verify.worker_kills import Kill, KillReport
@@ -23,19 +23,13 @@ WIDTH = 30  # letters of the longest bar
 
 
 def verify_with_kills(
-    console: Console, env: str, kills: int, json_path: Path | None, **arguments: Any
+    console: Console, world: WorldSpec, kills: int, json_path: Path | None, **arguments: Any
 ) -> None:
     """Kill and stop workers beside undisturbed worlds; exit code 1 if anything differs."""
     from cavmarl.verify.worker_kills import verify_kills
 
-    with progress_bar(console) as bar:
-        task = bar.add_task(f"{kills} workers of {env} are killed or stopped")
-        found = verify_kills(
-            env,
-            kills,
-            progress=lambda k, n: bar.update(task, completed=k, total=n),
-            **arguments,
-        )
+    with counting(console, f"{kills} workers of {world.env} are killed or stopped") as progress:
+        found = verify_kills(world, kills, progress=progress, **arguments)
     write_json(json_path, found.to_dict())
     _print(console, found)
     if not found.holds:
@@ -64,9 +58,7 @@ def _print(console: Console, found: KillReport) -> None:
 def _spreads(found: KillReport) -> Table:
     import numpy as np
 
-    table = Table("", "deaths", box=box.SIMPLE_HEAD, pad_edge=False)
-    for heading in ("p50", "p95", "p99", "max"):
-        table.add_column(heading, justify="right")
+    rows = []
     for text, kind, name in (
         ("killed at work: noticed after, ms", "SIGKILL", "noticed_ms"),
         ("stopped at work: noticed after, ms", "SIGSTOP", "noticed_ms"),
@@ -79,24 +71,21 @@ def _spreads(found: KillReport) -> Table:
             if kind is None or (kill.signal == kind and not kill.idle)
         ]
         shown = [f"{np.percentile(values, p):.3g}" if values else "-" for p in (50, 95, 99, 100)]
-        table.add_row(text, str(len(values)), *shown)
-    return table
+        rows.append((text, str(len(values)), *shown))
+    return grid(("", "deaths", "p50", "p95", "p99", "max"), rows, lefts=2)
 
 
 def _histogram(kills: tuple[Kill, ...]) -> Table:
-    """How many were noticed, and recovered from, how fast."""
     names = ("noticed_ms", "recovered_ms")
     counts = {name: [0] * (len(BOUNDS_MS) + 1) for name in names}
     for kill in kills:
         for name in names:
             counts[name][bisect_right(BOUNDS_MS, getattr(kill, name))] += 1
     most = max(1, *(max(column) for column in counts.values()))
-    table = Table("ms", "noticed", "recovered", box=box.SIMPLE_HEAD, pad_edge=False)
+    rows = []
     labels = [f"below {BOUNDS_MS[0]}", *(f"from {bound}" for bound in BOUNDS_MS)]
     for n, label in enumerate(labels):
         if any(counts[name][n] for name in names):
-            bars = (
-                f"{'█' * -(-WIDTH * counts[name][n] // most)} {counts[name][n]}" for name in names
-            )
-            table.add_row(label, *bars)
-    return table
+            found = [counts[name][n] for name in names]
+            rows.append((label, *(f"{'█' * -(-WIDTH * n // most)} {n}" for n in found)))
+    return grid(("ms", "noticed", "recovered"), rows, lefts=3)

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 _ROOT = Path(__file__).resolve().parents[3]
 
@@ -26,6 +27,15 @@ PACKAGES = (
     "safetensors",
 )
 UNKNOWN_COMMIT = "unknown: not a checkout"
+
+
+def describe_machine() -> dict[str, Any]:
+    """What stands in every record: hardware, software and code."""
+    return {
+        "hardware": describe_hardware(),
+        "software": describe_software(),
+        "code": describe_code(),
+    }
 
 
 def describe_hardware() -> dict[str, str | int | float | list[str] | None]:

@@ -21,7 +21,7 @@ from typing import Any
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ManifestError
 from cavmarl.core.numba import kernel_cache_dir
-from cavmarl.evaluate.provenance.machine import describe_code, describe_hardware, describe_software
+from cavmarl.evaluate.provenance.machine import describe_machine
 from cavmarl.policies.policy import policy_files
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.traffic.demand import DemandFile
@@ -90,9 +90,7 @@ def open_manifest(folder: Path, document: Mapping[str, Any]) -> Document:
         "ended": None,
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
         **document,
-        "hardware": describe_hardware(),
-        "software": describe_software(),
-        "code": describe_code(),
+        **describe_machine(),
         "results_sha256": {},
     }
     write_text(path, json.dumps(opened, indent=2) + "\n")
@@ -102,13 +100,7 @@ def open_manifest(folder: Path, document: Mapping[str, Any]) -> Document:
 def close_manifest(
     folder: Path, files: list[str], document: Mapping[str, Any] | None = None
 ) -> Document:
-    """Mark the manifest as closed.
-
-    Args:
-        folder: of the results.
-        files: that lie beside it; their hashes are put down.
-        document: what is only known now.
-    """
+    """Mark the manifest as closed."""
     path = folder / MANIFEST_FILE
     closed: Document = {
         **_read(path),

@@ -33,13 +33,8 @@ def begin_training(
 ) -> None:
     """Put on record what is about to be trained, in place of the record of an earlier run there.
 
-    Args:
-        folder: of the run; it exists.
-        program: that trains.
-        settings: its own, whole; `seed` is one of them.
-        world: that it learns in, or many of it.
-        plans: which worker hosts what; `cavmarl plan --again FOLDER/manifest.json` makes them
-            again.
+    `plans` say which worker hosts what; `cavmarl plan --again FOLDER/manifest.json` makes them
+    again. `seed` is one of the settings.
     """
     (folder / MANIFEST_FILE).unlink(missing_ok=True)
     open_manifest(
@@ -55,13 +50,6 @@ def begin_training(
 
 
 def end_training(folder: Path, files: Sequence[str], plans: Sequence[Plan] = ()) -> None:
-    """Close the record.
-
-    Args:
-        folder: of the run.
-        files: that the run left there; their hashes are put down.
-        plans: which worker hosted what at the end.
-    """
     placement = {PLACEMENT_AT_END: [plan.to_dict() for plan in plans]}
     close_manifest(folder, list(files), placement)
 

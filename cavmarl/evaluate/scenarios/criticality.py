@@ -33,15 +33,11 @@ def trace_of(row: np.void, time_s: float) -> tuple[float, ...]:
 
 
 def time_to_collision_s(one: np.void, other: np.void) -> float:
-    """When two bodies touch if both keep their velocities, in s; inf: never, 0: they do already.
+    """When two bodies (TRACE) touch if both keep their velocities, in s; inf: never, 0: they do.
 
     Hayward's time to collision ("Near miss determination through use of a scale of danger", Highway
     Research Record 384, 1972) for rectangles that move and do not turn: they touch when their
     shadows overlap on each of the four separating axes.
-
-    Args:
-        one: TRACE.
-        other: TRACE.
     """
     dx, dy = float(other["x"] - one["x"]), float(other["y"] - one["y"])
     vx, vy = (
@@ -72,13 +68,9 @@ def post_encroachment_s(one: NDArray[np.void], other: NDArray[np.void]) -> float
     """The shortest time between one body's leaving a place and the other's being there, in s.
 
     Post-encroachment time (Allen, Shin, Cooper: "Analysis of traffic conflicts and collisions",
-    Transportation Research Record 667, 1978), with the ground that a body covers as the place: inf
-    if no place was covered by both, 0 if both were there at a time. As bodies are known at moments
-    only, it is too long by at most twice the time between two of them.
-
-    Args:
-        one: TRACE (n,).
-        other: TRACE (m,).
+    Transportation Research Record 667, 1978) of TRACE (n,) and (m,), with the ground that a body
+    covers as the place: inf if no place was covered by both, 0 if both were there at a time. As
+    bodies are known at moments only, it is too long by at most twice the time between two of them.
     """
     reach = 0.5 * (np.hypot(one["length"], one["width"]).max(initial=0.0)
                    + np.hypot(other["length"], other["width"]).max(initial=0.0))  # fmt: skip

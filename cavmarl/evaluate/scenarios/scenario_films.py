@@ -25,16 +25,10 @@ HALF_M = (64.0, 36.0)  # of what is shown around the middle of the scene
 
 
 class ScenarioCamera:
-    """Films the first world of a vector environment; use it in a `with` block.
+    """Films the first world after `make_scenario`; use it in a `with` block.
 
-    Args:
-        vec: the worlds, run in this process, after `make_scenario`.
-        picture: where the moment goes in which an agent was closest to an actor that has moved;
-            None: nowhere.
-        video: where everything goes; None: nowhere.
-
-    Raises:
-        ConfigError: a picture that is no `.png`, or a path that cannot be written.
+    `picture` is of the moment in which an agent was closest to an actor that has moved, `video` of
+    everything; None: it goes nowhere.
     """
 
     def __init__(self, vec: CavVectorEnv, picture: Path | None, video: Path | None) -> None:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.records.codes import (
     DRIVER_BACKGROUND,
@@ -48,114 +49,90 @@ VERDICTS = {
 
 @dataclass(frozen=True)
 class ScenarioRun:
-    """What became of one run.
+    """What became of one run."""
 
-    Attributes:
-        scenario: its name.
-        environment: whose map it was played on.
-        place: where.
-        driver: of the agents.
-        seed: of place and traffic.
-        zones: into which the world was divided.
-        agents: how many.
-        background: vehicles beside the agents and the actors.
-        verdict: `passed` (all through, and none hurt), or what became of the worst of the
-            agents: `collided`, `off road`, or `stuck`.
-        verdicts: of each agent, that to which the scene is played first.
-        min_ttc_s: least time to collision of an agent with an actor, 0 after a collision with
-            one; None: they were never about to.
-        pet_s: least post-encroachment time likewise; None: no place was used by both.
-        collisions: vehicles and actors that began to touch another one, agents among them.
-        red_lights: steps in which an agent entered a junction at red.
-        delay_s: of the first agent, above what its way takes at the speed that it started with.
-        longest_wait_s: for which any other vehicle had stood when the run was over.
-        time_s: the run took.
-        state_hash: of the world at the end.
-    """
-
-    scenario: str
-    environment: str
-    place: str
-    driver: str
-    seed: int
-    zones: int
-    agents: int
-    background: int
+    scenario: str  # its name
+    environment: str  # whose map it was played on
+    place: str  # where
+    driver: str  # of the agents
+    seed: int  # of place and traffic
+    zones: int  # into which the world was divided
+    agents: int  # how many
+    background: int  # vehicles beside the agents and the actors
+    # `passed` (all through, and none hurt), or what became of the worst of the agents: `collided`,
+    # `off road`, or `stuck`
     verdict: str
-    verdicts: tuple[str, ...]
+    verdicts: tuple[str, ...]  # of each agent, that to which the scene is played first
+    # least time to collision of an agent with an actor, 0 after a collision with one; None: they
+    # were never about to
     min_ttc_s: float | None
-    pet_s: float | None
-    collisions: int
-    red_lights: int
-    delay_s: float
-    longest_wait_s: float
-    time_s: float
-    state_hash: str
+    pet_s: float | None  # least post-encroachment time likewise; None: no place was used by both
+    collisions: int  # vehicles and actors that began to touch another one, agents among them
+    red_lights: int  # steps in which an agent entered a junction at red
+    delay_s: float  # of the first agent, above what its way takes at the speed that it started with
+    longest_wait_s: float  # for which any other vehicle had stood when the run was over
+    time_s: float  # the run took
+    state_hash: str  # of the world at the end
 
     @property
     def passed(self) -> bool:
         """Whether all agents came through and hurt no one."""
         return self.verdict == "passed"
 
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
-
 
 def make_scenario(
     scenario: str,
-    env: str | Path = "grid4x4",
+    env: str | Path | WorldSpec = "grid4x4",
     *,
     params: Mapping[str, bool | float] | None = None,
     place: str = "",
     density: str = "none",
-    seed: int = 0,
     zones: int | None = None,
-    agents: int = 1,
-    overrides: Mapping[str, Any] | None = None,
+    **keys: Unpack[WorldKeys],
 ) -> CavVectorEnv:
     """One world in which a scenario is played to its agents, which steer and accelerate.
 
     Args:
         scenario: name, or path of a file.
-        env: name, folder or map file of an environment.
+        env: as in `make_vec`, like the other keywords.
         params: of the scenario.
-        place: where; empty: drawn by the seed.
+        place: where; empty: drawn by the seed, which is that of the first reset, too.
         density: of the other traffic, of `DENSITIES`.
-        seed: draws the place, and is that of the first reset.
         zones: into which the world is divided; None: as the environment says.
-        agents: how many: the first is in the conflict, the others come after it.
-        overrides: values for any other key.
+        keys: of the world; of the agents, by default 1, the first is in the conflict, the others
+            come after it.
 
     Raises:
         ConfigError: no such scenario, no place for it on the map, or no room for the agents; a
             parameter, a density or a key that cannot work.
     """
+    spec = WorldSpec.of(env, **keys)
     if density not in DENSITIES:
         raise ConfigError(f"density = {density!r}: must be one of {', '.join(DENSITIES)}")
     background = 0
     if density != "none":
-        lanes = load_world(env, agents=1, background=0).network.lanes
+        lanes = load_world(spec.env, agents=1, background=0).network.lanes
         lane_km = float(lanes["length_m"][~lanes["internal"]].sum()) / 1000.0
         background = round(DENSITIES[density] * lane_km)
-    keys: dict[str, Any] = {
+    settings: dict[str, Any] = {
         "scenario.name": scenario,
         "scenario.place": place,
-        "scenario.seed": seed,
+        "scenario.seed": spec.seed,
         "scenario.params": dict(params or {}),
         "population.mode": "closed",
         "population.budget": None,
         "action.kind": "continuous",
         "horizon_s": HORIZON_S,
-        **(overrides or {}),
+        **spec.overrides,
     }
     return make_vec(
-        env,
+        spec.env,
         zones=zones,
-        agents=agents,
+        agents=1 if spec.agents is None else spec.agents,
         background=background,
-        seed=seed,
+        seed=spec.seed,
         autoreset_mode="NextStep",
-        overrides=keys,
+        overrides=settings,
     )
 
 
@@ -165,14 +142,7 @@ def run_scenario(
     seed: int = 0,
     look: Callable[[], None] | None = None,
 ) -> ScenarioRun:
-    """Play the scenario of a world once, from its reset to its end.
-
-    Args:
-        vec: as `make_scenario` returns it, run in this process.
-        driver: a name or a path of a policy.
-        seed: of the reset, and of a driver that draws.
-        look: called after each step, while an agent is there.
-    """
+    """Play the scenario of a world once, from its reset to its end; `look` is called each step."""
     policy = load_policy(driver, vec)
     observations, infos = vec.reset(seed=seed)
     policy.reset(seed)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import closing
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,19 +18,13 @@ from cavmarl.evaluate.scenarios.scenario_runs import ScenarioRun, make_scenario,
 
 
 class SweepRow(NamedTuple):
-    """One scenario on one map.
+    """One scenario on one map."""
 
-    Attributes:
-        scenario: its name.
-        environment: name, folder or map file.
-        passing: runs of the driver that is to pass; none where the map has no place for it.
-        failing: runs of the one that is not.
-    """
-
-    scenario: str
-    environment: str
+    scenario: str  # its name
+    environment: str  # name, folder or map file
+    # runs of the driver that is to pass; none where the map has no place for it
     passing: list[ScenarioRun]
-    failing: list[ScenarioRun]
+    failing: list[ScenarioRun]  # runs of the one that is not
 
     @property
     def holds(self) -> bool:
@@ -50,13 +45,9 @@ class SweepRow(NamedTuple):
         return min((value for value in values if value is not None), default=None)
 
     def to_dict(self) -> dict[str, Any]:
-        return {
-            "scenario": self.scenario,
-            "environment": self.environment,
-            "holds": self.holds,
-            "passing": [run.to_dict() for run in self.passing],
-            "failing": [run.to_dict() for run in self.failing],
-        }
+        plain = {"scenario": self.scenario, "environment": self.environment, "holds": self.holds}
+        sides = {"passing": self.passing, "failing": self.failing}
+        return plain | {side: [asdict(run) for run in runs] for side, runs in sides.items()}
 
 
 def sweep_scenarios(

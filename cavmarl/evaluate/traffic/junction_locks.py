@@ -18,9 +18,6 @@ class JunctionLocks:
     which a link has no red signal. A lock is the number of seconds with a vehicle waiting since
     a vehicle has last entered or left the junction; it also ends when none waits there, unless
     they are only held by red. So time at red neither counts nor ends a lock.
-
-    Args:
-        network: the map.
     """
 
     def __init__(self, network: RoadNetwork) -> None:

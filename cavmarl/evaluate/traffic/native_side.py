@@ -24,19 +24,9 @@ def load_demand(
     dt_s: float,
     overrides: Mapping[str, Any] | None = None,
 ) -> World:
-    """What a world with background traffic and no agents is made of.
+    """What a world with background traffic and no agents is made of, with ticks of `dt_s`.
 
-    Args:
-        map_file: a SUMO network.
-        demand: what drives on it, and the signal programs that its additional files have.
-        seconds: how long.
-        dt_s: seconds a tick.
-        overrides: values for other keys.
-
-    Raises:
-        ConfigError: a demand or a tick that cannot work.
-        DemandError: a demand that cannot be, or not on this map.
-        MapError: the map cannot be driven.
+    The signal programs that additional files of the demand have count, too.
     """
     own = {
         "clock.sim_dt_s": dt_s,
@@ -51,20 +41,6 @@ def load_demand(
 def make_world(
     map_file: Path, demand: Sequence[Path], seconds: int, seed: int, dt_s: float
 ) -> Simulation:
-    """The world of `load_demand` at the start of an episode.
-
-    Args:
-        map_file: a SUMO network.
-        demand: what drives on it.
-        seconds: how long.
-        seed: root of all random numbers.
-        dt_s: seconds a tick.
-
-    Raises:
-        ConfigError: see `load_demand`.
-        DemandError: see `load_demand`.
-        MapError: see `load_demand`.
-    """
     config, network, file, partition = load_demand(map_file, demand, seconds, dt_s)
     simulation = Simulation(config, network, demand=file, partition=partition)
     simulation.seed(seed)
@@ -72,28 +48,19 @@ def make_world(
     return simulation
 
 
-def advance(simulation: Simulation, commands: Commands) -> None:
-    simulation.step(commands)
-
-
 def idle_commands(simulation: Simulation) -> Commands:
-    """Room for the commands of `advance`."""
+    """Commands of a step in which no agent does anything."""
     shape = simulation.outputs.present.shape
     return Commands(np.zeros((*shape, 2)), np.full(shape, ACTION_IDLE, dtype=np.int64))
 
 
 def run_native(simulation: Simulation, seconds: int) -> TrafficRun:
-    """Run and measure it.
-
-    Args:
-        simulation: of `make_world`; a whole number of its ticks is a second.
-        seconds: how long.
-    """
+    """Run the world of `make_world` and measure it; a whole number of its ticks is a second."""
     meter = TrafficMeter(simulation.network)
     commands = idle_commands(simulation)
     ticks_per_s = round(1.0 / simulation.config.clock.sim_dt_s)
     for tick in range(1, seconds * ticks_per_s + 1):
-        advance(simulation, commands)
+        simulation.step(commands)
         rows = simulation.vehicles()
         meter.see(rows)
         if tick % ticks_per_s == 0:

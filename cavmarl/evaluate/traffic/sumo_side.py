@@ -32,45 +32,27 @@ from cavmarl.traffic.sumo.sumo_input import SumoInput, command_words, free_libsu
 
 @dataclass(frozen=True)
 class SumoJob:
-    """One run.
+    """One run."""
 
-    Attributes:
-        map_file: a SUMO network.
-        demand: what drives on it.
-        seconds: how long, from `demand.begin_s`.
-        dt_s: step length.
-        seed: of SUMO's random numbers.
-        teleports: whether SUMO may put vehicles elsewhere that stand for too long (300 s unless
-            the demand's configuration says otherwise).
-    """
-
-    map_file: Path
-    demand: SumoInput
-    seconds: int
-    dt_s: float
-    seed: int
+    map_file: Path  # a SUMO network
+    demand: SumoInput  # what drives on it
+    seconds: int  # how long, from `demand.begin_s`
+    dt_s: float  # step length
+    seed: int  # of SUMO's random numbers
+    # whether SUMO may put vehicles elsewhere that stand for too long (300 s unless the demand's
+    # configuration says otherwise)
     teleports: bool = True
 
 
 def run_sumo(job: SumoJob) -> TrafficRun:
-    """Run and measure it in a process of its own.
-
-    Raises:
-        ConfigError: SUMO refuses the demand on this map; the message is SUMO's.
-        MissingExtraError: SUMO is not installed.
-    """
+    """Run and measure it in a process of its own."""
     with sumo_process(job) as process:
         return process.submit(_measure, job).result()
 
 
 @contextmanager
 def sumo_process(job: SumoJob) -> Iterator[ProcessPoolExecutor]:
-    """A fresh process for one simulation of SUMO's; what is submitted runs there.
-
-    Raises:
-        ConfigError: SUMO ended the process.
-        MissingExtraError: SUMO is not installed.
-    """
+    """A fresh process for one simulation of SUMO's; what is submitted runs there."""
     require("libsumo", "sumo")
     with ProcessPoolExecutor(1, get_context("spawn")) as process:
         try:
@@ -80,16 +62,9 @@ def sumo_process(job: SumoJob) -> Iterator[ProcessPoolExecutor]:
 
 
 def start_sumo(job: SumoJob, folder: Path, *more: str) -> Any:
-    """Load the job into this process's libsumo and return it.
+    """Load the job into this process's libsumo and return it; `more` are options of SUMO.
 
-    Args:
-        job: what to run.
-        folder: for SUMO's log and for copies of additional files.
-        more: options.
-
-    Raises:
-        ConfigError: SUMO refuses it.
-        SumoError: a simulation runs in this process.
+    Its log, and copies of additional files, go into the folder.
     """
     libsumo: Any = free_libsumo()
     log = folder / "errors.log"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,26 +21,16 @@ RATIOS = ("departed", "waiting", "arrived", "mean_speed_mps", "mean_delay_s", "q
 
 @dataclass(frozen=True)
 class TrafficComparison:
-    """Result of the comparison.
+    """Result of the comparison."""
 
-    Attributes:
-        map_name: the map's name.
-        seconds: how long both ran.
-        dt_s: step length of both.
-        seed: of both.
-        ours: our run.
-        sumo: SUMO's.
-        edge_ids: of the map, by the rows that `edge_minutes` name.
-        tolerated: what ours left out of the demand or took for something near, with counts.
-    """
-
-    map_name: str
-    seconds: int
-    dt_s: float
-    seed: int
-    ours: TrafficRun
-    sumo: TrafficRun
-    edge_ids: tuple[str, ...]
+    map_name: str  # the map's name
+    seconds: int  # how long both ran
+    dt_s: float  # step length of both
+    seed: int  # of both
+    ours: TrafficRun  # our run
+    sumo: TrafficRun  # SUMO's
+    edge_ids: tuple[str, ...]  # of the map, by the rows that `edge_minutes` name
+    # what ours left out of the demand or took for something near, with counts
     tolerated: tuple[str, ...] = ()
 
     def ratio(self, figure: str) -> float | None:
@@ -51,7 +41,7 @@ class TrafficComparison:
     def to_dict(self) -> dict[str, Any]:
         sides = {
             name: {
-                "figures": run.figures.to_dict(),
+                "figures": asdict(run.figures),
                 "locks_s": run.locks_s,
                 "edge_minutes": {
                     key: run.edge_minutes[key].tolist() for key in EDGE_MINUTE.names or ()

@@ -7,18 +7,19 @@ for everything else. Definitions stand with the fields of `TrafficFigures`.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.math.neighbors import make_grid
+from cavmarl.driving.kernels.contacts import find_contacts
 from cavmarl.evaluate.traffic.junction_locks import JunctionLocks
-from cavmarl.evaluate.traffic.touching import TouchCounter
 from cavmarl.roads.network import RoadNetwork
 
 STANDING_MPS = 0.1  # slower is standing, as in SUMO's waiting time
 SAMPLES_PER_S = 1
 MINUTE_S = 60
+CELL_M = 10.0  # of the grid in which vehicles that touch are looked for
 
 EDGE_MINUTE = np.dtype(
     [
@@ -35,78 +36,73 @@ EDGE_MINUTE = np.dtype(
 
 @dataclass(frozen=True)
 class TrafficCounts:
-    """What only the simulator itself can count, from the beginning to the end.
+    """What only the simulator itself can count, from the beginning to the end."""
 
-    Attributes:
-        departed: vehicles that have entered.
-        waiting: vehicles whose time to depart has come and that have not entered.
-        arrived: vehicles that reached the end of their trip.
-        mean_delay_s: over the arrived ones, time above that of the same way at the speed which the
-            driver wants there; None where none arrived.
-        teleports: vehicles that were put elsewhere because they stood for too long.
-    """
-
-    departed: int
-    waiting: int
-    arrived: int
+    departed: int  # vehicles that have entered
+    waiting: int  # vehicles whose time to depart has come and that have not entered
+    arrived: int  # vehicles that reached the end of their trip
+    # over the arrived ones, time above that of the same way at the speed which the driver wants
+    # there; None where none arrived
     mean_delay_s: float | None
-    teleports: int = 0
+    teleports: int = 0  # vehicles that were put elsewhere because they stood for too long
 
 
 @dataclass(frozen=True)
 class TrafficFigures:
-    """One simulator's row of the table.
+    """One simulator's row of the table."""
 
-    Attributes:
-        departed: see `TrafficCounts`.
-        waiting: see `TrafficCounts`.
-        arrived: see `TrafficCounts`.
-        mean_delay_s: see `TrafficCounts`.
-        teleports: see `TrafficCounts`.
-        mean_speed_mps: over all vehicles of all samples; None where there was none.
-        queue: vehicles that stand (below 0.1 m/s) on lanes that end at a signal, mean of the
-            samples.
-        contacts: pairs of vehicles whose rectangles began to overlap on the same level.
-        longest_lock_s: the longest lock of any junction, see `JunctionLocks`.
-        locked_junction: whose that was; empty where no junction was ever locked.
-    """
-
-    departed: int
-    waiting: int
-    arrived: int
-    mean_speed_mps: float | None
-    mean_delay_s: float | None
+    departed: int  # see `TrafficCounts`
+    waiting: int  # see `TrafficCounts`
+    arrived: int  # see `TrafficCounts`
+    mean_speed_mps: float | None  # over all vehicles of all samples; None where there was none
+    mean_delay_s: float | None  # see `TrafficCounts`
+    # vehicles that stand (below 0.1 m/s) on lanes that end at a signal, mean of the samples
     queue: float
-    contacts: int
-    longest_lock_s: float
-    locked_junction: str
-    teleports: int
-
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
+    contacts: int  # pairs of vehicles whose rectangles began to overlap on the same level
+    longest_lock_s: float  # the longest lock of any junction, see `JunctionLocks`
+    locked_junction: str  # whose that was; empty where no junction was ever locked
+    teleports: int  # see `TrafficCounts`
 
 
 @dataclass(frozen=True)
 class TrafficRun:
-    """What came out of one run.
+    """What came out of one run."""
 
-    Attributes:
-        figures: the row of the table.
-        locks_s: junction → its longest lock in seconds, of those that had one.
-        edge_minutes: EDGE_MINUTE rows of all edges and minutes with a vehicle.
+    figures: TrafficFigures  # the row of the table
+    locks_s: dict[str, float]  # junction → its longest lock in seconds, of those that had one
+    edge_minutes: NDArray[np.void]  # EDGE_MINUTE rows of all edges and minutes with a vehicle
+
+
+class TouchCounter:
+    """Counts the pairs that began to touch, tick by tick, on a map of these bounds (m).
+
+    Of several that touch one vehicle at once, only its pair with the lowest id counts.
     """
 
-    figures: TrafficFigures
-    locks_s: dict[str, float]
-    edge_minutes: NDArray[np.void]
+    def __init__(self, bounds: tuple[float, float, float, float]) -> None:
+        self.count = 0  # pairs so far; one that parts and touches again counts again
+        self._bounds = bounds
+        self._make_room(0)
+        self._touching: set[tuple[int, int]] = set()
+
+    def see(self, rows: NDArray[np.void]) -> None:
+        """Look at VEHICLE (num_vehicles,) of the next tick."""
+        if len(rows) > len(self._hit):
+            self._make_room(2 * len(rows))
+        find_contacts(rows, len(rows), self._grid, self._hit)
+        hitting = np.flatnonzero(self._hit[: len(rows)] >= 0)
+        ids, others = rows["id"][hitting].tolist(), self._hit[hitting].tolist()
+        touching = {(min(pair), max(pair)) for pair in zip(ids, others, strict=True)}
+        self.count += len(touching - self._touching)
+        self._touching = touching
+
+    def _make_room(self, capacity: int) -> None:
+        self._grid = make_grid(self._bounds, CELL_M, capacity)
+        self._hit = np.zeros(capacity, dtype=np.int64)
 
 
 class TrafficMeter:
-    """Measures one world on one map.
-
-    Args:
-        network: the map that the vehicles' `lane` speaks of.
-    """
+    """Measures one world on one map."""
 
     def __init__(self, network: RoadNetwork) -> None:
         self._network = network
@@ -123,11 +119,7 @@ class TrafficMeter:
         self._metres: list[NDArray[np.float64]] = []
 
     def see(self, rows: NDArray[np.void]) -> None:
-        """Look for contacts after a tick.
-
-        Args:
-            rows: VEHICLE (num_vehicles,).
-        """
+        """Look for contacts of VEHICLE (num_vehicles,) after a tick."""
         self._touches.see(rows)
 
     def sample(self, rows: NDArray[np.void], codes: NDArray[np.uint8]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,16 +18,7 @@ COLORS = {"SUMO": "#d1793b", "cavmarl": "#2f6db5"}
 
 
 def plot_fundamental_diagram(found: TrafficComparison, path: Path) -> None:
-    """Write flow and speed over density; a point is an edge of 50 m or more in a minute.
-
-    Args:
-        found: both runs.
-        path: a picture; its ending says of which kind (.png, .svg, .pdf).
-
-    Raises:
-        ConfigError: the picture cannot be written.
-        MissingExtraError: matplotlib is not installed.
-    """
+    """Write flow and speed over density; a point is an edge of 50 m or more in a minute."""
     figure = require("matplotlib.figure", "report").Figure(
         figsize=(10.0, 4.2), layout="constrained"
     )
@@ -49,6 +41,10 @@ def plot_fundamental_diagram(found: TrafficComparison, path: Path) -> None:
         axes.legend(frameon=False)
     edges = f"each edge of {LEAST_EDGE_M:g} m or more, each minute"
     figure.suptitle(f"{found.map_name}, {found.seconds} s, step {found.dt_s:g} s: {edges}")
+    save_figure(figure, path)
+
+
+def save_figure(figure: Any, path: Path) -> None:
     try:
         figure.savefig(path, dpi=150)
     except (OSError, ValueError) as error:
