@@ -49,17 +49,12 @@ class Balancer:
 
     def round(
         self,
-        snapshot: LoadSnapshot,
+        snapshot: LoadSnapshot,  # of the workers that there are now
         *,
-        costs: tuple[ShardCost, ...] | None = None,
-        rule: BalanceRule | None = None,
+        costs: tuple[ShardCost, ...] | None = None,  # to go by; default: the measured ones
+        rule: BalanceRule | None = None,  # default: that of the present plan
     ) -> Plan:
         """Move what has to be moved, and a few shards more if that is worth it.
-
-        Args:
-            snapshot: of the workers that there are now.
-            costs: to go by; default: the measured ones.
-            rule: default: that of the present plan.
 
         Raises:
             NoAdmissibleWorkerError: a worker is lost, and all others are excluded.

@@ -47,9 +47,6 @@ class Watch:
     other workers and this process have used there: what a run computes for itself is no reason to
     take shards away. RAM is the machine's, and GPU that of its busiest one by `nvidia-smi`;
     without that it is 0 and `gpu_source` is `none`.
-
-    Args:
-        workers: number → process id, as for `take_snapshot`.
     """
 
     def __init__(self, workers: Mapping[int, int | None]) -> None:

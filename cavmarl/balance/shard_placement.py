@@ -24,11 +24,6 @@ MIN_SPEED = 0.01  # of a worker that has nothing left: it is slow, not endless
 class Workers:
     """The workers that answer, in the order of their numbers.
 
-    Args:
-        candidates: them.
-        rejections: why some of them are given nothing more.
-        weights: of the score.
-
     Attributes:
         numbers: of the workers.
         scores: their LoadScores.
@@ -38,9 +33,9 @@ class Workers:
 
     def __init__(
         self,
-        candidates: Sequence[Candidate],
-        rejections: Sequence[Rejection],
-        weights: tuple[float, float, float],
+        candidates: Sequence[Candidate],  # them
+        rejections: Sequence[Rejection],  # why some of them are given nothing more
+        weights: tuple[float, float, float],  # of the score
     ) -> None:
         self.numbers = tuple(candidate.worker for candidate in candidates)
         self.scores = tuple(load_score(candidate.use, weights) for candidate in candidates)

@@ -17,11 +17,7 @@ T = TypeVar("T")
 
 
 class Registry(Generic[T]):
-    """Entries of one kind by name, in the order in which they were registered.
-
-    Args:
-        kind: names it in messages.
-    """
+    """Entries of one kind by name, in the order in which they were registered."""
 
     def __init__(self, kind: str) -> None:
         self._kind = kind
@@ -84,9 +80,6 @@ REGISTERED_MODELS: Registry[int] = Registry("driver_model")
 
 def extension_modules(names: Iterable[str]) -> list[str]:
     """The modules that other processes have to import, in the order of registration.
-
-    Args:
-        names: that the configuration uses.
 
     Raises:
         ConfigError: one was registered in the program itself, which no worker can import.

@@ -63,13 +63,7 @@ def agent_view(
 
 
 class RegisteredFunction:
-    """Calls a function from outside and checks what it answers.
-
-    Args:
-        name: of the term or the sensor, in messages.
-        function: of a view; its answer has `size` numbers.
-        size: how many.
-    """
+    """Calls a function from outside and checks what it answers."""
 
     def __init__(self, name: str, function: Callable[[AgentView], Any], size: int) -> None:
         self._name = name

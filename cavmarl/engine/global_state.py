@@ -19,11 +19,6 @@ def global_state(
 
     x and y go from -1 to 1 over the map's extent, speed is over 40 m/s; places without a vehicle
     are 0.
-
-    Args:
-        network: the roads.
-        vehicles: live VEHICLE records, in any order.
-        space: `spaces.state_space` of the environment.
     """
     state = np.zeros((space.shape[0] // STATE_FEATURES, STATE_FEATURES), dtype=np.float32)
     rows = vehicles[np.argsort(vehicles["id"])]

@@ -19,9 +19,6 @@ from cavmarl.shards.shard import Commands
 class MountedSensors:
     """The rig of an environment; see `Attached`.
 
-    Args:
-        host: what it is attached to.
-
     Attributes:
         rig: all of its sensors.
         platform: what the sensors are mounted on.

@@ -18,11 +18,6 @@ class Cues:
     """Looks at the agents of all zones at the beginning of each tick; `Attached` to the worlds.
 
     Which cues have come is among what all shards have in common, `Worlds.cues`.
-
-    Args:
-        cues: CUE (T,) of the scene.
-        shards: one a zone.
-        division: all of them together.
     """
 
     def __init__(self, cues: NDArray[np.void], shards: Sequence[Shard], division: Division) -> None:

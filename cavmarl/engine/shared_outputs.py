@@ -19,13 +19,6 @@ from cavmarl.shards.agent_outputs import make_outputs
 class SharedOutputs:
     """What all shards of W worlds share, and the steps that are taken once for all of them.
 
-    Args:
-        config: the environment.
-        network: the roads of the whole map.
-        num_worlds: W.
-        observations: (W, A, D) where the agents' are written; None: made for them.
-        zeros: makes all other outputs.
-
     Attributes:
         outputs: of all agents; every shard writes at the indices of its own ones.
     """
@@ -33,10 +26,11 @@ class SharedOutputs:
     def __init__(
         self,
         config: EnvConfig,
-        network: RoadNetwork,
-        num_worlds: int,
+        network: RoadNetwork,  # the roads of the whole map
+        num_worlds: int,  # W
+        # (W, A, D) where the agents' are written; None: made for them
         observations: NDArray[np.float32] | None = None,
-        zeros: Zeros = huge_zeros,
+        zeros: Zeros = huge_zeros,  # makes all other outputs
     ) -> None:
         self.outputs = make_outputs(config, num_worlds, observations, zeros)
         self._roads = network.arrays
@@ -48,11 +42,7 @@ class SharedOutputs:
         self._settle_outputs = repeated(settle_outputs)
 
     def switch_signals(self, worlds: Worlds) -> None:
-        """Bring the signals to the present tick, after `detect` of all shards.
-
-        Args:
-            worlds: of any shard; the arrays of signals are those of all.
-        """
+        """Bring the signals to the present tick, after `detect` of all shards."""
         if self._roads.signals.size > 0:
             self._switch_signals(
                 self._roads,

@@ -59,19 +59,6 @@ KEPT_BY_GATE = (
 class Simulation(WorldViews):
     """W worlds of one environment on one map.
 
-    Args:
-        config: the environment.
-        network: its roads.
-        num_worlds: W.
-        demand: whose vehicles drive beside the generator's; of a file, or SUMO's.
-        partition: the zones; None: cut as `config.zones` says.
-        observations: (W, A, D) float32, where the agents' are written; None: made for them.
-        frames: where the samples of their rigs are written; None: made for them.
-        warm: call every kernel now, so that none is loaded in a step.
-        zeros: makes the arrays that shards write.
-        like: worlds of the same environment, whose tables are used; None: they are made.
-        runs: what coordinators are to go by, one a world; None: as `config.zones` says.
-
     Attributes:
         everywhere: (W,) all of the worlds.
         frames: what the rigs of the agents have sensed; arrays that the next step overwrites.
@@ -81,15 +68,20 @@ class Simulation(WorldViews):
         self,
         config: EnvConfig,
         network: RoadNetwork,
-        num_worlds: int = 1,
+        num_worlds: int = 1,  # W
+        # whose vehicles drive beside the generator's; of a file, or SUMO's
         demand: DemandFile | SumoDemand | None = None,
-        partition: ZonePartition | None = None,
+        partition: ZonePartition | None = None,  # the zones; None: cut as `config.zones` says
         *,
+        # (W, A, D) float32, where the agents' are written; None: made for them
         observations: NDArray[np.float32] | None = None,
+        # where the samples of their rigs are written; None: made for them
         frames: Frames | None = None,
-        warm: bool = False,
-        zeros: Zeros = huge_zeros,
+        warm: bool = False,  # call every kernel now, so that none is loaded in a step
+        zeros: Zeros = huge_zeros,  # makes the arrays that shards write
+        # worlds of the same environment, whose tables are used; None: they are made
         like: Simulation | None = None,
+        # what coordinators are to go by, one a world; None: as `config.zones` says
         runs: Sequence[WorldRun] | None = None,
     ) -> None:
         self.config = config
@@ -206,12 +198,7 @@ class Simulation(WorldViews):
         self._episodes[:] = 0
 
     def seed(self, seed: int, first_world: int = 0) -> None:
-        """Set the root of all random numbers; the next reset of each world is its first episode.
-
-        Args:
-            seed: the root.
-            first_world: number of the first of these worlds among all worlds of the seed.
-        """
+        """Set the root of all random numbers; the next reset of each world is its first episode."""
         self._seed = seed
         self._first_world = first_world
         self._episodes[:] = 0
@@ -287,11 +274,6 @@ class Simulation(WorldViews):
     def run_tick(self, commands: Commands, is_first: bool, is_last: bool) -> None:
         """One tick of a step, begun again as often as it takes where hosts may die.
 
-        Args:
-            commands: of the agents, the same in all ticks of a step.
-            is_first: whether it begins the step.
-            is_last: whether it ends it.
-
         Raises:
             LostTickError: every host of a zone, or every coordinator, died of it.
         """
@@ -341,14 +323,11 @@ class Simulation(WorldViews):
 
     def host(
         self,
+        # called with the shards, and with what the phase `gather` is called with
         make: Callable[[Sequence[Shard], tuple[float, float]], Together],
-        gathers: bool = True,
+        gathers: bool = True,  # whether that phase is his, too
     ) -> None:
         """From now on let others run the phases of the shards, as `make` returns them.
-
-        Args:
-            make: called with the shards, and with what the phase `gather` is called with.
-            gathers: whether that phase is his, too.
 
         Raises:
             ConfigError: zones become others, and the caller would not be told.
@@ -358,9 +337,6 @@ class Simulation(WorldViews):
 
     def time_shards(self, every: int = 1) -> ShardClock:
         """From now on run phases zone by zone, with a clock on each.
-
-        Args:
-            every: one tick of so many; the others as ever.
 
         Raises:
             ConfigError: hosts die by plan, and what is repeated would be counted, too.
@@ -418,11 +394,7 @@ class Simulation(WorldViews):
         return [roots, episodes, *snapshot.share_of(self._parts(), world)]
 
     def join(self, shares: Sequence[Sequence[NDArray[Any]]]) -> list[NDArray[Any]]:
-        """What `load` takes, of worlds of which each share has been one by itself.
-
-        Args:
-            shares: what `share_of` gave, of worlds that follow each other.
-        """
+        """What `load` takes, of worlds of which each share has been one by itself."""
         episodes = np.concatenate([share[1] for share in shares])
         return [
             shares[0][0], episodes, *snapshot.join(self._parts(), [share[2:] for share in shares])

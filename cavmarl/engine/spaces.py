@@ -96,17 +96,11 @@ def _feature_box(
 
 @dataclass(frozen=True)
 class ObservationPart:
-    """One sensor's part of an observation.
+    """One sensor's part of an observation."""
 
-    Attributes:
-        place: where its features lie in each frame of a flat observation.
-        shape: in a Dict observation; the frames of a stack are its first axis.
-        dtype: in a Dict observation.
-    """
-
-    place: slice
-    shape: tuple[int, ...]
-    dtype: DTypeLike
+    place: slice  # where its features lie in each frame of a flat observation
+    shape: tuple[int, ...]  # in a Dict observation; the frames of a stack are its first axis
+    dtype: DTypeLike  # in a Dict observation
 
 
 def observation_parts(config: SensorsConfig) -> dict[str, ObservationPart]:

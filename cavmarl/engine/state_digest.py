@@ -11,12 +11,7 @@ from cavmarl.engine.world_snapshot import Parts
 
 
 def digest_world(parts: Parts, world: int) -> str:
-    """Hex digest of one world; see `Simulation.state_hash`.
-
-    Args:
-        parts: the parts that keep the state of the worlds.
-        world: which one.
-    """
+    """Hex digest of one world; see `Simulation.state_hash`."""
     worlds, gate, rerouting = parts.worlds, parts.gate, parts.traffic.rerouting
     sumo = parts.sumo
     rows = parts.division.vehicles(world)

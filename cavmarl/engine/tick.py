@@ -25,21 +25,8 @@ from cavmarl.traffic.sumo.sumo_traffic import SumoTraffic
 class Tick:
     """The phases of a tick in their order, and the parts whose calls they are.
 
-    Args:
-        shards: one a zone.
-        division: of all shards.
-        traffic: what comes.
-        commons: what all shards share.
-        gate: through which vehicles come and go.
-        attached: what acts in each tick beside the traffic.
-
     Attributes:
-        shards: one a zone.
-        division: of all shards.
-        traffic: what comes.
-        commons: what all shards share.
         gate: through which vehicles come and go; a reset may replace it.
-        attached: what acts in each tick beside the traffic.
         executor: runs the phases of the shards, wherever they are hosted.
         coordination: decides ownership; None: all is one zone.
         sumo: beside these worlds; None: there is none.
@@ -48,12 +35,12 @@ class Tick:
 
     def __init__(
         self,
-        shards: Sequence[Shard],
-        division: Division,
-        traffic: NativeTraffic,
-        commons: SharedOutputs,
-        gate: Gate,
-        attached: tuple[Attached, ...],
+        shards: Sequence[Shard],  # one a zone
+        division: Division,  # of all shards
+        traffic: NativeTraffic,  # what comes
+        commons: SharedOutputs,  # what all shards share
+        gate: Gate,  # through which vehicles come and go
+        attached: tuple[Attached, ...],  # what acts in each tick beside the traffic
     ) -> None:
         self.shards = shards
         self.division = division
@@ -76,13 +63,7 @@ class Tick:
         self._occasions = repeated(occasions)
 
     def run(self, commands: Commands, is_first: bool, is_last: bool) -> None:
-        """Begin → attached → begin the step → advance … signals → attached → sense → end.
-
-        Args:
-            commands: of the agents, the same in all ticks of a step.
-            is_first: whether it begins the step.
-            is_last: whether it ends it.
-        """
+        """Begin → attached → begin the step → advance … signals → attached → sense → end."""
         if self.coordination is not None:
             self.coordination.begin(commands)
         for part in self.attached:
@@ -186,11 +167,7 @@ class Tick:
             self.let_in(all_phases=self.hosts_may_die)
 
     def let_in(self, all_phases: bool) -> None:
-        """Rank → assign → propose, and if any departure has found a gap, accept → admit.
-
-        Args:
-            all_phases: go through the last two in any case.
-        """
+        """Rank → assign → propose, and if any departure has found a gap, accept → admit."""
         traffic, gate, worlds = self.traffic, self.gate, self._shard.worlds
         self.executor.each("rank_lanes", gate)
         traffic.assign_lanes(gate, worlds)
@@ -242,15 +219,11 @@ class Tick:
 
     def host(
         self,
+        # called with the shards, and with what the phase `gather` is called with
         make: Callable[[Sequence[Shard], tuple[float, float]], Together],
-        gathers: bool,
+        gathers: bool,  # whether that phase is his, too
     ) -> None:
-        """From now on let others run the phases of the shards, as `make` returns them.
-
-        Args:
-            make: called with the shards, and with what the phase `gather` is called with.
-            gathers: whether that phase is his, too.
-        """
+        """From now on let others run the phases of the shards, as `make` returns them."""
         team = make(self.shards, self.division.gathering)
         self.executor, self._meet = team, team.meet
         self._gathers = gathers and self.division.let_gather(team)

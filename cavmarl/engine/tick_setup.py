@@ -26,24 +26,14 @@ def make_tick(
     config: EnvConfig,
     network: RoadNetwork,
     partition: ZonePartition,
-    demand: DemandFile | SumoDemand | None,
-    commons: SharedOutputs,
-    frames: Frames,
-    zeros: Zeros,
+    demand: DemandFile | SumoDemand | None,  # of files, or SUMO's, beside the generator's
+    commons: SharedOutputs,  # what all zones of a world share
+    frames: Frames,  # of the mounted sensors
+    zeros: Zeros,  # where large arrays lie
+    # of other worlds of the same environment, as many as these; None: it is made
     traffic: NativeTraffic | None,
 ) -> Tick:
-    """The phases of a tick, over shards that are made here.
-
-    Args:
-        config: of the environment.
-        network: its roads.
-        partition: its zones.
-        demand: of files, or SUMO's, beside the generator's.
-        commons: what all zones of a world share.
-        frames: of the mounted sensors.
-        zeros: where large arrays lie.
-        traffic: of other worlds of the same environment, as many as these; None: it is made.
-    """
+    """The phases of a tick, over shards that are made here."""
     num_worlds = commons.outputs.present.shape[0]
     blank = blank_vehicle()
     if traffic is None:

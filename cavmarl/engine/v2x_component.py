@@ -20,12 +20,6 @@ class Messaging:
     """Lets the stations of W worlds send and receive at the end of each tick; an `Attached`.
 
     What is received in a tick is in the inboxes when agents sense, at its end.
-
-    Args:
-        host: what it is attached to.
-
-    Attributes:
-        bus: the messages.
     """
 
     def __init__(self, host: ComponentContext) -> None:

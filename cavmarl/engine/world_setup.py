@@ -35,17 +35,11 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 
 
 class World(NamedTuple):
-    """What a world is made of.
-
-    Attributes:
-        config: the environment.
-        network: its roads.
-        demand: whose vehicles drive beside the generator's; of a file, or SUMO's.
-        partition: its zones.
-    """
+    """What a world is made of."""
 
     config: EnvConfig
     network: RoadNetwork
+    # whose vehicles drive beside the generator's; of a file, or SUMO's
     demand: DemandFile | SumoDemand | None
     partition: ZonePartition
 
@@ -90,10 +84,6 @@ def load_world(
 def make_world(config: EnvConfig, base_dir: Path) -> World:
     """What a configuration describes.
 
-    Args:
-        config: of the environment.
-        base_dir: the folder that relative files start from.
-
     Raises:
         CavmarlError: as of `load_world`.
     """
@@ -115,10 +105,6 @@ def make_world(config: EnvConfig, base_dir: Path) -> World:
 def load_roads(config: EnvConfig, base_dir: Path) -> RoadNetwork:
     """The roads of a configuration, with the buildings and the signal programs that it names.
 
-    Args:
-        config: of the environment.
-        base_dir: the folder that relative files start from.
-
     Raises:
         MapError: the map or a file of buildings or programs cannot be read, or they do not fit.
     """
@@ -131,11 +117,6 @@ def load_roads(config: EnvConfig, base_dir: Path) -> RoadNetwork:
 
 def load_zones(config: EnvConfig, base_dir: Path, network: RoadNetwork) -> ZonePartition:
     """The zones of a configuration.
-
-    Args:
-        config: of the environment.
-        base_dir: the folder that relative files start from.
-        network: its roads.
 
     Raises:
         ConfigError: a zone file that cannot be read, or more zones than the map can hold; a zone

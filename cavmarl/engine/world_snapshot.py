@@ -28,29 +28,17 @@ _OF_GATE = ("next_order", "num_queue", "next_id", "num_entered", "counts", "sums
 
 
 class Parts(NamedTuple):
-    """The parts that keep the state of W worlds.
+    """The parts that keep the state of W worlds."""
 
-    Attributes:
-        worlds: of the first shard.
-        division: of all shards.
-        gate: through which vehicles come and go.
-        traffic: what comes.
-        outputs: what agents have got; the frames of the next observation, too.
-        coordination: decides ownership; None: all is one zone.
-        has_frames: an observation has frames of the ones before.
-        attached: what acts in each tick beside the traffic.
-        sumo: beside the worlds; None: there is none.
-    """
-
-    worlds: Worlds
-    division: Division
-    gate: Gate
-    traffic: NativeTraffic
-    outputs: Outputs
-    coordination: Coordinators | None
-    has_frames: bool
-    attached: tuple[Attached, ...]
-    sumo: SumoTraffic | None
+    worlds: Worlds  # of the first shard
+    division: Division  # of all shards
+    gate: Gate  # through which vehicles come and go
+    traffic: NativeTraffic  # what comes
+    outputs: Outputs  # what agents have got; the frames of the next observation, too
+    coordination: Coordinators | None  # decides ownership; None: all is one zone
+    has_frames: bool  # an observation has frames of the ones before
+    attached: tuple[Attached, ...]  # what acts in each tick beside the traffic
+    sumo: SumoTraffic | None  # beside the worlds; None: there is none
 
 
 def save(parts: Parts) -> list[Array]:
@@ -72,10 +60,6 @@ def save(parts: Parts) -> list[Array]:
 
 def load(parts: Parts, saved: Sequence[Array]) -> Gate:
     """Put everything in its place.
-
-    Args:
-        parts: of worlds of the same environment, as many as there were.
-        saved: what `save` gave.
 
     Returns:
         the gate, or a larger one.
@@ -123,12 +107,7 @@ def share_of(parts: Parts, w: int) -> list[Array]:
 
 
 def join(parts: Parts, shares: Sequence[Sequence[Array]]) -> list[Array]:
-    """What `save` would give of worlds of which each share has been one.
-
-    Args:
-        parts: of as many worlds.
-        shares: what `share_of` gave, in the order in which the worlds are to be.
-    """
+    """What `save` would give of worlds of which each share has been one."""
     zones, rerouting = parts.division.count, parts.traffic.rerouting
     if parts.sumo is not None:
         shares = [_shifted(parts, parts.sumo, share, w) for w, share in enumerate(shares)]

@@ -31,19 +31,12 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 
 
 class WorldViews:
-    """Read access to W worlds that run; `Simulation` makes and steps them.
-
-    Attributes:
-        config: of the environment.
-        network: its roads.
-        num_worlds: W.
-        partition: the zones.
-    """
+    """Read access to W worlds that run; `Simulation` makes and steps them."""
 
     config: EnvConfig
     network: RoadNetwork
-    num_worlds: int
-    partition: ZonePartition
+    num_worlds: int  # W
+    partition: ZonePartition  # the zones
     _shards: Sequence[Shard]
     _tick: Tick
     _recovery: Recovery | None
@@ -88,9 +81,6 @@ class WorldViews:
 
     def listen(self, config: EnvConfig) -> tuple[Bus, Callable[[], None]]:
         """A bus beside the world, for tools that measure: stations in the world do not hear of it.
-
-        Args:
-            config: whose `v2x` it is of.
 
         Returns:
             the bus, and what lets it send and receive in the present tick.

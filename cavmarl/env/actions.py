@@ -19,12 +19,6 @@ from cavmarl.shards.shard import Commands
 class ActionDecoder:
     """Checks and decodes the actions of W worlds with A agents each.
 
-    Args:
-        config: what an agent can do.
-        num_worlds: W.
-        agents: the A agent ids.
-        commands: where decoded actions are written, over those of the step before; None: made.
-
     Attributes:
         clipped: (W,) values beyond ±1 that were clipped in this episode (`out_of_range = clip`).
         held: (W,) missing actions that were replaced by the last one (`missing_action = hold`).
@@ -33,9 +27,10 @@ class ActionDecoder:
 
     def __init__(
         self,
-        config: ActionConfig,
-        num_worlds: int,
-        agents: Sequence[str],
+        config: ActionConfig,  # what an agent can do
+        num_worlds: int,  # W
+        agents: Sequence[str],  # the A agent ids
+        # where decoded actions are written, over those of the step before; None: made
         commands: Commands | None = None,
     ) -> None:
         self._config = config
@@ -95,11 +90,6 @@ class ActionDecoder:
         self, actions: Mapping[str, Any], live: Sequence[str], needed: Sequence[str]
     ) -> Commands:
         """Decode the actions of one world; those of live agents without a vehicle are not read.
-
-        Args:
-            actions: by agent id.
-            live: ids in the episode.
-            needed: those of them that have a vehicle and must act.
 
         Raises:
             ActionError: an id that never was, or has left (unless `late_actions = ignore`); a

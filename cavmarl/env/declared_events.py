@@ -13,12 +13,7 @@ from cavmarl.v2x.v2x_messages import cause_code
 
 
 class DeclaredEvents:
-    """At most one event an agent and step; a later one takes the place of an earlier one.
-
-    Args:
-        config: the environment.
-        num_worlds: W.
-    """
+    """At most one event an agent and step; a later one takes the place of an earlier one."""
 
     def __init__(self, config: EnvConfig, num_worlds: int) -> None:
         self._enabled = config.v2x.enabled

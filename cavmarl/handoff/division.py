@@ -34,17 +34,11 @@ from cavmarl.zones.visibility import Visibility
 
 
 class ZoneLoads(NamedTuple):
-    """What the zones of W worlds hold.
+    """What the zones of W worlds hold."""
 
-    Attributes:
-        owned: (k, W) vehicles.
-        ghosts: (k, W) copies of other zones' vehicles.
-        halo_m: how far zones see over their borders.
-    """
-
-    owned: NDArray[np.int64]
-    ghosts: NDArray[np.int64]
-    halo_m: float
+    owned: NDArray[np.int64]  # (k, W) vehicles
+    ghosts: NDArray[np.int64]  # (k, W) copies of other zones' vehicles
+    halo_m: float  # how far zones see over their borders
 
     def imbalance(self) -> NDArray[np.float64]:
         """(W,) maximum over mean of the vehicles that zones own."""
@@ -54,37 +48,23 @@ class ZoneLoads(NamedTuple):
 class Division:
     """Which zones own and see which vehicles.
 
-    Args:
-        shards: one a zone, in the order of zones.
-        zoned: their rows.
-        zones: of the partition.
-        halo: what each zone sees over its borders.
-        sight: what says so for other zones.
-        touching_m: no ghost further outside of a zone can touch one of its vehicles.
-        borders: when a vehicle is near one.
-        codec: of vehicles' states.
-
     Attributes:
-        zones: of the partition.
-        borders: when a vehicle is near one.
-        codec: of vehicles' states.
         book: vehicles near a border.
         gathering: what shards are called with that `gather` their ghosts: how far outside of a zone
             a ghost can be that touches a vehicle in it, and how far inside one is at a border, m.
         call_hand_over: the kernel, with the types of all worlds' arrays found out once.
-        call_release: the same.
     """
 
     def __init__(
         self,
-        shards: Sequence[Shard],
-        zoned: Zoned,
+        shards: Sequence[Shard],  # one a zone, in the order of zones
+        zoned: Zoned,  # their rows
         zones: ZoneArrays,
-        halo: Halo,
-        sight: Visibility,
-        touching_m: float,
-        borders: Borders,
-        codec: TransferCodec,
+        halo: Halo,  # what each zone sees over its borders
+        sight: Visibility,  # what says so for other zones
+        touching_m: float,  # no ghost further outside of a zone can touch one of its vehicles
+        borders: Borders,  # when a vehicle is near one
+        codec: TransferCodec,  # of vehicles' states
     ) -> None:
         self.zones = zones
         self.borders = borders
@@ -139,9 +119,6 @@ class Division:
         """Divide the plane otherwise, between two ticks: owners stay, ghosts are those of now.
 
         A vehicle in another zone than its owner's changes its owner as at any border.
-
-        Args:
-            partition: as many zones as before.
         """
         zones, halo = partition.arrays, self._sight.halo(partition)
         self.zones, self._halo, self._rects = zones, halo, zones.rects.tolist()
@@ -254,12 +231,7 @@ class Division:
             shard.align()
 
     def near(self, w: int, everybody: bool) -> list[Near]:
-        """Vehicles of a world near a border, by its committed rows.
-
-        Args:
-            w: which world.
-            everybody: look at all of them: rows have changed since the ghosts were renewed.
-        """
+        """Vehicles of a world near a border, by its committed rows."""
         if everybody:
             self._look(self.zones, self.borders, self._zoned, self.side, w, True, 0, self.book)
         num = self.book.num_near.item(w)

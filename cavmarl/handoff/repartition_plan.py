@@ -25,19 +25,12 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Proposal:
-    """A partition by measured cost.
+    """A partition by measured cost."""
 
-    Attributes:
-        partition: as many zones as before.
-        before: maximum over mean of the zones' costs as they are.
-        after: the same as they would be.
-        moved: vehicles that would be in a zone of another number.
-    """
-
-    partition: ZonePartition
-    before: float
-    after: float
-    moved: int
+    partition: ZonePartition  # as many zones as before
+    before: float  # maximum over mean of the zones' costs as they are
+    after: float  # the same as they would be
+    moved: int  # vehicles that would be in a zone of another number
 
 
 def vehicle_costs(zones: NDArray[np.int32], costs_s: Sequence[float]) -> Floats:
@@ -54,20 +47,13 @@ def vehicle_costs(zones: NDArray[np.int32], costs_s: Sequence[float]) -> Floats:
 
 def propose_zones(
     network: RoadNetwork,
-    partition: ZonePartition,
-    positions: Floats,
-    costs_s: Sequence[float],
+    partition: ZonePartition,  # its zones now
+    positions: Floats,  # (n, 2) x and y of vehicles in m
+    costs_s: Sequence[float],  # measured, of each zone, seconds a tick
     *,
-    tolerance: float = 0.1,
+    tolerance: float = 0.1,  # by which share of the mean the costliest zone has to become cheaper
 ) -> Proposal | None:
     """Zones of about the same cost; None where they would gain no more than the tolerance.
-
-    Args:
-        network: the map.
-        partition: its zones now.
-        positions: (n, 2) x and y of vehicles in m.
-        costs_s: measured, of each zone, seconds a tick.
-        tolerance: by which share of the mean the costliest zone has to become cheaper.
 
     Raises:
         ConfigError: not one cost a zone, or one that is none.
@@ -101,13 +87,7 @@ def propose_zones(
 def _renumbered(
     partition: ZonePartition, before: NDArray[np.int32], after: NDArray[np.int32]
 ) -> ZonePartition:
-    """The same zones, numbered so that many vehicles stay in the zone that they were in.
-
-    Args:
-        partition: the proposed one.
-        before: zone of each vehicle as it is.
-        after: zone of each vehicle in the proposed one.
-    """
+    """The same zones, numbered so that many vehicles stay in the zone that they were in."""
     count = partition.count
     common = np.bincount(before * count + after, minlength=count * count).reshape(count, count)
     order = np.empty(count, dtype=np.int64)

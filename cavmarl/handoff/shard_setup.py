@@ -32,21 +32,12 @@ def divide(
     config: EnvConfig,
     network: RoadNetwork,
     partition: ZonePartition,
-    traffic: NativeTraffic,
-    outputs: Outputs,
-    num_worlds: int,
-    zeros: Zeros = huge_zeros,
+    traffic: NativeTraffic,  # departures and routes
+    outputs: Outputs,  # where all agents get what they sense
+    num_worlds: int,  # how many worlds are stepped together
+    zeros: Zeros = huge_zeros,  # makes the arrays that shards write
 ) -> tuple[list[Shard], Division]:
     """One shard a zone, and the division that knows them all.
-
-    Args:
-        config: the environment.
-        network: its roads.
-        partition: its zones.
-        traffic: departures and routes.
-        outputs: where all agents get what they sense.
-        num_worlds: how many worlds are stepped together.
-        zeros: makes the arrays that shards write.
 
     Raises:
         ConfigError: `zones.halo_m` is less than exactness needs.

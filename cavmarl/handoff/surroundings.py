@@ -12,10 +12,6 @@ from cavmarl.handoff.division import Division
 class NearBorders:
     """Vehicles near a border when the tick began, and those that have crossed one.
 
-    Args:
-        division: of all worlds.
-        world: which one.
-
     Attributes:
         near: of the tick that is on its way; to be set.
         places: vehicle that has changed its owner in it → the row that it had there; to be set.

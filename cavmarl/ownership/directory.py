@@ -165,19 +165,14 @@ class Directory:
 
     def begin(
         self,
+        # (vehicle, zone that contains it) for the vehicles outside their owner's zone by more than
+        # the hysteresis, and for no others
         movers: Iterable[tuple[int, int]],
         births: Iterable[Birth] = (),
-        inputs: bytes = b"",
-        payloads: Mapping[int, bytes] | None = None,
+        inputs: bytes = b"",  # digest of the actions
+        payloads: Mapping[int, bytes] | None = None,  # zone → what rides with its STEP
     ) -> Output:
         """Decide the way to the next tick: BEGIN, then a STEP for every zone.
-
-        Args:
-            movers: (vehicle, zone that contains it) for the vehicles outside their owner's zone
-                by more than the hysteresis, and for no others.
-            births: new vehicles.
-            inputs: digest of the actions.
-            payloads: zone → what rides with its STEP.
 
         Raises:
             ProtocolError: the tick before is not committed, or a mover is unknown; an id that the

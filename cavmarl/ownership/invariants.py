@@ -56,11 +56,6 @@ class Monitor:
     def check(self, directory: Directory, endpoints: Mapping[int, Endpoint], store: Store) -> None:
         """I1 to I6 and I10, at any time.
 
-        Args:
-            directory: the coordinator.
-            endpoints: zone → its living host; dead ones are left out.
-            store: the committed store.
-
         Raises:
             ProtocolError: one of them does not hold.
         """

@@ -46,11 +46,6 @@ class Offers:
     ) -> tuple[dict[int, tuple[Offer, ...]], dict[int, tuple[Withdrawn, ...]]]:
         """The offers of a tick, and what is withdrawn because it is not among them.
 
-        Args:
-            tick: of the states.
-            approaches: owned vehicles and the zones that they come near.
-            epochs: owned vehicle → epoch.
-
         Returns:
             Target → offers, and target → withdrawals.
 

@@ -15,27 +15,17 @@ from cavmarl.ownership.messages import Begin, Confirmed, Done, Out, Removed, Spa
 
 @dataclass(slots=True)
 class OwnershipPlan:
-    """The way from the committed tick to the next.
+    """The way from the committed tick to the next."""
 
-    Attributes:
-        record: the decision, as logged.
-        expected: zone → what it owns after IN, OUT and SPAWN, before any is removed.
-        switches: vehicle → its switch.
-        births: vehicle → its zone.
-        enter: zone → switches into it.
-        leave: zone → vehicles that it gives away.
-        spawn: zone → new vehicles.
-        attach: vehicles whose state rides with STEP.
-    """
-
-    record: Begin
+    record: Begin  # the decision, as logged
+    # zone → what it owns after IN, OUT and SPAWN, before any is removed
     expected: Mapping[int, OwnedTally]
-    switches: dict[int, Switch] = field(default_factory=dict)
-    births: dict[int, int] = field(default_factory=dict)
-    enter: dict[int, list[Switch]] = field(default_factory=dict)
-    leave: dict[int, list[Out]] = field(default_factory=dict)
-    spawn: dict[int, list[Spawn]] = field(default_factory=dict)
-    attach: set[int] = field(default_factory=set)
+    switches: dict[int, Switch] = field(default_factory=dict)  # vehicle → its switch
+    births: dict[int, int] = field(default_factory=dict)  # vehicle → its zone
+    enter: dict[int, list[Switch]] = field(default_factory=dict)  # zone → switches into it
+    leave: dict[int, list[Out]] = field(default_factory=dict)  # zone → vehicles that it gives away
+    spawn: dict[int, list[Spawn]] = field(default_factory=dict)  # zone → new vehicles
+    attach: set[int] = field(default_factory=set)  # vehicles whose state rides with STEP
 
     def changes(self, zone: int) -> bool:
         """Whether a vehicle enters the zone, leaves it, or is born there."""

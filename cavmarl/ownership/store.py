@@ -50,10 +50,6 @@ class MemoryStore:
 
         After a COMMIT that was logged but not carried out, a coordinator that starts again calls
         it once more: the segments are still there.
-
-        Args:
-            tick: as the COMMIT record has it.
-            incarnations: zone → incarnation, from the same record.
         """
         self.committed = {
             vehicle: state

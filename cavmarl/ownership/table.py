@@ -96,20 +96,15 @@ class Table:
 
     def settle(
         self,
-        tick: int,
-        switches: Iterable[Switch] = (),
+        tick: int,  # which one; in those before nothing has changed
+        switches: Iterable[Switch] = (),  # changes of owner
         births: Iterable[Birth] = (),
+        # vehicles that have left the world, of those before and of these
         removed: Iterable[Removed] = (),
     ) -> None:
         """Reach a later tick at once, as a BEGIN and a COMMIT with the same contents would.
 
         For a coordinator that has checked them itself, and whose log, if there is one, has them.
-
-        Args:
-            tick: which one; in those before nothing has changed.
-            switches: changes of owner.
-            births: new vehicles.
-            removed: vehicles that have left the world, of those before and of these.
 
         Raises:
             ProtocolError: a tick is in progress, or vehicles wait for their transfer; nobody owned

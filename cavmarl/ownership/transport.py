@@ -75,19 +75,14 @@ FAULTLESS = Rates()
 
 @dataclass(frozen=True, slots=True)
 class FaultPlan:
-    """What happens to which messages.
+    """What happens to which messages."""
 
-    Attributes:
-        seed: of all choices.
-        rates: name of the kind (`"Prepare"`, `"Ack"`, …) → its rates; others have `otherwise`.
-        until: the first phase in which nothing happens any more; None means never.
-        until_tick: the first tick whose messages nothing happens to any more; None means never.
-    """
-
-    seed: int = 0
+    seed: int = 0  # of all choices
+    # name of the kind (`"Prepare"`, `"Ack"`, …) → its rates; others have `otherwise`
     rates: Mapping[str, Rates] = field(default_factory=dict)
     otherwise: Rates = FAULTLESS
-    until: int | None = None
+    until: int | None = None  # the first phase in which nothing happens any more; None means never
+    # the first tick whose messages nothing happens to any more; None means never
     until_tick: int | None = None
 
     def of(self, kind: str, phase: int, tick: int = 0) -> Rates:

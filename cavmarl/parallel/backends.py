@@ -23,37 +23,25 @@ class MakeWorlds(Protocol):
 
     def __call__(
         self,
-        world: World,
-        base_dir: Path,
-        num_worlds: int,
-        workers: int | None,
-        in_next_step: bool,
+        world: World,  # what each is made of
+        base_dir: Path,  # the folder that its relative files start from
+        num_worlds: int,  # W
+        workers: int | None,  # how many run them; None: as many as are of use
+        in_next_step: bool,  # when worlds begin anew; see `SteppedWorlds`
     ) -> SteppedWorlds:
-        """Worlds that are stepped together.
-
-        Args:
-            world: what each is made of.
-            base_dir: the folder that its relative files start from.
-            num_worlds: W.
-            workers: how many run them; None: as many as are of use.
-            in_next_step: when worlds begin anew; see `SteppedWorlds`.
-        """
+        """Worlds that are stepped together."""
         ...
 
 
 @dataclass(frozen=True)
 class Backend:
-    """A place where worlds run.
+    """A place where worlds run."""
 
-    Attributes:
-        make: makes them there.
-        needs_workers: whether the number of workers, or the name in its place, has to be given.
-        keeps_state: whether the caller's process has the state of so many worlds with so many
-            workers, so that it can draw them.
-    """
-
-    make: MakeWorlds
+    make: MakeWorlds  # makes them there
+    # whether the number of workers, or the name in its place, has to be given
     needs_workers: bool = False
+    # whether the caller's process has the state of so many worlds with so many workers, so that it
+    # can draw them
     keeps_state: Callable[[int, int | None], bool] = lambda num_worlds, workers: False
 
 
@@ -143,35 +131,21 @@ def check_hosts(workers: int | str | None, hosts: str | None) -> tuple[str, int 
 
 
 def keeps_state(num_worlds: int, workers: int | str | None, hosts: str | None) -> bool:
-    """Whether this process has the state of the worlds; arguments and errors as of `check_hosts`.
-
-    Args:
-        num_worlds: W.
-        workers: how many, or a backend's name.
-        hosts: a backend's name.
-    """
+    """Whether this process has the state of the worlds; arguments and errors as of `check_hosts`."""
     name, number = check_hosts(workers, hosts)
     return _BACKENDS[name].keeps_state(num_worlds, number)
 
 
 def make_worlds(
-    world: World,
-    base_dir: Path,
-    num_worlds: int,
+    world: World,  # what each is made of
+    base_dir: Path,  # the folder that its relative files start from
+    num_worlds: int,  # W
+    # how many run them; 0 or None: this process; a backend's name: as many as are of use there
     workers: int | str | None = None,
-    hosts: str | None = None,
-    in_next_step: bool = False,
+    hosts: str | None = None,  # a backend's name; None: this machine
+    in_next_step: bool = False,  # when worlds begin anew; see `SteppedWorlds`
 ) -> SteppedWorlds:
     """Worlds of the backend that `workers` and `hosts` name.
-
-    Args:
-        world: what each is made of.
-        base_dir: the folder that its relative files start from.
-        num_worlds: W.
-        workers: how many run them; 0 or None: this process; a backend's name: as many as are of
-            use there.
-        hosts: a backend's name; None: this machine.
-        in_next_step: when worlds begin anew; see `SteppedWorlds`.
 
     Raises:
         ConfigError: workers or hosts that cannot be, or a setting that they cannot have.

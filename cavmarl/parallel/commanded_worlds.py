@@ -28,17 +28,11 @@ log = logging.getLogger("cavmarl.workers")
 
 
 class OrderedWorlds(ABC):
-    """What is the same wherever the worlds live; see `arrays.SteppedWorlds`.
+    """What is the same wherever the worlds live; see `arrays.SteppedWorlds`."""
 
-    Attributes:
-        arrays: what goes in and comes out.
-        placement: which worker hosts what.
-        mover: has that changed; None: it does not change.
-    """
-
-    arrays: StepArrays
-    placement: StepPlacement
-    mover: Mover | None = None
+    arrays: StepArrays  # what goes in and comes out
+    placement: StepPlacement  # which worker hosts what
+    mover: Mover | None = None  # has that changed; None: it does not change
     _steps = 0  # since the last reset of all
 
     @property
@@ -56,11 +50,6 @@ class OrderedWorlds(ABC):
     @abstractmethod
     def _send(self, task: Task, letter: Any, commits: bool) -> None:
         """Let all workers do a task.
-
-        Args:
-            task: which.
-            letter: what it needs to know.
-            commits: whether it changes the worlds.
 
         Raises:
             WorkerFailureError: one has raised an error.

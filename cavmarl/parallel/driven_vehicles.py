@@ -11,33 +11,18 @@ from cavmarl.engine.simulation import Simulation
 
 
 class Driven(NamedTuple):
-    """An agent's vehicle, as plain numbers.
+    """An agent's vehicle, as plain numbers."""
 
-    Attributes:
-        agent: index of it.
-        vehicle_id: of the vehicle.
-        vclass: index into `roads.network.VEHICLE_CLASSES`.
-        length_m: of its body.
-        width_m: of its body.
-        goal_edge: EDGE row of where it is to go.
-    """
-
-    agent: int
+    agent: int  # index of it
     vehicle_id: int
-    vclass: int
-    length_m: float
-    width_m: float
-    goal_edge: int
+    vclass: int  # index into `roads.network.VEHICLE_CLASSES`
+    length_m: float  # of its body
+    width_m: float  # of its body
+    goal_edge: int  # EDGE row of where it is to go
 
 
 def driven_by(simulation: Simulation, world: int, agents: Sequence[int]) -> list[Driven]:
-    """The vehicles of agents, in no order; agents without one are left out.
-
-    Args:
-        simulation: the worlds.
-        world: which one.
-        agents: indices.
-    """
+    """The vehicles of agents, in no order; agents without one are left out."""
     rows = simulation.vehicles(world)
     rows = rows[np.isin(rows["agent"], agents)]
     columns = (

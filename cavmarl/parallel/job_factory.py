@@ -34,9 +34,6 @@ from cavmarl.parallel.worlds_job import commands_of, fingerprint
 def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
     """The jobs of all workers, every kernel loaded.
 
-    Args:
-        recipe: what `pooled.PooledWorlds` writes.
-
     Raises:
         WorkerError: a file is not what it was.
     """

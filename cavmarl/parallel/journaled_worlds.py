@@ -40,11 +40,6 @@ def refuse_watched(zones: ZonesConfig, where: str, cure: str) -> None:
 def check_watched(world: World, parts: Sequence[Part], may_change: bool) -> None:
     """See that worlds with a journal or faults can be run by these workers.
 
-    Args:
-        world: what each is made of.
-        parts: what each team of workers runs.
-        may_change: whether worlds move from worker to worker.
-
     Raises:
         ConfigError: a world is divided among workers, or moves; or the faults cannot be.
     """

@@ -30,18 +30,7 @@ from cavmarl.traffic.sumo.sumo_history import ToldLog
 class LocalWorlds:
     """W worlds of one environment; no loop of Python runs over agents or vehicles in a step.
 
-    Args:
-        world: what each is made of.
-        num_worlds: W.
-        arrays: where to write; None: arrays of its own.
-        warm: have all kernels ready now.
-        in_next_step: when worlds begin anew; see `SteppedWorlds`.
-        zeros: makes the arrays that shards write.
-        like: worlds of the same environment, whose tables are used; None: they are made.
-        runs: see `Simulation`.
-
     Attributes:
-        world: what each is made of.
         arrays: what goes into a step, and what comes out.
         simulation: the worlds.
         in_next_step: when worlds begin anew.
@@ -50,14 +39,15 @@ class LocalWorlds:
 
     def __init__(
         self,
-        world: World,
-        num_worlds: int,
-        arrays: StepArrays | None = None,
-        warm: bool = False,
-        in_next_step: bool = False,
-        zeros: Zeros = huge_zeros,
+        world: World,  # what each is made of
+        num_worlds: int,  # W
+        arrays: StepArrays | None = None,  # where to write; None: arrays of its own
+        warm: bool = False,  # have all kernels ready now
+        in_next_step: bool = False,  # when worlds begin anew; see `SteppedWorlds`
+        zeros: Zeros = huge_zeros,  # makes the arrays that shards write
+        # worlds of the same environment, whose tables are used; None: they are made
         like: LocalWorlds | None = None,
-        runs: Sequence[WorldRun] | None = None,
+        runs: Sequence[WorldRun] | None = None,  # see `Simulation`
     ) -> None:
         self.world = world
         self.in_next_step = in_next_step

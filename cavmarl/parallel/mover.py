@@ -45,10 +45,6 @@ class Mover:
     def before_step(self, run: Run, pids: Callable[[], Mapping[int, int]]) -> list[Part] | None:
         """Count a step; if it is time, plan anew and move.
 
-        Args:
-            run: lets all workers do a task.
-            pids: tells those of their processes.
-
         Returns:
             which worker runs what now; None: what they did before.
         """

@@ -33,18 +33,8 @@ PROGRAM = "cavmarl.parallel.world_worker"
 class PooledWorlds(OrderedWorlds):
     """W worlds over m worker processes.
 
-    Args:
-        world: what each is made of.
-        base_dir: the folder that its relative files start from.
-        num_worlds: W.
-        workers: m, from 1 to W times the zones of each; more than W divide the worlds.
-        in_next_step: when worlds begin anew; see `SteppedWorlds`.
-        program: that the processes run; None: the one that runs worlds.
-
     Attributes:
-        world: what each is made of.
         arrays: in shared memory; each worker writes those of its worlds.
-        pool: the processes.
         in_next_step: when worlds begin anew.
         placement: which worker hosts what.
         mover: has that changed; None: it does not change.
@@ -57,12 +47,12 @@ class PooledWorlds(OrderedWorlds):
 
     def __init__(
         self,
-        world: World,
-        base_dir: Path,
-        num_worlds: int,
-        workers: int,
-        in_next_step: bool = False,
-        program: str | None = None,
+        world: World,  # what each is made of
+        base_dir: Path,  # the folder that its relative files start from
+        num_worlds: int,  # W
+        workers: int,  # m, from 1 to W times the zones of each; more than W divide the worlds
+        in_next_step: bool = False,  # when worlds begin anew; see `SteppedWorlds`
+        program: str | None = None,  # that the processes run; None: the one that runs worlds
     ) -> None:
         self.world = world
         self.in_next_step = in_next_step

@@ -92,17 +92,11 @@ def layout_of(config: EnvConfig, capacity: int, num_worlds: int) -> Layout:
 
 
 class SteppedWorlds(Protocol):
-    """W worlds that begin a new episode by themselves, as `CavVectorEnv` describes it.
+    """W worlds that begin a new episode by themselves, as `CavVectorEnv` describes it."""
 
-    Attributes:
-        world: what each is made of.
-        arrays: what goes into a step, and what comes out.
-        in_next_step: a new episode begins in the step after the one in which the old one ends.
-    """
-
-    world: World
-    arrays: StepArrays
-    in_next_step: bool
+    world: World  # what each is made of
+    arrays: StepArrays  # what goes into a step, and what comes out
+    in_next_step: bool  # a new episode begins in the step after the one in which the old one ends
 
     @property
     def simulation(self) -> Simulation:

@@ -25,11 +25,6 @@ Floats = NDArray[np.float64]
 class StepPlacement:
     """The plans of all workers: one of all worlds, or one of the zones of each world.
 
-    Args:
-        world: what each is made of.
-        num_worlds: W.
-        workers: how many.
-
     Raises:
         ConfigError: more workers than zones of all worlds.
         NoAdmissibleWorkerError: workers are too busy.
@@ -58,11 +53,7 @@ class StepPlacement:
         return tuple(balancer.plan for balancer in self._balancers)
 
     def watch(self, pids: Mapping[int, int]) -> None:
-        """Look at the machine from now on, if that is wanted.
-
-        Args:
-            pids: of the workers' processes.
-        """
+        """Look at the machine from now on, if that is wanted."""
         if self._watches:
             from cavmarl.balance.probe import Watch  # psutil is only needed here
 

@@ -33,12 +33,7 @@ class Task(IntEnum):
 
 
 class WorldsJob:
-    """Some of the worlds, next to each other.
-
-    Args:
-        worlds: that write their part of the shared arrays.
-        first: number of the first one among all.
-    """
+    """Some of the worlds, next to each other."""
 
     def __init__(self, worlds: LocalWorlds, first: int) -> None:
         self._take(worlds, first)

@@ -13,18 +13,11 @@ from cavmarl.sensors.observed import frame_size
 
 def make_outputs(
     config: EnvConfig,
-    num_worlds: int,
-    observations: NDArray[np.float32] | None = None,
-    zeros: Zeros = np.zeros,
+    num_worlds: int,  # W
+    observations: NDArray[np.float32] | None = None,  # (W, A, D) to be used; None: they are made
+    zeros: Zeros = np.zeros,  # makes all others
 ) -> Outputs:
-    """Outputs of W empty worlds.
-
-    Args:
-        config: the environment.
-        num_worlds: W.
-        observations: (W, A, D) to be used; None: they are made.
-        zeros: makes all others.
-    """
+    """Outputs of W empty worlds."""
     agents = (num_worlds, config.population.num_ids)
     if observations is None:
         size = config.sensors.stack * frame_size(config.sensors)

@@ -54,38 +54,19 @@ SUGGESTED_HORIZON_S = 1.0  # in which a suggested target speed is to be reached
 
 @dataclass(frozen=True)
 class Commands:
-    """Decoded actions of one step.
+    """Decoded actions of one step."""
 
-    Attributes:
-        controls: (W, A, 2) throttle in m/s² and steering in rad; continuous actions.
-        meta_actions: (W, A) ACTION_* codes; discrete actions.
-        declared: (W, A) CAUSE_* of events that agents tell others of, 0: none; (0, 0): no messages.
-    """
-
+    # (W, A, 2) throttle in m/s² and steering in rad; continuous actions
     controls: NDArray[np.float64]
-    meta_actions: NDArray[np.int64]
+    meta_actions: NDArray[np.int64]  # (W, A) ACTION_* codes; discrete actions
+    # (W, A) CAUSE_* of events that agents tell others of, 0: none; (0, 0): no messages
     declared: NDArray[np.int32] = field(default_factory=lambda: np.zeros((0, 0), np.int32))
 
 
 class Shard:
     """The sub-worlds of one zone.
 
-    Args:
-        config: the environment.
-        network: the roads.
-        plans: PLAN (G, L), the ways of agents.
-        travel: types and ways.
-        zoned: the rows of all zones.
-        outputs: where the agents of all shards get what they sense, each at its own index.
-        zone: which one.
-        zones: of the partition.
-        halo: how far it sees over its borders.
-        first: the first shard of this process, whose clock, keys, signals and room to work in this
-            one shares; None: this is it.
-        zeros: makes what all zones have in common.
-
     Attributes:
-        worlds: what it has.
         sides: VEHICLE (W, C), the two buffers that rows are kept in, swapped each tick.
         side: in which of them the committed rows are.
         next_side: where the next ones come; the same, but in ticks that put rows in order.
@@ -96,15 +77,18 @@ class Shard:
         self,
         config: EnvConfig,
         network: RoadNetwork,
-        plans: NDArray[np.void],
+        plans: NDArray[np.void],  # PLAN (G, L), the ways of agents
         travel: Travel,
-        zoned: Zoned,
+        zoned: Zoned,  # the rows of all zones
+        # where the agents of all shards get what they sense, each at its own index
         outputs: Outputs,
         zone: int,
         zones: ZoneArrays,
-        halo: Halo,
+        halo: Halo,  # how far it sees over its borders
+        # the first shard of this process, whose clock, keys, signals and room to work in this one
+        # shares; None: this is it
         first: Shard | None = None,
-        zeros: Zeros = np.zeros,
+        zeros: Zeros = np.zeros,  # makes what all zones have in common
     ) -> None:
         self.zone = zone
         self.zoned = zoned

@@ -72,11 +72,6 @@ class TransferHeader(NamedTuple):
 class TransferCodec:
     """Packs and unpacks the vehicles of one set of worlds.
 
-    Args:
-        record: dtype of a vehicle's record.
-        commands: (W, A, …) float64, the delayed commands of agents: `Worlds.pending`.
-        frames: (W, A, F) float32, what the next observation of an agent takes from the last one.
-
     Attributes:
         schema: a number in [0, 2^63) that is the same where the other's states can be unpacked.
 
@@ -86,8 +81,10 @@ class TransferCodec:
 
     def __init__(
         self,
-        record: np.dtype[np.void],
+        record: np.dtype[np.void],  # dtype of a vehicle's record
+        # (W, A, …) float64, the delayed commands of agents: `Worlds.pending`
         commands: NDArray[np.float64],
+        # (W, A, F) float32, what the next observation of an agent takes from the last one
         frames: NDArray[np.float32],
     ) -> None:
         text = layout_text(record)
@@ -138,14 +135,6 @@ class TransferCodec:
         self, data: bytes, vehicle: int, tick: int, rows: NDArray[np.void], world: int, i: int
     ) -> None:
         """Write a state into `rows[world, i]`, and what its agent keeps; nothing if it is refused.
-
-        Args:
-            data: as `pack` returns it.
-            vehicle: whose state it has to be.
-            tick: of which tick.
-            rows: VEHICLE (W, C).
-            world: number of the world.
-            i: the row.
 
         Raises:
             MessageError: these bytes are no state, or none of this vehicle and tick, or of another

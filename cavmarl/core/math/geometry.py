@@ -162,37 +162,23 @@ def project_near(
 
 @kernel
 def boxes_overlap(
-    x1: float,
-    y1: float,
-    cos1: float,
-    sin1: float,
-    half_length1: float,
-    half_width1: float,
-    x2: float,
-    y2: float,
-    cos2: float,
-    sin2: float,
-    half_length2: float,
-    half_width2: float,
+    x1: float,  # centre of the first box, m
+    y1: float,  # centre of the first box, m
+    cos1: float,  # of its heading
+    sin1: float,  # of its heading
+    half_length1: float,  # along its heading, m
+    half_width1: float,  # across its heading, m
+    x2: float,  # the same of the second box
+    y2: float,  # see `x2`
+    cos2: float,  # see `x2`
+    sin2: float,  # see `x2`
+    half_length2: float,  # see `x2`
+    half_width2: float,  # see `x2`
 ) -> bool:
     """Whether two oriented rectangles share area; touching does not count.
 
     Separating axes (Gottschalk, Lin, Manocha: "OBBTree", SIGGRAPH 1996), in the plane. Written so
     that swapping the boxes swaps the comparisons and changes no bit of them.
-
-    Args:
-        x1: centre of the first box, m.
-        y1: centre of the first box, m.
-        cos1: of its heading.
-        sin1: of its heading.
-        half_length1: along its heading, m.
-        half_width1: across its heading, m.
-        x2: the same of the second box.
-        y2: see `x2`.
-        cos2: see `x2`.
-        sin2: see `x2`.
-        half_length2: see `x2`.
-        half_width2: see `x2`.
     """
     dx = x2 - x1
     dy = y2 - y1

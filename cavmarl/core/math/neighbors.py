@@ -184,28 +184,18 @@ def fill_grid(rows: NDArray[np.void], num: int, grid: Grid) -> None:
 
 @kernel
 def k_nearest(
-    grid: Grid,
-    row: int,
-    x: float,
-    y: float,
-    z: float,
-    radius_m: float,
-    k: int,
+    grid: Grid,  # filled for this tick
+    row: int,  # VEHICLE row to leave out, the one that asks; -1 for none
+    x: float,  # m
+    y: float,  # m
+    z: float,  # m; vehicles more than `LEVEL_HEIGHT_M` above or below are not seen
+    radius_m: float,  # centres further away than this are not seen, in the plane
+    k: int,  # how many to find at most
+    # (k,) int, VEHICLE rows of those found, overwritten up to the returned number
     out_row: NDArray[np.int32],
-    out_squared: NDArray[np.float64],
+    out_squared: NDArray[np.float64],  # (k,) squared distances in m², likewise
 ) -> int:
     """The nearest vehicles around a place on the same level, sorted by distance, then by id.
-
-    Args:
-        grid: filled for this tick.
-        row: VEHICLE row to leave out, the one that asks; -1 for none.
-        x: m.
-        y: m.
-        z: m; vehicles more than `LEVEL_HEIGHT_M` above or below are not seen.
-        radius_m: centres further away than this are not seen, in the plane.
-        k: how many to find at most.
-        out_row: (k,) int, VEHICLE rows of those found, overwritten up to the returned number.
-        out_squared: (k,) squared distances in m², likewise.
 
     Returns:
         how many were found.

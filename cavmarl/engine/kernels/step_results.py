@@ -99,20 +99,14 @@ def report_who_goes_on(
 
 @kernel
 def keep_last(
-    results: Results,
+    results: Results,  # which agents have ended, and which episodes are over
+    # (W, A, D); those of agents that are gone become 0, unless worlds begin anew in the next step
     observations: NDArray[np.float32],
+    # (W, A, D) where something has ended, what they were; written
     final_observations: NDArray[np.float32],
-    in_next_step: bool,
+    in_next_step: bool,  # when worlds begin anew
 ) -> None:
-    """Keep the last observations of agents that have ended.
-
-    Args:
-        results: which agents have ended, and which episodes are over.
-        observations: (W, A, D); those of agents that are gone become 0, unless worlds begin anew in
-            the next step.
-        final_observations: (W, A, D) where something has ended, what they were; written.
-        in_next_step: when worlds begin anew.
-    """
+    """Keep the last observations of agents that have ended."""
     for w in range(observations.shape[0]):
         ended = results.episode_over[w]
         for agent in range(observations.shape[1]):

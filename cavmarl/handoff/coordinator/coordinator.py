@@ -53,10 +53,6 @@ class Watcher(Protocol):
 class Coordinator(ABC):
     """Decides ownership, tick by tick: `begin`, then the zones' work, then `end`.
 
-    Args:
-        directory: the owners.
-        journal: takes the records; None: not kept.
-
     Attributes:
         journal: what takes the records.
         switched: vehicles that have changed their owner.

@@ -26,10 +26,6 @@ from cavmarl.zones.kernels.zone_lookup import zones_of
 class RowStates:
     """States of one world's vehicles at the committed tick, read from the rows of their owners.
 
-    Args:
-        division: of all worlds.
-        world: which one.
-
     Attributes:
         borders: vehicles near a border when the tick began.
     """
@@ -77,25 +73,17 @@ class RowStates:
 
 
 class Coordinators:
-    """The coordinators of all worlds.
-
-    Args:
-        division: whose rows change hands.
-        coordinators: one a world.
-        states: of the vehicles of each world, as the coordinators read them.
-        digests: of zones' rows; None: not needed.
-        store: keeps what is committed; None: no process can die alone.
-        monitor: checks every tick that is committed; None: none.
-    """
+    """The coordinators of all worlds."""
 
     def __init__(
         self,
-        division: Division,
-        coordinators: Sequence[Coordinator],
-        states: Sequence[RowStates],
-        digests: RowDigests | None = None,
+        division: Division,  # whose rows change hands
+        coordinators: Sequence[Coordinator],  # one a world
+        states: Sequence[RowStates],  # of the vehicles of each world, as the coordinators read them
+        digests: RowDigests | None = None,  # of zones' rows; None: not needed
+        # keeps what is committed; None: no process can die alone
         store: CommittedStore | None = None,
-        monitor: InvariantMonitor | None = None,
+        monitor: InvariantMonitor | None = None,  # checks every tick that is committed; None: none
     ) -> None:
         self.coordinators = tuple(coordinators)
         self._division = division
@@ -126,11 +114,7 @@ class Coordinators:
             self._stirred[w] = True
 
     def begin(self, commands: Commands) -> None:
-        """Lease the next tick, and hand over whose owner changes.
-
-        Args:
-            commands: what the agents do in it; a journal keeps their digest.
-        """
+        """Lease the next tick, and hand over whose owner changes."""
         for w, coordinator in enumerate(self.coordinators):
             everybody, self._stirred[w] = self._stirred[w], False
             coordinator.begin(
@@ -183,10 +167,6 @@ class Coordinators:
 
     def take_up(self, records: Sequence[Record], notes: Sequence[Notes]) -> None:
         """Go on in the one world where others have stopped.
-
-        Args:
-            records: of their coordinator.
-            notes: what has happened since its last BEGIN.
 
         Raises:
             ProtocolError: they sent messages, and its own coordinator sends none.

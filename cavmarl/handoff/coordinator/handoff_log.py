@@ -32,12 +32,7 @@ class OwnerChange(NamedTuple):
 
 
 class HandoffLog:
-    """Gives vehicles to the zones that they are in, and keeps what came of it until it is read.
-
-    Args:
-        division: of all worlds.
-        world: which one.
-    """
+    """Gives vehicles to the zones that they are in, and keeps what came of it until it is read."""
 
     def __init__(self, division: Division, world: int) -> None:
         self._division = division

@@ -52,11 +52,6 @@ class OwnersOnRecord:
     It is told what a `Trace` is told, and by coordinators that make records later, which vehicles
     change their owner meanwhile.
 
-    Args:
-        zones: how many.
-        limits: deadlines.
-        is_direct: there are records alone; see `TraceChecker`.
-
     Attributes:
         entered: vehicles that zones have begun to own, since the reset.
         left: vehicles that have been removed.
@@ -140,11 +135,6 @@ class InvariantMonitor:
     """Raises ProtocolError after the first tick in which an invariant does not hold.
 
     Its memory is as large as the worlds are, however long they run.
-
-    Args:
-        division: whose rows are looked at.
-        records: of the coordinator of each world.
-        longest_move_m: no vehicle moves further in a tick.
     """
 
     def __init__(
@@ -172,10 +162,6 @@ class InvariantMonitor:
     def begin(self, w: int, births: Sequence[Birth]) -> None:
         """Look at a world that has been reset.
 
-        Args:
-            w: which one.
-            births: the vehicles there.
-
         Raises:
             ProtocolError: an invariant does not hold.
         """
@@ -186,10 +172,6 @@ class InvariantMonitor:
 
     def end(self, w: int, births: Sequence[Birth]) -> None:
         """Look at a world after a tick.
-
-        Args:
-            w: which one.
-            births: vehicles that entered in the tick, not in the records yet.
 
         Raises:
             ProtocolError: an invariant does not hold.

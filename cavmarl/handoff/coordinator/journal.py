@@ -90,7 +90,6 @@ class Journal:
             outlive the machine.
 
     Attributes:
-        path: of the file.
         sequence: the number of the next line.
         dropped: the line that was dropped, or nothing.
 

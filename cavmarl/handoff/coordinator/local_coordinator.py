@@ -47,13 +47,6 @@ _NO_NEWS = _News()
 class LocalCoordinator(Coordinator):
     """Decides ownership, without messages.
 
-    Args:
-        directory: the owners.
-        journal: takes the records; None: not kept.
-        book: hands rows over.
-        counts: how many vehicles each zone owns now, by its rows.
-        transfers: told of all that goes on.
-
     Attributes:
         foretell: told at once of changes of owner that records tell of later.
     """
@@ -61,10 +54,10 @@ class LocalCoordinator(Coordinator):
     def __init__(
         self,
         directory: Directory,
-        journal: AnyJournal | None,
-        book: HandoffLog,
-        counts: Callable[[], list[int]],
-        transfers: TransferLog,
+        journal: AnyJournal | None,  # takes the records; None: not kept
+        book: HandoffLog,  # hands rows over
+        counts: Callable[[], list[int]],  # how many vehicles each zone owns now, by its rows
+        transfers: TransferLog,  # told of all that goes on
     ) -> None:
         super().__init__(directory, journal)
         self._book = book
@@ -232,9 +225,6 @@ class LocalCoordinator(Coordinator):
     def _check(self, births: Iterable[Birth]) -> None:
         """Compare what zones should own with their rows, where all that have left are on record.
 
-        Args:
-            births: vehicles in the rows, which will be on record in the next tick.
-
         Raises:
             ProtocolError: a zone has more or fewer.
         """
@@ -256,12 +246,7 @@ def _switch(change: OwnerChange) -> Switch:
 
 
 def _removed_with(changes: NDArray[np.void], left: Mapping[int, int]) -> list[bool]:
-    """Whether each vehicle left the world in the tick in which it changed.
-
-    Args:
-        changes: CHANGE (n,).
-        left: vehicle → tick, of those that have left.
-    """
+    """Whether each vehicle left the world in the tick in which it changed."""
     if not left:
         return [False] * len(changes)
     pairs = zip(changes["vehicle"].tolist(), changes["tick"].tolist(), strict=True)

@@ -28,34 +28,23 @@ Notes = tuple[tuple[Birth, ...], tuple[Removed, ...]]
 
 
 class CommittedImage(NamedTuple):
-    """A copy of everything.
+    """A copy of everything."""
 
-    Attributes:
-        counts: by shard, those of `COUNTS`.
-        rows: by shard and world, VEHICLE (n,), owned rows and ghosts.
-        shared: what the shards have in common, and what is kept beside them.
-        notes: by world.
-    """
-
-    counts: list[Arrays]
-    rows: list[Arrays]
-    shared: Arrays
-    notes: tuple[Notes, ...]
+    counts: list[Arrays]  # by shard, those of `COUNTS`
+    rows: list[Arrays]  # by shard and world, VEHICLE (n,), owned rows and ghosts
+    shared: Arrays  # what the shards have in common, and what is kept beside them
+    notes: tuple[Notes, ...]  # by world
 
 
 class CommittedStore:
-    """Two copies of the worlds.
-
-    Args:
-        shards: whose rows are kept.
-        shared: the arrays beside theirs that a tick changes, as they are now.
-        safeguards: remedies of the protocol; without `double_buffer` there is one copy only.
-    """
+    """Two copies of the worlds."""
 
     def __init__(
         self,
-        shards: Sequence[Shard],
+        shards: Sequence[Shard],  # whose rows are kept
+        # the arrays beside theirs that a tick changes, as they are now
         shared: Callable[[], Iterable[Array]],
+        # remedies of the protocol; without `double_buffer` there is one copy only
         safeguards: Safeguards = ALL_ON,
     ) -> None:
         self._has_two = safeguards.double_buffer
@@ -65,11 +54,7 @@ class CommittedStore:
         self._next: CommittedImage | None = None
 
     def write(self, notes: tuple[Notes, ...]) -> None:
-        """Copy what there is now; the truth stays what it was.
-
-        Args:
-            notes: by world.
-        """
+        """Copy what there is now; the truth stays what it was."""
         counts: list[Arrays] = []
         rows: list[Arrays] = []
         for shard in self._shards:

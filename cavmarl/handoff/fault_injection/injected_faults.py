@@ -27,10 +27,7 @@ class ZoneDeath(CavmarlError):
     """The host of a zone has died.
 
     Attributes:
-        zone: which.
-        point: of the tick.
         lives_on: it only seemed so.
-        cause: of which.
     """
 
     def __init__(self, zone: int, point: str, lives_on: bool, cause: str = "on purpose") -> None:
@@ -49,9 +46,6 @@ class CoordinatorDeath(CavmarlError):
 
 class Crashes:
     """Says which processes die where, and counts.
-
-    Args:
-        faults: the plan.
 
     Attributes:
         tick: of the run, that the world is on its way to; to be set.
@@ -111,12 +105,7 @@ class Crashes:
 
 
 class FaultyPhases:
-    """Runs the phases of a tick zone by zone; hosts die in or after their part of one.
-
-    Args:
-        shards: all of them.
-        crashes: which processes die where.
-    """
+    """Runs the phases of a tick zone by zone; hosts die in or after their part of one."""
 
     def __init__(self, shards: Sequence[Shard], crashes: Crashes) -> None:
         self._hosts = [(shard.zone, SerialExecutor((shard,))) for shard in shards]
@@ -151,12 +140,7 @@ def _call_hosted(zone: int, host: Executor, phase: Phase, arguments: tuple[Any, 
 
 
 class FaultyCoordinator(MessageCoordinator):
-    """A coordinator that dies, and whose zones' hosts die, at named points.
-
-    Args:
-        arguments: as of `MessageCoordinator`.
-        crashes: which processes die where.
-    """
+    """A coordinator that dies, and whose zones' hosts die, at named points."""
 
     def __init__(self, *arguments: Any, crashes: Crashes) -> None:
         super().__init__(*arguments)

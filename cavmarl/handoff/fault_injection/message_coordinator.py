@@ -50,15 +50,6 @@ class States(Protocol):
 class MessageCoordinator(Coordinator):
     """Runs the protocol of one world over messages.
 
-    Args:
-        run: 16 bytes that no other run has.
-        zones: how many.
-        states: of vehicles at the committed tick.
-        limits: deadlines.
-        post: carries the messages.
-        journal: takes the records; None: not kept.
-        safeguards: remedies of the protocol; tests take one away.
-
     Attributes:
         endpoints: zone → its host's side.
         post: what carries the messages.
@@ -68,13 +59,13 @@ class MessageCoordinator(Coordinator):
 
     def __init__(
         self,
-        run: bytes,
+        run: bytes,  # 16 bytes that no other run has
         zones: int,
-        states: States,
+        states: States,  # of vehicles at the committed tick
         limits: Limits,
-        post: Post,
-        journal: AnyJournal | None = None,
-        safeguards: Safeguards = ALL_ON,
+        post: Post,  # carries the messages
+        journal: AnyJournal | None = None,  # takes the records; None: not kept
+        safeguards: Safeguards = ALL_ON,  # remedies of the protocol; tests take one away
     ) -> None:
         super().__init__(Directory(run, range(zones), states, limits, safeguards), journal)
         self.endpoints: dict[int, Endpoint] = {}
@@ -151,10 +142,6 @@ class MessageCoordinator(Coordinator):
 
     def end(self, rows: Callable[[int], int], stored: Callable[[int], int] | None = None) -> None:
         """Every zone is through: DONE and COMMIT.
-
-        Args:
-            rows: zone → digest of its rows.
-            stored: zone → digest of its rows in the store; None: where `rows` are is the store.
 
         Raises:
             ProtocolError: a vehicle was lost or doubled; a zone does not answer.

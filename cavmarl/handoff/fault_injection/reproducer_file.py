@@ -34,40 +34,24 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class Reproducer:
-    """A tick of one world, and all that it is a function of.
+    """A tick of one world, and all that it is a function of."""
 
-    Attributes:
-        made_with: versions of what has run it.
-        config: the environment, as plain values.
-        sources: hashes of its roads, demand and zones.
-        seed: root of all random numbers.
-        first_world: number of the world among all worlds of the seed.
-        episode: number of the world's episode since the seed, from 1 on.
-        tick: of the run, that could not be reached.
-        zone: whose hosts died; None: the coordinators.
-        cause: what the error said.
-        is_first: whether the tick begins a step.
-        is_last: whether it ends one.
-        commands: of the agents, W = 1.
-        records: of the coordinator, as far as the episode needs them, up to the committed tick, and
-            the BEGIN of the one that could not be reached if there is one.
-        image: of the committed tick.
-    """
-
-    made_with: Mapping[str, str | None]
-    config: Mapping[str, Any]
-    sources: Mapping[str, str | None]
-    seed: int
-    first_world: int
-    episode: int
-    tick: int
-    zone: int | None
-    cause: str
-    is_first: bool
-    is_last: bool
-    commands: Commands
+    made_with: Mapping[str, str | None]  # versions of what has run it
+    config: Mapping[str, Any]  # the environment, as plain values
+    sources: Mapping[str, str | None]  # hashes of its roads, demand and zones
+    seed: int  # root of all random numbers
+    first_world: int  # number of the world among all worlds of the seed
+    episode: int  # number of the world's episode since the seed, from 1 on
+    tick: int  # of the run, that could not be reached
+    zone: int | None  # whose hosts died; None: the coordinators
+    cause: str  # what the error said
+    is_first: bool  # whether the tick begins a step
+    is_last: bool  # whether it ends one
+    commands: Commands  # of the agents, W = 1
+    # of the coordinator, as far as the episode needs them, up to the committed tick, and the BEGIN
+    # of the one that could not be reached if there is one
     records: tuple[Record, ...]
-    image: CommittedImage
+    image: CommittedImage  # of the committed tick
 
     def write(self, path: Path) -> None:
         """Write the file, which must not exist.

@@ -22,21 +22,13 @@ _READ_AT_ONCE = 64  # entries
 
 
 class LoggedAction(NamedTuple):
-    """One order.
+    """One order."""
 
-    Attributes:
-        is_reset: or else a step.
-        seed: of a reset; None: none was given.
-        first_world: of a reset, as the command has it.
-        chosen: (W,) which worlds a reset is about.
-        commands: of the agents in a step.
-    """
-
-    is_reset: bool
-    seed: int | None
-    first_world: int
-    chosen: NDArray[np.bool_]
-    commands: Commands
+    is_reset: bool  # or else a step
+    seed: int | None  # of a reset; None: none was given
+    first_world: int  # of a reset, as the command has it
+    chosen: NDArray[np.bool_]  # (W,) which worlds a reset is about
+    commands: Commands  # of the agents in a step
 
 
 class ActionLog:

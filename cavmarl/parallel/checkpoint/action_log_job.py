@@ -18,11 +18,6 @@ class ActionLogJob(WorldsJob):
     """Some of the worlds, next to each other, whose successor begins at their beginning.
 
     They are made where they run, not where workers are forked: a journal belongs to one process.
-
-    Args:
-        make: the worlds, the same ones each time.
-        first: number of the first one among all.
-        tape: on which is kept what they are told.
     """
 
     def __init__(self, make: Callable[[], LocalWorlds], first: int, tape: ActionLog) -> None:

@@ -17,13 +17,7 @@ AGAIN_S = 0.04  # a successor goes through no more steps again than take that lo
 
 
 class CheckpointJob(WorldsJob):
-    """Some of the worlds, next to each other.
-
-    Args:
-        worlds: that write their part of the shared arrays.
-        first: number of the first one among all.
-        diary: the checkpoint log in which they leave their state.
-    """
+    """Some of the worlds, next to each other."""
 
     def __init__(self, worlds: LocalWorlds, first: int, diary: CheckpointLog) -> None:
         super().__init__(worlds, first)

@@ -42,11 +42,6 @@ class CheckpointLog:
     There are two images, each with room for the steps after it: while one is written, the other one
     is what was committed begins with. What SUMOs were told is kept beside each of them.
 
-    Args:
-        config: the environment.
-        num_worlds: how many.
-        descriptors: of what `make_segments` has made.
-
     Attributes:
         place: (2,) which image it begins with, and how many steps follow; to be committed.
         entries: what the agents do in each of the steps that there is room for, of both images.
@@ -81,12 +76,7 @@ class CheckpointLog:
         self.is_prepared = False
 
     def prepare(self, state: Arrays, logs: Sequence[ToldLog] = ()) -> None:
-        """Write the image of the present state that it will begin anew with.
-
-        Args:
-            state: what is to be in it.
-            logs: what the SUMO of each world was told; none: no SUMO is told anything.
-        """
+        """Write the image of the present state that it will begin anew with."""
         image = 1 - self.place.item(0)
         self._images[image].write(state)
         for kept, log in zip(self._logs[image], logs, strict=True):

@@ -20,9 +20,6 @@ class KeptLog:
 
     A log only grows in an episode, so what is added costs no more than what happened since the last
     time, however long the episode is.
-
-    Args:
-        segment: that holds it; it grows as the log does.
     """
 
     def __init__(self, segment: Segment) -> None:

@@ -15,21 +15,13 @@ Bytes = NDArray[np.uint8]
 
 
 class WorldMove(NamedTuple):
-    """What becomes of the worlds of one host, which follow each other before and after.
+    """What becomes of the worlds of one host, which follow each other before and after."""
 
-    Attributes:
-        first: of those that it keeps, as it has counted up to now.
-        last: the one after the last that it keeps.
-        before: how many come that stand before those.
-        coming: how many come.
-        bytes: of their cases.
-    """
-
-    first: int
-    last: int
-    before: int = 0
-    coming: int = 0
-    bytes: int = 0
+    first: int  # of those that it keeps, as it has counted up to now
+    last: int  # the one after the last that it keeps
+    before: int = 0  # how many come that stand before those
+    coming: int = 0  # how many come
+    bytes: int = 0  # of their cases
 
 
 def moves_of(before: Sequence[int], after: Sequence[int]) -> list[WorldMove]:
@@ -59,12 +51,7 @@ def buffers(count: int, size: int) -> tuple[NDArray[np.int64], Bytes]:
 
 
 def pack(image: Image, worlds: Sequence[Sequence[Array]]) -> tuple[NDArray[np.int64], Bytes]:
-    """Cases of some worlds, as `buffers` has room for.
-
-    Args:
-        image: to write each into.
-        worlds: arrays of each, of the same dtypes.
-    """
+    """Cases of some worlds, as `buffers` has room for."""
     cases = []
     for arrays in worlds:
         image.write(arrays)
@@ -77,12 +64,6 @@ def unpack(
     image: Image, sizes: NDArray[np.int64], content: Bytes, dtypes: Sequence[np.dtype[Any]]
 ) -> list[list[Array]]:
     """The arrays of each of some worlds.
-
-    Args:
-        image: to read each from.
-        sizes: of the cases.
-        content: their bytes.
-        dtypes: of the arrays of each.
 
     Raises:
         WorkerError: they are not what was packed.

@@ -49,27 +49,16 @@ class Kind(IntEnum):
 
 
 class Dialect(NamedTuple):
-    """What both ends of a connection agree on.
+    """What both ends of a connection agree on."""
 
-    Attributes:
-        magic: four bytes that every frame begins with.
-        version: of everything that is said.
-        kinds: of frames.
-        max_letter: bytes of the longest payload.
-        max_data: bytes of the most data.
-        write: a payload's bytes.
-        read: the payload again; a ValueError says that it is none.
-        cure: what to do about another version.
-    """
-
-    magic: bytes
-    version: int
-    kinds: type[IntEnum]
-    max_letter: int
-    max_data: int
-    write: Callable[[Any], bytes]
-    read: Callable[[bytes], Any]
-    cure: str
+    magic: bytes  # four bytes that every frame begins with
+    version: int  # of everything that is said
+    kinds: type[IntEnum]  # of frames
+    max_letter: int  # bytes of the longest payload
+    max_data: int  # bytes of the most data
+    write: Callable[[Any], bytes]  # a payload's bytes
+    read: Callable[[bytes], Any]  # the payload again; a ValueError says that it is none
+    cure: str  # what to do about another version
 
 
 def _as_json(letter: Any) -> bytes:
@@ -89,21 +78,13 @@ HOSTS = Dialect(
 
 
 class Frame(NamedTuple):
-    """What stands before a frame's data.
+    """What stands before a frame's data."""
 
-    Attributes:
-        kind: what it says.
-        order: which order it belongs to.
-        letter: as the dialect reads it; None: nothing.
-        size: bytes of data.
-        checksum: of them.
-    """
-
-    kind: IntEnum
-    order: int
-    letter: Any
-    size: int
-    checksum: int
+    kind: IntEnum  # what it says
+    order: int  # which order it belongs to
+    letter: Any  # as the dialect reads it; None: nothing
+    size: int  # bytes of data
+    checksum: int  # of them
 
 
 class FramedSocket:
@@ -133,12 +114,6 @@ class FramedSocket:
         self, kind: IntEnum, order: int, letter: Any = None, arrays: Sequence[Array] = ()
     ) -> None:
         """Send one frame.
-
-        Args:
-            kind: what it says.
-            order: which order it belongs to.
-            letter: as the dialect can write it.
-            arrays: contiguous.
 
         Raises:
             OSError: the other end is gone, or does not read.

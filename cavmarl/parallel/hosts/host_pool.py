@@ -46,12 +46,6 @@ IMAGE_EVERY = 8  # commands that are noted: a successor repeats as many at most
 class HostPool:
     """m parts of a job over at least as many hosts.
 
-    Args:
-        launcher: starts the hosts.
-        program: what they run.
-        timeout_s: for so long a host may be busy with one order.
-        repeats: how often a command is begun again because a host has died.
-
     Attributes:
         deaths: all that there were of hosts with a part.
 
@@ -117,21 +111,15 @@ class HostPool:
     def run(
         self,
         task: int,
-        letters: Sequence[Any],
-        inputs: Sequence[Arrays],
+        letters: Sequence[Any],  # what is said to each part, as JSON knows it
+        inputs: Sequence[Arrays],  # arrays for each part
+        # part, answer → arrays that what comes out is written to
         outputs: Callable[[int, Any], Arrays],
-        commits: bool = True,
+        commits: bool = True,  # the task changes their state
+        # of the parts after it, where it changes them; such a task is not the noted one
         sizes: Sequence[int] | None = None,
     ) -> list[Any]:
         """Let all hosts do a task.
-
-        Args:
-            task: of the job.
-            letters: what is said to each part, as JSON knows it.
-            inputs: arrays for each part.
-            outputs: part, answer → arrays that what comes out is written to.
-            commits: the task changes their state.
-            sizes: of the parts after it, where it changes them; such a task is not the noted one.
 
         Returns:
             what each part has answered.

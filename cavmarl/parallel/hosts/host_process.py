@@ -27,37 +27,22 @@ _FIRST_IMAGE_BYTES = 1 << 12
 
 
 class Order(NamedTuple):
-    """The payload of a command; its data are an image, what was done since, and what to do now.
+    """The payload of a command; its data are an image, what was done since, and what to do now."""
 
-    Attributes:
-        task: what to do.
-        letter: what is said to it.
-        size: of the part that it is about, before it.
-        image: bytes of the image to begin from; 0: go on from where you are.
-        repeats: how often what was done since has to be done again; each has data of its own.
-        repeated: the task that is.
-        saves: an image is to be sent of what comes out.
-    """
-
-    task: int
-    letter: Any
-    size: int
-    image: int
-    repeats: int
-    repeated: int
-    saves: bool
+    task: int  # what to do
+    letter: Any  # what is said to it
+    size: int  # of the part that it is about, before it
+    image: int  # bytes of the image to begin from; 0: go on from where you are
+    repeats: int  # how often what was done since has to be done again; each has data of its own
+    repeated: int  # the task that is
+    saves: bool  # an image is to be sent of what comes out
 
 
 class TaskOutcome(NamedTuple):
-    """What comes out of a task.
+    """What comes out of a task."""
 
-    Attributes:
-        answer: what the caller is to know, as JSON knows it; mostly nothing.
-        arrays: that it is sent; of what shapes follows from the task and the answer.
-    """
-
-    answer: Any
-    arrays: Sequence[Array]
+    answer: Any  # what the caller is to know, as JSON knows it; mostly nothing
+    arrays: Sequence[Array]  # that it is sent; of what shapes follows from the task and the answer
 
 
 class RemoteJob(Protocol):
@@ -89,12 +74,6 @@ def serve(
     make_job: Callable[[], RemoteJob], place: tuple[str, int], secret: bytes, number: int
 ) -> NoReturn:
     """The whole life of a host; its process ends with the connection.
-
-    Args:
-        make_job: with every kernel loaded.
-        place: where the caller listens.
-        secret: shared by its hosts.
-        number: of this host.
 
     Raises:
         OSError: the caller cannot be reached.
@@ -162,9 +141,6 @@ class _Line:
 
     A thread says so as long as the other one uses the processor. A process that is stopped says
     nothing, and neither does one that sleeps where it should work.
-
-    Args:
-        wire: to the caller.
     """
 
     def __init__(self, wire: FramedSocket) -> None:

@@ -84,22 +84,12 @@ def code_stamp() -> str:
 
 
 def host_worlds(recipe: str, place: tuple[str, int], secret: bytes, number: int) -> NoReturn:
-    """The whole life of a process that hosts worlds; see `hosts.host.serve`.
-
-    Args:
-        recipe: what `remote.RemoteWorlds` writes.
-        place: where it listens.
-        secret: of its hosts.
-        number: of this one.
-    """
+    """The whole life of a process that hosts worlds; see `hosts.host.serve`."""
     serve(partial(HostedWorlds, json.loads(recipe)), place, secret, number)
 
 
 class HostedWorlds:
     """Some of the worlds, next to each other; which ones, only their caller knows.
-
-    Args:
-        recipe: environment, and how many worlds there will be.
 
     Raises:
         WorkerError: this machine's files are not the caller's.

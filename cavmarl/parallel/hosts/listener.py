@@ -32,10 +32,6 @@ _HELLO = struct.Struct(f"<4sHI{NONCE}s")
 class PendingConnection:
     """A caller that has not proved its identity yet.
 
-    Args:
-        connection: to it.
-        secret: that it has to know.
-
     Attributes:
         until_s: for so long it may take, by `time.monotonic`.
         number: that it says it has; -1: it has said nothing.
@@ -97,9 +93,6 @@ class PendingConnection:
 class Listener:
     """Listens.
 
-    Args:
-        address: of this machine, under which hosts reach it.
-
     Attributes:
         place: address and port.
         secret: that hosts have to know.
@@ -135,11 +128,6 @@ class Listener:
 
 def knock(place: tuple[str, int], secret: bytes, number: int) -> FramedSocket:
     """Call as a host; the caller may be busy for long before it answers.
-
-    Args:
-        place: address and port of the door.
-        secret: shared by the run's processes.
-        number: of the host.
 
     Raises:
         OSError: nobody listens there.

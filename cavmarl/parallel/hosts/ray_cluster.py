@@ -21,19 +21,12 @@ _joined = 0  # how many have joined by `join`, where the program itself had not
 
 @dataclass(frozen=True)
 class Node:
-    """A node of the cluster; shares are those reserved with Ray.
-
-    Attributes:
-        name: its id.
-        cpus: free ones.
-        use: what is reserved.
-        hosted: how many hosts it has been given.
-    """
+    """A node of the cluster; shares are those reserved with Ray."""
 
     name: str
-    cpus: int
-    use: Utilisation
-    hosted: int = 0
+    cpus: int  # free ones
+    use: Utilisation  # what is reserved
+    hosted: int = 0  # how many hosts it has been given
 
 
 def join() -> bool:
@@ -118,10 +111,6 @@ def nodes_with(cpus: int) -> list[Node]:
 
 def choose_nodes(known: Sequence[Node], workers: int) -> list[str]:
     """A node for each host: admissible, of the lowest LoadScore, with the fewest hosts so far.
-
-    Args:
-        known: all nodes.
-        workers: hosts with a CPU of their own.
 
     Returns:
         names of nodes.

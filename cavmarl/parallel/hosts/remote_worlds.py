@@ -38,17 +38,8 @@ Array = NDArray[np.uint8]
 class RemoteWorlds(OrderedWorlds):
     """W worlds over m hosts, whole worlds each.
 
-    Args:
-        world: what each is made of.
-        base_dir: the folder that its relative files start from, on every machine.
-        num_worlds: W.
-        workers: m, from 1 to W; None: as many as the cluster has free CPUs.
-        in_next_step: when worlds begin anew; see `SteppedWorlds`.
-
     Attributes:
-        world: what each is made of.
         arrays: of this process; what hosts send is written to them.
-        pool: the hosts.
         in_next_step: when worlds begin anew.
         placement: which host runs what.
         mover: has that changed; None: it does not change.
@@ -62,11 +53,11 @@ class RemoteWorlds(OrderedWorlds):
 
     def __init__(
         self,
-        world: World,
-        base_dir: Path,
-        num_worlds: int,
-        workers: int | None,
-        in_next_step: bool = False,
+        world: World,  # what each is made of
+        base_dir: Path,  # the folder that its relative files start from, on every machine
+        num_worlds: int,  # W
+        workers: int | None,  # m, from 1 to W; None: as many as the cluster has free CPUs
+        in_next_step: bool = False,  # when worlds begin anew; see `SteppedWorlds`
     ) -> None:
         self.world = world
         self.in_next_step = in_next_step

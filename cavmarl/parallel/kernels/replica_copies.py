@@ -69,27 +69,17 @@ def note_spans(memory: Words, known: Words, spans: NDArray[np.int64], out: Words
 
 @kernel
 def note_rows(
-    memory: Words,
-    known: Words,
-    first: int,
+    memory: Words,  # what there is
+    known: Words,  # what the other process has; made the same
+    first: int,  # byte of the first row of zone 0 in world 0
+    # (3,) bytes from zone to zone, from world to world, from row to row
     strides: NDArray[np.int64],
     zones: NDArray[np.int64],
-    counts: NDArray[np.int64],
-    out: Words,
-    at: int,
+    counts: NDArray[np.int64],  # (k, W) rows to look at
+    out: Words,  # as for `note_spans`
+    at: int,  # as for `note_spans`
 ) -> int:
-    """Note what has changed in the first rows of some zones; the stream's words afterwards.
-
-    Args:
-        memory: what there is.
-        known: what the other process has; made the same.
-        first: byte of the first row of zone 0 in world 0.
-        strides: (3,) bytes from zone to zone, from world to world, from row to row.
-        zones: which ones.
-        counts: (k, W) rows to look at.
-        out: as for `note_spans`.
-        at: as for `note_spans`.
-    """
+    """Note what has changed in the first rows of some zones; the stream's words afterwards."""
     for zone in zones:
         for w in range(counts.shape[1]):
             begin = first + zone * strides[0] + w * strides[1]
@@ -100,25 +90,15 @@ def note_rows(
 
 @kernel
 def note_agents(
-    memory: Words,
-    known: Words,
-    first: int,
-    size: int,
-    marks: NDArray[np.bool_],
-    out: Words,
-    at: int,
+    memory: Words,  # what there is
+    known: Words,  # what the other process has; made the same
+    first: int,  # byte at which an array (W, A, …) begins
+    size: int,  # bytes of each agent in it
+    marks: NDArray[np.bool_],  # (W, A) which agents
+    out: Words,  # as for `note_spans`
+    at: int,  # as for `note_spans`
 ) -> int:
-    """Note what has changed at the indices of some agents; the stream's words afterwards.
-
-    Args:
-        memory: what there is.
-        known: what the other process has; made the same.
-        first: byte at which an array (W, A, …) begins.
-        size: bytes of each agent in it.
-        marks: (W, A) which agents.
-        out: as for `note_spans`.
-        at: as for `note_spans`.
-    """
+    """Note what has changed at the indices of some agents; the stream's words afterwards."""
     for w in range(marks.shape[0]):
         for agent in range(marks.shape[1]):
             if marks[w, agent]:
@@ -129,19 +109,12 @@ def note_agents(
 
 @kernel
 def mark_agents(
-    rows: NDArray[np.void],
-    num_owned: NDArray[np.int64],
+    rows: NDArray[np.void],  # VEHICLE (k, W, C)
+    num_owned: NDArray[np.int64],  # (k, W)
     zones: NDArray[np.int64],
-    marks: NDArray[np.bool_],
+    marks: NDArray[np.bool_],  # (W, A) is written
 ) -> None:
-    """Find the agents whose vehicles some zones own.
-
-    Args:
-        rows: VEHICLE (k, W, C).
-        num_owned: (k, W).
-        zones: which ones.
-        marks: (W, A) is written.
-    """
+    """Find the agents whose vehicles some zones own."""
     marks[:] = False
     for zone in zones:
         for w in range(num_owned.shape[1]):

@@ -35,19 +35,12 @@ class ServerGoneError(Exception):
 
 @dataclass
 class Process:
-    """One worker's process.
+    """One worker's process."""
 
-    Attributes:
-        pid: its number, not given again until it is reaped.
-        pidfd: readable when it has ended.
-        wire: socket to it.
-        mail: what it has sent, unread.
-    """
-
-    pid: int
-    pidfd: int
-    wire: socket.socket
-    mail: list[bytes] = field(default_factory=list)
+    pid: int  # its number, not given again until it is reaped
+    pidfd: int  # readable when it has ended
+    wire: socket.socket  # socket to it
+    mail: list[bytes] = field(default_factory=list)  # what it has sent, unread
 
     def collect(self) -> None:
         """Take what has come through the wire; calls to wake up are forgotten."""

@@ -34,7 +34,6 @@ class Segment:
 
     Attributes:
         fd: to be passed to other processes.
-        size: bytes.
     """
 
     def __init__(self, fd: int, size: int) -> None:

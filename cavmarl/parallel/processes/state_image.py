@@ -27,25 +27,15 @@ _IS_PYTHON = bool(_settings.DISABLE_JIT)
 
 
 class _Place(NamedTuple):
-    """Where an array goes in an image.
-
-    Attributes:
-        shape: of the array.
-        end: of it, in words from the image's begin.
-        target: the place itself, as raw items.
-    """
+    """Where an array goes in an image."""
 
     shape: tuple[int, ...]
-    end: int
-    target: Array
+    end: int  # of it, in words from the image's begin
+    target: Array  # the place itself, as raw items
 
 
 class Image:
-    """Arrays as they were at one moment.
-
-    Args:
-        segment: that holds it; it grows as the arrays do.
-    """
+    """Arrays as they were at one moment."""
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
@@ -115,9 +105,6 @@ class Image:
 
     def read(self, dtypes: Sequence[np.dtype[Any]]) -> Iterator[Array]:
         """The arrays, in their order, as views.
-
-        Args:
-            dtypes: of each.
 
         Raises:
             WorkerError: they are not what was written.

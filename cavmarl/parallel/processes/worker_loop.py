@@ -96,11 +96,7 @@ def die_with_parent() -> None:
 
 
 def serve(make_jobs: MakeJobs) -> NoReturn:
-    """The whole life of the forking process.
-
-    Args:
-        make_jobs: from what the pool says about them.
-    """
+    """The whole life of the forking process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the pool, which sees to the rest
     faulthandler.enable()
     start = json.loads(sys.argv[1])

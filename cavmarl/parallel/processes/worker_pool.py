@@ -28,25 +28,15 @@ __all__ = ["Death", "Pool", "Program"]
 
 @dataclass
 class Death:
-    """What became of one process and of what it did; times are those of `time.monotonic`.
+    """What became of one process and of what it did; times are those of `time.monotonic`."""
 
-    Attributes:
-        worker: whose process it was.
-        order: that was to be carried out.
-        cause: signal or exit status, or why it was taken for dead.
-        ordered_s: when the command was given.
-        noticed_s: when that was noticed.
-        replaced_s: when its successor had its order.
-        done_s: when that was carried out; nan: not yet.
-    """
-
-    worker: int
-    order: int
-    cause: str
-    ordered_s: float
-    noticed_s: float
-    replaced_s: float
-    done_s: float = nan
+    worker: int  # whose process it was
+    order: int  # that was to be carried out
+    cause: str  # signal or exit status, or why it was taken for dead
+    ordered_s: float  # when the command was given
+    noticed_s: float  # when that was noticed
+    replaced_s: float  # when its successor had its order
+    done_s: float = nan  # when that was carried out; nan: not yet
 
 
 class Pool:
@@ -97,11 +87,6 @@ class Pool:
 
     def run(self, task: int, letter: Any = None, commits: bool = True) -> list[Any]:
         """Let all workers do a task.
-
-        Args:
-            task: of the job.
-            letter: what is said to all, as JSON knows it.
-            commits: the task changes their state.
 
         Returns:
             what each has answered.
@@ -171,12 +156,6 @@ class Pool:
         self, workers: tuple[int, ...], mail: bytes | None, expected_s: float, sleeps: bool
     ) -> None:
         """Return when all workers have carried out their order.
-
-        Args:
-            workers: the workers that have one.
-            mail: that came with it.
-            expected_s: how long it has taken the last time.
-            sleeps: they know that the caller does not poll.
 
         Raises:
             WorkerDeathError: too many processes died of it; the pool is closed.
@@ -262,13 +241,7 @@ class Pool:
 
 
 class _Guard:
-    """Checks the workers that are waited for, from time to time.
-
-    Args:
-        crew: that they belong to.
-        timeout_s: for so long each may be busy.
-        since_s: when they were given their command, by `time.monotonic`.
-    """
+    """Checks the workers that are waited for, from time to time."""
 
     def __init__(self, crew: WorkerProcesses, timeout_s: float, since_s: float) -> None:
         self._crew = crew

@@ -11,11 +11,7 @@ PARTS = 32  # of a frame, in each of which lines are taken to cost the same
 
 
 class LineCosts:
-    """At first every line of a frame costs the same.
-
-    Args:
-        num_lines: of a frame of each sensor.
-    """
+    """At first every line of a frame costs the same."""
 
     def __init__(self, num_lines: Sequence[int]) -> None:
         self._num_lines = tuple(num_lines)

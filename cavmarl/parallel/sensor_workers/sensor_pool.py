@@ -35,48 +35,28 @@ NEW_COST = 0.5  # weight of the latest costs from then on; what is first measure
 
 
 class SensorWorkerPlan(NamedTuple):
-    """What processes are made of.
+    """What processes are made of."""
 
-    Attributes:
-        module: that they run.
-        recipe: from which it makes its jobs; `shape` and `scene` are added.
-        frames: memory that samples are written to; it goes with the farm.
-        shape: of what is shared.
-        num_lines: (S,) into how many lines a frame of each sensor can be divided.
-        workers: how they are watched, and how sensing is shared out.
-    """
-
-    module: str
-    recipe: Mapping[str, Any]
-    frames: Segment
-    shape: SceneShape
-    num_lines: tuple[int, ...]
-    workers: WorkersConfig
+    module: str  # that they run
+    recipe: Mapping[str, Any]  # from which it makes its jobs; `shape` and `scene` are added
+    frames: Segment  # memory that samples are written to; it goes with the farm
+    shape: SceneShape  # of what is shared
+    num_lines: tuple[int, ...]  # (S,) into how many lines a frame of each sensor can be divided
+    workers: WorkersConfig  # how they are watched, and how sensing is shared out
 
 
 @dataclass
 class SensorWorkerTimes:
-    """Sums over all ticks in which sensors were due.
+    """Sums over all ticks in which sensors were due."""
 
-    Attributes:
-        publish_s: writing down what there is to see, and which worker senses what.
-        own_s: sensing what stays here.
-        wait_s: from the command until all frames were there.
-        busy_s: of that, while the busiest worker sensed.
-        ticks: how many.
-        sent_bytes: that the workers were given to read.
-        got_bytes: of frames that they have written.
-        messages: commands and answers.
-    """
-
-    publish_s: float = 0.0
-    own_s: float = 0.0
-    wait_s: float = 0.0
-    busy_s: float = 0.0
+    publish_s: float = 0.0  # writing down what there is to see, and which worker senses what
+    own_s: float = 0.0  # sensing what stays here
+    wait_s: float = 0.0  # from the command until all frames were there
+    busy_s: float = 0.0  # of that, while the busiest worker sensed
     ticks: int = 0
-    sent_bytes: int = 0
-    got_bytes: int = 0
-    messages: int = 0
+    sent_bytes: int = 0  # that the workers were given to read
+    got_bytes: int = 0  # of frames that they have written
+    messages: int = 0  # commands and answers
 
     def since(self, before: SensorWorkerTimes) -> SensorWorkerTimes:
         """What has come to it since it was a copy of `before`."""
@@ -130,9 +110,6 @@ class SensorWorkers:
     It starts them when it is called for the first time, so it may be made before a fork. A call
     returns when each sensor that is due has delivered the frame of this tick. A late one is waited
     for; a dead one is replaced, and its successor senses the same again.
-
-    Args:
-        plan: what the processes are made of.
 
     Attributes:
         times: where the time has gone.

@@ -29,12 +29,6 @@ def local_worlds(
 ) -> LocalWorlds:
     """Worlds of this process, with as many sensor workers as `workers.sensors` says.
 
-    Args:
-        world: what each is made of.
-        base_dir: the folder that its relative files start from.
-        num_worlds: W.
-        in_next_step: when worlds begin anew; see `SteppedWorlds`.
-
     Raises:
         WorkerError: there is no memory that processes could share.
     """
@@ -65,15 +59,7 @@ def warn_if_crowded(sensor_workers: int, times: int) -> None:
 def farm_of(
     world: World, base_dir: Path, arrays: Segment, part: tuple[int, int], num_worlds: int
 ) -> SensorWorkers:
-    """The sensor workers of some worlds, to be started when they are needed.
-
-    Args:
-        world: what each is made of.
-        base_dir: the folder that its relative files start from.
-        arrays: the memory of the `StepArrays` of all worlds; it goes with the farm.
-        part: the first of its worlds, and the one after the last.
-        num_worlds: in all.
-    """
+    """The sensor workers of some worlds, to be started when they are needed."""
     config = world.config
     first, last = part
     shape = SceneShape(
@@ -96,11 +82,7 @@ def farm_of(
 
 
 def make_sensor_jobs(recipe: Mapping[str, Any]) -> list[SensorJob]:
-    """The jobs of all sensor workers, every kernel loaded.
-
-    Args:
-        recipe: of `farm_of`, with what the farm has added.
-    """
+    """The jobs of all sensor workers, every kernel loaded."""
     from cavmarl.config.io import validate  # pydantic is slow to import
 
     load_extensions(recipe["extensions"])

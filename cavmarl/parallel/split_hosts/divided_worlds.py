@@ -40,17 +40,8 @@ log = logging.getLogger("cavmarl.workers")
 class DividedWorlds:
     """W worlds that this process leads, and m hosts that run their zones, the same of all worlds.
 
-    Args:
-        world: what each is made of.
-        base_dir: the folder that its relative files start from, on every machine.
-        num_worlds: W.
-        workers: m, from 2 to the zones of a world.
-        in_next_step: when worlds begin anew; see `SteppedWorlds`.
-
     Attributes:
-        world: what each is made of.
         arrays: of this process.
-        pool: the hosts.
         in_next_step: when worlds begin anew.
         placement: which host has which zones.
         leader: runs the phases.
@@ -65,11 +56,11 @@ class DividedWorlds:
 
     def __init__(
         self,
-        world: World,
-        base_dir: Path,
-        num_worlds: int,
-        workers: int,
-        in_next_step: bool = False,
+        world: World,  # what each is made of
+        base_dir: Path,  # the folder that its relative files start from, on every machine
+        num_worlds: int,  # W
+        workers: int,  # m, from 2 to the zones of a world
+        in_next_step: bool = False,  # when worlds begin anew; see `SteppedWorlds`
     ) -> None:
         _check(world, num_worlds, workers)
         config = world.config

@@ -35,15 +35,10 @@ _WORD = 8
 
 
 class Place(NamedTuple):
-    """Where an array lies.
+    """Where an array lies."""
 
-    Attributes:
-        arena: in which part of the memory.
-        first: byte of it.
-    """
-
-    arena: int
-    first: int
+    arena: int  # in which part of the memory
+    first: int  # byte of it
 
 
 Spans = Sequence[tuple[int, NDArray[np.int64]]]
@@ -86,11 +81,7 @@ class ReplicaMemory:
         return len(self.arenas) - 1
 
     def find(self, array: Array) -> Place | None:
-        """Where an array lies; None: somewhere else.
-
-        Args:
-            array: contiguous.
-        """
+        """Where an array lies; None: somewhere else."""
         at = _address(array)
         for number, (start, arena) in enumerate(zip(self._starts, self.arenas, strict=True)):
             if start <= at and at + array.nbytes <= start + arena.nbytes:

@@ -29,24 +29,15 @@ class ZoneLeader:
 
     What goes from zone to zone it does itself: ownership, ghosts, the gate, the signals. So it
     has all rows at the end of each phase, and a host that is lost costs no more than its phase.
-
-    Args:
-        shards: one a zone.
-        memory: in which their arrays lie.
-        inputs: what phases are called with.
-        zones: of each host.
-        spent_s: (k,) where the processor time of each zone is added up, if hosts measure it.
-
-    Attributes:
-        zones: of each host.
     """
 
     def __init__(
         self,
-        shards: Sequence[Shard],
-        memory: ReplicaMemory,
-        inputs: PhaseInputs,
-        zones: Sequence[Sequence[int]],
+        shards: Sequence[Shard],  # one a zone
+        memory: ReplicaMemory,  # in which their arrays lie
+        inputs: PhaseInputs,  # what phases are called with
+        zones: Sequence[Sequence[int]],  # of each host
+        # (k,) where the processor time of each zone is added up, if hosts measure it
         spent_s: NDArray[np.float64],
     ) -> None:
         self._everybody = ShardGroup(shards)

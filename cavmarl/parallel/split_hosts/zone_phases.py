@@ -49,23 +49,14 @@ CLEARED = 1 << 16  # words that are made 0 at once
 
 
 class PhaseInputs(NamedTuple):
-    """What phases are called with, at the same place in all processes.
+    """What phases are called with, at the same place in all processes."""
 
-    Attributes:
-        commands: of the agents.
-        chosen: (W,) worlds in which agents sense.
-        suggested: (W, A, 2) what the built-in driver would do.
-        before: POSE (W, A) of all agents in the tick before.
-        due: (S, 3, W) of each sensor of the rig, see `Due`.
-        frames: what the rigs sense.
-    """
-
-    commands: Commands
-    chosen: NDArray[np.bool_]
-    suggested: NDArray[np.float64]
-    before: NDArray[np.void]
-    due: NDArray[np.int64]
-    frames: Frames
+    commands: Commands  # of the agents
+    chosen: NDArray[np.bool_]  # (W,) worlds in which agents sense
+    suggested: NDArray[np.float64]  # (W, A, 2) what the built-in driver would do
+    before: NDArray[np.void]  # POSE (W, A) of all agents in the tick before
+    due: NDArray[np.int64]  # (S, 3, W) of each sensor of the rig, see `Due`
+    frames: Frames  # what the rigs sense
 
     @classmethod
     def make(
@@ -88,23 +79,14 @@ class PhaseInputs(NamedTuple):
 
 
 class ZoneTurn(NamedTuple):
-    """One phase on some zones.
-
-    Attributes:
-        phase: which one.
-        zones: on which, rising.
-        side: where their rows are.
-        next_side: where the next ones are.
-        begins_step: before it moves, the accounts of a step are opened.
-        sensors: of the rig, by number, that are due.
-    """
+    """One phase on some zones."""
 
     phase: ZonePhase
-    zones: NDArray[np.int64]
-    side: int
-    next_side: int
-    begins_step: bool = False
-    sensors: tuple[int, ...] = ()
+    zones: NDArray[np.int64]  # on which, rising
+    side: int  # where their rows are
+    next_side: int  # where the next ones are
+    begins_step: bool = False  # before it moves, the accounts of a step are opened
+    sensors: tuple[int, ...] = ()  # of the rig, by number, that are due
 
 
 class _Rows(NamedTuple):
@@ -124,13 +106,7 @@ class _OfAgents(NamedTuple):
 class ZonePhases:
     """What is sent before and after the phases of some worlds.
 
-    Args:
-        shards: one a zone.
-        memory: in which the arrays lie that they write.
-        inputs: what phases are called with.
-
     Attributes:
-        inputs: the same.
         pieces: of a stream there are at most so many that do not lie next to each other.
     """
 

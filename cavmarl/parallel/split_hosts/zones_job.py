@@ -32,52 +32,27 @@ Array = NDArray[Any]
 
 
 class PhaseOrder(NamedTuple):
-    """The payload of a command: a phase on some zones, and how much has changed before it.
+    """The payload of a command: a phase on some zones, and how much has changed before it."""
 
-    Attributes:
-        is_new: the host is to forget what it has.
-        words: of changes.
-        phase: a `ZonePhase`.
-        zones: see `ZoneTurn`, as the rest.
-        side: where the rows are.
-        next_side: where the next ones are.
-        begins_step: whether a step begins.
-        sensors: that are due.
-    """
-
-    is_new: bool
-    words: int
-    phase: int
-    zones: list[int]
-    side: int
-    next_side: int
-    begins_step: bool
-    sensors: list[int]
+    is_new: bool  # the host is to forget what it has
+    words: int  # of changes
+    phase: int  # a `ZonePhase`
+    zones: list[int]  # see `ZoneTurn`, as the rest
+    side: int  # where the rows are
+    next_side: int  # where the next ones are
+    begins_step: bool  # whether a step begins
+    sensors: list[int]  # that are due
 
 
 def host_zones(recipe: str, place: tuple[str, int], secret: bytes, number: int) -> NoReturn:
-    """The whole life of a process that hosts zones; see `hosts.host.serve`.
-
-    Args:
-        recipe: what `divided.DividedWorlds` writes.
-        place: where it listens.
-        secret: of its hosts.
-        number: of this one.
-    """
+    """The whole life of a process that hosts zones; see `hosts.host.serve`."""
     serve(partial(ZonesJob, json.loads(recipe)), place, secret, number)
 
 
 def make_replicated(
     world: World, num_worlds: int, in_next_step: bool, warm: bool
 ) -> tuple[LocalWorlds, ReplicaMemory, PhaseInputs]:
-    """Worlds whose arrays lie at the same places wherever they are made.
-
-    Args:
-        world: what each is made of.
-        num_worlds: W.
-        in_next_step: when worlds begin anew; see `SteppedWorlds`.
-        warm: have all kernels ready now.
-    """
+    """Worlds whose arrays lie at the same places wherever they are made."""
     memory = ReplicaMemory()
     config = world.config
     layout = layout_of(config, world.capacity, num_worlds).items()
@@ -91,9 +66,6 @@ def make_replicated(
 
 class ZonesJob:
     """Some zones of all worlds; which ones, each command says.
-
-    Args:
-        recipe: environment, and how many worlds there are.
 
     Raises:
         WorkerError: this machine's files are not the caller's.

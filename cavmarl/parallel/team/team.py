@@ -57,21 +57,16 @@ class LeftAloneError(Exception):
 
 
 class Team:
-    """The workers of one world and their zones; made before the processes start.
-
-    Args:
-        shards: one a zone, in the order of zones; their arrays are shared.
-        zones: of each worker, to begin with; the first leads.
-        known: what phases are called with that are run together, by their names: for each phase all
-            that there is to choose from; the arrays among it are shared.
-        spent_s: (k,) where the processor time of each zone is added up; None: not measured.
-    """
+    """The workers of one world and their zones; made before the processes start."""
 
     def __init__(
         self,
-        shards: Sequence[Shard],
-        zones: Sequence[Sequence[int]],
+        shards: Sequence[Shard],  # one a zone, in the order of zones; their arrays are shared
+        zones: Sequence[Sequence[int]],  # of each worker, to begin with; the first leads
+        # what phases are called with that are run together, by their names: for each phase all that
+        # there is to choose from; the arrays among it are shared
         known: Mapping[str, Sequence[tuple[Any, ...]]],
+        # (k,) where the processor time of each zone is added up; None: not measured
         spent_s: NDArray[np.float64] | None = None,
     ) -> None:
         self.known = {name: tuple(known.get(name, ((),))) for name in TOGETHER}
@@ -87,11 +82,7 @@ class Team:
 
 
 class Leader:
-    """Runs each phase on all shards of a world, with the help of the followers; an `Executor`.
-
-    Args:
-        team: that it leads.
-    """
+    """Runs each phase on all shards of a world, with the help of the followers; an `Executor`."""
 
     def __init__(self, team: Team) -> None:
         self._known = team.known
@@ -194,12 +185,7 @@ class Leader:
 
 
 class TeamFollower:
-    """Runs the phases that the leader announces on its own shards.
-
-    Args:
-        team: that it belongs to.
-        number: in the team, from 1.
-    """
+    """Runs the phases that the leader announces on its own shards."""
 
     def __init__(self, team: Team, number: int) -> None:
         self._known = team.known

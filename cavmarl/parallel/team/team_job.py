@@ -23,22 +23,15 @@ ALONE = (Task.STATE_HASH, Task.TRAFFIC_STATS, Task.DRIVEN, Task.SIGNAL_PHASES)
 
 
 class LeaderJob(CheckpointJob):
-    """One world that several workers run, of which this one leads.
-
-    Args:
-        worlds: the one; what its shards write is shared.
-        first: its number among all.
-        zones: that each worker hosts, to begin with; the leader's first.
-        diary: the checkpoint log in which it leaves the state behind.
-        spent_s: (k,) where the processor time of each zone is added up; None: not measured.
-    """
+    """One world that several workers run, of which this one leads."""
 
     def __init__(
         self,
-        worlds: LocalWorlds,
-        first: int,
-        zones: Sequence[Sequence[int]],
-        diary: CheckpointLog,
+        worlds: LocalWorlds,  # the one; what its shards write is shared
+        first: int,  # its number among all
+        zones: Sequence[Sequence[int]],  # that each worker hosts, to begin with; the leader's first
+        diary: CheckpointLog,  # the checkpoint log in which it leaves the state behind
+        # (k,) where the processor time of each zone is added up; None: not measured
         spent_s: NDArray[np.float64] | None = None,
     ) -> None:
         super().__init__(worlds, first, diary)
@@ -104,14 +97,7 @@ class LeaderJob(CheckpointJob):
 
 
 class FollowerJob:
-    """Some zones of one world, of which other workers have the rest.
-
-    Args:
-        follower: that runs their phases.
-        world: the world's number among all.
-        number: in the team, from 1.
-        hosts: (k,) number in the team of each zone's worker.
-    """
+    """Some zones of one world, of which other workers have the rest."""
 
     def __init__(
         self, follower: TeamFollower, world: int, number: int, hosts: NDArray[np.int64]
@@ -146,11 +132,7 @@ class FollowerJob:
 
 
 def _hosts(zones: Sequence[Sequence[int]]) -> NDArray[np.int64]:
-    """(k,) number in the team of each zone's worker.
-
-    Args:
-        zones: of each worker.
-    """
+    """(k,) number in the team of each zone's worker."""
     hosts = np.zeros(sum(map(len, zones)), dtype=np.int64)
     for number, hosted in enumerate(zones):
         hosts[list(hosted)] = number

@@ -37,27 +37,20 @@ class Borders(NamedTuple):
 @kernel
 def find_near(
     zones: ZoneArrays,
-    borders: Borders,
-    zoned: Zoned,
-    side: int,
+    borders: Borders,  # when a vehicle is near one
+    zoned: Zoned,  # the rows of all zones
+    side: int,  # whose rows, 0 or 1
     w: int,
+    # whether to look at all owned rows, and not only at those that `exchange` has found near a
+    # border
     everybody: bool,
+    # NEAR (2 C,) overwritten: by zones and rows, a crossing before an approach
     out: NDArray[np.void],
 ) -> int:
     """The owned rows that other zones have to be told of; how many entries there are.
 
     A vehicle is near a zone that it lies in, further than the hysteresis outside of its own, and
     one that it would lie in so after `ahead_s` at its present velocity.
-
-    Args:
-        zones: of the partition.
-        borders: when a vehicle is near one.
-        zoned: the rows of all zones.
-        side: whose rows, 0 or 1.
-        w: in which world.
-        everybody: whether to look at all owned rows, and not only at those that `exchange` has
-            found near a border.
-        out: NEAR (2 C,) overwritten: by zones and rows, a crossing before an approach.
     """
     found = 0
     for zone in range(zones.rects.shape[0]):

@@ -34,32 +34,22 @@ ROW_LINES = 6  # of memory, that a VEHICLE row takes
 @kernel
 def exchange(
     zones: ZoneArrays,
-    halo: Halo,
-    touching_m: float,
-    borders: Borders,
+    halo: Halo,  # from `roads.zone_halo.zone_halo`, for the same partition
+    touching_m: float,  # no ghost further outside of a zone can touch one of its vehicles
+    borders: Borders,  # when a vehicle is near one
+    # the ghosts and how many there are, border and num_border are written. Of the owned rows those
+    # in `outer` are looked at; they are noted here, if they are not yet
     zoned: Zoned,
-    side: int,
-    first: int,
-    last: int,
-    book: BorderRecords,
+    side: int,  # whose rows, 0 or 1
+    first: int,  # the first world
+    last: int,  # the one after the last
+    book: BorderRecords,  # vehicles near a border are written
 ) -> None:
     """Renew all ghosts of some worlds from the owned rows, and note vehicles near a border.
 
     Zone z needs a vehicle if and only if a driver there may ask about it (`zones.is_seen`). A
     vehicle that has left its own zone's rectangle, because its transfer is late, is published like
     any other, to the zone that it is in as well.
-
-    Args:
-        zones: of the partition.
-        halo: from `roads.zone_halo.zone_halo`, for the same partition.
-        touching_m: no ghost further outside of a zone can touch one of its vehicles.
-        borders: when a vehicle is near one.
-        zoned: the ghosts and how many there are, border and num_border are written. Of the owned
-            rows those in `outer` are looked at; they are noted here, if they are not yet.
-        side: whose rows, 0 or 1.
-        first: the first world.
-        last: the one after the last.
-        book: vehicles near a border are written.
     """
     # No other vehicle can be behind a border by then.
     border_m = borders.max_speed_mps * borders.ahead_s
@@ -78,28 +68,19 @@ def exchange(
 @kernel
 def gather(
     zones: ZoneArrays,
-    halo: Halo,
-    touching_m: float,
-    border_m: float,
+    halo: Halo,  # as for `exchange`
+    touching_m: float,  # as for `exchange`
+    border_m: float,  # within that of another zone an owned row is at a border, m
+    # the ghosts of this zone and how many there are, its border and num_border are written; outer
+    # and num_outer stay
     zoned: Zoned,
-    side: int,
-    zone: int,
+    side: int,  # whose rows, 0 or 1
+    zone: int,  # whose ghosts
     w: int,
 ) -> None:
     """Renew the ghosts of one zone from all others' owned rows, and note vehicles at a border.
 
     It writes what is this zone's alone, and reads of the others what no other call of it writes.
-
-    Args:
-        zones: of the partition.
-        halo: as for `exchange`.
-        touching_m: as for `exchange`.
-        border_m: within that of another zone an owned row is at a border, m.
-        zoned: the ghosts of this zone and how many there are, its border and num_border are
-            written; outer and num_outer stay.
-        side: whose rows, 0 or 1.
-        zone: whose ghosts.
-        w: in which world.
     """
     near_limit = touching_m * touching_m
     border_limit = min(halo.halo_m * halo.halo_m, border_m * border_m)

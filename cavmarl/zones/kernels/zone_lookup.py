@@ -146,13 +146,7 @@ def note_outer(outer: np.void, row: np.void, i: int) -> None:
 
 @inlined_kernel
 def is_asked_about(halo: Halo, watch: np.void, row: np.void) -> bool:
-    """Whether some driver of a zone that watches a vehicle's lane may ask about it.
-
-    Args:
-        halo: of all zones.
-        watch: WATCH of the lane.
-        row: VEHICLE or OUTER.
-    """
+    """Whether some driver of a zone that watches a vehicle's lane may ask about it."""
     # Answers are unpredictable: branches would cost more than all that they leave out.
     s = row["s"]
     reach_m = announced_m(row["speed"])

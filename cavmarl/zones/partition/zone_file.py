@@ -98,20 +98,13 @@ def zones_for(network: RoadNetwork, path: str | Path, count: int | None) -> Zone
 
 def named_zones(
     network: RoadNetwork,
-    layout: str,
-    count: int | None,
+    layout: str,  # one of ZONE_LAYOUTS, or a path
+    count: int | None,  # how many zones; None: as many as the file has, of a layout 4
     *,
-    avoid_junctions: bool = False,
-    weight: str = "lane_length",
+    avoid_junctions: bool = False,  # of `cut_map`
+    weight: str = "lane_length",  # of `cut_map`
 ) -> ZonePartition:
     """The partition that a layout's name or the path of a zone file stands for.
-
-    Args:
-        network: the map.
-        layout: one of ZONE_LAYOUTS, or a path.
-        count: how many zones; None: as many as the file has, of a layout 4.
-        avoid_junctions: of `cut_map`.
-        weight: of `cut_map`.
 
     Raises:
         ConfigError: neither a layout nor a zone file; see `cut_map` and `zones_for`.

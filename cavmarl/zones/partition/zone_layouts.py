@@ -35,38 +35,26 @@ _CLEAR_M = 1.0
 
 @dataclass(frozen=True)
 class _Area:
-    """What is cut: the map's box, what counts in it, and what to keep whole.
+    """What is cut: the map's box, what counts in it, and what to keep whole."""
 
-    Attributes:
-        bounds: the box.
-        samples: (n, 3) x, y and weight; none: area counts.
-        junctions: (m, 4) boxes that cuts avoid.
-    """
-
-    bounds: Bounds
-    samples: Floats | None
-    junctions: Floats
+    bounds: Bounds  # the box
+    samples: Floats | None  # (n, 3) x, y and weight; none: area counts
+    junctions: Floats  # (m, 4) boxes that cuts avoid
 
 
 def cut_map(
     network: RoadNetwork,
-    layout: str,
-    count: int,
+    layout: str,  # `grid`, `strips` or `bisection`
+    count: int,  # k
     *,
+    # move cuts aside, by at most a quarter of a zone's side (bisection: a tenth of the weight),
+    # where that keeps junctions whole
     avoid_junctions: bool = False,
-    weight: str = "lane_length",
+    weight: str = "lane_length",  # what bisection shares out: `lane_length`, or `uniform` for area
+    # (n, 3) x and y in m, and a weight: shared out instead, such as expected vehicles
     density: Floats | None = None,
 ) -> ZonePartition:
     """Divide a map into `count` zones.
-
-    Args:
-        network: the map.
-        layout: `grid`, `strips` or `bisection`.
-        count: k.
-        avoid_junctions: move cuts aside, by at most a quarter of a zone's side (bisection: a tenth
-            of the weight), where that keeps junctions whole.
-        weight: what bisection shares out: `lane_length`, or `uniform` for area.
-        density: (n, 3) x and y in m, and a weight: shared out instead, such as expected vehicles.
 
     Raises:
         ConfigError: no such layout or weight, more zones than there can be or than the map can
