@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.memory import Zeros
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.core.records.arrays import Worlds
 from cavmarl.roads.kernels.signal_phases import switch_signals
 from cavmarl.roads.network import RoadNetwork
@@ -37,9 +37,9 @@ class SharedOutputs:
         self._sim_dt_s = config.clock.sim_dt_s
         self._weights = np.array(config.terms.weight_of_each)
         self._team_share = config.terms.team_share
-        self._switch_signals = repeated(switch_signals)
-        self._clear_outputs = repeated(clear_outputs)
-        self._settle_outputs = repeated(settle_outputs)
+        self._switch_signals = specialized(switch_signals)
+        self._clear_outputs = specialized(clear_outputs)
+        self._settle_outputs = specialized(settle_outputs)
 
     def switch_signals(self, worlds: Worlds) -> None:
         """Bring the signals to the present tick, after `detect` of all shards."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.math.tallies import count_tick, occasions
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.core.records.arrays import Gate
 from cavmarl.engine.component import Attached
 from cavmarl.engine.shared_outputs import SharedOutputs
@@ -59,8 +59,8 @@ class Tick:
         self._meet: Callable[[], None] = _there
         self._gathers = False
         self._note_phase: Callable[[str], None] = _pass_over
-        self._count_tick = repeated(count_tick)
-        self._occasions = repeated(occasions)
+        self._count_tick = specialized(count_tick)
+        self._occasions = specialized(occasions)
 
     def run(self, commands: Commands, is_first: bool, is_last: bool) -> None:
         """Begin → attached → begin the step → advance … signals → attached → sense → end."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import ActionConfig
 from cavmarl.core.errors import ActionError
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.core.records.codes import ACTION_IDLE, ACTION_SLOWER
 from cavmarl.engine.kernels.decoding import decode_choices, decode_pairs
 from cavmarl.shards.shard import Commands
@@ -52,8 +52,8 @@ class ActionDecoder:
         commands.controls[:] = 0.0
         commands.meta_actions[:] = ACTION_IDLE
         self._decoded = commands
-        self._decode_pairs = {np.dtype(kind): repeated(decode_pairs) for kind in ("f4", "f8")}
-        self._decode_choices = repeated(decode_choices)
+        self._decode_pairs = {np.dtype(kind): specialized(decode_pairs) for kind in ("f4", "f8")}
+        self._decode_choices = specialized(decode_choices)
         self.clipped = np.zeros(num_worlds, dtype=np.int64)
         self.held = np.zeros(num_worlds, dtype=np.int64)
         self.ignored = np.zeros(num_worlds, dtype=np.int64)

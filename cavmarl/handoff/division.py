@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.math.tallies import totals
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.core.records.arrays import Worlds, Zoned
 from cavmarl.handoff.coordinator.coordinator import Near
 from cavmarl.ownership.messages import Birth, Switch
@@ -80,13 +80,13 @@ class Division:
         self._gatherers: Executor | None = None
         self._ids, self._x, self._y = (zoned.rows[name] for name in ("id", "x", "y"))
         self._rects: list[list[float]] = zones.rects.tolist()
-        self._call_exchange = repeated(exchange)
-        self._note_gathered = repeated(note_gathered)
-        self._look = repeated(look)
-        self._pass_on = repeated(pass_on)
-        self._totals = repeated(totals)
-        self.call_hand_over = repeated(hand_over)
-        self.call_release = repeated(release)
+        self._call_exchange = specialized(exchange)
+        self._note_gathered = specialized(note_gathered)
+        self._look = specialized(look)
+        self._pass_on = specialized(pass_on)
+        self._totals = specialized(totals)
+        self.call_hand_over = specialized(hand_over)
+        self.call_release = specialized(release)
 
     @property
     def count(self) -> int:

@@ -181,7 +181,7 @@ class TransferLog:
                 self._counts["refused"] += len(message.entries)
 
     def add_later(self, number: int, removed: int, make: Callable[[], Iterable[Transfer]]) -> None:
-        """Note changes of owner that no message tells of, whose rows are made when they are read."""
+        """Note changes of owner that no message tells of; rows are made when they are read."""
         self._counts["switched"] += number
         if removed:
             self._counts["removed"] += removed

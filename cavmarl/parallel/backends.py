@@ -131,7 +131,7 @@ def check_hosts(workers: int | str | None, hosts: str | None) -> tuple[str, int 
 
 
 def keeps_state(num_worlds: int, workers: int | str | None, hosts: str | None) -> bool:
-    """Whether this process has the state of the worlds; arguments and errors as of `check_hosts`."""
+    """Whether this process has the state of the worlds; the rest as of `check_hosts`."""
     name, number = check_hosts(workers, hosts)
     return _BACKENDS[name].keeps_state(num_worlds, number)
 

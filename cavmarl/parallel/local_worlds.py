@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cavmarl.balance.balance_plan import Plan
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.memory import Zeros
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.engine.global_state import global_state
 from cavmarl.engine.kernels.step_results import Results, keep_last, report, report_who_goes_on
 from cavmarl.engine.simulation import Simulation
@@ -77,9 +77,9 @@ class LocalWorlds:
         self._steps = np.zeros(num_worlds, dtype=np.int64)
         self._waiting = np.zeros(num_worlds, dtype=np.bool_)  # over, and not begun anew yet
         self._results = Results(*(getattr(arrays, name) for name in Results._fields))
-        self._report = repeated(report)
-        self._report_who_goes_on = repeated(report_who_goes_on)
-        self._keep_last = repeated(keep_last)
+        self._report = specialized(report)
+        self._report_who_goes_on = specialized(report_who_goes_on)
+        self._keep_last = specialized(keep_last)
         if warm:
             self._write_results()
             self._write_who_goes_on()

@@ -17,7 +17,7 @@ from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.math.buckets import make_lists
 from cavmarl.core.math.neighbors import make_grid
 from cavmarl.core.memory import Zeros
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.core.records.arrays import (
     Common,
     Gate,
@@ -128,10 +128,10 @@ class Shard:
         self._messages_at = layout(config.sensors).get("messages")
         self.target_speeds = np.array(config.action.target_speeds_mps)
         self.discrete = config.action.kind == "discrete"
-        self._call_leave = repeated(leave)
-        self._call_observe_further = repeated(observe_optional)
-        self._call_observe_messages = repeated(observe_messages)
-        self._call_fill_stacks = repeated(fill_stacks)
+        self._call_leave = specialized(leave)
+        self._call_observe_further = specialized(observe_optional)
+        self._call_observe_messages = specialized(observe_messages)
+        self._call_fill_stacks = specialized(fill_stacks)
 
     def cut(self, zones: ZoneArrays, halo: Halo) -> None:
         """Say where its zone and the others are; a group has to be made anew after it."""

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.core.records.arrays import Common, Demand, Gate
 from cavmarl.shards.kernels.group_phases import (
     FRAME,
@@ -60,20 +60,20 @@ class ShardGroup:
             Common(*(getattr(first.worlds, name) for name in Common._fields)),
         )
         self._controls = np.zeros_like(first.worlds.pending[:, :, 0])
-        self._advance = repeated(advance_each)
-        self._gather = repeated(gather_each)
-        self._resolve = repeated(resolve_each)
-        self._choose_goals = repeated(choose_goals_each)
-        self._rank_lanes = repeated(rank_lanes_each)
-        self._propose = repeated(propose_each)
-        self._admit = repeated(admit_each)
+        self._advance = specialized(advance_each)
+        self._gather = specialized(gather_each)
+        self._resolve = specialized(resolve_each)
+        self._choose_goals = specialized(choose_goals_each)
+        self._rank_lanes = specialized(rank_lanes_each)
+        self._propose = specialized(propose_each)
+        self._admit = specialized(admit_each)
         self._meta_actions = np.zeros(self._controls.shape[:2], dtype=np.int64)
-        self._begin_step = repeated(begin_step_each)
-        self._detect = repeated(detect_each)
-        self._sense = repeated(sense_each)
-        self._credit = repeated(credit_each)
-        self._retire = repeated(retire_each)
-        self._forget = repeated(forget_each)
+        self._begin_step = specialized(begin_step_each)
+        self._detect = specialized(detect_each)
+        self._sense = specialized(sense_each)
+        self._credit = specialized(credit_each)
+        self._retire = specialized(retire_each)
+        self._forget = specialized(forget_each)
 
     @property
     def sides(self) -> tuple[int, int]:

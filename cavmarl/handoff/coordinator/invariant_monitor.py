@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import ProtocolError
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.driving.vehicles import GHOST_FIELDS
 from cavmarl.handoff.coordinator.handoff_log import OwnerChange
 from cavmarl.handoff.coordinator.row_digests import digest_tables
@@ -157,7 +157,7 @@ class InvariantMonitor:
         )
         self._tallies = np.zeros(division.count, dtype=TALLY)
         self._found = np.zeros(1, dtype=FINDING)
-        self._watch = repeated(watch)
+        self._watch = specialized(watch)
 
     def begin(self, w: int, births: Sequence[Birth]) -> None:
         """Look at a world that has been reset.

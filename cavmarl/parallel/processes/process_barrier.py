@@ -28,7 +28,7 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from cavmarl.core.numba import kernel
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 
 Words = NDArray[np.int64]
 
@@ -162,11 +162,11 @@ _has, _set, _look, _pass, present_core = (
     (_plain_has, _plain_set, _plain_look, _plain_pass, _plain_core)
     if _IS_PYTHON
     else (
-        repeated(_compiled_has),
-        repeated(_compiled_set),
-        repeated(_compiled_look),
-        repeated(_compiled_pass),
-        repeated(_compiled_core),
+        specialized(_compiled_has),
+        specialized(_compiled_set),
+        specialized(_compiled_look),
+        specialized(_compiled_pass),
+        specialized(_compiled_core),
     )
 )
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import WorkerError
 from cavmarl.core.numba import kernel
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.parallel.processes.shared_memory import Segment
 
 Array = NDArray[Any]
@@ -180,7 +180,7 @@ def _sealed(words: NDArray[np.uint64]) -> None:
     words[1] = _mixed(words[2 : int(words[0])])
 
 
-_mix, _seal = repeated(_mixed), repeated(_sealed)
+_mix, _seal = specialized(_mixed), specialized(_sealed)
 
 
 def _num_words(array: Array) -> int:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.engine.simulation import Simulation
 from cavmarl.parallel.processes.state_image import Arrays
@@ -52,8 +52,8 @@ class SensorJob:
             if not sensor.stamps_itself
         ]
         self._spare = np.zeros(1, dtype=VEHICLE)
-        self._take_rows = repeated(take_rows)
-        self._put_first = repeated(put_first)
+        self._take_rows = specialized(take_rows)
+        self._put_first = specialized(put_first)
 
     def warm(self) -> None:
         """Have the kernels of all sensors ready; no vehicle is there to be sensed."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import WorkersConfig
 from cavmarl.core.errors import WorkerError
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.parallel.processes.shared_memory import Segment, size_of
 from cavmarl.parallel.processes.worker_pool import Death, Pool, Program
 from cavmarl.parallel.sensor_workers.line_costs import LineCosts
@@ -127,7 +127,7 @@ class SensorWorkers:
         self._line_costs = LineCosts(plan.num_lines)
         self._sharings: dict[tuple[int, ...], _Sharing] = {}
         self._written: Shares | None = None
-        self._gather = repeated(gather_rows)
+        self._gather = specialized(gather_rows)
 
     @property
     def pool(self) -> Pool | None:

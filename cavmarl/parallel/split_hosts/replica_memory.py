@@ -17,7 +17,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from cavmarl.core.errors import MessageError
 from cavmarl.core.huge_pages import huge_zeros
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.parallel.kernels.replica_copies import (
     GROUP,
     note_agents,
@@ -142,10 +142,10 @@ class MemoryReplica:
         self._memory = memory
         self._stream: Words = np.empty(memory.most_words + 6 * pieces + 1, dtype=np.uint64)
         self._size = 0
-        self._note_spans = repeated(note_spans)
-        self._note_rows = repeated(note_rows)
-        self._note_agents = repeated(note_agents)
-        self._take_changes = repeated(take_changes)
+        self._note_spans = specialized(note_spans)
+        self._note_rows = specialized(note_rows)
+        self._note_agents = specialized(note_agents)
+        self._take_changes = specialized(take_changes)
         self.forget()
 
     def forget(self) -> None:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.core.records.arrays import Common
 from cavmarl.parallel.kernels.replica_copies import mark_agents
 from cavmarl.parallel.split_hosts.replica_memory import MemoryReplica, Place, ReplicaMemory
@@ -116,7 +116,7 @@ class ZonePhases:
         self._memory = memory
         self._zoned = zoned = first.zoned
         self._marks = np.zeros(inputs.commands.meta_actions.shape, dtype=np.bool_)
-        self._mark_agents = repeated(mark_agents)
+        self._mark_agents = specialized(mark_agents)
         common = [
             *(getattr(first.worlds, name) for name in Common._fields if name != "pending"),
             *(array for array in _ways_on_the_way(first) if memory.find(array) is not None),

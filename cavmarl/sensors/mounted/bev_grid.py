@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from cavmarl.config.rig import BevGridConfig
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.sensors.kernels.birds_eye import make_birds_eye
 from cavmarl.sensors.kernels.panorama import make_panorama
 from cavmarl.sensors.kernels.rig_pictures import fill_grids
@@ -32,7 +32,7 @@ class BevGrid(MountedSensor[BevGridConfig]):
         self._backdrop = platform.backdrop
         self._panorama = make_panorama(platform.backdrop, platform.capacity)
         self._reach_m = self.reach_m(config, 0.0)
-        self._fill = repeated(fill_grids)
+        self._fill = specialized(fill_grids)
 
     @staticmethod
     def bounds(config: BevGridConfig) -> Bounds:

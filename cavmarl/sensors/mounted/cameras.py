@@ -14,7 +14,7 @@ from cavmarl.config.rig import (
     RgbCameraConfig,
     SemanticCameraConfig,
 )
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.sensors.kernels.camera_picture import make_camera, make_picture
 from cavmarl.sensors.kernels.panorama import make_panorama
 from cavmarl.sensors.kernels.pixels import colours
@@ -74,7 +74,7 @@ class DepthCamera(_Camera[DepthCameraConfig]):
     def __init__(self, name: str, config: DepthCameraConfig, platform: Platform) -> None:
         super().__init__(name, config, platform)
         self._room = np.zeros(self._picture.face.shape, np.float32)
-        self._take = repeated(take_depths)
+        self._take = specialized(take_depths)
 
     @staticmethod
     def bounds(config: DepthCameraConfig) -> Bounds:
@@ -107,7 +107,7 @@ class SemanticCamera(_Camera[SemanticCameraConfig]):
 
     def __init__(self, name: str, config: SemanticCameraConfig, platform: Platform) -> None:
         super().__init__(name, config, platform)
-        self._take = repeated(take_classes)
+        self._take = specialized(take_classes)
 
     @staticmethod
     def bounds(config: SemanticCameraConfig) -> Bounds:
@@ -138,7 +138,7 @@ class RgbCamera(_Camera[RgbCameraConfig]):
     def __init__(self, name: str, config: RgbCameraConfig, platform: Platform) -> None:
         super().__init__(name, config, platform)
         self._palette = colours()
-        self._take = repeated(take_colours)
+        self._take = specialized(take_colours)
 
     @staticmethod
     def bounds(config: RgbCameraConfig) -> Bounds:

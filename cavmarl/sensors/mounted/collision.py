@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from cavmarl.config.rig import CollisionConfig
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.sensors.kernels.event_reports import report_events
 from cavmarl.sensors.kernels.rig_schedule import Due
 from cavmarl.sensors.mounted.frames import SensorFrames
@@ -30,7 +30,7 @@ class Collision(MountedSensor[CollisionConfig]):
         super().__init__(name, config, platform)
         self._platform = platform
         self._stream = stream_of(name)
-        self._report = repeated(report_events)
+        self._report = specialized(report_events)
 
     @staticmethod
     def bounds(config: CollisionConfig) -> Bounds:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from cavmarl.config.rig import GnssConfig
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.sensors.kernels.antenna_positions import measure_places
 from cavmarl.sensors.kernels.rig_schedule import Due
 from cavmarl.sensors.mounted.frames import SensorFrames
@@ -38,7 +38,7 @@ class Gnss(MountedSensor[GnssConfig]):
         self._measured = np.zeros(agents, dtype=np.bool_)
         self._noise = noise_of(name, config)
         self._room = np.zeros((2, 3, 3))
-        self._measure = repeated(measure_places)
+        self._measure = specialized(measure_places)
 
     @staticmethod
     def bounds(config: GnssConfig) -> Bounds:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from cavmarl.config.rig import ImuConfig
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.sensors.kernels.inertia import measure_inertia
 from cavmarl.sensors.kernels.rig_schedule import Due
 from cavmarl.sensors.mounted.frames import SensorFrames
@@ -30,7 +30,7 @@ class Imu(MountedSensor[ImuConfig]):
         self._tick_s = platform.sim_dt_s
         self._noise = noise_of(name, config)
         self._room = np.zeros(6)
-        self._measure = repeated(measure_inertia)
+        self._measure = specialized(measure_inertia)
 
     @staticmethod
     def bounds(config: ImuConfig) -> Bounds:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from cavmarl.config.rig import LaneBoundaryConfig
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.sensors.kernels.lane_offsets import measure_lane_boundary
 from cavmarl.sensors.kernels.rig_schedule import Due
 from cavmarl.sensors.mounted.frames import SensorFrames
@@ -30,7 +30,7 @@ class LaneBoundary(MountedSensor[LaneBoundaryConfig]):
         self._noise = noise_of(name, config)
         self._axes = np.zeros((2, 3, 3))
         self._room = np.zeros(5)
-        self._measure = repeated(measure_lane_boundary)
+        self._measure = specialized(measure_lane_boundary)
 
     @staticmethod
     def bounds(config: LaneBoundaryConfig) -> Bounds:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from cavmarl.config.rig import LidarRigConfig
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.sensors.kernels.panorama import make_panorama
 from cavmarl.sensors.kernels.ray_fan import HIT, Fan, make_fan
 from cavmarl.sensors.kernels.rig_rays import measure_lidar
@@ -56,7 +56,7 @@ class Lidar(MountedSensor[LidarRigConfig]):
         self._backdrop = platform.backdrop
         self._panorama = make_panorama(platform.backdrop, platform.capacity)
         self._hits = np.zeros((config.rays, config.layers), HIT)
-        self._measure = repeated(measure_lidar)
+        self._measure = specialized(measure_lidar)
 
     @staticmethod
     def bounds(config: LidarRigConfig) -> Bounds:

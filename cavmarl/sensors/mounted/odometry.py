@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from cavmarl.config.rig import OdometryConfig
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.sensors.kernels.rig_schedule import Due
 from cavmarl.sensors.kernels.wheel_motion import measure_odometry
 from cavmarl.sensors.mounted.frames import SensorFrames
@@ -29,7 +29,7 @@ class Odometry(MountedSensor[OdometryConfig]):
         super().__init__(name, config, platform)
         self._noise = noise_of(name, config)
         self._room = np.zeros(3)
-        self._measure = repeated(measure_odometry)
+        self._measure = specialized(measure_odometry)
 
     @staticmethod
     def bounds(config: OdometryConfig) -> Bounds:

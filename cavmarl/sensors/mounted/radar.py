@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from cavmarl.config.rig import RadarConfig
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.sensors.kernels.panorama import make_panorama
 from cavmarl.sensors.kernels.radar_targets import TARGET
 from cavmarl.sensors.kernels.ray_fan import HIT, make_fan
@@ -41,7 +41,7 @@ class Radar(MountedSensor[RadarConfig]):
         self._hits = np.zeros((config.rays, 1), HIT)
         self._targets = np.zeros(config.rays, TARGET)
         self._order = np.zeros(config.rays, np.int32)
-        self._measure = repeated(measure_radar)
+        self._measure = specialized(measure_radar)
 
     @staticmethod
     def bounds(config: RadarConfig) -> Bounds:

@@ -315,7 +315,7 @@ def release(
     now_ms: float,  # of a clock
     book: BorderRecords,  # `changes` is written
 ) -> None:
-    """Note when the tick of the newest changes is over, and how far from their old zone they are."""
+    """Note when the tick of the newest changes ends, and how far from their old zone they are."""
     last = book.num_changes[w]
     for n in range(last - changed, last):
         change = book.changes[w, n]
