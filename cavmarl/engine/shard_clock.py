@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.shards.executor import Phase, SerialExecutor
+from cavmarl.shards.executor import SerialExecutor
+from cavmarl.shards.phases import PHASES
 from cavmarl.shards.shard import Shard
-
-NOT_OF_A_TICK = ("suggest",)  # what a driver would do is asked beside the tick
 
 
 class ShardClock:
@@ -33,7 +32,7 @@ class ShardClock:
         self._ticks = 0
         self._spent_ns = np.zeros(len(self._hosts), dtype=np.int64)
 
-    def each(self, phase: Phase, *arguments: Any) -> None:
+    def each(self, phase: str, *arguments: Any) -> None:
         """Run a phase on every shard, in order."""
         self._ticks += phase == "advance"
         if self._ticks % self._every:
@@ -42,7 +41,7 @@ class ShardClock:
         for zone, host in enumerate(self._hosts):
             began = time.thread_time_ns()
             host.each(phase, *arguments)
-            if phase not in NOT_OF_A_TICK and self._ticks > self._every:
+            if not PHASES[phase].is_beside and self._ticks > self._every:
                 self._spent_ns[zone] += time.thread_time_ns() - began
 
     def take_s(self) -> NDArray[np.float64]:

@@ -27,7 +27,6 @@ from cavmarl.engine import world_snapshot as snapshot
 from cavmarl.engine.compilation import announce_compilation, compiling_all
 from cavmarl.engine.shard_clock import ShardClock
 from cavmarl.engine.shared_outputs import SharedOutputs
-from cavmarl.engine.state_digest import digest_world
 from cavmarl.engine.tick_setup import cut_zones, make_frames, make_tick
 from cavmarl.engine.world_views import WorldViews
 from cavmarl.handoff.coordinator.coordinator_setup import WorldRun, make_coordinators
@@ -48,12 +47,6 @@ from cavmarl.traffic.sumo.sumo_demand import SumoDemand
 from cavmarl.traffic.sumo.sumo_traffic import SumoTraffic
 from cavmarl.zones.partition.zone_partition import ZonePartition
 from cavmarl.zones.reach import longest_move_m
-
-# Fields of `Gate` that outlive a tick.
-KEPT_BY_GATE = (
-    "next_order", "queue", "num_queue", "next_id", "num_entered", "counts", "sums", "num_passing",
-    "lane_taken",
-)  # fmt: skip
 
 
 class Simulation(WorldViews):
@@ -164,16 +157,7 @@ class Simulation(WorldViews):
             self._keeper = Keeper(self.config, sources, refereeing.store, coordinator)
 
     def _shared_arrays(self) -> Iterator[NDArray[Any]]:
-        """What a tick changes beside the shards' own and what they have in common."""
-        tick = self._tick
-        gate = tick.gate
-        for name in KEPT_BY_GATE:
-            yield getattr(gate, name)
-        yield from self.outputs
-        if tick.traffic.rerouting is not None:
-            yield from tick.traffic.rerouting.arrays()
-        for part in tick.attached:
-            yield from part.arrays()
+        return snapshot.committed(self._parts())
 
     def _call_every_kernel(self) -> None:
         tick = self._tick
@@ -403,15 +387,15 @@ class Simulation(WorldViews):
     def _parts(self) -> snapshot.Parts:
         tick = self._tick
         return snapshot.Parts(
-            self._shard.worlds,
-            tick.division,
-            tick.gate,
-            tick.traffic,
-            self.outputs,
-            tick.coordination,
-            self.config.sensors.stack > 1,
-            tick.attached,
-            tick.sumo,
+            worlds=self._shard.worlds,
+            division=tick.division,
+            gate=tick.gate,
+            traffic=tick.traffic,
+            outputs=self.outputs,
+            coordination=tick.coordination,
+            has_frames=self.config.sensors.stack > 1,
+            attached=tick.attached,
+            sumo=tick.sumo,
         )
 
     def suggest(self, out: NDArray[np.float64]) -> None:
@@ -425,4 +409,4 @@ class Simulation(WorldViews):
         all random numbers; not over where a record lives, nor over what a view keeps (steps to the
         horizon, held actions).
         """
-        return digest_world(self._parts(), world)
+        return snapshot.digest_world(self._parts(), world)

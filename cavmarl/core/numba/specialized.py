@@ -47,7 +47,7 @@ class _Specialized:
     def __call__(self, *arguments: Any) -> Any:
         compiled = self._compiled
         if compiled is None:
-            types: Any = tuple(map(numba.typeof, arguments))
+            types = tuple(map(_kind, arguments))
             self._compiled = compiled = self._kernel.compile(types)
             self._forms = tuple(map(_Form, arguments, types))
         elif not all(map(is_, arguments, self._last)):
@@ -59,7 +59,7 @@ class _Specialized:
         for form, new, last in zip(self._forms, arguments, self._last, strict=True):
             if new is not last and not form.fits(new, last):
                 raise TypeError(
-                    f"{self._kernel.__name__}: an argument of {numba.typeof(new)} where the first "
+                    f"{self._kernel.__name__}: an argument of {_kind(new)} where the first "
                     f"call had one of {form.kind}"
                 )
 
@@ -83,9 +83,9 @@ class _Form:
     def fits(self, new: Any, last: Any) -> bool:
         """Whether an argument is of the type; `last` is one that was."""
         if type(new) is not self._python:
-            return not self._fields and self._dtype is None and bool(numba.typeof(new) == self.kind)
+            return not self._fields and self._dtype is None and bool(_kind(new) == self.kind)
         if self._dtype is not None:
-            return (
+            return bool(
                 (new.dtype is self._dtype or new.dtype == self._dtype)
                 and new.ndim == self._ndim
                 and new.flags.num & self._wants == self._wants
@@ -94,6 +94,11 @@ class _Form:
             item is known or form.fits(item, known)
             for form, item, known in zip(self._fields, new, last, strict=True)
         )
+
+
+def _kind(argument: Any) -> Any:
+    typeof: Any = numba.typeof
+    return typeof(argument)
 
 
 def _flags_of(array: np.ndarray[Any, Any]) -> int:

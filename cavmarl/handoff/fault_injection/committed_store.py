@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import JournalError, ProtocolError
+from cavmarl.core.records.arrays import Common, Zoned
 from cavmarl.ownership.messages import Birth, Removed
 from cavmarl.ownership.safeguards import ALL_ON, Safeguards
-from cavmarl.shards.shard import COMMON, Shard
+from cavmarl.shards.shard import Shard
+from cavmarl.shards.state import Use, arrays_of, names_of
 
-# Counts of `Worlds` that each shard has of its own.
-COUNTS = ("num_owned", "num_rows", "num_through", "num_touching", "num_contacts")
+COUNTS = names_of(Zoned, Use.COMMITTED)  # of `Worlds` that each shard has of its own
 
 Array = NDArray[Any]
 Arrays = list[Array]
@@ -125,9 +126,7 @@ class CommittedStore:
 
     def shared(self) -> Iterator[Array]:
         """What is kept beside the shards' own, as it is now."""
-        worlds = self._shards[0].worlds
-        for name in COMMON:
-            yield getattr(worlds, name)
+        yield from arrays_of(self._shards[0].worlds, Common, Use.COMMITTED)
         yield from self._others()
 
     def truth(self) -> CommittedImage:

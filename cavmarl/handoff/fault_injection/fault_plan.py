@@ -10,12 +10,10 @@ from typing import Any, TypeVar
 
 from cavmarl.core.errors import ConfigError
 from cavmarl.ownership.transport import FaultPlan, Rates, check_rate, check_whole
+from cavmarl.shards import phases
 
 MESSAGES = ("Step", "Done", "Prepare", "Ack", "Nack", "Abort", "Need")
-PHASES = (
-    "begin_step", "advance", "choose_goals", "leave", "resolve", "rank_lanes", "propose", "admit",
-    "commit", "detect", "sense", "credit",
-)  # fmt: skip
+PHASES = tuple(name for name, rule in phases.PHASES.items() if rule.may_die)
 ZONE_POINTS = (
     "PREPARE arrives", "ACK sent", "STEP arrives", "lease taken", *PHASES, "before DONE",
 )  # fmt: skip

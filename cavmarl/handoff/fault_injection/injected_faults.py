@@ -16,7 +16,7 @@ from cavmarl.handoff.fault_injection.mailbox import Parcel
 from cavmarl.handoff.fault_injection.message_coordinator import MessageCoordinator
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.messages import COORDINATOR, Begin, Commit, Output, Prepare, Step
-from cavmarl.shards.executor import Executor, Phase, SerialExecutor
+from cavmarl.shards.executor import Executor, SerialExecutor
 from cavmarl.shards.shard import Shard
 
 Visit: TypeAlias = tuple[int, str, int]
@@ -112,7 +112,7 @@ class FaultyPhases:
         self._crashes = crashes
         self.on = False
 
-    def each(self, phase: Phase, *arguments: Any) -> None:
+    def each(self, phase: str, *arguments: Any) -> None:
         """Call the method `phase` of every shard, in order, while all live."""
         watched = self.on and phase in PHASES
         for zone, host in self._hosts:
@@ -125,7 +125,7 @@ class FaultyPhases:
             self._crashes.coordinator(phase)
 
 
-def _call_hosted(zone: int, host: Executor, phase: Phase, arguments: tuple[Any, ...]) -> None:
+def _call_hosted(zone: int, host: Executor, phase: str, arguments: tuple[Any, ...]) -> None:
     """Run a phase in a host's process: an unexpected error ends the host and no more.
 
     Raises:

@@ -15,7 +15,6 @@ from cavmarl.parallel.split_hosts.zone_phases import PhaseInputs, ZonePhase, Zon
 from cavmarl.parallel.split_hosts.zones_job import PhaseOrder
 from cavmarl.sensors.mounted.mounted_sensor import SensedScene
 from cavmarl.sensors.mounted.sensor_rig import Turn, sense_here
-from cavmarl.shards.executor import Phase
 from cavmarl.shards.shard import Commands, Shard
 from cavmarl.shards.shard_group import ShardGroup
 
@@ -60,7 +59,7 @@ class ZoneLeader:
         """From now on there are hosts; before, all was done here."""
         self._pool = pool
 
-    def each(self, phase: Phase, *arguments: Any) -> None:
+    def each(self, phase: str, *arguments: Any) -> None:
         """Run a phase on every shard.
 
         Raises:

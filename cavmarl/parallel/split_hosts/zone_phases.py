@@ -15,13 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.numba.specialized import specialized
-from cavmarl.core.records.arrays import Common
+from cavmarl.core.records.arrays import Common, Outputs, Zoned
 from cavmarl.parallel.kernels.replica_copies import mark_agents
 from cavmarl.parallel.split_hosts.replica_memory import MemoryReplica, Place, ReplicaMemory
 from cavmarl.sensors.kernels.rig_frames import POSE
 from cavmarl.sensors.kernels.rig_schedule import Due
 from cavmarl.sensors.mounted.frames import Frames
 from cavmarl.shards.shard import Commands, Shard
+from cavmarl.shards.state import Use, arrays_of
+from cavmarl.v2x.kernels.v2x_records import Mail
 
 Array = NDArray[Any]
 
@@ -35,15 +37,6 @@ class ZonePhase(IntEnum):
     SUGGEST = 3
     MOUNTED = 4  # the sensors of the rig
 
-
-# Fields of `Zoned` (k, W), of `Mail` that agents read, of `Outputs` that zones write.
-NUMBERS = (
-    "num_owned", "num_rows", "num_near", "num_through", "num_touching", "num_contacts", "num_outer",
-)  # fmt: skip
-INBOXES = ("objects", "events", "signals")
-SENSED = (
-    "observations", "terms", "terminated", "present", "acted", "events", "vehicle_ids",
-)  # fmt: skip
 
 CLEARED = 1 << 16  # words that are made 0 at once
 
@@ -118,11 +111,11 @@ class ZonePhases:
         self._marks = np.zeros(inputs.commands.meta_actions.shape, dtype=np.bool_)
         self._mark_agents = specialized(mark_agents)
         common = [
-            *(getattr(first.worlds, name) for name in Common._fields if name != "pending"),
+            *arrays_of(first.worlds, Common, Use.SENT),
             *(array for array in _ways_on_the_way(first) if memory.find(array) is not None),
         ]
-        numbers = [getattr(zoned, name) for name in NUMBERS]
-        inboxes = [] if first.mail is None else [getattr(first.mail, name) for name in INBOXES]
+        numbers = list(arrays_of(zoned, Zoned, Use.SENT))
+        inboxes = [] if first.mail is None else list(arrays_of(first.mail, Mail, Use.SENT))
         acts = inputs.commands.meta_actions if first.discrete else inputs.commands.controls
         reads = {
             ZonePhase.MOVE: [*common, *numbers, acts],
@@ -134,10 +127,9 @@ class ZonePhases:
         of_agents = {
             ZonePhase.MOVE: [first.worlds.pending],
             ZonePhase.SENSE: [
-                array
-                for array in (getattr(first.outputs, name) for name in SENSED)
-                if memory.find(array)
-                is not None  # with `observation.mode: sensors` some are not seen
+                array  # with `observation.mode: sensors` some are not seen
+                for array in arrays_of(first.outputs, Outputs, Use.SENT)
+                if memory.find(array) is not None
             ],
             ZonePhase.SUGGEST: [inputs.suggested],
             ZonePhase.MOUNTED: [frames.data for frames in inputs.frames.values()],

@@ -31,7 +31,7 @@ from cavmarl.parallel.processes.process_barrier import (
 )
 from cavmarl.parallel.processes.shared_memory import shared_zeros
 from cavmarl.parallel.team.hosted_zones import HostedZones
-from cavmarl.shards.executor import Phase
+from cavmarl.shards.phases import PHASES
 from cavmarl.shards.shard import Shard
 from cavmarl.shards.shard_group import ShardGroup
 
@@ -43,13 +43,8 @@ FAILED = 2
 CORE = 5  # a word of both: where the process was when it began with a phase
 
 # Methods of `ShardGroup` and `Shard` that are run together, by their code.
-TOGETHER = ("begin_step", "move", "gather", "resolve", "sense", "credit", "suggest")
+TOGETHER = tuple(rule.together for rule in PHASES.values() if rule.together)
 END = len(TOGETHER)
-# After which the next phase only asks that it has been run on the same zone: there is no wait
-# before a phase reads what other zones have made of it.
-WAITED_FOR_LATER = ("begin_step", "resolve")
-# What the leader runs on all zones, and what asks for nothing that those write.
-AT_ANY_TIME = ("commit", "detect")
 
 
 class LeftAloneError(Exception):
@@ -108,7 +103,7 @@ class Leader:
         finally:
             self._dismiss()
 
-    def end_after(self, phase: Phase | str) -> None:
+    def end_after(self, phase: str) -> None:
         """Let the followers end the command with the next phase of that name that they run."""
         self._last = phase
 
@@ -122,19 +117,18 @@ class Leader:
         """From now on these zones are its own; the others are the followers'."""
         self._own.take(zones)
 
-    def each(self, phase: Phase, *arguments: Any) -> None:
+    def each(self, phase: str, *arguments: Any) -> None:
         """Run a phase on every shard.
 
         Raises:
             LeftAloneError: a follower has failed.
         """
-        name: str = phase
-        if phase == "advance":
+        rule = PHASES[phase]
+        name = rule.together or phase
+        if name == "move":
             self._everybody.turn()
-            name = "move"
         which = self._which(name, arguments)
-        is_late = name in WAITED_FOR_LATER
-        if (which < 0 and name not in AT_ANY_TIME) or is_late:
+        if (which < 0 and not rule.is_early) or rule.is_late:
             self.meet()
         if which < 0:
             self._everybody.each(name, *arguments)
@@ -142,7 +136,7 @@ class Leader:
         self._announce(self._codes[name], which)
         self._is_ahead = True
         self._own.each(name, *arguments)
-        if is_late:
+        if rule.is_late:
             return
         self.meet()
         if name == self._last:
