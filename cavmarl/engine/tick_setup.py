@@ -38,32 +38,32 @@ def make_tick(
     blank = blank_vehicle()
     if traffic is None:
         traffic = NativeTraffic(
-            network,
-            config.traffic,
-            config.population,
-            blank,
-            config.clock.sim_dt_s,
-            config.horizon_s,
-            None if isinstance(demand, SumoDemand) else demand,
-            num_worlds,
-            zeros,
-            plan_scene(config.scenario, network),
-            demand if isinstance(demand, SumoDemand) else None,
+            network=network,
+            traffic=config.traffic,
+            population=config.population,
+            blank=blank,
+            dt=config.clock.sim_dt_s,
+            horizon_s=config.horizon_s,
+            file=None if isinstance(demand, SumoDemand) else demand,
+            num_worlds=num_worlds,
+            zeros=zeros,
+            scene=plan_scene(config.scenario, network),
+            sumo=demand if isinstance(demand, SumoDemand) else None,
         )
     shards, division = divide(
         config, network, partition, traffic, commons.outputs, num_worlds, zeros
     )
     attached = attach(
         ComponentContext(
-            config,
-            network,
-            num_worlds,
-            shards,
-            division,
-            shards[0].travel,
-            commons.outputs,
-            zeros,
-            frames,
+            config=config,
+            network=network,
+            num_worlds=num_worlds,
+            shards=shards,
+            division=division,
+            travel=shards[0].travel,
+            outputs=commons.outputs,
+            zeros=zeros,
+            frames=frames,
         )
     )
     gate = make_gate(num_worlds, traffic.capacity, network.arrays, blank.dtype)

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.records.arrays import Common
-from cavmarl.shards.shard import Commands
+from cavmarl.shards.shard import Commands, common_of
 from cavmarl.v2x.bus import Bus
 
 if TYPE_CHECKING:
@@ -32,7 +31,7 @@ class Messaging:
             host.network,
             host.travel.types,
             host.division.zoned,
-            Common(*(getattr(worlds, name) for name in Common._fields)),
+            common_of(worlds),
             host.zeros,
         )
         for shard in host.shards:

@@ -8,10 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
-from cavmarl.core.errors import (
-    ConfigError,
-)
-from cavmarl.core.records.arrays import Common, Gate, Outputs, Worlds
+from cavmarl.core.errors import ConfigError
+from cavmarl.core.records.arrays import Gate, Outputs, Worlds
 from cavmarl.engine.component import Attached
 from cavmarl.engine.rig_component import MountedSensors
 from cavmarl.engine.tick import Tick
@@ -23,7 +21,7 @@ from cavmarl.handoff.fault_injection.recovery import Recovery, Revival
 from cavmarl.handoff.repartitioning import Recut, Recutter
 from cavmarl.handoff.zone_view import ZoneView, view_zones
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.shards.shard import Shard
+from cavmarl.shards.shard import Shard, common_of
 from cavmarl.traffic.scenarios.scene import Scene
 from cavmarl.traffic.sumo.sumo_traffic import SumoTraffic
 from cavmarl.v2x.bus import Bus
@@ -86,9 +84,8 @@ class WorldViews:
             the bus, and what lets it send and receive in the present tick.
         """
         worlds = self._shard.worlds
-        common = Common(*(getattr(worlds, name) for name in Common._fields))
         types, zoned = self._shard.travel.types, self._tick.division.zoned
-        bus = Bus(config, self.network, types, zoned, common)
+        bus = Bus(config, self.network, types, zoned, common_of(worlds))
         return bus, lambda: bus.exchange(self._tick.division.side)
 
     @property

@@ -70,26 +70,26 @@ def divide(
         shard = Shard(
             config,
             network,
-            traffic.plans,
-            traffic.travel,
-            zoned,
-            outputs,
-            zone,
-            partition.arrays,
-            halo,
-            shards[0] if shards else None,
-            zeros,
+            plans=traffic.plans,
+            travel=traffic.travel,
+            zoned=zoned,
+            outputs=outputs,
+            zone=zone,
+            zones=partition.arrays,
+            halo=halo,
+            first=shards[0] if shards else None,
+            zeros=zeros,
         )
         shards.append(shard)
     division = Division(
         shards,
-        zoned,
-        partition.arrays,
-        halo,
-        sight,
-        touching_m,
-        Borders(settings.hysteresis_m, settings.approach_ticks * dt, MAX_SPEED_MPS),
-        TransferCodec.of(shards[0].worlds, outputs, config.sensors.stack),
+        zoned=zoned,
+        zones=partition.arrays,
+        halo=halo,
+        sight=sight,
+        touching_m=touching_m,
+        borders=Borders(settings.hysteresis_m, settings.approach_ticks * dt, MAX_SPEED_MPS),
+        codec=TransferCodec.of(shards[0].worlds, outputs, config.sensors.stack),
     )
     return shards, division
 

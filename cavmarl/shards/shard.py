@@ -113,13 +113,13 @@ class Shard:
             num_worlds,
             capacity,
             network,
-            config.population.num_ids,
-            config.clock.control_latency_ticks,
-            zoned,
-            zone,
-            None if first is None else first.worlds,
-            zeros,
-            len(travel.scripts.cues),
+            num_agents=config.population.num_ids,
+            latency_ticks=config.clock.control_latency_ticks,
+            zoned=zoned,
+            zone=zone,
+            common=None if first is None else first.worlds,
+            zeros=zeros,
+            num_cues=len(travel.scripts.cues),
         )
         self.sides = (self.worlds.rows, zoned.rows[1, zone])
         self.side = self.next_side = 0
@@ -258,6 +258,11 @@ def make_worlds(
     if common is None:
         return worlds
     return worlds._replace(**{name: getattr(common, name) for name in COMMON})
+
+
+def common_of(worlds: Worlds) -> Common:
+    """What all shards have in common, of any of them."""
+    return Common(**{name: getattr(worlds, name) for name in COMMON})
 
 
 def make_zoned(num_zones: int, num_worlds: int, capacity: int, zeros: Zeros = np.zeros) -> Zoned:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.numba.specialized import specialized
-from cavmarl.core.records.arrays import Common, Demand, Gate
+from cavmarl.core.records.arrays import Demand, Gate
 from cavmarl.shards.kernels.group_phases import (
     FRAME,
     Members,
@@ -27,7 +27,7 @@ from cavmarl.shards.kernels.group_phases import (
     retire_each,
     sense_each,
 )
-from cavmarl.shards.shard import TICKS_IN_ORDER, Commands, Shard
+from cavmarl.shards.shard import TICKS_IN_ORDER, Commands, Shard, common_of
 
 
 class ShardGroup:
@@ -52,12 +52,12 @@ class ShardGroup:
         self._room = max(grids, key=lambda grid: grid.newest.size)
         frames = [tuple(getattr(grid, name) for name in FRAME.names or ()) for grid in grids]
         self._members = Members(
-            np.array([shard.zone for shard in shards]),
-            np.array(frames, dtype=FRAME),
-            first.zones,
-            first.halo,
-            first.zoned,
-            Common(*(getattr(first.worlds, name) for name in Common._fields)),
+            numbers=np.array([shard.zone for shard in shards]),
+            frames=np.array(frames, dtype=FRAME),
+            zones=first.zones,
+            halo=first.halo,
+            zoned=first.zoned,
+            common=common_of(first.worlds),
         )
         self._controls = np.zeros_like(first.worlds.pending[:, :, 0])
         self._advance = specialized(advance_each)

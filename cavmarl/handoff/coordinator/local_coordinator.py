@@ -261,8 +261,10 @@ def _rows(changes: NDArray[np.void], episode: int, removed: list[bool]) -> list[
 def _row(change: OwnerChange, episode: int, removed: bool) -> Transfer:
     release_m = change.release_depth_m
     return Transfer(
-        episode, change.tick, change.vehicle, change.source, change.target, change.epoch,
-        False, removed, change.approached, 0, change.tick - change.approached, 0,
-        change.prepare_depth_m, change.switch_depth_m,
-        None if release_m != release_m else release_m, change.ms,
+        episode=episode, tick=change.tick, vehicle=change.vehicle,
+        source=change.source, target=change.target, epoch=change.epoch,
+        forced=False, removed=removed, approached=change.approached, waited=0,
+        offers=change.tick - change.approached, state_bytes=0,
+        prepare_depth_m=change.prepare_depth_m, switch_depth_m=change.switch_depth_m,
+        release_depth_m=None if release_m != release_m else release_m, ms=change.ms,
     )  # fmt: skip

@@ -166,7 +166,7 @@ class HostPool:
         """
         began = time.monotonic()
         nothing = OpenOrder(
-            self._number, NOTHING, _say_nothing, _no_arrays, (), saves=False, ordered_s=began,
+            self._number, NOTHING, _say_nothing, _no_arrays, sizes=(), saves=False, ordered_s=began,
             first_death=len(self.deaths), pending=set(), is_void=True,
         )  # fmt: skip
         while not self._company.free:
@@ -255,8 +255,8 @@ class HostPool:
         before = [truth.image, *truth.since] if is_behind and truth.image.size else []
         said, inputs = order.say(k, host.knows)
         letter = Order(
-            order.task, said, truth.size, before[0].size if before else 0,
-            max(len(before) - 1, 0), program.noted, order.saves,
+            order.task, said, size=truth.size, image=before[0].size if before else 0,
+            repeats=max(len(before) - 1, 0), repeated=program.noted, saves=order.saves,
         )  # fmt: skip
         host.part, host.knows = k, host.knows and order.task == NOTHING
         host.given_s = host.heard_s = time.monotonic()

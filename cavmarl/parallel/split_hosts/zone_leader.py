@@ -125,11 +125,7 @@ class ZoneLeader:
             turn = ZoneTurn(phase, zones, side, next_side, self._begins_step, sensors)
             self._phases.note_inputs(replica, turn)
             stream = replica.stream
-            order = PhaseOrder(
-                is_new, stream.size, phase, zones.tolist(), side, next_side,
-                self._begins_step, list(sensors),
-            )  # fmt: skip
-            return order, [stream]
+            return PhaseOrder(is_new, stream.size, turn.told()), [stream]
 
         def outputs(k: int, answer: Any) -> Arrays:
             if answer[0] > self._room[k].size:  # memory that is new has to be had page by page

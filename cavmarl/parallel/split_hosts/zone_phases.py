@@ -81,6 +81,19 @@ class ZoneTurn(NamedTuple):
     begins_step: bool = False  # before it moves, the accounts of a step are opened
     sensors: tuple[int, ...] = ()  # of the rig, by number, that are due
 
+    def told(self) -> list[Any]:
+        """The same, as JSON knows it."""
+        return list(self._replace(zones=self.zones.tolist()))
+
+    @classmethod
+    def heard(cls, told: Sequence[Any]) -> ZoneTurn:
+        turn = cls(*told)
+        return turn._replace(
+            phase=ZonePhase(turn.phase),
+            zones=np.array(turn.zones, dtype=np.int64),
+            sensors=tuple(turn.sensors),
+        )
+
 
 class _Rows(NamedTuple):
     """An array (k, W, C), of which each zone of each world has the first few."""

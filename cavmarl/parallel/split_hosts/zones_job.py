@@ -36,12 +36,7 @@ class PhaseOrder(NamedTuple):
 
     is_new: bool  # the host is to forget what it has
     words: int  # of changes
-    phase: int  # a `ZonePhase`
-    zones: list[int]  # see `ZoneTurn`, as the rest
-    side: int  # where the rows are
-    next_side: int  # where the next ones are
-    begins_step: bool  # whether a step begins
-    sensors: list[int]  # that are due
+    turn: list[Any]  # a `ZoneTurn`, as JSON knows it
 
 
 def host_zones(recipe: str, place: tuple[str, int], secret: bytes, number: int) -> NoReturn:
@@ -120,14 +115,11 @@ class ZonesJob:
         if order.is_new:
             self._phases.clear()
             self._caller.forget()
-        if order.is_new or order.zones != self._zones:
-            self._zones = order.zones
-            self._hosted.take(order.zones)
+        turn = ZoneTurn.heard(order.turn)
+        if order.is_new or order.turn[1] != self._zones:
+            self._zones = turn.zones.tolist()
+            self._hosted.take(self._zones)
         self._caller.take(self._coming)
-        turn = ZoneTurn(
-            ZonePhase(order.phase), np.array(order.zones, dtype=np.int64), order.side,
-            order.next_side, order.begins_step, tuple(order.sensors),
-        )  # fmt: skip
         self._run(turn)
         self._phases.note_results(self._caller, turn)
         stream = self._caller.stream

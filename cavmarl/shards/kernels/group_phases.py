@@ -67,25 +67,25 @@ def _worlds(members: Members, zone: int, side: int, next_side: int) -> Worlds:
     zoned = members.zoned
     common = members.common
     return Worlds(
-        zoned.rows[side, zone],
-        zoned.rows[next_side, zone],
-        zoned.num_owned[zone],
-        zoned.num_rows[zone],
-        common.ticks,
-        common.keys,
-        common.signal_phase,
-        common.controllers,
-        common.detected_s,
-        zoned.num_through[zone],
-        common.pending,
-        zoned.num_near[zone],
-        zoned.num_touching[zone],
-        zoned.num_contacts[zone],
-        zoned.step[zone],
-        zoned.step_at[zone],
-        zoned.outer[zone],
-        zoned.num_outer[zone],
-        common.cues,
+        rows=zoned.rows[side, zone],
+        next_rows=zoned.rows[next_side, zone],
+        num_owned=zoned.num_owned[zone],
+        num_rows=zoned.num_rows[zone],
+        ticks=common.ticks,
+        keys=common.keys,
+        signal_phase=common.signal_phase,
+        controllers=common.controllers,
+        detected_s=common.detected_s,
+        num_through=zoned.num_through[zone],
+        pending=common.pending,
+        num_near=zoned.num_near[zone],
+        num_touching=zoned.num_touching[zone],
+        num_contacts=zoned.num_contacts[zone],
+        step=zoned.step[zone],
+        step_at=zoned.step_at[zone],
+        outer=zoned.outer[zone],
+        num_outer=zoned.num_outer[zone],
+        cues=common.cues,
     )
 
 
@@ -94,17 +94,17 @@ def _grid(frame: np.void, room: Grid) -> Grid:
     """A zone's spatial index, in the room of the largest one."""
     cells = frame["num_x"] * frame["num_y"]
     return Grid(
-        frame["min_x"],
-        frame["min_y"],
-        frame["cells_per_m"],
-        frame["num_x"],
-        frame["num_y"],
-        room.start[: cells + 1],
-        room.bodies,
-        room.cell,
-        room.largest,
-        room.newest[:cells],
-        room.spots,
+        min_x=frame["min_x"],
+        min_y=frame["min_y"],
+        cells_per_m=frame["cells_per_m"],
+        num_x=frame["num_x"],
+        num_y=frame["num_y"],
+        start=room.start[: cells + 1],
+        bodies=room.bodies,
+        cell=room.cell,
+        largest=room.largest,
+        newest=room.newest[:cells],
+        spots=room.spots,
     )
 
 
