@@ -15,7 +15,9 @@ from cavmarl.balance.balance_plan import Plan
 from cavmarl.balance.plan_text import describe_plan
 from cavmarl.core.errors import CavmarlError, WorkerDeathError, WorkerFailureError
 from cavmarl.parallel.driven_vehicles import Driven
+from cavmarl.parallel.hosts.host_pool import HostPool
 from cavmarl.parallel.mover import Mover
+from cavmarl.parallel.processes.worker_pool import Death, Pool
 from cavmarl.parallel.step_arrays import StepArrays
 from cavmarl.parallel.step_placement import StepPlacement
 from cavmarl.parallel.work_shares import Part
@@ -32,12 +34,21 @@ class OrderedWorlds(ABC):
 
     arrays: StepArrays  # what goes in and comes out
     placement: StepPlacement  # which worker hosts what
+    pool: Pool | HostPool  # that runs them
     mover: Mover | None = None  # has that changed; None: it does not change
     _steps = 0  # since the last reset of all
 
     @property
     def plans(self) -> tuple[Plan, ...]:
         return self.placement.plans
+
+    @property
+    def deaths(self) -> list[Death]:
+        return self.pool.deaths
+
+    def close(self) -> None:
+        """End the processes, and a cluster that was started for them."""
+        self.pool.close()
 
     @abstractmethod
     def _pids(self) -> Mapping[int, int]:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Any, NamedTuple, NoReturn, Protocol
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple, NoReturn
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -45,29 +49,43 @@ class TaskOutcome(NamedTuple):
     arrays: Sequence[Array]  # that it is sent; of what shapes follows from the task and the answer
 
 
-class RemoteJob(Protocol):
+@cache
+def code_stamp() -> str:
+    """What this machine runs: digest of all sources, and the libraries that compute."""
+    package = Path(__file__).resolve().parents[2]
+    digest = hashlib.sha256()
+    for source in sorted(package.rglob("*.py")):
+        name = source.relative_to(package).as_posix()
+        if not name.startswith("data/"):  # which only a wheel has
+            digest.update(name.encode() + b"\0" + source.read_bytes())
+    sources = digest.hexdigest()[:12]
+    return f"cavmarl of sources {sources}, numpy {np.__version__}, numba {numba.__version__}"
+
+
+class RemoteJob:
     """What a host does; every host can take up every part of it."""
 
     @property
     def code(self) -> str:
         """What has to be the same on all machines for the same to come out."""
-        ...
+        return code_stamp()
 
     def fit(self, size: int) -> None:
         """Be ready for a part of that size."""
-        ...
 
     def inputs(self, task: int, letter: Any) -> Sequence[Array]:
         """Arrays that a command of this task fills, as many as its payload says."""
-        ...
+        raise NotImplementedError
 
-    def perform(self, task: int, letter: Any) -> TaskOutcome: ...
+    def perform(self, task: int, letter: Any) -> TaskOutcome:
+        raise NotImplementedError
 
     def save(self) -> Sequence[Array]:
-        """All that another host needs to go on from here."""
-        ...
+        """All that another host needs to go on from here; nothing where the caller keeps it."""
+        return []
 
-    def load(self, saved: Sequence[Array]) -> None: ...
+    def load(self, saved: Sequence[Array]) -> None:
+        """Go on from what `save` gave."""
 
 
 def serve(

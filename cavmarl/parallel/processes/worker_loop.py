@@ -24,7 +24,7 @@ import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from typing import Any, NoReturn, Protocol
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -50,26 +50,24 @@ MAX_TRACEBACK = 16_000  # characters, six bytes each at most; the end of a longe
 _PR_SET_PDEATHSIG = 1
 
 
-class Job(Protocol):
+class Job:
     """What one worker does."""
 
     def perform(self, task: int, letter: Any) -> Any:
-        """Do a task.
+        """Do a task; the answer, as JSON knows it, of those that have one.
 
         Args:
             task: which one; numbers from 0 on are the job's own.
             letter: what the pool has to say to it, as JSON knows it; mostly nothing.
-
-        Returns:
-            what the pool is to know, as JSON knows it; mostly nothing.
         """
-        ...
+        raise NotImplementedError
 
     def save(self) -> Arrays:
         """All that a successor needs to go on from here; nothing if there is no such thing."""
-        ...
+        return []
 
-    def load(self, arrays: Sequence[Any]) -> None: ...
+    def load(self, saved: Sequence[Any]) -> None:
+        """Go on from what `save` gave."""
 
     def afterwards(self) -> None:
         """Called after a command's answer is sent: for work that is not waited for.
@@ -77,14 +75,12 @@ class Job(Protocol):
         What it makes must not be needed before another command is carried out: that one may be
         carried out by a successor, which finds what was committed.
         """
-        ...
 
     def prepare(self) -> None:
         """Called where workers are forked, before each fork that is to do this job.
 
         The worker that did it is dead; so are those it shares memory with, if it is their first.
         """
-        ...
 
 
 MakeJobs = Callable[[Mapping[str, Any]], Sequence[Job]]

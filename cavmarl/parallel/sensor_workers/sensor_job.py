@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from enum import IntEnum
 from time import perf_counter, thread_time
 from typing import Any
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from cavmarl.core.numba.specialized import specialized
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.engine.simulation import Simulation
-from cavmarl.parallel.processes.state_image import Arrays
+from cavmarl.parallel.processes.worker_loop import Job
 from cavmarl.parallel.sensor_workers.sensor_scene import SceneArrays
 from cavmarl.sensors.kernels.sensor_share import put_first, take_rows
 from cavmarl.sensors.mounted.frames import Frames
@@ -25,7 +24,7 @@ class SensorTask(IntEnum):
     SENSE = 0
 
 
-class SensorJob:
+class SensorJob(Job):
     """Senses for the agents that are its share, as a zone would that owned them and saw all others.
 
     Args:
@@ -63,12 +62,6 @@ class SensorJob:
             sensor.lines = lines
             sensor.sense(self._scenes, due, frames)
 
-    def afterwards(self) -> None:
-        """Nothing to do."""
-
-    def prepare(self) -> None:
-        """Nothing to do."""
-
     def perform(self, task: int, letter: Any) -> None:
         """Sense what is due."""
         began = perf_counter()
@@ -84,13 +77,6 @@ class SensorJob:
             shared.spent_s[number, place] = thread_time() - spent
             shared.delivered[number, place] = shared.ticks
         shared.busy_s[number] = perf_counter() - began
-
-    def save(self) -> Arrays:
-        """Nothing: all that it needs comes with an order."""
-        return []
-
-    def load(self, arrays: Sequence[Any]) -> None:
-        """Nothing to do."""
 
     def _look(self) -> None:
         """Take the tick that is to be sensed."""

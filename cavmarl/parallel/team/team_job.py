@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from cavmarl.parallel.checkpoint.checkpoint_job import CheckpointJob
 from cavmarl.parallel.checkpoint.checkpoint_log import CheckpointLog
 from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.processes.worker_loop import Job
 from cavmarl.parallel.team.team import Leader, Team, TeamFollower
 from cavmarl.parallel.worlds_job import Task, WorldsJob
 from cavmarl.shards.shard import Shard
@@ -96,7 +97,7 @@ class LeaderJob(CheckpointJob):
         super().load([place])
 
 
-class FollowerJob:
+class FollowerJob(Job):
     """Some zones of one world, of which other workers have the rest."""
 
     def __init__(
@@ -106,12 +107,6 @@ class FollowerJob:
         self._world = world
         self._number = number
         self._hosts = hosts
-
-    def afterwards(self) -> None:
-        """Nothing to do."""
-
-    def prepare(self) -> None:
-        """Nothing to do."""
 
     def perform(self, task: int, letter: Any) -> None:
         if task == Task.HOST:
