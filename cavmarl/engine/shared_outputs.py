@@ -9,11 +9,11 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.memory import Zeros
 from cavmarl.core.numba.specialized import specialized
-from cavmarl.core.records.arrays import Worlds
+from cavmarl.core.records.arrays import Outputs, Worlds
 from cavmarl.roads.kernels.signal_phases import switch_signals
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.kernels.output_reset import clear_outputs, settle_outputs
-from cavmarl.shards.agent_outputs import make_outputs
+from cavmarl.sensors.observed import frame_size
 
 
 class SharedOutputs:
@@ -60,3 +60,29 @@ class SharedOutputs:
     def settle_outputs(self, chosen: NDArray[np.bool_]) -> None:
         """Finish the outputs of the chosen worlds (W,) after `sense`, before `credit`."""
         self._settle_outputs(self.outputs, self._weights, self._team_share, chosen)
+
+
+def make_outputs(
+    config: EnvConfig,
+    num_worlds: int,  # W
+    observations: NDArray[np.float32] | None = None,  # (W, A, D) to be used; None: they are made
+    zeros: Zeros = np.zeros,  # makes all others
+) -> Outputs:
+    """Outputs of W empty worlds."""
+    agents = (num_worlds, config.population.num_ids)
+    if observations is None:
+        size = config.sensors.stack * frame_size(config.sensors)
+        # Not `zeros`: NumPy asks for huge pages where it fills the array itself.
+        observations = np.full((*agents, size), 0.0, dtype=np.float32)
+    vehicle_ids = zeros(agents, dtype=np.int64)
+    vehicle_ids[...] = -1
+    return Outputs(
+        observations=observations,
+        terms=zeros((*agents, len(config.terms.names)), dtype=np.float32),
+        rewards=zeros(agents, dtype=np.float32),
+        terminated=zeros(agents, dtype=np.bool_),
+        present=zeros(agents, dtype=np.bool_),
+        acted=zeros(agents, dtype=np.bool_),
+        events=zeros(agents, dtype=np.int32),
+        vehicle_ids=vehicle_ids,
+    )

@@ -13,6 +13,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from cavmarl.config.env import ActionConfig, EnvConfig, SensorsConfig
 from cavmarl.config.rig import samples_per_step
+from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.mounted.catalogue import type_of
 from cavmarl.sensors.mounted.frames import Frames
 from cavmarl.sensors.observed import Feature, layout, sensors_of
@@ -20,6 +21,7 @@ from cavmarl.sensors.observed import Feature, layout, sensors_of
 # Features of one vehicle in the global state: present, x, y, cos, sin, speed.
 STATE_FEATURES = 6
 NUM_META_ACTIONS = 5
+STATE_SPEED_MPS = 40.0  # that is 1 in it
 
 
 def _box(size: int) -> spaces.Box:
@@ -181,6 +183,27 @@ def action_space(config: ActionConfig) -> spaces.Box | spaces.Discrete:
 def state_space(capacity: int) -> spaces.Box:
     """The global state: `STATE_FEATURES` numbers for each vehicle that the world can hold."""
     return _box(capacity * STATE_FEATURES)
+
+
+def global_state(
+    network: RoadNetwork, vehicles: NDArray[np.void], space: spaces.Box
+) -> NDArray[np.float32]:
+    """All vehicles in the order of their ids: present, x, y, cos, sin of the heading, speed.
+
+    x and y go from -1 to 1 over the map's extent, speed is over 40 m/s; places without a vehicle
+    are 0.
+    """
+    state = np.zeros((space.shape[0] // STATE_FEATURES, STATE_FEATURES), dtype=np.float32)
+    rows = vehicles[np.argsort(vehicles["id"])]
+    min_x, min_y, max_x, max_y = network.extent_m
+    live = state[: len(rows)]
+    live[:, 0] = 1.0
+    live[:, 1] = 2.0 * (rows["x"] - min_x) / max(max_x - min_x, 1.0) - 1.0
+    live[:, 2] = 2.0 * (rows["y"] - min_y) / max(max_y - min_y, 1.0) - 1.0
+    live[:, 3] = np.cos(rows["heading"])
+    live[:, 4] = np.sin(rows["heading"])
+    live[:, 5] = rows["speed"] / STATE_SPEED_MPS
+    return np.clip(state, -1.0, 1.0).ravel()
 
 
 def observation_table(config: SensorsConfig) -> str:

@@ -5,10 +5,12 @@ from __future__ import annotations
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.memory import Zeros
 from cavmarl.driving.vehicles import blank_vehicle
-from cavmarl.engine.component import ComponentContext
-from cavmarl.engine.component_setup import attach
+from cavmarl.engine.component import Attached, ComponentContext
+from cavmarl.engine.rig_component import MountedSensors
+from cavmarl.engine.scenario_cues import Cues
 from cavmarl.engine.shared_outputs import SharedOutputs
 from cavmarl.engine.tick import Tick
+from cavmarl.engine.v2x_component import Messaging
 from cavmarl.handoff.shard_setup import divide
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.mounted.catalogue import frame_layout, frames_in
@@ -68,6 +70,18 @@ def make_tick(
     )
     gate = make_gate(num_worlds, traffic.capacity, network.arrays, blank.dtype)
     return Tick(shards, division, traffic, commons, gate, attached)
+
+
+def attach(host: ComponentContext) -> tuple[Attached, ...]:
+    """The parts that the environment asks for, in the order in which they act."""
+    parts: list[Attached] = []
+    if host.config.scenario.name:
+        parts.append(Cues(host.travel.scripts.cues, host.shards, host.division))
+    if host.config.rig:
+        parts.append(MountedSensors(host))
+    if host.config.v2x.enabled:
+        parts.append(Messaging(host))
+    return tuple(parts)
 
 
 def make_frames(config: EnvConfig, num_worlds: int, zeros: Zeros) -> Frames:

@@ -14,8 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from cavmarl.core.errors import JournalError, LostTickError, ProtocolError
 from cavmarl.ownership.decisions import CommittedStates, Decisions
-from cavmarl.ownership.leases import make_step
-from cavmarl.ownership.ledger import world_digest
+from cavmarl.ownership.ledger import state_digest, world_digest
 from cavmarl.ownership.limits import DeadlinePolicy, Limits
 from cavmarl.ownership.messages import (
     Ack,
@@ -25,6 +24,7 @@ from cavmarl.ownership.messages import (
     Done,
     Fence,
     Host,
+    In,
     Message,
     Nack,
     Need,
@@ -33,6 +33,7 @@ from cavmarl.ownership.messages import (
     Refusal,
     Reset,
     Step,
+    Switch,
     ZoneLedger,
 )
 from cavmarl.ownership.planning import all_removed, check_done
@@ -337,3 +338,25 @@ class Directory:
     def _logged(self, record: Record) -> Output:
         self.table.apply(record)
         return Output((record,))
+
+
+def make_step(table: Table, zone: int, store: CommittedStates, payload: bytes) -> Step:
+    """The lease of a zone's present host for the tick in progress.
+
+    States ride along for vehicles whose switch is forced, and for those that have to be sent again.
+    """
+    plan = table.planned
+    enter = tuple(
+        _entry(switch, store.state(switch.vehicle), switch.vehicle in plan.attach)
+        for switch in plan.enter.get(zone, ())
+    )
+    return Step(
+        table.run, table.episode, plan.record.tick, zone, table.hosts[zone][1], table.tick,
+        enter, tuple(plan.leave.get(zone, ())), tuple(plan.spawn.get(zone, ())),
+        plan.expected[zone], payload,
+    )  # fmt: skip
+
+
+def _entry(switch: Switch, state: bytes, attached: bool) -> In:
+    carried = state if attached else b""
+    return In(switch.vehicle, switch.epoch, attached, state_digest(state), carried)

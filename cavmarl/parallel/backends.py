@@ -78,11 +78,6 @@ _BACKENDS = {
 _OWN = frozenset(_BACKENDS)
 
 
-def backend_names() -> tuple[str, ...]:
-    """What `hosts` can name."""
-    return tuple(_BACKENDS)
-
-
 def register_backend(name: str, make: MakeWorlds) -> None:
     """Add a place where worlds run, which `hosts` of `make_vec` and `parallel_env` can name.
 

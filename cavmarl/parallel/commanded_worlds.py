@@ -14,11 +14,10 @@ import cavmarl.core.errors
 from cavmarl.balance.balance_plan import Plan
 from cavmarl.balance.plan_text import describe_plan
 from cavmarl.core.errors import CavmarlError, WorkerDeathError, WorkerFailureError
-from cavmarl.parallel.driven_vehicles import Driven
 from cavmarl.parallel.hosts.host_pool import HostPool
 from cavmarl.parallel.mover import Mover
 from cavmarl.parallel.processes.worker_pool import Death, Pool
-from cavmarl.parallel.step_arrays import StepArrays
+from cavmarl.parallel.step_arrays import Driven, StepArrays
 from cavmarl.parallel.step_placement import StepPlacement
 from cavmarl.parallel.work_shares import Part
 from cavmarl.parallel.worlds_job import Task

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cavmarl.handoff.coordinator.coordinator_setup import WorldRun
-from cavmarl.parallel.checkpoint.action_log import ActionLog
-from cavmarl.parallel.checkpoint.action_log_job import ActionLogJob
+from cavmarl.parallel.checkpoint.action_log import ActionLog, ActionLogJob
 from cavmarl.parallel.checkpoint.checkpoint_job import CheckpointJob
 from cavmarl.parallel.checkpoint.checkpoint_log import CheckpointLog
 from cavmarl.parallel.checkpoint.moving_job import MovingJob

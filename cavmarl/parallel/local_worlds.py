@@ -13,15 +13,13 @@ from cavmarl.balance.balance_plan import Plan
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.memory import Zeros
 from cavmarl.core.numba.specialized import specialized
-from cavmarl.engine.global_state import global_state
 from cavmarl.engine.kernels.step_results import Results, keep_last, report, report_who_goes_on
 from cavmarl.engine.simulation import Simulation
-from cavmarl.engine.spaces import state_space, write_sensed
+from cavmarl.engine.spaces import global_state, state_space, write_sensed
 from cavmarl.engine.world_setup import World
 from cavmarl.handoff.coordinator.coordinator_setup import WorldRun
-from cavmarl.parallel.driven_vehicles import Driven, driven_by
 from cavmarl.parallel.sensor_workers.sensor_pool import SensorWorkers
-from cavmarl.parallel.step_arrays import StepArrays, layout_of
+from cavmarl.parallel.step_arrays import Driven, StepArrays, layout_of
 from cavmarl.sensors.mounted.catalogue import frame_layout
 from cavmarl.shards.shard import Commands
 from cavmarl.traffic.sumo.sumo_history import ToldLog
@@ -193,8 +191,19 @@ class LocalWorlds:
         return stats
 
     def driven(self, world: int, agents: Sequence[int]) -> list[Driven]:
-        """The vehicles of some agents of one world, in no order."""
-        return driven_by(self.simulation, world, agents)
+        """The vehicles of some agents of one world, in no order; some may have none."""
+        simulation = self.simulation
+        rows = simulation.vehicles(world)
+        rows = rows[np.isin(rows["agent"], agents)]
+        columns = (
+            rows["agent"],
+            rows["id"],
+            simulation.types["vclass"][rows["vtype"]],
+            rows["length"].astype(np.float64),
+            rows["width"].astype(np.float64),
+            simulation.goal_edges[rows["goal"]],
+        )
+        return [Driven(*row) for row in zip(*(column.tolist() for column in columns), strict=True)]
 
     def signal_phases(self, world: int) -> NDArray[np.int32]:
         """(num_signals,) PHASE rows that are on in one world; a view."""

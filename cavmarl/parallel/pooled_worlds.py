@@ -12,10 +12,9 @@ from cavmarl.engine.compilation import compiled_before
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
 from cavmarl.parallel.checkpoint.checkpoint_log import make_segments
-from cavmarl.parallel.checkpoint.moving_memory import MovingMemory
 from cavmarl.parallel.commanded_worlds import OrderedWorlds, own_error
 from cavmarl.parallel.journaled_worlds import check_watched, is_watched, runs_as_text, unwatched
-from cavmarl.parallel.mover import Mover
+from cavmarl.parallel.mover import Mover, MovingMemory
 from cavmarl.parallel.processes.process_barrier import usable_cores
 from cavmarl.parallel.processes.shared_memory import Segment, arrays_in, size_of
 from cavmarl.parallel.processes.worker_pool import Pool, Program

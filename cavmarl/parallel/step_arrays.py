@@ -13,7 +13,6 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.spaces import flat_observation_space, state_space
 from cavmarl.engine.world_setup import World
-from cavmarl.parallel.driven_vehicles import Driven
 from cavmarl.parallel.processes.shared_memory import Layout
 from cavmarl.sensors.mounted.catalogue import frame_layout, frames_in
 from cavmarl.sensors.mounted.frames import Frames
@@ -89,6 +88,17 @@ def layout_of(config: EnvConfig, capacity: int, num_worlds: int) -> Layout:
         **frame_layout(config, num_worlds),
         **frame_layout(config, num_worlds, FINAL_FRAMES),
     }
+
+
+class Driven(NamedTuple):
+    """An agent's vehicle, as plain numbers, for drivers outside the process."""
+
+    agent: int  # index of it
+    vehicle_id: int
+    vclass: int  # index into `roads.network.VEHICLE_CLASSES`
+    length_m: float  # of its body
+    width_m: float  # of its body
+    goal_edge: int  # EDGE row of where it is to go
 
 
 class SteppedWorlds(Protocol):

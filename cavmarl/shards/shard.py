@@ -30,7 +30,6 @@ from cavmarl.core.records.arrays import (
     Zoned,
 )
 from cavmarl.core.records.codes import DRIVER_BACKGROUND, DRIVER_SUMO
-from cavmarl.driving.controllers import CONTROLLER
 from cavmarl.driving.kernels.approach import APPROACH
 from cavmarl.driving.kernels.lane_index import ENTRY
 from cavmarl.driving.vehicles import VEHICLE
@@ -50,6 +49,16 @@ CELL_M = 25.0  # of the spatial index over vehicles
 COMMON = Common._fields
 TICKS_IN_ORDER = 32  # for so long rows that have been put in the order of the lanes nearly stay so
 SUGGESTED_HORIZON_S = 1.0  # in which a suggested target speed is to be reached
+
+# What a world knows of one actuated signal program.
+CONTROLLER = np.dtype(
+    [
+        ("phase", np.int64),  # PHASE row that is on
+        ("since_ms", np.int64),  # when it began, since reset
+        ("next_ms", np.int64),  # when to look whether it goes on
+    ],
+    align=True,
+)
 
 
 @dataclass(frozen=True)

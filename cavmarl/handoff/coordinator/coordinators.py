@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from hashlib import blake2b
 
 import numpy as np
@@ -16,11 +17,44 @@ from cavmarl.handoff.coordinator.row_digests import RowDigests
 from cavmarl.handoff.division import Division
 from cavmarl.handoff.fault_injection.committed_store import CommittedStore, Notes
 from cavmarl.handoff.fault_injection.message_coordinator import MessageCoordinator
-from cavmarl.handoff.surroundings import NearBorders
 from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.messages import Record
 from cavmarl.shards.shard import Commands
 from cavmarl.zones.kernels.zone_lookup import zones_of
+
+
+class NearBorders:
+    """What rows of transfers need to know: vehicles near a border, and those that crossed one.
+
+    Attributes:
+        near: of the tick that is on its way; to be set.
+        places: vehicle that has changed its owner in it → the row that it had there; to be set.
+    """
+
+    def __init__(self, division: Division, world: int) -> None:
+        self.places: Mapping[int, int] = {}
+        self._division = division
+        self._world = world
+        self.near: Sequence[Near] = ()
+        self._depths: dict[tuple[int, int], float] = {}
+        self._told: Sequence[Near] = ()
+
+    def depth_m(self, vehicle: int, target: int) -> float | None:
+        """How far outside of its owner's zone, less than 0 inside; None: it was not near."""
+        if self._told is not self.near:
+            self._told = self.near
+            self._depths = {(entry.vehicle, entry.target): entry.depth_m for entry in self.near}
+        return self._depths.get((vehicle, target))
+
+    def release_depth_m(self, vehicle: int, source: int, target: int) -> float | None:
+        """How far outside of its old zone a vehicle is that has changed; None: it has left."""
+        hint = self.places.get(vehicle, 0)
+        return self._division.depth_m(self._world, vehicle, target, source, hint)
+
+    @staticmethod
+    def now_ms() -> float:
+        """Of the process's clock."""
+        return 1e3 * time.perf_counter()
 
 
 class RowStates:

@@ -12,8 +12,7 @@ from typing import Any, TypeAlias
 
 from cavmarl.core.errors import CavmarlError
 from cavmarl.handoff.fault_injection.fault_plan import PHASES, Crash, Faults
-from cavmarl.handoff.fault_injection.mailbox import Parcel
-from cavmarl.handoff.fault_injection.message_coordinator import MessageCoordinator
+from cavmarl.handoff.fault_injection.message_coordinator import MessageCoordinator, Parcel
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.messages import COORDINATOR, Begin, Commit, Output, Prepare, Step
 from cavmarl.shards.executor import Executor, SerialExecutor

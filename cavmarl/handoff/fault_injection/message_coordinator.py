@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
-from typing import Protocol
+from collections.abc import Callable, Iterable, Sequence
+from typing import Protocol, TypeAlias
 
 from cavmarl.core.errors import ProtocolError
 from cavmarl.handoff.coordinator.coordinator import ArrivingVehicle, Coordinator, Near
 from cavmarl.handoff.coordinator.journal import AnyJournal, MemoryJournal
-from cavmarl.handoff.fault_injection.mailbox import Parcel, Post
 from cavmarl.ownership.directory import SILENCE, Directory
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import (
     COORDINATOR,
     Begin,
+    Message,
     Output,
     Prepare,
     Record,
@@ -27,6 +27,20 @@ from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 
 PATIENCE = 10_000
 """So often a tick asks a zone that does not answer, before it gives up."""
+
+
+Parcel: TypeAlias = tuple[int, Message, bool]
+"""A message at its destination, and whether it is to be refused; see `transport.Delivery`."""
+
+
+class Post(Protocol):
+    """Carries messages; `ownership.transport.Network` is the one that loses some of them."""
+
+    def send(self, messages: Iterable[Message]) -> None:
+        """Take messages; each goes to all of its destinations."""
+        ...
+
+    def deliver(self) -> Sequence[Parcel]: ...
 
 
 class States(Protocol):
