@@ -38,11 +38,7 @@ class WorkerLoad(NamedTuple):
 
 @dataclass(frozen=True)
 class Plan:
-    """A placement, reproducible: `make_plan(plan.problem) == plan`.
-
-    Raises:
-        ConfigError: not one home a shard, or one that does not answer.
-    """
+    """A placement, reproducible: `make_plan(plan.problem) == plan`."""
 
     problem: Problem  # what it follows from
     homes: tuple[int, ...]  # worker of each shard, in the order of `problem.shards`

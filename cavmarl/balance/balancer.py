@@ -36,11 +36,7 @@ class Balancer:
         return self._costs
 
     def measure(self, measured: Iterable[ShardCost]) -> None:
-        """Take in what all shards have cost lately, in any order.
-
-        Raises:
-            ConfigError: not the shards of the plan.
-        """
+        """Take in what all shards have cost lately, in any order."""
         rows = sorted(measured)
         names = [(shard.world, shard.zone) for shard in rows]
         if names != [(shard.world, shard.zone) for shard in self.plan.problem.shards]:

@@ -58,12 +58,7 @@ class Utilisation:
 
 @dataclass(frozen=True)
 class LoadRule:
-    """How workers are scored and which ones are excluded.
-
-    Raises:
-        ConfigError: a weight below 0, weights that do not sum to 1, a threshold outside of
-            [0, 1], thresholds that would leave nothing of a worker, a margin below 0.
-    """
+    """How workers are scored and which ones are excluded."""
 
     # of CPU, RAM and GPU in the score; they add up to 1
     weights: tuple[float, float, float] = WEIGHTS
@@ -160,12 +155,7 @@ def find_rejections(
 def admissible(
     candidates: Sequence[Candidate], rejections: Sequence[Rejection]
 ) -> tuple[Candidate, ...]:
-    """Those without a reason against them, by worker.
-
-    Raises:
-        NoAdmissibleWorkerError: there is none.
-        ConfigError: two candidates are the same worker.
-    """
+    """Those without a reason against them, by worker."""
     numbers = [candidate.worker for candidate in candidates]
     if len(set(numbers)) != len(numbers):
         raise ConfigError(f"workers {sorted(numbers)}: one of them is named twice")
@@ -194,7 +184,6 @@ def select(
 
     Raises:
         NoAdmissibleWorkerError: all are excluded; the error holds every reason.
-        ConfigError: the preferred worker is none of them.
     """
     known = {candidate.worker for candidate in candidates}
     if preferred is not None and preferred not in known:

@@ -18,11 +18,7 @@ SUPPOSED_IDLE = "supposed idle"
 
 @dataclass(frozen=True)
 class LoadSnapshot:
-    """Utilisation of all workers.
-
-    Raises:
-        ConfigError: no worker, or one twice.
-    """
+    """Utilisation of all workers."""
 
     workers: tuple[Candidate, ...]  # by number; at least one
     gpu_source: str  # what told the use of GPUs; `none`: there is none, and it counts as 0

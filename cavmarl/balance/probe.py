@@ -29,9 +29,6 @@ def take_snapshot(
     Args:
         workers: number → process id; None: not started yet, it will run where this process may.
         interval_s: for how long; this call takes as long.
-
-    Raises:
-        ConfigError: no worker, or an interval that is none.
     """
     if not interval_s > 0.0:
         raise ConfigError(f"interval_s = {interval_s}: must be above 0")

@@ -32,11 +32,7 @@ def equal_costs(worlds: int, zones: int) -> tuple[ShardCost, ...]:
 
 @dataclass(frozen=True)
 class BalanceRule:
-    """When shards move, and how many at once.
-
-    Raises:
-        ConfigError: a tolerance or a price below 0, no move a round, or no tick.
-    """
+    """When shards move, and how many at once."""
 
     load: LoadRule = field(default_factory=LoadRule)  # how workers are scored and excluded
     # while the slowest worker takes at most this share longer than a perfect division would,
@@ -61,13 +57,7 @@ class BalanceRule:
 
 @dataclass(frozen=True)
 class Problem:
-    """Everything that a plan follows from; it is put in order, so that no order ever counts.
-
-    Raises:
-        ConfigError: no shard, one twice, a cost below 0 or none, a zone without a row in
-            `neighbors`, neighbours that are not each other's, more workers than shards, not one
-            present worker a shard, present workers that are not in a row though they have to be.
-    """
+    """Everything that a plan follows from; it is put in order, so that no order ever counts."""
 
     shards: tuple[ShardCost, ...]  # of all worlds, by world and zone
     neighbors: tuple[tuple[int, ...], ...]  # for each zone those that share a side with it

@@ -18,9 +18,6 @@ def divide_row(placement: Placement) -> Placement:
 
     Args:
         placement: it is changed, and returned.
-
-    Raises:
-        NoAdmissibleWorkerError: a worker is excluded, though each has to host one.
     """
     problem, workers = placement.problem, placement.workers
     if not workers.is_open.all():

@@ -15,9 +15,6 @@ class SmoothCosts:
 
     Args:
         newest: weight of the newest measurement; the first one of a shard counts whole.
-
-    Raises:
-        ConfigError: a weight that is not above 0 and at most 1.
     """
 
     def __init__(self, newest: float = NEWEST) -> None:

@@ -35,7 +35,6 @@ class Registry(Generic[T]):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What is registered."""
         return tuple(self._entries)
 
     def add(self, name: str, entry: T, source: Callable[..., Any], taken: Iterable[str]) -> None:
@@ -46,9 +45,6 @@ class Registry(Generic[T]):
             entry: what it stands for.
             source: a function of the module that registers it.
             taken: names of the package's own.
-
-        Raises:
-            ConfigError: the name is taken or no name.
         """
         module = inspect.unwrap(getattr(source, "py_func", source)).__module__
         if not name.isidentifier():
@@ -64,7 +60,6 @@ class Registry(Generic[T]):
         self.modules[name] = module
 
     def remove(self, name: str) -> None:
-        """Take an entry back."""
         del self._entries[name], self.modules[name]
 
     def advice(self) -> str:
@@ -79,11 +74,7 @@ REGISTERED_MODELS: Registry[int] = Registry("driver_model")
 
 
 def extension_modules(names: Iterable[str]) -> list[str]:
-    """The modules that other processes have to import, in the order of registration.
-
-    Raises:
-        ConfigError: one was registered in the program itself, which no worker can import.
-    """
+    """The modules that other processes have to import, in the order of registration."""
     found: dict[str, None] = {}
     used = set(names)
     for registry in (REGISTERED_TERMS, REGISTERED_SENSORS, REGISTERED_MODELS):
@@ -99,11 +90,7 @@ def extension_modules(names: Iterable[str]) -> list[str]:
 
 
 def load_extensions(modules: Iterable[str]) -> None:
-    """Import the modules that register what a configuration names.
-
-    Raises:
-        WorkerError: one is not there.
-    """
+    """Import the modules that register what a configuration names."""
     for module in modules:
         try:
             importlib.import_module(module)

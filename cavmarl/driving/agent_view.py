@@ -72,12 +72,7 @@ class RegisteredFunction:
         self._unchecked = ORDER_CHECKS
 
     def __call__(self, view: AgentView) -> NDArray[np.float32]:
-        """Its numbers (size,).
-
-        Raises:
-            RegisteredFunctionError: other numbers than it should, or those that depend on the
-                order of the others.
-        """
+        """Its numbers (size,)."""
         numbers = self._ask(view)
         if self._unchecked and view.others.size > 1:
             self._unchecked -= 1

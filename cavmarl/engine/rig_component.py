@@ -46,7 +46,6 @@ class MountedSensors:
         self.rig.reset(self.scenes(), chosen)
 
     def begin(self, commands: Commands) -> None:
-        """Note how all agents move before the tick."""
         self.rig.begin(self.scenes())
 
     def end(self) -> None:

@@ -33,7 +33,6 @@ class ShardClock:
         self._spent_ns = np.zeros(len(self._hosts), dtype=np.int64)
 
     def each(self, phase: str, *arguments: Any) -> None:
-        """Run a phase on every shard, in order."""
         self._ticks += phase == "advance"
         if self._ticks % self._every:
             self._together.each(phase, *arguments)

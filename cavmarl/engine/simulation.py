@@ -11,13 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
-from cavmarl.core.errors import (
-    CapacityError,
-    ConfigError,
-    JournalError,
-    LostTickError,
-    SumoError,
-)
+from cavmarl.core.errors import CapacityError, ConfigError, JournalError, LostTickError, SumoError
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.math.rng import world_key
 from cavmarl.core.memory import Zeros
@@ -191,9 +185,6 @@ class Simulation(WorldViews):
         """Begin a new episode in the chosen worlds (W,), all by default, and sense.
 
         World w's episode is a function of (seed, first_world + w, its resets since `seed`).
-
-        Raises:
-            CapacityError: the map has no room for that many agents of a closed world.
         """
         chosen = self.everywhere if chosen is None else np.ascontiguousarray(chosen, dtype=np.bool_)
         self._populate(chosen)
@@ -277,9 +268,6 @@ class Simulation(WorldViews):
         """Go to the committed tick of a reproducer; `run_tick` runs the next one.
 
         No further reproducers are written.
-
-        Raises:
-            JournalError: it is of other worlds.
         """
         if self._tick.sumo is not None:
             raise JournalError("a world with SUMO beside it cannot be taken up in its middle")
@@ -320,11 +308,7 @@ class Simulation(WorldViews):
         self._tick.host(make, gathers)
 
     def time_shards(self, every: int = 1) -> ShardClock:
-        """From now on run phases zone by zone, with a clock on each.
-
-        Raises:
-            ConfigError: hosts die by plan, and what is repeated would be counted, too.
-        """
+        """From now on run phases zone by zone, with a clock on each."""
         if self._recovery is not None:
             raise ConfigError("zones.faults: shards are timed where no host dies; leave it out")
         self._refuse_recutting("measuring what each zone costs")
@@ -339,7 +323,6 @@ class Simulation(WorldViews):
             )
 
     def close(self) -> None:
-        """End the processes that the worlds have."""
         if self._tick.sumo is not None:
             self._tick.sumo.close()
 

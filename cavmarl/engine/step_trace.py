@@ -61,8 +61,6 @@ class StepTrace:
 
 
 class _Traced:
-    """Stands for an executor."""
-
     def __init__(self, part: Any, note: Callable[[str], None]) -> None:
         self._part = part
         self._note = note

@@ -116,7 +116,6 @@ class Tick:
             self.traffic.settle(gate, worlds)
 
     def switch_signals(self) -> None:
-        """Detect → switch."""
         if self.sumo is not None:
             self.sumo.show(self._shard.worlds)
             return

@@ -91,7 +91,6 @@ def make_frames(config: EnvConfig, num_worlds: int, zeros: Zeros) -> Frames:
 
 
 def cut_zones(config: EnvConfig, network: RoadNetwork) -> ZonePartition:
-    """The zones that the settings ask for."""
     settings = config.zones
     return cut_map(
         network,

@@ -148,11 +148,7 @@ def find_map(env: str | Path) -> Path:
 
 
 def check_workers(workers: int | None) -> int:
-    """How many worker processes share some worlds out; 0: none, the caller's process runs them.
-
-    Raises:
-        ConfigError: no whole number from 0.
-    """
+    """How many worker processes share some worlds out; 0: none, the caller's process runs them."""
     if workers is None:
         return 0
     if isinstance(workers, bool) or not isinstance(workers, (int, np.integer)):
@@ -163,10 +159,6 @@ def check_workers(workers: int | None) -> int:
 
 
 def check_agents(config: EnvConfig) -> None:
-    """Refuse a world without agents where a caller wants to drive one.
-
-    Raises:
-        ConfigError: `population.agents` is 0.
-    """
+    """Refuse a world without agents where a caller wants to drive one."""
     if config.population.agents == 0:
         raise ConfigError("population.agents = 0: an environment needs at least one agent")

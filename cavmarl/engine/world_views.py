@@ -52,7 +52,6 @@ class WorldViews:
 
     @property
     def capacity(self) -> int:
-        """How many vehicles a world can hold."""
         return int(self._shard.worlds.rows.shape[1])
 
     @property
@@ -62,11 +61,7 @@ class WorldViews:
 
     @property
     def messages(self) -> Bus:
-        """What vehicles and roadside units tell each other.
-
-        Raises:
-            ConfigError: they tell each other nothing.
-        """
+        """What vehicles and roadside units tell each other."""
         for part in self._tick.attached:
             if isinstance(part, Messaging):
                 return part.bus
@@ -116,17 +111,14 @@ class WorldViews:
         return self._tick.division.vehicles(world)
 
     def zone_loads(self) -> ZoneLoads:
-        """What each zone holds now."""
         return self._tick.division.loads()
 
     def zone_view(self, world: int = 0) -> ZoneView:
-        """Which zones own and see which vehicles of one world now."""
         halo_m, coordination = self.zone_loads().halo_m, self._tick.coordination
         transfers = () if coordination is None else coordination.in_flight(world)
         return view_zones(self._shards, self.partition, halo_m, world, transfers)
 
     def running(self) -> NDArray[np.int64]:
-        """(W,) vehicles of each world."""
         return self._tick.division.running()
 
     def ghosts(self, zone: int, world: int = 0) -> NDArray[np.void]:
@@ -171,7 +163,6 @@ class WorldViews:
         return phases
 
     def ticks(self) -> NDArray[np.int64]:
-        """(W,) ticks since each world's reset."""
         return self._shard.worlds.ticks
 
     @property
@@ -190,7 +181,6 @@ class WorldViews:
         return self._tick.sumo
 
     def agents_to_come(self) -> NDArray[np.bool_]:
-        """(W,) whether an agent waits to enter."""
         tick = self._tick
         longest = int(tick.gate.num_queue.max(initial=0))
         if longest == 0:
@@ -200,5 +190,4 @@ class WorldViews:
         return np.asarray(found, dtype=np.bool_)
 
     def traffic_stats(self, world: int = 0) -> TrafficStats:
-        """Counts and means since the world's reset."""
         return count_traffic(self._tick.gate, self._tick.division, world)

@@ -89,13 +89,7 @@ class ActionDecoder:
     def from_dict(
         self, actions: Mapping[str, Any], live: Sequence[str], needed: Sequence[str]
     ) -> Commands:
-        """Decode the actions of one world; those of live agents without a vehicle are not read.
-
-        Raises:
-            ActionError: an id that never was, or has left (unless `late_actions = ignore`); a
-                needed agent without an action (unless `missing_action = hold`); wrong shape, dtype
-                or value.
-        """
+        """Decode the actions of one world; those of live agents without a vehicle are not read."""
         if not isinstance(actions, Mapping):
             raise ActionError(
                 f"actions are a {type(actions).__name__}: pass a dict from agent id to action"
@@ -123,11 +117,7 @@ class ActionDecoder:
         return self._commands(checked)
 
     def from_array(self, actions: Any, mask: NDArray[np.bool_]) -> Commands:
-        """Decode the actions of all worlds; entries where `mask` (W, A) is False are not read.
-
-        Raises:
-            ActionError: wrong shape, dtype or value.
-        """
+        """Decode the actions of all worlds; entries where `mask` (W, A) is False are not read."""
         if self._decode_at_once(actions, mask):
             return self._decoded
         array = self._as_numbers(actions, "actions")

@@ -21,12 +21,6 @@ class DeclaredEvents:
         self._are_any = False
 
     def declare(self, world: int, agent: int, cause: str) -> None:
-        """Note an event.
-
-        Raises:
-            ActionError: no such world or agent.
-            ConfigError: no such cause, or nobody says anything in this environment.
-        """
         if not self._enabled:
             raise ConfigError("nobody says anything here: set v2x.enabled to true")
         num_worlds, num_agents = self._causes.shape

@@ -90,12 +90,10 @@ class Division:
 
     @property
     def count(self) -> int:
-        """How many zones."""
         return len(self._shards)
 
     @property
     def num_worlds(self) -> int:
-        """W."""
         return len(self._shards[0].worlds.ticks)
 
     def distribute(self, chosen: NDArray[np.bool_]) -> None:
@@ -240,11 +238,7 @@ class Division:
         return [Near(*entry) for entry in self.book.near[w, :num].tolist()]
 
     def find(self, w: int, vehicle: int) -> tuple[int, int]:
-        """The zone that owns a vehicle, and its committed row there.
-
-        Raises:
-            ConfigError: nobody owns it.
-        """
+        """The zone that owns a vehicle, and its committed row there."""
         for shard in self._shards:
             worlds = shard.worlds
             found = np.flatnonzero(worlds.rows["id"][w, : worlds.num_owned[w]] == vehicle)
@@ -268,9 +262,6 @@ class Division:
 
         Returns:
             the row where the new one keeps it.
-
-        Raises:
-            ConfigError: the old owner does not have it, or the new one has not seen it come.
         """
         place = self._pass_on(
             switch.vehicle, switch.source, hint, switch.target, switch.epoch,
@@ -343,12 +334,10 @@ class Division:
 
     @property
     def zoned(self) -> Zoned:
-        """The rows of all zones."""
         return self._zoned
 
     @property
     def halo(self) -> Halo:
-        """How far each zone sees over its borders."""
         return self._halo
 
     @property
@@ -358,7 +347,6 @@ class Division:
 
     @property
     def next_side(self) -> int:
-        """On which side the next rows are."""
         return self._side(self._shards[0].worlds.next_rows)
 
     def owners(self, w: int) -> list[tuple[int, int]]:
@@ -370,7 +358,6 @@ class Division:
         ]
 
     def counts(self, w: int) -> list[int]:
-        """How many vehicles of a world each zone owns."""
         counts: list[int] = self._zoned.num_owned[:, w].tolist()
         return counts
 
@@ -381,7 +368,6 @@ class Division:
         return running
 
     def loads(self) -> ZoneLoads:
-        """What each zone holds."""
         owned = np.array([shard.worlds.num_owned for shard in self._shards])
         rows = np.array([shard.worlds.num_rows for shard in self._shards])
         return ZoneLoads(owned, rows - owned, self._halo.halo_m)

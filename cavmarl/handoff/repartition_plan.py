@@ -53,11 +53,7 @@ def propose_zones(
     *,
     tolerance: float = 0.1,  # by which share of the mean the costliest zone has to become cheaper
 ) -> Proposal | None:
-    """Zones of about the same cost; None where they would gain no more than the tolerance.
-
-    Raises:
-        ConfigError: not one cost a zone, or one that is none.
-    """
+    """Zones of about the same cost; None where they would gain no more than the tolerance."""
     if len(costs_s) != partition.count or not all(
         math.isfinite(cost_s) and cost_s >= 0.0 for cost_s in costs_s
     ):

@@ -73,6 +73,5 @@ class Recutter:
         return proposal.partition
 
     def cut(self, partition: ZonePartition) -> None:
-        """Divide the worlds into these zones, as many as before."""
         self._division.cut(partition)
         self._coordination.cut()

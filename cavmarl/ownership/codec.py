@@ -17,9 +17,7 @@ from dataclasses import fields
 from enum import IntEnum
 from typing import Any, get_args, get_origin, get_type_hints
 
-from cavmarl.core.errors import (
-    MessageError,
-)
+from cavmarl.core.errors import MessageError
 from cavmarl.ownership.messages import Abort, Ack, Done, Message, Nack, Need, Prepare, Step
 
 VERSION = 1
@@ -47,10 +45,6 @@ def decode(data: bytes, run: bytes | None = None) -> Message:
     Args:
         data: one whole message.
         run: of the receiver; None accepts all.
-
-    Raises:
-        MessageError: it ends too early or goes on after its end; another version of this form; the
-            checksum or a field is wrong; it belongs to another run.
     """
     if len(data) < _HEADER.size + _CRC.size:
         raise MessageError(f"a message of {len(data)} bytes has no room for its header")

@@ -98,11 +98,7 @@ class Directory:
         limits: Limits | None = None,
         safeguards: Safeguards = ALL_ON,
     ) -> Directory:
-        """The coordinator that wrote these records. Send what `resend` says before all else.
-
-        Raises:
-            JournalError: the log does not begin with a RESET, or cannot have been written so.
-        """
+        """The coordinator that wrote these records. Send what `resend` says before all else."""
         if not records or not isinstance(records[0], Reset):
             raise JournalError("a log begins with a RESET, which names the run")
         directory = cls(records[0].run, zones, store, limits, safeguards)
@@ -131,10 +127,6 @@ class Directory:
         """Give a zone to a new process of `worker`, which has to be loaded with `hosting(zone)`.
 
         In the middle of a tick the zone has to be fenced first; its STEP is sent again.
-
-        Raises:
-            LostTickError: this tick has had as many hosts of the zone as are allowed.
-            ProtocolError: the zone is hosted and a tick is in progress.
         """
         table = self.table
         if table.plan is not None:
@@ -173,12 +165,7 @@ class Directory:
         inputs: bytes = b"",  # digest of the actions
         payloads: Mapping[int, bytes] | None = None,  # zone → what rides with its STEP
     ) -> Output:
-        """Decide the way to the next tick: BEGIN, then a STEP for every zone.
-
-        Raises:
-            ProtocolError: the tick before is not committed, or a mover is unknown; an id that the
-                episode has seen, or a zone that is none.
-        """
+        """Decide the way to the next tick: BEGIN, then a STEP for every zone."""
         table = self.table
         if table.plan is not None:
             raise ProtocolError(f"tick {table.plan.record.tick} is not committed")
@@ -240,7 +227,6 @@ class Directory:
             rows: zone → digest of the rows that the store holds for the tick.
 
         Raises:
-            ProtocolError: a zone has not answered; a vehicle was lost or doubled.
             StoreError: the store holds other rows than a zone told of. Fence and host it anew.
         """
         table = self.table

@@ -19,11 +19,7 @@ from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 
 @dataclass(frozen=True, slots=True)
 class Distances:
-    """The three distances of a world.
-
-    Raises:
-        ConfigError: a distance below 0, or they are not in order.
-    """
+    """The three distances of a world."""
 
     approach_m: float  # before the border; offers begin
     hysteresis_m: float  # beyond the border; up to there the owner stays
@@ -66,11 +62,7 @@ def needed_overlap_m(
 def check_coverage(
     distances: Distances, limits: Limits, *, reach_m: float, v_max_mps: float, dt_s: float
 ) -> None:
-    """Refuse a world in which "the source stays authoritative" would not be safe.
-
-    Raises:
-        ConfigError: the overlap is too narrow, or the approach is shorter than a tick's way.
-    """
+    """Refuse a world in which "the source stays authoritative" would not be safe."""
     needed = needed_overlap_m(reach_m, distances.hysteresis_m, limits, v_max_mps, dt_s)
     if distances.overlap_m < needed:
         raise ConfigError(

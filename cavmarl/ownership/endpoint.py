@@ -101,9 +101,6 @@ class Endpoint:
             rows: digest of the rows that were stored (`world_digest` of their `row_hash`).
             removed: vehicles that left the world in this tick.
             payload: for the runtime.
-
-        Raises:
-            ProtocolError: there is no lease.
         """
         if self.lease is None:
             raise ProtocolError(f"zone {self.zone} has no lease: no STEP after tick {self.tick}")
@@ -139,9 +136,7 @@ class Endpoint:
             return self.on_message(message)
         refused = tuple(
             Refused(
-                offer.vehicle,
-                offer.epoch,
-                self.replicas.refuse(offer, message.tick, Refusal.LOAD),
+                offer.vehicle, offer.epoch, self.replicas.refuse(offer, message.tick, Refusal.LOAD)
             )
             for offer in message.entries
         )

@@ -25,11 +25,7 @@ class DeadlinePolicy(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Deadlines that all parties of a run share.
-
-    Raises:
-        ConfigError: a number that is too small, or a grace without a policy that uses it.
-    """
+    """Deadlines that all parties of a run share."""
 
     deferral: int = 2  # ticks for which the source goes on without a confirmation (D)
     lifetime: int = 16  # ticks after which a replica that is not refreshed is dropped (K)

@@ -48,9 +48,6 @@ class Offers:
 
         Returns:
             Target → offers, and target → withdrawals.
-
-        Raises:
-            ProtocolError: a vehicle is not owned.
         """
         self.barred = {pair: until for pair, until in self.barred.items() if until > tick}
         before, self.open, self.owed, self.attempts = self.open, {}, {}, 1

@@ -60,7 +60,6 @@ class MemoryStore:
         self.segments.clear()
 
     def reset(self, tick: int) -> None:
-        """Begin an episode without vehicles."""
         self.tick, self.committed = tick, {}
         self.segments.clear()
 

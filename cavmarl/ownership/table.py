@@ -78,11 +78,6 @@ class Table:
 
     @property
     def planned(self) -> OwnershipPlan:
-        """The tick in progress.
-
-        Raises:
-            ProtocolError: there is none.
-        """
         if self.plan is None:
             raise ProtocolError("no tick is in progress")
         return self.plan
@@ -105,10 +100,6 @@ class Table:
         """Reach a later tick at once, as a BEGIN and a COMMIT with the same contents would.
 
         For a coordinator that has checked them itself, and whose log, if there is one, has them.
-
-        Raises:
-            ProtocolError: a tick is in progress, or vehicles wait for their transfer; nobody owned
-                one of those who have left, or somebody else one of those who have changed.
         """
         if self.plan is not None or self.deferred:
             raise ProtocolError(f"tick {self.tick + 1} is in progress")

@@ -60,11 +60,6 @@ class _Orders:
 
 
 def check_trace(entries: Iterable[TraceEntry], longest_deferral: int, lifetime: int) -> None:
-    """Read a trace from its beginning.
-
-    Raises:
-        ProtocolError: the first entry that a correct run does not leave, and why.
-    """
     checker = TraceChecker(longest_deferral, lifetime)
     for number, entry in enumerate(entries, start=1):
         try:

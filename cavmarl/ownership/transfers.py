@@ -142,7 +142,6 @@ class TransferLog:
         return rows
 
     def logged(self, records: Iterable[Record]) -> None:
-        """Note records, in the order of the log."""
         for record in records:
             match record:  # the frequent ones first
                 case Begin():

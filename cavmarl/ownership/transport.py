@@ -50,22 +50,14 @@ class Rates:
 
 
 def check_rate(name: str, value: Any, most: float) -> None:
-    """See that a value is a probability up to `most`.
-
-    Raises:
-        ConfigError: it is not.
-    """
+    """See that a value is a probability up to `most`."""
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if not is_number or not 0.0 <= value <= most:
         raise ConfigError(f"{name} is {value!r}: must be a number from 0 to {most:g}")
 
 
 def check_whole(name: str, value: Any, least: int) -> None:
-    """See that a value is a whole number, `least` or more.
-
-    Raises:
-        ConfigError: it is not.
-    """
+    """See that a value is a whole number, `least` or more."""
     if not isinstance(value, int) or isinstance(value, bool) or value < least:
         raise ConfigError(f"{name} is {value!r}: must be a whole number, {least} or more")
 

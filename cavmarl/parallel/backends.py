@@ -19,8 +19,6 @@ LOCAL, PROCESSES, RAY = "local", "processes", "ray"
 
 
 class MakeWorlds(Protocol):
-    """Makes worlds somewhere."""
-
     def __call__(
         self,
         world: World,  # what each is made of
@@ -35,8 +33,6 @@ class MakeWorlds(Protocol):
 
 @dataclass(frozen=True)
 class Backend:
-    """A place where worlds run."""
-
     make: MakeWorlds  # makes them there
     # whether the number of workers, or the name in its place, has to be given
     needs_workers: bool = False
@@ -96,11 +92,7 @@ def register_backend(name: str, make: MakeWorlds) -> None:
 
 
 def check_hosts(workers: int | str | None, hosts: str | None) -> tuple[str, int | None]:
-    """The backend that both name, and its number of workers, None where it finds that out.
-
-    Raises:
-        ConfigError: another name, no number, or no workers to be hosted.
-    """
+    """The backend that both name, and its number of workers, None where it finds that out."""
     known = ", ".join(f"'{name}'" for name in sorted(_BACKENDS, key=lambda name: name != RAY))
     if hosts is not None and hosts not in _BACKENDS:
         raise ConfigError(f"hosts = {hosts!r}: must be {known}, or None for this machine")

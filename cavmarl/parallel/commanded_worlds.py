@@ -59,12 +59,7 @@ class OrderedWorlds(ABC):
 
     @abstractmethod
     def _send(self, task: Task, letter: Any, commits: bool) -> None:
-        """Let all workers do a task.
-
-        Raises:
-            WorkerFailureError: one has raised an error.
-            WorkerDeathError: one has died of it too often.
-        """
+        """Let all workers do a task."""
 
     @abstractmethod
     def _ask(self, task: Task, world: int, more: Any = None) -> Any:
@@ -77,7 +72,6 @@ class OrderedWorlds(ABC):
         """
 
     def reset(self, seed: int | None, first_world: int) -> None:
-        """Begin an episode in the worlds of `chosen`."""
         self._order(Task.RESET, {"seed": seed, "first_world": first_world})
         if self.arrays.chosen.all():
             self._steps = 0
@@ -104,23 +98,19 @@ class OrderedWorlds(ABC):
         self._order(Task.SUGGEST, commits=False)
 
     def write_states(self) -> None:
-        """Write the global state of each world."""
         self._order(Task.WRITE_STATES, commits=False)
 
     def ticks(self) -> NDArray[np.int64]:
-        """(W,) ticks since each world's reset."""
         return self.arrays.ticks.copy()
 
     def state_hash(self, world: int) -> str:
         return str(self._ask(Task.STATE_HASH, world))
 
     def traffic_stats(self, world: int) -> dict[str, float]:
-        """Traffic of one world since its reset."""
         found: dict[str, float] = self._ask(Task.TRAFFIC_STATS, world)
         return found
 
     def driven(self, world: int, agents: Sequence[int]) -> list[Driven]:
-        """The vehicles of some agents of one world, in no order."""
         found = []
         for first in range(0, len(agents), ASKED_AT_ONCE):
             some = list(agents[first : first + ASKED_AT_ONCE])
@@ -128,7 +118,6 @@ class OrderedWorlds(ABC):
         return found
 
     def signal_phases(self, world: int) -> NDArray[np.int32]:
-        """(num_signals,) PHASE rows that are on in one world."""
         return np.array(self._ask(Task.SIGNAL_PHASES, world), dtype=np.int32)
 
     def _order(self, task: Task, letter: Any = None, commits: bool = True) -> None:

@@ -27,11 +27,7 @@ def unwatched(world: World) -> World:
 
 
 def refuse_watched(zones: ZonesConfig, where: str, cure: str) -> None:
-    """Refuse what only the workers of whole worlds on this machine can have.
-
-    Raises:
-        ConfigError: a journal or faults.
-    """
+    """Refuse what only the workers of whole worlds on this machine can have."""
     for name in ("journal", "faults"):
         if getattr(zones, name):
             raise ConfigError(f"zones.{name} = {getattr(zones, name)!r} {where}: {cure}")

@@ -85,7 +85,6 @@ class LocalWorlds:
             self._steps[:] = 0
 
     def reset(self, seed: int | None, first_world: int) -> None:
-        """Begin an episode in the worlds of `chosen`."""
         arrays, chosen = self.arrays, self.arrays.chosen
         if seed is not None:
             self.simulation.seed(seed, first_world)
@@ -147,7 +146,6 @@ class LocalWorlds:
             arrays.mask[over] = self.simulation.outputs.present[over]
 
     def _keep_observations(self) -> None:
-        """Keep the last observations of agents that have ended."""
         arrays = self.arrays
         self._keep_last(
             self._results, arrays.observations, arrays.final_observations, self.in_next_step
@@ -176,15 +174,12 @@ class LocalWorlds:
             state[:] = global_state(self.world.network, simulation.vehicles(world), space)
 
     def ticks(self) -> NDArray[np.int64]:
-        """(W,) ticks since each world's reset."""
         return self.simulation.ticks().copy()
 
     def state_hash(self, world: int) -> str:
-        """Hex digest of one world."""
         return self.simulation.state_hash(world)
 
     def traffic_stats(self, world: int) -> dict[str, float]:
-        """Traffic of one world since its reset."""
         stats = asdict(self.simulation.traffic_stats(world))
         if self.world.config.v2x.enabled:
             stats |= self.simulation.messages.statistics(world).to_dict()
@@ -251,7 +246,6 @@ class LocalWorlds:
         self.farm = farm
 
     def close(self) -> None:
-        """End the processes that the worlds have."""
         if self.farm is not None:
             self.farm.close()
         self.simulation.close()

@@ -32,8 +32,6 @@ class PooledWorlds(OrderedWorlds):
     """W worlds over m worker processes.
 
     Raises:
-        ConfigError: a setting that worlds of several processes cannot have, or more of those than
-            zones.
         WorkerError: no process, or no memory.
     """
 
@@ -129,11 +127,7 @@ class PooledWorlds(OrderedWorlds):
 
     @property
     def simulation(self) -> Simulation:
-        """Refused: the worlds live in other processes.
-
-        Raises:
-            ConfigError: always.
-        """
+        """Refused: the worlds live in other processes."""
         raise ConfigError("the worlds live in worker processes: use workers=0 to look into them")
 
     def _settle(self, parts: list[Part]) -> None:

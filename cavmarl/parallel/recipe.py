@@ -31,7 +31,6 @@ def world_of(recipe: Mapping[str, Any], trouble: str = "") -> World:
     """The world of a recipe, made anew; `trouble` says what it means if its files differ.
 
     Raises:
-        WorkerError: they do; not looked at without `trouble`.
         CavmarlError: they cannot be read.
     """
     from cavmarl.config.io import validate  # pydantic is slow to import

@@ -112,7 +112,6 @@ class StepPlacement:
 
 
 def _present_snapshot(workers: int) -> LoadSnapshot:
-    """How busy this machine is before the workers are started."""
     from cavmarl.balance.probe import take_snapshot
 
     return take_snapshot(dict.fromkeys(range(workers)))

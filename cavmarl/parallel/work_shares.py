@@ -54,7 +54,6 @@ def make_plans(
         one plan of all worlds, or one of the zones of each world.
 
     Raises:
-        ConfigError: more workers than zones of all worlds.
         NoAdmissibleWorkerError: workers are too busy.
     """
     count = world.partition.count

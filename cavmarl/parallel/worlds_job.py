@@ -47,7 +47,6 @@ class WorldsJob(Job):
         self._commands = commands_of(worlds.arrays)
 
     def perform(self, task: int, letter: Any) -> Any:
-        """Do a task; the answer of those that have one."""
         worlds = self._worlds
         if task == Task.STEP:
             worlds.step(self._commands)
@@ -76,7 +75,6 @@ class WorldsJob(Job):
         return np.asarray(vehicles * (spent_s / float(vehicles.sum())), dtype=np.float64)
 
     def save(self) -> list[NDArray[Any]]:
-        """All that the next step depends on."""
         return self._worlds.save()
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:

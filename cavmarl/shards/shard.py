@@ -164,7 +164,6 @@ class Shard:
         self._call_leave(gate, self.worlds, self.worlds.next_rows, DRIVER_SUMO, 0)
 
     def commit(self) -> None:
-        """Make the next rows the committed state."""
         self.face(self.next_side, self.next_side)
 
     def align(self) -> None:
@@ -172,7 +171,6 @@ class Shard:
         self.face(0, 0)
 
     def face(self, side: int, next_side: int) -> None:
-        """Say on which side the rows are, and the next ones."""
         self.side, self.next_side = side, next_side
         self.worlds = self.worlds._replace(rows=self.sides[side], next_rows=self.sides[next_side])
 

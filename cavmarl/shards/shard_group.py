@@ -113,7 +113,6 @@ class ShardGroup:
                 shard.turn()
 
     def face(self, side: int, next_side: int) -> None:
-        """Say on which side the rows are, and the next ones."""
         if self.sides != (side, next_side):
             for shard in self._shards:
                 shard.face(side, next_side)
@@ -144,7 +143,6 @@ class ShardGroup:
         self._gather(self._members, self._first.next_side, touching_m, border_m)
 
     def resolve(self) -> None:
-        """Find contacts in the next rows."""
         first = self._first
         self._resolve(self._members, first.side, first.next_side, self._scratch, self._room)
 
@@ -185,7 +183,6 @@ class ShardGroup:
         self._admit(self._members, first.side, first.next_side, gate)
 
     def commit(self) -> None:
-        """Make the next rows the committed state."""
         if self._first.next_side != self._first.side:
             for shard in self._shards:
                 shard.commit()

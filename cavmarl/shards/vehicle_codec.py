@@ -25,9 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import (
-    MessageError,
-)
+from cavmarl.core.errors import MessageError
 from cavmarl.core.records.arrays import Outputs, Worlds
 from cavmarl.core.records.codes import AUTHORITATIVE
 from cavmarl.driving.vehicles import RECORD_VERSION
@@ -74,9 +72,6 @@ class TransferCodec:
 
     Attributes:
         schema: a number in [0, 2^63) that is the same where the other's states can be unpacked.
-
-    Raises:
-        MessageError: the record has padding, whose bytes nobody sets.
     """
 
     def __init__(
@@ -134,12 +129,7 @@ class TransferCodec:
     def unpack(
         self, data: bytes, vehicle: int, tick: int, rows: NDArray[np.void], world: int, i: int
     ) -> None:
-        """Write a state into `rows[world, i]`, and what its agent keeps; nothing if it is refused.
-
-        Raises:
-            MessageError: these bytes are no state, or none of this vehicle and tick, or of another
-                version, build or environment; the type says which.
-        """
+        """Write a state to `rows[world, i]`, and what its agent keeps; nothing if it is refused."""
         header = self.header(data)
         if (header.vehicle, header.tick) != (vehicle, tick):
             raise MessageError(
@@ -158,11 +148,7 @@ class TransferCodec:
         frames[:] = np.frombuffer(data, frames.dtype, frames.size, end + header.commands)
 
     def header(self, data: bytes) -> TransferHeader:
-        """What stands before a state, once it is seen that the state is whole and of this layout.
-
-        Raises:
-            MessageError: it is not; the type says why.
-        """
+        """What stands before a state, once the state is seen to be whole and of this layout."""
         if len(data) < _HEADER.size:
             raise MessageError(
                 f"a state of {len(data)} bytes has no room for its header of {_HEADER.size}"

@@ -27,7 +27,6 @@ class Visibility:
     outside_m: float  # how far outside of its zone a vehicle can be whose transfer is late
 
     def halo(self, partition: ZonePartition) -> Halo:
-        """What each zone of a partition sees."""
         halo = zone_halo(partition, self.halo_m)
         if partition.count == 1 or self.sure_m >= self.halo_m:
             return halo

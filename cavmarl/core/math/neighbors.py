@@ -108,7 +108,6 @@ def _slot(offset: float, cells_per_m: float, count: int) -> int:
 
 @kernel
 def cell_at(grid: Grid, x: float, y: float) -> int:
-    """The cell of a place."""
     column = _slot(x - grid.min_x, grid.cells_per_m, grid.num_x)
     return _slot(y - grid.min_y, grid.cells_per_m, grid.num_y) * grid.num_x + column
 

@@ -71,12 +71,7 @@ def find_contacts(rows: NDArray[np.void], num: int, grid: Grid, hit: NDArray[np.
 
 @inlined_kernel
 def _touches_earlier(
-    rows: NDArray[np.void],
-    i: int,
-    spot: np.void,
-    reach: float,
-    grid: Grid,
-    hit: NDArray[np.int64],
+    rows: NDArray[np.void], i: int, spot: np.void, reach: float, grid: Grid, hit: NDArray[np.int64]
 ) -> bool:
     """Note the vehicles in the cells that row i touches."""
     found = False

@@ -33,12 +33,7 @@ def no_press(kind: np.void) -> float:
 
 @kernel
 def _asked(
-    kind: np.void,
-    speed: float,
-    allowed: float,
-    gap: float,
-    front_speed: float,
-    front_decel: float,
+    kind: np.void, speed: float, allowed: float, gap: float, front_speed: float, front_decel: float
 ) -> float:
     """The acceleration in m/s² that a model asks for that is neither IDM nor Krauss's."""
     min_gap = float(kind["min_gap"])

@@ -113,13 +113,7 @@ def index_lanes(
 
 @inlined_kernel
 def _insert(
-    scratch: Scratch,
-    types: NDArray[np.void],
-    lane: int,
-    row: np.void,
-    i: int,
-    s: float,
-    side: bool,
+    scratch: Scratch, types: NDArray[np.void], lane: int, row: np.void, i: int, s: float, side: bool
 ) -> None:
     """Put an entry among those of its lane that are there already, by (s, id)."""
     k = _make_place(scratch, lane, s, row["id"])

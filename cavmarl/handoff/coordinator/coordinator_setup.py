@@ -69,12 +69,7 @@ def prepare_runs(settings: ZonesConfig, num_worlds: int) -> list[WorldRun]:
 
 
 def check_faults(settings: ZonesConfig, zones: int, num_worlds: int) -> tuple[Faults | None, bool]:
-    """The plan of faults, and whether hosts may die by it or be given up.
-
-    Raises:
-        ConfigError: faults that cannot be, deaths in several worlds at once, or no folder for
-            reproducers.
-    """
+    """The plan of faults, and whether hosts may die by it or be given up."""
     faults = read_faults(settings.faults) if settings.faults else None
     if settings.reproducers and faults is None:
         faults = Faults()  # none on purpose

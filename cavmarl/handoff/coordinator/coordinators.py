@@ -107,8 +107,6 @@ class RowStates:
 
 
 class Coordinators:
-    """The coordinators of all worlds."""
-
     def __init__(
         self,
         division: Division,  # whose rows change hands
@@ -148,7 +146,6 @@ class Coordinators:
             self._stirred[w] = True
 
     def begin(self, commands: Commands) -> None:
-        """Lease the next tick, and hand over whose owner changes."""
         for w, coordinator in enumerate(self.coordinators):
             everybody, self._stirred[w] = self._stirred[w], False
             coordinator.begin(
@@ -183,15 +180,10 @@ class Coordinators:
             self._store.flip()
 
     def in_flight(self, w: int) -> list[TransferInFlight]:
-        """Vehicles of a world on the way from one zone to another."""
         return [TransferInFlight(*entry) for entry in self.coordinators[w].in_flight()]
 
     def load(self) -> None:
-        """Take everything back to what is committed.
-
-        Raises:
-            ProtocolError: it is not kept.
-        """
+        """Take everything back to what is committed."""
         if self._store is None:
             raise ProtocolError("the committed state is not kept")
         self._division.align()
@@ -200,11 +192,7 @@ class Coordinators:
             self._stirred[w] = True
 
     def take_up(self, records: Sequence[Record], notes: Sequence[Notes]) -> None:
-        """Go on in the one world where others have stopped.
-
-        Raises:
-            ProtocolError: they sent messages, and its own coordinator sends none.
-        """
+        """Go on in the one world where others have stopped."""
         (coordinator,) = self.coordinators
         if not isinstance(coordinator, MessageCoordinator):
             raise ProtocolError("a coordinator without messages cannot go on in the middle of one")
@@ -213,7 +201,6 @@ class Coordinators:
         self._stirred[0] = True
 
     def left(self, gate: Gate) -> None:
-        """Those in `gate.passing` have left their worlds."""
         for w, coordinator in enumerate(self.coordinators):
             gone = gate.passing[w, : gate.num_passing[w]]
             if len(gone):
@@ -221,7 +208,6 @@ class Coordinators:
                 self._stirred[w] |= not coordinator.is_open
 
     def entered(self, gate: Gate) -> None:
-        """Those in `gate.passing` have come into their worlds."""
         for w, coordinator in enumerate(self.coordinators):
             new = gate.passing[w, : gate.num_passing[w]]
             if len(new):

@@ -53,7 +53,6 @@ class HandoffLog:
             how many have changed.
 
         Raises:
-            ProtocolError: there are more or fewer vehicles.
             ConfigError: a zone has not seen who enters it.
         """
         division, book, w = self._division, self._book, self._world
@@ -119,6 +118,5 @@ class HandoffLog:
         return list(zip(entries["vehicle"].tolist(), entries["target"].tolist(), strict=True))
 
     def reset(self, tick: int) -> None:
-        """Another episode begins at a tick."""
         self._book.num_changes[self._world] = 0
         self._book.tick[self._world] = tick

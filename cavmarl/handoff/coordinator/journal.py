@@ -45,12 +45,7 @@ class JournalReader:
         self._drop_torn = drop_torn
 
     def __iter__(self) -> Iterator[Record]:
-        """From the first line on.
-
-        Raises:
-            JournalError: the last line is cut short; a line is damaged, missing or out of order;
-                the file cannot be read.
-        """
+        """From the first line on."""
         self.lines, self.size, self.torn = 0, 0, ""
         try:
             with self.path.open("rb") as file:
@@ -92,11 +87,6 @@ class Journal:
     Attributes:
         sequence: the number of the next line.
         dropped: the line that was dropped, or nothing.
-
-    Raises:
-        ConfigError: no such `sync`.
-        JournalError: the file exists, or does not, or cannot be opened, or another run writes it;
-            what is there is damaged.
     """
 
     def __init__(
@@ -130,12 +120,7 @@ class Journal:
             raise
 
     def append(self, records: Iterable[Record]) -> None:
-        """Write records down; when it returns, messages may be sent.
-
-        Raises:
-            JournalError: not all of it could be written, or the journal is closed. After the first
-                of these it is closed; what was written of the last line is dropped on `resume`.
-        """
+        """Write records down; when it returns, messages may be sent."""
         lines = [record_to_line(record, self.sequence + k) for k, record in enumerate(records)]
         if not lines:
             return
@@ -231,11 +216,6 @@ class MemoryJournal:
         return len(self.records)
 
     def append(self, records: Iterable[Record]) -> None:
-        """Keep records.
-
-        Raises:
-            JournalError: the journal is closed.
-        """
         if self._closed:
             raise JournalError("the journal is closed")
         self.records += records
@@ -255,7 +235,6 @@ class MemoryJournal:
         self.close()
 
     def read(self) -> Iterator[Record]:
-        """What has been written, from the first record on."""
         return iter(self.records)
 
     def reopened(self) -> MemoryJournal:

@@ -79,11 +79,7 @@ def summarize(path: Path) -> tuple[JournalSummary, Table]:
 
 
 def owners_at(path: Path, tick: int) -> Table:
-    """The table as of the commit of a tick.
-
-    Raises:
-        JournalError: the same as `summarize`, or the journal has no such tick.
-    """
+    """The table as of the commit of a tick."""
     table, reader = Table(_zones(path)), JournalReader(path, drop_torn=True)
     for record in reader:
         _apply(table, record, reader)
@@ -100,11 +96,7 @@ def _apply(table: Table, record: Record, reader: JournalReader) -> None:
 
 
 def _zones(path: Path) -> set[int]:
-    """Zones that ever had a host.
-
-    Raises:
-        JournalError: no coordinator has begun this file.
-    """
+    """Zones that ever had a host."""
     reader = JournalReader(path, drop_torn=True)
     zones = set()
     for record in reader:

@@ -84,23 +84,19 @@ class LocalCoordinator(Coordinator):
 
     @property
     def is_open(self) -> bool:
-        """Whether a tick has been begun and is not committed."""
         return self._is_open
 
     def entered(self, vehicles: Iterable[tuple[int, int]]) -> None:
-        """(id, zone) of vehicles that are new since the last BEGIN."""
         known = len(self._births)
         super().entered(vehicles)
         self._vehicles += len(self._births) - known
 
     def left(self, vehicles: Iterable[tuple[int, int]]) -> None:
-        """(id, reason) of vehicles that have left the world."""
         gone = list(vehicles)
         super().left(gone)
         self._vehicles -= len(gone)
 
     def reset(self) -> None:
-        """Begin an episode without vehicles."""
         directory = self.directory
         self.resume()
         self._is_open, self._changed, self._vehicles = False, 0, 0
@@ -184,12 +180,7 @@ class LocalCoordinator(Coordinator):
         self._transfers.count(acknowledged=acknowledged, aborted=aborted)
 
     def _settle(self, tick: int, changes: NDArray[np.void], news: _News, is_told: bool) -> None:
-        """Put what came of one tick, or of all up to one, on the table, and tell watchers of it.
-
-        Raises:
-            ProtocolError: a vehicle changed its owner that belonged to somebody else; a vehicle
-                entered that has been there.
-        """
+        """Put what came of one tick, or of all up to one, on the table, and tell watchers of it."""
         table = self._directory.table
         columns = (changes[name].tolist() for name in ("vehicle", "source", "target", "epoch"))
         switches = tuple(map(Switch, *columns, repeat(False)))
@@ -223,11 +214,7 @@ class LocalCoordinator(Coordinator):
         return Counter()
 
     def _check(self, births: Iterable[Birth]) -> None:
-        """Compare what zones should own with their rows, where all that have left are on record.
-
-        Raises:
-            ProtocolError: a zone has more or fewer.
-        """
+        """Compare what zones should own with their rows, where all that have left are on record."""
         owned = list(self.directory.table.counts.values())
         for birth in births:
             owned[birth.zone] += 1

@@ -39,11 +39,7 @@ class Violations:
     def explain(
         self, kind: int, vehicle: int, owners: Mapping[int, Owner], births: Sequence[Birth]
     ) -> None:
-        """Say what is wrong.
-
-        Raises:
-            ProtocolError: always.
-        """
+        """Say what is wrong."""
         expected = {**owners, **{birth.vehicle: (birth.zone, 0) for birth in births}}
         for words in (
             self._doubled(),

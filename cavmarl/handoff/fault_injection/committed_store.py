@@ -68,11 +68,7 @@ class CommittedStore:
             self._committed = self._next
 
     def flip(self) -> None:
-        """Make what was written last the truth.
-
-        Raises:
-            ProtocolError: nothing has been written since.
-        """
+        """Make what was written last the truth."""
         if self._next is None:
             raise ProtocolError("nothing has been written to the store since it was flipped")
         self._committed, self._next = self._next, None
@@ -91,11 +87,7 @@ class CommittedStore:
         return image.notes
 
     def adopt(self, image: CommittedImage) -> tuple[Notes, ...]:
-        """Take the worlds to what another store has kept of such worlds; the notes of each.
-
-        Raises:
-            JournalError: those worlds were not such ones.
-        """
+        """Take the worlds to what another store has kept of such worlds; the notes of each."""
         shared = list(self.shared())
         if (len(image.rows), len(image.shared)) != (len(self._shards), len(shared)):
             raise JournalError(
@@ -113,11 +105,7 @@ class CommittedStore:
         return image.notes
 
     def written(self, zone: int, world: int) -> NDArray[np.void]:
-        """VEHICLE (n,), a zone's owned rows as they were written last.
-
-        Raises:
-            ProtocolError: nothing has been written since the store was flipped.
-        """
+        """VEHICLE (n,), a zone's owned rows as they were written last."""
         if self._next is None:
             raise ProtocolError("nothing has been written to the store since it was flipped")
         num = int(self._next.counts[zone][COUNTS.index("num_owned")][world])
@@ -125,27 +113,18 @@ class CommittedStore:
         return rows
 
     def shared(self) -> Iterator[Array]:
-        """What is kept beside the shards' own, as it is now."""
         yield from arrays_of(self._shards[0].worlds, Common, Use.COMMITTED)
         yield from self._others()
 
     def truth(self) -> CommittedImage:
-        """What is committed; not to be changed.
-
-        Raises:
-            ProtocolError: nothing is.
-        """
+        """What is committed; not to be changed."""
         if self._committed is None:
             raise ProtocolError("nothing is committed: reset the worlds first")
         return self._committed
 
 
 def _put(kept: Array, array: Array, what: str) -> None:
-    """Write what was kept into an array of the same meaning, which may have less room to spare.
-
-    Raises:
-        JournalError: it has another type or fewer places.
-    """
+    """Write what was kept into an array of the same meaning, which may have less room to spare."""
     if kept.dtype != array.dtype:
         raise JournalError(f"{what}: kept in another layout; use the version that wrote them")
     if kept.ndim != array.ndim or any(a < b for a, b in zip(kept.shape, array.shape, strict=True)):

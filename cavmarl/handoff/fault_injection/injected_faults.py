@@ -64,21 +64,11 @@ class Crashes:
         self._drawn: set[Visit] = set()
 
     def zone(self, point: str, zone: int) -> None:
-        """A zone's host is at a point.
-
-        Raises:
-            ZoneDeath: it dies there.
-        """
         crash = self._strikes(point, zone)
         if crash is not None:
             raise ZoneDeath(zone, point, crash.lives_on)
 
     def coordinator(self, point: str) -> None:
-        """The coordinator is at a point.
-
-        Raises:
-            CoordinatorDeath: it dies there.
-        """
         if self._strikes(point, COORDINATOR) is not None:
             raise CoordinatorDeath(point)
 
@@ -125,11 +115,7 @@ class FaultyPhases:
 
 
 def _call_hosted(zone: int, host: Executor, phase: str, arguments: tuple[Any, ...]) -> None:
-    """Run a phase in a host's process: an unexpected error ends the host and no more.
-
-    Raises:
-        ZoneDeath: something else than cavmarl's own errors was raised.
-    """
+    """Run a phase in a host's process: an unexpected error ends the host and no more."""
     try:
         host.each(phase, *arguments)
     except CavmarlError:

@@ -12,15 +12,7 @@ from cavmarl.handoff.coordinator.journal import AnyJournal, MemoryJournal
 from cavmarl.ownership.directory import SILENCE, Directory
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.limits import Limits
-from cavmarl.ownership.messages import (
-    COORDINATOR,
-    Begin,
-    Message,
-    Output,
-    Prepare,
-    Record,
-    Removed,
-)
+from cavmarl.ownership.messages import COORDINATOR, Begin, Message, Output, Prepare, Record, Removed
 from cavmarl.ownership.offers import Approach
 from cavmarl.ownership.reactions import Advance
 from cavmarl.ownership.safeguards import ALL_ON, Safeguards
@@ -93,7 +85,6 @@ class MessageCoordinator(Coordinator):
 
     @property
     def is_open(self) -> bool:
-        """Whether a tick has been begun and is not committed."""
         return self.directory.table.plan is not None
 
     def dropped(self) -> Counter[tuple[str, str]]:
@@ -106,7 +97,6 @@ class MessageCoordinator(Coordinator):
     # Between ticks
 
     def reset(self) -> None:
-        """Begin an episode without vehicles."""
         self.resume()
         self._leases = {}
         self._do(self.directory.reset())
@@ -115,7 +105,6 @@ class MessageCoordinator(Coordinator):
                 self.host(zone)
 
     def host(self, zone: int) -> None:
-        """Give a zone to a new host, in this process."""
         output = self.directory.host(zone, worker=0)
         self.endpoints[zone] = Endpoint(
             self.directory.hosting(zone), self._limits, self._safeguards

@@ -75,11 +75,6 @@ class Reproducer:
 
 
 def read_reproducer(path: Path) -> Reproducer:
-    """The reproducer of a file.
-
-    Raises:
-        JournalError: it cannot be read, is damaged, or is none of this version.
-    """
     try:
         content = json.loads(path.read_text(encoding="ascii"))
     except OSError as error:
@@ -123,11 +118,6 @@ def _packed(array: Array) -> dict[str, Any]:
 
 
 def _unpacked(entry: Any) -> Array:
-    """The array of `_packed`.
-
-    Raises:
-        KeyError, TypeError, ValueError, zlib.error: it is none.
-    """
     dtype, shape = _dtype(entry["dtype"]), tuple(entry["shape"])
     data = zlib.decompressobj().decompress(base64.b64decode(entry["data"]), MAX_BYTES)
     return np.frombuffer(data, dtype=dtype).reshape(shape)

@@ -25,8 +25,6 @@ _READ_AT_ONCE = 64  # entries
 
 
 class LoggedAction(NamedTuple):
-    """One order."""
-
     is_reset: bool  # or else a step
     seed: int | None  # of a reset; None: none was given
     first_world: int  # of a reset, as the command has it
@@ -59,11 +57,7 @@ class ActionLog:
         self._commands = Commands(*(np.zeros_like(getattr(like, name)) for name in _COMMANDS))
 
     def write(self, number: int, entry: LoggedAction) -> None:
-        """Put down an entry, in the place of that and all later ones.
-
-        Raises:
-            WorkerError: there is no more memory.
-        """
+        """Put down an entry, in the place of that and all later ones."""
         row = self._row
         row["is_reset"], row["has_seed"] = entry.is_reset, entry.seed is not None
         row["seed"], row["first_world"] = entry.seed or 0, entry.first_world
@@ -106,7 +100,6 @@ class ActionLogJob(WorldsJob):
         self._is_there = False  # where the tape ends
 
     def perform(self, task: int, letter: Any) -> Any:
-        """Do a task; the answer of those that have one."""
         if not self._is_there:
             self._begin_anew()
         if task not in (Task.STEP, Task.RESET):

@@ -48,7 +48,6 @@ class MovingJob(WorldsJob):
         return first, last
 
     def perform(self, task: int, letter: Any) -> Any:
-        """Do a task; the answer of those that have one."""
         if task == Task.PACK:
             self._pack(letter)
         elif task == Task.UNPACK:

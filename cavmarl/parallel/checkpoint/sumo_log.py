@@ -44,11 +44,7 @@ class KeptLog:
         self._episode, self._size = log.episode, len(words)
 
     def read(self) -> NDArray[np.int64]:
-        """(n,) `ToldLog.words` of the last time, a view.
-
-        Raises:
-            WorkerError: it was not written.
-        """
+        """(n,) `ToldLog.words` of the last time, a view."""
         self._map_all()
         size = self._words.item(0)
         if not ToldLog.HEAD <= size < len(self._words):

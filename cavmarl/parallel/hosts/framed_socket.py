@@ -107,7 +107,6 @@ class FramedSocket:
         self.is_torn = False
 
     def fileno(self) -> int:
-        """The socket's descriptor."""
         return self._socket.fileno()
 
     def send(
@@ -135,7 +134,6 @@ class FramedSocket:
         Raises:
             EOFError: the other end has ended.
             OSError: it is gone, or sends nothing.
-            MessageError: this is no frame.
         """
         dialect = self._dialect
         self.is_torn = True
@@ -165,7 +163,6 @@ class FramedSocket:
         Raises:
             EOFError: the other end has ended.
             OSError: it is gone, or sends no more.
-            MessageError: these are not the data that were sent, or as many.
         """
         frame = self._frame
         assert frame is not None
@@ -209,11 +206,7 @@ class FramedSocket:
 
 
 def _frame(dialect: Dialect, kind: int, order: int, text: bytes, size: int, checksum: int) -> Frame:
-    """The same, understood.
-
-    Raises:
-        MessageError: it says nothing that is known.
-    """
+    """The same, understood."""
     try:
         letter = dialect.read(text) if text else None
         return Frame(dialect.kinds(kind), order, letter, size, checksum)

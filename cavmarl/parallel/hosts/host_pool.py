@@ -19,12 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from cavmarl.core.errors import (
-    MessageError,
-    WorkerDeathError,
-    WorkerError,
-    WorkerFailureError,
-)
+from cavmarl.core.errors import MessageError, WorkerDeathError, WorkerError, WorkerFailureError
 from cavmarl.parallel.hosts.framed_socket import Frame, Kind
 from cavmarl.parallel.hosts.host_commands import Arrays, CommittedState, HostProgram, OpenOrder, Say
 from cavmarl.parallel.hosts.host_process import Order
@@ -90,7 +85,6 @@ class HostPool:
         return tuple(truth.size for truth in self._truths)
 
     def rename(self, names: Sequence[str]) -> None:
-        """Say in other words what the parts are."""
         self._names = tuple(names)
 
     def signal(self, part: int, how: signal.Signals) -> bool:
@@ -306,11 +300,7 @@ class HostPool:
             order.failure = WorkerFailureError(k, self._names[k], **frame.letter)
 
     def _lose(self, order: OpenOrder, k: int, cause: str, restart: bool) -> None:
-        """A host is gone, or taken for it: another one goes on in its place.
-
-        Raises:
-            WorkerDeathError: too many have.
-        """
+        """A host is gone, or taken for it: another one goes on in its place."""
         host = self._hosts.pop(k)
         self._company.drop(host, restart)
         if order.is_void:
@@ -326,12 +316,6 @@ class HostPool:
             raise WorkerDeathError(k, self._names[k], order.number, what, causes)
 
     def _check(self, order: OpenOrder) -> None:
-        """Check the hosts that are waited for.
-
-        Raises:
-            WorkerDeathError: too many have died.
-            WorkerError: there is no host left, and none comes.
-        """
         now = time.monotonic()
         for k in sorted(order.pending):
             host = self._hosts.get(k)
@@ -356,11 +340,7 @@ class HostPool:
             self._complain(time.monotonic() - began, there)
 
     def _complain(self, waited_s: float, where: str) -> None:
-        """Give up if no host will come.
-
-        Raises:
-            WorkerError: so it is.
-        """
+        """Give up if no host will come."""
         trouble = self._launcher.trouble()
         if trouble is None and waited_s > COMES_S:
             trouble = f"none has come within {COMES_S:g} s; ray status tells what Ray waits for"

@@ -113,7 +113,6 @@ class HostRegistry:
         return speaking
 
     def drop(self, host: HostConnection, restart: bool) -> None:
-        """Forget a host."""
         self.mute(host)
         host.wire.close()
         if self._hosts.get(host.number) is host:

@@ -87,12 +87,10 @@ class HostedWorlds(RemoteJob):
         self._make(recipe["size"])
 
     def fit(self, size: int) -> None:
-        """Have that many worlds."""
         if size != len(self._worlds.arrays.mask):
             self._make(size)
 
     def inputs(self, task: int, letter: Any) -> list[Array]:
-        """Arrays that a command of this task fills."""
         if task == Task.UNPACK:
             move = WorldMove(*letter)
             self._coming = buffers(move.coming, move.bytes)
@@ -155,12 +153,10 @@ class HostedWorlds(RemoteJob):
         return [*(array[w : w + 1] for array in begun), *self._worlds.share_of(w)]
 
     def save(self) -> list[Array]:
-        """All that the next task depends on."""
         begun = results_of(Task.RESET, self._worlds.arrays, None)
         return [*begun, *(log.words for log in self._logs), *self._worlds.save()]
 
     def load(self, saved: Sequence[Array]) -> None:
-        """Go on from what `save` gave."""
         begun = results_of(Task.RESET, self._worlds.arrays, None)
         rest = iter(saved[len(begun) :])
         for log in self._logs:
@@ -170,7 +166,6 @@ class HostedWorlds(RemoteJob):
             array[:] = kept
 
     def close(self) -> None:
-        """End the processes that the worlds have."""
         self._worlds.close()
         self._one.close()
 

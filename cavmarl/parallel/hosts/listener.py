@@ -47,7 +47,6 @@ class PendingConnection:
         self._expected = b""
 
     def fileno(self) -> int:
-        """The socket's descriptor."""
         return self._socket.fileno()
 
     def listen(self) -> socket.socket | None:
@@ -55,8 +54,6 @@ class PendingConnection:
 
         Raises:
             OSError: it is gone.
-            EOFError: it has ended.
-            MessageError: it is a stranger, or of another version.
         """
         wanted = PROOF if self._expected else _HELLO.size
         heard = self._socket.recv(wanted - len(self._heard))
@@ -96,9 +93,6 @@ class Listener:
     Attributes:
         place: address and port.
         secret: that hosts have to know.
-
-    Raises:
-        WorkerError: nobody can listen there.
     """
 
     def __init__(self, address: str) -> None:
@@ -111,7 +105,6 @@ class Listener:
         self.place: tuple[str, int] = self._listener.getsockname()[:2]
 
     def fileno(self) -> int:
-        """The socket's descriptor."""
         return self._listener.fileno()
 
     def open(self) -> PendingConnection | None:
@@ -131,8 +124,6 @@ def knock(place: tuple[str, int], secret: bytes, number: int) -> FramedSocket:
 
     Raises:
         OSError: nobody listens there.
-        EOFError: whoever listens there does not want us.
-        MessageError: it does not know the secret.
     """
     connection = socket.create_connection(place, CALL_S)
     try:

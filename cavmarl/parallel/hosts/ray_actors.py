@@ -69,11 +69,6 @@ class RayActors:
         self._recipe = recipe(self.workers)
 
     def start(self, place: tuple[str, int], secret: bytes) -> None:
-        """Start all of them.
-
-        Raises:
-            WorkerError: Ray cannot.
-        """
         for number, node in enumerate(self._nodes):
             try:
                 self._start(number, node, place, secret)

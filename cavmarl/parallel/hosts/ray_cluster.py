@@ -41,8 +41,6 @@ def join() -> bool:
 
     Raises:
         MissingExtraError: Ray is not installed.
-        ConfigError: the program is only a client of a cluster.
-        WorkerError: there is no cluster at the address.
     """
     global _joined
     ray = require("ray", "ray")
@@ -68,11 +66,7 @@ def join() -> bool:
 
 
 def _call(address: str) -> None:
-    """Check that a process listens there: Ray would try for minutes.
-
-    Raises:
-        OSError: none does.
-    """
+    """Check that a process listens there: Ray would try for minutes."""
     host, colon, port = address.rpartition(":")
     if colon and port.isdigit():
         socket.create_connection((host, int(port)), CALL_S).close()
@@ -116,7 +110,6 @@ def choose_nodes(known: Sequence[Node], workers: int) -> list[str]:
         names of nodes.
 
     Raises:
-        ConfigError: more workers than free CPUs.
         NoAdmissibleWorkerError: the rest of the CPUs is on nodes that are too busy.
     """
     free = sum(node.cpus for node in known)

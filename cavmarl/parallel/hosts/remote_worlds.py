@@ -97,11 +97,7 @@ class RemoteWorlds(OrderedWorlds):
 
     @property
     def simulation(self) -> Simulation:
-        """Refused: the worlds live elsewhere.
-
-        Raises:
-            ConfigError: always.
-        """
+        """Refused: the worlds live elsewhere."""
         raise ConfigError("the worlds live on other machines: use workers=0 to look into them")
 
     def _pids(self) -> Mapping[int, int]:
@@ -143,7 +139,6 @@ class RemoteWorlds(OrderedWorlds):
             self._spent_s[:, 0] += np.concatenate(spent_s)
 
     def _pack(self, bounds: Sequence[int]) -> None:
-        """Let hosts send the worlds that are to be another's."""
         moves = moves_of(self._bounds, bounds)
         found = [buffers(0, 0) for _ in moves]
 
@@ -189,11 +184,7 @@ class RemoteWorlds(OrderedWorlds):
 
 
 def refuse_on_hosts(workers: WorkersConfig) -> None:
-    """Refuse what worlds on several machines cannot have.
-
-    Raises:
-        ConfigError: it is asked for.
-    """
+    """Refuse what worlds on several machines cannot have."""
     if workers.monitor_cpu:
         raise ConfigError(
             "workers.monitor_cpu = True, hosts = 'ray': sees one machine; leave it out "

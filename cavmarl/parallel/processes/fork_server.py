@@ -80,7 +80,6 @@ class ForkServer:
         descriptors: that it and its workers get.
 
     Raises:
-        WorkerError: it did not come up.
         WorkerFailureError: an exception in it.
     """
 
@@ -121,7 +120,6 @@ class ForkServer:
         """A new process for a worker.
 
         Raises:
-            ServerGoneError: nobody answers.
             WorkerError: this process has no descriptors left.
         """
         ours, theirs = _wires()
@@ -146,7 +144,6 @@ class ForkServer:
         return int(self._ask({"bury": process.pid})["status"])
 
     def close(self) -> None:
-        """End the process, and with it all workers."""
         self._wire.close()
         try:
             self._process.wait(END_S)
@@ -185,11 +182,7 @@ class ForkServer:
 
 
 def _wires() -> tuple[socket.socket, socket.socket]:
-    """The two ends of a wire that carries messages.
-
-    Raises:
-        WorkerError: no descriptors are left.
-    """
+    """The two ends of a wire that carries messages."""
     try:
         return socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     except OSError as error:

@@ -224,7 +224,6 @@ class Meeting:
         self._crowded = crowded
 
     def post(self, number: int) -> None:
-        """Tell the other side that this one has come to a number."""
         if self.announce(number):
             self.wake()
         if self._crowded:
@@ -235,12 +234,10 @@ class Meeting:
         return _set(self.mine, NUMBER, number, self.theirs)
 
     def wake(self) -> None:
-        """Wake the other side."""
         with suppress(BrokenPipeError, ConnectionResetError):  # its process has ended
             self.wire.send(WAKE)
 
     def has(self, number: int) -> bool:
-        """Whether the other side has come to a number."""
         return _has(self.theirs, number)
 
     def watch(self, number: int, last_s: float, work_s: float = 0.0, is_soon: bool = False) -> bool:
@@ -280,5 +277,4 @@ class Meeting:
         return True
 
     def get_up(self) -> None:
-        """Say that this side is awake."""
         _set(self.mine, ASLEEP, 0, self.theirs)

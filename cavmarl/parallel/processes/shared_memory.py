@@ -42,11 +42,7 @@ class Segment:
 
     @classmethod
     def make(cls, size: int) -> Segment:
-        """A new one, of zeros.
-
-        Raises:
-            WorkerError: there is not so much memory.
-        """
+        """A new one, of zeros."""
         try:
             free = _free_bytes()
             if free is not None and size > free:
@@ -72,11 +68,7 @@ class Segment:
             self.size = size
 
     def map(self) -> mmap.mmap:
-        """Its bytes, as many as there are by now, as this process reads and writes them.
-
-        Raises:
-            WorkerError: there is no room for them in this process.
-        """
+        """Its bytes, as many as there are by now, as this process reads and writes them."""
         self.size = os.fstat(self.fd).st_size
         try:
             return mmap.mmap(self.fd, self.size)

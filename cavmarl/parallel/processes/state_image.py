@@ -62,7 +62,6 @@ class Image:
             _seal(self._unsigned)
 
     def _find_places(self, arrays: Arrays) -> None:
-        """Say what has to be copied where."""
         shapes = [array.shape for array in arrays]
         same = _num_same(shapes, self._places)
         if len(arrays) != len(self._places):
@@ -104,11 +103,7 @@ class Image:
             at = end
 
     def read(self, dtypes: Sequence[np.dtype[Any]]) -> Iterator[Array]:
-        """The arrays, in their order, as views.
-
-        Raises:
-            WorkerError: they are not what was written.
-        """
+        """The arrays, in their order, as views."""
         self._map_all()
         words = self._words
         size = int(words[0]) if len(words) else 0

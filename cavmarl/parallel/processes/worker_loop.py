@@ -119,11 +119,7 @@ def serve(make_jobs: MakeJobs) -> NoReturn:
 
 
 def _refuse_threads() -> None:
-    """A process with threads must not fork.
-
-    Raises:
-        RuntimeError: there are some.
-    """
+    """A process with threads must not fork."""
     threads = len(os.listdir("/proc/self/task"))
     if threads > 1:
         names = [thread.name for thread in threading.enumerate()]

@@ -82,7 +82,6 @@ class Pool:
         return self._program.team_of(worker)
 
     def processor_s(self) -> list[float]:
-        """Processor time that each worker's process has taken."""
         return [processor_s(pid) for pid in self.pids]
 
     def run(self, task: int, letter: Any = None, commits: bool = True) -> list[Any]:
@@ -106,7 +105,6 @@ class Pool:
         self.run(NOTHING, commits=False)
 
     def rename(self, parts: tuple[str, ...]) -> None:
-        """Say anew what each worker hosts, in words."""
         self._program = self._program._replace(parts=parts)
 
     def close(self) -> None:
@@ -155,11 +153,6 @@ class Pool:
     def _await(
         self, workers: tuple[int, ...], mail: bytes | None, expected_s: float, sleeps: bool
     ) -> None:
-        """Return when all workers have carried out their order.
-
-        Raises:
-            WorkerDeathError: too many processes died of it; the pool is closed.
-        """
         pending = list(workers)
         if not sleeps:
             pending = [k for k in workers if not self._crew.watch(k, expected_s)]
@@ -223,11 +216,6 @@ class Pool:
         raise WorkerDeathError(k, part, number, what, causes)
 
     def _read(self, workers: tuple[int, ...]) -> list[Any]:
-        """What the workers have answered.
-
-        Raises:
-            WorkerFailureError: of the first in which something went wrong, not because of another.
-        """
         answers: list[Any] = []
         failure: WorkerFailureError | None = None
         for k in workers:

@@ -55,7 +55,6 @@ class WorkerProcesses:
         orders: (m, WORDS) the lines that this side writes.
 
     Raises:
-        WorkerError: no process, or no memory.
         WorkerFailureError: an exception while the jobs were made.
     """
 
@@ -125,11 +124,9 @@ class WorkerProcesses:
             self._meetings[k].wake()
 
     def number(self, k: int) -> int:
-        """Number of the last command that a worker was given."""
         return self.orders.item(k, NUMBER)
 
     def has(self, k: int) -> bool:
-        """Whether a worker has carried it out."""
         return self._meetings[k].has(self.number(k))
 
     def watch(self, k: int, last_s: float = 0.0, is_soon: bool = False) -> bool:

@@ -63,7 +63,6 @@ class SensorJob(Job):
             sensor.sense(self._scenes, due, frames)
 
     def perform(self, task: int, letter: Any) -> None:
-        """Sense what is due."""
         began = perf_counter()
         self._look()
         shared, number = self._shared, self._number

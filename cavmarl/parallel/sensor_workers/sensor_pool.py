@@ -82,7 +82,6 @@ class _Sharing:
         self.agents = 0
 
     def note(self, spent_s: NDArray[np.float64], agents: int) -> None:
-        """Add what a tick has taken."""
         self.uses += 1
         self.spent_s += spent_s
         self.agents += agents
@@ -99,7 +98,6 @@ class _Sharing:
         return often and self.agents > 0
 
     def forget(self) -> None:
-        """Begin to measure anew."""
         self.spent_s[:] = 0.0
         self.agents = 0
 
@@ -136,7 +134,6 @@ class SensorWorkers:
 
     @property
     def deaths(self) -> list[Death]:
-        """Of sensor workers, up to now."""
         return [] if self._pool is None else self._pool.deaths
 
     @property
@@ -145,12 +142,7 @@ class SensorWorkers:
         return self._costs_s.copy()
 
     def __call__(self, scenes: Sequence[SensedScene], turns: Sequence[Turn]) -> None:
-        """Write the samples of all turns.
-
-        Raises:
-            WorkerError: a frame is not that of the tick; workers cannot be started, or die again
-                and again.
-        """
+        """Write the samples of all turns."""
         theirs = [turn for turn in turns if not turn.sensor.stamps_itself]
         if not theirs:
             sense_here(scenes, turns)
@@ -169,7 +161,6 @@ class SensorWorkers:
         self._note(began, published, sensed, ended, theirs)
 
     def close(self) -> None:
-        """End the processes."""
         self._unused()
         if self._pool is not None:
             self._pool.close()
@@ -211,11 +202,7 @@ class SensorWorkers:
         shared.spent_s[:] = 0.0
 
     def check(self, turns: Sequence[Turn]) -> None:
-        """See that every worker has delivered every frame that is due, of this tick.
-
-        Raises:
-            WorkerError: the first that is not.
-        """
+        """See that every worker has delivered every frame that is due, of this tick."""
         shared = self.shared
         wrong = (shared.delivered != shared.ticks) & (shared.due[:, 0] > 0)  # (n, S, W)
         if not wrong.any():
@@ -274,12 +261,7 @@ class SensorWorkers:
         sharing.forget()
 
     def _note(
-        self,
-        began: float,
-        published: float,
-        sensed: float,
-        ended: float,
-        turns: Sequence[Turn],
+        self, began: float, published: float, sensed: float, ended: float, turns: Sequence[Turn]
     ) -> None:
         """Add up what a tick has taken; times are those of `time.perf_counter`."""
         times, shared = self.times, self.shared

@@ -148,11 +148,7 @@ class DividedWorlds(LocalWorlds):
 
     @contextmanager
     def _whole(self, begins_anew: bool = False) -> Iterator[None]:
-        """The time in which worlds change; an interrupt then leaves them half changed.
-
-        Raises:
-            WorkerError: so it is.
-        """
+        """The time in which worlds change; an interrupt then leaves them half changed."""
         if self._is_torn and not begins_anew:
             raise WorkerError(
                 "the worlds were interrupted in the middle of a step: reset all of them"
@@ -176,11 +172,6 @@ def _names(part: Part) -> tuple[str, ...]:
 
 
 def _check(world: World, num_worlds: int, workers: int) -> None:
-    """Refuse what such worlds cannot have.
-
-    Raises:
-        ConfigError: so it is.
-    """
     config, count = world.config, world.partition.count
     if workers > count:
         raise ConfigError(

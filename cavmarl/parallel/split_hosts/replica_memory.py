@@ -35,8 +35,6 @@ _WORD = 8
 
 
 class Place(NamedTuple):
-    """Where an array lies."""
-
     arena: int  # in which part of the memory
     first: int  # byte of it
 
@@ -89,11 +87,6 @@ class ReplicaMemory:
         return None
 
     def place_of(self, array: Array) -> Place:
-        """Where an array of this memory lies.
-
-        Raises:
-            ValueError: it is none.
-        """
         place = self.find(array)
         if place is None:
             raise ValueError(f"an array {array.shape} of {array.dtype} is no part of this memory")
@@ -155,7 +148,6 @@ class MemoryReplica:
         ]
 
     def begin(self) -> None:
-        """Begin a stream."""
         self._size = 0
 
     @property
@@ -164,7 +156,6 @@ class MemoryReplica:
         return self._stream[: self._size]
 
     def note(self, spans: Spans) -> None:
-        """Note what has changed in some arrays."""
         for arena, bounds in spans:
             at = self._open(arena)
             memory, known = self._memory.arenas[arena], self._known[arena]
@@ -191,11 +182,7 @@ class MemoryReplica:
         self._close(self._note_agents(memory, known, place.first, size, marks, self._stream, at))
 
     def take(self, stream: Words) -> None:
-        """Make the changes that the other process has sent.
-
-        Raises:
-            MessageError: they are not of this memory.
-        """
+        """Make the changes that the other process has sent."""
         at = 0
         while at < stream.size:
             arena, end = (stream.item(at), stream.item(at + 1)) if at + 2 <= stream.size else (0, 0)

@@ -52,7 +52,6 @@ class ZoneLeader:
         self.host(zones)
 
     def host(self, zones: Sequence[Sequence[int]]) -> None:
-        """From now on each host has these zones."""
         self.zones = [np.array(sorted(own), dtype=np.int64) for own in zones]
 
     def let_work(self, pool: HostPool) -> None:

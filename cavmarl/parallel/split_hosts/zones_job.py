@@ -78,7 +78,6 @@ class ZonesJob(RemoteJob):
         self._rehearse(np.arange(len(shards)))
 
     def inputs(self, task: int, letter: Any) -> list[Array]:
-        """Where the changes of a command go."""
         self._coming = np.empty(PhaseOrder(*letter).words, dtype=np.uint64)
         return [self._coming]
 
@@ -146,7 +145,6 @@ class ZonesJob(RemoteJob):
             self._spent_s[zone] += 1e-9 * (time.thread_time_ns() - began_ns)
 
     def close(self) -> None:
-        """End the processes that the worlds have."""
         self._worlds.close()
 
     def _rehearse(self, zones: NDArray[np.int64]) -> None:

@@ -143,11 +143,7 @@ class Leader:
             self._dismiss()
 
     def meet(self) -> None:
-        """Wait until the followers are through with the last phase, whatever it was.
-
-        Raises:
-            LeftAloneError: a follower has failed.
-        """
+        """Wait until the followers are through with the last phase, whatever it was."""
         if not self._is_ahead:
             return
         self._wait()
@@ -211,7 +207,6 @@ class TeamFollower:
             raise failure
 
     def take(self, zones: Sequence[int]) -> None:
-        """From now on these zones are its own."""
         self._own.take(zones)
 
     def _get_out_of_the_way(self) -> None:

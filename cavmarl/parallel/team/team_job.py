@@ -66,7 +66,6 @@ class LeaderJob(CheckpointJob):
         self._team.forget()
 
     def perform(self, task: int, letter: Any) -> Any:
-        """Do a task; the answer of those that have one."""
         if task in ALONE:
             return super().perform(task, letter)
         if task == Task.HOST:

@@ -119,7 +119,6 @@ def write_terms(
     step_s: float,  # seconds a step
     out: NDArray[np.float32],  # (NUM_TERMS,) in the order of `config.TERMS`
 ) -> None:
-    """Write row i's terms."""
     row = rows[i]
     out[0] = _progress(row, step_s)
     out[1] = _speed(roads, row)

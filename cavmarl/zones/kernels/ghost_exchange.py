@@ -206,12 +206,7 @@ def _publish(
 
 @inlined_kernel
 def _note_due(
-    due: np.void,
-    outer: np.void,
-    zone: int,
-    squared: float,
-    near_limit: float,
-    border_limit: float,
+    due: np.void, outer: np.void, zone: int, squared: float, near_limit: float, border_limit: float
 ) -> None:
     """Note a row for a zone that is so far away, as squares of m; it counts if its place stays."""
     due["row"] = outer["row"]

@@ -95,8 +95,6 @@ class BorderRecords(NamedTuple):
 
 
 def make_book(num_worlds: int, capacity: int) -> BorderRecords:
-    """An empty one."""
-
     def numbers(*shape: int) -> NDArray[np.int64]:
         return np.zeros((num_worlds, *shape), np.int64)
 

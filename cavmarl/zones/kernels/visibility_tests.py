@@ -47,7 +47,6 @@ class VisibilityScratch(NamedTuple):
 
 
 def make_room(num_lanes: int, num_links: int) -> VisibilityScratch:
-    """Room for a map."""
     first, last, ahead, behind, to_line, beyond = np.full((6, num_lanes), np.inf)
     asked, foe = np.zeros((2, num_links), dtype=np.bool_)
     waits, following = np.zeros(num_lanes, dtype=np.bool_), np.zeros(num_lanes, dtype=np.int32)

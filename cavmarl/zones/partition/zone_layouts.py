@@ -54,12 +54,7 @@ def cut_map(
     # (n, 3) x and y in m, and a weight: shared out instead, such as expected vehicles
     density: Floats | None = None,
 ) -> ZonePartition:
-    """Divide a map into `count` zones.
-
-    Raises:
-        ConfigError: no such layout or weight, more zones than there can be or than the map can
-            hold, or a density that is none.
-    """
+    """Divide a map into `count` zones."""
     if layout not in ZONE_LAYOUTS:
         raise ConfigError(f"layout '{layout}': there are {', '.join(ZONE_LAYOUTS)}")
     if weight not in _WEIGHTS:

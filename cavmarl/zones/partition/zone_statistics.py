@@ -62,7 +62,6 @@ def zone_statistics(
     halo_m: float = 0.0,  # how far zones see over their borders
     positions: Floats | None = None,  # (n, 2) x and y of vehicles in m
 ) -> ZoneStatistics:
-    """Count what is in each zone."""
     places = np.empty((0, 2)) if positions is None else np.asarray(positions, dtype=np.float64)
     owners = partition.zones_of(places)
     boxes = junction_boxes(network)
