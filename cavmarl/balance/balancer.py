@@ -15,9 +15,6 @@ from cavmarl.core.errors import ConfigError
 class Balancer:
     """Keeps the plan, and what is known of the shards' costs.
 
-    Args:
-        first: shards, neighbours, workers and rule; `equal_costs` where nothing is measured yet.
-
     Attributes:
         plan: the present one; each is made again from its own problem.
 
@@ -25,7 +22,11 @@ class Balancer:
         NoAdmissibleWorkerError: all workers are excluded.
     """
 
-    def __init__(self, first: Problem) -> None:
+    def __init__(
+        self,
+        # shards, neighbours, workers and rule; `equal_costs` where nothing is measured yet
+        first: Problem,
+    ) -> None:
         self.plan: Plan = make_plan(first)
         self._smooth = SmoothCosts()
         self._costs = first.shards

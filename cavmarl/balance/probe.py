@@ -22,14 +22,11 @@ GPU_QUERY = ("--query-gpu=utilization.gpu", "--format=csv,noheader,nounits")
 
 
 def take_snapshot(
-    workers: Mapping[int, int | None], interval_s: float = INTERVAL_S
+    # number → process id; None: not started yet, it will run where this process may
+    workers: Mapping[int, int | None],
+    interval_s: float = INTERVAL_S,  # for how long; this call takes as long
 ) -> LoadSnapshot:
-    """Watch the machine for `interval_s` and say how busy each worker's part of it is.
-
-    Args:
-        workers: number → process id; None: not started yet, it will run where this process may.
-        interval_s: for how long; this call takes as long.
-    """
+    """Watch the machine for `interval_s` and say how busy each worker's part of it is."""
     if not interval_s > 0.0:
         raise ConfigError(f"interval_s = {interval_s}: must be above 0")
     watch = Watch(workers)

@@ -37,15 +37,14 @@ class Registry(Generic[T]):
     def names(self) -> tuple[str, ...]:
         return tuple(self._entries)
 
-    def add(self, name: str, entry: T, source: Callable[..., Any], taken: Iterable[str]) -> None:
-        """Register an entry; the module that has registered a name can do it again.
-
-        Args:
-            name: a Python name.
-            entry: what it stands for.
-            source: a function of the module that registers it.
-            taken: names of the package's own.
-        """
+    def add(
+        self,
+        name: str,  # a Python name
+        entry: T,  # what it stands for
+        source: Callable[..., Any],  # a function of the module that registers it
+        taken: Iterable[str],  # names of the package's own
+    ) -> None:
+        """Register an entry; the module that has registered a name can do it again."""
         module = inspect.unwrap(getattr(source, "py_func", source)).__module__
         if not name.isidentifier():
             raise ConfigError(f"{self._kind} {name!r}: must be a name of letters, digits and _")

@@ -40,17 +40,13 @@ class AgentView:
 
 
 def agent_view(
-    rows: NDArray[np.void], i: int, reach_m: float, network: RoadNetwork, step_s: float
+    rows: NDArray[np.void],  # VEHICLE (n,), own ones and ghosts
+    i: int,  # of the agent's vehicle
+    reach_m: float,  # how far away the centres of others can be
+    network: RoadNetwork,
+    step_s: float,  # seconds a step
 ) -> AgentView:
-    """The view of row i.
-
-    Args:
-        rows: VEHICLE (n,), own ones and ghosts.
-        i: of the agent's vehicle.
-        reach_m: how far away the centres of others can be.
-        network: the roads.
-        step_s: seconds a step.
-    """
+    """The view of row i."""
     dx, dy = rows["x"] - rows["x"][i], rows["y"] - rows["y"][i]
     near = dx * dx + dy * dy <= reach_m * reach_m
     near[i] = False

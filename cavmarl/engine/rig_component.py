@@ -20,7 +20,6 @@ class MountedSensors:
     """The rig of an environment; see `Attached`.
 
     Attributes:
-        rig: all of its sensors.
         platform: what the sensors are mounted on.
     """
 
@@ -39,7 +38,7 @@ class MountedSensors:
         ids = host.zeros((host.num_worlds, config.population.num_ids), dtype=np.int64)
         ids[...] = -1
         self._host = host
-        self.rig = Rig(config.rig, self.platform, host.frames, ids)
+        self.rig = Rig(config.rig, self.platform, host.frames, ids)  # all of its sensors
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
         """Take the samples that are due at the reset of the chosen worlds (W,)."""

@@ -18,14 +18,15 @@ class ShardClock:
     """Runs the phases of a tick zone by zone and adds up what each zone takes.
 
     What is done once for all zones (ghosts, the gate, signals, owners) is in no zone's time.
-
-    Args:
-        shards: one a zone, in the order of zones.
-        every: one tick of so many is run zone by zone, and its time stands for the others. The
-            first one of them is not counted: it makes ready what the others use.
     """
 
-    def __init__(self, shards: Sequence[Shard], every: int = 1) -> None:
+    def __init__(
+        self,
+        shards: Sequence[Shard],  # one a zone, in the order of zones
+        # one tick of so many is run zone by zone, and its time stands for the others. The first one
+        # of them is not counted: it makes ready what the others use
+        every: int = 1,
+    ) -> None:
         self._hosts = [SerialExecutor((shard,)) for shard in shards]
         self._together = SerialExecutor(shards)
         self._every = every

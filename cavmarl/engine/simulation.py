@@ -47,7 +47,6 @@ class Simulation(WorldViews):
     """W worlds of one environment on one map.
 
     Attributes:
-        everywhere: (W,) all of the worlds.
         frames: what the rigs of the agents have sensed; arrays that the next step overwrites.
     """
 
@@ -79,7 +78,7 @@ class Simulation(WorldViews):
         self._seed = 0
         self._first_world = 0
         self._episodes = np.zeros(num_worlds, dtype=np.int64)
-        self.everywhere = np.ones(num_worlds, dtype=np.bool_)
+        self.everywhere = np.ones(num_worlds, dtype=np.bool_)  # (W,) all of the worlds
         self.frames: Frames = make_frames(config, num_worlds, zeros) if frames is None else frames
         self.transfers: tuple[TransferLog, ...] = ()
         self._recovery: Recovery | None = None

@@ -130,13 +130,10 @@ def sensed_observation(frames: Frames) -> dict[str, NDArray[Any]]:
 
 
 def named_observation(
-    parts: Mapping[str, ObservationPart], frames: NDArray[np.float32]
+    parts: Mapping[str, ObservationPart],  # of `observation_parts`
+    frames: NDArray[np.float32],  # (…, stack, frame size): flat observations, reshaped
 ) -> dict[str, NDArray[Any]]:
     """Flat observations by sensor: views of them, but for images, which become bytes.
-
-    Args:
-        parts: of `observation_parts`.
-        frames: (…, stack, frame size): flat observations, reshaped.
 
     Returns:
         an array (…, *shape) a sensor.
@@ -149,15 +146,11 @@ def named_observation(
 
 
 def flat_observation(
-    names: Iterable[str], named: Mapping[str, NDArray[Any]], stack: int
+    names: Iterable[str],  # of the sensors in the order of the flat observation
+    named: Mapping[str, NDArray[Any]],  # an array a sensor, in any order
+    stack: int,  # frames in an observation
 ) -> NDArray[np.float32]:
-    """The flat observation (stack · frame size,) of one that is named by sensor.
-
-    Args:
-        names: of the sensors in the order of the flat observation.
-        named: an array a sensor, in any order.
-        stack: frames in an observation.
-    """
+    """The flat observation (stack · frame size,) of one that is named by sensor."""
     frames = [np.asarray(named[name], np.float32).reshape(stack, -1) for name in names]
     return np.concatenate(frames, axis=1).ravel()
 

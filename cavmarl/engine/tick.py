@@ -26,10 +26,7 @@ class Tick:
     """The phases of a tick in their order, and the parts whose calls they are.
 
     Attributes:
-        gate: through which vehicles come and go; a reset may replace it.
         executor: runs the phases of the shards, wherever they are hosted.
-        coordination: decides ownership; None: all is one zone.
-        sumo: beside these worlds; None: there is none.
         hosts_may_die: in any phase, so also those are gone through in which nothing is to be done.
     """
 
@@ -46,11 +43,11 @@ class Tick:
         self.division = division
         self.traffic = traffic
         self.commons = commons
-        self.gate = gate
+        self.gate = gate  # through which vehicles come and go; a reset may replace it
         self.attached = attached
         self.executor: Executor = SerialExecutor(shards)
-        self.coordination: Coordinators | None = None
-        self.sumo: SumoTraffic | None = None
+        self.coordination: Coordinators | None = None  # decides ownership; None: all is one zone
+        self.sumo: SumoTraffic | None = None  # beside these worlds; None: there is none
         self.hosts_may_die = False
         self._shard = shards[0]
         self._is_undivided = len(shards) == 1

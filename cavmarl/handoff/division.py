@@ -49,7 +49,6 @@ class Division:
     """Which zones own and see which vehicles.
 
     Attributes:
-        book: vehicles near a border.
         gathering: what shards are called with that `gather` their ghosts: how far outside of a zone
             a ghost can be that touches a vehicle in it, and how far inside one is at a border, m.
         call_hand_over: the kernel, with the types of all worlds' arrays found out once.
@@ -69,7 +68,7 @@ class Division:
         self.zones = zones
         self.borders = borders
         self.codec = codec
-        self.book = make_book(*shards[0].worlds.rows.shape)
+        self.book = make_book(*shards[0].worlds.rows.shape)  # vehicles near a border
         self._shards = tuple(shards)
         self._zoned = zoned
         self._first_side = shards[0].worlds.rows
@@ -201,13 +200,12 @@ class Division:
     def _side(self, rows: NDArray[np.void]) -> int:
         return 0 if rows is self._first_side else 1
 
-    def place(self, vehicles: Sequence[NDArray[np.void]], contacts: NDArray[np.int64]) -> None:
-        """Give every vehicle to the zone that it is in, whatever zone owned it before.
-
-        Args:
-            vehicles: VEHICLE (n,) of each world.
-            contacts: (W,) of each, as `contacts` counts them.
-        """
+    def place(
+        self,
+        vehicles: Sequence[NDArray[np.void]],  # VEHICLE (n,) of each world
+        contacts: NDArray[np.int64],  # (W,) of each, as `contacts` counts them
+    ) -> None:
+        """Give every vehicle to the zone that it is in, whatever zone owned it before."""
         first = self._shards[0].worlds
         # A host that died in the middle of a tick may have left a step that is not what this says.
         self._zoned.step_at[...] = 0
@@ -251,14 +249,14 @@ class Division:
         worlds = self._shards[zone].worlds
         return self.codec.pack(worlds.rows, w, row, int(worlds.ticks[w]))
 
-    def hand_over(self, w: int, switch: Switch, state: bytes | None, hint: int = 0) -> int:
+    def hand_over(
+        self,
+        w: int,
+        switch: Switch,  # the vehicle, its source and its target
+        state: bytes | None,  # what the new owner goes on with; None: the old one's row as it is
+        hint: int = 0,  # the row where the old one probably keeps it
+    ) -> int:
         """Let a vehicle change its owner, by its committed row.
-
-        Args:
-            w: in which world.
-            switch: the vehicle, its source and its target.
-            state: what the new owner goes on with; None: the old one's row as it is.
-            hint: the row where the old one probably keeps it.
 
         Returns:
             the row where the new one keeps it.
@@ -287,15 +285,15 @@ class Division:
             "narrow"
         )
 
-    def depth_m(self, w: int, vehicle: int, zone: int, outside: int, hint: int) -> float | None:
+    def depth_m(
+        self,
+        w: int,
+        vehicle: int,
+        zone: int,  # that owns it
+        outside: int,  # of which zone
+        hint: int,  # the row where its owner probably keeps it
+    ) -> float | None:
         """How far outside of a zone a vehicle is, by its committed row.
-
-        Args:
-            w: in which world.
-            vehicle: its id.
-            zone: that owns it.
-            outside: of which zone.
-            hint: the row where its owner probably keeps it.
 
         Returns:
             the distance in m, 0 inside; None: its owner does not have it.

@@ -33,13 +33,12 @@ class Proposal:
     moved: int  # vehicles that would be in a zone of another number
 
 
-def vehicle_costs(zones: NDArray[np.int32], costs_s: Sequence[float]) -> Floats:
-    """Each zone's cost shared out among its vehicles, (n,).
-
-    Args:
-        zones: of each vehicle.
-        costs_s: measured, of each zone; what a zone without vehicles costs is left out.
-    """
+def vehicle_costs(
+    zones: NDArray[np.int32],  # of each vehicle
+    # measured, of each zone; what a zone without vehicles costs is left out
+    costs_s: Sequence[float],
+) -> Floats:
+    """Each zone's cost shared out among its vehicles, (n,)."""
     counts = np.bincount(zones, minlength=len(costs_s))
     shares: Floats = (np.asarray(costs_s) / np.maximum(counts, 1))[zones]
     return shares

@@ -30,11 +30,7 @@ class Recut(NamedTuple):
 
 
 class Recutter:
-    """Looks every so many steps whether other zones would share out the vehicles better.
-
-    Attributes:
-        recuts: what has been done.
-    """
+    """Looks every so many steps whether other zones would share out the vehicles better."""
 
     def __init__(
         self,
@@ -44,7 +40,7 @@ class Recutter:
         every: int,  # steps between checks
         tolerance: float,  # by which share of the mean the fullest zone has to become emptier
     ) -> None:
-        self.recuts: list[Recut] = []
+        self.recuts: list[Recut] = []  # what has been done
         self._network = network
         self._division = division
         self._coordination = coordination

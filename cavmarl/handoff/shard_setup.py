@@ -95,15 +95,13 @@ def divide(
 
 
 def halo_m(
-    config: EnvConfig, reach_m: float, zones: int, fastest_mps: float = MAX_SPEED_MPS
+    config: EnvConfig,  # `zones.halo_m` is taken if it is given
+    reach_m: float,  # the farthest that any driver looks
+    zones: int,  # how many there are
+    # the way of a tick over its length, with what vehicles jump on the map
+    fastest_mps: float = MAX_SPEED_MPS,
 ) -> float:
     """How far zones see over their borders.
-
-    Args:
-        config: `zones.halo_m` is taken if it is given.
-        reach_m: the farthest that any driver looks.
-        zones: how many there are.
-        fastest_mps: the way of a tick over its length, with what vehicles jump on the map.
 
     Raises:
         ConfigError: that is less than exactness needs, with all numbers.

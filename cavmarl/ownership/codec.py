@@ -39,13 +39,11 @@ def encode(message: Message) -> bytes:
     return body + _CRC.pack(zlib.crc32(body))
 
 
-def decode(data: bytes, run: bytes | None = None) -> Message:
-    """The message of a wire form.
-
-    Args:
-        data: one whole message.
-        run: of the receiver; None accepts all.
-    """
+def decode(
+    data: bytes,  # one whole message
+    run: bytes | None = None,  # of the receiver; None accepts all
+) -> Message:
+    """The message of a wire form."""
     if len(data) < _HEADER.size + _CRC.size:
         raise MessageError(f"a message of {len(data)} bytes has no room for its header")
     magic, version, kind, zero = _HEADER.unpack_from(data)

@@ -47,15 +47,11 @@ SILENCE = Output()
 
 
 class StoreError(ProtocolError):
-    """What is stored is not what the zones say they stored.
-
-    Attributes:
-        zones: those that have to be hosted anew and step again.
-    """
+    """What is stored is not what the zones say they stored."""
 
     def __init__(self, zones: tuple[int, ...]) -> None:
         super().__init__(f"zones {list(zones)} stored other rows than they told: host them anew")
-        self.zones = zones
+        self.zones = zones  # those that have to be hosted anew and step again
 
 
 class Directory:
@@ -63,8 +59,6 @@ class Directory:
 
     Attributes:
         table: owners, hosts and the tick in progress, as the log has them.
-        dones: zone → its DONE for the tick in progress.
-        readiness: what targets have acknowledged.
         dropped: (kind, reason) → messages or entries that did not count.
         refusals: reason → how often a target did not hold a state.
     """
@@ -79,8 +73,8 @@ class Directory:
     ) -> None:
         self.run = run
         self.table = Table(zones, safeguards)
-        self.dones: dict[int, Done] = {}
-        self.readiness = Readiness(safeguards)
+        self.dones: dict[int, Done] = {}  # zone → its DONE for the tick in progress
+        self.readiness = Readiness(safeguards)  # what targets have acknowledged
         self.dropped: Counter[tuple[str, str]] = Counter()
         self.refusals: Counter[Refusal] = Counter()
         self._payloads: Mapping[int, bytes] = {}
@@ -185,14 +179,12 @@ class Directory:
         self._decisions.check_births(self.table, births)
 
     def resend(
-        self, zones: Iterable[int] | None = None, payloads: Mapping[int, bytes] | None = None
+        self,
+        zones: Iterable[int] | None = None,  # only these
+        # as in `begin`, whose payloads are kept; needed after `restore`
+        payloads: Mapping[int, bytes] | None = None,
     ) -> Output:
-        """The STEPs once more, of zones that have not answered.
-
-        Args:
-            zones: only these.
-            payloads: as in `begin`, whose payloads are kept; needed after `restore`.
-        """
+        """The STEPs once more, of zones that have not answered."""
         if payloads is not None:
             self._payloads = payloads
         asked = self.waiting_for() if zones is None else tuple(zones)
@@ -220,11 +212,11 @@ class Directory:
         deferred, bound = self.table.plan.record.deferred, self._limits.deferral
         return tuple(vehicle for vehicle, ticks in deferred if ticks > bound)
 
-    def commit(self, rows: Mapping[int, int]) -> Output:
+    def commit(
+        self,
+        rows: Mapping[int, int],  # zone → digest of the rows that the store holds for the tick
+    ) -> Output:
         """Make the tick in progress the truth: every zone is done, and the ledger is exact.
-
-        Args:
-            rows: zone → digest of the rows that the store holds for the tick.
 
         Raises:
             StoreError: the store holds other rows than a zone told of. Fence and host it anew.

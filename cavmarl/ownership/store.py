@@ -17,14 +17,12 @@ class MemoryStore:
     """States as bytes, by vehicle.
 
     Attributes:
-        tick: the committed tick.
-        committed: vehicle → state at that tick.
         segments: (zone, incarnation) → what that process has written for the next tick.
     """
 
     def __init__(self, safeguards: Safeguards = ALL_ON) -> None:
-        self.tick = 0
-        self.committed: dict[int, bytes] = {}
+        self.tick = 0  # the committed tick
+        self.committed: dict[int, bytes] = {}  # vehicle → state at that tick
         self.segments: dict[tuple[int, int], dict[int, bytes]] = {}
         self._safeguards = safeguards
 

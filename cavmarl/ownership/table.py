@@ -42,11 +42,7 @@ class Table:
         owners: vehicle → (zone, epoch) as of the committed tick.
         deferred: vehicle → ticks that it has been with a zone which does not contain it.
         hosts: zone → (worker, incarnation); incarnation 0 means never hosted.
-        states: zone → UNHOSTED, HOSTED or FENCED.
         counts: zone → how many vehicles it owned at the committed tick.
-        seen: ids that have been in the episode.
-        repeats: zone → new hosts in the tick in progress.
-        plan: the tick in progress, or None.
     """
 
     def __init__(self, zones: Iterable[int], safeguards: Safeguards = ALL_ON) -> None:
@@ -54,10 +50,10 @@ class Table:
         self.owners: dict[int, tuple[int, int]] = {}
         self.deferred: dict[int, int] = {}
         self.hosts = dict.fromkeys(sorted(zones), (-1, 0))
-        self.states = dict.fromkeys(self.hosts, State.UNHOSTED)
-        self.seen = SeenIds()
-        self.repeats: Counter[int] = Counter()
-        self.plan: OwnershipPlan | None = None
+        self.states = dict.fromkeys(self.hosts, State.UNHOSTED)  # zone → UNHOSTED, HOSTED or FENCED
+        self.seen = SeenIds()  # ids that have been in the episode
+        self.repeats: Counter[int] = Counter()  # zone → new hosts in the tick in progress
+        self.plan: OwnershipPlan | None = None  # the tick in progress, or None
         self._safeguards = safeguards
         self.counts = dict.fromkeys(self.hosts, 0)
         self._tallies = dict.fromkeys(self.hosts, OwnedTally())

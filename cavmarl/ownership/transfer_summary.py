@@ -53,14 +53,14 @@ class TransferSummary:
     failure_rate: float | None  # share of transfers that had to be forced; None without transfers
 
     @classmethod
-    def of(cls, rows: Iterable[Transfer], counts: Mapping[str, int]) -> TransferSummary:
-        """A summary.
-
-        Args:
-            rows: whose spread is told.
-            counts: of a `TransferLog`, or the sum of several; they may know of more transfers than
-                there are rows left.
-        """
+    def of(
+        cls,
+        rows: Iterable[Transfer],  # whose spread is told
+        # of a `TransferLog`, or the sum of several; they may know of more transfers than there are
+        # rows left
+        counts: Mapping[str, int],
+    ) -> TransferSummary:
+        """A summary."""
         kept = list(rows)
         forced = counts.get("forced", 0)
         transfers = forced + counts.get("switched", 0)

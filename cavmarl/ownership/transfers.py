@@ -99,17 +99,16 @@ UNKNOWN = _Switching(None, None)
 class TransferLog:
     """Follows records and deliveries.
 
-    Args:
-        lifetime: ticks after which a state that is not refreshed is forgotten.
-        surroundings: tells depths and times; None: they are left out.
-
     Attributes:
-        episode: of the newest record.
         ask: called before each reading, to bring late records up to date.
     """
 
-    def __init__(self, lifetime: int, surroundings: Surroundings | None = None) -> None:
-        self.episode = -1
+    def __init__(
+        self,
+        lifetime: int,  # ticks after which a state that is not refreshed is forgotten
+        surroundings: Surroundings | None = None,  # tells depths and times; None: they are left out
+    ) -> None:
+        self.episode = -1  # of the newest record
         self.ask: Callable[[], None] = lambda: None
         self._rows: deque[Transfer] = deque(maxlen=KEPT_ROWS)
         self._later: deque[tuple[int, Callable[[], Iterable[Transfer]]]] = deque()

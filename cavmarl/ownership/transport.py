@@ -107,19 +107,13 @@ class _Flight(NamedTuple):
 
 
 class Network:
-    """Carries messages from phase to phase.
-
-    Attributes:
-        phase: how often `deliver` has been called.
-        sent: kind → copies that were sent.
-        faults: (kind, fault) → how often.
-    """
+    """Carries messages from phase to phase."""
 
     def __init__(self, plan: FaultPlan | None = None) -> None:
         self.plan = FaultPlan() if plan is None else plan
-        self.phase = 0
-        self.sent: Counter[str] = Counter()
-        self.faults: Counter[tuple[str, str]] = Counter()
+        self.phase = 0  # how often `deliver` has been called
+        self.sent: Counter[str] = Counter()  # kind → copies that were sent
+        self.faults: Counter[tuple[str, str]] = Counter()  # (kind, fault) → how often
         self._flights: list[_Flight] = []
         self._copies: Counter[tuple[object, ...]] = Counter()
         self._sequence = 0

@@ -62,14 +62,13 @@ class OrderedWorlds(ABC):
         """Let all workers do a task."""
 
     @abstractmethod
-    def _ask(self, task: Task, world: int, more: Any = None) -> Any:
-        """Let the worker of a world answer.
-
-        Args:
-            task: what is asked.
-            world: its number; numbers from the end count as they do for arrays.
-            more: than the world that the worker has to know.
-        """
+    def _ask(
+        self,
+        task: Task,
+        world: int,  # its number; numbers from the end count as they do for arrays
+        more: Any = None,  # than the world that the worker has to know
+    ) -> Any:
+        """Let the worker of a world answer."""
 
     def reset(self, seed: int | None, first_world: int) -> None:
         self._order(Task.RESET, {"seed": seed, "first_world": first_world})

@@ -29,10 +29,7 @@ class LocalWorlds:
     """W worlds of one environment; no loop of Python runs over agents or vehicles in a step.
 
     Attributes:
-        arrays: what goes into a step, and what comes out.
         simulation: the worlds.
-        in_next_step: when worlds begin anew.
-        farm: its sensor workers; None: there are none.
     """
 
     def __init__(
@@ -48,8 +45,8 @@ class LocalWorlds:
         runs: Sequence[WorldRun] | None = None,  # see `Simulation`
     ) -> None:
         self.world = world
-        self.in_next_step = in_next_step
-        self.farm: SensorWorkers | None = None
+        self.in_next_step = in_next_step  # when worlds begin anew
+        self.farm: SensorWorkers | None = None  # its sensor workers; None: there are none
         form = world.config.observation
         self._senses = form.mode == "sensors"
         self._is_flat = form.kind == "flat"
@@ -70,7 +67,7 @@ class LocalWorlds:
             arrays = _own_arrays(self.simulation, num_worlds)
             if not self._senses:
                 arrays = arrays._replace(observations=self.simulation.outputs.observations)
-        self.arrays = arrays
+        self.arrays = arrays  # what goes into a step, and what comes out
         self._horizon = world.config.max_steps
         self._steps = np.zeros(num_worlds, dtype=np.int64)
         self._waiting = np.zeros(num_worlds, dtype=np.bool_)  # over, and not begun anew yet

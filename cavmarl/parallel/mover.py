@@ -21,30 +21,24 @@ Run = Callable[[Task, Any, bool], None]
 
 
 class Mover:
-    """Measures shards, plans anew from time to time, and has moved what the plans move.
-
-    Args:
-        placement: the plans.
-        num_zones: of each world.
-        every: so many steps from one round to the next.
-        spent_s: (W, zones) processor time of each shard from the start on, which others add up;
-            whole worlds count as one zone.
-
-    Attributes:
-        moves: of shards, up to now.
-        moved_s: how long they have taken together.
-    """
+    """Measures shards, plans anew from time to time, and has moved what the plans move."""
 
     def __init__(
-        self, placement: StepPlacement, num_zones: int, every: int, spent_s: NDArray[np.float64]
+        self,
+        placement: StepPlacement,  # the plans
+        num_zones: int,  # of each world
+        every: int,  # so many steps from one round to the next
+        # (W, zones) processor time of each shard from the start on, which others add up; whole
+        # worlds count as one zone
+        spent_s: NDArray[np.float64],
     ) -> None:
         self._placement = placement
         self._num_zones = num_zones
         self._every = every
         self._spent_s = spent_s
         self._steps = 0
-        self.moves = 0
-        self.moved_s = 0.0
+        self.moves = 0  # of shards, up to now
+        self.moved_s = 0.0  # how long they have taken together
 
     def before_step(self, run: Run, pids: Callable[[], Mapping[int, int]]) -> list[Part] | None:
         """Count a step; if it is time, plan anew and move.
@@ -84,13 +78,7 @@ class Mover:
 class MovingMemory:
     """What shards have cost, and a case for each worker that may give whole worlds away.
 
-    Args:
-        num_worlds: W.
-        num_zones: of each world, as they are placed; whole worlds count as one.
-        cases: how many.
-
     Attributes:
-        segments: the memory.
         recipe: what workers are told about it.
         spent_s: (W, zones) processor time of each shard from the start on.
 
@@ -98,9 +86,14 @@ class MovingMemory:
         WorkerError: there is none.
     """
 
-    def __init__(self, num_worlds: int, num_zones: int, cases: int) -> None:
+    def __init__(
+        self,
+        num_worlds: int,  # W
+        num_zones: int,  # of each world, as they are placed; whole worlds count as one
+        cases: int,
+    ) -> None:
         layout = {"spent_s": ("<f8", (num_worlds, num_zones))}
-        self.segments = [Segment.make(size_of(layout))]
+        self.segments = [Segment.make(size_of(layout))]  # the memory
         try:
             self.segments += [Segment.make(_CASE_BYTES) for _ in range(cases)]
             self.spent_s = arrays_in(self.segments[0].map(), layout)["spent_s"]

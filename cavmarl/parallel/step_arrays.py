@@ -118,13 +118,12 @@ class SteppedWorlds(Protocol):
         """Which worker hosts what, one plan of all worlds, or one a world; none without workers."""
         ...
 
-    def reset(self, seed: int | None, first_world: int) -> None:
-        """Begin an episode in the worlds of `chosen`; writes `observations` and `mask`.
-
-        Args:
-            seed: root of all random numbers; None goes on with those of the last seed.
-            first_world: number of the first of these worlds among all worlds of the seed.
-        """
+    def reset(
+        self,
+        seed: int | None,  # root of all random numbers; None goes on with those of the last seed
+        first_world: int,  # number of the first of these worlds among all worlds of the seed
+    ) -> None:
+        """Begin an episode in the worlds of `chosen`; writes `observations` and `mask`."""
         ...
 
     def step(self, commands: Commands) -> None:

@@ -59,14 +59,14 @@ class StepPlacement:
 
             self._watch, self._pids = Watch(pids), dict(pids)
 
-    def round(self, spent_s: Floats, steps: int, pids: Mapping[int, int]) -> bool:
+    def round(
+        self,
+        # (W, zones) processor time of each shard from the start on; whole worlds count as one zone
+        spent_s: Floats,
+        steps: int,  # since the last round
+        pids: Mapping[int, int],  # of the workers' processes
+    ) -> bool:
         """Plan anew by what shards have cost since the last round.
-
-        Args:
-            spent_s: (W, zones) processor time of each shard from the start on; whole worlds count
-                as one zone.
-            steps: since the last round.
-            pids: of the workers' processes.
 
         Returns:
             whether something has to be moved.

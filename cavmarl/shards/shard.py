@@ -77,9 +77,7 @@ class Shard:
 
     Attributes:
         sides: VEHICLE (W, C), the two buffers that rows are kept in, swapped each tick.
-        side: in which of them the committed rows are.
         next_side: where the next ones come; the same, but in ticks that put rows in order.
-        mail: what agents have been told over the air; None: no messages.
     """
 
     def __init__(
@@ -131,9 +129,9 @@ class Shard:
             num_cues=len(travel.scripts.cues),
         )
         self.sides = (self.worlds.rows, zoned.rows[1, zone])
-        self.side = self.next_side = 0
+        self.side = self.next_side = 0  # in which of them the committed rows are
         self.outputs = outputs
-        self.mail: Mail | None = None
+        self.mail: Mail | None = None  # what agents have been told over the air; None: no messages
         self._messages_at = layout(config.sensors).get("messages")
         self.target_speeds = np.array(config.action.target_speeds_mps)
         self.discrete = config.action.kind == "discrete"

@@ -35,12 +35,12 @@ class ShardGroup:
 
     Phases that every tick has are one call for all shards, with what does not change put together
     once. Others, and those which have nothing to do in most ticks, go from shard to shard.
-
-    Args:
-        shards: of one process, by rising zones; they share clock and room.
     """
 
-    def __init__(self, shards: Sequence[Shard]) -> None:
+    def __init__(
+        self,
+        shards: Sequence[Shard],  # of one process, by rising zones; they share clock and room
+    ) -> None:
         self._shards = tuple(shards)
         first = shards[0]
         self._first = first

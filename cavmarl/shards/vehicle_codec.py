@@ -106,16 +106,16 @@ class TransferCodec:
         oldest = outputs.observations.shape[2] // stack
         return cls(worlds.rows.dtype, worlds.pending, outputs.observations[:, :, oldest:])
 
-    def pack(self, rows: NDArray[np.void], world: int, i: int, tick: int) -> bytes:
-        """The state of a vehicle.
-
-        Args:
-            rows: VEHICLE (W, C).
-            world: number of the world.
-            i: the row.
-            tick: of the state, as `unpack` will be asked for it. `VEHICLE["tick"]` is one less in
-                vehicles that entered after the reset.
-        """
+    def pack(
+        self,
+        rows: NDArray[np.void],  # VEHICLE (W, C)
+        world: int,
+        i: int,
+        # of the state, as `unpack` will be asked for it. `VEHICLE["tick"]` is one less in vehicles
+        # that entered after the reset
+        tick: int,
+    ) -> bytes:
+        """The state of a vehicle."""
         record: bytes = rows[world, i : i + 1].tobytes()
         (vehicle,) = _LONG.unpack_from(record, self._id_at)
         (agent,) = _INT.unpack_from(record, self._agent_at)

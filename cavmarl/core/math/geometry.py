@@ -43,15 +43,12 @@ def segment_at(points: NDArray[np.void], first: int, num: int, s: float) -> int:
 
 @kernel
 def lane_pose(
-    points: NDArray[np.void], first: int, num: int, s: float
+    points: NDArray[np.void],  # POINT (num_points,)
+    first: int,  # row of the polyline's first point
+    num: int,  # points of the polyline, at least 2
+    s: float,  # m; beyond the ends the end segments go on straight
 ) -> tuple[float, float, float, float, float, float]:
     """The place and direction at arc length `s` of a polyline.
-
-    Args:
-        points: POINT (num_points,).
-        first: row of the polyline's first point.
-        num: points of the polyline, at least 2.
-        s: m; beyond the ends the end segments go on straight.
 
     Returns:
         x, y, z in metres, cos and sin of the direction, slope dz/ds.
@@ -121,19 +118,16 @@ def _project_between(
 
 @kernel
 def project(
-    points: NDArray[np.void], first: int, num: int, x: float, y: float
+    points: NDArray[np.void],  # POINT (num_points,)
+    first: int,  # row of the polyline's first point
+    num: int,  # points of the polyline, at least 2
+    x: float,  # m
+    y: float,  # m
 ) -> tuple[float, float, float, float]:
     """The lane coordinates of a place: those of the nearest point of the polyline.
 
     Of several nearest points the one with the smaller `s` counts. Where that point is an end of the
     polyline, `s` and `d` are taken along the end segment's line, so `s` may leave [0, length].
-
-    Args:
-        points: POINT (num_points,).
-        first: row of the polyline's first point.
-        num: points of the polyline, at least 2.
-        x: m.
-        y: m.
 
     Returns:
         s and d in metres, cos and sin of the direction there.

@@ -71,14 +71,12 @@ class Grid(NamedTuple):
     spots: NDArray[np.void]  # SPOT (capacity,) by VEHICLE row; both only `contacts` uses
 
 
-def make_grid(bounds: tuple[float, float, float, float], cell_m: float, capacity: int) -> Grid:
-    """An empty grid.
-
-    Args:
-        bounds: min_x, min_y, max_x, max_y of the area in m.
-        cell_m: side of a cell in m; about half the usual search distance is fast.
-        capacity: most vehicles that it can take.
-    """
+def make_grid(
+    bounds: tuple[float, float, float, float],  # min_x, min_y, max_x, max_y of the area in m
+    cell_m: float,  # side of a cell in m; about half the usual search distance is fast
+    capacity: int,  # most vehicles that it can take
+) -> Grid:
+    """An empty grid."""
     min_x, min_y, max_x, max_y = bounds
     num_x = max(1, math.ceil((max_x - min_x) / cell_m))
     num_y = max(1, math.ceil((max_y - min_y) / cell_m))
@@ -153,14 +151,12 @@ def _fill_body(body: np.void, vehicle: np.void, row: int) -> None:
 
 
 @kernel
-def fill_grid(rows: NDArray[np.void], num: int, grid: Grid) -> None:
-    """Sort the vehicles of one world into the cells of `grid`, which forgets what it held.
-
-    Args:
-        rows: VEHICLE (C,).
-        num: live rows, `rows[:num]`; at most the grid's capacity.
-        grid: from `make_grid`, overwritten.
-    """
+def fill_grid(
+    rows: NDArray[np.void],  # VEHICLE (C,)
+    num: int,  # live rows, `rows[:num]`; at most the grid's capacity
+    grid: Grid,  # from `make_grid`, overwritten
+) -> None:
+    """Sort the vehicles of one world into the cells of `grid`, which forgets what it held."""
     start = grid.start
     cell = grid.cell
     start[:] = 0

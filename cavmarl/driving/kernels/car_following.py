@@ -24,14 +24,12 @@ ACCEL_LIMIT = 6.0  # m/s², what the car can do at most, speeding up and braking
 
 
 @kernel
-def idm_free(speed: float, target_speed: float, accel_max: float) -> float:
-    """Acceleration on a free road in m/s²: accel_max · (1 - (speed / target_speed)⁴).
-
-    Args:
-        speed: m/s; driving backwards counts as standing.
-        target_speed: m/s, already cut to the speed limit.
-        accel_max: m/s², see `ACCEL_MAX`.
-    """
+def idm_free(
+    speed: float,  # m/s; driving backwards counts as standing
+    target_speed: float,  # m/s, already cut to the speed limit
+    accel_max: float,  # m/s², see `ACCEL_MAX`
+) -> float:
+    """Acceleration on a free road in m/s²: accel_max · (1 - (speed / target_speed)⁴)."""
     ratio = max(speed, 0.0) / abs(not_zero(target_speed))
     squared = ratio * ratio
     return accel_max * (1.0 - squared * squared)

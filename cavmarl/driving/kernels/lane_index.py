@@ -69,17 +69,13 @@ def _fill(
 
 @kernel
 def index_lanes(
-    roads: RoadArrays, travel: Travel, rows: NDArray[np.void], num: int, scratch: Scratch
+    roads: RoadArrays,
+    travel: Travel,  # the vehicles' types
+    rows: NDArray[np.void],  # VEHICLE (C,), of which `num` live
+    num: int,  # live rows
+    scratch: Scratch,  # the lists by lane and entries are written
 ) -> None:
-    """Sort the vehicles of one world by (lane, s, id) into `scratch.entries`.
-
-    Args:
-        roads: the road arrays.
-        travel: the vehicles' types.
-        rows: VEHICLE (C,), of which `num` live.
-        num: live rows.
-        scratch: the lists by lane and entries are written.
-    """
+    """Sort the vehicles of one world by (lane, s, id) into `scratch.entries`."""
     forget(scratch.lanes)
     for i in range(num):
         row = rows[i]

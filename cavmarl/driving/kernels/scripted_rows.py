@@ -44,17 +44,13 @@ def _let_go(roads: RoadArrays, travel: Travel, row: np.void, goal: int) -> None:
 
 @inlined_kernel
 def follow_script(
-    roads: RoadArrays, travel: Travel, cues: NDArray[np.int64], row: np.void, dt: float
+    roads: RoadArrays,
+    travel: Travel,  # with the scripts
+    cues: NDArray[np.int64],  # (T,) the tick in which each came, -1: not yet
+    row: np.void,  # VEHICLE, the committed record, which becomes the next one
+    dt: float,  # seconds of the tick
 ) -> None:
-    """Advance a row that follows a script by one tick.
-
-    Args:
-        roads: the road arrays.
-        travel: with the scripts.
-        cues: (T,) the tick in which each came, -1: not yet.
-        row: VEHICLE, the committed record, which becomes the next one.
-        dt: seconds of the tick.
-    """
+    """Advance a row that follows a script by one tick."""
     before = before_tick(row)
     frame = travel.scripts.frames[row["goal"]]
     if frame["cue"] < 0 or cues[frame["cue"]] >= 0:

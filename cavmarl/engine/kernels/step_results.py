@@ -32,14 +32,13 @@ class Results(NamedTuple):
 
 
 @kernel
-def report(outputs: Outputs, steps: NDArray[np.int64], horizon: int, results: Results) -> bool:
+def report(
+    outputs: Outputs,  # of the step
+    steps: NDArray[np.int64],  # (W,) since each world's reset; are counted
+    horizon: int,  # steps of an episode
+    results: Results,  # are written
+) -> bool:
     """Write what the agents have got, all but which act next.
-
-    Args:
-        outputs: of the step.
-        steps: (W,) since each world's reset; are counted.
-        horizon: steps of an episode.
-        results: are written.
 
     Returns:
         whether the trip of some vehicle has ended.
@@ -65,18 +64,15 @@ def report(outputs: Outputs, steps: NDArray[np.int64], horizon: int, results: Re
 
 @kernel
 def report_who_goes_on(
-    outputs: Outputs, gate: Gate, steps: NDArray[np.int64], horizon: int, results: Results
+    outputs: Outputs,  # of the step
+    gate: Gate,  # vehicles that wait, and how many have arrived
+    steps: NDArray[np.int64],  # (W,) since each world's reset
+    horizon: int,  # steps of an episode
+    results: Results,  # are written
 ) -> bool:
     """Write which agents act next and which episodes are over, once vehicles that end are gone.
 
     An episode is over at its horizon, and when no agent is there and none waits to enter.
-
-    Args:
-        outputs: of the step.
-        gate: vehicles that wait, and how many have arrived.
-        steps: (W,) since each world's reset.
-        horizon: steps of an episode.
-        results: are written.
 
     Returns:
         whether an episode is over.

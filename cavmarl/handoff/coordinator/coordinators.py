@@ -27,7 +27,6 @@ class NearBorders:
     """What rows of transfers need to know: vehicles near a border, and those that crossed one.
 
     Attributes:
-        near: of the tick that is on its way; to be set.
         places: vehicle that has changed its owner in it → the row that it had there; to be set.
     """
 
@@ -35,7 +34,7 @@ class NearBorders:
         self.places: Mapping[int, int] = {}
         self._division = division
         self._world = world
-        self.near: Sequence[Near] = ()
+        self.near: Sequence[Near] = ()  # of the tick that is on its way; to be set
         self._depths: dict[tuple[int, int], float] = {}
         self._told: Sequence[Near] = ()
 
@@ -58,14 +57,10 @@ class NearBorders:
 
 
 class RowStates:
-    """States of one world's vehicles at the committed tick, read from the rows of their owners.
-
-    Attributes:
-        borders: vehicles near a border when the tick began.
-    """
+    """States of one world's vehicles at the committed tick, read from the rows of their owners."""
 
     def __init__(self, division: Division, world: int) -> None:
-        self.borders = NearBorders(division, world)
+        self.borders = NearBorders(division, world)  # vehicles near a border when the tick began
         self._division = division
         self._world = world
         self._known: dict[int, bytes] = {}

@@ -41,13 +41,14 @@ class HandoffLog:
         self._hand_over = division.call_hand_over
         self._release = division.call_release
 
-    def hand_over(self, everybody: bool, vehicles: int, newborn: Sequence[Birth]) -> int:
+    def hand_over(
+        self,
+        everybody: bool,  # look at all rows: they have changed since the ghosts were renewed
+        vehicles: int,  # how many there have to be
+        # those of them that entered since the last tick began; they stay where they are
+        newborn: Sequence[Birth],
+    ) -> int:
         """Let vehicles change their owner, by the committed rows.
-
-        Args:
-            everybody: look at all rows: they have changed since the ghosts were renewed.
-            vehicles: how many there have to be.
-            newborn: those of them that entered since the last tick began; they stay where they are.
 
         Returns:
             how many have changed.

@@ -53,13 +53,12 @@ class OwnersOnRecord:
     change their owner meanwhile.
 
     Attributes:
-        entered: vehicles that zones have begun to own, since the reset.
         left: vehicles that have been removed.
         ask: lets the coordinator make the records that it still owes.
     """
 
     def __init__(self, zones: int, limits: Limits, is_direct: bool = False) -> None:
-        self.entered = self.left = 0
+        self.entered = self.left = 0  # vehicles that zones have begun to own, since the reset
         self._checker = TraceChecker(limits.longest_deferral, limits.lifetime, is_direct)
         self._sums = np.zeros(zones, dtype=np.uint64)
         self._current = self._sums  # with what records that are still to come add to them

@@ -28,18 +28,20 @@ Sync: TypeAlias = Literal["flush", "fsync"]
 class JournalReader:
     """The records of a file, one after the other.
 
-    Args:
-        path: of the file.
-        drop_torn: whether a last line that is cut short ends the log instead of being an error: it
-            was never acted upon.
-
     Attributes:
         lines: whole lines that have been read.
         size: bytes of them.
         torn: the number of the line that was dropped and how it begins, or nothing.
     """
 
-    def __init__(self, path: Path, *, drop_torn: bool = False) -> None:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        # whether a last line that is cut short ends the log instead of being an error: it was never
+        # acted upon
+        drop_torn: bool = False,
+    ) -> None:
         self.path = path
         self.lines, self.size, self.torn = 0, 0, ""
         self._drop_torn = drop_torn
@@ -75,22 +77,24 @@ class JournalReader:
 class Journal:
     """A file that records are appended to, by one run at a time.
 
-    Args:
-        path: of the file; without `resume` it must not exist.
-        resume: go on behind what is there. All of it is read, and a last line that is cut short is
-            dropped.
-        anew: the file may exist, and is begun anew: by a run that does again what is in it.
-        sync: when an append returns, its lines have been given to the operating system ("flush"),
-            so that they outlive the process, or have been written out ("fsync"), so that they
-            outlive the machine.
-
     Attributes:
         sequence: the number of the next line.
         dropped: the line that was dropped, or nothing.
     """
 
     def __init__(
-        self, path: Path, *, resume: bool = False, anew: bool = False, sync: Sync = "flush"
+        self,
+        path: Path,  # of the file; without `resume` it must not exist
+        *,
+        # go on behind what is there. All of it is read, and a last line that is cut short is
+        # dropped
+        resume: bool = False,
+        # the file may exist, and is begun anew: by a run that does again what is in it
+        anew: bool = False,
+        # when an append returns, its lines have been given to the operating system ("flush"), so
+        # that they outlive the process, or have been written out ("fsync"), so that they outlive
+        # the machine
+        sync: Sync = "flush",
     ) -> None:
         if sync not in get_args(Sync):
             raise ConfigError(f"sync is {sync!r}: it has to be one of {get_args(Sync)}")
@@ -201,14 +205,10 @@ class Journal:
 
 
 class MemoryJournal:
-    """A journal for tests, and for runs that are not replayed.
-
-    Attributes:
-        records: all of them.
-    """
+    """A journal for tests, and for runs that are not replayed."""
 
     def __init__(self) -> None:
-        self.records: list[Record] = []
+        self.records: list[Record] = []  # all of them
         self._closed = False
 
     @property

@@ -47,12 +47,11 @@ class Crashes:
     """Says which processes die where, and counts.
 
     Attributes:
-        tick: of the run, that the world is on its way to; to be set.
         visits: (tick, point, party) of every point reached; None: not noted.
     """
 
     def __init__(self, faults: Faults) -> None:
-        self.tick = 0
+        self.tick = 0  # of the run, that the world is on its way to; to be set
         self.visits: set[Visit] | None = None
         self._plan = faults.plan()
         self._rate = faults.crash_rate

@@ -57,8 +57,6 @@ class MessageCoordinator(Coordinator):
     """Runs the protocol of one world over messages.
 
     Attributes:
-        endpoints: zone → its host's side.
-        post: what carries the messages.
         resent: phase → messages that were sent again, since no answer had come: PREPARE; STEP, for
             a lease not taken; DONE, STEPs for an answer that had not come.
     """
@@ -74,8 +72,8 @@ class MessageCoordinator(Coordinator):
         safeguards: Safeguards = ALL_ON,  # remedies of the protocol; tests take one away
     ) -> None:
         super().__init__(Directory(run, range(zones), states, limits, safeguards), journal)
-        self.endpoints: dict[int, Endpoint] = {}
-        self.post = post
+        self.endpoints: dict[int, Endpoint] = {}  # zone → its host's side
+        self.post = post  # what carries the messages
         self.resent: Counter[str] = Counter()
         self._states = states
         self._limits = limits

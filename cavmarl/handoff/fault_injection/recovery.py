@@ -41,11 +41,7 @@ class Revival(NamedTuple):
 
 
 class Recovery:
-    """Runs ticks of one world until they are committed.
-
-    Attributes:
-        revivals: one for each death.
-    """
+    """Runs ticks of one world until they are committed."""
 
     def __init__(
         self,
@@ -59,7 +55,7 @@ class Recovery:
         # same point
         repeats: int,
     ) -> None:
-        self.revivals: list[Revival] = []
+        self.revivals: list[Revival] = []  # one for each death
         self._shards = tuple(shards)
         self._coordination = coordination
         self._coordinator = coordinator

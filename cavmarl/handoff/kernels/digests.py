@@ -16,16 +16,12 @@ from cavmarl.core.numba import kernel
 
 @kernel
 def digest_rows(
-    words: NDArray[np.uint64], num: int, masks: NDArray[np.uint64], factors: NDArray[np.uint64]
+    words: NDArray[np.uint64],  # (C, n) the records of vehicles as whole words
+    num: int,  # how many count
+    masks: NDArray[np.uint64],  # (n,) which bits of each word count
+    factors: NDArray[np.uint64],  # (n,) odd random numbers
 ) -> tuple[np.uint64, np.uint64]:
-    """Upper and lower half of the sum of the digests of `words[:num]`, modulo 2**128.
-
-    Args:
-        words: (C, n) the records of vehicles as whole words.
-        num: how many count.
-        masks: (n,) which bits of each word count.
-        factors: (n,) odd random numbers.
-    """
+    """Upper and lower half of the sum of the digests of `words[:num]`, modulo 2**128."""
     upper = np.uint64(0)
     lower = np.uint64(0)
     for i in range(num):

@@ -33,14 +33,13 @@ class LoggedAction(NamedTuple):
 
 
 class ActionLog:
-    """Entries one behind the other, in memory that outlives its writers.
+    """Entries one behind the other, in memory that outlives its writers."""
 
-    Args:
-        fd: of that memory, which grows.
-        like: what agents do, in arrays of the shapes and dtypes that they always have.
-    """
-
-    def __init__(self, fd: int, like: Commands) -> None:
+    def __init__(
+        self,
+        fd: int,  # of that memory, which grows
+        like: Commands,  # what agents do, in arrays of the shapes and dtypes that they always have
+    ) -> None:
         self._fd = fd
         worlds = len(like.controls)
         fields: list[tuple[str, str, tuple[int, ...]]] = [

@@ -45,13 +45,12 @@ class CheckpointLog:
     Attributes:
         place: (2,) which image it begins with, and how many steps follow; to be committed.
         entries: what the agents do in each of the steps that there is room for, of both images.
-        is_prepared: the other image is that of the state at the end of the log.
     """
 
     def __init__(self, config: EnvConfig, num_worlds: int, descriptors: list[int]) -> None:
         *images, steps = (Segment(fd, 0) for fd in descriptors[:3])
         self.place = np.zeros(2, dtype=np.int64)
-        self.is_prepared = False
+        self.is_prepared = False  # the other image is that of the state at the end of the log
         self._images = [Image(segment) for segment in images]
         kept = [KeptLog(Segment(fd, 0)) for fd in descriptors[3:]]
         self._logs = kept[::2], kept[1::2]  # of each image, by world

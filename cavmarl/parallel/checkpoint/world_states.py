@@ -24,13 +24,11 @@ class WorldMove(NamedTuple):
     bytes: int = 0  # of their cases
 
 
-def moves_of(before: Sequence[int], after: Sequence[int]) -> list[WorldMove]:
-    """What each host keeps, and how many worlds come to it.
-
-    Args:
-        before: (m + 1,) the first world of each host, and the end of the last one's.
-        after: the same, when all have moved.
-    """
+def moves_of(
+    before: Sequence[int],  # (m + 1,) the first world of each host, and the end of the last one's
+    after: Sequence[int],  # the same, when all have moved
+) -> list[WorldMove]:
+    """What each host keeps, and how many worlds come to it."""
     moves = []
     for k in range(len(before) - 1):
         own, wanted = range(*before[k : k + 2]), range(*after[k : k + 2])

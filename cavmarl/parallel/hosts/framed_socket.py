@@ -90,15 +90,15 @@ class Frame(NamedTuple):
 class FramedSocket:
     """One end of a connection; everything blocks, at most as long as the socket's timeout.
 
-    Args:
-        connection: a socket of a stream, which the wire owns from here on.
-        dialect: that both ends speak.
-
     Attributes:
         is_torn: a frame was begun and not ended, so what follows cannot be understood.
     """
 
-    def __init__(self, connection: socket.socket, dialect: Dialect = HOSTS) -> None:
+    def __init__(
+        self,
+        connection: socket.socket,  # a socket of a stream, which the wire owns from here on
+        dialect: Dialect = HOSTS,  # that both ends speak
+    ) -> None:
         if connection.family != socket.AF_UNIX:
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._socket = connection
@@ -154,11 +154,11 @@ class FramedSocket:
         self._frame = _frame(dialect, kind, order, text, size, checksum)
         return self._frame
 
-    def take(self, arrays: Sequence[Array]) -> None:
+    def take(
+        self,
+        arrays: Sequence[Array],  # contiguous; they are filled one after the other
+    ) -> None:
         """Read the data of the frame that was received.
-
-        Args:
-            arrays: contiguous; they are filled one after the other.
 
         Raises:
             EOFError: the other end has ended.

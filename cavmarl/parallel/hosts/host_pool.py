@@ -41,9 +41,6 @@ IMAGE_EVERY = 8  # commands that are noted: a successor repeats as many at most
 class HostPool:
     """m parts of a job over at least as many hosts.
 
-    Attributes:
-        deaths: all that there were of hosts with a part.
-
     Raises:
         WorkerError: they do not come.
         WorkerFailureError: an exception while they made their jobs.
@@ -52,7 +49,7 @@ class HostPool:
     def __init__(
         self, launcher: Launcher, program: HostProgram, timeout_s: float, repeats: int
     ) -> None:
-        self.deaths: list[Death] = []
+        self.deaths: list[Death] = []  # all that there were of hosts with a part
         self._launcher = launcher
         self._program = program
         self._timeout_s = timeout_s
@@ -125,17 +122,19 @@ class HostPool:
         """
         return self._command(self._all, task, _said(letters, inputs), outputs, commits, sizes)
 
-    def tell(self, task: int, say: Say, outputs: Callable[[int, Any], Arrays]) -> list[Any]:
+    def tell(
+        self,
+        task: int,
+        # called for each host that is given the order, and told whether it has carried out the last
+        # one; what it returns is sent at once
+        say: Say,
+        # part, answer → arrays that what comes out is written to
+        outputs: Callable[[int, Any], Arrays],
+    ) -> list[Any]:
         """Let all hosts do a task for a caller that keeps the state of all parts itself.
 
         Nothing is committed: the successor of a dead host is told all that it
         needs.
-
-        Args:
-            task: of the job.
-            say: called for each host that is given the order, and told whether it has carried out
-                the last one; what it returns is sent at once.
-            outputs: part, answer → arrays that what comes out is written to.
 
         Returns:
             what each part has answered; errors as of `run`.

@@ -64,15 +64,12 @@ class HostConnection:
 class HostRegistry:
     """Lets hosts in and watches all connections at once.
 
-    Attributes:
-        free: hosts that are ready and have no part.
-
     Raises:
         WorkerError: nobody can listen, or hosts cannot be started.
     """
 
     def __init__(self, launcher: Launcher, code: str) -> None:
-        self.free: list[HostConnection] = []
+        self.free: list[HostConnection] = []  # hosts that are ready and have no part
         self._launcher = launcher
         self._code = code
         self._hosts: dict[int, HostConnection] = {}

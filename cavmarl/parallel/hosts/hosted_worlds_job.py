@@ -38,14 +38,12 @@ def inputs_of(task: int, arrays: StepArrays) -> list[Array]:
     return [arrays.chosen] if task == Task.RESET else []
 
 
-def results_of(task: int, arrays: StepArrays, ended: Sequence[int] | None) -> list[Array]:
-    """What comes out of a task, at both ends.
-
-    Args:
-        task: the task.
-        arrays: of the worlds that have done it.
-        ended: worlds in which something ended; None: none.
-    """
+def results_of(
+    task: int,
+    arrays: StepArrays,  # of the worlds that have done it
+    ended: Sequence[int] | None,  # worlds in which something ended; None: none
+) -> list[Array]:
+    """What comes out of a task, at both ends."""
     if task == Task.STEP:
         finals = [arrays.final_observations, *_sensed(arrays.final_frames)]
         last = [array[w] for w in ended or () for array in finals]

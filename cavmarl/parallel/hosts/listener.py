@@ -30,17 +30,12 @@ _HELLO = struct.Struct(f"<4sHI{NONCE}s")
 
 
 class PendingConnection:
-    """A caller that has not proved its identity yet.
-
-    Attributes:
-        until_s: for so long it may take, by `time.monotonic`.
-        number: that it says it has; -1: it has said nothing.
-    """
+    """A caller that has not proved its identity yet."""
 
     def __init__(self, connection: socket.socket, secret: bytes) -> None:
         connection.setblocking(False)
-        self.until_s = time.monotonic() + GREETING_S
-        self.number = -1
+        self.until_s = time.monotonic() + GREETING_S  # for so long it may take, by `time.monotonic`
+        self.number = -1  # that it says it has; -1: it has said nothing
         self._socket = connection
         self._secret = secret
         self._heard = b""
@@ -88,21 +83,16 @@ class PendingConnection:
 
 
 class Listener:
-    """Listens.
-
-    Attributes:
-        place: address and port.
-        secret: that hosts have to know.
-    """
+    """Listens."""
 
     def __init__(self, address: str) -> None:
-        self.secret = secrets.token_bytes(SECRET)
+        self.secret = secrets.token_bytes(SECRET)  # that hosts have to know
         try:
             self._listener = socket.create_server((address, 0), backlog=MAX_GUESTS)
         except OSError as error:
             raise WorkerError(f"cannot listen on {address}: {error}") from error
         self._listener.setblocking(False)
-        self.place: tuple[str, int] = self._listener.getsockname()[:2]
+        self.place: tuple[str, int] = self._listener.getsockname()[:2]  # address and port
 
     def fileno(self) -> int:
         return self._listener.fileno()

@@ -49,15 +49,14 @@ def _note(memory: Words, known: Words, begin: int, end: int, out: Words, at: int
 
 
 @kernel
-def note_spans(memory: Words, known: Words, spans: NDArray[np.int64], out: Words, at: int) -> int:
+def note_spans(
+    memory: Words,  # what there is
+    known: Words,  # what the other process has; made the same
+    spans: NDArray[np.int64],  # (n, 2) first byte and the one after the last
+    out: Words,  # the stream, with a word to spare behind all changes
+    at: int,  # its words so far
+) -> int:
     """Note what has changed between some bytes.
-
-    Args:
-        memory: what there is.
-        known: what the other process has; made the same.
-        spans: (n, 2) first byte and the one after the last.
-        out: the stream, with a word to spare behind all changes.
-        at: its words so far.
 
     Returns:
         its words now.
@@ -125,15 +124,14 @@ def mark_agents(
 
 
 @kernel
-def take_changes(stream: Words, first: int, last: int, memory: Words, known: Words) -> bool:
+def take_changes(
+    stream: Words,  # what `note_spans` and the others have written
+    first: int,  # where in it the groups of this memory begin
+    last: int,  # and where they end
+    memory: Words,  # is written
+    known: Words,  # what the other process has; is written, too
+) -> bool:
     """Put changes of another process where they belong.
-
-    Args:
-        stream: what `note_spans` and the others have written.
-        first: where in it the groups of this memory begin.
-        last: and where they end.
-        memory: is written.
-        known: what the other process has; is written, too.
 
     Returns:
         whether they fit there; if not, some may have been written.

@@ -74,17 +74,15 @@ class Process:
 class ForkServer:
     """Starts the process and asks it for workers.
 
-    Args:
-        program: module that is run, and calls `worker.serve`.
-        start: what it is told, as JSON knows it; descriptors by number.
-        descriptors: that it and its workers get.
-
     Raises:
         WorkerFailureError: an exception in it.
     """
 
     def __init__(
-        self, program: str, start: Mapping[str, Any], descriptors: tuple[int, ...]
+        self,
+        program: str,  # module that is run, and calls `worker.serve`
+        start: Mapping[str, Any],  # what it is told, as JSON knows it; descriptors by number
+        descriptors: tuple[int, ...],  # that it and its workers get
     ) -> None:
         ours, theirs = _wires()
         told = {

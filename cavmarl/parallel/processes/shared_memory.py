@@ -26,18 +26,14 @@ _LINE = 64  # bytes of a cache line: no two arrays share one
 
 
 class Segment:
-    """Memory of a number of bytes, all of them had.
+    """Memory of a number of bytes, all of them had."""
 
-    Args:
-        fd: descriptor, which the segment owns from here on.
-        size: bytes.
-
-    Attributes:
-        fd: to be passed to other processes.
-    """
-
-    def __init__(self, fd: int, size: int) -> None:
-        self.fd = fd
+    def __init__(
+        self,
+        fd: int,  # descriptor, which the segment owns from here on
+        size: int,  # bytes
+    ) -> None:
+        self.fd = fd  # to be passed to other processes
         self.size = size
 
     @classmethod

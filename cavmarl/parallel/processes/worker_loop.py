@@ -53,13 +53,12 @@ _PR_SET_PDEATHSIG = 1
 class Job:
     """What one worker does."""
 
-    def perform(self, task: int, letter: Any) -> Any:
-        """Do a task; the answer, as JSON knows it, of those that have one.
-
-        Args:
-            task: which one; numbers from 0 on are the job's own.
-            letter: what the pool has to say to it, as JSON knows it; mostly nothing.
-        """
+    def perform(
+        self,
+        task: int,  # which one; numbers from 0 on are the job's own
+        letter: Any,  # what the pool has to say to it, as JSON knows it; mostly nothing
+    ) -> Any:
+        """Do a task; the answer, as JSON knows it, of those that have one."""
         raise NotImplementedError
 
     def save(self) -> Arrays:
@@ -242,14 +241,13 @@ def _obey(job: Job, meeting: Meeting, slots: Sequence[Image]) -> NoReturn:
                 os._exit(OUT_OF_MEMORY)
 
 
-def _await(meeting: Meeting, order: int, last_s: float, work_s: float) -> float:
+def _await(
+    meeting: Meeting,  # with the pool
+    order: int,
+    last_s: float,  # how long the last wait was that was one
+    work_s: float,  # how long was worked since
+) -> float:
     """Return when there is a command; end with the pool.
-
-    Args:
-        meeting: with the pool.
-        order: its number.
-        last_s: how long the last wait was that was one.
-        work_s: how long was worked since.
 
     Returns:
         how long the last wait was, which may be this one.

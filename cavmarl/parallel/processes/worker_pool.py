@@ -42,21 +42,18 @@ class Death:
 class Pool:
     """m worker processes.
 
-    Args:
-        program: what they run.
-        timeout_s: for so long a worker may be busy with one order.
-        repeats: how often a command is begun again because a worker has died.
-
-    Attributes:
-        deaths: all that there were.
-
     Raises:
         WorkerError: no process, or no memory.
         WorkerFailureError: an exception while the jobs were made.
     """
 
-    def __init__(self, program: Program, timeout_s: float, repeats: int) -> None:
-        self.deaths: list[Death] = []
+    def __init__(
+        self,
+        program: Program,
+        timeout_s: float,  # for so long a worker may be busy with one order
+        repeats: int,  # how often a command is begun again because a worker has died
+    ) -> None:
+        self.deaths: list[Death] = []  # all that there were
         self._program = program
         self._timeout_s = timeout_s
         self._repeats = repeats

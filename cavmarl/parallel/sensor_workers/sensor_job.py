@@ -25,18 +25,15 @@ class SensorTask(IntEnum):
 
 
 class SensorJob(Job):
-    """Senses for the agents that are its share, as a zone would that owned them and saw all others.
-
-    Args:
-        simulation: undivided worlds of the same environment, without vehicles: the roads,
-            and room for rows.
-        shared: what there is to see.
-        frames: where the samples go.
-        number: of the worker.
-    """
+    """Senses for the agents of its share, as a zone would that owned them and saw all others."""
 
     def __init__(
-        self, simulation: Simulation, shared: SceneArrays, frames: Frames, number: int
+        self,
+        # undivided worlds of the same environment, without vehicles: the roads, and room for rows
+        simulation: Simulation,
+        shared: SceneArrays,  # what there is to see
+        frames: Frames,  # where the samples go
+        number: int,
     ) -> None:
         mounted = simulation.mounted
         assert mounted is not None

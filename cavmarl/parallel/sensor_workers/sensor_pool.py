@@ -69,17 +69,14 @@ class _Sharing:
     """Which worker senses what of the same sensors, and the time it has taken since then.
 
     Attributes:
-        shares: which worker senses what.
-        uses: ticks, in all.
         spent_s: (n, S) processor time since then, of each worker for each sensor.
-        agents: that have been sensed for, summed over these ticks.
     """
 
     def __init__(self, shares: Shares, sensors: int) -> None:
-        self.shares = shares
-        self.uses = 0
+        self.shares = shares  # which worker senses what
+        self.uses = 0  # ticks, in all
         self.spent_s = np.zeros((shares.workers, sensors))
-        self.agents = 0
+        self.agents = 0  # that have been sensed for, summed over these ticks
 
     def note(self, spent_s: NDArray[np.float64], agents: int) -> None:
         self.uses += 1
@@ -110,14 +107,13 @@ class SensorWorkers:
     for; a dead one is replaced, and its successor senses the same again.
 
     Attributes:
-        times: where the time has gone.
         shared: with the processes, once they have been started.
     """
 
     shared: SceneArrays
 
     def __init__(self, plan: SensorWorkerPlan) -> None:
-        self.times = SensorWorkerTimes()
+        self.times = SensorWorkerTimes()  # where the time has gone
         self._plan = plan
         self._pool: Pool | None = None
         self._unused = weakref.finalize(self, plan.frames.close)

@@ -41,10 +41,8 @@ class DividedWorlds(LocalWorlds):
     Attributes:
         arrays: of this process.
         in_next_step: when worlds begin anew.
-        placement: which host has which zones.
         leader: runs the phases.
         spent_s: (1, zones) processor time of each zone of all worlds, if hosts measure it.
-        mover: has that changed; None: it does not change.
 
     Raises:
         MissingExtraError: Ray is not installed.
@@ -62,7 +60,7 @@ class DividedWorlds(LocalWorlds):
     ) -> None:
         _check(world, num_worlds, workers)
         config = world.config
-        self.placement = StepPlacement(world, 1, workers)
+        self.placement = StepPlacement(world, 1, workers)  # which host has which zones
         (part,) = parts_of(self.placement.plans, world.partition.count)
         memory, arrays, inputs = replicated_arrays(world, num_worlds)
         super().__init__(
@@ -70,7 +68,7 @@ class DividedWorlds(LocalWorlds):
         )
         self._is_torn = False
         self.spent_s = np.zeros((1, world.partition.count))
-        self.mover: Mover | None = None
+        self.mover: Mover | None = None  # has that changed; None: it does not change
         if every := config.workers.balance_steps:
             self.mover = Mover(self.placement, world.partition.count, every, self.spent_s)
 

@@ -44,14 +44,10 @@ Spans = Sequence[tuple[int, NDArray[np.int64]]]
 
 
 class ReplicaMemory:
-    """The arrays of one process.
-
-    Attributes:
-        arenas: (n,) words each; what arrays lie in.
-    """
+    """The arrays of one process."""
 
     def __init__(self) -> None:
-        self.arenas: list[Words] = []
+        self.arenas: list[Words] = []  # (n,) words each; what arrays lie in
         self._starts: list[int] = []
         self._used = ARENA  # bytes of the arena that small arrays share
         self._shared = -1  # its number
@@ -124,14 +120,13 @@ def _address(array: Array) -> int:
 
 
 class MemoryReplica:
-    """What one other process knows of a memory.
+    """What one other process knows of a memory."""
 
-    Args:
-        memory: whose arrays are all made.
-        pieces: how many there can be at most in a stream that are not next to each other.
-    """
-
-    def __init__(self, memory: ReplicaMemory, pieces: int) -> None:
+    def __init__(
+        self,
+        memory: ReplicaMemory,  # whose arrays are all made
+        pieces: int,  # how many there can be at most in a stream that are not next to each other
+    ) -> None:
         self._memory = memory
         self._stream: Words = np.empty(memory.most_words + 6 * pieces + 1, dtype=np.uint64)
         self._size = 0

@@ -241,15 +241,14 @@ def advance(
 
 
 @kernel
-def resolve(worlds: Worlds, scratch: Scratch, grid: Grid) -> None:
-    """Mark contacts in `next_rows`.
-
-    Args:
-        worlds: events and hit of the owned next_rows are written; num_contacts rises by one for
-            each vehicle when it begins to touch another.
-        scratch: room.
-        grid: spatial index over the vehicles of one world, filled here as far as it is needed.
-    """
+def resolve(
+    # events and hit of the owned next_rows are written; num_contacts rises by one for each vehicle
+    # when it begins to touch another
+    worlds: Worlds,
+    scratch: Scratch,
+    grid: Grid,  # spatial index over the vehicles of one world, filled here as far as it is needed
+) -> None:
+    """Mark contacts in `next_rows`."""
     for w in range(worlds.ticks.shape[0]):
         rows = worlds.next_rows[w]
         touch = find_contacts(rows, worlds.num_near[w], grid, scratch.hit)

@@ -120,21 +120,18 @@ def _note(
 
 @kernel
 def pass_on(
-    vehicle: int, source: int, row: int, target: int, epoch: int, zoned: Zoned, side: int, w: int
+    vehicle: int,
+    source: int,  # the zone that owns it
+    row: int,  # where it probably is there
+    target: int,  # the zone that will own it
+    epoch: int,  # from then on
+    zoned: Zoned,  # the rows of all zones, and how many they are
+    side: int,  # whose rows, 0 or 1
+    w: int,
 ) -> int:
     """Make a vehicle a ghost of the zone that owned it, and an owned row where it was a ghost.
 
     The new row says what the old one does, but for its owner and epoch.
-
-    Args:
-        vehicle: its id.
-        source: the zone that owns it.
-        row: where it probably is there.
-        target: the zone that will own it.
-        epoch: from then on.
-        zoned: the rows of all zones, and how many they are.
-        side: whose rows, 0 or 1.
-        w: in which world.
 
     Returns:
         its row at the target; -1: the source does not own it; -2: the target has no ghost of it.

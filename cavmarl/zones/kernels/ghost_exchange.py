@@ -123,17 +123,13 @@ def gather(
 
 @kernel
 def note_gathered(
-    zones: ZoneArrays, borders: Borders, zoned: Zoned, side: int, book: BorderRecords
+    zones: ZoneArrays,
+    borders: Borders,  # when a vehicle is near one
+    zoned: Zoned,  # num_outer is written: rows may change from here on
+    side: int,  # whose rows, 0 or 1
+    book: BorderRecords,  # vehicles near a border are written
 ) -> None:
-    """All zones have gathered their ghosts: note vehicles near a border, as `exchange` does.
-
-    Args:
-        zones: of the partition.
-        borders: when a vehicle is near one.
-        zoned: num_outer is written: rows may change from here on.
-        side: whose rows, 0 or 1.
-        book: vehicles near a border are written.
-    """
+    """All zones have gathered their ghosts: note vehicles near a border, as `exchange` does."""
     for w in range(zoned.num_outer.shape[1]):
         for zone in range(zones.rects.shape[0]):
             zoned.num_outer[zone, w] = -1

@@ -355,16 +355,12 @@ def _farther(
 
 @kernel
 def farthest_m(
-    roads: RoadArrays, rects: NDArray[np.float64], zone: int, looks: NDArray[np.void]
+    roads: RoadArrays,
+    rects: NDArray[np.float64],  # (k, 4) all zones, as in `ZoneArrays`
+    zone: int,
+    looks: NDArray[np.void],  # LOOK (L,) what `find_looks` has found for it
 ) -> float:
-    """How far outside of a zone the farthest place lies that its drivers may ask about.
-
-    Args:
-        roads: the road arrays.
-        rects: (k, 4) all zones, as in `ZoneArrays`.
-        zone: which one.
-        looks: LOOK (L,) what `find_looks` has found for it.
-    """
+    """How far outside of a zone the farthest place lies that its drivers may ask about."""
     squared = 0.0
     for lane in range(roads.lanes.shape[0]):
         look = looks[lane]

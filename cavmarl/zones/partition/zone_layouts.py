@@ -192,15 +192,14 @@ def _quantile(rect: Rect, samples: Floats | None, axis: int) -> Callable[[float]
     return place
 
 
-def _quiet_cut(area: _Area, rect: Rect, axis: int, window: tuple[float, float, float]) -> float:
-    """The cut within a window that divides the fewest junctions; of several the nearest.
-
-    Args:
-        area: whose junctions are kept whole.
-        rect: what is cut.
-        axis: 0: between left and right, 1: between below and above.
-        window: where it may begin, where the cut is wanted, where it may end.
-    """
+def _quiet_cut(
+    area: _Area,  # whose junctions are kept whole
+    rect: Rect,  # what is cut
+    axis: int,  # 0: between left and right, 1: between below and above
+    # where it may begin, where the cut is wanted, where it may end
+    window: tuple[float, float, float],
+) -> float:
+    """The cut within a window that divides the fewest junctions; of several the nearest."""
     first, wanted, last = window
     across = 1 - axis
     boxes = area.junctions
