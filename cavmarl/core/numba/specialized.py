@@ -18,29 +18,45 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-def specialized(kernel: Callable[P, R]) -> Callable[P, R]:
+def specialized(kernel: Callable[P, R], checks: bool = True) -> Callable[P, R]:
     """A kernel for one caller whose arguments, by position, are of the same types in every call.
 
     The types are those of the first call. Later calls compare what is not the same object as in the
-    call before, array by array in a bundle: another type is a TypeError.
+    call before, array by array in a bundle: another type is a TypeError. For that a call keeps its
+    arguments until the next one. Without `checks` nothing is compared: for loops in which one
+    process waits for another, whose few callers see to the types.
 
     With `NUMBA_DISABLE_JIT=1` or `NUMBA_BOUNDSCHECK=1` it is the kernel itself.
     """
     settings: Any = numba.core.config
     if settings.DISABLE_JIT or settings.BOUNDSCHECK:
         return kernel
-    call: Any = _Specialized(kernel)
+    call: Any = _Specialized(kernel) if checks else _Unchecked(kernel)
     return call  # type: ignore[no-any-return]
 
 
-class _Specialized:
+class _Unchecked:
     """Calls what Numba has compiled for the types of the first call."""
 
-    __slots__ = ("_compiled", "_forms", "_kernel", "_last")
+    __slots__ = ("_compiled", "_kernel")
 
     def __init__(self, kernel: Any) -> None:
         self._kernel = kernel
         self._compiled: Callable[..., Any] | None = None
+
+    def __call__(self, *arguments: Any) -> Any:
+        if self._compiled is None:
+            self._compiled = self._kernel.compile(tuple(map(_kind, arguments)))
+        return self._compiled(*arguments)
+
+
+class _Specialized(_Unchecked):
+    """Looks, too, whether the arguments are of these types."""
+
+    __slots__ = ("_forms", "_last")
+
+    def __init__(self, kernel: Any) -> None:
+        super().__init__(kernel)
         self._forms: tuple[_Form, ...] = ()
         self._last: tuple[Any, ...] = ()
 
@@ -57,7 +73,9 @@ class _Specialized:
 
     def _check(self, arguments: tuple[Any, ...]) -> None:
         for form, new, last in zip(self._forms, arguments, self._last, strict=True):
-            if new is not last and not form.fits(new, last):
+            if new is last or type(new) is form.scalar:
+                continue
+            if not form.fits(new, last):
                 raise TypeError(
                     f"{self._kernel.__name__}: an argument of {_kind(new)} where the first "
                     f"call had one of {form.kind}"
@@ -67,10 +85,11 @@ class _Specialized:
 class _Form:
     """What an argument has to be like: the type of the one that it was made of."""
 
-    __slots__ = ("_dtype", "_fields", "_ndim", "_python", "_wants", "kind")
+    __slots__ = ("_dtype", "_fields", "_ndim", "_python", "_wants", "kind", "scalar")
 
     def __init__(self, argument: Any, kind: Any) -> None:
         self.kind = kind
+        self.scalar: type[Any] | None = None  # that of a number
         self._python = type(argument)
         self._fields: tuple[_Form, ...] = ()
         self._dtype: np.dtype[Any] | None = None
@@ -79,18 +98,22 @@ class _Form:
             self._wants = _flags_of(argument)
         elif isinstance(argument, tuple):
             self._fields = tuple(map(_Form, argument, kind.types))
+        else:
+            self.scalar = self._python
 
     def fits(self, new: Any, last: Any) -> bool:
         """Whether an argument is of the type; `last` is one that was."""
+        if self.scalar is not None:
+            return type(new) is self.scalar or bool(_kind(new) == self.kind)
         if type(new) is not self._python:
-            return not self._fields and self._dtype is None and bool(_kind(new) == self.kind)
+            return False
         if self._dtype is not None:
             return bool(
                 (new.dtype is self._dtype or new.dtype == self._dtype)
                 and new.ndim == self._ndim
                 and new.flags.num & self._wants == self._wants
             )
-        return not self._fields or all(
+        return all(
             item is known or form.fits(item, known)
             for form, item, known in zip(self._fields, new, last, strict=True)
         )

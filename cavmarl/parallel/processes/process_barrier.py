@@ -162,11 +162,11 @@ _has, _set, _look, _pass, present_core = (
     (_plain_has, _plain_set, _plain_look, _plain_pass, _plain_core)
     if _IS_PYTHON
     else (
-        specialized(_compiled_has),
-        specialized(_compiled_set),
-        specialized(_compiled_look),
-        specialized(_compiled_pass),
-        specialized(_compiled_core),
+        specialized(_compiled_has, checks=False),
+        specialized(_compiled_set, checks=False),
+        specialized(_compiled_look, checks=False),
+        specialized(_compiled_pass, checks=False),
+        specialized(_compiled_core, checks=False),
     )
 )
 

@@ -44,6 +44,7 @@ class Image:
         self._begin = 0  # of the first array
         self._places: list[_Place] = []
         self._written: Arrays = ()  # the last time
+        self._seal = specialized(_sealed)
         self._copies: list[tuple[Array, Array]] = []  # to where, from where
 
     def write(self, arrays: Arrays) -> None:
@@ -59,7 +60,7 @@ class Image:
         if _IS_PYTHON:
             self._words[1] = _checksum(self._words[2 : self._words.item(0)])
         else:
-            _seal(self._unsigned)
+            self._seal(self._unsigned)
 
     def _find_places(self, arrays: Arrays) -> None:
         shapes = [array.shape for array in arrays]
@@ -175,9 +176,6 @@ def _sealed(words: NDArray[np.uint64]) -> None:
     words[1] = _mixed(words[2 : int(words[0])])
 
 
-_mix, _seal = specialized(_mixed), specialized(_sealed)
-
-
 def _num_words(array: Array) -> int:
     return -(-array.nbytes // _WORD)
 
@@ -193,11 +191,11 @@ def _num_same(shapes: Sequence[tuple[int, ...]], places: Sequence[_Place]) -> in
 def _checksum(words: NDArray[np.int64]) -> int:
     if _IS_PYTHON:
         return zlib.crc32(words.data)
-    return int(np.uint64(_mix(words.view(np.uint64))).view(np.int64))
+    return int(np.uint64(_mixed(words.view(np.uint64))).view(np.int64))
 
 
 def load_kernels() -> None:
     """Have the checksum ready, for this process and those that it forks."""
     words = np.full(_HEAD, _HEAD, dtype=np.int64)
     _checksum(words)
-    _seal(words.view(np.uint64))
+    _sealed(words.view(np.uint64))
