@@ -132,12 +132,8 @@ def sensed_observation(frames: Frames) -> dict[str, NDArray[Any]]:
 def named_observation(
     parts: Mapping[str, ObservationPart],  # of `observation_parts`
     frames: NDArray[np.float32],  # (…, stack, frame size): flat observations, reshaped
-) -> dict[str, NDArray[Any]]:
-    """Flat observations by sensor: views of them, but for images, which become bytes.
-
-    Returns:
-        an array (…, *shape) a sensor.
-    """
+) -> dict[str, NDArray[Any]]:  # an array (…, *shape) a sensor
+    """Flat observations by sensor: views of them, but for images, which become bytes."""
     before = frames.shape[:-2]
     return {
         name: frames[..., part.place].reshape(*before, *part.shape).astype(part.dtype, copy=False)

@@ -56,12 +56,8 @@ def save(parts: Parts) -> list[Array]:
     ]
 
 
-def load(parts: Parts, saved: Sequence[Array]) -> Gate:
-    """Put everything in its place.
-
-    Returns:
-        the gate, or a larger one.
-    """
+def load(parts: Parts, saved: Sequence[Array]) -> Gate:  # the gate, or a larger one
+    """Put everything in its place."""
     everywhere = np.ones(len(parts.worlds.ticks), dtype=np.bool_)
     rest = iter(saved)
     parts.division.align()

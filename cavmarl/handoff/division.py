@@ -255,12 +255,8 @@ class Division:
         switch: Switch,  # the vehicle, its source and its target
         state: bytes | None,  # what the new owner goes on with; None: the old one's row as it is
         hint: int = 0,  # the row where the old one probably keeps it
-    ) -> int:
-        """Let a vehicle change its owner, by its committed row.
-
-        Returns:
-            the row where the new one keeps it.
-        """
+    ) -> int:  # the row where the new one keeps it
+        """Let a vehicle change its owner, by its committed row."""
         place = self._pass_on(
             switch.vehicle, switch.source, hint, switch.target, switch.epoch,
             self._zoned, self._side(self._shards[0].worlds.rows), w,
@@ -292,12 +288,8 @@ class Division:
         zone: int,  # that owns it
         outside: int,  # of which zone
         hint: int,  # the row where its owner probably keeps it
-    ) -> float | None:
-        """How far outside of a zone a vehicle is, by its committed row.
-
-        Returns:
-            the distance in m, 0 inside; None: its owner does not have it.
-        """
+    ) -> float | None:  # the distance in m, 0 inside; None: its owner does not have it
+        """How far outside of a zone a vehicle is, by its committed row."""
         place = (self.side, zone, w, hint)
         num = self._zoned.num_owned.item(zone, w)
         if hint >= num or self._ids.item(place) != vehicle:

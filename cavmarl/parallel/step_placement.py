@@ -65,12 +65,8 @@ class StepPlacement:
         spent_s: Floats,
         steps: int,  # since the last round
         pids: Mapping[int, int],  # of the workers' processes
-    ) -> bool:
-        """Plan anew by what shards have cost since the last round.
-
-        Returns:
-            whether something has to be moved.
-        """
+    ) -> bool:  # whether something has to be moved
+        """Plan anew by what shards have cost since the last round."""
         seen = self._snapshot(pids)
         cost_s = (spent_s - self._before_s) / (steps * self._ticks_per_step)
         self._before_s = spent_s.copy()
@@ -92,12 +88,8 @@ class StepPlacement:
         for balancer, plan in zip(self._balancers, plans, strict=True):
             balancer.plan = plan
 
-    def moved(self, lasted_s: float) -> int:
-        """Note how long it took to make the present plans true: later moves have to be worth that.
-
-        Returns:
-            how many shards have moved.
-        """
+    def moved(self, lasted_s: float) -> int:  # how many shards have moved
+        """Note how long it took to make the present plans true: later moves are worth that."""
         moves = sum(len(plan.moves) for plan in self.plans)
         self._rule = replace(self._rule, move_s=lasted_s / moves)
         return moves

@@ -47,11 +47,8 @@ def make_plans(
     workers: int,  # how many, at least 1
     snapshot: LoadSnapshot | None = None,  # how busy they are; None: they are idle
     rule: BalanceRule | None = None,  # of the plans
-) -> list[Plan]:
+) -> list[Plan]:  # one plan of all worlds, or one of the zones of each world
     """Worlds to workers as evenly as may be; those are divided of which there are too few.
-
-    Returns:
-        one plan of all worlds, or one of the zones of each world.
 
     Raises:
         NoAdmissibleWorkerError: workers are too busy.

@@ -123,14 +123,11 @@ def project(
     num: int,  # points of the polyline, at least 2
     x: float,  # m
     y: float,  # m
-) -> tuple[float, float, float, float]:
+) -> tuple[float, float, float, float]:  # s and d in metres, cos and sin of the direction there
     """The lane coordinates of a place: those of the nearest point of the polyline.
 
     Of several nearest points the one with the smaller `s` counts. Where that point is an end of the
     polyline, `s` and `d` are taken along the end segment's line, so `s` may leave [0, length].
-
-    Returns:
-        s and d in metres, cos and sin of the direction there.
     """
     return _project_between(points, first, num, first, first + num - 1, x, y)
 

@@ -189,12 +189,8 @@ def k_nearest(
     # (k,) int, VEHICLE rows of those found, overwritten up to the returned number
     out_row: NDArray[np.int32],
     out_squared: NDArray[np.float64],  # (k,) squared distances in m², likewise
-) -> int:
-    """The nearest vehicles around a place on the same level, sorted by distance, then by id.
-
-    Returns:
-        how many were found.
-    """
+) -> int:  # how many were found
+    """The nearest vehicles around a place on the same level, sorted by distance, then by id."""
     found = nearest_bodies(grid, row, x, y, z, radius_m, k, out_row, out_squared)
     for m in range(found):
         out_row[m] = grid.bodies[out_row[m]]["row"]

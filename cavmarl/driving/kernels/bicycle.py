@@ -64,14 +64,11 @@ def clip_control(
     crashed: bool,  # whether the car has collided
     min_speed: float,  # m/s, negative; `MIN_SPEED_MPS` in highway-env
     max_speed: float,  # m/s; `MAX_SPEED_MPS` in highway-env
-) -> tuple[float, float]:
+) -> tuple[float, float]:  # acceleration in m/s² and steering in rad
     """The control that a car obeys: highway-env's `Vehicle.clip_actions`.
 
     A crashed car comes to rest with straight wheels, with a time constant of 1 s. A car beyond
     what its engine can do falls back to that with the same time constant.
-
-    Returns:
-        acceleration in m/s² and steering in rad.
     """
     if crashed:
         steering = 0.0

@@ -26,12 +26,8 @@ def steering_control(
     d: float,  # lateral offset from the lane's centre in m, positive to the left
     heading_error: float,  # lane's direction `speed · PURSUIT_S` ahead minus the car's heading, rad
     length: float,  # of the car, m
-) -> float:
-    """The steering angle in rad that brings a car to the centre of a lane.
-
-    Returns:
-        angle within ±`MAX_STEERING_RAD`, positive to the left.
-    """
+) -> float:  # angle within ±`MAX_STEERING_RAD`, positive to the left
+    """The steering angle in rad that brings a car to the centre of a lane."""
     divisor = not_zero(speed)
     approach = math.asin(clamp(-KP_LATERAL * d / divisor, -1.0, 1.0))
     approach = clamp(approach, -MAX_APPROACH_RAD, MAX_APPROACH_RAD)

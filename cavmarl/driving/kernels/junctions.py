@@ -339,15 +339,12 @@ def press_inside(
     phase: NDArray[np.int32],  # (num_signals,) PHASE rows that are on
     dt: float,  # seconds a tick
     scratch: Scratch,  # with the lane and link indices of this tick
-) -> tuple[float, int]:
+) -> tuple[float, int]:  # press, and why it holds at the waiting position (HOLD_*)
     """How foes on the same junction press row i, whose front is beyond its stop line.
 
     Of two vehicles in conflict the one that is nearer to the shared area goes first; at equal
     distance the smaller id. Where both lead into one lane, the other follows it there. At a
     waiting position inside, row i waits until it may go on.
-
-    Returns:
-        press, and why it holds at the waiting position (HOLD_*).
     """
     row = rows[i]
     kind = travel.types[row["vtype"]]

@@ -19,12 +19,8 @@ def decode_pairs(
     steering_rad: float,  # what a steering of 1 means
     last: NDArray[np.float64],  # (W, A, 2) is written, the actions themselves
     controls: NDArray[np.float64],  # (W, A, 2) is written, what they mean
-) -> bool:
-    """Decode shares of the largest throttle and steering angle; nothing if one is out of range.
-
-    Returns:
-        whether all are within [-1, 1]; False of what is no number, too.
-    """
+) -> bool:  # whether all are within [-1, 1]; False of what is no number, too
+    """Decode shares of the largest throttle and steering angle; nothing if one is out of range."""
     for w in range(mask.shape[0]):
         for agent in range(mask.shape[1]):
             if mask[w, agent]:
@@ -51,12 +47,8 @@ def decode_choices(
     mask: NDArray[np.bool_],  # (W, A) whose are read; others stay idle
     last: NDArray[np.int64],  # (W, A) is written
     meta_actions: NDArray[np.int64],  # (W, A) is written, too
-) -> bool:
-    """Take over meta-actions; nothing if one is none.
-
-    Returns:
-        whether all are ACTION_* codes.
-    """
+) -> bool:  # whether all are ACTION_* codes
+    """Take over meta-actions; nothing if one is none."""
     for w in range(mask.shape[0]):
         for agent in range(mask.shape[1]):
             if mask[w, agent] and not 0 <= actions[w, agent] <= ACTION_SLOWER:

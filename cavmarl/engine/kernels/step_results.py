@@ -37,12 +37,8 @@ def report(
     steps: NDArray[np.int64],  # (W,) since each world's reset; are counted
     horizon: int,  # steps of an episode
     results: Results,  # are written
-) -> bool:
-    """Write what the agents have got, all but which act next.
-
-    Returns:
-        whether the trip of some vehicle has ended.
-    """
+) -> bool:  # whether the trip of some vehicle has ended
+    """Write what the agents have got, all but which act next."""
     ended = False
     for w in range(steps.size):
         steps[w] += 1
@@ -69,13 +65,10 @@ def report_who_goes_on(
     steps: NDArray[np.int64],  # (W,) since each world's reset
     horizon: int,  # steps of an episode
     results: Results,  # are written
-) -> bool:
+) -> bool:  # whether an episode is over
     """Write which agents act next and which episodes are over, once vehicles that end are gone.
 
     An episode is over at its horizon, and when no agent is there and none waits to enter.
-
-    Returns:
-        whether an episode is over.
     """
     some_over = False
     for w in range(steps.size):

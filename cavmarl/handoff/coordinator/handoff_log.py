@@ -47,11 +47,8 @@ class HandoffLog:
         vehicles: int,  # how many there have to be
         # those of them that entered since the last tick began; they stay where they are
         newborn: Sequence[Birth],
-    ) -> int:
+    ) -> int:  # how many have changed
         """Let vehicles change their owner, by the committed rows.
-
-        Returns:
-            how many have changed.
 
         Raises:
             ConfigError: a zone has not seen who enters it.

@@ -84,12 +84,8 @@ class HostPool:
     def rename(self, names: Sequence[str]) -> None:
         self._names = tuple(names)
 
-    def signal(self, part: int, how: signal.Signals) -> bool:
-        """Send a signal to the process of a part, which has to be on this machine.
-
-        Returns:
-            whether there is one at the moment.
-        """
+    def signal(self, part: int, how: signal.Signals) -> bool:  # whether there is one at the moment
+        """Send a signal to the process of a part, which has to be on this machine."""
         host = self._hosts.get(part)
         if host is not None:
             os.kill(host.pid, how)
@@ -109,11 +105,8 @@ class HostPool:
         commits: bool = True,  # the task changes their state
         # of the parts after it, where it changes them; such a task is not the noted one
         sizes: Sequence[int] | None = None,
-    ) -> list[Any]:
+    ) -> list[Any]:  # what each part has answered
         """Let all hosts do a task.
-
-        Returns:
-            what each part has answered.
 
         Raises:
             WorkerDeathError: too many hosts died of it; the pool is closed.
@@ -130,14 +123,11 @@ class HostPool:
         say: Say,
         # part, answer → arrays that what comes out is written to
         outputs: Callable[[int, Any], Arrays],
-    ) -> list[Any]:
+    ) -> list[Any]:  # what each part has answered; errors as of `run`
         """Let all hosts do a task for a caller that keeps the state of all parts itself.
 
         Nothing is committed: the successor of a dead host is told all that it
         needs.
-
-        Returns:
-            what each part has answered; errors as of `run`.
         """
         return self._command(self._all, task, say, outputs, False)
 

@@ -29,15 +29,12 @@ class Node:
     hosted: int = 0  # how many hosts it has been given
 
 
-def join() -> bool:
+def join() -> bool:  # whether `leave` has to be called
     """Join the cluster that this program belongs to, or start one on this machine.
 
     A program that has called `ray.init` is a member already. Else it is the cluster of
     `RAY_ADDRESS`, the one that `ray start` has started here, or a new one that ends with its last
     user.
-
-    Returns:
-        whether `leave` has to be called.
 
     Raises:
         MissingExtraError: Ray is not installed.
@@ -103,11 +100,8 @@ def nodes_with(cpus: int) -> list[Node]:
         time.sleep(0.1)
 
 
-def choose_nodes(known: Sequence[Node], workers: int) -> list[str]:
+def choose_nodes(known: Sequence[Node], workers: int) -> list[str]:  # names of nodes
     """A node for each host: admissible, of the lowest LoadScore, with the fewest hosts so far.
-
-    Returns:
-        names of nodes.
 
     Raises:
         NoAdmissibleWorkerError: the rest of the CPUs is on nodes that are too busy.

@@ -55,12 +55,8 @@ def note_spans(
     spans: NDArray[np.int64],  # (n, 2) first byte and the one after the last
     out: Words,  # the stream, with a word to spare behind all changes
     at: int,  # its words so far
-) -> int:
-    """Note what has changed between some bytes.
-
-    Returns:
-        its words now.
-    """
+) -> int:  # its words now
+    """Note what has changed between some bytes."""
     for n in range(spans.shape[0]):
         at = _note(memory, known, spans[n, 0], spans[n, 1], out, at)
     return at
@@ -130,12 +126,8 @@ def take_changes(
     last: int,  # and where they end
     memory: Words,  # is written
     known: Words,  # what the other process has; is written, too
-) -> bool:
-    """Put changes of another process where they belong.
-
-    Returns:
-        whether they fit there; if not, some may have been written.
-    """
+) -> bool:  # whether they fit there; if not, some may have been written
+    """Put changes of another process where they belong."""
     at = first
     size = memory.size
     while at < last:

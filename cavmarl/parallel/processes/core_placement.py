@@ -19,12 +19,8 @@ UNKNOWN = -1  # as `barrier.present_core` says it where nothing is compiled
 def homes(
     cores: Sequence[int],  # where each has been found
     usable: set[int],  # all that there are
-) -> list[int]:
-    """A core for each process, where it has been unless one before it has been there, too.
-
-    Returns:
-        as many different cores, or none if there are not so many.
-    """
+) -> list[int]:  # as many different cores, or none if there are not so many
+    """A core for each process, where it has been unless one before it has been there, too."""
     free = sorted(usable - set(cores))
     found: list[int] = []
     for core in cores:

@@ -246,12 +246,8 @@ def _await(
     order: int,
     last_s: float,  # how long the last wait was that was one
     work_s: float,  # how long was worked since
-) -> float:
-    """Return when there is a command; end with the pool.
-
-    Returns:
-        how long the last wait was, which may be this one.
-    """
+) -> float:  # how long the last wait was, which may be this one
+    """Return when there is a command; end with the pool."""
     if meeting.has(order):
         return last_s
     began = time.perf_counter()

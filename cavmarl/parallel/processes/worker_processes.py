@@ -135,12 +135,8 @@ class WorkerProcesses:
 
     def sleep(
         self, pending: Sequence[int], limit_s: float, is_lying: bool = False
-    ) -> dict[int, Process]:
-        """Sleep until one of those is done, or one is dead, but not for ever.
-
-        Returns:
-            the dead, by worker.
-        """
+    ) -> dict[int, Process]:  # the dead, by worker
+        """Sleep until one of those is done, or one is dead, but not for ever."""
         ready: list[tuple[int, int]] = []
         if self._hears_nobody(pending) if is_lying else self._lie_down(pending):
             ready = self._poll.poll(1000.0 * limit_s)

@@ -155,12 +155,8 @@ def advance(
     steering_limit: float,  # rad, of the agents' front wheels
     dt: float,  # seconds of the tick
     in_place: bool,  # whether `next_rows` is `rows`; if not, rows are put in the order of the lanes
-) -> int:
-    """Decide all controls from the committed rows, then move every owned row into `next_rows`.
-
-    Returns:
-        how many background vehicles have arrived, in all worlds.
-    """
+) -> int:  # how many background vehicles have arrived, in all worlds
+    """Decide all controls from the committed rows, then move every owned row into `next_rows`."""
     arrived = 0
     for w in range(worlds.ticks.shape[0]):
         rows = worlds.rows[w]

@@ -269,13 +269,10 @@ def _take_ghost(
 @kernel
 def take_own(
     zones: ZoneArrays, zone: int, source: NDArray[np.void], num: int, rows: NDArray[np.void]
-) -> int:
+) -> int:  # how many
     """Copy the rows of `source[:num]` that lie in a zone, as its own, to the front of `rows`.
 
     `source` and `rows` may be the same array.
-
-    Returns:
-        how many.
     """
     found = 0
     for i in range(num):
