@@ -80,11 +80,7 @@ def plan_from_dict(document: Mapping[str, Any]) -> Plan:
 
 
 def snapshot_from_dict(document: Mapping[str, Any]) -> LoadSnapshot:
-    """The snapshot of a document.
-
-    Raises:
-        ConfigError: a key is missing, or a value is none.
-    """
+    """The snapshot of a document. Raises ConfigError: a key is missing, or a value is none."""
     rows = _list(document.get("workers"), "workers")
     return LoadSnapshot(
         workers=tuple(_candidate(_table(row, "worker")) for row in rows),

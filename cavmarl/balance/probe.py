@@ -50,11 +50,7 @@ class Watch:
         self._before = _busy_s()
 
     def snapshot(self) -> LoadSnapshot:
-        """How busy others kept each worker's part of the machine.
-
-        Raises:
-            ConfigError: no worker.
-        """
+        """How busy others kept each worker's part of the machine. Raises ConfigError: no worker."""
         elapsed_s = max(time.perf_counter() - self._began_s, SHORTEST_S)
         foreign = [
             (after - before) / elapsed_s

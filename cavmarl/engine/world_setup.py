@@ -82,11 +82,7 @@ def load_world(
 
 
 def make_world(config: EnvConfig, base_dir: Path) -> World:
-    """What a configuration describes.
-
-    Raises:
-        CavmarlError: as of `load_world`.
-    """
+    """What a configuration describes. Raises CavmarlError: as of `load_world`."""
     network = load_roads(config, base_dir)
     files = resolve_demand(config, base_dir)
     demand: DemandFile | SumoDemand | None = None

@@ -7,7 +7,7 @@ of its process.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,6 +70,9 @@ class Commands:
     meta_actions: NDArray[np.int64]  # (W, A) ACTION_* codes; discrete actions
     # (W, A) CAUSE_* of events that agents tell others of, 0: none; (0, 0): no messages
     declared: NDArray[np.int32] = field(default_factory=lambda: np.zeros((0, 0), np.int32))
+
+
+COMMANDS = tuple(entry.name for entry in fields(Commands))
 
 
 class Shard:

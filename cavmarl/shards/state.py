@@ -29,7 +29,7 @@ class Use(Enum):
 S, C, T, D = Use.SAVED, Use.COMMITTED, Use.SENT, Use.DIGESTED
 
 
-class Kept(NamedTuple):
+class StateArray(NamedTuple):
     """An array, and what is done with it."""
 
     bundle: type[tuple[Any, ...]]
@@ -39,40 +39,40 @@ class Kept(NamedTuple):
 
 
 STATE = (
-    Kept(Common, "ticks", (S, C, T, D), 4),
-    Kept(Common, "keys", (S, C, T, D), 5),
-    Kept(Common, "signal_phase", (S, C, T, D), 1),
-    Kept(Common, "controllers", (S, C, T, D), 2),
-    Kept(Common, "detected_s", (S, C, T, D), 3),
-    Kept(Common, "pending", (S, C)),  # sent and digested agent by agent
-    Kept(Common, "cues", (S, C, T, D), 6),
-    Kept(Zoned, "num_owned", (C, T)),
-    Kept(Zoned, "num_rows", (C, T)),
-    Kept(Zoned, "num_near", (T,)),
-    Kept(Zoned, "num_through", (C, T)),
-    Kept(Zoned, "num_touching", (C, T)),
-    Kept(Zoned, "num_contacts", (C, T)),  # saved as the sum of all zones
-    Kept(Zoned, "num_outer", (T,)),
-    Kept(Gate, "next_order", (S, C, D), 8),
-    Kept(Gate, "queue", (C,)),  # saved and digested as far as vehicles wait
-    Kept(Gate, "num_queue", (S, C)),
-    Kept(Gate, "next_id", (S, C, D), 7),
-    Kept(Gate, "num_entered", (S, C, D), 9),
-    Kept(Gate, "counts", (S, C)),
-    Kept(Gate, "sums", (S, C)),
-    Kept(Gate, "num_passing", (C,)),  # between two steps no vehicle is passing the gate
-    Kept(Gate, "lane_taken", (C,)),
-    Kept(Outputs, "observations", (S, C, T)),  # saved where an observation has earlier frames
-    Kept(Outputs, "terms", (S, C, T)),
-    Kept(Outputs, "rewards", (S, C)),
-    Kept(Outputs, "terminated", (S, C, T)),
-    Kept(Outputs, "present", (S, C, T)),
-    Kept(Outputs, "acted", (S, C, T)),
-    Kept(Outputs, "events", (S, C, T)),
-    Kept(Outputs, "vehicle_ids", (S, C, T)),
-    Kept(Mail, "objects", (T,)),
-    Kept(Mail, "events", (T,)),
-    Kept(Mail, "signals", (T,)),
+    StateArray(Common, "ticks", (S, C, T, D), 4),
+    StateArray(Common, "keys", (S, C, T, D), 5),
+    StateArray(Common, "signal_phase", (S, C, T, D), 1),
+    StateArray(Common, "controllers", (S, C, T, D), 2),
+    StateArray(Common, "detected_s", (S, C, T, D), 3),
+    StateArray(Common, "pending", (S, C)),  # sent and digested agent by agent
+    StateArray(Common, "cues", (S, C, T, D), 6),
+    StateArray(Zoned, "num_owned", (C, T)),
+    StateArray(Zoned, "num_rows", (C, T)),
+    StateArray(Zoned, "num_near", (T,)),
+    StateArray(Zoned, "num_through", (C, T)),
+    StateArray(Zoned, "num_touching", (C, T)),
+    StateArray(Zoned, "num_contacts", (C, T)),  # saved as the sum of all zones
+    StateArray(Zoned, "num_outer", (T,)),
+    StateArray(Gate, "next_order", (S, C, D), 8),
+    StateArray(Gate, "queue", (C,)),  # saved and digested as far as vehicles wait
+    StateArray(Gate, "num_queue", (S, C)),
+    StateArray(Gate, "next_id", (S, C, D), 7),
+    StateArray(Gate, "num_entered", (S, C, D), 9),
+    StateArray(Gate, "counts", (S, C)),
+    StateArray(Gate, "sums", (S, C)),
+    StateArray(Gate, "num_passing", (C,)),  # between two steps no vehicle is passing the gate
+    StateArray(Gate, "lane_taken", (C,)),
+    StateArray(Outputs, "observations", (S, C, T)),  # saved where an observation has earlier frames
+    StateArray(Outputs, "terms", (S, C, T)),
+    StateArray(Outputs, "rewards", (S, C)),
+    StateArray(Outputs, "terminated", (S, C, T)),
+    StateArray(Outputs, "present", (S, C, T)),
+    StateArray(Outputs, "acted", (S, C, T)),
+    StateArray(Outputs, "events", (S, C, T)),
+    StateArray(Outputs, "vehicle_ids", (S, C, T)),
+    StateArray(Mail, "objects", (T,)),
+    StateArray(Mail, "events", (T,)),
+    StateArray(Mail, "signals", (T,)),
 )
 
 

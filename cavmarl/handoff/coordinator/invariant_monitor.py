@@ -71,11 +71,7 @@ class OwnersOnRecord:
         return self._checker.owners
 
     def logged(self, records: Iterable[Record]) -> None:
-        """Note records.
-
-        Raises:
-            ProtocolError: one that a correct run does not leave here.
-        """
+        """Note records. Raises ProtocolError: one that a correct run does not leave here."""
         for record in records:
             self._take(LOG, record)
             if isinstance(record, Reset):
@@ -159,22 +155,14 @@ class InvariantMonitor:
         self._watch = specialized(watch)
 
     def begin(self, w: int, births: Sequence[Birth]) -> None:
-        """Look at a world that has been reset.
-
-        Raises:
-            ProtocolError: an invariant does not hold.
-        """
+        """Look at a world that has been reset. Raises ProtocolError: an invariant does not hold."""
         self._ticks[w] = 0
         self._kept[w][0].num[:] = 0
         self._vehicles[w].clear()
         self._look(w, births, new_late=0)
 
     def end(self, w: int, births: Sequence[Birth]) -> None:
-        """Look at a world after a tick.
-
-        Raises:
-            ProtocolError: an invariant does not hold.
-        """
+        """Look at a world after a tick. Raises ProtocolError: an invariant does not hold."""
         self._ticks[w] += 1
         self._look(w, births, new_late=1)
 

@@ -54,11 +54,7 @@ class Reproducer:
     image: CommittedImage  # of the committed tick
 
     def write(self, path: Path) -> None:
-        """Write the file, which must not exist.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """Write the file, which must not exist. Raises OSError: it cannot be written."""
         plain = {name: dict(getattr(self, name)) for name in ("made_with", "config", "sources")}
         names = ("seed", "first_world", "episode", "tick", "zone", "cause", "is_first", "is_last")
         content = {

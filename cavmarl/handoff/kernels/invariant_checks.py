@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from cavmarl.core.math.rng import mix
 from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import Zoned
+from cavmarl.handoff.kernels.digests import row_digest
 from cavmarl.zones.kernels.zone_lookup import (
     Halo,
     ZoneArrays,
@@ -117,17 +118,6 @@ KIND_SUMS = 3  # zones own others, or see others, than they should
 def owner_hash(vehicle: int, epoch: int) -> np.uint64:
     """What a vehicle adds to the sum of those that a zone owns."""
     return mix(mix(np.uint64(vehicle)) + np.uint64(epoch))
-
-
-@inlined_kernel
-def _digest(
-    words: NDArray[np.uint64], i: int, masks: NDArray[np.uint64], factors: NDArray[np.uint64]
-) -> np.uint64:
-    row = words[i]  # so that several words are multiplied at once
-    total = np.uint64(0)
-    for n in range(row.shape[0]):
-        total += (row[n] & masks[n]) * factors[n]
-    return mix(total)
 
 
 @kernel
@@ -233,7 +223,7 @@ def watch(
         tallies[zone]["owned"] = owned
         seen = np.uint64(0)
         for i in range(num_owned, zoned.num_rows[zone, w]):
-            seen += _digest(own_words, i, masks, factors)
+            seen += row_digest(own_words, i, masks, factors)
         tallies[zone]["seen"] = seen
     _match(before, now, clock, strays, missing, moved, finding)
     if finding["kind"] == KIND_NONE:
@@ -303,6 +293,6 @@ def _owe_ghosts(
         other = halo.near[n]
         if other != zone and is_seen(halo, other, row, squared_distance(zones.rects, other, x, y)):
             if sought:  # many out here are seen by none
-                digest = _digest(words, i, masks, factors)
+                digest = row_digest(words, i, masks, factors)
                 sought = False
             tallies[other]["due"] += digest

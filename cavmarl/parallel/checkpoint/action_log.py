@@ -18,9 +18,8 @@ from cavmarl.core.errors import WorkerError
 from cavmarl.handoff.coordinator.journal import Journal
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.worlds_job import Task, WorldsJob
-from cavmarl.shards.shard import Commands
+from cavmarl.shards.shard import COMMANDS, Commands
 
-_COMMANDS = ("controls", "meta_actions", "declared")
 _READ_AT_ONCE = 64  # entries
 
 
@@ -49,11 +48,11 @@ class ActionLog:
             ("first_world", "<i8", ()),
             ("chosen", "|b1", (worlds,)),
         ]
-        for name in _COMMANDS:
+        for name in COMMANDS:
             array = getattr(like, name)
             fields.append((name, array.dtype.str, array.shape))
         self._row = np.zeros(1, dtype=np.dtype(fields))
-        self._commands = Commands(*(np.zeros_like(getattr(like, name)) for name in _COMMANDS))
+        self._commands = Commands(*(np.zeros_like(getattr(like, name)) for name in COMMANDS))
 
     def write(self, number: int, entry: LoggedAction) -> None:
         """Put down an entry, in the place of that and all later ones."""
@@ -61,7 +60,7 @@ class ActionLog:
         row["is_reset"], row["has_seed"] = entry.is_reset, entry.seed is not None
         row["seed"], row["first_world"] = entry.seed or 0, entry.first_world
         row["chosen"] = entry.chosen
-        for name in _COMMANDS:
+        for name in COMMANDS:
             row[name] = getattr(entry.commands, name)
         try:
             os.pwrite(self._fd, row.tobytes(), number * row.itemsize)
@@ -78,7 +77,7 @@ class ActionLog:
             some = min(count - first, _READ_AT_ONCE)
             raw = os.pread(self._fd, some * size, first * size)
             for row in np.frombuffer(raw, dtype=self._row.dtype):
-                for name in _COMMANDS:  # whose arrays kernels know: aligned and writable
+                for name in COMMANDS:  # whose arrays kernels know: aligned and writable
                     getattr(self._commands, name)[...] = row[name]
                 seed = int(row["seed"]) if row["has_seed"] else None
                 is_reset, first_world = bool(row["is_reset"]), int(row["first_world"])

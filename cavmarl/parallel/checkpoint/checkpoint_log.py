@@ -16,12 +16,11 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.parallel.checkpoint.sumo_log import FIRST_LOG_BYTES, KeptLog
 from cavmarl.parallel.processes.shared_memory import Layout, Segment, arrays_in, size_of
 from cavmarl.parallel.processes.state_image import Arrays, Image
-from cavmarl.shards.shard import Commands
+from cavmarl.shards.shard import COMMANDS, Commands
 from cavmarl.traffic.sumo.sumo_history import ToldLog
 
 STEPS = 16  # from one image to the next: a successor repeats that many at most
 _FIRST_IMAGE_BYTES = 1 << 12
-_COMMANDS = ("controls", "meta_actions", "declared")
 
 
 def make_segments(config: EnvConfig, num_worlds: int) -> list[Segment]:
@@ -55,7 +54,7 @@ class CheckpointLog:
         kept = [KeptLog(Segment(fd, 0)) for fd in descriptors[3:]]
         self._logs = kept[::2], kept[1::2]  # of each image, by world
         arrays = arrays_in(steps.map(), _layout(config, num_worlds))
-        self.entries = tuple(map(Commands, *(arrays[name] for name in _COMMANDS)))
+        self.entries = tuple(map(Commands, *(arrays[name] for name in COMMANDS)))
 
     def __len__(self) -> int:
         return self.place.item(1)
@@ -68,9 +67,8 @@ class CheckpointLog:
     def note(self, commands: Commands) -> None:
         """Write down what the agents do in one more step."""
         entry = self.entries[self.place.item(0) * STEPS + len(self)]
-        entry.controls[:] = commands.controls
-        entry.meta_actions[:] = commands.meta_actions
-        entry.declared[:] = commands.declared
+        for name in COMMANDS:
+            getattr(entry, name)[...] = getattr(commands, name)
         self.place[1] += 1
         self.is_prepared = False
 
@@ -118,5 +116,5 @@ class CheckpointLog:
 def _layout(config: EnvConfig, num_worlds: int) -> Layout:
     agents: tuple[int, ...] = (2 * STEPS, num_worlds, config.population.num_ids)
     return dict(
-        zip(_COMMANDS, (("<f8", (*agents, 2)), ("<i8", agents), ("<i4", agents)), strict=True)
+        zip(COMMANDS, (("<f8", (*agents, 2)), ("<i8", agents), ("<i4", agents)), strict=True)
     )

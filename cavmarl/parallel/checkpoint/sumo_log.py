@@ -29,11 +29,7 @@ class KeptLog:
         self._size = 0
 
     def write(self, log: ToldLog) -> None:
-        """Bring it up to date.
-
-        Raises:
-            OSError: there is no memory for it.
-        """
+        """Bring it up to date. Raises OSError: there is no memory for it."""
         words = log.words
         # One word in front says how many there are: it is written last.
         self._make_room(1 + len(words))

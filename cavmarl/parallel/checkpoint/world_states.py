@@ -61,11 +61,7 @@ def pack(image: Image, worlds: Sequence[Sequence[Array]]) -> tuple[NDArray[np.in
 def unpack(
     image: Image, sizes: NDArray[np.int64], content: Bytes, dtypes: Sequence[np.dtype[Any]]
 ) -> list[list[Array]]:
-    """The arrays of each of some worlds.
-
-    Raises:
-        WorkerError: they are not what was packed.
-    """
+    """The arrays of each of some worlds. Raises WorkerError: they are not what was packed."""
     worlds = []
     for case in np.split(content, np.cumsum(sizes)[:-1]) if sizes.size else []:
         image.put(case)

@@ -112,11 +112,7 @@ class FramedSocket:
     def send(
         self, kind: IntEnum, order: int, letter: Any = None, arrays: Sequence[Array] = ()
     ) -> None:
-        """Send one frame.
-
-        Raises:
-            OSError: the other end is gone, or does not read.
-        """
+        """Send one frame. Raises OSError: the other end is gone, or does not read."""
         dialect = self._dialect
         text = b"" if letter is None else dialect.write(letter)
         data = [array.data.cast("B") for array in arrays if array.nbytes]

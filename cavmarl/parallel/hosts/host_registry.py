@@ -24,11 +24,7 @@ class Launcher(Protocol):
     address: str  # of this machine, under which they reach it
 
     def start(self, place: tuple[str, int], secret: bytes) -> None:
-        """Start all of them; each runs `host.serve`.
-
-        Raises:
-            WorkerError: they cannot be started.
-        """
+        """Start all of them; each runs `host.serve`. Raises WorkerError: they cannot be started."""
         ...
 
     def restart(self, number: int) -> None:

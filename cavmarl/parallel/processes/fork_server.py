@@ -115,11 +115,7 @@ class ForkServer:
         return self._process.pid
 
     def fork(self, number: int) -> Process:
-        """A new process for a worker.
-
-        Raises:
-            WorkerError: this process has no descriptors left.
-        """
+        """A new process for a worker. Raises WorkerError: this process has no descriptors left."""
         ours, theirs = _wires()
         try:
             pid = int(self._ask({"fork": number}, theirs.fileno())["pid"])

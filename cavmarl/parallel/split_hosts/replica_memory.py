@@ -8,7 +8,7 @@ other end: what it knows of this memory, what is to be sent, and what has come (
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from math import prod
 from typing import Any, NamedTuple
 
@@ -152,9 +152,7 @@ class MemoryReplica:
 
     def note(self, spans: Spans) -> None:
         for arena, bounds in spans:
-            at = self._open(arena)
-            memory, known = self._memory.arenas[arena], self._known[arena]
-            self._close(self._note_spans(memory, known, bounds, self._stream, at))
+            self._write(arena, self._note_spans, bounds)
 
     def note_rows(
         self,
@@ -164,17 +162,11 @@ class MemoryReplica:
         counts: NDArray[np.int64],
     ) -> None:
         """Note what has changed in the first rows of zones; see `kernels.replicas.note_rows`."""
-        at = self._open(place.arena)
-        memory, known = self._memory.arenas[place.arena], self._known[place.arena]
-        self._close(
-            self._note_rows(memory, known, place.first, strides, zones, counts, self._stream, at)
-        )
+        self._write(place.arena, self._note_rows, place.first, strides, zones, counts)
 
     def note_agents(self, place: Place, size: int, marks: NDArray[np.bool_]) -> None:
         """Note what has changed of some agents; see `kernels.replicas.note_agents`."""
-        at = self._open(place.arena)
-        memory, known = self._memory.arenas[place.arena], self._known[place.arena]
-        self._close(self._note_agents(memory, known, place.first, size, marks, self._stream, at))
+        self._write(place.arena, self._note_agents, place.first, size, marks)
 
     def take(self, stream: Words) -> None:
         """Make the changes that the other process has sent."""
@@ -188,13 +180,11 @@ class MemoryReplica:
                 raise MessageError("changes of a memory that is not like this one")
             at = end
 
-    def _open(self, arena: int) -> int:
-        """Begin with the changes of one part of the memory; where its groups begin."""
-        self._stream[self._size] = arena
-        return self._size + 2
-
-    def _close(self, at: int) -> None:
-        """End it there; without groups it was none."""
-        if at > self._size + 2:
+    def _write(self, arena: int, note: Callable[..., int], *what: Any) -> None:
+        """Let a kernel write the changes of one part of the memory; without groups it was none."""
+        memory, known, first = self._memory.arenas[arena], self._known[arena], self._size + 2
+        at = note(memory, known, *what, self._stream, first)
+        if at > first:
+            self._stream[self._size] = arena
             self._stream[self._size + 1] = at
             self._size = at

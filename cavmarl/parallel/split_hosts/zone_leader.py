@@ -59,11 +59,7 @@ class ZoneLeader:
         self._pool = pool
 
     def each(self, phase: str, *arguments: Any) -> None:
-        """Run a phase on every shard.
-
-        Raises:
-            WorkerError: hosts cannot go on.
-        """
+        """Run a phase on every shard. Raises WorkerError: hosts cannot go on."""
         inputs = self._inputs
         if self._pool is None:
             self._everybody.each(phase, *arguments)

@@ -118,11 +118,7 @@ class Leader:
         self._own.take(zones)
 
     def each(self, phase: str, *arguments: Any) -> None:
-        """Run a phase on every shard.
-
-        Raises:
-            LeftAloneError: a follower has failed.
-        """
+        """Run a phase on every shard. Raises LeftAloneError: a follower has failed."""
         rule = PHASES[phase]
         name = rule.together or phase
         if name == "move":
