@@ -17,7 +17,7 @@ from cavmarl.parallel.step_arrays import StepArrays, layout_of
 __all__ = ["TrivialJob", "make_jobs"]
 
 
-class TrivialJob:
+class TrivialJob(Job):
     """Worlds in which every agent sees how many tasks there have been.
 
     Args:
@@ -29,12 +29,6 @@ class TrivialJob:
         self._tasks = np.zeros(1, dtype=np.int64)
         arrays.mask[:] = True
         arrays.acted[:] = True
-
-    def afterwards(self) -> None:
-        """Nothing to do."""
-
-    def prepare(self) -> None:
-        """Nothing to do."""
 
     def perform(self, task: int, letter: Any) -> None:
         """Show the number of this task."""

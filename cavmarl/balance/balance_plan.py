@@ -18,55 +18,31 @@ VERSION = 1
 
 
 class ShardMove(NamedTuple):
-    """A shard that changes its worker.
-
-    Attributes:
-        world: its world.
-        zone: its zone.
-        source: where it was.
-        target: where it goes.
-    """
+    """A shard that changes its worker."""
 
     world: int
     zone: int
-    source: int
-    target: int
+    source: int  # where it was
+    target: int  # where it goes
 
 
 class WorkerLoad(NamedTuple):
-    """What a plan makes of a worker that answers.
-
-    Attributes:
-        worker: its number.
-        score: its LoadScore before.
-        shards: how many it hosts.
-        load_s: what they cost, seconds a tick.
-        tick_s: how long it takes for them beside what others use of it.
-    """
+    """What a plan makes of a worker that answers."""
 
     worker: int
-    score: float
-    shards: int
-    load_s: float
-    tick_s: float
+    score: float  # its LoadScore before
+    shards: int  # how many it hosts
+    load_s: float  # what they cost, seconds a tick
+    tick_s: float  # how long it takes for them beside what others use of it
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A placement, reproducible: `make_plan(plan.problem) == plan`.
+    """A placement, reproducible: `make_plan(plan.problem) == plan`."""
 
-    Attributes:
-        problem: what it follows from.
-        homes: worker of each shard, in the order of `problem.shards`.
-        method: how it was found, in words.
-
-    Raises:
-        ConfigError: not one home a shard, or one that does not answer.
-    """
-
-    problem: Problem
-    homes: tuple[int, ...]
-    method: str
+    problem: Problem  # what it follows from
+    homes: tuple[int, ...]  # worker of each shard, in the order of `problem.shards`
+    method: str  # how it was found, in words
 
     def __post_init__(self) -> None:
         answering = {one.worker for one in self.problem.snapshot.workers if one.available}

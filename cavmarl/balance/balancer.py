@@ -15,9 +15,6 @@ from cavmarl.core.errors import ConfigError
 class Balancer:
     """Keeps the plan, and what is known of the shards' costs.
 
-    Args:
-        first: shards, neighbours, workers and rule; `equal_costs` where nothing is measured yet.
-
     Attributes:
         plan: the present one; each is made again from its own problem.
 
@@ -25,7 +22,11 @@ class Balancer:
         NoAdmissibleWorkerError: all workers are excluded.
     """
 
-    def __init__(self, first: Problem) -> None:
+    def __init__(
+        self,
+        # shards, neighbours, workers and rule; `equal_costs` where nothing is measured yet
+        first: Problem,
+    ) -> None:
         self.plan: Plan = make_plan(first)
         self._smooth = SmoothCosts()
         self._costs = first.shards
@@ -36,11 +37,7 @@ class Balancer:
         return self._costs
 
     def measure(self, measured: Iterable[ShardCost]) -> None:
-        """Take in what all shards have cost lately, in any order.
-
-        Raises:
-            ConfigError: not the shards of the plan.
-        """
+        """Take in what all shards have cost lately, in any order."""
         rows = sorted(measured)
         names = [(shard.world, shard.zone) for shard in rows]
         if names != [(shard.world, shard.zone) for shard in self.plan.problem.shards]:
@@ -49,17 +46,12 @@ class Balancer:
 
     def round(
         self,
-        snapshot: LoadSnapshot,
+        snapshot: LoadSnapshot,  # of the workers that there are now
         *,
-        costs: tuple[ShardCost, ...] | None = None,
-        rule: BalanceRule | None = None,
+        costs: tuple[ShardCost, ...] | None = None,  # to go by; default: the measured ones
+        rule: BalanceRule | None = None,  # default: that of the present plan
     ) -> Plan:
         """Move what has to be moved, and a few shards more if that is worth it.
-
-        Args:
-            snapshot: of the workers that there are now.
-            costs: to go by; default: the measured ones.
-            rule: default: that of the present plan.
 
         Raises:
             NoAdmissibleWorkerError: a worker is lost, and all others are excluded.

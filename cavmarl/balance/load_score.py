@@ -43,18 +43,13 @@ def _check_share(name: str, value: float) -> None:
 class Utilisation:
     """How much of each resource is in use, as shares of it.
 
-    Attributes:
-        cpu: of the processors.
-        ram: of the memory.
-        gpu: of the GPU; 0 where there is none.
-
     Raises:
         ConfigError: a value outside of [0, 1], or none.
     """
 
-    cpu: float
-    ram: float
-    gpu: float = 0.0
+    cpu: float  # of the processors
+    ram: float  # of the memory
+    gpu: float = 0.0  # of the GPU; 0 where there is none
 
     def __post_init__(self) -> None:
         for name in RESOURCES:
@@ -63,20 +58,13 @@ class Utilisation:
 
 @dataclass(frozen=True)
 class LoadRule:
-    """How workers are scored and which ones are excluded.
+    """How workers are scored and which ones are excluded."""
 
-    Attributes:
-        weights: of CPU, RAM and GPU in the score; they add up to 1.
-        thresholds: a worker that uses more is excluded; one that uses as much is not.
-        margin: a preferred worker is kept while its score is at most this above the best one.
-
-    Raises:
-        ConfigError: a weight below 0, weights that do not sum to 1, a threshold outside of
-            [0, 1], thresholds that would leave nothing of a worker, a margin below 0.
-    """
-
+    # of CPU, RAM and GPU in the score; they add up to 1
     weights: tuple[float, float, float] = WEIGHTS
+    # a worker that uses more is excluded; one that uses as much is not
     thresholds: tuple[float, float, float] = THRESHOLDS
+    # a preferred worker is kept while its score is at most this above the best one
     margin: float = 0.05
 
     def __post_init__(self) -> None:
@@ -108,35 +96,22 @@ DEFAULT_RULE = LoadRule()
 
 @dataclass(frozen=True)
 class Candidate:
-    """A worker that could be chosen.
-
-    Attributes:
-        worker: its number.
-        use: what is used of its resources.
-        hosted: how many shards it has; of two with the same score the one with fewer is chosen.
-        available: whether it answers, and what is known of it is recent.
-    """
+    """A worker that could be chosen."""
 
     worker: int
-    use: Utilisation
+    use: Utilisation  # what is used of its resources
+    # how many shards it has; of two with the same score the one with fewer is chosen
     hosted: int = 0
-    available: bool = True
+    available: bool = True  # whether it answers, and what is known of it is recent
 
 
 class Rejection(NamedTuple):
-    """Why a worker is not asked.
-
-    Attributes:
-        worker: its number.
-        resource: `cpu`, `ram`, `gpu` or `unavailable`.
-        value: the share in use; None: it is not available.
-        threshold: what the value is above; None: it is not available.
-    """
+    """Why a worker is not asked."""
 
     worker: int
-    resource: str
-    value: float | None
-    threshold: float | None
+    resource: str  # `cpu`, `ram`, `gpu` or `unavailable`
+    value: float | None  # the share in use; None: it is not available
+    threshold: float | None  # what the value is above; None: it is not available
 
     def __str__(self) -> str:
         if self.value is None:
@@ -146,20 +121,13 @@ class Rejection(NamedTuple):
 
 @dataclass(frozen=True)
 class Selection:
-    """The worker that `select` chose and why.
-
-    Attributes:
-        worker: the one.
-        preferred: the one asked for, if any.
-        outcome: why it is this one.
-        scores: (worker, LoadScore) of all admissible ones, by worker.
-        rejections: of the others, by worker; one for each resource that is too busy.
-    """
+    """The worker that `select` chose and why."""
 
     worker: int
-    preferred: int | None
-    outcome: Outcome
-    scores: tuple[tuple[int, float], ...]
+    preferred: int | None  # the one asked for, if any
+    outcome: Outcome  # why it is this one
+    scores: tuple[tuple[int, float], ...]  # (worker, LoadScore) of all admissible ones, by worker
+    # of the others, by worker; one for each resource that is too busy
     rejections: tuple[Rejection, ...]
 
     @property
@@ -187,12 +155,7 @@ def find_rejections(
 def admissible(
     candidates: Sequence[Candidate], rejections: Sequence[Rejection]
 ) -> tuple[Candidate, ...]:
-    """Those without a reason against them, by worker.
-
-    Raises:
-        NoAdmissibleWorkerError: there is none.
-        ConfigError: two candidates are the same worker.
-    """
+    """Those without a reason against them, by worker."""
     numbers = [candidate.worker for candidate in candidates]
     if len(set(numbers)) != len(numbers):
         raise ConfigError(f"workers {sorted(numbers)}: one of them is named twice")
@@ -209,23 +172,18 @@ def admissible(
 
 
 def select(
-    candidates: Sequence[Candidate],
+    candidates: Sequence[Candidate],  # all workers
+    # weights, thresholds, and how much worse a preferred worker may be
     rule: LoadRule = DEFAULT_RULE,
-    preferred: int | None = None,
+    preferred: int | None = None,  # a worker kept while it is admissible and within the margin
 ) -> Selection:
     """The admissible worker of the lowest score, or the preferred one if it is about as good.
 
     Of equal scores the one that hosts fewer shards wins, then the lower number: the order of
     `candidates` never counts.
 
-    Args:
-        candidates: all workers.
-        rule: weights, thresholds, and how much worse a preferred worker may be.
-        preferred: a worker kept while it is admissible and within the margin.
-
     Raises:
         NoAdmissibleWorkerError: all are excluded; the error holds every reason.
-        ConfigError: the preferred worker is none of them.
     """
     known = {candidate.worker for candidate in candidates}
     if preferred is not None and preferred not in known:

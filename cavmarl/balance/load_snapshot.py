@@ -18,20 +18,11 @@ SUPPOSED_IDLE = "supposed idle"
 
 @dataclass(frozen=True)
 class LoadSnapshot:
-    """Utilisation of all workers.
+    """Utilisation of all workers."""
 
-    Attributes:
-        workers: by number; at least one.
-        gpu_source: what told the use of GPUs; `none`: there is none, and it counts as 0.
-        origin: where the shares come from, in words: `measured`, `supposed idle`, `generated`.
-
-    Raises:
-        ConfigError: no worker, or one twice.
-    """
-
-    workers: tuple[Candidate, ...]
-    gpu_source: str
-    origin: str
+    workers: tuple[Candidate, ...]  # by number; at least one
+    gpu_source: str  # what told the use of GPUs; `none`: there is none, and it counts as 0
+    origin: str  # where the shares come from, in words: `measured`, `supposed idle`, `generated`
 
     def __post_init__(self) -> None:
         numbers = [candidate.worker for candidate in self.workers]

@@ -21,11 +21,6 @@ LONGEST = 40  # letters of a wrong value in a message
 
 
 def read_plan(path: Path) -> Plan:
-    """The plan of a file.
-
-    Raises:
-        ConfigError: it cannot be read, or holds no plan of this version, or more than one.
-    """
     plans = read_plans(path)
     if len(plans) != 1:
         raise ConfigError(f"{path}: {len(plans)} plans, of which one is needed")
@@ -33,11 +28,7 @@ def read_plan(path: Path) -> Plan:
 
 
 def read_plans(path: Path) -> list[Plan]:
-    """The plan of a file, or those of a manifest: when the run began, then when it ended.
-
-    Raises:
-        ConfigError: it cannot be read, or holds no plan of this version.
-    """
+    """The plan of a file, or those of a manifest: when the run began, then when it ended."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
@@ -58,11 +49,7 @@ def read_plans(path: Path) -> list[Plan]:
 
 
 def plan_from_dict(document: Mapping[str, Any]) -> Plan:
-    """The plan of a document; what follows from the rest is not read.
-
-    Raises:
-        ConfigError: not a plan of this version, or a value in it is none.
-    """
+    """The plan of a document; what follows from the rest is not read."""
     if not isinstance(document, Mapping) or document.get("schema") != SCHEMA:
         raise ConfigError(f"not a plan: there is no schema '{SCHEMA}'")
     if document.get("version") != VERSION:
@@ -93,11 +80,7 @@ def plan_from_dict(document: Mapping[str, Any]) -> Plan:
 
 
 def snapshot_from_dict(document: Mapping[str, Any]) -> LoadSnapshot:
-    """The snapshot of a document.
-
-    Raises:
-        ConfigError: a key is missing, or a value is none.
-    """
+    """The snapshot of a document. Raises ConfigError: a key is missing, or a value is none."""
     rows = _list(document.get("workers"), "workers")
     return LoadSnapshot(
         workers=tuple(_candidate(_table(row, "worker")) for row in rows),

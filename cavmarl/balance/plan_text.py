@@ -9,17 +9,7 @@ from itertools import groupby
 from cavmarl.balance.balance_plan import Plan
 from cavmarl.balance.problem import MEASURED_COSTS
 
-HEADINGS = (
-    "worker",
-    "cpu",
-    "ram",
-    "gpu",
-    "score",
-    "shards",
-    "load",
-    "tick",
-    "hosts",
-)
+HEADINGS = ("worker", "cpu", "ram", "gpu", "score", "shards", "load", "tick", "hosts")
 LEFT = len(HEADINGS) - 1  # the last column is text
 
 

@@ -22,17 +22,11 @@ GPU_QUERY = ("--query-gpu=utilization.gpu", "--format=csv,noheader,nounits")
 
 
 def take_snapshot(
-    workers: Mapping[int, int | None], interval_s: float = INTERVAL_S
+    # number → process id; None: not started yet, it will run where this process may
+    workers: Mapping[int, int | None],
+    interval_s: float = INTERVAL_S,  # for how long; this call takes as long
 ) -> LoadSnapshot:
-    """Watch the machine for `interval_s` and say how busy each worker's part of it is.
-
-    Args:
-        workers: number → process id; None: not started yet, it will run where this process may.
-        interval_s: for how long; this call takes as long.
-
-    Raises:
-        ConfigError: no worker, or an interval that is none.
-    """
+    """Watch the machine for `interval_s` and say how busy each worker's part of it is."""
     if not interval_s > 0.0:
         raise ConfigError(f"interval_s = {interval_s}: must be above 0")
     watch = Watch(workers)
@@ -47,9 +41,6 @@ class Watch:
     other workers and this process have used there: what a run computes for itself is no reason to
     take shards away. RAM is the machine's, and GPU that of its busiest one by `nvidia-smi`;
     without that it is 0 and `gpu_source` is `none`.
-
-    Args:
-        workers: number → process id, as for `take_snapshot`.
     """
 
     def __init__(self, workers: Mapping[int, int | None]) -> None:
@@ -59,11 +50,7 @@ class Watch:
         self._before = _busy_s()
 
     def snapshot(self) -> LoadSnapshot:
-        """How busy others kept each worker's part of the machine.
-
-        Raises:
-            ConfigError: no worker.
-        """
+        """How busy others kept each worker's part of the machine. Raises ConfigError: no worker."""
         elapsed_s = max(time.perf_counter() - self._began_s, SHORTEST_S)
         foreign = [
             (after - before) / elapsed_s

@@ -18,17 +18,11 @@ MAX_COST_S = 1e6  # of a tick: sums stay finite
 
 
 class ShardCost(NamedTuple):
-    """What one shard costs.
-
-    Attributes:
-        world: its world.
-        zone: its zone.
-        cost_s: seconds a tick, on an otherwise idle processor.
-    """
+    """What one shard costs."""
 
     world: int
     zone: int
-    cost_s: float
+    cost_s: float  # seconds a tick, on an otherwise idle processor
 
 
 def equal_costs(worlds: int, zones: int) -> tuple[ShardCost, ...]:
@@ -38,26 +32,17 @@ def equal_costs(worlds: int, zones: int) -> tuple[ShardCost, ...]:
 
 @dataclass(frozen=True)
 class BalanceRule:
-    """When shards move, and how many at once.
+    """When shards move, and how many at once."""
 
-    Attributes:
-        load: how workers are scored and excluded.
-        tolerance: while the slowest worker takes at most this share longer than a perfect division
-            would, nothing moves; a round that gains less than this is not made; and so much may be
-            given up to keep neighbours together.
-        max_moves: shards that change their worker in one round, those of lost workers not counted.
-        move_s: what a move costs, once.
-        payback_ticks: a round is made only if it saves the workers together that much in so many
-            ticks.
-
-    Raises:
-        ConfigError: a tolerance or a price below 0, no move a round, or no tick.
-    """
-
-    load: LoadRule = field(default_factory=LoadRule)
+    load: LoadRule = field(default_factory=LoadRule)  # how workers are scored and excluded
+    # while the slowest worker takes at most this share longer than a perfect division would,
+    # nothing moves; a round that gains less than this is not made; and so much may be given up to
+    # keep neighbours together
     tolerance: float = 0.1
+    # shards that change their worker in one round, those of lost workers not counted
     max_moves: int = 4
-    move_s: float = 0.01
+    move_s: float = 0.01  # what a move costs, once
+    # a round is made only if it saves the workers together that much in so many ticks
     payback_ticks: int = 1000
 
     def __post_init__(self) -> None:
@@ -72,30 +57,18 @@ class BalanceRule:
 
 @dataclass(frozen=True)
 class Problem:
-    """Everything that a plan follows from; it is put in order, so that no order ever counts.
+    """Everything that a plan follows from; it is put in order, so that no order ever counts."""
 
-    Attributes:
-        shards: of all worlds, by world and zone.
-        neighbors: for each zone those that share a side with it.
-        snapshot: of the workers.
-        rule: when shards move.
-        present: worker of each shard now, in the order of `shards`; None: none is hosted yet.
-        in_row: the shards of a worker follow each other, workers by their numbers, each with one at
-            least; so it is for worlds whose results lie in one array.
-        cost_source: where costs come from; if it is not `measured`, they only compare shards.
-
-    Raises:
-        ConfigError: no shard, one twice, a cost below 0 or none, a zone without a row in
-            `neighbors`, neighbours that are not each other's, more workers than shards, not one
-            present worker a shard, present workers that are not in a row though they have to be.
-    """
-
-    shards: tuple[ShardCost, ...]
-    neighbors: tuple[tuple[int, ...], ...]
-    snapshot: LoadSnapshot
-    rule: BalanceRule = field(default_factory=BalanceRule)
+    shards: tuple[ShardCost, ...]  # of all worlds, by world and zone
+    neighbors: tuple[tuple[int, ...], ...]  # for each zone those that share a side with it
+    snapshot: LoadSnapshot  # of the workers
+    rule: BalanceRule = field(default_factory=BalanceRule)  # when shards move
+    # worker of each shard now, in the order of `shards`; None: none is hosted yet
     present: tuple[int, ...] | None = None
+    # the shards of a worker follow each other, workers by their numbers, each with one at least; so
+    # it is for worlds whose results lie in one array
     in_row: bool = False
+    # where costs come from; if it is not `measured`, they only compare shards
     cost_source: str = MEASURED_COSTS
 
     def __post_init__(self) -> None:

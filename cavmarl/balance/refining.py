@@ -16,23 +16,18 @@ MOVES_A_SHARD = 4  # a limit that is not met: every change makes the slowest pai
 
 
 def refine(
-    placement: Placement,
+    placement: Placement,  # it is changed, and returned
     *,
-    until_s: float = 0.0,
+    until_s: float = 0.0,  # a makespan that is good enough
+    # of all changes that help and are worse than the best by no more than this, the one that tears
+    # fewest neighbours apart is made
     slack_s: float = 0.0,
-    max_moves: int | None = None,
+    max_moves: int | None = None,  # of shards; a swap is two. None: as many as help
 ) -> Placement:
     """Move one shard off the slowest worker, or swap it for one of another, as long as that helps.
 
     A change helps if both workers then take less long than the slowest took. Nothing is moved to
     a worker that is excluded.
-
-    Args:
-        placement: it is changed, and returned.
-        until_s: a makespan that is good enough.
-        slack_s: of all changes that help and are worse than the best by no more than this, the one
-            that tears fewest neighbours apart is made.
-        max_moves: of shards; a swap is two. None: as many as help.
     """
     left = MOVES_A_SHARD * len(placement.homes) if max_moves is None else max_moves
     touching = _touching(placement.problem)
@@ -91,23 +86,14 @@ def _best_change(
 
 
 def _more_cut(
-    near: NDArray[np.int64],
-    touching: NDArray[np.int64],
-    own: NDArray[np.int64],
-    others: NDArray[np.int64],
-    source: int,
-    targets: NDArray[np.int64],
+    near: NDArray[np.int64],  # (n, m) neighbours of each shard on each worker
+    touching: NDArray[np.int64],  # (n, n) which shards are neighbours
+    own: NDArray[np.int64],  # shards of the source
+    others: NDArray[np.int64],  # those that may be swapped for; they are the last columns
+    source: int,  # the worker that gives
+    targets: NDArray[np.int64],  # the worker that takes, column by column
 ) -> NDArray[np.int64]:
-    """How many more pairs of neighbours each change cuts, (own, targets).
-
-    Args:
-        near: (n, m) neighbours of each shard on each worker.
-        touching: (n, n) which shards are neighbours.
-        own: shards of the source.
-        others: those that may be swapped for; they are the last columns.
-        source: the worker that gives.
-        targets: the worker that takes, column by column.
-    """
+    """How many more pairs of neighbours each change cuts, (own, targets)."""
     cut = near[own, source][:, None] - near[own][:, targets]
     first = len(targets) - len(others)
     homes = targets[first:]

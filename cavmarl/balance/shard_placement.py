@@ -24,13 +24,7 @@ MIN_SPEED = 0.01  # of a worker that has nothing left: it is slow, not endless
 class Workers:
     """The workers that answer, in the order of their numbers.
 
-    Args:
-        candidates: them.
-        rejections: why some of them are given nothing more.
-        weights: of the score.
-
     Attributes:
-        numbers: of the workers.
         scores: their LoadScores.
         speeds: what is left of each.
         is_open: which ones may be given shards.
@@ -38,11 +32,11 @@ class Workers:
 
     def __init__(
         self,
-        candidates: Sequence[Candidate],
-        rejections: Sequence[Rejection],
-        weights: tuple[float, float, float],
+        candidates: Sequence[Candidate],  # them
+        rejections: Sequence[Rejection],  # why some of them are given nothing more
+        weights: tuple[float, float, float],  # of the score
     ) -> None:
-        self.numbers = tuple(candidate.worker for candidate in candidates)
+        self.numbers = tuple(candidate.worker for candidate in candidates)  # of the workers
         self.scores = tuple(load_score(candidate.use, weights) for candidate in candidates)
         self.speeds: Floats = np.maximum(1.0 - np.array(self.scores), MIN_SPEED)
         rejected = {rejection.worker for rejection in rejections}
@@ -53,15 +47,14 @@ class Workers:
 
 
 class Placement:
-    """Which shard is on which worker.
+    """Which shard is on which worker."""
 
-    Args:
-        problem: the shards.
-        workers: those that can host them.
-        homes: place in `workers` of each shard's one; -1: it has none yet.
-    """
-
-    def __init__(self, problem: Problem, workers: Workers, homes: Iterable[int]) -> None:
+    def __init__(
+        self,
+        problem: Problem,  # the shards
+        workers: Workers,  # those that can host them
+        homes: Iterable[int],  # place in `workers` of each shard's one; -1: it has none yet
+    ) -> None:
         self.problem = problem
         self.workers = workers
         self.homes = list(homes)

@@ -13,15 +13,10 @@ from cavmarl.balance.shard_placement import Placement
 from cavmarl.core.errors import NoAdmissibleWorkerError
 
 
-def divide_row(placement: Placement) -> Placement:
-    """Cut the row into one piece a worker, as long as its speed; one shard at least.
-
-    Args:
-        placement: it is changed, and returned.
-
-    Raises:
-        NoAdmissibleWorkerError: a worker is excluded, though each has to host one.
-    """
+def divide_row(
+    placement: Placement,  # it is changed, and returned
+) -> Placement:
+    """Cut the row into one piece a worker, as long as its speed; one shard at least."""
     problem, workers = placement.problem, placement.workers
     if not workers.is_open.all():
         rejections = find_rejections(problem.snapshot.workers, problem.rule.load)
@@ -43,17 +38,17 @@ def divide_row(placement: Placement) -> Placement:
     return placement
 
 
-def slide(placement: Placement, *, until_s: float, max_moves: int) -> Placement:
+def slide(
+    placement: Placement,  # it is changed, and returned
+    *,
+    until_s: float,  # a makespan that is good enough
+    max_moves: int,  # of shards
+) -> Placement:
     """Let the slowest worker's piece become shorter, again and again.
 
     It gives the shard at one of its ends to the worker beside it; that one may give one on to the
     next, and so forth, until all of them take less long than the slowest took. Of these changes
     the one after which they take least is made, of equal ones the one that moves fewer shards.
-
-    Args:
-        placement: it is changed, and returned.
-        until_s: a makespan that is good enough.
-        max_moves: of shards.
     """
     left = max_moves
     while left > 0 and placement.makespan_s > until_s:

@@ -11,16 +11,13 @@ NEWEST = 0.3  # weight of the newest measurement
 
 
 class SmoothCosts:
-    """The exponentially weighted mean of each shard's cost.
+    """The exponentially weighted mean of each shard's cost."""
 
-    Args:
-        newest: weight of the newest measurement; the first one of a shard counts whole.
-
-    Raises:
-        ConfigError: a weight that is not above 0 and at most 1.
-    """
-
-    def __init__(self, newest: float = NEWEST) -> None:
+    def __init__(
+        self,
+        # weight of the newest measurement; the first one of a shard counts whole
+        newest: float = NEWEST,
+    ) -> None:
         if not 0.0 < newest <= 1.0:
             raise ConfigError(f"newest = {newest}: must be above 0 and at most 1")
         self._newest = newest

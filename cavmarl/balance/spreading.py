@@ -10,17 +10,16 @@ from cavmarl.balance.shard_placement import Placement
 HALVINGS = 60  # of an interval: more than a float can tell
 
 
-def spread(placement: Placement, groups: Iterable[Sequence[int]]) -> Placement:
+def spread(
+    placement: Placement,  # it is changed, and returned
+    groups: Iterable[Sequence[int]],  # of shards that stay together
+) -> Placement:
     """Give each group, the costliest first, to the worker that would be through with it first.
 
     LPT: at most 4/3 - 1/(3m) times the least makespan for m equal workers (Graham, SIAM J. Appl.
     Math. 17, 1969), at most twice with different speeds (Gonzalez, Ibarra, Sahni, SIAM J. Comput.
     6, 1977). Of equal workers the one with fewer shards wins, then the lower score, then the lower
     number.
-
-    Args:
-        placement: it is changed, and returned.
-        groups: of shards that stay together.
     """
     workers, shards = placement.workers, placement.problem.shards
     loads = placement.loads_s().tolist()
@@ -41,16 +40,15 @@ def spread(placement: Placement, groups: Iterable[Sequence[int]]) -> Placement:
     return placement
 
 
-def string(placement: Placement) -> Placement:
+def string(
+    placement: Placement,  # it is changed, and returned
+) -> Placement:
     """Divide the row of all shards, by world and zone, into one piece a worker.
 
     Zones of a bisection that follow each other are neighbours, so pieces hold together. Of all such
     divisions it is one of the least makespan: the limit is halved in, and each worker takes as many
     as it can within the limit (chains on chains; Pinar and Aykanat, J. Parallel Distrib. Comput.
     64, 2004).
-
-    Args:
-        placement: it is changed, and returned.
     """
     low, high = 0.0, _longest_s(placement)
     homes = _within(placement, high)

@@ -17,11 +17,7 @@ T = TypeVar("T")
 
 
 class Registry(Generic[T]):
-    """Entries of one kind by name, in the order in which they were registered.
-
-    Args:
-        kind: names it in messages.
-    """
+    """Entries of one kind by name, in the order in which they were registered."""
 
     def __init__(self, kind: str) -> None:
         self._kind = kind
@@ -39,21 +35,16 @@ class Registry(Generic[T]):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What is registered."""
         return tuple(self._entries)
 
-    def add(self, name: str, entry: T, source: Callable[..., Any], taken: Iterable[str]) -> None:
-        """Register an entry; the module that has registered a name can do it again.
-
-        Args:
-            name: a Python name.
-            entry: what it stands for.
-            source: a function of the module that registers it.
-            taken: names of the package's own.
-
-        Raises:
-            ConfigError: the name is taken or no name.
-        """
+    def add(
+        self,
+        name: str,  # a Python name
+        entry: T,  # what it stands for
+        source: Callable[..., Any],  # a function of the module that registers it
+        taken: Iterable[str],  # names of the package's own
+    ) -> None:
+        """Register an entry; the module that has registered a name can do it again."""
         module = inspect.unwrap(getattr(source, "py_func", source)).__module__
         if not name.isidentifier():
             raise ConfigError(f"{self._kind} {name!r}: must be a name of letters, digits and _")
@@ -68,7 +59,6 @@ class Registry(Generic[T]):
         self.modules[name] = module
 
     def remove(self, name: str) -> None:
-        """Take an entry back."""
         del self._entries[name], self.modules[name]
 
     def advice(self) -> str:
@@ -83,14 +73,7 @@ REGISTERED_MODELS: Registry[int] = Registry("driver_model")
 
 
 def extension_modules(names: Iterable[str]) -> list[str]:
-    """The modules that other processes have to import, in the order of registration.
-
-    Args:
-        names: that the configuration uses.
-
-    Raises:
-        ConfigError: one was registered in the program itself, which no worker can import.
-    """
+    """The modules that other processes have to import, in the order of registration."""
     found: dict[str, None] = {}
     used = set(names)
     for registry in (REGISTERED_TERMS, REGISTERED_SENSORS, REGISTERED_MODELS):
@@ -106,11 +89,7 @@ def extension_modules(names: Iterable[str]) -> list[str]:
 
 
 def load_extensions(modules: Iterable[str]) -> None:
-    """Import the modules that register what a configuration names.
-
-    Raises:
-        WorkerError: one is not there.
-    """
+    """Import the modules that register what a configuration names."""
     for module in modules:
         try:
             importlib.import_module(module)

@@ -12,11 +12,7 @@ SEED_BITS = 63
 
 
 def check_seed(seed: Any) -> int:
-    """A seed that all random numbers can be rooted in.
-
-    Raises:
-        ConfigError: not a whole number from 0 to 2**63 - 1.
-    """
+    """A seed that all random numbers can be rooted in."""
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)):
         raise ConfigError(f"seed = {seed!r}: must be a whole number")
     if not 0 <= int(seed) < 1 << SEED_BITS:

@@ -40,17 +40,13 @@ class AgentView:
 
 
 def agent_view(
-    rows: NDArray[np.void], i: int, reach_m: float, network: RoadNetwork, step_s: float
+    rows: NDArray[np.void],  # VEHICLE (n,), own ones and ghosts
+    i: int,  # of the agent's vehicle
+    reach_m: float,  # how far away the centres of others can be
+    network: RoadNetwork,
+    step_s: float,  # seconds a step
 ) -> AgentView:
-    """The view of row i.
-
-    Args:
-        rows: VEHICLE (n,), own ones and ghosts.
-        i: of the agent's vehicle.
-        reach_m: how far away the centres of others can be.
-        network: the roads.
-        step_s: seconds a step.
-    """
+    """The view of row i."""
     dx, dy = rows["x"] - rows["x"][i], rows["y"] - rows["y"][i]
     near = dx * dx + dy * dy <= reach_m * reach_m
     near[i] = False
@@ -63,13 +59,7 @@ def agent_view(
 
 
 class RegisteredFunction:
-    """Calls a function from outside and checks what it answers.
-
-    Args:
-        name: of the term or the sensor, in messages.
-        function: of a view; its answer has `size` numbers.
-        size: how many.
-    """
+    """Calls a function from outside and checks what it answers."""
 
     def __init__(self, name: str, function: Callable[[AgentView], Any], size: int) -> None:
         self._name = name
@@ -78,12 +68,7 @@ class RegisteredFunction:
         self._unchecked = ORDER_CHECKS
 
     def __call__(self, view: AgentView) -> NDArray[np.float32]:
-        """Its numbers (size,).
-
-        Raises:
-            RegisteredFunctionError: other numbers than it should, or those that depend on the
-                order of the others.
-        """
+        """Its numbers (size,)."""
         numbers = self._ask(view)
         if self._unchecked and view.others.size > 1:
             self._unchecked -= 1

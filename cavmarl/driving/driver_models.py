@@ -40,11 +40,6 @@ def model_names() -> tuple[str, ...]:
 
 
 def model_code(name: str, key: str = "traffic.model") -> int:
-    """MODEL_* of a model.
-
-    Raises:
-        ConfigError: there is none of that name.
-    """
     if name in MODELS:
         return MODELS[name]
     if name in REGISTERED_MODELS:

@@ -141,9 +141,6 @@ def generated_types(model: int = MODEL_IDM) -> NDArray[np.void]:
     """VTYPE (1,): the passenger car of the generator and of agents.
 
     It drives with highway-env's defaults for IDM and has that car's size (5 m × 2 m).
-
-    Args:
-        model: MODEL_* of its driver.
     """
     types = np.zeros(1, dtype=VTYPE)
     car = types[0]

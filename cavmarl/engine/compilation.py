@@ -25,7 +25,6 @@ class _Announcer(_Listener):  # type: ignore[misc]
         self.has_told = False
 
     def on_start(self, event: Any) -> None:
-        """Called by Numba."""
         module = event.data["dispatcher"].py_func.__module__
         if not self.has_told and module.startswith("cavmarl."):
             self.has_told = True

@@ -23,29 +23,17 @@ from cavmarl.shards.shard import Commands, Shard
 
 
 class ComponentContext(NamedTuple):
-    """What a part is attached to.
-
-    Attributes:
-        config: the environment.
-        network: its roads.
-        num_worlds: W.
-        shards: one a zone; their rows are what a part reads.
-        division: all of them together.
-        travel: types and ways.
-        outputs: what the agents get.
-        zeros: makes the arrays that outlive a tick.
-        frames: what the rigs of the agents get.
-    """
+    """What a part is attached to."""
 
     config: EnvConfig
     network: RoadNetwork
-    num_worlds: int
-    shards: Sequence[Shard]
-    division: Division
+    num_worlds: int  # W
+    shards: Sequence[Shard]  # one a zone; their rows are what a part reads
+    division: Division  # all of them together
     travel: Travel
-    outputs: Outputs
-    zeros: Zeros
-    frames: Frames
+    outputs: Outputs  # what the agents get
+    zeros: Zeros  # makes the arrays that outlive a tick
+    frames: Frames  # what the rigs of the agents get
 
 
 class Attached(Protocol):

@@ -19,37 +19,32 @@ from cavmarl.shards.shard import Commands
 class MountedSensors:
     """The rig of an environment; see `Attached`.
 
-    Args:
-        host: what it is attached to.
-
     Attributes:
-        rig: all of its sensors.
         platform: what the sensors are mounted on.
     """
 
     def __init__(self, host: ComponentContext) -> None:
         config = host.config
         self.platform = Platform(
-            host.network,
-            generated_types()[0],
-            host.num_worlds,
-            config.population.num_ids,
-            config.clock.sim_dt_s,
-            config.clock.ticks_per_step,
-            host.shards[0].worlds.rows.shape[1],
-            make_backdrop(host.network, host.travel.types),
+            network=host.network,
+            body=generated_types()[0],
+            num_worlds=host.num_worlds,
+            num_agents=config.population.num_ids,
+            sim_dt_s=config.clock.sim_dt_s,
+            ticks_per_step=config.clock.ticks_per_step,
+            capacity=host.shards[0].worlds.rows.shape[1],
+            backdrop=make_backdrop(host.network, host.travel.types),
         )
         ids = host.zeros((host.num_worlds, config.population.num_ids), dtype=np.int64)
         ids[...] = -1
         self._host = host
-        self.rig = Rig(config.rig, self.platform, host.frames, ids)
+        self.rig = Rig(config.rig, self.platform, host.frames, ids)  # all of its sensors
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
         """Take the samples that are due at the reset of the chosen worlds (W,)."""
         self.rig.reset(self.scenes(), chosen)
 
     def begin(self, commands: Commands) -> None:
-        """Note how all agents move before the tick."""
         self.rig.begin(self.scenes())
 
     def end(self) -> None:
@@ -62,13 +57,13 @@ class MountedSensors:
         """What the agents of each zone can see now."""
         return [
             SensedScene(
-                shard.roads,
-                shard.lane_grid,
-                shard.plans,
-                shard.travel,
-                shard.worlds,
-                shard.grid,
-                self.rig.before,
+                roads=shard.roads,
+                lane_grid=shard.lane_grid,
+                plans=shard.plans,
+                travel=shard.travel,
+                worlds=shard.worlds,
+                grid=shard.grid,
+                before=self.rig.before,
             )
             for shard in self._host.shards
         ]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.driving.kernels.scripted_rows import note_cues
 from cavmarl.handoff.division import Division
 from cavmarl.shards.shard import Commands, Shard
@@ -18,18 +18,13 @@ class Cues:
     """Looks at the agents of all zones at the beginning of each tick; `Attached` to the worlds.
 
     Which cues have come is among what all shards have in common, `Worlds.cues`.
-
-    Args:
-        cues: CUE (T,) of the scene.
-        shards: one a zone.
-        division: all of them together.
     """
 
     def __init__(self, cues: NDArray[np.void], shards: Sequence[Shard], division: Division) -> None:
         self._cues = cues
         self._worlds = shards[0].worlds
         self._division = division
-        self._note_cues = repeated(note_cues)
+        self._note_cues = specialized(note_cues)
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
         """Nothing to do: with the actors of an episode no cue has come yet."""

@@ -8,23 +8,16 @@ from numpy.typing import NDArray
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.memory import Zeros
-from cavmarl.core.numba.repeated import repeated
-from cavmarl.core.records.arrays import Worlds
+from cavmarl.core.numba.specialized import specialized
+from cavmarl.core.records.arrays import Outputs, Worlds
 from cavmarl.roads.kernels.signal_phases import switch_signals
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.kernels.output_reset import clear_outputs, settle_outputs
-from cavmarl.shards.agent_outputs import make_outputs
+from cavmarl.sensors.observed import frame_size
 
 
 class SharedOutputs:
     """What all shards of W worlds share, and the steps that are taken once for all of them.
-
-    Args:
-        config: the environment.
-        network: the roads of the whole map.
-        num_worlds: W.
-        observations: (W, A, D) where the agents' are written; None: made for them.
-        zeros: makes all other outputs.
 
     Attributes:
         outputs: of all agents; every shard writes at the indices of its own ones.
@@ -33,26 +26,23 @@ class SharedOutputs:
     def __init__(
         self,
         config: EnvConfig,
-        network: RoadNetwork,
-        num_worlds: int,
+        network: RoadNetwork,  # the roads of the whole map
+        num_worlds: int,  # W
+        # (W, A, D) where the agents' are written; None: made for them
         observations: NDArray[np.float32] | None = None,
-        zeros: Zeros = huge_zeros,
+        zeros: Zeros = huge_zeros,  # makes all other outputs
     ) -> None:
         self.outputs = make_outputs(config, num_worlds, observations, zeros)
         self._roads = network.arrays
         self._sim_dt_s = config.clock.sim_dt_s
         self._weights = np.array(config.terms.weight_of_each)
         self._team_share = config.terms.team_share
-        self._switch_signals = repeated(switch_signals)
-        self._clear_outputs = repeated(clear_outputs)
-        self._settle_outputs = repeated(settle_outputs)
+        self._switch_signals = specialized(switch_signals)
+        self._clear_outputs = specialized(clear_outputs)
+        self._settle_outputs = specialized(settle_outputs)
 
     def switch_signals(self, worlds: Worlds) -> None:
-        """Bring the signals to the present tick, after `detect` of all shards.
-
-        Args:
-            worlds: of any shard; the arrays of signals are those of all.
-        """
+        """Bring the signals to the present tick, after `detect` of all shards."""
         if self._roads.signals.size > 0:
             self._switch_signals(
                 self._roads,
@@ -70,3 +60,29 @@ class SharedOutputs:
     def settle_outputs(self, chosen: NDArray[np.bool_]) -> None:
         """Finish the outputs of the chosen worlds (W,) after `sense`, before `credit`."""
         self._settle_outputs(self.outputs, self._weights, self._team_share, chosen)
+
+
+def make_outputs(
+    config: EnvConfig,
+    num_worlds: int,  # W
+    observations: NDArray[np.float32] | None = None,  # (W, A, D) to be used; None: they are made
+    zeros: Zeros = np.zeros,  # makes all others
+) -> Outputs:
+    """Outputs of W empty worlds."""
+    agents = (num_worlds, config.population.num_ids)
+    if observations is None:
+        size = config.sensors.stack * frame_size(config.sensors)
+        # Not `zeros`: NumPy asks for huge pages where it fills the array itself.
+        observations = np.full((*agents, size), 0.0, dtype=np.float32)
+    vehicle_ids = zeros(agents, dtype=np.int64)
+    vehicle_ids[...] = -1
+    return Outputs(
+        observations=observations,
+        terms=zeros((*agents, len(config.terms.names)), dtype=np.float32),
+        rewards=zeros(agents, dtype=np.float32),
+        terminated=zeros(agents, dtype=np.bool_),
+        present=zeros(agents, dtype=np.bool_),
+        acted=zeros(agents, dtype=np.bool_),
+        events=zeros(agents, dtype=np.int32),
+        vehicle_ids=vehicle_ids,
+    )

@@ -11,13 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
-from cavmarl.core.errors import (
-    CapacityError,
-    ConfigError,
-    JournalError,
-    LostTickError,
-    SumoError,
-)
+from cavmarl.core.errors import CapacityError, ConfigError, JournalError, LostTickError, SumoError
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.math.rng import world_key
 from cavmarl.core.memory import Zeros
@@ -27,7 +21,6 @@ from cavmarl.engine import world_snapshot as snapshot
 from cavmarl.engine.compilation import announce_compilation, compiling_all
 from cavmarl.engine.shard_clock import ShardClock
 from cavmarl.engine.shared_outputs import SharedOutputs
-from cavmarl.engine.state_digest import digest_world
 from cavmarl.engine.tick_setup import cut_zones, make_frames, make_tick
 from cavmarl.engine.world_views import WorldViews
 from cavmarl.handoff.coordinator.coordinator_setup import WorldRun, make_coordinators
@@ -49,31 +42,11 @@ from cavmarl.traffic.sumo.sumo_traffic import SumoTraffic
 from cavmarl.zones.partition.zone_partition import ZonePartition
 from cavmarl.zones.reach import longest_move_m
 
-# Fields of `Gate` that outlive a tick.
-KEPT_BY_GATE = (
-    "next_order", "queue", "num_queue", "next_id", "num_entered", "counts", "sums", "num_passing",
-    "lane_taken",
-)  # fmt: skip
-
 
 class Simulation(WorldViews):
     """W worlds of one environment on one map.
 
-    Args:
-        config: the environment.
-        network: its roads.
-        num_worlds: W.
-        demand: whose vehicles drive beside the generator's; of a file, or SUMO's.
-        partition: the zones; None: cut as `config.zones` says.
-        observations: (W, A, D) float32, where the agents' are written; None: made for them.
-        frames: where the samples of their rigs are written; None: made for them.
-        warm: call every kernel now, so that none is loaded in a step.
-        zeros: makes the arrays that shards write.
-        like: worlds of the same environment, whose tables are used; None: they are made.
-        runs: what coordinators are to go by, one a world; None: as `config.zones` says.
-
     Attributes:
-        everywhere: (W,) all of the worlds.
         frames: what the rigs of the agents have sensed; arrays that the next step overwrites.
     """
 
@@ -81,15 +54,20 @@ class Simulation(WorldViews):
         self,
         config: EnvConfig,
         network: RoadNetwork,
-        num_worlds: int = 1,
+        num_worlds: int = 1,  # W
+        # whose vehicles drive beside the generator's; of a file, or SUMO's
         demand: DemandFile | SumoDemand | None = None,
-        partition: ZonePartition | None = None,
+        partition: ZonePartition | None = None,  # the zones; None: cut as `config.zones` says
         *,
+        # (W, A, D) float32, where the agents' are written; None: made for them
         observations: NDArray[np.float32] | None = None,
+        # where the samples of their rigs are written; None: made for them
         frames: Frames | None = None,
-        warm: bool = False,
-        zeros: Zeros = huge_zeros,
+        warm: bool = False,  # call every kernel now, so that none is loaded in a step
+        zeros: Zeros = huge_zeros,  # makes the arrays that shards write
+        # worlds of the same environment, whose tables are used; None: they are made
         like: Simulation | None = None,
+        # what coordinators are to go by, one a world; None: as `config.zones` says
         runs: Sequence[WorldRun] | None = None,
     ) -> None:
         self.config = config
@@ -100,7 +78,7 @@ class Simulation(WorldViews):
         self._seed = 0
         self._first_world = 0
         self._episodes = np.zeros(num_worlds, dtype=np.int64)
-        self.everywhere = np.ones(num_worlds, dtype=np.bool_)
+        self.everywhere = np.ones(num_worlds, dtype=np.bool_)  # (W,) all of the worlds
         self.frames: Frames = make_frames(config, num_worlds, zeros) if frames is None else frames
         self.transfers: tuple[TransferLog, ...] = ()
         self._recovery: Recovery | None = None
@@ -172,16 +150,7 @@ class Simulation(WorldViews):
             self._keeper = Keeper(self.config, sources, refereeing.store, coordinator)
 
     def _shared_arrays(self) -> Iterator[NDArray[Any]]:
-        """What a tick changes beside the shards' own and what they have in common."""
-        tick = self._tick
-        gate = tick.gate
-        for name in KEPT_BY_GATE:
-            yield getattr(gate, name)
-        yield from self.outputs
-        if tick.traffic.rerouting is not None:
-            yield from tick.traffic.rerouting.arrays()
-        for part in tick.attached:
-            yield from part.arrays()
+        return snapshot.committed(self._parts())
 
     def _call_every_kernel(self) -> None:
         tick = self._tick
@@ -206,12 +175,7 @@ class Simulation(WorldViews):
         self._episodes[:] = 0
 
     def seed(self, seed: int, first_world: int = 0) -> None:
-        """Set the root of all random numbers; the next reset of each world is its first episode.
-
-        Args:
-            seed: the root.
-            first_world: number of the first of these worlds among all worlds of the seed.
-        """
+        """Set the root of all random numbers; the next reset of each world is its first episode."""
         self._seed = seed
         self._first_world = first_world
         self._episodes[:] = 0
@@ -220,9 +184,6 @@ class Simulation(WorldViews):
         """Begin a new episode in the chosen worlds (W,), all by default, and sense.
 
         World w's episode is a function of (seed, first_world + w, its resets since `seed`).
-
-        Raises:
-            CapacityError: the map has no room for that many agents of a closed world.
         """
         chosen = self.everywhere if chosen is None else np.ascontiguousarray(chosen, dtype=np.bool_)
         self._populate(chosen)
@@ -287,11 +248,6 @@ class Simulation(WorldViews):
     def run_tick(self, commands: Commands, is_first: bool, is_last: bool) -> None:
         """One tick of a step, begun again as often as it takes where hosts may die.
 
-        Args:
-            commands: of the agents, the same in all ticks of a step.
-            is_first: whether it begins the step.
-            is_last: whether it ends it.
-
         Raises:
             LostTickError: every host of a zone, or every coordinator, died of it.
         """
@@ -311,9 +267,6 @@ class Simulation(WorldViews):
         """Go to the committed tick of a reproducer; `run_tick` runs the next one.
 
         No further reproducers are written.
-
-        Raises:
-            JournalError: it is of other worlds.
         """
         if self._tick.sumo is not None:
             raise JournalError("a world with SUMO beside it cannot be taken up in its middle")
@@ -341,14 +294,11 @@ class Simulation(WorldViews):
 
     def host(
         self,
+        # called with the shards, and with what the phase `gather` is called with
         make: Callable[[Sequence[Shard], tuple[float, float]], Together],
-        gathers: bool = True,
+        gathers: bool = True,  # whether that phase is his, too
     ) -> None:
         """From now on let others run the phases of the shards, as `make` returns them.
-
-        Args:
-            make: called with the shards, and with what the phase `gather` is called with.
-            gathers: whether that phase is his, too.
 
         Raises:
             ConfigError: zones become others, and the caller would not be told.
@@ -357,14 +307,7 @@ class Simulation(WorldViews):
         self._tick.host(make, gathers)
 
     def time_shards(self, every: int = 1) -> ShardClock:
-        """From now on run phases zone by zone, with a clock on each.
-
-        Args:
-            every: one tick of so many; the others as ever.
-
-        Raises:
-            ConfigError: hosts die by plan, and what is repeated would be counted, too.
-        """
+        """From now on run phases zone by zone, with a clock on each."""
         if self._recovery is not None:
             raise ConfigError("zones.faults: shards are timed where no host dies; leave it out")
         self._refuse_recutting("measuring what each zone costs")
@@ -379,7 +322,6 @@ class Simulation(WorldViews):
             )
 
     def close(self) -> None:
-        """End the processes that the worlds have."""
         if self._tick.sumo is not None:
             self._tick.sumo.close()
 
@@ -418,11 +360,7 @@ class Simulation(WorldViews):
         return [roots, episodes, *snapshot.share_of(self._parts(), world)]
 
     def join(self, shares: Sequence[Sequence[NDArray[Any]]]) -> list[NDArray[Any]]:
-        """What `load` takes, of worlds of which each share has been one by itself.
-
-        Args:
-            shares: what `share_of` gave, of worlds that follow each other.
-        """
+        """What `load` takes, of worlds of which each share has been one by itself."""
         episodes = np.concatenate([share[1] for share in shares])
         return [
             shares[0][0], episodes, *snapshot.join(self._parts(), [share[2:] for share in shares])
@@ -431,15 +369,15 @@ class Simulation(WorldViews):
     def _parts(self) -> snapshot.Parts:
         tick = self._tick
         return snapshot.Parts(
-            self._shard.worlds,
-            tick.division,
-            tick.gate,
-            tick.traffic,
-            self.outputs,
-            tick.coordination,
-            self.config.sensors.stack > 1,
-            tick.attached,
-            tick.sumo,
+            worlds=self._shard.worlds,
+            division=tick.division,
+            gate=tick.gate,
+            traffic=tick.traffic,
+            outputs=self.outputs,
+            coordination=tick.coordination,
+            has_frames=self.config.sensors.stack > 1,
+            attached=tick.attached,
+            sumo=tick.sumo,
         )
 
     def suggest(self, out: NDArray[np.float64]) -> None:
@@ -453,4 +391,4 @@ class Simulation(WorldViews):
         all random numbers; not over where a record lives, nor over what a view keeps (steps to the
         horizon, held actions).
         """
-        return digest_world(self._parts(), world)
+        return snapshot.digest_world(self._parts(), world)

@@ -13,6 +13,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from cavmarl.config.env import ActionConfig, EnvConfig, SensorsConfig
 from cavmarl.config.rig import samples_per_step
+from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.mounted.frames import Frames
 from cavmarl.sensors.observed import layout, sensors_of
 from cavmarl.sensors.observed.feature import Feature
@@ -21,6 +22,7 @@ from cavmarl.sensors.registry import type_of
 # Features of one vehicle in the global state: present, x, y, cos, sin, speed.
 STATE_FEATURES = 6
 NUM_META_ACTIONS = 5
+STATE_SPEED_MPS = 40.0  # that is 1 in it
 
 
 def _box(size: int) -> spaces.Box:
@@ -97,17 +99,11 @@ def _feature_box(
 
 @dataclass(frozen=True)
 class ObservationPart:
-    """One sensor's part of an observation.
+    """One sensor's part of an observation."""
 
-    Attributes:
-        place: where its features lie in each frame of a flat observation.
-        shape: in a Dict observation; the frames of a stack are its first axis.
-        dtype: in a Dict observation.
-    """
-
-    place: slice
-    shape: tuple[int, ...]
-    dtype: DTypeLike
+    place: slice  # where its features lie in each frame of a flat observation
+    shape: tuple[int, ...]  # in a Dict observation; the frames of a stack are its first axis
+    dtype: DTypeLike  # in a Dict observation
 
 
 def observation_parts(config: SensorsConfig) -> dict[str, ObservationPart]:
@@ -135,17 +131,10 @@ def sensed_observation(frames: Frames) -> dict[str, NDArray[Any]]:
 
 
 def named_observation(
-    parts: Mapping[str, ObservationPart], frames: NDArray[np.float32]
-) -> dict[str, NDArray[Any]]:
-    """Flat observations by sensor: views of them, but for images, which become bytes.
-
-    Args:
-        parts: of `observation_parts`.
-        frames: (…, stack, frame size): flat observations, reshaped.
-
-    Returns:
-        an array (…, *shape) a sensor.
-    """
+    parts: Mapping[str, ObservationPart],  # of `observation_parts`
+    frames: NDArray[np.float32],  # (…, stack, frame size): flat observations, reshaped
+) -> dict[str, NDArray[Any]]:  # an array (…, *shape) a sensor
+    """Flat observations by sensor: views of them, but for images, which become bytes."""
     before = frames.shape[:-2]
     return {
         name: frames[..., part.place].reshape(*before, *part.shape).astype(part.dtype, copy=False)
@@ -154,15 +143,11 @@ def named_observation(
 
 
 def flat_observation(
-    names: Iterable[str], named: Mapping[str, NDArray[Any]], stack: int
+    names: Iterable[str],  # of the sensors in the order of the flat observation
+    named: Mapping[str, NDArray[Any]],  # an array a sensor, in any order
+    stack: int,  # frames in an observation
 ) -> NDArray[np.float32]:
-    """The flat observation (stack · frame size,) of one that is named by sensor.
-
-    Args:
-        names: of the sensors in the order of the flat observation.
-        named: an array a sensor, in any order.
-        stack: frames in an observation.
-    """
+    """The flat observation (stack · frame size,) of one that is named by sensor."""
     frames = [np.asarray(named[name], np.float32).reshape(stack, -1) for name in names]
     return np.concatenate(frames, axis=1).ravel()
 
@@ -188,6 +173,27 @@ def action_space(config: ActionConfig) -> spaces.Box | spaces.Discrete:
 def state_space(capacity: int) -> spaces.Box:
     """The global state: `STATE_FEATURES` numbers for each vehicle that the world can hold."""
     return _box(capacity * STATE_FEATURES)
+
+
+def global_state(
+    network: RoadNetwork, vehicles: NDArray[np.void], space: spaces.Box
+) -> NDArray[np.float32]:
+    """All vehicles in the order of their ids: present, x, y, cos, sin of the heading, speed.
+
+    x and y go from -1 to 1 over the map's extent, speed is over 40 m/s; places without a vehicle
+    are 0.
+    """
+    state = np.zeros((space.shape[0] // STATE_FEATURES, STATE_FEATURES), dtype=np.float32)
+    rows = vehicles[np.argsort(vehicles["id"])]
+    min_x, min_y, max_x, max_y = network.extent_m
+    live = state[: len(rows)]
+    live[:, 0] = 1.0
+    live[:, 1] = 2.0 * (rows["x"] - min_x) / max(max_x - min_x, 1.0) - 1.0
+    live[:, 2] = 2.0 * (rows["y"] - min_y) / max(max_y - min_y, 1.0) - 1.0
+    live[:, 3] = np.cos(rows["heading"])
+    live[:, 4] = np.sin(rows["heading"])
+    live[:, 5] = rows["speed"] / STATE_SPEED_MPS
+    return np.clip(state, -1.0, 1.0).ravel()
 
 
 def observation_table(config: SensorsConfig) -> str:

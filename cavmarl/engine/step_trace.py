@@ -37,11 +37,7 @@ class Traced(Protocol):
 
 
 class StepTrace:
-    """Notes phases, cycle by cycle.
-
-    Args:
-        cycles: how many of the last ones are kept.
-    """
+    """Notes phases, cycle by cycle."""
 
     def __init__(self, cycles: int = 10_000) -> None:
         self._cycles: deque[list[str]] = deque(maxlen=cycles)
@@ -65,8 +61,6 @@ class StepTrace:
 
 
 class _Traced:
-    """Stands for an executor."""
-
     def __init__(self, part: Any, note: Callable[[str], None]) -> None:
         self._part = part
         self._note = note

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.math.tallies import count_tick, occasions
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.core.records.arrays import Gate
 from cavmarl.engine.component import Attached
 from cavmarl.engine.shared_outputs import SharedOutputs
@@ -25,45 +25,29 @@ from cavmarl.traffic.sumo.sumo_traffic import SumoTraffic
 class Tick:
     """The phases of a tick in their order, and the parts whose calls they are.
 
-    Args:
-        shards: one a zone.
-        division: of all shards.
-        traffic: what comes.
-        commons: what all shards share.
-        gate: through which vehicles come and go.
-        attached: what acts in each tick beside the traffic.
-
     Attributes:
-        shards: one a zone.
-        division: of all shards.
-        traffic: what comes.
-        commons: what all shards share.
-        gate: through which vehicles come and go; a reset may replace it.
-        attached: what acts in each tick beside the traffic.
         executor: runs the phases of the shards, wherever they are hosted.
-        coordination: decides ownership; None: all is one zone.
-        sumo: beside these worlds; None: there is none.
         hosts_may_die: in any phase, so also those are gone through in which nothing is to be done.
     """
 
     def __init__(
         self,
-        shards: Sequence[Shard],
-        division: Division,
-        traffic: NativeTraffic,
-        commons: SharedOutputs,
-        gate: Gate,
-        attached: tuple[Attached, ...],
+        shards: Sequence[Shard],  # one a zone
+        division: Division,  # of all shards
+        traffic: NativeTraffic,  # what comes
+        commons: SharedOutputs,  # what all shards share
+        gate: Gate,  # through which vehicles come and go
+        attached: tuple[Attached, ...],  # what acts in each tick beside the traffic
     ) -> None:
         self.shards = shards
         self.division = division
         self.traffic = traffic
         self.commons = commons
-        self.gate = gate
+        self.gate = gate  # through which vehicles come and go; a reset may replace it
         self.attached = attached
         self.executor: Executor = SerialExecutor(shards)
-        self.coordination: Coordinators | None = None
-        self.sumo: SumoTraffic | None = None
+        self.coordination: Coordinators | None = None  # decides ownership; None: all is one zone
+        self.sumo: SumoTraffic | None = None  # beside these worlds; None: there is none
         self.hosts_may_die = False
         self._shard = shards[0]
         self._is_undivided = len(shards) == 1
@@ -72,17 +56,11 @@ class Tick:
         self._meet: Callable[[], None] = _there
         self._gathers = False
         self._note_phase: Callable[[str], None] = _pass_over
-        self._count_tick = repeated(count_tick)
-        self._occasions = repeated(occasions)
+        self._count_tick = specialized(count_tick)
+        self._occasions = specialized(occasions)
 
     def run(self, commands: Commands, is_first: bool, is_last: bool) -> None:
-        """Begin → attached → begin the step → advance … signals → attached → sense → end.
-
-        Args:
-            commands: of the agents, the same in all ticks of a step.
-            is_first: whether it begins the step.
-            is_last: whether it ends it.
-        """
+        """Begin → attached → begin the step → advance … signals → attached → sense → end."""
         if self.coordination is not None:
             self.coordination.begin(commands)
         for part in self.attached:
@@ -135,7 +113,6 @@ class Tick:
             self.traffic.settle(gate, worlds)
 
     def switch_signals(self) -> None:
-        """Detect → switch."""
         if self.sumo is not None:
             self.sumo.show(self._shard.worlds)
             return
@@ -186,11 +163,7 @@ class Tick:
             self.let_in(all_phases=self.hosts_may_die)
 
     def let_in(self, all_phases: bool) -> None:
-        """Rank → assign → propose, and if any departure has found a gap, accept → admit.
-
-        Args:
-            all_phases: go through the last two in any case.
-        """
+        """Rank → assign → propose, and if any departure has found a gap, accept → admit."""
         traffic, gate, worlds = self.traffic, self.gate, self._shard.worlds
         self.executor.each("rank_lanes", gate)
         traffic.assign_lanes(gate, worlds)
@@ -242,15 +215,11 @@ class Tick:
 
     def host(
         self,
+        # called with the shards, and with what the phase `gather` is called with
         make: Callable[[Sequence[Shard], tuple[float, float]], Together],
-        gathers: bool,
+        gathers: bool,  # whether that phase is his, too
     ) -> None:
-        """From now on let others run the phases of the shards, as `make` returns them.
-
-        Args:
-            make: called with the shards, and with what the phase `gather` is called with.
-            gathers: whether that phase is his, too.
-        """
+        """From now on let others run the phases of the shards, as `make` returns them."""
         team = make(self.shards, self.division.gathering)
         self.executor, self._meet = team, team.meet
         self._gathers = gathers and self.division.let_gather(team)

@@ -5,10 +5,12 @@ from __future__ import annotations
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.memory import Zeros
 from cavmarl.driving.vehicles import blank_vehicle
-from cavmarl.engine.component import ComponentContext
-from cavmarl.engine.component_setup import attach
+from cavmarl.engine.component import Attached, ComponentContext
+from cavmarl.engine.rig_component import MountedSensors
+from cavmarl.engine.scenario_cues import Cues
 from cavmarl.engine.shared_outputs import SharedOutputs
 from cavmarl.engine.tick import Tick
+from cavmarl.engine.v2x_component import Messaging
 from cavmarl.handoff.shard_setup import divide
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.mounted.frames import Frames
@@ -26,58 +28,60 @@ def make_tick(
     config: EnvConfig,
     network: RoadNetwork,
     partition: ZonePartition,
-    demand: DemandFile | SumoDemand | None,
-    commons: SharedOutputs,
-    frames: Frames,
-    zeros: Zeros,
+    demand: DemandFile | SumoDemand | None,  # of files, or SUMO's, beside the generator's
+    commons: SharedOutputs,  # what all zones of a world share
+    frames: Frames,  # of the mounted sensors
+    zeros: Zeros,  # where large arrays lie
+    # of other worlds of the same environment, as many as these; None: it is made
     traffic: NativeTraffic | None,
 ) -> Tick:
-    """The phases of a tick, over shards that are made here.
-
-    Args:
-        config: of the environment.
-        network: its roads.
-        partition: its zones.
-        demand: of files, or SUMO's, beside the generator's.
-        commons: what all zones of a world share.
-        frames: of the mounted sensors.
-        zeros: where large arrays lie.
-        traffic: of other worlds of the same environment, as many as these; None: it is made.
-    """
+    """The phases of a tick, over shards that are made here."""
     num_worlds = commons.outputs.present.shape[0]
     blank = blank_vehicle()
     if traffic is None:
         traffic = NativeTraffic(
-            network,
-            config.traffic,
-            config.population,
-            blank,
-            config.clock.sim_dt_s,
-            config.horizon_s,
-            None if isinstance(demand, SumoDemand) else demand,
-            num_worlds,
-            zeros,
-            plan_scene(config.scenario, network),
-            demand if isinstance(demand, SumoDemand) else None,
+            network=network,
+            traffic=config.traffic,
+            population=config.population,
+            blank=blank,
+            dt=config.clock.sim_dt_s,
+            horizon_s=config.horizon_s,
+            file=None if isinstance(demand, SumoDemand) else demand,
+            num_worlds=num_worlds,
+            zeros=zeros,
+            scene=plan_scene(config.scenario, network),
+            sumo=demand if isinstance(demand, SumoDemand) else None,
         )
     shards, division = divide(
         config, network, partition, traffic, commons.outputs, num_worlds, zeros
     )
     attached = attach(
         ComponentContext(
-            config,
-            network,
-            num_worlds,
-            shards,
-            division,
-            shards[0].travel,
-            commons.outputs,
-            zeros,
-            frames,
+            config=config,
+            network=network,
+            num_worlds=num_worlds,
+            shards=shards,
+            division=division,
+            travel=shards[0].travel,
+            outputs=commons.outputs,
+            zeros=zeros,
+            frames=frames,
         )
     )
     gate = make_gate(num_worlds, traffic.capacity, network.arrays, blank.dtype)
     return Tick(shards, division, traffic, commons, gate, attached)
+
+
+def attach(host: ComponentContext) -> tuple[Attached, ...]:
+    """The parts that the environment asks for, in the order in which they act."""
+    parts: list[Attached] = []
+    if host.config.scenario.name:
+        parts.append(Cues(host.travel.scripts.cues, host.shards, host.division))
+    if host.config.rig:
+        parts.append(MountedSensors(host))
+    if host.config.v2x.enabled:
+        parts.append(Messaging(host))
+    return tuple(parts)
 
 
 def make_frames(config: EnvConfig, num_worlds: int, zeros: Zeros) -> Frames:
@@ -87,7 +91,6 @@ def make_frames(config: EnvConfig, num_worlds: int, zeros: Zeros) -> Frames:
 
 
 def cut_zones(config: EnvConfig, network: RoadNetwork) -> ZonePartition:
-    """The zones that the settings ask for."""
     settings = config.zones
     return cut_map(
         network,

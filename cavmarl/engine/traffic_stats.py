@@ -21,33 +21,19 @@ from cavmarl.handoff.division import Division
 
 @dataclass(frozen=True)
 class TrafficStats:
-    """Traffic of one world since its reset; agents count as vehicles.
+    """Traffic of one world since its reset; agents count as vehicles."""
 
-    Attributes:
-        departed: vehicles that have entered, those placed at reset included.
-        waiting: departures that wait for a safe gap.
-        running: vehicles in the world.
-        arrived: vehicles that reached their goal.
-        contacts: vehicles that began to touch another one.
-        removed: agents taken out after a collision or off the road.
-        rerouted: vehicles that took another way; one that did so twice counts twice.
-        mean_speed_mps: over the vehicles in the world now.
-        mean_trip_m: over the arrived ones.
-        mean_trip_s: over the arrived ones.
-        mean_delay_s: over the arrived ones, time above what the way takes at the speed that
-            limit and driver allow.
-    """
-
-    departed: int
-    waiting: int
-    running: int
-    arrived: int
-    contacts: int
-    removed: int
-    rerouted: int
-    mean_speed_mps: float
-    mean_trip_m: float
-    mean_trip_s: float
+    departed: int  # vehicles that have entered, those placed at reset included
+    waiting: int  # departures that wait for a safe gap
+    running: int  # vehicles in the world
+    arrived: int  # vehicles that reached their goal
+    contacts: int  # vehicles that began to touch another one
+    removed: int  # agents taken out after a collision or off the road
+    rerouted: int  # vehicles that took another way; one that did so twice counts twice
+    mean_speed_mps: float  # over the vehicles in the world now
+    mean_trip_m: float  # over the arrived ones
+    mean_trip_s: float  # over the arrived ones
+    # over the arrived ones, time above what the way takes at the speed that limit and driver allow
     mean_delay_s: float
 
 

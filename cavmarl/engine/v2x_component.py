@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.records.arrays import Common
-from cavmarl.shards.shard import Commands
+from cavmarl.shards.shard import Commands, common_of
 from cavmarl.v2x.bus import Bus
 
 if TYPE_CHECKING:
@@ -20,12 +19,6 @@ class Messaging:
     """Lets the stations of W worlds send and receive at the end of each tick; an `Attached`.
 
     What is received in a tick is in the inboxes when agents sense, at its end.
-
-    Args:
-        host: what it is attached to.
-
-    Attributes:
-        bus: the messages.
     """
 
     def __init__(self, host: ComponentContext) -> None:
@@ -38,7 +31,7 @@ class Messaging:
             host.network,
             host.travel.types,
             host.division.zoned,
-            Common(*(getattr(worlds, name) for name in Common._fields)),
+            common_of(worlds),
             host.zeros,
         )
         for shard in host.shards:

@@ -35,17 +35,11 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 
 
 class World(NamedTuple):
-    """What a world is made of.
-
-    Attributes:
-        config: the environment.
-        network: its roads.
-        demand: whose vehicles drive beside the generator's; of a file, or SUMO's.
-        partition: its zones.
-    """
+    """What a world is made of."""
 
     config: EnvConfig
     network: RoadNetwork
+    # whose vehicles drive beside the generator's; of a file, or SUMO's
     demand: DemandFile | SumoDemand | None
     partition: ZonePartition
 
@@ -88,15 +82,7 @@ def load_world(
 
 
 def make_world(config: EnvConfig, base_dir: Path) -> World:
-    """What a configuration describes.
-
-    Args:
-        config: of the environment.
-        base_dir: the folder that relative files start from.
-
-    Raises:
-        CavmarlError: as of `load_world`.
-    """
+    """What a configuration describes. Raises CavmarlError: as of `load_world`."""
     network = load_roads(config, base_dir)
     files = resolve_demand(config, base_dir)
     demand: DemandFile | SumoDemand | None = None
@@ -115,10 +101,6 @@ def make_world(config: EnvConfig, base_dir: Path) -> World:
 def load_roads(config: EnvConfig, base_dir: Path) -> RoadNetwork:
     """The roads of a configuration, with the buildings and the signal programs that it names.
 
-    Args:
-        config: of the environment.
-        base_dir: the folder that relative files start from.
-
     Raises:
         MapError: the map or a file of buildings or programs cannot be read, or they do not fit.
     """
@@ -131,11 +113,6 @@ def load_roads(config: EnvConfig, base_dir: Path) -> RoadNetwork:
 
 def load_zones(config: EnvConfig, base_dir: Path, network: RoadNetwork) -> ZonePartition:
     """The zones of a configuration.
-
-    Args:
-        config: of the environment.
-        base_dir: the folder that relative files start from.
-        network: its roads.
 
     Raises:
         ConfigError: a zone file that cannot be read, or more zones than the map can hold; a zone
@@ -167,11 +144,7 @@ def find_map(env: str | Path) -> Path:
 
 
 def check_workers(workers: int | None) -> int:
-    """How many worker processes share some worlds out; 0: none, the caller's process runs them.
-
-    Raises:
-        ConfigError: no whole number from 0.
-    """
+    """How many worker processes share some worlds out; 0: none, the caller's process runs them."""
     if workers is None:
         return 0
     if isinstance(workers, bool) or not isinstance(workers, (int, np.integer)):
@@ -182,10 +155,6 @@ def check_workers(workers: int | None) -> int:
 
 
 def check_agents(config: EnvConfig) -> None:
-    """Refuse a world without agents where a caller wants to drive one.
-
-    Raises:
-        ConfigError: `population.agents` is 0.
-    """
+    """Refuse a world without agents where a caller wants to drive one."""
     if config.population.agents == 0:
         raise ConfigError("population.agents = 0: an environment needs at least one agent")

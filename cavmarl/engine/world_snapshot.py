@@ -1,4 +1,4 @@
-"""The state that the next tick of W worlds depends on, as a list of arrays, to go on from.
+"""The state that the next tick of W worlds depends on: as arrays to go on from, and as a digest.
 
 Ownership is not part of it: that changes no result. A successor of a divided world gives
 each vehicle to the zone that it is in, as at a reset.
@@ -6,51 +6,37 @@ each vehicle to the zone that it is in, as at a reset.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.records.arrays import Gate, Outputs, Worlds
+from cavmarl.core.records.arrays import Common, Gate, Outputs, Worlds
+from cavmarl.driving.vehicles import STATE_FIELDS
 from cavmarl.engine.component import Attached
 from cavmarl.handoff.coordinator.coordinators import Coordinators
 from cavmarl.handoff.division import Division
-from cavmarl.shards.shard import COMMON
+from cavmarl.shards.state import Use, arrays_of
 from cavmarl.traffic.native import NativeTraffic
 from cavmarl.traffic.sumo.sumo_traffic import SumoTraffic
 
 Array = NDArray[Any]
 
-# Fields of `Gate` that outlive a tick, beside its queue. Between two steps no vehicle is passing
-# it.
-_OF_GATE = ("next_order", "num_queue", "next_id", "num_entered", "counts", "sums")
-
 
 class Parts(NamedTuple):
-    """The parts that keep the state of W worlds.
+    """The parts that keep the state of W worlds."""
 
-    Attributes:
-        worlds: of the first shard.
-        division: of all shards.
-        gate: through which vehicles come and go.
-        traffic: what comes.
-        outputs: what agents have got; the frames of the next observation, too.
-        coordination: decides ownership; None: all is one zone.
-        has_frames: an observation has frames of the ones before.
-        attached: what acts in each tick beside the traffic.
-        sumo: beside the worlds; None: there is none.
-    """
-
-    worlds: Worlds
-    division: Division
-    gate: Gate
-    traffic: NativeTraffic
-    outputs: Outputs
-    coordination: Coordinators | None
-    has_frames: bool
-    attached: tuple[Attached, ...]
-    sumo: SumoTraffic | None
+    worlds: Worlds  # of the first shard
+    division: Division  # of all shards
+    gate: Gate  # through which vehicles come and go
+    traffic: NativeTraffic  # what comes
+    outputs: Outputs  # what agents have got; the frames of the next observation, too
+    coordination: Coordinators | None  # decides ownership; None: all is one zone
+    has_frames: bool  # an observation has frames of the ones before
+    attached: tuple[Attached, ...]  # what acts in each tick beside the traffic
+    sumo: SumoTraffic | None  # beside the worlds; None: there is none
 
 
 def save(parts: Parts) -> list[Array]:
@@ -70,16 +56,8 @@ def save(parts: Parts) -> list[Array]:
     ]
 
 
-def load(parts: Parts, saved: Sequence[Array]) -> Gate:
-    """Put everything in its place.
-
-    Args:
-        parts: of worlds of the same environment, as many as there were.
-        saved: what `save` gave.
-
-    Returns:
-        the gate, or a larger one.
-    """
+def load(parts: Parts, saved: Sequence[Array]) -> Gate:  # the gate, or a larger one
+    """Put everything in its place."""
     everywhere = np.ones(len(parts.worlds.ticks), dtype=np.bool_)
     rest = iter(saved)
     parts.division.align()
@@ -123,17 +101,12 @@ def share_of(parts: Parts, w: int) -> list[Array]:
 
 
 def join(parts: Parts, shares: Sequence[Sequence[Array]]) -> list[Array]:
-    """What `save` would give of worlds of which each share has been one.
-
-    Args:
-        parts: of as many worlds.
-        shares: what `share_of` gave, in the order in which the worlds are to be.
-    """
+    """What `save` would give of worlds of which each share has been one."""
     zones, rerouting = parts.division.count, parts.traffic.rerouting
     if parts.sumo is not None:
         shares = [_shifted(parts, parts.sumo, share, w) for w, share in enumerate(shares)]
     fields = zip(*(share[:-zones] for share in shares), strict=True)
-    joined = [_stacked(arrays) for arrays in fields]
+    joined = [_stacked(field) for field in fields]
     for w, share in enumerate(shares):
         for owned in share[-zones:]:
             rows = owned.copy()
@@ -155,26 +128,33 @@ def _shifted(
     return found
 
 
-def _stacked(arrays: Sequence[Array]) -> Array:
+def _stacked(shares: Sequence[Array]) -> Array:
     """Rows of one world each below one another, shorter ones with zeros behind."""
-    if arrays[0].ndim < 2:
-        return np.concatenate(arrays)
-    longest = max(array.shape[1] for array in arrays)
-    stacked = np.zeros((len(arrays), longest, *arrays[0].shape[2:]), dtype=arrays[0].dtype)
-    for row, array in zip(stacked, arrays, strict=True):
-        row[: array.shape[1]] = array[0]
+    if shares[0].ndim < 2:
+        return np.concatenate(shares)
+    longest = max(share.shape[1] for share in shares)
+    stacked = np.zeros((len(shares), longest, *shares[0].shape[2:]), dtype=shares[0].dtype)
+    for row, share in zip(stacked, shares, strict=True):
+        row[: share.shape[1]] = share[0]
     return stacked
 
 
 def _fixed(parts: Parts) -> Iterator[Array]:
     """The arrays whose shapes follow from the environment, (W, …)."""
-    for name in COMMON:
-        yield getattr(parts.worlds, name)
-    for name in _OF_GATE:
-        yield getattr(parts.gate, name)
-    for name, array in parts.outputs._asdict().items():
-        if name != "observations" or parts.has_frames:
+    yield from arrays_of(parts.worlds, Common, Use.SAVED)
+    yield from arrays_of(parts.gate, Gate, Use.SAVED)
+    for array in arrays_of(parts.outputs, Outputs, Use.SAVED):
+        if array is not parts.outputs.observations or parts.has_frames:
             yield array
+    for part in parts.attached:
+        yield from part.arrays()
+
+
+def committed(parts: Parts) -> Iterator[Array]:
+    """What a tick changes beside the shards' own and what they have in common."""
+    yield from arrays_of(parts.gate, Gate, Use.COMMITTED)
+    yield from arrays_of(parts.outputs, Outputs, Use.COMMITTED)
+    yield from _of_rerouting(parts)
     for part in parts.attached:
         yield from part.arrays()
 
@@ -188,3 +168,36 @@ def _put(target: Array, saved: Array) -> None:
     """Copy what both have: room for the orders of an episode grows as it is needed."""
     shared = tuple(slice(min(pair)) for pair in zip(target.shape, saved.shape, strict=True))
     target[shared] = saved[shared]
+
+
+def digest_world(parts: Parts, world: int) -> str:
+    """Hex digest of one world, whatever the order of rows; see `Simulation.state_hash`."""
+    worlds, gate, rerouting = parts.worlds, parts.gate, parts.traffic.rerouting
+    sumo = parts.sumo
+    rows = parts.division.vehicles(world)
+    rows = rows[np.argsort(rows["id"])]
+    if rerouting is not None:
+        rows["way"] = rerouting.ways_of_first_world(rows["way"], world)
+    if sumo is not None:
+        sumo.shift(rows, -world)
+    digest = hashlib.blake2b(digest_size=16)
+    for name in STATE_FIELDS:
+        digest.update(np.ascontiguousarray(rows[name]).tobytes())
+    agents = rows["agent"][rows["agent"] >= 0]
+    digest.update(worlds.pending[world, agents].tobytes())
+    queue = gate.queue[world, : gate.num_queue[world]]
+    if sumo is not None:
+        queue = queue.copy()
+        sumo.shift(queue, -world)
+    for name in queue.dtype.names or ():
+        digest.update(np.ascontiguousarray(queue[name]).tobytes())
+    common = arrays_of(worlds, Common, Use.DIGESTED)
+    for array in (*common, *arrays_of(gate, Gate, Use.DIGESTED)):
+        digest.update(array[world].tobytes())
+    if rerouting is not None:
+        for array in rerouting.state(world, parts.division.vehicles(world)):
+            digest.update(array.tobytes())
+    for part in parts.attached:
+        for array in part.arrays():
+            digest.update(array[world].tobytes())
+    return digest.hexdigest()

@@ -8,10 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
-from cavmarl.core.errors import (
-    ConfigError,
-)
-from cavmarl.core.records.arrays import Common, Gate, Outputs, Worlds
+from cavmarl.core.errors import ConfigError
+from cavmarl.core.records.arrays import Gate, Outputs, Worlds
 from cavmarl.engine.component import Attached
 from cavmarl.engine.rig_component import MountedSensors
 from cavmarl.engine.tick import Tick
@@ -23,7 +21,7 @@ from cavmarl.handoff.fault_injection.recovery import Recovery, Revival
 from cavmarl.handoff.repartitioning import Recut, Recutter
 from cavmarl.handoff.zone_view import ZoneView, view_zones
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.shards.shard import Shard
+from cavmarl.shards.shard import Shard, common_of
 from cavmarl.traffic.scenarios.scene import Scene
 from cavmarl.traffic.sumo.sumo_traffic import SumoTraffic
 from cavmarl.v2x.bus import Bus
@@ -31,19 +29,12 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 
 
 class WorldViews:
-    """Read access to W worlds that run; `Simulation` makes and steps them.
-
-    Attributes:
-        config: of the environment.
-        network: its roads.
-        num_worlds: W.
-        partition: the zones.
-    """
+    """Read access to W worlds that run; `Simulation` makes and steps them."""
 
     config: EnvConfig
     network: RoadNetwork
-    num_worlds: int
-    partition: ZonePartition
+    num_worlds: int  # W
+    partition: ZonePartition  # the zones
     _shards: Sequence[Shard]
     _tick: Tick
     _recovery: Recovery | None
@@ -61,7 +52,6 @@ class WorldViews:
 
     @property
     def capacity(self) -> int:
-        """How many vehicles a world can hold."""
         return int(self._shard.worlds.rows.shape[1])
 
     @property
@@ -71,11 +61,7 @@ class WorldViews:
 
     @property
     def messages(self) -> Bus:
-        """What vehicles and roadside units tell each other.
-
-        Raises:
-            ConfigError: they tell each other nothing.
-        """
+        """What vehicles and roadside units tell each other."""
         for part in self._tick.attached:
             if isinstance(part, Messaging):
                 return part.bus
@@ -89,16 +75,12 @@ class WorldViews:
     def listen(self, config: EnvConfig) -> tuple[Bus, Callable[[], None]]:
         """A bus beside the world, for tools that measure: stations in the world do not hear of it.
 
-        Args:
-            config: whose `v2x` it is of.
-
         Returns:
             the bus, and what lets it send and receive in the present tick.
         """
         worlds = self._shard.worlds
-        common = Common(*(getattr(worlds, name) for name in Common._fields))
         types, zoned = self._shard.travel.types, self._tick.division.zoned
-        bus = Bus(config, self.network, types, zoned, common)
+        bus = Bus(config, self.network, types, zoned, common_of(worlds))
         return bus, lambda: bus.exchange(self._tick.division.side)
 
     @property
@@ -129,17 +111,14 @@ class WorldViews:
         return self._tick.division.vehicles(world)
 
     def zone_loads(self) -> ZoneLoads:
-        """What each zone holds now."""
         return self._tick.division.loads()
 
     def zone_view(self, world: int = 0) -> ZoneView:
-        """Which zones own and see which vehicles of one world now."""
         halo_m, coordination = self.zone_loads().halo_m, self._tick.coordination
         transfers = () if coordination is None else coordination.in_flight(world)
         return view_zones(self._shards, self.partition, halo_m, world, transfers)
 
     def running(self) -> NDArray[np.int64]:
-        """(W,) vehicles of each world."""
         return self._tick.division.running()
 
     def ghosts(self, zone: int, world: int = 0) -> NDArray[np.void]:
@@ -184,7 +163,6 @@ class WorldViews:
         return phases
 
     def ticks(self) -> NDArray[np.int64]:
-        """(W,) ticks since each world's reset."""
         return self._shard.worlds.ticks
 
     @property
@@ -203,7 +181,6 @@ class WorldViews:
         return self._tick.sumo
 
     def agents_to_come(self) -> NDArray[np.bool_]:
-        """(W,) whether an agent waits to enter."""
         tick = self._tick
         longest = int(tick.gate.num_queue.max(initial=0))
         if longest == 0:
@@ -213,5 +190,4 @@ class WorldViews:
         return np.asarray(found, dtype=np.bool_)
 
     def traffic_stats(self, world: int = 0) -> TrafficStats:
-        """Counts and means since the world's reset."""
         return count_traffic(self._tick.gate, self._tick.division, world)

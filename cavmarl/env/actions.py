@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import ActionConfig
 from cavmarl.core.errors import ActionError
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.core.records.codes import ACTION_IDLE, ACTION_SLOWER
 from cavmarl.engine.kernels.decoding import decode_choices, decode_pairs
 from cavmarl.shards.shard import Commands
@@ -18,12 +18,6 @@ from cavmarl.shards.shard import Commands
 
 class ActionDecoder:
     """Checks and decodes the actions of W worlds with A agents each.
-
-    Args:
-        config: what an agent can do.
-        num_worlds: W.
-        agents: the A agent ids.
-        commands: where decoded actions are written, over those of the step before; None: made.
 
     Attributes:
         clipped: (W,) values beyond ±1 that were clipped in this episode (`out_of_range = clip`).
@@ -33,9 +27,10 @@ class ActionDecoder:
 
     def __init__(
         self,
-        config: ActionConfig,
-        num_worlds: int,
-        agents: Sequence[str],
+        config: ActionConfig,  # what an agent can do
+        num_worlds: int,  # W
+        agents: Sequence[str],  # the A agent ids
+        # where decoded actions are written, over those of the step before; None: made
         commands: Commands | None = None,
     ) -> None:
         self._config = config
@@ -57,8 +52,8 @@ class ActionDecoder:
         commands.controls[:] = 0.0
         commands.meta_actions[:] = ACTION_IDLE
         self._decoded = commands
-        self._decode_pairs = {np.dtype(kind): repeated(decode_pairs) for kind in ("f4", "f8")}
-        self._decode_choices = repeated(decode_choices)
+        self._decode_pairs = {np.dtype(kind): specialized(decode_pairs) for kind in ("f4", "f8")}
+        self._decode_choices = specialized(decode_choices)
         self.clipped = np.zeros(num_worlds, dtype=np.int64)
         self.held = np.zeros(num_worlds, dtype=np.int64)
         self.ignored = np.zeros(num_worlds, dtype=np.int64)
@@ -103,18 +98,7 @@ class ActionDecoder:
     def from_dict(
         self, actions: Mapping[str, Any], live: Sequence[str], needed: Sequence[str]
     ) -> Commands:
-        """Decode the actions of one world; those of live agents without a vehicle are not read.
-
-        Args:
-            actions: by agent id.
-            live: ids in the episode.
-            needed: those of them that have a vehicle and must act.
-
-        Raises:
-            ActionError: an id that never was, or has left (unless `late_actions = ignore`); a
-                needed agent without an action (unless `missing_action = hold`); wrong shape, dtype
-                or value.
-        """
+        """Decode the actions of one world; those of live agents without a vehicle are not read."""
         if not isinstance(actions, Mapping):
             raise ActionError(
                 f"actions are a {type(actions).__name__}: pass a dict from agent id to action"
@@ -142,11 +126,7 @@ class ActionDecoder:
         return self._commands(checked)
 
     def from_array(self, actions: Any, mask: NDArray[np.bool_]) -> Commands:
-        """Decode the actions of all worlds; entries where `mask` (W, A) is False are not read.
-
-        Raises:
-            ActionError: wrong shape, dtype or value.
-        """
+        """Decode the actions of all worlds; entries where `mask` (W, A) is False are not read."""
         if self._decode_at_once(actions, mask):
             return self._decoded
         array = self._as_numbers(actions, "actions")

@@ -13,12 +13,7 @@ from cavmarl.v2x.v2x_messages import cause_code
 
 
 class DeclaredEvents:
-    """At most one event an agent and step; a later one takes the place of an earlier one.
-
-    Args:
-        config: the environment.
-        num_worlds: W.
-    """
+    """At most one event an agent and step; a later one takes the place of an earlier one."""
 
     def __init__(self, config: EnvConfig, num_worlds: int) -> None:
         self._enabled = config.v2x.enabled
@@ -26,12 +21,6 @@ class DeclaredEvents:
         self._are_any = False
 
     def declare(self, world: int, agent: int, cause: str) -> None:
-        """Note an event.
-
-        Raises:
-            ActionError: no such world or agent.
-            ConfigError: no such cause, or nobody says anything in this environment.
-        """
         if not self._enabled:
             raise ConfigError("nobody says anything here: set v2x.enabled to true")
         num_worlds, num_agents = self._causes.shape

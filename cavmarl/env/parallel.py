@@ -416,7 +416,7 @@ class CavEnv(CopiedWithWorlds, ParallelEnv[str, Any, Any]):  # type: ignore[misc
         self._decoder.check(agent, action)
 
     def state(self) -> NDArray[np.float32]:
-        """The global state, within `state_space`: see `engine.global_state`."""
+        """The global state, within `state_space`: see `engine.spaces.global_state`."""
         self.worlds.write_states()
         state: NDArray[np.float32] = self.worlds.arrays.states[0].copy()
         return state

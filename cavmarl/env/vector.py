@@ -39,11 +39,7 @@ Observations: TypeAlias = Any
 """(W, A, D) float32, or an array (W, A, …) a sensor of the rig."""
 
 StepResult = tuple[
-    Observations,
-    NDArray[np.float32],
-    NDArray[np.bool_],
-    NDArray[np.bool_],
-    dict[str, NDArray[Any]],
+    Observations, NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_], dict[str, NDArray[Any]]
 ]
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.math.tallies import totals
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.core.records.arrays import Worlds, Zoned
 from cavmarl.handoff.coordinator.coordinator import Near
 from cavmarl.ownership.messages import Birth, Switch
@@ -34,17 +34,11 @@ from cavmarl.zones.visibility import Visibility
 
 
 class ZoneLoads(NamedTuple):
-    """What the zones of W worlds hold.
+    """What the zones of W worlds hold."""
 
-    Attributes:
-        owned: (k, W) vehicles.
-        ghosts: (k, W) copies of other zones' vehicles.
-        halo_m: how far zones see over their borders.
-    """
-
-    owned: NDArray[np.int64]
-    ghosts: NDArray[np.int64]
-    halo_m: float
+    owned: NDArray[np.int64]  # (k, W) vehicles
+    ghosts: NDArray[np.int64]  # (k, W) copies of other zones' vehicles
+    halo_m: float  # how far zones see over their borders
 
     def imbalance(self) -> NDArray[np.float64]:
         """(W,) maximum over mean of the vehicles that zones own."""
@@ -54,42 +48,27 @@ class ZoneLoads(NamedTuple):
 class Division:
     """Which zones own and see which vehicles.
 
-    Args:
-        shards: one a zone, in the order of zones.
-        zoned: their rows.
-        zones: of the partition.
-        halo: what each zone sees over its borders.
-        sight: what says so for other zones.
-        touching_m: no ghost further outside of a zone can touch one of its vehicles.
-        borders: when a vehicle is near one.
-        codec: of vehicles' states.
-
     Attributes:
-        zones: of the partition.
-        borders: when a vehicle is near one.
-        codec: of vehicles' states.
-        book: vehicles near a border.
         gathering: what shards are called with that `gather` their ghosts: how far outside of a zone
             a ghost can be that touches a vehicle in it, and how far inside one is at a border, m.
         call_hand_over: the kernel, with the types of all worlds' arrays found out once.
-        call_release: the same.
     """
 
     def __init__(
         self,
-        shards: Sequence[Shard],
-        zoned: Zoned,
+        shards: Sequence[Shard],  # one a zone, in the order of zones
+        zoned: Zoned,  # their rows
         zones: ZoneArrays,
-        halo: Halo,
-        sight: Visibility,
-        touching_m: float,
-        borders: Borders,
-        codec: TransferCodec,
+        halo: Halo,  # what each zone sees over its borders
+        sight: Visibility,  # what says so for other zones
+        touching_m: float,  # no ghost further outside of a zone can touch one of its vehicles
+        borders: Borders,  # when a vehicle is near one
+        codec: TransferCodec,  # of vehicles' states
     ) -> None:
         self.zones = zones
         self.borders = borders
         self.codec = codec
-        self.book = make_book(*shards[0].worlds.rows.shape)
+        self.book = make_book(*shards[0].worlds.rows.shape)  # vehicles near a border
         self._shards = tuple(shards)
         self._zoned = zoned
         self._first_side = shards[0].worlds.rows
@@ -100,22 +79,20 @@ class Division:
         self._gatherers: Executor | None = None
         self._ids, self._x, self._y = (zoned.rows[name] for name in ("id", "x", "y"))
         self._rects: list[list[float]] = zones.rects.tolist()
-        self._call_exchange = repeated(exchange)
-        self._note_gathered = repeated(note_gathered)
-        self._look = repeated(look)
-        self._pass_on = repeated(pass_on)
-        self._totals = repeated(totals)
-        self.call_hand_over = repeated(hand_over)
-        self.call_release = repeated(release)
+        self._call_exchange = specialized(exchange)
+        self._note_gathered = specialized(note_gathered)
+        self._look = specialized(look)
+        self._pass_on = specialized(pass_on)
+        self._totals = specialized(totals)
+        self.call_hand_over = specialized(hand_over)
+        self.call_release = specialized(release)
 
     @property
     def count(self) -> int:
-        """How many zones."""
         return len(self._shards)
 
     @property
     def num_worlds(self) -> int:
-        """W."""
         return len(self._shards[0].worlds.ticks)
 
     def distribute(self, chosen: NDArray[np.bool_]) -> None:
@@ -139,9 +116,6 @@ class Division:
         """Divide the plane otherwise, between two ticks: owners stay, ghosts are those of now.
 
         A vehicle in another zone than its owner's changes its owner as at any border.
-
-        Args:
-            partition: as many zones as before.
         """
         zones, halo = partition.arrays, self._sight.halo(partition)
         self.zones, self._halo, self._rects = zones, halo, zones.rects.tolist()
@@ -226,13 +200,12 @@ class Division:
     def _side(self, rows: NDArray[np.void]) -> int:
         return 0 if rows is self._first_side else 1
 
-    def place(self, vehicles: Sequence[NDArray[np.void]], contacts: NDArray[np.int64]) -> None:
-        """Give every vehicle to the zone that it is in, whatever zone owned it before.
-
-        Args:
-            vehicles: VEHICLE (n,) of each world.
-            contacts: (W,) of each, as `contacts` counts them.
-        """
+    def place(
+        self,
+        vehicles: Sequence[NDArray[np.void]],  # VEHICLE (n,) of each world
+        contacts: NDArray[np.int64],  # (W,) of each, as `contacts` counts them
+    ) -> None:
+        """Give every vehicle to the zone that it is in, whatever zone owned it before."""
         first = self._shards[0].worlds
         # A host that died in the middle of a tick may have left a step that is not what this says.
         self._zoned.step_at[...] = 0
@@ -254,12 +227,7 @@ class Division:
             shard.align()
 
     def near(self, w: int, everybody: bool) -> list[Near]:
-        """Vehicles of a world near a border, by its committed rows.
-
-        Args:
-            w: which world.
-            everybody: look at all of them: rows have changed since the ghosts were renewed.
-        """
+        """Vehicles of a world near a border, by its committed rows."""
         if everybody:
             self._look(self.zones, self.borders, self._zoned, self.side, w, True, 0, self.book)
         num = self.book.num_near.item(w)
@@ -268,11 +236,7 @@ class Division:
         return [Near(*entry) for entry in self.book.near[w, :num].tolist()]
 
     def find(self, w: int, vehicle: int) -> tuple[int, int]:
-        """The zone that owns a vehicle, and its committed row there.
-
-        Raises:
-            ConfigError: nobody owns it.
-        """
+        """The zone that owns a vehicle, and its committed row there."""
         for shard in self._shards:
             worlds = shard.worlds
             found = np.flatnonzero(worlds.rows["id"][w, : worlds.num_owned[w]] == vehicle)
@@ -285,21 +249,14 @@ class Division:
         worlds = self._shards[zone].worlds
         return self.codec.pack(worlds.rows, w, row, int(worlds.ticks[w]))
 
-    def hand_over(self, w: int, switch: Switch, state: bytes | None, hint: int = 0) -> int:
-        """Let a vehicle change its owner, by its committed row.
-
-        Args:
-            w: in which world.
-            switch: the vehicle, its source and its target.
-            state: what the new owner goes on with; None: the old one's row as it is.
-            hint: the row where the old one probably keeps it.
-
-        Returns:
-            the row where the new one keeps it.
-
-        Raises:
-            ConfigError: the old owner does not have it, or the new one has not seen it come.
-        """
+    def hand_over(
+        self,
+        w: int,
+        switch: Switch,  # the vehicle, its source and its target
+        state: bytes | None,  # what the new owner goes on with; None: the old one's row as it is
+        hint: int = 0,  # the row where the old one probably keeps it
+    ) -> int:  # the row where the new one keeps it
+        """Let a vehicle change its owner, by its committed row."""
         place = self._pass_on(
             switch.vehicle, switch.source, hint, switch.target, switch.epoch,
             self._zoned, self._side(self._shards[0].worlds.rows), w,
@@ -324,19 +281,15 @@ class Division:
             "narrow"
         )
 
-    def depth_m(self, w: int, vehicle: int, zone: int, outside: int, hint: int) -> float | None:
-        """How far outside of a zone a vehicle is, by its committed row.
-
-        Args:
-            w: in which world.
-            vehicle: its id.
-            zone: that owns it.
-            outside: of which zone.
-            hint: the row where its owner probably keeps it.
-
-        Returns:
-            the distance in m, 0 inside; None: its owner does not have it.
-        """
+    def depth_m(
+        self,
+        w: int,
+        vehicle: int,
+        zone: int,  # that owns it
+        outside: int,  # of which zone
+        hint: int,  # the row where its owner probably keeps it
+    ) -> float | None:  # the distance in m, 0 inside; None: its owner does not have it
+        """How far outside of a zone a vehicle is, by its committed row."""
         place = (self.side, zone, w, hint)
         num = self._zoned.num_owned.item(zone, w)
         if hint >= num or self._ids.item(place) != vehicle:
@@ -371,12 +324,10 @@ class Division:
 
     @property
     def zoned(self) -> Zoned:
-        """The rows of all zones."""
         return self._zoned
 
     @property
     def halo(self) -> Halo:
-        """How far each zone sees over its borders."""
         return self._halo
 
     @property
@@ -386,7 +337,6 @@ class Division:
 
     @property
     def next_side(self) -> int:
-        """On which side the next rows are."""
         return self._side(self._shards[0].worlds.next_rows)
 
     def owners(self, w: int) -> list[tuple[int, int]]:
@@ -398,7 +348,6 @@ class Division:
         ]
 
     def counts(self, w: int) -> list[int]:
-        """How many vehicles of a world each zone owns."""
         counts: list[int] = self._zoned.num_owned[:, w].tolist()
         return counts
 
@@ -409,7 +358,6 @@ class Division:
         return running
 
     def loads(self) -> ZoneLoads:
-        """What each zone holds."""
         owned = np.array([shard.worlds.num_owned for shard in self._shards])
         rows = np.array([shard.worlds.num_rows for shard in self._shards])
         return ZoneLoads(owned, rows - owned, self._halo.halo_m)

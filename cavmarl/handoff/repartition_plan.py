@@ -25,28 +25,20 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Proposal:
-    """A partition by measured cost.
+    """A partition by measured cost."""
 
-    Attributes:
-        partition: as many zones as before.
-        before: maximum over mean of the zones' costs as they are.
-        after: the same as they would be.
-        moved: vehicles that would be in a zone of another number.
-    """
-
-    partition: ZonePartition
-    before: float
-    after: float
-    moved: int
+    partition: ZonePartition  # as many zones as before
+    before: float  # maximum over mean of the zones' costs as they are
+    after: float  # the same as they would be
+    moved: int  # vehicles that would be in a zone of another number
 
 
-def vehicle_costs(zones: NDArray[np.int32], costs_s: Sequence[float]) -> Floats:
-    """Each zone's cost shared out among its vehicles, (n,).
-
-    Args:
-        zones: of each vehicle.
-        costs_s: measured, of each zone; what a zone without vehicles costs is left out.
-    """
+def vehicle_costs(
+    zones: NDArray[np.int32],  # of each vehicle
+    # measured, of each zone; what a zone without vehicles costs is left out
+    costs_s: Sequence[float],
+) -> Floats:
+    """Each zone's cost shared out among its vehicles, (n,)."""
     counts = np.bincount(zones, minlength=len(costs_s))
     shares: Floats = (np.asarray(costs_s) / np.maximum(counts, 1))[zones]
     return shares
@@ -54,24 +46,13 @@ def vehicle_costs(zones: NDArray[np.int32], costs_s: Sequence[float]) -> Floats:
 
 def propose_zones(
     network: RoadNetwork,
-    partition: ZonePartition,
-    positions: Floats,
-    costs_s: Sequence[float],
+    partition: ZonePartition,  # its zones now
+    positions: Floats,  # (n, 2) x and y of vehicles in m
+    costs_s: Sequence[float],  # measured, of each zone, seconds a tick
     *,
-    tolerance: float = 0.1,
+    tolerance: float = 0.1,  # by which share of the mean the costliest zone has to become cheaper
 ) -> Proposal | None:
-    """Zones of about the same cost; None where they would gain no more than the tolerance.
-
-    Args:
-        network: the map.
-        partition: its zones now.
-        positions: (n, 2) x and y of vehicles in m.
-        costs_s: measured, of each zone, seconds a tick.
-        tolerance: by which share of the mean the costliest zone has to become cheaper.
-
-    Raises:
-        ConfigError: not one cost a zone, or one that is none.
-    """
+    """Zones of about the same cost; None where they would gain no more than the tolerance."""
     if len(costs_s) != partition.count or not all(
         math.isfinite(cost_s) and cost_s >= 0.0 for cost_s in costs_s
     ):
@@ -101,13 +82,7 @@ def propose_zones(
 def _renumbered(
     partition: ZonePartition, before: NDArray[np.int32], after: NDArray[np.int32]
 ) -> ZonePartition:
-    """The same zones, numbered so that many vehicles stay in the zone that they were in.
-
-    Args:
-        partition: the proposed one.
-        before: zone of each vehicle as it is.
-        after: zone of each vehicle in the proposed one.
-    """
+    """The same zones, numbered so that many vehicles stay in the zone that they were in."""
     count = partition.count
     common = np.bincount(before * count + after, minlength=count * count).reshape(count, count)
     order = np.empty(count, dtype=np.int64)

@@ -20,46 +20,27 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 
 
 class Recut(NamedTuple):
-    """Worlds have been cut anew.
+    """Worlds have been cut anew."""
 
-    Attributes:
-        step: after which one, of all that these worlds have made.
-        before: maximum over mean of the zones' vehicles.
-        after: the same in the new zones.
-        moved: vehicles that are in a zone of another number.
-        ms: that it took; handing them over is part of the next tick.
-    """
-
-    step: int
-    before: float
-    after: float
-    moved: int
-    ms: float
+    step: int  # after which one, of all that these worlds have made
+    before: float  # maximum over mean of the zones' vehicles
+    after: float  # the same in the new zones
+    moved: int  # vehicles that are in a zone of another number
+    ms: float  # that it took; handing them over is part of the next tick
 
 
 class Recutter:
-    """Looks every so many steps whether other zones would share out the vehicles better.
-
-    Args:
-        network: the map.
-        division: of the worlds.
-        coordination: of the worlds.
-        every: steps between checks.
-        tolerance: by which share of the mean the fullest zone has to become emptier.
-
-    Attributes:
-        recuts: what has been done.
-    """
+    """Looks every so many steps whether other zones would share out the vehicles better."""
 
     def __init__(
         self,
         network: RoadNetwork,
         division: Division,
         coordination: Coordinators,
-        every: int,
-        tolerance: float,
+        every: int,  # steps between checks
+        tolerance: float,  # by which share of the mean the fullest zone has to become emptier
     ) -> None:
-        self.recuts: list[Recut] = []
+        self.recuts: list[Recut] = []  # what has been done
         self._network = network
         self._division = division
         self._coordination = coordination
@@ -68,11 +49,7 @@ class Recutter:
         self._steps = 0
 
     def after_step(self, partition: ZonePartition) -> ZonePartition | None:
-        """Note that a step is over; the new zones, if there are any.
-
-        Args:
-            partition: the zones as they are.
-        """
+        """Note that a step is over; the new zones, if there are any."""
         self._steps += 1
         if self._steps % self._every:
             return None
@@ -92,6 +69,5 @@ class Recutter:
         return proposal.partition
 
     def cut(self, partition: ZonePartition) -> None:
-        """Divide the worlds into these zones, as many as before."""
         self._division.cut(partition)
         self._coordination.cut()

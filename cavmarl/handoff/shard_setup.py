@@ -32,21 +32,12 @@ def divide(
     config: EnvConfig,
     network: RoadNetwork,
     partition: ZonePartition,
-    traffic: NativeTraffic,
-    outputs: Outputs,
-    num_worlds: int,
-    zeros: Zeros = huge_zeros,
+    traffic: NativeTraffic,  # departures and routes
+    outputs: Outputs,  # where all agents get what they sense
+    num_worlds: int,  # how many worlds are stepped together
+    zeros: Zeros = huge_zeros,  # makes the arrays that shards write
 ) -> tuple[list[Shard], Division]:
     """One shard a zone, and the division that knows them all.
-
-    Args:
-        config: the environment.
-        network: its roads.
-        partition: its zones.
-        traffic: departures and routes.
-        outputs: where all agents get what they sense.
-        num_worlds: how many worlds are stepped together.
-        zeros: makes the arrays that shards write.
 
     Raises:
         ConfigError: `zones.halo_m` is less than exactness needs.
@@ -79,40 +70,38 @@ def divide(
         shard = Shard(
             config,
             network,
-            traffic.plans,
-            traffic.travel,
-            zoned,
-            outputs,
-            zone,
-            partition.arrays,
-            halo,
-            shards[0] if shards else None,
-            zeros,
+            plans=traffic.plans,
+            travel=traffic.travel,
+            zoned=zoned,
+            outputs=outputs,
+            zone=zone,
+            zones=partition.arrays,
+            halo=halo,
+            first=shards[0] if shards else None,
+            zeros=zeros,
         )
         shards.append(shard)
     division = Division(
         shards,
-        zoned,
-        partition.arrays,
-        halo,
-        sight,
-        touching_m,
-        Borders(settings.hysteresis_m, settings.approach_ticks * dt, MAX_SPEED_MPS),
-        TransferCodec.of(shards[0].worlds, outputs, config.sensors.stack),
+        zoned=zoned,
+        zones=partition.arrays,
+        halo=halo,
+        sight=sight,
+        touching_m=touching_m,
+        borders=Borders(settings.hysteresis_m, settings.approach_ticks * dt, MAX_SPEED_MPS),
+        codec=TransferCodec.of(shards[0].worlds, outputs, config.sensors.stack),
     )
     return shards, division
 
 
 def halo_m(
-    config: EnvConfig, reach_m: float, zones: int, fastest_mps: float = MAX_SPEED_MPS
+    config: EnvConfig,  # `zones.halo_m` is taken if it is given
+    reach_m: float,  # the farthest that any driver looks
+    zones: int,  # how many there are
+    # the way of a tick over its length, with what vehicles jump on the map
+    fastest_mps: float = MAX_SPEED_MPS,
 ) -> float:
     """How far zones see over their borders.
-
-    Args:
-        config: `zones.halo_m` is taken if it is given.
-        reach_m: the farthest that any driver looks.
-        zones: how many there are.
-        fastest_mps: the way of a tick over its length, with what vehicles jump on the map.
 
     Raises:
         ConfigError: that is less than exactness needs, with all numbers.

@@ -14,56 +14,35 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 
 
 class TransferInFlight(NamedTuple):
-    """A vehicle that is on its way from one zone to another.
-
-    Attributes:
-        vehicle: its id.
-        source: the zone that owns it.
-        target: the zone that it is offered or switched to.
-        state: of the protocol, for people to read.
-    """
+    """A vehicle that is on its way from one zone to another."""
 
     vehicle: int
-    source: int
-    target: int
-    state: str
+    source: int  # the zone that owns it
+    target: int  # the zone that it is offered or switched to
+    state: str  # of the protocol, for people to read
 
 
 @dataclass(frozen=True)
 class ZoneView:
-    """One world's zones between two ticks.
+    """One world's zones between two ticks."""
 
-    Attributes:
-        partition: where the zones are.
-        halo_m: how far each sees over its borders.
-        owners: (n,) the zone that owns each vehicle, in the order of `Simulation.vehicles`.
-        ghosts: of each zone, the ids of other zones' vehicles that it sees.
-        transfers: in flight.
-    """
-
-    partition: ZonePartition
-    halo_m: float
+    partition: ZonePartition  # where the zones are
+    halo_m: float  # how far each sees over its borders
+    # (n,) the zone that owns each vehicle, in the order of `Simulation.vehicles`
     owners: NDArray[np.int64]
+    # of each zone, the ids of other zones' vehicles that it sees
     ghosts: tuple[NDArray[np.int64], ...]
-    transfers: tuple[TransferInFlight, ...] = ()
+    transfers: tuple[TransferInFlight, ...] = ()  # in flight
 
 
 def view_zones(
-    shards: Sequence[Shard],
-    partition: ZonePartition,
-    halo_m: float,
+    shards: Sequence[Shard],  # one a zone, in the order of zones
+    partition: ZonePartition,  # where the zones are
+    halo_m: float,  # how far each sees over its borders
     world: int = 0,
-    transfers: Sequence[TransferInFlight] = (),
+    transfers: Sequence[TransferInFlight] = (),  # in flight in that world
 ) -> ZoneView:
-    """What the shards hold of one world.
-
-    Args:
-        shards: one a zone, in the order of zones.
-        partition: where the zones are.
-        halo_m: how far each sees over its borders.
-        world: which.
-        transfers: in flight in that world.
-    """
+    """What the shards hold of one world."""
     held = [shard.worlds for shard in shards]
     owned = [int(worlds.num_owned[world]) for worlds in held]
     ghosts = tuple(

@@ -17,9 +17,7 @@ from dataclasses import fields
 from enum import IntEnum
 from typing import Any, get_args, get_origin, get_type_hints
 
-from cavmarl.core.errors import (
-    MessageError,
-)
+from cavmarl.core.errors import MessageError
 from cavmarl.ownership.messages import Abort, Ack, Done, Message, Nack, Need, Prepare, Step
 
 VERSION = 1
@@ -41,17 +39,11 @@ def encode(message: Message) -> bytes:
     return body + _CRC.pack(zlib.crc32(body))
 
 
-def decode(data: bytes, run: bytes | None = None) -> Message:
-    """The message of a wire form.
-
-    Args:
-        data: one whole message.
-        run: of the receiver; None accepts all.
-
-    Raises:
-        MessageError: it ends too early or goes on after its end; another version of this form; the
-            checksum or a field is wrong; it belongs to another run.
-    """
+def decode(
+    data: bytes,  # one whole message
+    run: bytes | None = None,  # of the receiver; None accepts all
+) -> Message:
+    """The message of a wire form."""
     if len(data) < _HEADER.size + _CRC.size:
         raise MessageError(f"a message of {len(data)} bytes has no room for its header")
     magic, version, kind, zero = _HEADER.unpack_from(data)

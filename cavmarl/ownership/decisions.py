@@ -36,11 +36,7 @@ class Decisions:
     def switches(
         self, table: Table, movers: Iterable[tuple[int, int]]
     ) -> tuple[tuple[Switch, ...], tuple[Deferral, ...]]:
-        """What becomes of (vehicle, zone that contains it).
-
-        Raises:
-            ProtocolError: the vehicle or the zone does not exist.
-        """
+        """What becomes of (vehicle, zone that contains it)."""
         switches, deferred = [], []
         for vehicle, zone in sorted(movers):
             if vehicle not in table.owners or zone not in table.hosts:
@@ -62,11 +58,7 @@ class Decisions:
         return tuple(switches), tuple(deferred)
 
     def check_births(self, table: Table, births: Iterable[Birth]) -> None:
-        """See that new vehicles are new.
-
-        Raises:
-            ProtocolError: an id that the episode has seen, or a zone that does not exist.
-        """
+        """See that new vehicles are new."""
         ids = set()
         for vehicle, zone, _ in births:
             if zone not in table.hosts:

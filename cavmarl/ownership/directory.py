@@ -14,8 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from cavmarl.core.errors import JournalError, LostTickError, ProtocolError
 from cavmarl.ownership.decisions import CommittedStates, Decisions
-from cavmarl.ownership.leases import make_step
-from cavmarl.ownership.ledger import world_digest
+from cavmarl.ownership.ledger import state_digest, world_digest
 from cavmarl.ownership.limits import DeadlinePolicy, Limits
 from cavmarl.ownership.messages import (
     Ack,
@@ -25,6 +24,7 @@ from cavmarl.ownership.messages import (
     Done,
     Fence,
     Host,
+    In,
     Message,
     Nack,
     Need,
@@ -33,6 +33,7 @@ from cavmarl.ownership.messages import (
     Refusal,
     Reset,
     Step,
+    Switch,
     ZoneLedger,
 )
 from cavmarl.ownership.planning import all_removed, check_done
@@ -46,15 +47,11 @@ SILENCE = Output()
 
 
 class StoreError(ProtocolError):
-    """What is stored is not what the zones say they stored.
-
-    Attributes:
-        zones: those that have to be hosted anew and step again.
-    """
+    """What is stored is not what the zones say they stored."""
 
     def __init__(self, zones: tuple[int, ...]) -> None:
         super().__init__(f"zones {list(zones)} stored other rows than they told: host them anew")
-        self.zones = zones
+        self.zones = zones  # those that have to be hosted anew and step again
 
 
 class Directory:
@@ -62,8 +59,6 @@ class Directory:
 
     Attributes:
         table: owners, hosts and the tick in progress, as the log has them.
-        dones: zone → its DONE for the tick in progress.
-        readiness: what targets have acknowledged.
         dropped: (kind, reason) → messages or entries that did not count.
         refusals: reason → how often a target did not hold a state.
     """
@@ -78,8 +73,8 @@ class Directory:
     ) -> None:
         self.run = run
         self.table = Table(zones, safeguards)
-        self.dones: dict[int, Done] = {}
-        self.readiness = Readiness(safeguards)
+        self.dones: dict[int, Done] = {}  # zone → its DONE for the tick in progress
+        self.readiness = Readiness(safeguards)  # what targets have acknowledged
         self.dropped: Counter[tuple[str, str]] = Counter()
         self.refusals: Counter[Refusal] = Counter()
         self._payloads: Mapping[int, bytes] = {}
@@ -97,11 +92,7 @@ class Directory:
         limits: Limits | None = None,
         safeguards: Safeguards = ALL_ON,
     ) -> Directory:
-        """The coordinator that wrote these records. Send what `resend` says before all else.
-
-        Raises:
-            JournalError: the log does not begin with a RESET, or cannot have been written so.
-        """
+        """The coordinator that wrote these records. Send what `resend` says before all else."""
         if not records or not isinstance(records[0], Reset):
             raise JournalError("a log begins with a RESET, which names the run")
         directory = cls(records[0].run, zones, store, limits, safeguards)
@@ -130,10 +121,6 @@ class Directory:
         """Give a zone to a new process of `worker`, which has to be loaded with `hosting(zone)`.
 
         In the middle of a tick the zone has to be fenced first; its STEP is sent again.
-
-        Raises:
-            LostTickError: this tick has had as many hosts of the zone as are allowed.
-            ProtocolError: the zone is hosted and a tick is in progress.
         """
         table = self.table
         if table.plan is not None:
@@ -165,24 +152,14 @@ class Directory:
 
     def begin(
         self,
+        # (vehicle, zone that contains it) for the vehicles outside their owner's zone by more than
+        # the hysteresis, and for no others
         movers: Iterable[tuple[int, int]],
         births: Iterable[Birth] = (),
-        inputs: bytes = b"",
-        payloads: Mapping[int, bytes] | None = None,
+        inputs: bytes = b"",  # digest of the actions
+        payloads: Mapping[int, bytes] | None = None,  # zone → what rides with its STEP
     ) -> Output:
-        """Decide the way to the next tick: BEGIN, then a STEP for every zone.
-
-        Args:
-            movers: (vehicle, zone that contains it) for the vehicles outside their owner's zone
-                by more than the hysteresis, and for no others.
-            births: new vehicles.
-            inputs: digest of the actions.
-            payloads: zone → what rides with its STEP.
-
-        Raises:
-            ProtocolError: the tick before is not committed, or a mover is unknown; an id that the
-                episode has seen, or a zone that is none.
-        """
+        """Decide the way to the next tick: BEGIN, then a STEP for every zone."""
         table = self.table
         if table.plan is not None:
             raise ProtocolError(f"tick {table.plan.record.tick} is not committed")
@@ -202,14 +179,12 @@ class Directory:
         self._decisions.check_births(self.table, births)
 
     def resend(
-        self, zones: Iterable[int] | None = None, payloads: Mapping[int, bytes] | None = None
+        self,
+        zones: Iterable[int] | None = None,  # only these
+        # as in `begin`, whose payloads are kept; needed after `restore`
+        payloads: Mapping[int, bytes] | None = None,
     ) -> Output:
-        """The STEPs once more, of zones that have not answered.
-
-        Args:
-            zones: only these.
-            payloads: as in `begin`, whose payloads are kept; needed after `restore`.
-        """
+        """The STEPs once more, of zones that have not answered."""
         if payloads is not None:
             self._payloads = payloads
         asked = self.waiting_for() if zones is None else tuple(zones)
@@ -237,14 +212,13 @@ class Directory:
         deferred, bound = self.table.plan.record.deferred, self._limits.deferral
         return tuple(vehicle for vehicle, ticks in deferred if ticks > bound)
 
-    def commit(self, rows: Mapping[int, int]) -> Output:
+    def commit(
+        self,
+        rows: Mapping[int, int],  # zone → digest of the rows that the store holds for the tick
+    ) -> Output:
         """Make the tick in progress the truth: every zone is done, and the ledger is exact.
 
-        Args:
-            rows: zone → digest of the rows that the store holds for the tick.
-
         Raises:
-            ProtocolError: a zone has not answered; a vehicle was lost or doubled.
             StoreError: the store holds other rows than a zone told of. Fence and host it anew.
         """
         table = self.table
@@ -342,3 +316,25 @@ class Directory:
     def _logged(self, record: Record) -> Output:
         self.table.apply(record)
         return Output((record,))
+
+
+def make_step(table: Table, zone: int, store: CommittedStates, payload: bytes) -> Step:
+    """The lease of a zone's present host for the tick in progress.
+
+    States ride along for vehicles whose switch is forced, and for those that have to be sent again.
+    """
+    plan = table.planned
+    enter = tuple(
+        _entry(switch, store.state(switch.vehicle), switch.vehicle in plan.attach)
+        for switch in plan.enter.get(zone, ())
+    )
+    return Step(
+        table.run, table.episode, plan.record.tick, zone, table.hosts[zone][1], table.tick,
+        enter, tuple(plan.leave.get(zone, ())), tuple(plan.spawn.get(zone, ())),
+        plan.expected[zone], payload,
+    )  # fmt: skip
+
+
+def _entry(switch: Switch, state: bytes, attached: bool) -> In:
+    carried = state if attached else b""
+    return In(switch.vehicle, switch.epoch, attached, state_digest(state), carried)

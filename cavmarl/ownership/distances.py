@@ -19,20 +19,11 @@ from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 
 @dataclass(frozen=True, slots=True)
 class Distances:
-    """The three distances of a world.
+    """The three distances of a world."""
 
-    Attributes:
-        approach_m: before the border; offers begin.
-        hysteresis_m: beyond the border; up to there the owner stays.
-        overlap_m: width of the strip around a zone that it sees and has roads for (B).
-
-    Raises:
-        ConfigError: a distance below 0, or they are not in order.
-    """
-
-    approach_m: float
-    hysteresis_m: float
-    overlap_m: float
+    approach_m: float  # before the border; offers begin
+    hysteresis_m: float  # beyond the border; up to there the owner stays
+    overlap_m: float  # width of the strip around a zone that it sees and has roads for (B)
 
     def __post_init__(self) -> None:
         if min(self.approach_m, self.hysteresis_m) < 0:
@@ -71,18 +62,7 @@ def needed_overlap_m(
 def check_coverage(
     distances: Distances, limits: Limits, *, reach_m: float, v_max_mps: float, dt_s: float
 ) -> None:
-    """Refuse a world in which "the source stays authoritative" would not be safe.
-
-    Args:
-        distances: at its borders.
-        limits: its deadlines.
-        reach_m: the longest interaction or sensing range.
-        v_max_mps: the speed that the dynamics do not exceed.
-        dt_s: a tick.
-
-    Raises:
-        ConfigError: the overlap is too narrow, or the approach is shorter than a tick's way.
-    """
+    """Refuse a world in which "the source stays authoritative" would not be safe."""
     needed = needed_overlap_m(reach_m, distances.hysteresis_m, limits, v_max_mps, dt_s)
     if distances.overlap_m < needed:
         raise ConfigError(

@@ -43,25 +43,20 @@ class Endpoint:
     """The host of one zone.
 
     Attributes:
-        tick: the tick that the rows are at.
-        lease: the tick that the rows may be advanced to now, or None.
-        owned: vehicle → epoch.
         retained: vehicle → epoch of rows that wait for the commit of their switch.
-        replicas: states of vehicles that may come.
-        offers: states that neighbours were offered.
         dropped: (kind, reason) → messages or entries that did not count.
     """
 
     def __init__(self, hosting: Hosting, limits: Limits, safeguards: Safeguards = ALL_ON) -> None:
         self.run, self.episode = hosting.run, hosting.episode
         self.zone, self.incarnation = hosting.zone, hosting.incarnation
-        self.tick = hosting.tick
-        self.lease: int | None = None
-        self.owned = dict(hosting.owned)
+        self.tick = hosting.tick  # the tick that the rows are at
+        self.lease: int | None = None  # the tick that the rows may be advanced to now, or None
+        self.owned = dict(hosting.owned)  # vehicle → epoch
         self.tally = tally(self.run, self.owned)
         self.retained: dict[int, int] = {}
-        self.replicas = Replicas(limits, safeguards)
-        self.offers = Offers(limits)
+        self.replicas = Replicas(limits, safeguards)  # states of vehicles that may come
+        self.offers = Offers(limits)  # states that neighbours were offered
         self.dropped: Counter[tuple[str, str]] = Counter()
         self._answer: Done | None = None
         self._entering: tuple[Confirmed, ...] = ()
@@ -94,17 +89,13 @@ class Endpoint:
                 return NOTHING
         return self._drop(message, "kind")
 
-    def complete(self, rows: int, removed: Sequence[Removed] = (), payload: bytes = b"") -> Done:
-        """End the lease: the result is in the store.
-
-        Args:
-            rows: digest of the rows that were stored (`world_digest` of their `row_hash`).
-            removed: vehicles that left the world in this tick.
-            payload: for the runtime.
-
-        Raises:
-            ProtocolError: there is no lease.
-        """
+    def complete(
+        self,
+        rows: int,  # digest of the rows that were stored (`world_digest` of their `row_hash`)
+        removed: Sequence[Removed] = (),  # vehicles that left the world in this tick
+        payload: bytes = b"",  # for the runtime
+    ) -> Done:
+        """End the lease: the result is in the store."""
         if self.lease is None:
             raise ProtocolError(f"zone {self.zone} has no lease: no STEP after tick {self.tick}")
         for vehicle, _ in removed:
@@ -139,9 +130,7 @@ class Endpoint:
             return self.on_message(message)
         refused = tuple(
             Refused(
-                offer.vehicle,
-                offer.epoch,
-                self.replicas.refuse(offer, message.tick, Refusal.LOAD),
+                offer.vehicle, offer.epoch, self.replicas.refuse(offer, message.tick, Refusal.LOAD)
             )
             for offer in message.entries
         )

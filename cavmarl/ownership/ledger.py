@@ -31,8 +31,7 @@ def state_digest(state: bytes) -> bytes:
 def row_hash(vehicle: int, state: bytes) -> int:
     """What a row adds to the digest of the world, in [0, 2**128)."""
     return int.from_bytes(
-        blake2b(_ID.pack(vehicle) + state, digest_size=16, person=b"cavmarl row").digest(),
-        "little",
+        blake2b(_ID.pack(vehicle) + state, digest_size=16, person=b"cavmarl row").digest(), "little"
     )
 
 
@@ -54,11 +53,7 @@ class OwnedTally(NamedTuple):
         return OwnedTally(self.vehicles - 1, (self.digest - member(run, vehicle, epoch)) % _OWNED)
 
     def check(self, other: OwnedTally, where: str) -> None:
-        """Compare with another count.
-
-        Raises:
-            ProtocolError: the sets differ.
-        """
+        """Compare with another count."""
         if self == other:
             return
         what = (

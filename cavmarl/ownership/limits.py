@@ -25,32 +25,17 @@ class DeadlinePolicy(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Deadlines that all parties of a run share.
+    """Deadlines that all parties of a run share."""
 
-    Attributes:
-        deferral: ticks for which the source goes on without a confirmation (D).
-        lifetime: ticks after which a replica that is not refreshed is dropped (K).
-        attempts: how often a PREPARE is sent inside one tick (A).
-        repeats: new hosts for one tick of one zone (R_max).
-        backoff: ticks without an offer to a target that refused.
-        capacity: replicas that one host keeps.
-        policy: what happens after the deadline.
-        grace: further ticks that a policy other than FORCE grants.
-        schema: version of the vehicles' states.
-
-    Raises:
-        ConfigError: a number that is too small, or a grace without a policy that uses it.
-    """
-
-    deferral: int = 2
-    lifetime: int = 16
-    attempts: int = 3
-    repeats: int = 3
-    backoff: int = 4
-    capacity: int = 100_000
-    policy: DeadlinePolicy = DeadlinePolicy.FORCE
-    grace: int = 0
-    schema: int = 1
+    deferral: int = 2  # ticks for which the source goes on without a confirmation (D)
+    lifetime: int = 16  # ticks after which a replica that is not refreshed is dropped (K)
+    attempts: int = 3  # how often a PREPARE is sent inside one tick (A)
+    repeats: int = 3  # new hosts for one tick of one zone (R_max)
+    backoff: int = 4  # ticks without an offer to a target that refused
+    capacity: int = 100_000  # replicas that one host keeps
+    policy: DeadlinePolicy = DeadlinePolicy.FORCE  # what happens after the deadline
+    grace: int = 0  # further ticks that a policy other than FORCE grants
+    schema: int = 1  # version of the vehicles' states
 
     def __post_init__(self) -> None:
         least = {"deferral": 0, "lifetime": 1, "attempts": 1, "repeats": 0, "backoff": 0}

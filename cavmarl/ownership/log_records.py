@@ -33,7 +33,6 @@ _WIDE = frozenset({"world", "rows", "digest"})
 
 
 def record_to_dict(record: Record, sequence: int) -> dict[str, Any]:
-    """A record as plain values, with its checksum."""
     return sealed(_content(record, sequence))
 
 
@@ -44,11 +43,6 @@ def sealed(line: dict[str, Any]) -> dict[str, Any]:
 
 
 def record_from_dict(line: dict[str, Any], sequence: int) -> Record:
-    """The record of a line.
-
-    Raises:
-        JournalError: another schema or sequence number, a wrong checksum or content.
-    """
     where = f"line {sequence + 1} of the log"
     if line.get("schema") != SCHEMA:
         raise JournalError(f"{where} has schema {line.get('schema')!r}, not {SCHEMA!r}")
@@ -72,11 +66,6 @@ def record_to_line(record: Record, sequence: int) -> str:
 
 
 def record_from_line(line: str | bytes, sequence: int) -> Record:
-    """The record of a line of the log.
-
-    Raises:
-        JournalError: the line is damaged, or another one.
-    """
     try:
         content = json.loads(line)
     except (ValueError, RecursionError) as error:
@@ -87,12 +76,6 @@ def record_from_line(line: str | bytes, sequence: int) -> Record:
 
 
 def records_from_lines(text: str) -> tuple[Record, ...]:
-    """The records of a whole log.
-
-    Raises:
-        JournalError: the last line is cut short. `whole_lines` gives the text before it; a line is
-            damaged, missing or out of order.
-    """
     records = []
     for sequence, line in enumerate(text.splitlines(keepends=True)):
         if not line.endswith("\n"):
@@ -107,11 +90,7 @@ def whole_lines(text: str) -> str:
 
 
 def replay(records: Iterable[Record]) -> Table:
-    """The table that a log leads to, for any number of zones.
-
-    Raises:
-        JournalError: the records cannot have been written in this order.
-    """
+    """The table that a log leads to, for any number of zones."""
     log = tuple(records)
     if not log or not isinstance(log[0], Reset):
         raise JournalError("a log begins with a RESET, which names the run")

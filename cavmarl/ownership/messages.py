@@ -106,17 +106,11 @@ class Removed(NamedTuple):
 
 @dataclass(slots=True, unsafe_hash=True)
 class Message:
-    """What every message carries.
+    """What every message carries."""
 
-    Attributes:
-        run: 16 random bytes of this run.
-        episode: counts the resets; messages of earlier episodes are void.
-        tick: of the state that the message is about.
-    """
-
-    run: bytes
-    episode: int
-    tick: int
+    run: bytes  # 16 random bytes of this run
+    episode: int  # counts the resets; messages of earlier episodes are void
+    tick: int  # of the state that the message is about
 
     def destinations(self) -> tuple[int, ...]:
         """Zones, or COORDINATOR, that it goes to."""

@@ -46,16 +46,8 @@ class Offers:
     ) -> tuple[dict[int, tuple[Offer, ...]], dict[int, tuple[Withdrawn, ...]]]:
         """The offers of a tick, and what is withdrawn because it is not among them.
 
-        Args:
-            tick: of the states.
-            approaches: owned vehicles and the zones that they come near.
-            epochs: owned vehicle → epoch.
-
         Returns:
             Target → offers, and target → withdrawals.
-
-        Raises:
-            ProtocolError: a vehicle is not owned.
         """
         self.barred = {pair: until for pair, until in self.barred.items() if until > tick}
         before, self.open, self.owed, self.attempts = self.open, {}, {}, 1

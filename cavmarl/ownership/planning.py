@@ -15,27 +15,17 @@ from cavmarl.ownership.messages import Begin, Confirmed, Done, Out, Removed, Spa
 
 @dataclass(slots=True)
 class OwnershipPlan:
-    """The way from the committed tick to the next.
+    """The way from the committed tick to the next."""
 
-    Attributes:
-        record: the decision, as logged.
-        expected: zone → what it owns after IN, OUT and SPAWN, before any is removed.
-        switches: vehicle → its switch.
-        births: vehicle → its zone.
-        enter: zone → switches into it.
-        leave: zone → vehicles that it gives away.
-        spawn: zone → new vehicles.
-        attach: vehicles whose state rides with STEP.
-    """
-
-    record: Begin
+    record: Begin  # the decision, as logged
+    # zone → what it owns after IN, OUT and SPAWN, before any is removed
     expected: Mapping[int, OwnedTally]
-    switches: dict[int, Switch] = field(default_factory=dict)
-    births: dict[int, int] = field(default_factory=dict)
-    enter: dict[int, list[Switch]] = field(default_factory=dict)
-    leave: dict[int, list[Out]] = field(default_factory=dict)
-    spawn: dict[int, list[Spawn]] = field(default_factory=dict)
-    attach: set[int] = field(default_factory=set)
+    switches: dict[int, Switch] = field(default_factory=dict)  # vehicle → its switch
+    births: dict[int, int] = field(default_factory=dict)  # vehicle → its zone
+    enter: dict[int, list[Switch]] = field(default_factory=dict)  # zone → switches into it
+    leave: dict[int, list[Out]] = field(default_factory=dict)  # zone → vehicles that it gives away
+    spawn: dict[int, list[Spawn]] = field(default_factory=dict)  # zone → new vehicles
+    attach: set[int] = field(default_factory=set)  # vehicles whose state rides with STEP
 
     def changes(self, zone: int) -> bool:
         """Whether a vehicle enters the zone, leaves it, or is born there."""
@@ -76,12 +66,7 @@ def make_plan(run: bytes, record: Begin, committed: Mapping[int, OwnedTally]) ->
 def check_done(
     run: bytes, plan: OwnershipPlan, done: Done, owners: Mapping[int, tuple[int, int]]
 ) -> None:
-    """Compare what a zone did with what was planned.
-
-    Raises:
-        ProtocolError: it removed what it does not own, did not confirm what came in, or owns
-            something else than it should.
-    """
+    """Compare what a zone did with what was planned."""
     expected = plan.expected[done.zone]
     for vehicle, _ in done.removed:
         zone, epoch = plan.owner(vehicle, owners)

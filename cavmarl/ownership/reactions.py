@@ -10,41 +10,27 @@ from cavmarl.ownership.messages import Message, Spawn
 
 @dataclass(slots=True)
 class Hosting:
-    """What a new host is told: its identity, and what its zone owns at the committed tick.
-
-    Attributes:
-        owned: vehicle → epoch.
-    """
+    """What a new host is told: its identity, and what its zone owns at the committed tick."""
 
     run: bytes
     episode: int
     tick: int
     zone: int
     incarnation: int
-    owned: Mapping[int, int]
+    owned: Mapping[int, int]  # vehicle → epoch
 
 
 @dataclass(slots=True)
 class Advance:
-    """The shard's work for one tick: change the rows that are owned, then advance all of them.
+    """The shard's work for one tick: change the rows that are owned, then advance all of them."""
 
-    Attributes:
-        episode: when it changes, all earlier rows are void.
-        tick: the tick to reach.
-        release: rows kept from earlier switches, which may go or become ghosts now.
-        leave: rows that are frozen as they are and kept.
-        enter: (vehicle, state) of rows that come in.
-        spawn: new rows.
-        payload: the STEP's own, for the runtime.
-    """
-
-    episode: int
-    tick: int
-    release: tuple[int, ...]
-    leave: tuple[int, ...]
-    enter: tuple[tuple[int, bytes], ...]
-    spawn: tuple[Spawn, ...]
-    payload: bytes
+    episode: int  # when it changes, all earlier rows are void
+    tick: int  # the tick to reach
+    release: tuple[int, ...]  # rows kept from earlier switches, which may go or become ghosts now
+    leave: tuple[int, ...]  # rows that are frozen as they are and kept
+    enter: tuple[tuple[int, bytes], ...]  # (vehicle, state) of rows that come in
+    spawn: tuple[Spawn, ...]  # new rows
+    payload: bytes  # the STEP's own, for the runtime
 
 
 @dataclass(slots=True)

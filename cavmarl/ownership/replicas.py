@@ -30,12 +30,11 @@ class Replicas:
     """Replicas by vehicle.
 
     Attributes:
-        held: vehicle → replica.
         fences: vehicle → (epoch, tick) of the newest PREPARE or ABORT heard.
     """
 
     def __init__(self, limits: Limits, safeguards: Safeguards) -> None:
-        self.held: dict[int, Replica] = {}
+        self.held: dict[int, Replica] = {}  # vehicle → replica
         self.fences: dict[int, tuple[int, int]] = {}
         self._heard: defaultdict[int, list[int]] = defaultdict(list)  # tick → vehicles
         self._limits = limits

@@ -17,14 +17,12 @@ class MemoryStore:
     """States as bytes, by vehicle.
 
     Attributes:
-        tick: the committed tick.
-        committed: vehicle → state at that tick.
         segments: (zone, incarnation) → what that process has written for the next tick.
     """
 
     def __init__(self, safeguards: Safeguards = ALL_ON) -> None:
-        self.tick = 0
-        self.committed: dict[int, bytes] = {}
+        self.tick = 0  # the committed tick
+        self.committed: dict[int, bytes] = {}  # vehicle → state at that tick
         self.segments: dict[tuple[int, int], dict[int, bytes]] = {}
         self._safeguards = safeguards
 
@@ -50,10 +48,6 @@ class MemoryStore:
 
         After a COMMIT that was logged but not carried out, a coordinator that starts again calls
         it once more: the segments are still there.
-
-        Args:
-            tick: as the COMMIT record has it.
-            incarnations: zone → incarnation, from the same record.
         """
         self.committed = {
             vehicle: state
@@ -64,7 +58,6 @@ class MemoryStore:
         self.segments.clear()
 
     def reset(self, tick: int) -> None:
-        """Begin an episode without vehicles."""
         self.tick, self.committed = tick, {}
         self.segments.clear()
 

@@ -42,11 +42,7 @@ class Table:
         owners: vehicle → (zone, epoch) as of the committed tick.
         deferred: vehicle → ticks that it has been with a zone which does not contain it.
         hosts: zone → (worker, incarnation); incarnation 0 means never hosted.
-        states: zone → UNHOSTED, HOSTED or FENCED.
         counts: zone → how many vehicles it owned at the committed tick.
-        seen: ids that have been in the episode.
-        repeats: zone → new hosts in the tick in progress.
-        plan: the tick in progress, or None.
     """
 
     def __init__(self, zones: Iterable[int], safeguards: Safeguards = ALL_ON) -> None:
@@ -54,10 +50,10 @@ class Table:
         self.owners: dict[int, tuple[int, int]] = {}
         self.deferred: dict[int, int] = {}
         self.hosts = dict.fromkeys(sorted(zones), (-1, 0))
-        self.states = dict.fromkeys(self.hosts, State.UNHOSTED)
-        self.seen = SeenIds()
-        self.repeats: Counter[int] = Counter()
-        self.plan: OwnershipPlan | None = None
+        self.states = dict.fromkeys(self.hosts, State.UNHOSTED)  # zone → UNHOSTED, HOSTED or FENCED
+        self.seen = SeenIds()  # ids that have been in the episode
+        self.repeats: Counter[int] = Counter()  # zone → new hosts in the tick in progress
+        self.plan: OwnershipPlan | None = None  # the tick in progress, or None
         self._safeguards = safeguards
         self.counts = dict.fromkeys(self.hosts, 0)
         self._tallies = dict.fromkeys(self.hosts, OwnedTally())
@@ -78,11 +74,6 @@ class Table:
 
     @property
     def planned(self) -> OwnershipPlan:
-        """The tick in progress.
-
-        Raises:
-            ProtocolError: there is none.
-        """
         if self.plan is None:
             raise ProtocolError("no tick is in progress")
         return self.plan
@@ -96,24 +87,15 @@ class Table:
 
     def settle(
         self,
-        tick: int,
-        switches: Iterable[Switch] = (),
+        tick: int,  # which one; in those before nothing has changed
+        switches: Iterable[Switch] = (),  # changes of owner
         births: Iterable[Birth] = (),
+        # vehicles that have left the world, of those before and of these
         removed: Iterable[Removed] = (),
     ) -> None:
         """Reach a later tick at once, as a BEGIN and a COMMIT with the same contents would.
 
         For a coordinator that has checked them itself, and whose log, if there is one, has them.
-
-        Args:
-            tick: which one; in those before nothing has changed.
-            switches: changes of owner.
-            births: new vehicles.
-            removed: vehicles that have left the world, of those before and of these.
-
-        Raises:
-            ProtocolError: a tick is in progress, or vehicles wait for their transfer; nobody owned
-                one of those who have left, or somebody else one of those who have changed.
         """
         if self.plan is not None or self.deferred:
             raise ProtocolError(f"tick {self.tick + 1} is in progress")

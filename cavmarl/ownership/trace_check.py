@@ -60,11 +60,6 @@ class _Orders:
 
 
 def check_trace(entries: Iterable[TraceEntry], longest_deferral: int, lifetime: int) -> None:
-    """Read a trace from its beginning.
-
-    Raises:
-        ProtocolError: the first entry that a correct run does not leave, and why.
-    """
     checker = TraceChecker(longest_deferral, lifetime)
     for number, entry in enumerate(entries, start=1):
         try:
@@ -79,23 +74,19 @@ def _require(holds: bool, otherwise: str) -> None:
 
 
 class TraceChecker:
-    """Follows a trace entry by entry; `take` raises ProtocolError at the first that is wrong.
+    """Follows a trace entry by entry; `take` raises ProtocolError at the first that is wrong."""
 
-    Args:
-        longest_deferral: ticks that a vehicle may be with a zone that does not contain it.
-        lifetime: ticks after which a state that is not refreshed is forgotten.
-        is_direct: zones and coordinator live in one process, so that there are records alone, and
-            perhaps only of ticks that have something to tell of.
-
-    Attributes:
-        owners: vehicle → owner as of the committed tick.
-        changes: what the last COMMIT did to them.
-    """
-
-    def __init__(self, longest_deferral: int, lifetime: int, is_direct: bool = False) -> None:
+    def __init__(
+        self,
+        longest_deferral: int,  # ticks that a vehicle may be with a zone that does not contain it
+        lifetime: int,  # ticks after which a state that is not refreshed is forgotten
+        # zones and coordinator live in one process, so that there are records alone, and perhaps
+        # only of ticks that have something to tell of
+        is_direct: bool = False,
+    ) -> None:
         self._is_direct = is_direct
-        self.owners: dict[int, Owner] = {}
-        self.changes: list[OwnerStep] = []
+        self.owners: dict[int, Owner] = {}  # vehicle → owner as of the committed tick
+        self.changes: list[OwnerStep] = []  # what the last COMMIT did to them
         self._longest, self._lifetime = longest_deferral, lifetime
         self._run, self._episode, self._tick = b"", -1, 0
         self._tallies: defaultdict[int, OwnedTally] = defaultdict(OwnedTally)

@@ -30,53 +30,37 @@ class Spread(NamedTuple):
 
 @dataclass(frozen=True)
 class TransferSummary:
-    """Of transfers and of what led to none.
+    """Of transfers and of what led to none."""
 
-    Attributes:
-        transfers: vehicles that have changed their owner.
-        forced: of them, with the state attached, since no acknowledgement came in time.
-        removed: of them, that left the world in the same tick.
-        deferred: ticks in which a vehicle that had crossed stayed with its owner, summed.
-        refused: states that a target did not take.
-        aborted: approaches that ended without a transfer.
-        timeouts: by phase: `acknowledge`, no answer by the end of the tick (as many as `deferred`);
-            `switch`, none by the deadline (as many as `forced`); `replica`, states that were
-            neither asked for nor withdrawn in their lifetime.
-        latency_ticks: from the first state at the target until it had confirmed.
-        waited_ticks: of these, those behind the border.
-        latency_ms: the same as `latency_ticks`, by the clock.
-        state_bytes: of a vehicle.
-        prepare_depth_m: how far outside of its owner's zone at the first state, less than 0 inside.
-        switch_depth_m: at the switch.
-        release_depth_m: outside of its old zone when the switch was committed.
-        failure_rate: share of transfers that had to be forced; None without transfers.
-    """
-
-    transfers: int
-    forced: int
-    removed: int
-    deferred: int
-    refused: int
-    aborted: int
+    transfers: int  # vehicles that have changed their owner
+    forced: int  # of them, with the state attached, since no acknowledgement came in time
+    removed: int  # of them, that left the world in the same tick
+    deferred: int  # ticks in which a vehicle that had crossed stayed with its owner, summed
+    refused: int  # states that a target did not take
+    aborted: int  # approaches that ended without a transfer
+    # by phase: `acknowledge`, no answer by the end of the tick (as many as `deferred`); `switch`,
+    # none by the deadline (as many as `forced`); `replica`, states that were neither asked for nor
+    # withdrawn in their lifetime
     timeouts: Mapping[str, int]
-    latency_ticks: Spread
-    waited_ticks: Spread
-    latency_ms: Spread
-    state_bytes: Spread
+    latency_ticks: Spread  # from the first state at the target until it had confirmed
+    waited_ticks: Spread  # of these, those behind the border
+    latency_ms: Spread  # the same as `latency_ticks`, by the clock
+    state_bytes: Spread  # of a vehicle
+    # how far outside of its owner's zone at the first state, less than 0 inside
     prepare_depth_m: Spread
-    switch_depth_m: Spread
-    release_depth_m: Spread
-    failure_rate: float | None
+    switch_depth_m: Spread  # at the switch
+    release_depth_m: Spread  # outside of its old zone when the switch was committed
+    failure_rate: float | None  # share of transfers that had to be forced; None without transfers
 
     @classmethod
-    def of(cls, rows: Iterable[Transfer], counts: Mapping[str, int]) -> TransferSummary:
-        """A summary.
-
-        Args:
-            rows: whose spread is told.
-            counts: of a `TransferLog`, or the sum of several; they may know of more transfers than
-                there are rows left.
-        """
+    def of(
+        cls,
+        rows: Iterable[Transfer],  # whose spread is told
+        # of a `TransferLog`, or the sum of several; they may know of more transfers than there are
+        # rows left
+        counts: Mapping[str, int],
+    ) -> TransferSummary:
+        """A summary."""
         kept = list(rows)
         forced = counts.get("forced", 0)
         transfers = forced + counts.get("switched", 0)

@@ -29,46 +29,30 @@ KEPT_ROWS = 10_000
 
 
 class Transfer(NamedTuple):
-    """A change of owner.
+    """A change of owner."""
 
-    Attributes:
-        episode: in which it was.
-        tick: the tick that the new owner computed first.
-        vehicle: that changed.
-        source: from where.
-        target: to where.
-        epoch: the new one.
-        forced: whether the state rode along, since the target was not ready in time.
-        removed: whether the vehicle left the world in that tick.
-        approached: tick of the first state that arrived at the target, or -1.
-        waited: ticks for which the source went on after the crossing.
-        offers: states that arrived at the target, repeats included.
-        state_bytes: size of the last of them; 0 where no bytes were sent, since both zones live in
-            one process.
-        prepare_depth_m: how far it was outside of its owner's zone when the first of them arrived,
-            less than 0 inside; None: unknown.
-        switch_depth_m: the same when its switch was decided.
-        release_depth_m: how far outside of its old zone when that was committed, and the old
-            owner's copy went; None: unknown, or it has left the world.
-        ms: from that first state, or else from BEGIN, until the target has confirmed; None: without
-            a clock.
-    """
-
-    episode: int
-    tick: int
-    vehicle: int
-    source: int
-    target: int
-    epoch: int
-    forced: bool
-    removed: bool
-    approached: int
-    waited: int
-    offers: int
+    episode: int  # in which it was
+    tick: int  # the tick that the new owner computed first
+    vehicle: int  # that changed
+    source: int  # from where
+    target: int  # to where
+    epoch: int  # the new one
+    forced: bool  # whether the state rode along, since the target was not ready in time
+    removed: bool  # whether the vehicle left the world in that tick
+    approached: int  # tick of the first state that arrived at the target, or -1
+    waited: int  # ticks for which the source went on after the crossing
+    offers: int  # states that arrived at the target, repeats included
+    # size of the last of them; 0 where no bytes were sent, since both zones live in one process
     state_bytes: int
+    # how far it was outside of its owner's zone when the first of them arrived, less than 0 inside;
+    # None: unknown
     prepare_depth_m: float | None = None
-    switch_depth_m: float | None = None
+    switch_depth_m: float | None = None  # the same when its switch was decided
+    # how far outside of its old zone when that was committed, and the old owner's copy went; None:
+    # unknown, or it has left the world
     release_depth_m: float | None = None
+    # from that first state, or else from BEGIN, until the target has confirmed; None: without a
+    # clock
     ms: float | None = None
 
     @property
@@ -115,17 +99,16 @@ UNKNOWN = _Switching(None, None)
 class TransferLog:
     """Follows records and deliveries.
 
-    Args:
-        lifetime: ticks after which a state that is not refreshed is forgotten.
-        surroundings: tells depths and times; None: they are left out.
-
     Attributes:
-        episode: of the newest record.
         ask: called before each reading, to bring late records up to date.
     """
 
-    def __init__(self, lifetime: int, surroundings: Surroundings | None = None) -> None:
-        self.episode = -1
+    def __init__(
+        self,
+        lifetime: int,  # ticks after which a state that is not refreshed is forgotten
+        surroundings: Surroundings | None = None,  # tells depths and times; None: they are left out
+    ) -> None:
+        self.episode = -1  # of the newest record
         self.ask: Callable[[], None] = lambda: None
         self._rows: deque[Transfer] = deque(maxlen=KEPT_ROWS)
         self._later: deque[tuple[int, Callable[[], Iterable[Transfer]]]] = deque()
@@ -158,7 +141,6 @@ class TransferLog:
         return rows
 
     def logged(self, records: Iterable[Record]) -> None:
-        """Note records, in the order of the log."""
         for record in records:
             match record:  # the frequent ones first
                 case Begin():
@@ -197,13 +179,7 @@ class TransferLog:
                 self._counts["refused"] += len(message.entries)
 
     def add_later(self, number: int, removed: int, make: Callable[[], Iterable[Transfer]]) -> None:
-        """Note changes of owner that no message tells of, whose rows are made when they are read.
-
-        Args:
-            number: how many; none of them was forced.
-            removed: how many of them left the world in that tick.
-            make: makes the rows.
-        """
+        """Note changes of owner that no message tells of; rows are made when they are read."""
         self._counts["switched"] += number
         if removed:
             self._counts["removed"] += removed

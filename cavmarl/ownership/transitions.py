@@ -97,11 +97,7 @@ TABLE: dict[tuple[Party, State, Event], State] = {
 
 
 def after(party: Party, state: State, event: Event) -> State:
-    """The state that follows.
-
-    Raises:
-        ProtocolError: the table does not list the pair.
-    """
+    """The state that follows."""
     following = TABLE.get((party, state, event))
     if following is None:
         raise ProtocolError(f"{event} of {party.value}, which is {state}")

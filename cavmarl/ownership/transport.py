@@ -50,22 +50,14 @@ class Rates:
 
 
 def check_rate(name: str, value: Any, most: float) -> None:
-    """See that a value is a probability up to `most`.
-
-    Raises:
-        ConfigError: it is not.
-    """
+    """See that a value is a probability up to `most`."""
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if not is_number or not 0.0 <= value <= most:
         raise ConfigError(f"{name} is {value!r}: must be a number from 0 to {most:g}")
 
 
 def check_whole(name: str, value: Any, least: int) -> None:
-    """See that a value is a whole number, `least` or more.
-
-    Raises:
-        ConfigError: it is not.
-    """
+    """See that a value is a whole number, `least` or more."""
     if not isinstance(value, int) or isinstance(value, bool) or value < least:
         raise ConfigError(f"{name} is {value!r}: must be a whole number, {least} or more")
 
@@ -75,19 +67,14 @@ FAULTLESS = Rates()
 
 @dataclass(frozen=True, slots=True)
 class FaultPlan:
-    """What happens to which messages.
+    """What happens to which messages."""
 
-    Attributes:
-        seed: of all choices.
-        rates: name of the kind (`"Prepare"`, `"Ack"`, …) → its rates; others have `otherwise`.
-        until: the first phase in which nothing happens any more; None means never.
-        until_tick: the first tick whose messages nothing happens to any more; None means never.
-    """
-
-    seed: int = 0
+    seed: int = 0  # of all choices
+    # name of the kind (`"Prepare"`, `"Ack"`, …) → its rates; others have `otherwise`
     rates: Mapping[str, Rates] = field(default_factory=dict)
     otherwise: Rates = FAULTLESS
-    until: int | None = None
+    until: int | None = None  # the first phase in which nothing happens any more; None means never
+    # the first tick whose messages nothing happens to any more; None means never
     until_tick: int | None = None
 
     def of(self, kind: str, phase: int, tick: int = 0) -> Rates:
@@ -120,19 +107,13 @@ class _Flight(NamedTuple):
 
 
 class Network:
-    """Carries messages from phase to phase.
-
-    Attributes:
-        phase: how often `deliver` has been called.
-        sent: kind → copies that were sent.
-        faults: (kind, fault) → how often.
-    """
+    """Carries messages from phase to phase."""
 
     def __init__(self, plan: FaultPlan | None = None) -> None:
         self.plan = FaultPlan() if plan is None else plan
-        self.phase = 0
-        self.sent: Counter[str] = Counter()
-        self.faults: Counter[tuple[str, str]] = Counter()
+        self.phase = 0  # how often `deliver` has been called
+        self.sent: Counter[str] = Counter()  # kind → copies that were sent
+        self.faults: Counter[tuple[str, str]] = Counter()  # (kind, fault) → how often
         self._flights: list[_Flight] = []
         self._copies: Counter[tuple[object, ...]] = Counter()
         self._sequence = 0

@@ -19,41 +19,25 @@ LOCAL, PROCESSES, RAY = "local", "processes", "ray"
 
 
 class MakeWorlds(Protocol):
-    """Makes worlds somewhere."""
-
     def __call__(
         self,
-        world: World,
-        base_dir: Path,
-        num_worlds: int,
-        workers: int | None,
-        in_next_step: bool,
+        world: World,  # what each is made of
+        base_dir: Path,  # the folder that its relative files start from
+        num_worlds: int,  # W
+        workers: int | None,  # how many run them; None: as many as are of use
+        in_next_step: bool,  # when worlds begin anew; see `SteppedWorlds`
     ) -> SteppedWorlds:
-        """Worlds that are stepped together.
-
-        Args:
-            world: what each is made of.
-            base_dir: the folder that its relative files start from.
-            num_worlds: W.
-            workers: how many run them; None: as many as are of use.
-            in_next_step: when worlds begin anew; see `SteppedWorlds`.
-        """
+        """Worlds that are stepped together."""
         ...
 
 
 @dataclass(frozen=True)
 class Backend:
-    """A place where worlds run.
-
-    Attributes:
-        make: makes them there.
-        needs_workers: whether the number of workers, or the name in its place, has to be given.
-        keeps_state: whether the caller's process has the state of so many worlds with so many
-            workers, so that it can draw them.
-    """
-
-    make: MakeWorlds
+    make: MakeWorlds  # makes them there
+    # whether the number of workers, or the name in its place, has to be given
     needs_workers: bool = False
+    # whether the caller's process has the state of so many worlds with so many workers, so that it
+    # can draw them
     keeps_state: Callable[[int, int | None], bool] = lambda num_worlds, workers: False
 
 
@@ -90,11 +74,6 @@ _BACKENDS = {
 _OWN = frozenset(_BACKENDS)
 
 
-def backend_names() -> tuple[str, ...]:
-    """What `hosts` can name."""
-    return tuple(_BACKENDS)
-
-
 def register_backend(name: str, make: MakeWorlds) -> None:
     """Add a place where worlds run, which `hosts` of `make_vec` and `parallel_env` can name.
 
@@ -113,11 +92,7 @@ def register_backend(name: str, make: MakeWorlds) -> None:
 
 
 def check_hosts(workers: int | str | None, hosts: str | None) -> tuple[str, int | None]:
-    """The backend that both name, and its number of workers, None where it finds that out.
-
-    Raises:
-        ConfigError: another name, no number, or no workers to be hosted.
-    """
+    """The backend that both name, and its number of workers, None where it finds that out."""
     known = ", ".join(f"'{name}'" for name in sorted(_BACKENDS, key=lambda name: name != RAY))
     if hosts is not None and hosts not in _BACKENDS:
         raise ConfigError(f"hosts = {hosts!r}: must be {known}, or None for this machine")
@@ -143,35 +118,21 @@ def check_hosts(workers: int | str | None, hosts: str | None) -> tuple[str, int 
 
 
 def keeps_state(num_worlds: int, workers: int | str | None, hosts: str | None) -> bool:
-    """Whether this process has the state of the worlds; arguments and errors as of `check_hosts`.
-
-    Args:
-        num_worlds: W.
-        workers: how many, or a backend's name.
-        hosts: a backend's name.
-    """
+    """Whether this process has the state of the worlds; the rest as of `check_hosts`."""
     name, number = check_hosts(workers, hosts)
     return _BACKENDS[name].keeps_state(num_worlds, number)
 
 
 def make_worlds(
-    world: World,
-    base_dir: Path,
-    num_worlds: int,
+    world: World,  # what each is made of
+    base_dir: Path,  # the folder that its relative files start from
+    num_worlds: int,  # W
+    # how many run them; 0 or None: this process; a backend's name: as many as are of use there
     workers: int | str | None = None,
-    hosts: str | None = None,
-    in_next_step: bool = False,
+    hosts: str | None = None,  # a backend's name; None: this machine
+    in_next_step: bool = False,  # when worlds begin anew; see `SteppedWorlds`
 ) -> SteppedWorlds:
     """Worlds of the backend that `workers` and `hosts` name.
-
-    Args:
-        world: what each is made of.
-        base_dir: the folder that its relative files start from.
-        num_worlds: W.
-        workers: how many run them; 0 or None: this process; a backend's name: as many as are of
-            use there.
-        hosts: a backend's name; None: this machine.
-        in_next_step: when worlds begin anew; see `SteppedWorlds`.
 
     Raises:
         ConfigError: workers or hosts that cannot be, or a setting that they cannot have.

@@ -14,9 +14,10 @@ import cavmarl.core.errors
 from cavmarl.balance.balance_plan import Plan
 from cavmarl.balance.plan_text import describe_plan
 from cavmarl.core.errors import CavmarlError, ConfigError, WorkerDeathError, WorkerFailureError
-from cavmarl.parallel.driven_vehicles import Driven
+from cavmarl.parallel.hosts.host_pool import HostPool
 from cavmarl.parallel.mover import Mover
-from cavmarl.parallel.step_arrays import StepArrays
+from cavmarl.parallel.processes.worker_pool import Death, Pool
+from cavmarl.parallel.step_arrays import Driven, StepArrays
 from cavmarl.parallel.step_placement import StepPlacement
 from cavmarl.parallel.work_shares import Part
 from cavmarl.parallel.worlds_job import Task
@@ -28,22 +29,25 @@ log = logging.getLogger("cavmarl.workers")
 
 
 class OrderedWorlds(ABC):
-    """What is the same wherever the worlds live; see `arrays.SteppedWorlds`.
+    """What is the same wherever the worlds live; see `arrays.SteppedWorlds`."""
 
-    Attributes:
-        arrays: what goes in and comes out.
-        placement: which worker hosts what.
-        mover: has that changed; None: it does not change.
-    """
-
-    arrays: StepArrays
-    placement: StepPlacement
-    mover: Mover | None = None
+    arrays: StepArrays  # what goes in and comes out
+    placement: StepPlacement  # which worker hosts what
+    pool: Pool | HostPool  # that runs them
+    mover: Mover | None = None  # has that changed; None: it does not change
     _steps = 0  # since the last reset of all
 
     @property
     def plans(self) -> tuple[Plan, ...]:
         return self.placement.plans
+
+    @property
+    def deaths(self) -> list[Death]:
+        return self.pool.deaths
+
+    def close(self) -> None:
+        """End the processes, and a cluster that was started for them."""
+        self.pool.close()
 
     @abstractmethod
     def _pids(self) -> Mapping[int, int]:
@@ -55,33 +59,21 @@ class OrderedWorlds(ABC):
 
     @abstractmethod
     def _send(self, task: Task, letter: Any, commits: bool) -> None:
-        """Let all workers do a task.
-
-        Args:
-            task: which.
-            letter: what it needs to know.
-            commits: whether it changes the worlds.
-
-        Raises:
-            WorkerFailureError: one has raised an error.
-            WorkerDeathError: one has died of it too often.
-        """
+        """Let all workers do a task."""
 
     @abstractmethod
-    def _ask(self, task: Task, world: int, more: Any = None) -> Any:
-        """Let the worker of a world answer.
-
-        Args:
-            task: what is asked.
-            world: its number; numbers from the end count as they do for arrays.
-            more: than the world that the worker has to know.
-        """
+    def _ask(
+        self,
+        task: Task,
+        world: int,  # its number; numbers from the end count as they do for arrays
+        more: Any = None,  # than the world that the worker has to know
+    ) -> Any:
+        """Let the worker of a world answer."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         raise uncopied()
 
     def reset(self, seed: int | None, first_world: int) -> None:
-        """Begin an episode in the worlds of `chosen`."""
         self._order(Task.RESET, {"seed": seed, "first_world": first_world})
         if self.arrays.chosen.all():
             self._steps = 0
@@ -108,23 +100,19 @@ class OrderedWorlds(ABC):
         self._order(Task.SUGGEST, commits=False)
 
     def write_states(self) -> None:
-        """Write the global state of each world."""
         self._order(Task.WRITE_STATES, commits=False)
 
     def ticks(self) -> NDArray[np.int64]:
-        """(W,) ticks since each world's reset."""
         return self.arrays.ticks.copy()
 
     def state_hash(self, world: int) -> str:
         return str(self._ask(Task.STATE_HASH, world))
 
     def traffic_stats(self, world: int) -> dict[str, float]:
-        """Traffic of one world since its reset."""
         found: dict[str, float] = self._ask(Task.TRAFFIC_STATS, world)
         return found
 
     def driven(self, world: int, agents: Sequence[int]) -> list[Driven]:
-        """The vehicles of some agents of one world, in no order."""
         found = []
         for first in range(0, len(agents), ASKED_AT_ONCE):
             some = list(agents[first : first + ASKED_AT_ONCE])
@@ -132,7 +120,6 @@ class OrderedWorlds(ABC):
         return found
 
     def signal_phases(self, world: int) -> NDArray[np.int32]:
-        """(num_signals,) PHASE rows that are on in one world."""
         return np.array(self._ask(Task.SIGNAL_PHASES, world), dtype=np.int32)
 
     def _order(self, task: Task, letter: Any = None, commits: bool = True) -> None:

@@ -1,4 +1,4 @@
-"""Makes the jobs of all workers that run worlds, in the fork server."""
+"""The program of worker processes that run worlds: makes all their jobs, in the fork server."""
 
 from __future__ import annotations
 
@@ -8,13 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from cavmarl.config.env import EnvConfig
-from cavmarl.core.errors import WorkerError
-from cavmarl.core.extensions import load_extensions
-from cavmarl.engine.world_setup import make_world
 from cavmarl.handoff.coordinator.coordinator_setup import WorldRun
-from cavmarl.parallel.checkpoint.action_log import ActionLog
-from cavmarl.parallel.checkpoint.action_log_job import ActionLogJob
+from cavmarl.parallel.checkpoint.action_log import ActionLog, ActionLogJob
 from cavmarl.parallel.checkpoint.checkpoint_job import CheckpointJob
 from cavmarl.parallel.checkpoint.checkpoint_log import CheckpointLog
 from cavmarl.parallel.checkpoint.moving_job import MovingJob
@@ -23,32 +18,23 @@ from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.processes.shared_huge_pages import huge_shared_zeros
 from cavmarl.parallel.processes.shared_memory import Segment, arrays_in
 from cavmarl.parallel.processes.state_image import Image
-from cavmarl.parallel.processes.worker_loop import Job
+from cavmarl.parallel.processes.worker_loop import Job, serve
+from cavmarl.parallel.recipe import CHANGED, world_of
 from cavmarl.parallel.sensor_workers.sensor_worker_setup import farm_of
 from cavmarl.parallel.step_arrays import StepArrays, layout_of
 from cavmarl.parallel.team.team_job import LeaderJob
 from cavmarl.parallel.work_shares import Part
-from cavmarl.parallel.worlds_job import commands_of, fingerprint
+from cavmarl.parallel.worlds_job import commands_of
 
 
 def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
     """The jobs of all workers, every kernel loaded.
 
-    Args:
-        recipe: what `pooled.PooledWorlds` writes.
-
     Raises:
         WorkerError: a file is not what it was.
     """
-    from cavmarl.config.io import validate  # pydantic is slow to import
-
-    load_extensions(recipe["extensions"])
-    config = validate(EnvConfig, recipe["config"], "the environment")
-    world = make_world(config, Path(recipe["base_dir"]))
-    if fingerprint(world) != recipe["fingerprint"]:
-        raise WorkerError(
-            f"the files of '{config.name}' have changed while workers were started: try again"
-        )
+    world = world_of(recipe, CHANGED)
+    config = world.config
     layout = layout_of(config, recipe["capacity"], recipe["num_worlds"])
     arrays = StepArrays.of(arrays_in(Segment(recipe["arrays"], 0).map(), layout))
     one = LocalWorlds(unwatched(world), 1, warm=True)
@@ -99,3 +85,7 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
         else:
             jobs.append(CheckpointJob(hire(make(part.first, part.last), part), part.first, diary))
     return jobs
+
+
+if __name__ == "__main__":
+    serve(make_jobs)

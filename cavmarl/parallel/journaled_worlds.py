@@ -27,11 +27,7 @@ def unwatched(world: World) -> World:
 
 
 def refuse_watched(zones: ZonesConfig, where: str, cure: str) -> None:
-    """Refuse what only the workers of whole worlds on this machine can have.
-
-    Raises:
-        ConfigError: a journal or faults.
-    """
+    """Refuse what only the workers of whole worlds on this machine can have."""
     for name in ("journal", "faults"):
         if getattr(zones, name):
             raise ConfigError(f"zones.{name} = {getattr(zones, name)!r} {where}: {cure}")
@@ -39,11 +35,6 @@ def refuse_watched(zones: ZonesConfig, where: str, cure: str) -> None:
 
 def check_watched(world: World, parts: Sequence[Part], may_change: bool) -> None:
     """See that worlds with a journal or faults can be run by these workers.
-
-    Args:
-        world: what each is made of.
-        parts: what each team of workers runs.
-        may_change: whether worlds move from worker to worker.
 
     Raises:
         ConfigError: a world is divided among workers, or moves; or the faults cannot be.

@@ -14,16 +14,14 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.core.extensions import extension_modules, load_extensions
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.memory import Zeros
-from cavmarl.core.numba.repeated import repeated
-from cavmarl.engine.global_state import global_state
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.engine.kernels.step_results import Results, keep_last, report, report_who_goes_on
 from cavmarl.engine.simulation import Simulation
-from cavmarl.engine.spaces import state_space, write_sensed
+from cavmarl.engine.spaces import global_state, state_space, write_sensed
 from cavmarl.engine.world_setup import World
 from cavmarl.handoff.coordinator.coordinator_setup import WorldRun
-from cavmarl.parallel.driven_vehicles import Driven, driven_by
 from cavmarl.parallel.sensor_workers.sensor_pool import SensorWorkers
-from cavmarl.parallel.step_arrays import StepArrays, layout_of
+from cavmarl.parallel.step_arrays import Driven, StepArrays, layout_of
 from cavmarl.sensors.registry import frame_layout
 from cavmarl.shards.shard import Commands
 from cavmarl.traffic.sumo.sumo_history import ToldLog
@@ -32,38 +30,25 @@ from cavmarl.traffic.sumo.sumo_history import ToldLog
 class LocalWorlds:
     """W worlds of one environment; no loop of Python runs over agents or vehicles in a step.
 
-    Args:
-        world: what each is made of.
-        num_worlds: W.
-        arrays: where to write; None: arrays of its own.
-        warm: have all kernels ready now.
-        in_next_step: when worlds begin anew; see `SteppedWorlds`.
-        zeros: makes the arrays that shards write.
-        like: worlds of the same environment, whose tables are used; None: they are made.
-        runs: see `Simulation`.
-
     Attributes:
-        world: what each is made of.
-        arrays: what goes into a step, and what comes out.
         simulation: the worlds.
-        in_next_step: when worlds begin anew.
-        farm: its sensor workers; None: there are none.
     """
 
     def __init__(
         self,
-        world: World,
-        num_worlds: int,
-        arrays: StepArrays | None = None,
-        warm: bool = False,
-        in_next_step: bool = False,
-        zeros: Zeros = huge_zeros,
+        world: World,  # what each is made of
+        num_worlds: int,  # W
+        arrays: StepArrays | None = None,  # where to write; None: arrays of its own
+        warm: bool = False,  # have all kernels ready now
+        in_next_step: bool = False,  # when worlds begin anew; see `SteppedWorlds`
+        zeros: Zeros = huge_zeros,  # makes the arrays that shards write
+        # worlds of the same environment, whose tables are used; None: they are made
         like: LocalWorlds | None = None,
-        runs: Sequence[WorldRun] | None = None,
+        runs: Sequence[WorldRun] | None = None,  # see `Simulation`
     ) -> None:
         self.world = world
-        self.in_next_step = in_next_step
-        self.farm: SensorWorkers | None = None
+        self.in_next_step = in_next_step  # when worlds begin anew
+        self.farm: SensorWorkers | None = None  # its sensor workers; None: there are none
         form = world.config.observation
         self._senses = form.mode == "sensors"
         self._is_flat = form.kind == "flat"
@@ -84,14 +69,14 @@ class LocalWorlds:
             arrays = _own_arrays(self.simulation, num_worlds)
             if not self._senses:
                 arrays = arrays._replace(observations=self.simulation.outputs.observations)
-        self.arrays = arrays
+        self.arrays = arrays  # what goes into a step, and what comes out
         self._horizon = world.config.max_steps
         self._steps = np.zeros(num_worlds, dtype=np.int64)
         self._waiting = np.zeros(num_worlds, dtype=np.bool_)  # over, and not begun anew yet
         self._results = Results(*(getattr(arrays, name) for name in Results._fields))
-        self._report = repeated(report)
-        self._report_who_goes_on = repeated(report_who_goes_on)
-        self._keep_last = repeated(keep_last)
+        self._report = specialized(report)
+        self._report_who_goes_on = specialized(report_who_goes_on)
+        self._keep_last = specialized(keep_last)
         if warm:
             self._write_results()
             self._write_who_goes_on()
@@ -99,7 +84,6 @@ class LocalWorlds:
             self._steps[:] = 0
 
     def reset(self, seed: int | None, first_world: int) -> None:
-        """Begin an episode in the worlds of `chosen`."""
         arrays, chosen = self.arrays, self.arrays.chosen
         if seed is not None:
             self.simulation.seed(seed, first_world)
@@ -161,7 +145,6 @@ class LocalWorlds:
             arrays.mask[over] = self.simulation.outputs.present[over]
 
     def _keep_observations(self) -> None:
-        """Keep the last observations of agents that have ended."""
         arrays = self.arrays
         self._keep_last(
             self._results, arrays.observations, arrays.final_observations, self.in_next_step
@@ -190,23 +173,31 @@ class LocalWorlds:
             state[:] = global_state(self.world.network, simulation.vehicles(world), space)
 
     def ticks(self) -> NDArray[np.int64]:
-        """(W,) ticks since each world's reset."""
         return self.simulation.ticks().copy()
 
     def state_hash(self, world: int) -> str:
-        """Hex digest of one world."""
         return self.simulation.state_hash(world)
 
     def traffic_stats(self, world: int) -> dict[str, float]:
-        """Traffic of one world since its reset."""
         stats = asdict(self.simulation.traffic_stats(world))
         if self.world.config.v2x.enabled:
             stats |= self.simulation.messages.statistics(world).to_dict()
         return stats
 
     def driven(self, world: int, agents: Sequence[int]) -> list[Driven]:
-        """The vehicles of some agents of one world, in no order."""
-        return driven_by(self.simulation, world, agents)
+        """The vehicles of some agents of one world, in no order; some may have none."""
+        simulation = self.simulation
+        rows = simulation.vehicles(world)
+        rows = rows[np.isin(rows["agent"], agents)]
+        columns = (
+            rows["agent"],
+            rows["id"],
+            simulation.types["vclass"][rows["vtype"]],
+            rows["length"].astype(np.float64),
+            rows["width"].astype(np.float64),
+            simulation.goal_edges[rows["goal"]],
+        )
+        return [Driven(*row) for row in zip(*(column.tolist() for column in columns), strict=True)]
 
     def signal_phases(self, world: int) -> NDArray[np.int32]:
         """(num_signals,) PHASE rows that are on in one world; a view."""
@@ -286,7 +277,6 @@ class LocalWorlds:
         self.farm = farm
 
     def close(self) -> None:
-        """End the processes that the worlds have."""
         if self.farm is not None:
             self.farm.close()
         self.simulation.close()

@@ -9,45 +9,39 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.errors import WorkerError
+from cavmarl.parallel.processes.shared_memory import Segment, arrays_in, size_of
 from cavmarl.parallel.step_placement import StepPlacement
 from cavmarl.parallel.work_shares import Part, parts_of
 from cavmarl.parallel.worlds_job import Task
+
+_CASE_BYTES = 1 << 12  # of what a worker leaves for others; it grows
 
 Run = Callable[[Task, Any, bool], None]
 
 
 class Mover:
-    """Measures shards, plans anew from time to time, and has moved what the plans move.
-
-    Args:
-        placement: the plans.
-        num_zones: of each world.
-        every: so many steps from one round to the next.
-        spent_s: (W, zones) processor time of each shard from the start on, which others add up;
-            whole worlds count as one zone.
-
-    Attributes:
-        moves: of shards, up to now.
-        moved_s: how long they have taken together.
-    """
+    """Measures shards, plans anew from time to time, and has moved what the plans move."""
 
     def __init__(
-        self, placement: StepPlacement, num_zones: int, every: int, spent_s: NDArray[np.float64]
+        self,
+        placement: StepPlacement,  # the plans
+        num_zones: int,  # of each world
+        every: int,  # so many steps from one round to the next
+        # (W, zones) processor time of each shard from the start on, which others add up; whole
+        # worlds count as one zone
+        spent_s: NDArray[np.float64],
     ) -> None:
         self._placement = placement
         self._num_zones = num_zones
         self._every = every
         self._spent_s = spent_s
         self._steps = 0
-        self.moves = 0
-        self.moved_s = 0.0
+        self.moves = 0  # of shards, up to now
+        self.moved_s = 0.0  # how long they have taken together
 
     def before_step(self, run: Run, pids: Callable[[], Mapping[int, int]]) -> list[Part] | None:
         """Count a step; if it is time, plan anew and move.
-
-        Args:
-            run: lets all workers do a task.
-            pids: tells those of their processes.
 
         Returns:
             which worker runs what now; None: what they did before.
@@ -79,3 +73,33 @@ class Mover:
         bounds = [part.first for part in parts] + [parts[-1].last]
         run(Task.PACK, bounds, False)
         run(Task.UNPACK, bounds, True)
+
+
+class MovingMemory:
+    """What shards have cost, and a case for each worker that may give whole worlds away.
+
+    Attributes:
+        recipe: what workers are told about it.
+        spent_s: (W, zones) processor time of each shard from the start on.
+
+    Raises:
+        WorkerError: there is none.
+    """
+
+    def __init__(
+        self,
+        num_worlds: int,  # W
+        num_zones: int,  # of each world, as they are placed; whole worlds count as one
+        cases: int,
+    ) -> None:
+        layout = {"spent_s": ("<f8", (num_worlds, num_zones))}
+        self.segments = [Segment.make(size_of(layout))]  # the memory
+        try:
+            self.segments += [Segment.make(_CASE_BYTES) for _ in range(cases)]
+            self.spent_s = arrays_in(self.segments[0].map(), layout)["spent_s"]
+        except WorkerError:
+            for segment in self.segments:
+                segment.close()
+            raise
+        spent, *others = (segment.fd for segment in self.segments)
+        self.recipe = {"spent": spent, "layout": layout, "cases": others}

@@ -3,67 +3,49 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import asdict
 from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
 
 from cavmarl.core.errors import ConfigError, WorkerError, WorkerFailureError
-from cavmarl.core.extensions import extension_modules
 from cavmarl.engine.compilation import compiled_before
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
 from cavmarl.parallel.checkpoint.checkpoint_log import make_segments
-from cavmarl.parallel.checkpoint.moving_memory import MovingMemory
 from cavmarl.parallel.commanded_worlds import OrderedWorlds, own_error
 from cavmarl.parallel.journaled_worlds import check_watched, is_watched, runs_as_text, unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
-from cavmarl.parallel.mover import Mover
+from cavmarl.parallel.mover import Mover, MovingMemory
 from cavmarl.parallel.processes.process_barrier import usable_cores
 from cavmarl.parallel.processes.shared_memory import Segment, arrays_in, size_of
-from cavmarl.parallel.processes.worker_pool import Death, Pool, Program
+from cavmarl.parallel.processes.worker_pool import Pool, Program
+from cavmarl.parallel.recipe import recipe_of
 from cavmarl.parallel.sensor_workers.sensor_worker_setup import warn_if_crowded
 from cavmarl.parallel.step_arrays import StepArrays, layout_of
 from cavmarl.parallel.step_placement import StepPlacement
 from cavmarl.parallel.work_shares import Part, parts_of
-from cavmarl.parallel.worlds_job import Task, fingerprint
+from cavmarl.parallel.worlds_job import TASK_NAMES, Task
 
-PROGRAM = "cavmarl.parallel.world_worker"
+PROGRAM = "cavmarl.parallel.job_factory"
 
 
 class PooledWorlds(OrderedWorlds):
     """W worlds over m worker processes.
 
-    Args:
-        world: what each is made of.
-        base_dir: the folder that its relative files start from.
-        num_worlds: W.
-        workers: m, from 1 to W times the zones of each; more than W divide the worlds.
-        in_next_step: when worlds begin anew; see `SteppedWorlds`.
-        program: that the processes run; None: the one that runs worlds.
-
-    Attributes:
-        world: what each is made of.
-        arrays: in shared memory; each worker writes those of its worlds.
-        pool: the processes.
-        in_next_step: when worlds begin anew.
-        placement: which worker hosts what.
-        mover: has that changed; None: it does not change.
-
     Raises:
-        ConfigError: a setting that worlds of several processes cannot have, or more of those than
-            zones.
         WorkerError: no process, or no memory.
     """
 
+    pool: Pool
+
     def __init__(
         self,
-        world: World,
-        base_dir: Path,
-        num_worlds: int,
-        workers: int,
-        in_next_step: bool = False,
-        program: str | None = None,
+        world: World,  # what each is made of
+        base_dir: Path,  # the folder that its relative files start from
+        num_worlds: int,  # W
+        workers: int,  # m, from 1 to W times the zones of each; more than W divide the worlds
+        in_next_step: bool = False,  # when worlds begin anew; see `SteppedWorlds`
+        program: str | None = None,  # that the processes run; None: the one that runs worlds
     ) -> None:
         self.world = world
         self.in_next_step = in_next_step
@@ -108,27 +90,24 @@ class PooledWorlds(OrderedWorlds):
             else make_segments(config, part.last - part.first)
             for part in parts
         ]
-        recipe = {
-            "config": asdict(config),
-            "extensions": extension_modules(config.registered),
-            "base_dir": str(base_dir.resolve()),
-            "fingerprint": fingerprint(world),
-            "num_worlds": num_worlds,
-            "capacity": capacity,
-            "arrays": segment.fd,
-            "in_next_step": in_next_step,
-            "parts": parts,
-            "diaries": [[one.fd for one in diary] for diary in diaries],
-            "runs": runs_as_text(config.zones, num_worlds),
-            "mover": None if memory is None else memory.recipe,
-        }
-        tasks = tuple(task.name.lower().replace("_", " ") for task in Task)
+        recipe = recipe_of(
+            world,
+            base_dir,
+            num_worlds=num_worlds,
+            capacity=capacity,
+            arrays=segment.fd,
+            in_next_step=in_next_step,
+            parts=parts,
+            diaries=[[one.fd for one in diary] for diary in diaries],
+            runs=runs_as_text(config.zones, num_worlds),
+            mover=None if memory is None else memory.recipe,
+        )
         leaders = [0, *accumulate(len(part.zones) for part in parts)]
         teams = tuple(tuple(range(*bounds)) for bounds in pairwise(leaders))
         moving = () if memory is None else memory.segments
         segments = (segment, *(one for diary in diaries for one in diary), *moving)
         pins = config.workers.pin
-        what = Program(program or PROGRAM, recipe, _names(parts), segments, tasks, pins, teams)
+        what = Program(program or PROGRAM, recipe, _names(parts), segments, TASK_NAMES, pins, teams)
         try:
             self.pool = Pool(what, config.workers.timeout_s, config.workers.max_retries)
         except WorkerFailureError as failure:
@@ -148,19 +127,8 @@ class PooledWorlds(OrderedWorlds):
 
     @property
     def simulation(self) -> Simulation:
-        """Refused: the worlds live in other processes.
-
-        Raises:
-            ConfigError: always.
-        """
+        """Refused: the worlds live in other processes."""
         raise ConfigError("the worlds live in worker processes: use workers=0 to look into them")
-
-    @property
-    def deaths(self) -> list[Death]:
-        return self.pool.deaths
-
-    def close(self) -> None:
-        self.pool.close()
 
     def _settle(self, parts: list[Part]) -> None:
         self._asked = _leaders(parts)

@@ -13,7 +13,6 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.spaces import flat_observation_space, state_space
 from cavmarl.engine.world_setup import World
-from cavmarl.parallel.driven_vehicles import Driven
 from cavmarl.parallel.processes.shared_memory import Layout
 from cavmarl.sensors.mounted.frames import Frames
 from cavmarl.sensors.registry import frame_layout, frames_in
@@ -91,18 +90,23 @@ def layout_of(config: EnvConfig, capacity: int, num_worlds: int) -> Layout:
     }
 
 
+class Driven(NamedTuple):
+    """An agent's vehicle, as plain numbers, for drivers outside the process."""
+
+    agent: int  # index of it
+    vehicle_id: int
+    vclass: int  # index into `roads.network.VEHICLE_CLASSES`
+    length_m: float  # of its body
+    width_m: float  # of its body
+    goal_edge: int  # EDGE row of where it is to go
+
+
 class SteppedWorlds(Protocol):
-    """W worlds that begin a new episode by themselves, as `CavVectorEnv` describes it.
+    """W worlds that begin a new episode by themselves, as `CavVectorEnv` describes it."""
 
-    Attributes:
-        world: what each is made of.
-        arrays: what goes into a step, and what comes out.
-        in_next_step: a new episode begins in the step after the one in which the old one ends.
-    """
-
-    world: World
-    arrays: StepArrays
-    in_next_step: bool
+    world: World  # what each is made of
+    arrays: StepArrays  # what goes into a step, and what comes out
+    in_next_step: bool  # a new episode begins in the step after the one in which the old one ends
 
     @property
     def simulation(self) -> Simulation:
@@ -114,13 +118,12 @@ class SteppedWorlds(Protocol):
         """Which worker hosts what, one plan of all worlds, or one a world; none without workers."""
         ...
 
-    def reset(self, seed: int | None, first_world: int) -> None:
-        """Begin an episode in the worlds of `chosen`; writes `observations` and `mask`.
-
-        Args:
-            seed: root of all random numbers; None goes on with those of the last seed.
-            first_world: number of the first of these worlds among all worlds of the seed.
-        """
+    def reset(
+        self,
+        seed: int | None,  # root of all random numbers; None goes on with those of the last seed
+        first_world: int,  # number of the first of these worlds among all worlds of the seed
+    ) -> None:
+        """Begin an episode in the worlds of `chosen`; writes `observations` and `mask`."""
         ...
 
     def step(self, commands: Commands) -> None:
@@ -137,16 +140,10 @@ class SteppedWorlds(Protocol):
 
     def state_hash(self, world: int) -> str: ...
 
-    def traffic_stats(self, world: int) -> dict[str, float]:
-        """Traffic of one world since its reset."""
-        ...
+    def traffic_stats(self, world: int) -> dict[str, float]: ...
 
-    def driven(self, world: int, agents: Sequence[int]) -> list[Driven]:
-        """The vehicles of some agents of one world, in no order."""
-        ...
+    def driven(self, world: int, agents: Sequence[int]) -> list[Driven]: ...
 
-    def signal_phases(self, world: int) -> NDArray[np.int32]:
-        """(num_signals,) PHASE rows that are on in one world."""
-        ...
+    def signal_phases(self, world: int) -> NDArray[np.int32]: ...
 
     def close(self) -> None: ...

@@ -25,11 +25,6 @@ Floats = NDArray[np.float64]
 class StepPlacement:
     """The plans of all workers: one of all worlds, or one of the zones of each world.
 
-    Args:
-        world: what each is made of.
-        num_worlds: W.
-        workers: how many.
-
     Raises:
         ConfigError: more workers than zones of all worlds.
         NoAdmissibleWorkerError: workers are too busy.
@@ -58,28 +53,20 @@ class StepPlacement:
         return tuple(balancer.plan for balancer in self._balancers)
 
     def watch(self, pids: Mapping[int, int]) -> None:
-        """Look at the machine from now on, if that is wanted.
-
-        Args:
-            pids: of the workers' processes.
-        """
+        """Look at the machine from now on, if that is wanted."""
         if self._watches:
             from cavmarl.balance.probe import Watch  # psutil is only needed here
 
             self._watch, self._pids = Watch(pids), dict(pids)
 
-    def round(self, spent_s: Floats, steps: int, pids: Mapping[int, int]) -> bool:
-        """Plan anew by what shards have cost since the last round.
-
-        Args:
-            spent_s: (W, zones) processor time of each shard from the start on; whole worlds count
-                as one zone.
-            steps: since the last round.
-            pids: of the workers' processes.
-
-        Returns:
-            whether something has to be moved.
-        """
+    def round(
+        self,
+        # (W, zones) processor time of each shard from the start on; whole worlds count as one zone
+        spent_s: Floats,
+        steps: int,  # since the last round
+        pids: Mapping[int, int],  # of the workers' processes
+    ) -> bool:  # whether something has to be moved
+        """Plan anew by what shards have cost since the last round."""
         seen = self._snapshot(pids)
         cost_s = (spent_s - self._before_s) / (steps * self._ticks_per_step)
         self._before_s = spent_s.copy()
@@ -101,12 +88,8 @@ class StepPlacement:
         for balancer, plan in zip(self._balancers, plans, strict=True):
             balancer.plan = plan
 
-    def moved(self, lasted_s: float) -> int:
-        """Note how long it took to make the present plans true: later moves have to be worth that.
-
-        Returns:
-            how many shards have moved.
-        """
+    def moved(self, lasted_s: float) -> int:  # how many shards have moved
+        """Note how long it took to make the present plans true: later moves are worth that."""
         moves = sum(len(plan.moves) for plan in self.plans)
         self._rule = replace(self._rule, move_s=lasted_s / moves)
         return moves
@@ -121,7 +104,6 @@ class StepPlacement:
 
 
 def _present_snapshot(workers: int) -> LoadSnapshot:
-    """How busy this machine is before the workers are started."""
     from cavmarl.balance.probe import take_snapshot
 
     return take_snapshot(dict.fromkeys(range(workers)))

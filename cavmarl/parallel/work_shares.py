@@ -22,17 +22,11 @@ _LANES = "length of lanes"
 
 
 class Part(NamedTuple):
-    """What the workers of one team run; most teams are one worker.
+    """What the workers of one team run; most teams are one worker."""
 
-    Attributes:
-        first: world.
-        last: the one after the last; where there are several workers it is the next.
-        zones: that each worker hosts.
-    """
-
-    first: int
-    last: int
-    zones: list[list[int]]
+    first: int  # world
+    last: int  # the one after the last; where there are several workers it is the next
+    zones: list[list[int]]  # that each worker hosts
 
     @property
     def names(self) -> list[str]:
@@ -48,26 +42,15 @@ class Part(NamedTuple):
 
 
 def make_plans(
-    world: World,
-    num_worlds: int,
-    workers: int,
-    snapshot: LoadSnapshot | None = None,
-    rule: BalanceRule | None = None,
-) -> list[Plan]:
+    world: World,  # what each is made of
+    num_worlds: int,  # how many there are
+    workers: int,  # how many, at least 1
+    snapshot: LoadSnapshot | None = None,  # how busy they are; None: they are idle
+    rule: BalanceRule | None = None,  # of the plans
+) -> list[Plan]:  # one plan of all worlds, or one of the zones of each world
     """Worlds to workers as evenly as may be; those are divided of which there are too few.
 
-    Args:
-        world: what each is made of.
-        num_worlds: how many there are.
-        workers: how many, at least 1.
-        snapshot: how busy they are; None: they are idle.
-        rule: of the plans.
-
-    Returns:
-        one plan of all worlds, or one of the zones of each world.
-
     Raises:
-        ConfigError: more workers than zones of all worlds.
         NoAdmissibleWorkerError: workers are too busy.
     """
     count = world.partition.count
@@ -94,12 +77,7 @@ def share_out(world: World, num_worlds: int, workers: int) -> list[Part]:
 
 
 def parts_of(plans: Sequence[Plan], num_zones: int) -> list[Part]:
-    """What the workers of each team run.
-
-    Args:
-        plans: of all worlds; see `make_plans`.
-        num_zones: of each world.
-    """
+    """What the workers of each team run."""
     parts = []
     for plan in plans:
         numbers = [candidate.worker for candidate in plan.problem.snapshot.workers]

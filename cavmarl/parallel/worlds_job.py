@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.engine.world_setup import World
 from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.processes.worker_loop import Job
 from cavmarl.parallel.step_arrays import StepArrays
 from cavmarl.shards.shard import Commands
 
@@ -32,13 +32,11 @@ class Task(IntEnum):
     SIGNAL_PHASES = 10
 
 
-class WorldsJob:
-    """Some of the worlds, next to each other.
+TASK_NAMES = tuple(task.name.lower().replace("_", " ") for task in Task)
 
-    Args:
-        worlds: that write their part of the shared arrays.
-        first: number of the first one among all.
-    """
+
+class WorldsJob(Job):
+    """Some of the worlds, next to each other."""
 
     def __init__(self, worlds: LocalWorlds, first: int) -> None:
         self._take(worlds, first)
@@ -48,14 +46,7 @@ class WorldsJob:
         self._first = first
         self._commands = commands_of(worlds.arrays)
 
-    def afterwards(self) -> None:
-        """Nothing to do."""
-
-    def prepare(self) -> None:
-        """Nothing to do."""
-
     def perform(self, task: int, letter: Any) -> Any:
-        """Do a task; the answer of those that have one."""
         worlds = self._worlds
         if task == Task.STEP:
             worlds.step(self._commands)
@@ -84,7 +75,6 @@ class WorldsJob:
         return np.asarray(vehicles * (spent_s / float(vehicles.sum())), dtype=np.float64)
 
     def save(self) -> list[NDArray[Any]]:
-        """All that the next step depends on."""
         return self._worlds.save()
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
@@ -94,9 +84,3 @@ class WorldsJob:
 def commands_of(arrays: StepArrays) -> Commands:
     """What agents do in the next step; views."""
     return Commands(arrays.controls, arrays.meta_actions, arrays.declared)
-
-
-def fingerprint(world: World) -> str:
-    """Differs between two readings of the same files if one was changed in between."""
-    made_of = (world.network, world.demand, world.partition)
-    return " ".join("none" if part is None else part.content_hash for part in made_of)

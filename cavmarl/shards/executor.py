@@ -3,36 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 from cavmarl.shards.shard import Shard
 from cavmarl.shards.shard_group import ShardGroup
-
-# What a tick is made of: a name and its arguments can be sent anywhere.
-Phase = Literal[
-    "begin_step",
-    "advance",
-    "choose_goals",
-    "leave",
-    "gather",
-    "resolve",
-    "rank_lanes",
-    "propose",
-    "admit",
-    "commit",
-    "detect",
-    "sense",
-    "credit",
-    "suggest",
-    "retire",
-    "forget",
-]
 
 
 class Executor(Protocol):
     """Runs one phase on all shards and returns when all are through with it."""
 
-    def each(self, phase: Phase, *arguments: Any) -> None:
+    def each(self, phase: str, *arguments: Any) -> None:
         """Run the phase on every shard with the same arguments; see `ShardGroup`."""
         ...
 
@@ -51,5 +31,5 @@ class SerialExecutor:
     def __init__(self, shards: Sequence[Shard]) -> None:
         self._group = ShardGroup(shards)
 
-    def each(self, phase: Phase, *arguments: Any) -> None:
+    def each(self, phase: str, *arguments: Any) -> None:
         self._group.each(phase, *arguments)

@@ -16,12 +16,7 @@ from cavmarl.sensors.observed import layout
 
 
 class RegisteredOutputs:
-    """Asks the registered sensors and terms of a configuration.
-
-    Args:
-        config: the environment.
-        network: the roads.
-    """
+    """Asks the registered sensors and terms of a configuration."""
 
     def __init__(self, config: EnvConfig, network: RoadNetwork) -> None:
         self._network = network

@@ -7,7 +7,7 @@ of its process.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.math.buckets import make_lists
 from cavmarl.core.math.neighbors import make_grid
 from cavmarl.core.memory import Zeros
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.core.records.arrays import (
     Common,
     Gate,
@@ -30,7 +30,6 @@ from cavmarl.core.records.arrays import (
     Zoned,
 )
 from cavmarl.core.records.codes import DRIVER_BACKGROUND, DRIVER_SUMO
-from cavmarl.driving.controllers import CONTROLLER
 from cavmarl.driving.kernels.approach import APPROACH
 from cavmarl.driving.kernels.lane_index import ENTRY
 from cavmarl.driving.vehicles import VEHICLE
@@ -51,60 +50,55 @@ COMMON = Common._fields
 TICKS_IN_ORDER = 32  # for so long rows that have been put in the order of the lanes nearly stay so
 SUGGESTED_HORIZON_S = 1.0  # in which a suggested target speed is to be reached
 
+# What a world knows of one actuated signal program.
+CONTROLLER = np.dtype(
+    [
+        ("phase", np.int64),  # PHASE row that is on
+        ("since_ms", np.int64),  # when it began, since reset
+        ("next_ms", np.int64),  # when to look whether it goes on
+    ],
+    align=True,
+)
+
 
 @dataclass(frozen=True)
 class Commands:
-    """Decoded actions of one step.
+    """Decoded actions of one step."""
 
-    Attributes:
-        controls: (W, A, 2) throttle in m/s² and steering in rad; continuous actions.
-        meta_actions: (W, A) ACTION_* codes; discrete actions.
-        declared: (W, A) CAUSE_* of events that agents tell others of, 0: none; (0, 0): no messages.
-    """
-
+    # (W, A, 2) throttle in m/s² and steering in rad; continuous actions
     controls: NDArray[np.float64]
-    meta_actions: NDArray[np.int64]
+    meta_actions: NDArray[np.int64]  # (W, A) ACTION_* codes; discrete actions
+    # (W, A) CAUSE_* of events that agents tell others of, 0: none; (0, 0): no messages
     declared: NDArray[np.int32] = field(default_factory=lambda: np.zeros((0, 0), np.int32))
+
+
+COMMANDS = tuple(entry.name for entry in fields(Commands))
 
 
 class Shard:
     """The sub-worlds of one zone.
 
-    Args:
-        config: the environment.
-        network: the roads.
-        plans: PLAN (G, L), the ways of agents.
-        travel: types and ways.
-        zoned: the rows of all zones.
-        outputs: where the agents of all shards get what they sense, each at its own index.
-        zone: which one.
-        zones: of the partition.
-        halo: how far it sees over its borders.
-        first: the first shard of this process, whose clock, keys, signals and room to work in this
-            one shares; None: this is it.
-        zeros: makes what all zones have in common.
-
     Attributes:
-        worlds: what it has.
         sides: VEHICLE (W, C), the two buffers that rows are kept in, swapped each tick.
-        side: in which of them the committed rows are.
         next_side: where the next ones come; the same, but in ticks that put rows in order.
-        mail: what agents have been told over the air; None: no messages.
     """
 
     def __init__(
         self,
         config: EnvConfig,
         network: RoadNetwork,
-        plans: NDArray[np.void],
+        plans: NDArray[np.void],  # PLAN (G, L), the ways of agents
         travel: Travel,
-        zoned: Zoned,
+        zoned: Zoned,  # the rows of all zones
+        # where the agents of all shards get what they sense, each at its own index
         outputs: Outputs,
         zone: int,
         zones: ZoneArrays,
-        halo: Halo,
+        halo: Halo,  # how far it sees over its borders
+        # the first shard of this process, whose clock, keys, signals and room to work in this one
+        # shares; None: this is it
         first: Shard | None = None,
-        zeros: Zeros = np.zeros,
+        zeros: Zeros = np.zeros,  # makes what all zones have in common
     ) -> None:
         self.zone = zone
         self.zoned = zoned
@@ -129,25 +123,25 @@ class Shard:
             num_worlds,
             capacity,
             network,
-            config.population.num_ids,
-            config.clock.control_latency_ticks,
-            zoned,
-            zone,
-            None if first is None else first.worlds,
-            zeros,
-            len(travel.scripts.cues),
+            num_agents=config.population.num_ids,
+            latency_ticks=config.clock.control_latency_ticks,
+            zoned=zoned,
+            zone=zone,
+            common=None if first is None else first.worlds,
+            zeros=zeros,
+            num_cues=len(travel.scripts.cues),
         )
         self.sides = (self.worlds.rows, zoned.rows[1, zone])
-        self.side = self.next_side = 0
+        self.side = self.next_side = 0  # in which of them the committed rows are
         self.outputs = outputs
-        self.mail: Mail | None = None
+        self.mail: Mail | None = None  # what agents have been told over the air; None: no messages
         self._messages_at = layout(config.sensors).get("messages")
         self.target_speeds = np.array(config.action.target_speeds_mps)
         self.discrete = config.action.kind == "discrete"
-        self._call_leave = repeated(leave)
-        self._call_observe_further = repeated(observe_optional)
-        self._call_observe_messages = repeated(observe_messages)
-        self._call_fill_stacks = repeated(fill_stacks)
+        self._call_leave = specialized(leave)
+        self._call_observe_further = specialized(observe_optional)
+        self._call_observe_messages = specialized(observe_messages)
+        self._call_fill_stacks = specialized(fill_stacks)
 
     def cut(self, zones: ZoneArrays, halo: Halo) -> None:
         """Say where its zone and the others are; a group has to be made anew after it."""
@@ -171,7 +165,6 @@ class Shard:
         self._call_leave(gate, self.worlds, self.worlds.next_rows, DRIVER_SUMO, 0)
 
     def commit(self) -> None:
-        """Make the next rows the committed state."""
         self.face(self.next_side, self.next_side)
 
     def align(self) -> None:
@@ -179,7 +172,6 @@ class Shard:
         self.face(0, 0)
 
     def face(self, side: int, next_side: int) -> None:
-        """Say on which side the rows are, and the next ones."""
         self.side, self.next_side = side, next_side
         self.worlds = self.worlds._replace(rows=self.sides[side], next_rows=self.sides[next_side])
 
@@ -274,6 +266,11 @@ def make_worlds(
     if common is None:
         return worlds
     return worlds._replace(**{name: getattr(common, name) for name in COMMON})
+
+
+def common_of(worlds: Worlds) -> Common:
+    """What all shards have in common, of any of them."""
+    return Common(**{name: getattr(worlds, name) for name in COMMON})
 
 
 def make_zoned(num_zones: int, num_worlds: int, capacity: int, zeros: Zeros = np.zeros) -> Zoned:

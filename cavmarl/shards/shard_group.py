@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.numba.repeated import repeated
-from cavmarl.core.records.arrays import Common, Demand, Gate
+from cavmarl.core.numba.specialized import specialized
+from cavmarl.core.records.arrays import Demand, Gate
 from cavmarl.shards.kernels.group_phases import (
     FRAME,
     Members,
@@ -27,7 +27,7 @@ from cavmarl.shards.kernels.group_phases import (
     retire_each,
     sense_each,
 )
-from cavmarl.shards.shard import TICKS_IN_ORDER, Commands, Shard
+from cavmarl.shards.shard import TICKS_IN_ORDER, Commands, Shard, common_of
 
 
 class ShardGroup:
@@ -35,12 +35,12 @@ class ShardGroup:
 
     Phases that every tick has are one call for all shards, with what does not change put together
     once. Others, and those which have nothing to do in most ticks, go from shard to shard.
-
-    Args:
-        shards: of one process, by rising zones; they share clock and room.
     """
 
-    def __init__(self, shards: Sequence[Shard]) -> None:
+    def __init__(
+        self,
+        shards: Sequence[Shard],  # of one process, by rising zones; they share clock and room
+    ) -> None:
         self._shards = tuple(shards)
         first = shards[0]
         self._first = first
@@ -52,28 +52,28 @@ class ShardGroup:
         self._room = max(grids, key=lambda grid: grid.newest.size)
         frames = [tuple(getattr(grid, name) for name in FRAME.names or ()) for grid in grids]
         self._members = Members(
-            np.array([shard.zone for shard in shards]),
-            np.array(frames, dtype=FRAME),
-            first.zones,
-            first.halo,
-            first.zoned,
-            Common(*(getattr(first.worlds, name) for name in Common._fields)),
+            numbers=np.array([shard.zone for shard in shards]),
+            frames=np.array(frames, dtype=FRAME),
+            zones=first.zones,
+            halo=first.halo,
+            zoned=first.zoned,
+            common=common_of(first.worlds),
         )
         self._controls = np.zeros_like(first.worlds.pending[:, :, 0])
-        self._advance = repeated(advance_each)
-        self._gather = repeated(gather_each)
-        self._resolve = repeated(resolve_each)
-        self._choose_goals = repeated(choose_goals_each)
-        self._rank_lanes = repeated(rank_lanes_each)
-        self._propose = repeated(propose_each)
-        self._admit = repeated(admit_each)
+        self._advance = specialized(advance_each)
+        self._gather = specialized(gather_each)
+        self._resolve = specialized(resolve_each)
+        self._choose_goals = specialized(choose_goals_each)
+        self._rank_lanes = specialized(rank_lanes_each)
+        self._propose = specialized(propose_each)
+        self._admit = specialized(admit_each)
         self._meta_actions = np.zeros(self._controls.shape[:2], dtype=np.int64)
-        self._begin_step = repeated(begin_step_each)
-        self._detect = repeated(detect_each)
-        self._sense = repeated(sense_each)
-        self._credit = repeated(credit_each)
-        self._retire = repeated(retire_each)
-        self._forget = repeated(forget_each)
+        self._begin_step = specialized(begin_step_each)
+        self._detect = specialized(detect_each)
+        self._sense = specialized(sense_each)
+        self._credit = specialized(credit_each)
+        self._retire = specialized(retire_each)
+        self._forget = specialized(forget_each)
 
     @property
     def sides(self) -> tuple[int, int]:
@@ -113,7 +113,6 @@ class ShardGroup:
                 shard.turn()
 
     def face(self, side: int, next_side: int) -> None:
-        """Say on which side the rows are, and the next ones."""
         if self.sides != (side, next_side):
             for shard in self._shards:
                 shard.face(side, next_side)
@@ -144,7 +143,6 @@ class ShardGroup:
         self._gather(self._members, self._first.next_side, touching_m, border_m)
 
     def resolve(self) -> None:
-        """Find contacts in the next rows."""
         first = self._first
         self._resolve(self._members, first.side, first.next_side, self._scratch, self._room)
 
@@ -185,7 +183,6 @@ class ShardGroup:
         self._admit(self._members, first.side, first.next_side, gate)
 
     def commit(self) -> None:
-        """Make the next rows the committed state."""
         if self._first.next_side != self._first.side:
             for shard in self._shards:
                 shard.commit()

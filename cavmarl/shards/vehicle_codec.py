@@ -25,9 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import (
-    MessageError,
-)
+from cavmarl.core.errors import MessageError
 from cavmarl.core.records.arrays import Outputs, Worlds
 from cavmarl.core.records.codes import AUTHORITATIVE
 from cavmarl.driving.vehicles import RECORD_VERSION
@@ -72,22 +70,16 @@ class TransferHeader(NamedTuple):
 class TransferCodec:
     """Packs and unpacks the vehicles of one set of worlds.
 
-    Args:
-        record: dtype of a vehicle's record.
-        commands: (W, A, …) float64, the delayed commands of agents: `Worlds.pending`.
-        frames: (W, A, F) float32, what the next observation of an agent takes from the last one.
-
     Attributes:
         schema: a number in [0, 2^63) that is the same where the other's states can be unpacked.
-
-    Raises:
-        MessageError: the record has padding, whose bytes nobody sets.
     """
 
     def __init__(
         self,
-        record: np.dtype[np.void],
+        record: np.dtype[np.void],  # dtype of a vehicle's record
+        # (W, A, …) float64, the delayed commands of agents: `Worlds.pending`
         commands: NDArray[np.float64],
+        # (W, A, F) float32, what the next observation of an agent takes from the last one
         frames: NDArray[np.float32],
     ) -> None:
         text = layout_text(record)
@@ -114,16 +106,16 @@ class TransferCodec:
         oldest = outputs.observations.shape[2] // stack
         return cls(worlds.rows.dtype, worlds.pending, outputs.observations[:, :, oldest:])
 
-    def pack(self, rows: NDArray[np.void], world: int, i: int, tick: int) -> bytes:
-        """The state of a vehicle.
-
-        Args:
-            rows: VEHICLE (W, C).
-            world: number of the world.
-            i: the row.
-            tick: of the state, as `unpack` will be asked for it. `VEHICLE["tick"]` is one less in
-                vehicles that entered after the reset.
-        """
+    def pack(
+        self,
+        rows: NDArray[np.void],  # VEHICLE (W, C)
+        world: int,
+        i: int,
+        # of the state, as `unpack` will be asked for it. `VEHICLE["tick"]` is one less in vehicles
+        # that entered after the reset
+        tick: int,
+    ) -> bytes:
+        """The state of a vehicle."""
         record: bytes = rows[world, i : i + 1].tobytes()
         (vehicle,) = _LONG.unpack_from(record, self._id_at)
         (agent,) = _INT.unpack_from(record, self._agent_at)
@@ -137,20 +129,7 @@ class TransferCodec:
     def unpack(
         self, data: bytes, vehicle: int, tick: int, rows: NDArray[np.void], world: int, i: int
     ) -> None:
-        """Write a state into `rows[world, i]`, and what its agent keeps; nothing if it is refused.
-
-        Args:
-            data: as `pack` returns it.
-            vehicle: whose state it has to be.
-            tick: of which tick.
-            rows: VEHICLE (W, C).
-            world: number of the world.
-            i: the row.
-
-        Raises:
-            MessageError: these bytes are no state, or none of this vehicle and tick, or of another
-                version, build or environment; the type says which.
-        """
+        """Write a state to `rows[world, i]`, and what its agent keeps; nothing if it is refused."""
         header = self.header(data)
         if (header.vehicle, header.tick) != (vehicle, tick):
             raise MessageError(
@@ -169,11 +148,7 @@ class TransferCodec:
         frames[:] = np.frombuffer(data, frames.dtype, frames.size, end + header.commands)
 
     def header(self, data: bytes) -> TransferHeader:
-        """What stands before a state, once it is seen that the state is whole and of this layout.
-
-        Raises:
-            MessageError: it is not; the type says why.
-        """
+        """What stands before a state, once the state is seen to be whole and of this layout."""
         if len(data) < _HEADER.size:
             raise MessageError(
                 f"a state of {len(data)} bytes has no room for its header of {_HEADER.size}"

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cavmarl.config.env import PopulationConfig, TrafficConfig
 from cavmarl.core.errors import CapacityError, ConfigError, RouteError
 from cavmarl.core.memory import Zeros
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.core.records.arrays import Demand, Gate, Travel, Worlds
 from cavmarl.core.records.codes import MODEL_KRAUSS
 from cavmarl.driving.driver_models import model_code
@@ -49,10 +49,10 @@ class _Calls:
     """Kernels that ticks call."""
 
     def __init__(self) -> None:
-        self.call_orders = repeated(call_orders)
-        self.settle = repeated(settle)
-        self.assign_lanes = repeated(assign_lanes)
-        self.accept = repeated(accept)
+        self.call_orders = specialized(call_orders)
+        self.settle = specialized(settle)
+        self.assign_lanes = specialized(assign_lanes)
+        self.accept = specialized(accept)
 
 
 @dataclass(frozen=True)

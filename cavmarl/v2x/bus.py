@@ -19,7 +19,7 @@ from cavmarl.config.v2x import V2xConfig, period_ticks
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.math.neighbors import make_grid
 from cavmarl.core.math.walls import make_walls
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.core.records.arrays import Common, RoadArrays, Zoned
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.v2x.channel import make_channel
@@ -98,8 +98,8 @@ class Bus:
         self.mail = _make_mail(v2x, num_worlds, capacity, num_receivers, len(self.units), zeros)
         self._room = _make_room(network, self.mail, zoned, num_receivers)
         self._network: NetworkSimulator | None = None
-        self._exchange = repeated(exchange_messages)
-        self._hand_out = repeated(hand_out)
+        self._exchange = specialized(exchange_messages)
+        self._hand_out = specialized(hand_out)
         self.mail.owner[:] = -1
         self._empty(np.ones(num_worlds, dtype=np.bool_))
 

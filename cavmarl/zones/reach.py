@@ -25,10 +25,6 @@ def driving_reach_m(network: RoadNetwork, travel: Travel) -> float:
     A driver looks `view_m` ahead. With a line within `see_m`, or on a junction, it asks about
     vehicles that come to it, within `APPROACH_M` of the ends of the lanes that lead to it or are on
     it, or stand behind it, within `EXIT_LOOK_M`.
-
-    Args:
-        network: the roads.
-        travel: the types of vehicles, and how far they look.
     """
     longest_m = float(network.links["length_m"].max(initial=0.0))
     junction_m = max(travel.see_m, longest_m)

@@ -18,24 +18,15 @@ from cavmarl.zones.reach import off_lane_m
 
 @dataclass(frozen=True, eq=False)
 class Visibility:
-    """The distances that sight goes by, and what it takes to know on which roads it ends earlier.
-
-    Attributes:
-        network: the roads.
-        travel: the types of vehicles, and how far they look.
-        halo_m: vehicles further away are not seen.
-        sure_m: all nearer vehicles are seen; from `halo_m` on, roads are not asked.
-        outside_m: how far outside of its zone a vehicle can be whose transfer is late.
-    """
+    """The distances that sight goes by, and what tells on which roads it ends earlier."""
 
     network: RoadNetwork
-    travel: Travel
-    halo_m: float
-    sure_m: float
-    outside_m: float
+    travel: Travel  # the types of vehicles, and how far they look
+    halo_m: float  # vehicles further away are not seen
+    sure_m: float  # all nearer vehicles are seen; from `halo_m` on, roads are not asked
+    outside_m: float  # how far outside of its zone a vehicle can be whose transfer is late
 
     def halo(self, partition: ZonePartition) -> Halo:
-        """What each zone of a partition sees."""
         halo = zone_halo(partition, self.halo_m)
         if partition.count == 1 or self.sure_m >= self.halo_m:
             return halo

@@ -34,7 +34,7 @@ def test_every_folder_of_kernels_is_read() -> None:
     assert len(folders) > 8
     for folder in folders:
         assert ".".join(folder.relative_to(PACKAGE).parts) in SOURCES
-    assert {"core.math.rng", "core.records.codes", "core.numba.repeated"} <= SOURCES.keys()
+    assert {"core.math.rng", "core.records.codes", "core.numba.specialized"} <= SOURCES.keys()
 
 
 def test_a_change_moves_the_kernels_that_call_what_has_changed_and_no_others(

@@ -13,7 +13,7 @@ from cavmarl.core.records.arrays import Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.engine.shared_outputs import SharedOutputs
 from cavmarl.engine.simulation import Simulation
-from cavmarl.shards.executor import Phase, SerialExecutor
+from cavmarl.shards.executor import SerialExecutor
 from cavmarl.shards.shard import COMMON, Commands, Shard, make_zoned
 from cavmarl.zones.partition.zone_halo import zone_halo
 from cavmarl.zones.partition.zone_layouts import cut_map
@@ -88,7 +88,7 @@ class Halves:
                 shard.worlds.num_rows[w] = num
         return all(shard.worlds.num_owned.all() for shard in self.shards)
 
-    def each(self, phase: Phase, *arguments: Any) -> None:
+    def each(self, phase: str, *arguments: Any) -> None:
         """A phase of both shards."""
         self._executor.each(phase, *arguments)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cavmarl.engine.simulation import Simulation
 from cavmarl.handoff.fault_injection.fault_plan import Faults
 from cavmarl.handoff.fault_injection.injected_faults import Crashes, FaultyPhases
-from cavmarl.shards.executor import Executor, Phase
+from cavmarl.shards.executor import Executor
 from cavmarl.shards.shard import Commands, Shard
 from tests.support.driving import drive, make_simulation, start
 
@@ -43,7 +43,7 @@ class Strict:
         self._hosts = [(simulation._shards[zone], host) for zone, host in hosts]
         self._strangers = strangers
 
-    def each(self, phase: Phase, *arguments: Any) -> None:
+    def each(self, phase: str, *arguments: Any) -> None:
         for shard, host in self._hosts:
             if phase in ("begin_step", "advance"):
                 host.each(phase, self._own(shard, *arguments))

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 
 from cavmarl.ownership.directory import Directory, StoreError
 from cavmarl.ownership.endpoint import Endpoint
-from cavmarl.ownership.invariants import Monitor
 from cavmarl.ownership.ledger import row_hash, world_digest
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.log_records import record_to_line, records_from_lines, whole_lines
@@ -33,6 +32,7 @@ from cavmarl.ownership.store import MemoryStore
 from cavmarl.ownership.trace import Trace
 from cavmarl.ownership.trace_check import check_trace
 from cavmarl.ownership.transport import FaultPlan, Network
+from tests.ownership.protocol_invariants import Monitor
 from tests.ownership.toy import ToyWorld
 
 RUN = bytes(range(16))

@@ -25,7 +25,8 @@ from cavmarl.core.errors import (
 from cavmarl.engine.world_setup import load_world, make_world
 from cavmarl.evaluate.provenance.manifest import describe_world
 from cavmarl.parallel.hosts.hosted_worlds_job import HostedWorlds
-from cavmarl.parallel.worlds_job import Task, fingerprint
+from cavmarl.parallel.recipe import fingerprint
+from cavmarl.parallel.worlds_job import Task
 from cavmarl.traffic.sumo.sumo_input import free_libsumo
 from tests.support.driving import drive, start
 from tests.support.rerouting import make_map

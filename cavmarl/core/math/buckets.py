@@ -36,7 +36,6 @@ def make_lists(number: int, zeros: Callable[..., NDArray[Any]] = np.zeros) -> Li
 
 @kernel
 def forget(lists: Lists) -> None:
-    """Make all lists empty."""
     for word in range(lists.words.size):
         if lists.words[word] != 0:
             for k in range(word * WORD, (word + 1) * WORD):

@@ -43,15 +43,12 @@ def segment_at(points: NDArray[np.void], first: int, num: int, s: float) -> int:
 
 @kernel
 def lane_pose(
-    points: NDArray[np.void], first: int, num: int, s: float
+    points: NDArray[np.void],  # POINT (num_points,)
+    first: int,  # row of the polyline's first point
+    num: int,  # points of the polyline, at least 2
+    s: float,  # m; beyond the ends the end segments go on straight
 ) -> tuple[float, float, float, float, float, float]:
     """The place and direction at arc length `s` of a polyline.
-
-    Args:
-        points: POINT (num_points,).
-        first: row of the polyline's first point.
-        num: points of the polyline, at least 2.
-        s: m; beyond the ends the end segments go on straight.
 
     Returns:
         x, y, z in metres, cos and sin of the direction, slope dz/ds.
@@ -121,22 +118,16 @@ def _project_between(
 
 @kernel
 def project(
-    points: NDArray[np.void], first: int, num: int, x: float, y: float
-) -> tuple[float, float, float, float]:
+    points: NDArray[np.void],  # POINT (num_points,)
+    first: int,  # row of the polyline's first point
+    num: int,  # points of the polyline, at least 2
+    x: float,  # m
+    y: float,  # m
+) -> tuple[float, float, float, float]:  # s and d in metres, cos and sin of the direction there
     """The lane coordinates of a place: those of the nearest point of the polyline.
 
     Of several nearest points the one with the smaller `s` counts. Where that point is an end of the
     polyline, `s` and `d` are taken along the end segment's line, so `s` may leave [0, length].
-
-    Args:
-        points: POINT (num_points,).
-        first: row of the polyline's first point.
-        num: points of the polyline, at least 2.
-        x: m.
-        y: m.
-
-    Returns:
-        s and d in metres, cos and sin of the direction there.
     """
     return _project_between(points, first, num, first, first + num - 1, x, y)
 
@@ -162,37 +153,23 @@ def project_near(
 
 @kernel
 def boxes_overlap(
-    x1: float,
-    y1: float,
-    cos1: float,
-    sin1: float,
-    half_length1: float,
-    half_width1: float,
-    x2: float,
-    y2: float,
-    cos2: float,
-    sin2: float,
-    half_length2: float,
-    half_width2: float,
+    x1: float,  # centre of the first box, m
+    y1: float,  # centre of the first box, m
+    cos1: float,  # of its heading
+    sin1: float,  # of its heading
+    half_length1: float,  # along its heading, m
+    half_width1: float,  # across its heading, m
+    x2: float,  # the same of the second box
+    y2: float,  # see `x2`
+    cos2: float,  # see `x2`
+    sin2: float,  # see `x2`
+    half_length2: float,  # see `x2`
+    half_width2: float,  # see `x2`
 ) -> bool:
     """Whether two oriented rectangles share area; touching does not count.
 
     Separating axes (Gottschalk, Lin, Manocha: "OBBTree", SIGGRAPH 1996), in the plane. Written so
     that swapping the boxes swaps the comparisons and changes no bit of them.
-
-    Args:
-        x1: centre of the first box, m.
-        y1: centre of the first box, m.
-        cos1: of its heading.
-        sin1: of its heading.
-        half_length1: along its heading, m.
-        half_width1: across its heading, m.
-        x2: the same of the second box.
-        y2: see `x2`.
-        cos2: see `x2`.
-        sin2: see `x2`.
-        half_length2: see `x2`.
-        half_width2: see `x2`.
     """
     dx = x2 - x1
     dy = y2 - y1

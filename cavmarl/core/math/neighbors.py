@@ -71,14 +71,12 @@ class Grid(NamedTuple):
     spots: NDArray[np.void]  # SPOT (capacity,) by VEHICLE row; both only `contacts` uses
 
 
-def make_grid(bounds: tuple[float, float, float, float], cell_m: float, capacity: int) -> Grid:
-    """An empty grid.
-
-    Args:
-        bounds: min_x, min_y, max_x, max_y of the area in m.
-        cell_m: side of a cell in m; about half the usual search distance is fast.
-        capacity: most vehicles that it can take.
-    """
+def make_grid(
+    bounds: tuple[float, float, float, float],  # min_x, min_y, max_x, max_y of the area in m
+    cell_m: float,  # side of a cell in m; about half the usual search distance is fast
+    capacity: int,  # most vehicles that it can take
+) -> Grid:
+    """An empty grid."""
     min_x, min_y, max_x, max_y = bounds
     num_x = max(1, math.ceil((max_x - min_x) / cell_m))
     num_y = max(1, math.ceil((max_y - min_y) / cell_m))
@@ -108,7 +106,6 @@ def _slot(offset: float, cells_per_m: float, count: int) -> int:
 
 @kernel
 def cell_at(grid: Grid, x: float, y: float) -> int:
-    """The cell of a place."""
     column = _slot(x - grid.min_x, grid.cells_per_m, grid.num_x)
     return _slot(y - grid.min_y, grid.cells_per_m, grid.num_y) * grid.num_x + column
 
@@ -154,14 +151,12 @@ def _fill_body(body: np.void, vehicle: np.void, row: int) -> None:
 
 
 @kernel
-def fill_grid(rows: NDArray[np.void], num: int, grid: Grid) -> None:
-    """Sort the vehicles of one world into the cells of `grid`, which forgets what it held.
-
-    Args:
-        rows: VEHICLE (C,).
-        num: live rows, `rows[:num]`; at most the grid's capacity.
-        grid: from `make_grid`, overwritten.
-    """
+def fill_grid(
+    rows: NDArray[np.void],  # VEHICLE (C,)
+    num: int,  # live rows, `rows[:num]`; at most the grid's capacity
+    grid: Grid,  # from `make_grid`, overwritten
+) -> None:
+    """Sort the vehicles of one world into the cells of `grid`, which forgets what it held."""
     start = grid.start
     cell = grid.cell
     start[:] = 0
@@ -184,32 +179,18 @@ def fill_grid(rows: NDArray[np.void], num: int, grid: Grid) -> None:
 
 @kernel
 def k_nearest(
-    grid: Grid,
-    row: int,
-    x: float,
-    y: float,
-    z: float,
-    radius_m: float,
-    k: int,
+    grid: Grid,  # filled for this tick
+    row: int,  # VEHICLE row to leave out, the one that asks; -1 for none
+    x: float,  # m
+    y: float,  # m
+    z: float,  # m; vehicles more than `LEVEL_HEIGHT_M` above or below are not seen
+    radius_m: float,  # centres further away than this are not seen, in the plane
+    k: int,  # how many to find at most
+    # (k,) int, VEHICLE rows of those found, overwritten up to the returned number
     out_row: NDArray[np.int32],
-    out_squared: NDArray[np.float64],
-) -> int:
-    """The nearest vehicles around a place on the same level, sorted by distance, then by id.
-
-    Args:
-        grid: filled for this tick.
-        row: VEHICLE row to leave out, the one that asks; -1 for none.
-        x: m.
-        y: m.
-        z: m; vehicles more than `LEVEL_HEIGHT_M` above or below are not seen.
-        radius_m: centres further away than this are not seen, in the plane.
-        k: how many to find at most.
-        out_row: (k,) int, VEHICLE rows of those found, overwritten up to the returned number.
-        out_squared: (k,) squared distances in m², likewise.
-
-    Returns:
-        how many were found.
-    """
+    out_squared: NDArray[np.float64],  # (k,) squared distances in m², likewise
+) -> int:  # how many were found
+    """The nearest vehicles around a place on the same level, sorted by distance, then by id."""
     found = nearest_bodies(grid, row, x, y, z, radius_m, k, out_row, out_squared)
     for m in range(found):
         out_row[m] = grid.bodies[out_row[m]]["row"]

@@ -69,18 +69,14 @@ _ULP = 1.0 / (1 << 53)
 
 @kernel
 def philox4x32(
-    c0: np.uint64, c1: np.uint64, c2: np.uint64, c3: np.uint64, k0: np.uint64, k1: np.uint64
+    c0: np.uint64,  # lowest word of the counter, as all words a uint64 below 2**32
+    c1: np.uint64,  # second word of the counter
+    c2: np.uint64,  # third word of the counter
+    c3: np.uint64,  # highest word of the counter
+    k0: np.uint64,  # low word of the key
+    k1: np.uint64,  # high word of the key
 ) -> tuple[np.uint64, np.uint64, np.uint64, np.uint64]:
-    """One block of Philox4x32-10: four 32-bit words from a 128-bit counter and a 64-bit key.
-
-    Args:
-        c0: lowest word of the counter, as all words a uint64 below 2**32.
-        c1: second word of the counter.
-        c2: third word of the counter.
-        c3: highest word of the counter.
-        k0: low word of the key.
-        k1: high word of the key.
-    """
+    """One block of Philox4x32-10: four 32-bit words from a 128-bit counter and a 64-bit key."""
     for _ in range(_ROUNDS):
         product_0 = c0 * _MULTIPLIER_0
         product_1 = c2 * _MULTIPLIER_1
@@ -116,28 +112,24 @@ def _block(
 
 
 @kernel
-def world_key(seed: int | np.uint64, world: int, episode: int) -> np.uint64:
-    """The key of one world in one episode, mixed from the run's seed.
-
-    Args:
-        seed: of the run, in [0, 2**64).
-        world: number of the world, in [0, 2**48).
-        episode: number of the episode in that world, in [0, 2**48).
-    """
+def world_key(
+    seed: int | np.uint64,  # of the run, in [0, 2**64)
+    world: int,  # number of the world, in [0, 2**48)
+    episode: int,  # number of the episode in that world, in [0, 2**48)
+) -> np.uint64:
+    """The key of one world in one episode, mixed from the run's seed."""
     word_0, word_1 = _block(seed, world, episode, STREAM_WORLD)
     return word_0 | (word_1 << _SHIFT_32)
 
 
 @kernel
-def uniform(key: int | np.uint64, vehicle: int, tick: int, stream: int) -> float:
-    """A number of 53 random bits, uniform in [0, 1).
-
-    Args:
-        key: of the world, see `world_key`.
-        vehicle: id, in [0, 2**48).
-        tick: of the world, in [0, 2**48).
-        stream: one of `STREAM_*`, plus the index of the draw.
-    """
+def uniform(
+    key: int | np.uint64,  # of the world, see `world_key`
+    vehicle: int,  # id, in [0, 2**48)
+    tick: int,  # of the world, in [0, 2**48)
+    stream: int,  # one of `STREAM_*`, plus the index of the draw
+) -> float:
+    """A number of 53 random bits, uniform in [0, 1)."""
     word_0, word_1 = _block(key, vehicle, tick, stream)
     return float(((word_0 >> _SHIFT_5) << _SHIFT_26) | (word_1 >> _SHIFT_6)) * _ULP
 
@@ -156,16 +148,14 @@ def fill_uniform(
 
 
 @kernel
-def below(key: int | np.uint64, vehicle: int, tick: int, stream: int, n: int) -> int:
-    """An integer uniform in [0, n); no value's chance is off by more than 2**-64.
-
-    Args:
-        key: of the world, see `world_key`.
-        vehicle: id, in [0, 2**48).
-        tick: of the world, in [0, 2**48).
-        stream: one of `STREAM_*`, plus the index of the draw.
-        n: number of values, in [1, 2**32).
-    """
+def below(
+    key: int | np.uint64,  # of the world, see `world_key`
+    vehicle: int,  # id, in [0, 2**48)
+    tick: int,  # of the world, in [0, 2**48)
+    stream: int,  # one of `STREAM_*`, plus the index of the draw
+    n: int,  # number of values, in [1, 2**32)
+) -> int:
+    """An integer uniform in [0, n); no value's chance is off by more than 2**-64."""
     word_0, word_1 = _block(key, vehicle, tick, stream)
     count = np.uint64(n)
     # floor(n * (word_0 * 2**32 + word_1) / 2**64), carried out in two halves that fit.

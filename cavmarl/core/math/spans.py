@@ -20,15 +20,13 @@ from cavmarl.core.numba import kernel
 
 
 @kernel
-def row_span(edges: NDArray[np.float64], num: int, row: int, width: int) -> tuple[int, int]:
-    """The columns [first, last) of one row whose centres lie inside.
-
-    Args:
-        edges: (E, 4) constant, by column, by row, and one over by column.
-        num: how many of them count.
-        row: row of the picture.
-        width: columns of the picture.
-    """
+def row_span(
+    edges: NDArray[np.float64],  # (E, 4) constant, by column, by row, and one over by column
+    num: int,  # how many of them count
+    row: int,  # row of the picture
+    width: int,  # columns of the picture
+) -> tuple[int, int]:
+    """The columns [first, last) of one row whose centres lie inside."""
     low = 0.5
     high = width - 0.5
     v = row + 0.5

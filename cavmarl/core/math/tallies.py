@@ -23,15 +23,11 @@ def begins_second(ticks: NDArray[np.int64], ticks_per_s: int) -> bool:
 
 @kernel
 def occasions(
-    ticks: NDArray[np.int64], ticks_per_s: int, num_through: NDArray[np.int64]
+    ticks: NDArray[np.int64],  # (W,) the present tick
+    ticks_per_s: int,  # in a second
+    num_through: NDArray[np.int64],  # (k, W) vehicles that have arrived in each zone
 ) -> tuple[bool, bool]:
-    """Whether a second begins in some world, and whether a vehicle has arrived.
-
-    Args:
-        ticks: (W,) the present tick.
-        ticks_per_s: in a second.
-        num_through: (k, W) vehicles that have arrived in each zone.
-    """
+    """Whether a second begins in some world, and whether a vehicle has arrived."""
     somebody = False
     for zone in range(num_through.shape[0]):
         for w in range(num_through.shape[1]):

@@ -28,13 +28,11 @@ class Walls(NamedTuple):
     segments: NDArray[np.float64]  # (n, 4) x, y, x, y in m
 
 
-def make_walls(segments: NDArray[np.float64], cell_m: float = CELL_M) -> Walls:
-    """Sort walls into cells.
-
-    Args:
-        segments: (n, 4) their ends x, y, x, y in m; none is fine, too.
-        cell_m: side of a cell.
-    """
+def make_walls(
+    segments: NDArray[np.float64],  # (n, 4) their ends x, y, x, y in m; none is fine, too
+    cell_m: float = CELL_M,  # side of a cell
+) -> Walls:
+    """Sort walls into cells."""
     segments = np.ascontiguousarray(segments, dtype=np.float64).reshape(-1, 4)
     if len(segments) == 0:
         nothing = np.zeros(0, np.int32)

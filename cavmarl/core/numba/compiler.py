@@ -102,7 +102,6 @@ class _BundleModel(_Model):  # type: ignore[misc]
     """How Numba hands over a named tuple: ours as an address, all others as they were."""
 
     def get_argument_type(self) -> Any:
-        """What a function takes."""
         if _is_bundle(self._fe_type):
             return self.get_value_type().as_pointer()
         return super().get_argument_type()
@@ -257,7 +256,6 @@ class _KernelLowering(NativeLowering):
 
     @property
     def lowering_class(self) -> Any:
-        """What does it."""
         return _KernelLower
 
     def run_pass(self, state: Any) -> bool:
@@ -325,7 +323,6 @@ class KernelCompiler(_Compiler):  # type: ignore[misc]
                 gc.enable()
 
     def define_pipelines(self) -> list[Any]:
-        """The one pipeline."""
         builder: Any = DefaultPassBuilder
         manager = builder.define_nopython_pipeline(self.state)
         needless = set() if self.state.flags.nrt else _NEEDLESS

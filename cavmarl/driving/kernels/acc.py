@@ -37,27 +37,16 @@ def _extra_room_m(speed: float) -> float:
 
 @kernel
 def acc_acceleration(
-    speed: float,
-    allowed: float,
-    room: float,
-    front_speed: float,
-    front_decel: float,
-    tau: float,
-    accel: float,
-    decel: float,
+    speed: float,  # m/s
+    allowed: float,  # the speed to keep on a free road, m/s
+    room: float,  # to the leader, less the gap at rest, m; inf: there is none
+    front_speed: float,  # of the leader, m/s
+    front_decel: float,  # with which the leader can brake in comfort, m/s²
+    tau: float,  # time gap to keep, s
+    accel: float,  # the most that it accelerates, m/s²
+    decel: float,  # the most that it brakes to keep a speed, m/s², positive
 ) -> float:
-    """Acceleration in m/s², at most `accel`.
-
-    Args:
-        speed: m/s.
-        allowed: the speed to keep on a free road, m/s.
-        room: to the leader, less the gap at rest, m; inf: there is none.
-        front_speed: of the leader, m/s.
-        front_decel: with which the leader can brake in comfort, m/s².
-        tau: time gap to keep, s.
-        accel: the most that it accelerates, m/s².
-        decel: the most that it brakes to keep a speed, m/s², positive.
-    """
+    """Acceleration in m/s², at most `accel`."""
     asked = clamp(SPEED_GAIN * (allowed - speed), -decel, accel)
     if room == math.inf:
         return asked

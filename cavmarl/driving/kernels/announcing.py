@@ -22,11 +22,7 @@ def announced_m(speed: float) -> float:
 
 @inlined_kernel
 def is_let_stand(row: np.void) -> bool:
-    """Whether others need not give way to a vehicle before a line: it stands and will not go.
-
-    Args:
-        row: VEHICLE or OUTER.
-    """
+    """Whether others need not give way to a vehicle before a line: it stands and will not go."""
     hold = row["hold"]
     kept = (hold == HOLD_SIGNAL) | (hold == HOLD_EXIT_BLOCKED)
     idle = (hold == HOLD_NONE) & (row["wait_s"] > IMPATIENT_S)

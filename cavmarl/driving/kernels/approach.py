@@ -37,24 +37,16 @@ APPROACH = np.dtype(
 def register_links(
     roads: RoadArrays,
     travel: Travel,
-    rows: NDArray[np.void],
-    num: int,
+    rows: NDArray[np.void],  # VEHICLE (C,), of which `num` live
+    num: int,  # live rows
+    # PLAN (C,) of each row the step of its lane; written where it is another one
     step: NDArray[np.void],
-    step_at: NDArray[np.int64],
-    scratch: Scratch,
+    step_at: NDArray[np.int64],  # (C,) which one that is, see `Worlds`; written
+    scratch: Scratch,  # the lists by link and approach are written
 ) -> None:
     """List for every link the vehicles that are on it or will reach it, into `scratch.approach`.
 
     Only links with conflicts list those that approach.
-
-    Args:
-        roads: the road arrays.
-        travel: the ways.
-        rows: VEHICLE (C,), of which `num` live.
-        num: live rows.
-        step: PLAN (C,) of each row the step of its lane; written where it is another one.
-        step_at: (C,) which one that is, see `Worlds`; written.
-        scratch: the lists by link and approach are written.
     """
     pairs = 0
     for first in range(0, num, BLOCK):

@@ -18,14 +18,14 @@ MIN_SPEED_MPS = -40.0
 
 @kernel
 def bicycle_step(
-    x: float,
-    y: float,
-    heading: float,
-    speed: float,
-    accel: float,
-    steering: float,
-    length: float,
-    dt: float,
+    x: float,  # m, of the centre
+    y: float,  # m, of the centre
+    heading: float,  # rad
+    speed: float,  # m/s along the heading, negative backwards
+    accel: float,  # m/s²
+    steering: float,  # angle of the front wheels in rad, within (-pi/2, pi/2), positive to the left
+    length: float,  # of the car, m; its half is the distance from the centre to each axle
+    dt: float,  # s
 ) -> tuple[float, float, float, float, float]:
     """Move a car for one tick; place and heading with the speed before it, explicit Euler.
 
@@ -34,16 +34,6 @@ def bicycle_step(
         y      += speed · sin(heading + slip) · dt
         heading += speed · sin(slip) / (length / 2) · dt
         speed  += accel · dt
-
-    Args:
-        x: m, of the centre.
-        y: m, of the centre.
-        heading: rad.
-        speed: m/s along the heading, negative backwards.
-        accel: m/s².
-        steering: angle of the front wheels in rad, within (-pi/2, pi/2), positive to the left.
-        length: of the car, m; its half is the distance from the centre to each axle.
-        dt: s.
 
     Returns:
         x, y, heading, speed after the tick, and the yaw rate during it in rad/s. The heading
@@ -68,28 +58,17 @@ def bicycle_step(
 
 @kernel
 def clip_control(
-    speed: float,
-    accel: float,
-    steering: float,
-    crashed: bool,
-    min_speed: float,
-    max_speed: float,
-) -> tuple[float, float]:
+    speed: float,  # m/s
+    accel: float,  # commanded, m/s²
+    steering: float,  # commanded, rad
+    crashed: bool,  # whether the car has collided
+    min_speed: float,  # m/s, negative; `MIN_SPEED_MPS` in highway-env
+    max_speed: float,  # m/s; `MAX_SPEED_MPS` in highway-env
+) -> tuple[float, float]:  # acceleration in m/s² and steering in rad
     """The control that a car obeys: highway-env's `Vehicle.clip_actions`.
 
     A crashed car comes to rest with straight wheels, with a time constant of 1 s. A car beyond
     what its engine can do falls back to that with the same time constant.
-
-    Args:
-        speed: m/s.
-        accel: commanded, m/s².
-        steering: commanded, rad.
-        crashed: whether the car has collided.
-        min_speed: m/s, negative; `MIN_SPEED_MPS` in highway-env.
-        max_speed: m/s; `MAX_SPEED_MPS` in highway-env.
-
-    Returns:
-        acceleration in m/s² and steering in rad.
     """
     if crashed:
         steering = 0.0

@@ -24,14 +24,12 @@ ACCEL_LIMIT = 6.0  # m/s², what the car can do at most, speeding up and braking
 
 
 @kernel
-def idm_free(speed: float, target_speed: float, accel_max: float) -> float:
-    """Acceleration on a free road in m/s²: accel_max · (1 - (speed / target_speed)⁴).
-
-    Args:
-        speed: m/s; driving backwards counts as standing.
-        target_speed: m/s, already cut to the speed limit.
-        accel_max: m/s², see `ACCEL_MAX`.
-    """
+def idm_free(
+    speed: float,  # m/s; driving backwards counts as standing
+    target_speed: float,  # m/s, already cut to the speed limit
+    accel_max: float,  # m/s², see `ACCEL_MAX`
+) -> float:
+    """Acceleration on a free road in m/s²: accel_max · (1 - (speed / target_speed)⁴)."""
     ratio = max(speed, 0.0) / abs(not_zero(target_speed))
     squared = ratio * ratio
     return accel_max * (1.0 - squared * squared)
@@ -39,28 +37,19 @@ def idm_free(speed: float, target_speed: float, accel_max: float) -> float:
 
 @kernel
 def idm_interaction(
-    speed: float,
-    distance: float,
-    front_speed: float,
-    accel_max: float,
-    decel_comfort: float,
-    jam_distance: float,
-    time_headway: float,
+    speed: float,  # m/s
+    distance: float,  # to the leader in m, measured as `jam_distance` is; kept 1 cm away from zero
+    front_speed: float,  # of the leader along the follower's heading, m/s
+    accel_max: float,  # m/s², see `ACCEL_MAX`
+    decel_comfort: float,  # m/s², positive, see `DECEL_COMFORT`
+    jam_distance: float,  # m, see `JAM_DISTANCE_M`
+    time_headway: float,  # s, see `TIME_HEADWAY_S`
 ) -> float:
     """How much a leader takes off the free acceleration, in m/s², at least zero.
 
-        gap         = jam_distance + speed · time_headway
-                      + speed · (speed - front_speed) / (2 · sqrt(accel_max · decel_comfort))
-        interaction = accel_max · (gap / distance)²
-
-    Args:
-        speed: m/s.
-        distance: to the leader in m, measured as `jam_distance` is; kept 1 cm away from zero.
-        front_speed: of the leader along the follower's heading, m/s.
-        accel_max: m/s², see `ACCEL_MAX`.
-        decel_comfort: m/s², positive, see `DECEL_COMFORT`.
-        jam_distance: m, see `JAM_DISTANCE_M`.
-        time_headway: s, see `TIME_HEADWAY_S`.
+    gap         = jam_distance + speed · time_headway
+                  + speed · (speed - front_speed) / (2 · sqrt(accel_max · decel_comfort))
+    interaction = accel_max · (gap / distance)²
     """
     gap = (
         jam_distance

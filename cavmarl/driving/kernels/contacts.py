@@ -37,16 +37,15 @@ def _bodies_touch(one: np.void, other: np.void) -> bool:
 
 
 @kernel
-def find_contacts(rows: NDArray[np.void], num: int, grid: Grid, hit: NDArray[np.int64]) -> bool:
+def find_contacts(
+    rows: NDArray[np.void],  # VEHICLE (C,)
+    num: int,  # live rows of the world; at most the grid's capacity
+    grid: Grid,  # its `newest` and `spots` are overwritten
+    hit: NDArray[np.int64],  # (C,) by VEHICLE row, overwritten up to `num`: an id, or -1
+) -> bool:
     """For each vehicle the smallest id of those that it touches; whether any two do.
 
     One pass: each vehicle looks at those that are in the cells already and joins them.
-
-    Args:
-        rows: VEHICLE (C,).
-        num: live rows of the world; at most the grid's capacity.
-        grid: its `newest` and `spots` are overwritten.
-        hit: (C,) by VEHICLE row, overwritten up to `num`: an id, or -1.
     """
     grid.newest[:] = -1
     largest = 0.0
@@ -71,12 +70,7 @@ def find_contacts(rows: NDArray[np.void], num: int, grid: Grid, hit: NDArray[np.
 
 @inlined_kernel
 def _touches_earlier(
-    rows: NDArray[np.void],
-    i: int,
-    spot: np.void,
-    reach: float,
-    grid: Grid,
-    hit: NDArray[np.int64],
+    rows: NDArray[np.void], i: int, spot: np.void, reach: float, grid: Grid, hit: NDArray[np.int64]
 ) -> bool:
     """Note the vehicles in the cells that row i touches."""
     found = False

@@ -385,30 +385,18 @@ def _prefetch_further(roads: RoadArrays, step: np.void, scratch: Scratch) -> Non
 def decide(
     roads: RoadArrays,
     travel: Travel,
-    rows: NDArray[np.void],
-    num: int,
-    driver: int,
-    tick: int,
-    dt: float,
-    phase: NDArray[np.int32],
-    step: NDArray[np.void],
+    rows: NDArray[np.void],  # VEHICLE (C,), the committed state; not written
+    num: int,  # rows to decide for, the first of `rows`; all rows stand in the indices
+    driver: int,  # DRIVER_* whose rows are decided for
+    tick: int,  # of the committed state
+    dt: float,  # seconds of a tick
+    phase: NDArray[np.int32],  # (num_signals,) PHASE rows that are on
+    step: NDArray[np.void],  # PLAN (C,) of each row the step of its lane
+    # with the lane and link indices of this tick; accel (m/s²), lane_change, blinker, hold and
+    # link_ahead are written
     scratch: Scratch,
 ) -> None:
-    """Decide acceleration and lane change of all vehicles of one kind of driver in one world.
-
-    Args:
-        roads: the road arrays.
-        travel: types and ways.
-        rows: VEHICLE (C,), the committed state; not written.
-        num: rows to decide for, the first of `rows`; all rows stand in the indices.
-        driver: DRIVER_* whose rows are decided for.
-        tick: of the committed state.
-        dt: seconds of a tick.
-        phase: (num_signals,) PHASE rows that are on.
-        step: PLAN (C,) of each row the step of its lane.
-        scratch: with the lane and link indices of this tick; accel (m/s²), lane_change, blinker,
-            hold and link_ahead are written.
-    """
+    """Decide acceleration and lane change of all vehicles of one kind of driver in one world."""
     total = scratch.lane_start[roads.lanes.shape[0]]
     for k in range(total):
         if k + SOON < total:

@@ -33,12 +33,7 @@ def no_press(kind: np.void) -> float:
 
 @kernel
 def _asked(
-    kind: np.void,
-    speed: float,
-    allowed: float,
-    gap: float,
-    front_speed: float,
-    front_decel: float,
+    kind: np.void, speed: float, allowed: float, gap: float, front_speed: float, front_decel: float
 ) -> float:
     """The acceleration in m/s² that a model asks for that is neither IDM nor Krauss's."""
     min_gap = float(kind["min_gap"])
@@ -69,17 +64,13 @@ def _asked_of_all(kind: np.void, speed: float, allowed: float, press: float) -> 
 
 @kernel
 def behind(
-    kind: np.void, speed: float, gap: float, front_speed: float, front_decel: float
+    kind: np.void,  # VTYPE of the driver
+    speed: float,  # of the driver, m/s
+    gap: float,  # between the bumpers, m
+    front_speed: float,  # of the leader, m/s
+    front_decel: float,  # with which the leader can brake in comfort, m/s²
 ) -> float:
-    """How a leader presses.
-
-    Args:
-        kind: VTYPE of the driver.
-        speed: of the driver, m/s.
-        gap: between the bumpers, m.
-        front_speed: of the leader, m/s.
-        front_decel: with which the leader can brake in comfort, m/s².
-    """
+    """How a leader presses."""
     if kind["model"] == MODEL_KRAUSS:
         room = gap - kind["min_gap"]
         return -safe_speed(room, front_speed, kind["decel"], front_decel, kind["tau"])
@@ -154,18 +145,14 @@ def speed_behind(kind: np.void, gap: float, front_speed: float, front_decel: flo
 
 @kernel
 def response(
-    kind: np.void, speed: float, allowed: float, press: float, share: float, dt: float
+    kind: np.void,  # VTYPE of the driver
+    speed: float,  # m/s
+    allowed: float,  # the speed that limits and the vehicle allow, m/s
+    press: float,  # of all that stands ahead
+    share: float,  # a random number in [0, 1), for Krauss's imperfection
+    dt: float,  # seconds of the tick
 ) -> float:
-    """The acceleration in m/s² of the coming tick.
-
-    Args:
-        kind: VTYPE of the driver.
-        speed: m/s.
-        allowed: the speed that limits and the vehicle allow, m/s.
-        press: of all that stands ahead.
-        share: a random number in [0, 1), for Krauss's imperfection.
-        dt: seconds of the tick.
-    """
+    """The acceleration in m/s² of the coming tick."""
     if kind["model"] == MODEL_KRAUSS:
         wanted = min(-press, allowed, speed + kind["accel"] * dt)
         wanted = dawdle(max(wanted, 0.0), kind["accel"], kind["sigma"], share, dt)

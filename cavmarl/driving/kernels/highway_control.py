@@ -21,18 +21,13 @@ MAX_APPROACH_RAD = math.pi / 4.0  # steepest angle at which a lane is approached
 
 
 @kernel
-def steering_control(speed: float, d: float, heading_error: float, length: float) -> float:
-    """The steering angle in rad that brings a car to the centre of a lane.
-
-    Args:
-        speed: m/s.
-        d: lateral offset from the lane's centre in m, positive to the left.
-        heading_error: lane's direction `speed · PURSUIT_S` ahead minus the car's heading, rad.
-        length: of the car, m.
-
-    Returns:
-        angle within ±`MAX_STEERING_RAD`, positive to the left.
-    """
+def steering_control(
+    speed: float,  # m/s
+    d: float,  # lateral offset from the lane's centre in m, positive to the left
+    heading_error: float,  # lane's direction `speed · PURSUIT_S` ahead minus the car's heading, rad
+    length: float,  # of the car, m
+) -> float:  # angle within ±`MAX_STEERING_RAD`, positive to the left
+    """The steering angle in rad that brings a car to the centre of a lane."""
     divisor = not_zero(speed)
     approach = math.asin(clamp(-KP_LATERAL * d / divisor, -1.0, 1.0))
     approach = clamp(approach, -MAX_APPROACH_RAD, MAX_APPROACH_RAD)

@@ -260,27 +260,15 @@ def _exit_blocked(
 def may_enter(
     roads: RoadArrays,
     travel: Travel,
-    rows: NDArray[np.void],
-    i: int,
-    link: int,
-    distance: float,
-    way: int,
-    phase: NDArray[np.int32],
-    scratch: Scratch,
+    rows: NDArray[np.void],  # VEHICLE (C,)
+    i: int,  # the row that asks
+    link: int,  # LINK row
+    distance: float,  # of its centre to the end of its lane in m
+    way: int,  # of the row beyond the junction
+    phase: NDArray[np.int32],  # (num_signals,) PHASE rows that are on
+    scratch: Scratch,  # with the lane and link indices of this tick
 ) -> int:
-    """Whether row i may drive into `link`: HOLD_NONE, or why it has to stop at the line.
-
-    Args:
-        roads: the road arrays.
-        travel: the ways.
-        rows: VEHICLE (C,).
-        i: the row that asks.
-        link: LINK row.
-        distance: of its centre to the end of its lane in m.
-        way: of the row beyond the junction.
-        phase: (num_signals,) PHASE rows that are on.
-        scratch: with the lane and link indices of this tick.
-    """
+    """Whether row i may drive into `link`: HOLD_NONE, or why it has to stop at the line."""
     row = rows[i]
     signal = link_signal(roads, link, phase)
     back = roads.lanes[roads.links[link]["from_lane"]]["stop_back_m"]
@@ -343,35 +331,20 @@ def waits_inside(
 def press_inside(
     roads: RoadArrays,
     travel: Travel,
-    rows: NDArray[np.void],
-    i: int,
-    link: int,
-    place: float,
-    way: int,
-    phase: NDArray[np.int32],
-    dt: float,
-    scratch: Scratch,
-) -> tuple[float, int]:
+    rows: NDArray[np.void],  # VEHICLE (C,)
+    i: int,  # the row that asks
+    link: int,  # that it drives on
+    place: float,  # of its centre, m beyond the end of the lane that it comes from
+    way: int,  # of the row beyond the junction
+    phase: NDArray[np.int32],  # (num_signals,) PHASE rows that are on
+    dt: float,  # seconds a tick
+    scratch: Scratch,  # with the lane and link indices of this tick
+) -> tuple[float, int]:  # press, and why it holds at the waiting position (HOLD_*)
     """How foes on the same junction press row i, whose front is beyond its stop line.
 
     Of two vehicles in conflict the one that is nearer to the shared area goes first; at equal
     distance the smaller id. Where both lead into one lane, the other follows it there. At a
     waiting position inside, row i waits until it may go on.
-
-    Args:
-        roads: the road arrays.
-        travel: types and ways.
-        rows: VEHICLE (C,).
-        i: the row that asks.
-        link: that it drives on.
-        place: of its centre, m beyond the end of the lane that it comes from.
-        way: of the row beyond the junction.
-        phase: (num_signals,) PHASE rows that are on.
-        dt: seconds a tick.
-        scratch: with the lane and link indices of this tick.
-
-    Returns:
-        press, and why it holds at the waiting position (HOLD_*).
     """
     row = rows[i]
     kind = travel.types[row["vtype"]]

@@ -14,18 +14,15 @@ from cavmarl.core.numba import kernel
 
 @kernel
 def safe_speed(
-    gap: float, front_speed: float, decel: float, front_decel: float, reaction_s: float
+    gap: float,  # m that may be used up; a negative one answers 0 m/s
+    front_speed: float,  # of the leader, m/s; 0 for a line
+    decel: float,  # with which the driver brakes, m/s², positive
+    front_decel: float,  # with which the leader brakes, m/s², positive
+    reaction_s: float,  # before the driver brakes, s
 ) -> float:
     """The largest speed in m/s at which braking after `reaction_s` does not use up the gap.
 
     Solves v · reaction_s + v² / (2 · decel) = gap + front_speed² / (2 · max(decel, front_decel)).
-
-    Args:
-        gap: m that may be used up; a negative one answers 0 m/s.
-        front_speed: of the leader, m/s; 0 for a line.
-        decel: with which the driver brakes, m/s², positive.
-        front_decel: with which the leader brakes, m/s², positive.
-        reaction_s: before the driver brakes, s.
     """
     room = gap + 0.5 * front_speed * front_speed / max(decel, front_decel)
     if room <= 0.0:
@@ -35,15 +32,13 @@ def safe_speed(
 
 
 @kernel
-def dawdle(speed: float, accel: float, sigma: float, share: float, dt: float) -> float:
-    """The speed that is left of a wanted one by imperfect driving, in m/s.
-
-    Args:
-        speed: wanted, m/s.
-        accel: the largest acceleration, m/s².
-        sigma: imperfection in [0, 1].
-        share: a random number in [0, 1).
-        dt: seconds of the tick.
-    """
+def dawdle(
+    speed: float,  # wanted, m/s
+    accel: float,  # the largest acceleration, m/s²
+    sigma: float,  # imperfection in [0, 1]
+    share: float,  # a random number in [0, 1)
+    dt: float,  # seconds of the tick
+) -> float:
+    """The speed that is left of a wanted one by imperfect driving, in m/s."""
     # Who starts from a stand is slowed in proportion, so that it does start.
     return max(speed - dt * sigma * min(accel, speed) * share, 0.0)

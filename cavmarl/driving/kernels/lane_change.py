@@ -17,28 +17,18 @@ MIN_SPEED_MPS = 1.0  # m/s, slower cars do not change lanes
 
 @kernel
 def mobil_accepts(
-    own_accel: float,
-    own_accel_after: float,
-    new_follower_accel: float,
-    new_follower_accel_after: float,
-    old_follower_accel: float,
-    old_follower_accel_after: float,
+    own_accel: float,  # of the car that considers the change, now
+    own_accel_after: float,  # of the same car after the change
+    new_follower_accel: float,  # of the car that would be behind, now; 0 if there is none
+    new_follower_accel_after: float,  # of that car after the change; 0 if there is none
+    old_follower_accel: float,  # of the car that is behind, now; 0 if there is none
+    old_follower_accel_after: float,  # of that car after the change; 0 if there is none
+    # the route needs the change, so it only has to be safe for both. The caller sees to it that the
+    # lane lies on the route's side
     mandatory: bool,
-    max_braking: float = MAX_BRAKING_IMPOSED,
+    max_braking: float = MAX_BRAKING_IMPOSED,  # m/s², harder braking makes the change unsafe
 ) -> bool:
-    """Whether to change into a lane; all accelerations from the car-following model, in m/s².
-
-    Args:
-        own_accel: of the car that considers the change, now.
-        own_accel_after: of the same car after the change.
-        new_follower_accel: of the car that would be behind, now; 0 if there is none.
-        new_follower_accel_after: of that car after the change; 0 if there is none.
-        old_follower_accel: of the car that is behind, now; 0 if there is none.
-        old_follower_accel_after: of that car after the change; 0 if there is none.
-        mandatory: the route needs the change, so it only has to be safe for both. The caller sees
-            to it that the lane lies on the route's side.
-        max_braking: m/s², harder braking makes the change unsafe.
-    """
+    """Whether to change into a lane; all accelerations from the car-following model, in m/s²."""
     if new_follower_accel_after < -max_braking:
         return False
     if mandatory:

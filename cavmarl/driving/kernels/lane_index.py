@@ -69,17 +69,13 @@ def _fill(
 
 @kernel
 def index_lanes(
-    roads: RoadArrays, travel: Travel, rows: NDArray[np.void], num: int, scratch: Scratch
+    roads: RoadArrays,
+    travel: Travel,  # the vehicles' types
+    rows: NDArray[np.void],  # VEHICLE (C,), of which `num` live
+    num: int,  # live rows
+    scratch: Scratch,  # the lists by lane and entries are written
 ) -> None:
-    """Sort the vehicles of one world by (lane, s, id) into `scratch.entries`.
-
-    Args:
-        roads: the road arrays.
-        travel: the vehicles' types.
-        rows: VEHICLE (C,), of which `num` live.
-        num: live rows.
-        scratch: the lists by lane and entries are written.
-    """
+    """Sort the vehicles of one world by (lane, s, id) into `scratch.entries`."""
     forget(scratch.lanes)
     for i in range(num):
         row = rows[i]
@@ -113,13 +109,7 @@ def index_lanes(
 
 @inlined_kernel
 def _insert(
-    scratch: Scratch,
-    types: NDArray[np.void],
-    lane: int,
-    row: np.void,
-    i: int,
-    s: float,
-    side: bool,
+    scratch: Scratch, types: NDArray[np.void], lane: int, row: np.void, i: int, s: float, side: bool
 ) -> None:
     """Put an entry among those of its lane that are there already, by (s, id)."""
     k = _make_place(scratch, lane, s, row["id"])

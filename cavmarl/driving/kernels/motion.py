@@ -17,12 +17,7 @@ from cavmarl.core.math.geometry import lane_pose, segment_at, wrap_angle
 from cavmarl.core.math.scalars import clamp
 from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import LaneGrid, RoadArrays, Travel
-from cavmarl.core.records.codes import (
-    EVENT_ARRIVED,
-    EVENT_RED_LIGHT,
-    SIGNAL_RED,
-    SIGNAL_RED_YELLOW,
-)
+from cavmarl.core.records.codes import EVENT_ARRIVED, EVENT_RED_LIGHT, SIGNAL_RED, SIGNAL_RED_YELLOW
 from cavmarl.driving.kernels.bicycle import bicycle_step
 from cavmarl.driving.kernels.junctions import link_signal
 from cavmarl.driving.kernels.lane_index import beside_s
@@ -190,25 +185,16 @@ def _stand(row: np.void, throttle: float, dt: float) -> None:
 def move_background(
     roads: RoadArrays,
     travel: Travel,
-    row: np.void,
-    step: np.void,
-    accel: float,
-    lane_change: int,
-    dt: float,
+    row: np.void,  # VEHICLE, the committed record, which becomes the next one
+    step: np.void,  # PLAN, its own step before the tick
+    accel: float,  # decided acceleration in m/s²
+    lane_change: int,  # 1 to the left, -1 to the right, 0 none
+    dt: float,  # seconds of the tick
 ) -> None:
     """Advance a background vehicle by one tick.
 
     The new speed drives the whole tick (semi-implicit Euler), as the safe speed of Krauss's model
     takes it.
-
-    Args:
-        roads: the road arrays.
-        travel: the ways.
-        row: VEHICLE, the committed record, which becomes the next one.
-        step: PLAN, its own step before the tick.
-        accel: decided acceleration in m/s².
-        lane_change: 1 to the left, -1 to the right, 0 none.
-        dt: seconds of the tick.
     """
     before = before_tick(row)
     speed = clamp(before.speed + accel * dt, 0.0, MAX_SPEED_MPS)
@@ -256,26 +242,15 @@ def move_background(
 @kernel
 def move_agent(
     roads: RoadArrays,
-    plans: NDArray[np.void],
-    grid: LaneGrid,
-    row: np.void,
-    throttle: float,
-    steering: float,
-    phase: NDArray[np.int32],
-    dt: float,
+    plans: NDArray[np.void],  # PLAN (G, L)
+    grid: LaneGrid,  # which lanes lie near a place
+    row: np.void,  # VEHICLE, the committed record, which becomes the next one
+    throttle: float,  # commanded acceleration in m/s²
+    steering: float,  # commanded angle of the front wheels in rad
+    phase: NDArray[np.int32],  # (num_signals,) PHASE rows that are on
+    dt: float,  # seconds of the tick
 ) -> None:
-    """Advance an agent's vehicle by one tick.
-
-    Args:
-        roads: the road arrays.
-        plans: PLAN (G, L).
-        grid: which lanes lie near a place.
-        row: VEHICLE, the committed record, which becomes the next one.
-        throttle: commanded acceleration in m/s².
-        steering: commanded angle of the front wheels in rad.
-        phase: (num_signals,) PHASE rows that are on.
-        dt: seconds of the tick.
-    """
+    """Advance an agent's vehicle by one tick."""
     before = before_tick(row)
     # No reverse gear: the brake ends at a standstill.
     throttle = max(throttle, -before.speed / dt)

@@ -44,17 +44,13 @@ def _let_go(roads: RoadArrays, travel: Travel, row: np.void, goal: int) -> None:
 
 @inlined_kernel
 def follow_script(
-    roads: RoadArrays, travel: Travel, cues: NDArray[np.int64], row: np.void, dt: float
+    roads: RoadArrays,
+    travel: Travel,  # with the scripts
+    cues: NDArray[np.int64],  # (T,) the tick in which each came, -1: not yet
+    row: np.void,  # VEHICLE, the committed record, which becomes the next one
+    dt: float,  # seconds of the tick
 ) -> None:
-    """Advance a row that follows a script by one tick.
-
-    Args:
-        roads: the road arrays.
-        travel: with the scripts.
-        cues: (T,) the tick in which each came, -1: not yet.
-        row: VEHICLE, the committed record, which becomes the next one.
-        dt: seconds of the tick.
-    """
+    """Advance a row that follows a script by one tick."""
     before = before_tick(row)
     frame = travel.scripts.frames[row["goal"]]
     if frame["cue"] < 0 or cues[frame["cue"]] >= 0:
@@ -68,22 +64,15 @@ def follow_script(
 
 @kernel
 def note_cues(
-    cues: NDArray[np.void],
-    rows: NDArray[np.void],
-    num_owned: NDArray[np.int64],
-    ticks: NDArray[np.int64],
-    came: NDArray[np.int64],
+    cues: NDArray[np.void],  # CUE (T,)
+    rows: NDArray[np.void],  # VEHICLE (k, W, C), the committed ones of all zones
+    num_owned: NDArray[np.int64],  # (k, W)
+    ticks: NDArray[np.int64],  # (W,) since reset
+    came: NDArray[np.int64],  # (W, T) the tick in which each came, -1: not yet; written
 ) -> None:
     """Note which cues come in this tick: at their time, or as soon as an agent is near a place.
 
     An any-of over all agents of a world: neither the order of rows nor their owners matter.
-
-    Args:
-        cues: CUE (T,).
-        rows: VEHICLE (k, W, C), the committed ones of all zones.
-        num_owned: (k, W).
-        ticks: (W,) since reset.
-        came: (W, T) the tick in which each came, -1: not yet; written.
     """
     for w in range(ticks.size):
         for c in range(cues.size):

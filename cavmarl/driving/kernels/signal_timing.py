@@ -13,23 +13,16 @@ from cavmarl.roads.kernels.signal_phases import program_at
 @kernel
 def time_to_change(
     roads: RoadArrays,
+    # CONTROLLER (num_controllers,), the state of the actuated programs
     controllers: NDArray[np.void],
-    link: int,
-    phase: NDArray[np.int32],
-    time: float,
-    dt: float,
+    link: int,  # LINK row that has a signal
+    phase: NDArray[np.int32],  # (num_signals,) PHASE rows that are on
+    time: float,  # s since the world's reset
+    dt: float,  # seconds of a tick
 ) -> float:
     """Seconds until the signal of a link shows another letter; a whole cycle if it never does.
 
     Of an actuated program it is the soonest time: phases that may be prolonged last their shortest.
-
-    Args:
-        roads: the road arrays.
-        controllers: CONTROLLER (num_controllers,), the state of the actuated programs.
-        link: LINK row that has a signal.
-        phase: (num_signals,) PHASE rows that are on.
-        time: s since the world's reset.
-        dt: seconds of a tick.
     """
     index = roads.links[link]["signal_index"]
     signal = roads.links[link]["signal"]

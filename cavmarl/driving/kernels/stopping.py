@@ -46,17 +46,16 @@ def lane_to_stop(roads: RoadArrays, travel: Travel, row: np.void) -> int:
 
 
 @inlined_kernel
-def make_stop(roads: RoadArrays, travel: Travel, row: np.void, lane_before: int, dt: float) -> None:
+def make_stop(
+    roads: RoadArrays,
+    travel: Travel,  # with the stops
+    row: np.void,  # VEHICLE after the tick, written
+    lane_before: int,  # LANE that it was on before
+    dt: float,  # seconds a tick
+) -> None:
     """Count the time of a vehicle at its stop, and let it go when that is over.
 
     A stop that the vehicle could not make any more is left out.
-
-    Args:
-        roads: the road arrays.
-        travel: with the stops.
-        row: VEHICLE after the tick, written.
-        lane_before: LANE that it was on before.
-        dt: seconds a tick.
     """
     if row["stop"] < 0 or row["stop"] == row["stops_end"]:
         return

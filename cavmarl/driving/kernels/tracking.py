@@ -145,14 +145,13 @@ def _tell_how_far(roads: RoadArrays, row: np.void) -> None:
 
 
 @kernel
-def locate(roads: RoadArrays, plans: NDArray[np.void], grid: LaneGrid, row: np.void) -> int:
+def locate(
+    roads: RoadArrays,
+    plans: NDArray[np.void],  # PLAN (G, L)
+    grid: LaneGrid,  # which lanes lie near a place
+    row: np.void,  # VEHICLE with the new x, y, heading and the old lane context; written
+) -> int:
     """Bring lane, s, d and link of a steered vehicle up to its new place.
-
-    Args:
-        roads: the road arrays.
-        plans: PLAN (G, L).
-        grid: which lanes lie near a place.
-        row: VEHICLE with the new x, y, heading and the old lane context; written.
 
     Returns:
         EVENT_OFF_ROAD, EVENT_WRONG_WAY or 0. A vehicle on no lane of its direction keeps the last

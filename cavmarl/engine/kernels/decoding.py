@@ -13,26 +13,14 @@ from cavmarl.core.records.codes import ACTION_IDLE, ACTION_SLOWER
 
 @kernel
 def decode_pairs(
-    actions: NDArray[Any],
-    mask: NDArray[np.bool_],
-    acceleration_mps2: float,
-    steering_rad: float,
-    last: NDArray[np.float64],
-    controls: NDArray[np.float64],
-) -> bool:
-    """Decode shares of the largest throttle and steering angle; nothing if one is out of range.
-
-    Args:
-        actions: (W, A, 2) floats.
-        mask: (W, A) whose are read; those of others count as 0.
-        acceleration_mps2: what a throttle of 1 means.
-        steering_rad: what a steering of 1 means.
-        last: (W, A, 2) is written, the actions themselves.
-        controls: (W, A, 2) is written, what they mean.
-
-    Returns:
-        whether all are within [-1, 1]; False of what is no number, too.
-    """
+    actions: NDArray[Any],  # (W, A, 2) floats
+    mask: NDArray[np.bool_],  # (W, A) whose are read; those of others count as 0
+    acceleration_mps2: float,  # what a throttle of 1 means
+    steering_rad: float,  # what a steering of 1 means
+    last: NDArray[np.float64],  # (W, A, 2) is written, the actions themselves
+    controls: NDArray[np.float64],  # (W, A, 2) is written, what they mean
+) -> bool:  # whether all are within [-1, 1]; False of what is no number, too
+    """Decode shares of the largest throttle and steering angle; nothing if one is out of range."""
     for w in range(mask.shape[0]):
         for agent in range(mask.shape[1]):
             if mask[w, agent]:
@@ -55,22 +43,12 @@ def decode_pairs(
 
 @kernel
 def decode_choices(
-    actions: NDArray[Any],
-    mask: NDArray[np.bool_],
-    last: NDArray[np.int64],
-    meta_actions: NDArray[np.int64],
-) -> bool:
-    """Take over meta-actions; nothing if one is none.
-
-    Args:
-        actions: (W, A) whole numbers.
-        mask: (W, A) whose are read; others stay idle.
-        last: (W, A) is written.
-        meta_actions: (W, A) is written, too.
-
-    Returns:
-        whether all are ACTION_* codes.
-    """
+    actions: NDArray[Any],  # (W, A) whole numbers
+    mask: NDArray[np.bool_],  # (W, A) whose are read; others stay idle
+    last: NDArray[np.int64],  # (W, A) is written
+    meta_actions: NDArray[np.int64],  # (W, A) is written, too
+) -> bool:  # whether all are ACTION_* codes
+    """Take over meta-actions; nothing if one is none."""
     for w in range(mask.shape[0]):
         for agent in range(mask.shape[1]):
             if mask[w, agent] and not 0 <= actions[w, agent] <= ACTION_SLOWER:

@@ -32,18 +32,13 @@ class Results(NamedTuple):
 
 
 @kernel
-def report(outputs: Outputs, steps: NDArray[np.int64], horizon: int, results: Results) -> bool:
-    """Write what the agents have got, all but which act next.
-
-    Args:
-        outputs: of the step.
-        steps: (W,) since each world's reset; are counted.
-        horizon: steps of an episode.
-        results: are written.
-
-    Returns:
-        whether the trip of some vehicle has ended.
-    """
+def report(
+    outputs: Outputs,  # of the step
+    steps: NDArray[np.int64],  # (W,) since each world's reset; are counted
+    horizon: int,  # steps of an episode
+    results: Results,  # are written
+) -> bool:  # whether the trip of some vehicle has ended
+    """Write what the agents have got, all but which act next."""
     ended = False
     for w in range(steps.size):
         steps[w] += 1
@@ -65,21 +60,15 @@ def report(outputs: Outputs, steps: NDArray[np.int64], horizon: int, results: Re
 
 @kernel
 def report_who_goes_on(
-    outputs: Outputs, gate: Gate, steps: NDArray[np.int64], horizon: int, results: Results
-) -> bool:
+    outputs: Outputs,  # of the step
+    gate: Gate,  # vehicles that wait, and how many have arrived
+    steps: NDArray[np.int64],  # (W,) since each world's reset
+    horizon: int,  # steps of an episode
+    results: Results,  # are written
+) -> bool:  # whether an episode is over
     """Write which agents act next and which episodes are over, once vehicles that end are gone.
 
     An episode is over at its horizon, and when no agent is there and none waits to enter.
-
-    Args:
-        outputs: of the step.
-        gate: vehicles that wait, and how many have arrived.
-        steps: (W,) since each world's reset.
-        horizon: steps of an episode.
-        results: are written.
-
-    Returns:
-        whether an episode is over.
     """
     some_over = False
     for w in range(steps.size):
@@ -99,20 +88,14 @@ def report_who_goes_on(
 
 @kernel
 def keep_last(
-    results: Results,
+    results: Results,  # which agents have ended, and which episodes are over
+    # (W, A, D); those of agents that are gone become 0, unless worlds begin anew in the next step
     observations: NDArray[np.float32],
+    # (W, A, D) where something has ended, what they were; written
     final_observations: NDArray[np.float32],
-    in_next_step: bool,
+    in_next_step: bool,  # when worlds begin anew
 ) -> None:
-    """Keep the last observations of agents that have ended.
-
-    Args:
-        results: which agents have ended, and which episodes are over.
-        observations: (W, A, D); those of agents that are gone become 0, unless worlds begin anew in
-            the next step.
-        final_observations: (W, A, D) where something has ended, what they were; written.
-        in_next_step: when worlds begin anew.
-    """
+    """Keep the last observations of agents that have ended."""
     for w in range(observations.shape[0]):
         ended = results.episode_over[w]
         for agent in range(observations.shape[1]):

@@ -51,21 +51,12 @@ class Watcher(Protocol):
 
 
 class Coordinator(ABC):
-    """Decides ownership, tick by tick: `begin`, then the zones' work, then `end`.
-
-    Args:
-        directory: the owners.
-        journal: takes the records; None: not kept.
-
-    Attributes:
-        journal: what takes the records.
-        switched: vehicles that have changed their owner.
-    """
+    """Decides ownership, tick by tick: `begin`, then the zones' work, then `end`."""
 
     def __init__(self, directory: Directory, journal: AnyJournal | None) -> None:
         self._directory = directory
-        self.journal = journal
-        self.switched = 0
+        self.journal = journal  # what takes the records
+        self.switched = 0  # vehicles that have changed their owner
         self._watchers: tuple[Watcher, ...] = ()
         self._births: list[Birth] = []
         self._gone: list[Removed] = []  # between two ticks
@@ -109,12 +100,12 @@ class Coordinator(ABC):
         """Begin an episode without vehicles."""
 
     @abstractmethod
-    def begin(self, everybody: bool, inputs: bytes = b"") -> None:
+    def begin(
+        self,
+        everybody: bool,  # look at all rows: they have changed since the ghosts were renewed
+        inputs: bytes = b"",  # digest of the actions
+    ) -> None:
         """Decide the way to the next tick, and let rows change hands.
-
-        Args:
-            everybody: look at all rows: they have changed since the ghosts were renewed.
-            inputs: digest of the actions.
 
         Raises:
             ProtocolError: a vehicle was lost or doubled; it cannot be decided, or a zone does not
@@ -123,12 +114,13 @@ class Coordinator(ABC):
         """
 
     @abstractmethod
-    def end(self, rows: Callable[[int], int], stored: Callable[[int], int] | None = None) -> None:
+    def end(
+        self,
+        rows: Callable[[int], int],  # zone → digest of its rows
+        # zone → digest of its rows in the store; None: where `rows` are is the store
+        stored: Callable[[int], int] | None = None,
+    ) -> None:
         """Commit the tick, through which every zone is.
-
-        Args:
-            rows: zone → digest of its rows.
-            stored: zone → digest of its rows in the store; None: where `rows` are is the store.
 
         Raises:
             ProtocolError: a vehicle was lost or doubled; a zone does not answer.

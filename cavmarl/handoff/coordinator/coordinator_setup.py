@@ -36,33 +36,20 @@ from cavmarl.shards.shard import Shard
 
 
 class CoordinatorSetup(NamedTuple):
-    """The coordinators of a divided environment.
+    """The coordinators of a divided environment."""
 
-    Attributes:
-        coordination: of all worlds.
-        transfers: world → what became of each hand-over.
-        recovery: runs the ticks of the one world in which hosts may die.
-        phases: runs the phases of its ticks.
-        store: its committed state.
-    """
-
-    coordination: Coordinators
-    transfers: tuple[TransferLog, ...]
-    recovery: Recovery | None = None
-    phases: FaultyPhases | None = None
-    store: CommittedStore | None = None
+    coordination: Coordinators  # of all worlds
+    transfers: tuple[TransferLog, ...]  # world → what became of each hand-over
+    recovery: Recovery | None = None  # runs the ticks of the one world in which hosts may die
+    phases: FaultyPhases | None = None  # runs the phases of its ticks
+    store: CommittedStore | None = None  # its committed state
 
 
 class WorldRun(NamedTuple):
-    """One world's, where another process has said what it is.
+    """One world's, where another process has said what it is."""
 
-    Attributes:
-        run: 16 bytes that no other run has.
-        journal: its file, which is there and is begun anew; None: it has none.
-    """
-
-    run: bytes
-    journal: Path | None
+    run: bytes  # 16 bytes that no other run has
+    journal: Path | None  # its file, which is there and is begun anew; None: it has none
 
 
 def prepare_runs(settings: ZonesConfig, num_worlds: int) -> list[WorldRun]:
@@ -82,17 +69,7 @@ def prepare_runs(settings: ZonesConfig, num_worlds: int) -> list[WorldRun]:
 
 
 def check_faults(settings: ZonesConfig, zones: int, num_worlds: int) -> tuple[Faults | None, bool]:
-    """The plan of faults, and whether hosts may die by it or be given up.
-
-    Args:
-        settings: of the zones.
-        zones: of each world.
-        num_worlds: in all.
-
-    Raises:
-        ConfigError: faults that cannot be, deaths in several worlds at once, or no folder for
-            reproducers.
-    """
+    """The plan of faults, and whether hosts may die by it or be given up."""
     faults = read_faults(settings.faults) if settings.faults else None
     if settings.reproducers and faults is None:
         faults = Faults()  # none on purpose
@@ -110,24 +87,16 @@ def check_faults(settings: ZonesConfig, zones: int, num_worlds: int) -> tuple[Fa
 
 
 def make_coordinators(
-    settings: ZonesConfig,
-    shards: Sequence[Shard],
-    division: Division,
-    shared: Callable[[], Iterable[NDArray[Any]]],
-    longest_move_m: float,
-    safeguards: Safeguards = ALL_ON,
+    settings: ZonesConfig,  # journal, faults, checks and deadlines
+    shards: Sequence[Shard],  # one a zone
+    division: Division,  # of them
+    shared: Callable[[], Iterable[NDArray[Any]]],  # the arrays beside theirs that a tick changes
+    longest_move_m: float,  # of a vehicle in a tick
+    safeguards: Safeguards = ALL_ON,  # remedies of the protocol; tests take one away
+    # one a world; None: they are chosen, and their journals must not be there
     runs: Sequence[WorldRun] | None = None,
 ) -> CoordinatorSetup:
     """The coordinators of a divided world.
-
-    Args:
-        settings: journal, faults, checks and deadlines.
-        shards: one a zone.
-        division: of them.
-        shared: the arrays beside theirs that a tick changes.
-        longest_move_m: of a vehicle in a tick.
-        safeguards: remedies of the protocol; tests take one away.
-        runs: one a world; None: they are chosen, and their journals must not be there.
 
     Raises:
         ConfigError: faults that cannot be, deaths in several worlds at once, or no folder for

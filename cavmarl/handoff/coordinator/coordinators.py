@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from hashlib import blake2b
 
 import numpy as np
@@ -16,26 +17,50 @@ from cavmarl.handoff.coordinator.row_digests import RowDigests
 from cavmarl.handoff.division import Division
 from cavmarl.handoff.fault_injection.committed_store import CommittedStore, Notes
 from cavmarl.handoff.fault_injection.message_coordinator import MessageCoordinator
-from cavmarl.handoff.surroundings import NearBorders
 from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.messages import Record
 from cavmarl.shards.shard import Commands
 from cavmarl.zones.kernels.zone_lookup import zones_of
 
 
-class RowStates:
-    """States of one world's vehicles at the committed tick, read from the rows of their owners.
-
-    Args:
-        division: of all worlds.
-        world: which one.
+class NearBorders:
+    """What rows of transfers need to know: vehicles near a border, and those that crossed one.
 
     Attributes:
-        borders: vehicles near a border when the tick began.
+        places: vehicle that has changed its owner in it → the row that it had there; to be set.
     """
 
     def __init__(self, division: Division, world: int) -> None:
-        self.borders = NearBorders(division, world)
+        self.places: Mapping[int, int] = {}
+        self._division = division
+        self._world = world
+        self.near: Sequence[Near] = ()  # of the tick that is on its way; to be set
+        self._depths: dict[tuple[int, int], float] = {}
+        self._told: Sequence[Near] = ()
+
+    def depth_m(self, vehicle: int, target: int) -> float | None:
+        """How far outside of its owner's zone, less than 0 inside; None: it was not near."""
+        if self._told is not self.near:
+            self._told = self.near
+            self._depths = {(entry.vehicle, entry.target): entry.depth_m for entry in self.near}
+        return self._depths.get((vehicle, target))
+
+    def release_depth_m(self, vehicle: int, source: int, target: int) -> float | None:
+        """How far outside of its old zone a vehicle is that has changed; None: it has left."""
+        hint = self.places.get(vehicle, 0)
+        return self._division.depth_m(self._world, vehicle, target, source, hint)
+
+    @staticmethod
+    def now_ms() -> float:
+        """Of the process's clock."""
+        return 1e3 * time.perf_counter()
+
+
+class RowStates:
+    """States of one world's vehicles at the committed tick, read from the rows of their owners."""
+
+    def __init__(self, division: Division, world: int) -> None:
+        self.borders = NearBorders(division, world)  # vehicles near a border when the tick began
         self._division = division
         self._world = world
         self._known: dict[int, bytes] = {}
@@ -77,25 +102,15 @@ class RowStates:
 
 
 class Coordinators:
-    """The coordinators of all worlds.
-
-    Args:
-        division: whose rows change hands.
-        coordinators: one a world.
-        states: of the vehicles of each world, as the coordinators read them.
-        digests: of zones' rows; None: not needed.
-        store: keeps what is committed; None: no process can die alone.
-        monitor: checks every tick that is committed; None: none.
-    """
-
     def __init__(
         self,
-        division: Division,
-        coordinators: Sequence[Coordinator],
-        states: Sequence[RowStates],
-        digests: RowDigests | None = None,
+        division: Division,  # whose rows change hands
+        coordinators: Sequence[Coordinator],  # one a world
+        states: Sequence[RowStates],  # of the vehicles of each world, as the coordinators read them
+        digests: RowDigests | None = None,  # of zones' rows; None: not needed
+        # keeps what is committed; None: no process can die alone
         store: CommittedStore | None = None,
-        monitor: InvariantMonitor | None = None,
+        monitor: InvariantMonitor | None = None,  # checks every tick that is committed; None: none
     ) -> None:
         self.coordinators = tuple(coordinators)
         self._division = division
@@ -126,11 +141,6 @@ class Coordinators:
             self._stirred[w] = True
 
     def begin(self, commands: Commands) -> None:
-        """Lease the next tick, and hand over whose owner changes.
-
-        Args:
-            commands: what the agents do in it; a journal keeps their digest.
-        """
         for w, coordinator in enumerate(self.coordinators):
             everybody, self._stirred[w] = self._stirred[w], False
             coordinator.begin(
@@ -165,15 +175,10 @@ class Coordinators:
             self._store.flip()
 
     def in_flight(self, w: int) -> list[TransferInFlight]:
-        """Vehicles of a world on the way from one zone to another."""
         return [TransferInFlight(*entry) for entry in self.coordinators[w].in_flight()]
 
     def load(self) -> None:
-        """Take everything back to what is committed.
-
-        Raises:
-            ProtocolError: it is not kept.
-        """
+        """Take everything back to what is committed."""
         if self._store is None:
             raise ProtocolError("the committed state is not kept")
         self._division.align()
@@ -182,15 +187,7 @@ class Coordinators:
             self._stirred[w] = True
 
     def take_up(self, records: Sequence[Record], notes: Sequence[Notes]) -> None:
-        """Go on in the one world where others have stopped.
-
-        Args:
-            records: of their coordinator.
-            notes: what has happened since its last BEGIN.
-
-        Raises:
-            ProtocolError: they sent messages, and its own coordinator sends none.
-        """
+        """Go on in the one world where others have stopped."""
         (coordinator,) = self.coordinators
         if not isinstance(coordinator, MessageCoordinator):
             raise ProtocolError("a coordinator without messages cannot go on in the middle of one")
@@ -199,7 +196,6 @@ class Coordinators:
         self._stirred[0] = True
 
     def left(self, gate: Gate) -> None:
-        """Those in `gate.passing` have left their worlds."""
         for w, coordinator in enumerate(self.coordinators):
             gone = gate.passing[w, : gate.num_passing[w]]
             if len(gone):
@@ -207,7 +203,6 @@ class Coordinators:
                 self._stirred[w] |= not coordinator.is_open
 
     def entered(self, gate: Gate) -> None:
-        """Those in `gate.passing` have come into their worlds."""
         for w, coordinator in enumerate(self.coordinators):
             new = gate.passing[w, : gate.num_passing[w]]
             if len(new):

@@ -32,12 +32,7 @@ class OwnerChange(NamedTuple):
 
 
 class HandoffLog:
-    """Gives vehicles to the zones that they are in, and keeps what came of it until it is read.
-
-    Args:
-        division: of all worlds.
-        world: which one.
-    """
+    """Gives vehicles to the zones that they are in, and keeps what came of it until it is read."""
 
     def __init__(self, division: Division, world: int) -> None:
         self._division = division
@@ -46,19 +41,16 @@ class HandoffLog:
         self._hand_over = division.call_hand_over
         self._release = division.call_release
 
-    def hand_over(self, everybody: bool, vehicles: int, newborn: Sequence[Birth]) -> int:
+    def hand_over(
+        self,
+        everybody: bool,  # look at all rows: they have changed since the ghosts were renewed
+        vehicles: int,  # how many there have to be
+        # those of them that entered since the last tick began; they stay where they are
+        newborn: Sequence[Birth],
+    ) -> int:  # how many have changed
         """Let vehicles change their owner, by the committed rows.
 
-        Args:
-            everybody: look at all rows: they have changed since the ghosts were renewed.
-            vehicles: how many there have to be.
-            newborn: those of them that entered since the last tick began; they stay where they are.
-
-        Returns:
-            how many have changed.
-
         Raises:
-            ProtocolError: there are more or fewer vehicles.
             ConfigError: a zone has not seen who enters it.
         """
         division, book, w = self._division, self._book, self._world
@@ -124,6 +116,5 @@ class HandoffLog:
         return list(zip(entries["vehicle"].tolist(), entries["target"].tolist(), strict=True))
 
     def reset(self, tick: int) -> None:
-        """Another episode begins at a tick."""
         self._book.num_changes[self._world] = 0
         self._book.tick[self._world] = tick

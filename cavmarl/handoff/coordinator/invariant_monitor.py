@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import ProtocolError
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.driving.vehicles import GHOST_FIELDS
 from cavmarl.handoff.coordinator.handoff_log import OwnerChange
 from cavmarl.handoff.coordinator.row_digests import digest_tables
@@ -52,19 +52,13 @@ class OwnersOnRecord:
     It is told what a `Trace` is told, and by coordinators that make records later, which vehicles
     change their owner meanwhile.
 
-    Args:
-        zones: how many.
-        limits: deadlines.
-        is_direct: there are records alone; see `TraceChecker`.
-
     Attributes:
-        entered: vehicles that zones have begun to own, since the reset.
         left: vehicles that have been removed.
         ask: lets the coordinator make the records that it still owes.
     """
 
     def __init__(self, zones: int, limits: Limits, is_direct: bool = False) -> None:
-        self.entered = self.left = 0
+        self.entered = self.left = 0  # vehicles that zones have begun to own, since the reset
         self._checker = TraceChecker(limits.longest_deferral, limits.lifetime, is_direct)
         self._sums = np.zeros(zones, dtype=np.uint64)
         self._current = self._sums  # with what records that are still to come add to them
@@ -77,11 +71,7 @@ class OwnersOnRecord:
         return self._checker.owners
 
     def logged(self, records: Iterable[Record]) -> None:
-        """Note records.
-
-        Raises:
-            ProtocolError: one that a correct run does not leave here.
-        """
+        """Note records. Raises ProtocolError: one that a correct run does not leave here."""
         for record in records:
             self._take(LOG, record)
             if isinstance(record, Reset):
@@ -140,11 +130,6 @@ class InvariantMonitor:
     """Raises ProtocolError after the first tick in which an invariant does not hold.
 
     Its memory is as large as the worlds are, however long they run.
-
-    Args:
-        division: whose rows are looked at.
-        records: of the coordinator of each world.
-        longest_move_m: no vehicle moves further in a tick.
     """
 
     def __init__(
@@ -167,33 +152,17 @@ class InvariantMonitor:
         )
         self._tallies = np.zeros(division.count, dtype=TALLY)
         self._found = np.zeros(1, dtype=FINDING)
-        self._watch = repeated(watch)
+        self._watch = specialized(watch)
 
     def begin(self, w: int, births: Sequence[Birth]) -> None:
-        """Look at a world that has been reset.
-
-        Args:
-            w: which one.
-            births: the vehicles there.
-
-        Raises:
-            ProtocolError: an invariant does not hold.
-        """
+        """Look at a world that has been reset. Raises ProtocolError: an invariant does not hold."""
         self._ticks[w] = 0
         self._kept[w][0].num[:] = 0
         self._vehicles[w].clear()
         self._look(w, births, new_late=0)
 
     def end(self, w: int, births: Sequence[Birth]) -> None:
-        """Look at a world after a tick.
-
-        Args:
-            w: which one.
-            births: vehicles that entered in the tick, not in the records yet.
-
-        Raises:
-            ProtocolError: an invariant does not hold.
-        """
+        """Look at a world after a tick. Raises ProtocolError: an invariant does not hold."""
         self._ticks[w] += 1
         self._look(w, births, new_late=1)
 

@@ -28,29 +28,26 @@ Sync: TypeAlias = Literal["flush", "fsync"]
 class JournalReader:
     """The records of a file, one after the other.
 
-    Args:
-        path: of the file.
-        drop_torn: whether a last line that is cut short ends the log instead of being an error: it
-            was never acted upon.
-
     Attributes:
         lines: whole lines that have been read.
         size: bytes of them.
         torn: the number of the line that was dropped and how it begins, or nothing.
     """
 
-    def __init__(self, path: Path, *, drop_torn: bool = False) -> None:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        # whether a last line that is cut short ends the log instead of being an error: it was never
+        # acted upon
+        drop_torn: bool = False,
+    ) -> None:
         self.path = path
         self.lines, self.size, self.torn = 0, 0, ""
         self._drop_torn = drop_torn
 
     def __iter__(self) -> Iterator[Record]:
-        """From the first line on.
-
-        Raises:
-            JournalError: the last line is cut short; a line is damaged, missing or out of order;
-                the file cannot be read.
-        """
+        """From the first line on."""
         self.lines, self.size, self.torn = 0, 0, ""
         try:
             with self.path.open("rb") as file:
@@ -80,28 +77,24 @@ class JournalReader:
 class Journal:
     """A file that records are appended to, by one run at a time.
 
-    Args:
-        path: of the file; without `resume` it must not exist.
-        resume: go on behind what is there. All of it is read, and a last line that is cut short is
-            dropped.
-        anew: the file may exist, and is begun anew: by a run that does again what is in it.
-        sync: when an append returns, its lines have been given to the operating system ("flush"),
-            so that they outlive the process, or have been written out ("fsync"), so that they
-            outlive the machine.
-
     Attributes:
-        path: of the file.
         sequence: the number of the next line.
         dropped: the line that was dropped, or nothing.
-
-    Raises:
-        ConfigError: no such `sync`.
-        JournalError: the file exists, or does not, or cannot be opened, or another run writes it;
-            what is there is damaged.
     """
 
     def __init__(
-        self, path: Path, *, resume: bool = False, anew: bool = False, sync: Sync = "flush"
+        self,
+        path: Path,  # of the file; without `resume` it must not exist
+        *,
+        # go on behind what is there. All of it is read, and a last line that is cut short is
+        # dropped
+        resume: bool = False,
+        # the file may exist, and is begun anew: by a run that does again what is in it
+        anew: bool = False,
+        # when an append returns, its lines have been given to the operating system ("flush"), so
+        # that they outlive the process, or have been written out ("fsync"), so that they outlive
+        # the machine
+        sync: Sync = "flush",
     ) -> None:
         if sync not in get_args(Sync):
             raise ConfigError(f"sync is {sync!r}: it has to be one of {get_args(Sync)}")
@@ -131,12 +124,7 @@ class Journal:
             raise
 
     def append(self, records: Iterable[Record]) -> None:
-        """Write records down; when it returns, messages may be sent.
-
-        Raises:
-            JournalError: not all of it could be written, or the journal is closed. After the first
-                of these it is closed; what was written of the last line is dropped on `resume`.
-        """
+        """Write records down; when it returns, messages may be sent."""
         lines = [record_to_line(record, self.sequence + k) for k, record in enumerate(records)]
         if not lines:
             return
@@ -217,14 +205,10 @@ class Journal:
 
 
 class MemoryJournal:
-    """A journal for tests, and for runs that are not replayed.
-
-    Attributes:
-        records: all of them.
-    """
+    """A journal for tests, and for runs that are not replayed."""
 
     def __init__(self) -> None:
-        self.records: list[Record] = []
+        self.records: list[Record] = []  # all of them
         self._closed = False
 
     @property
@@ -232,11 +216,6 @@ class MemoryJournal:
         return len(self.records)
 
     def append(self, records: Iterable[Record]) -> None:
-        """Keep records.
-
-        Raises:
-            JournalError: the journal is closed.
-        """
         if self._closed:
             raise JournalError("the journal is closed")
         self.records += records
@@ -256,7 +235,6 @@ class MemoryJournal:
         self.close()
 
     def read(self) -> Iterator[Record]:
-        """What has been written, from the first record on."""
         return iter(self.records)
 
     def reopened(self) -> MemoryJournal:

@@ -14,41 +14,24 @@ from cavmarl.ownership.table import Table
 
 @dataclass
 class JournalSummary:
-    """What a journal tells, as far as it was committed.
+    """What a journal tells, as far as it was committed."""
 
-    Attributes:
-        run: which one, in hex.
-        lines: of the journal.
-        episodes: that began.
-        ticks: that were committed.
-        first_tick: the first of them; ticks are not numbered anew at a reset.
-        last_tick: the last of them.
-        births: vehicles that entered.
-        removals: vehicles that left.
-        switches: changes of owner.
-        forced: of these with the state attached, since the target was not ready in time.
-        deferrals: ticks that vehicles stayed with a zone that did not contain them, all together.
-        hosts: processes that were given a zone.
-        fences: processes that were given up.
-        unfinished: the tick that was begun and not committed, or -1.
-        torn: a last line that is cut short, or nothing.
-    """
-
-    run: str = ""
+    run: str = ""  # which one, in hex
     lines: int = 0
-    episodes: int = 0
-    ticks: int = 0
-    first_tick: int = -1
-    last_tick: int = -1
-    births: int = 0
-    removals: int = 0
-    switches: int = 0
-    forced: int = 0
+    episodes: int = 0  # that began
+    ticks: int = 0  # that were committed
+    first_tick: int = -1  # the first of them; ticks are not numbered anew at a reset
+    last_tick: int = -1  # the last of them
+    births: int = 0  # vehicles that entered
+    removals: int = 0  # vehicles that left
+    switches: int = 0  # changes of owner
+    forced: int = 0  # of these with the state attached, since the target was not ready in time
+    # ticks that vehicles stayed with a zone that did not contain them, all together
     deferrals: int = 0
-    hosts: int = 0
-    fences: int = 0
-    unfinished: int = -1
-    torn: str = ""
+    hosts: int = 0  # processes that were given a zone
+    fences: int = 0  # processes that were given up
+    unfinished: int = -1  # the tick that was begun and not committed, or -1
+    torn: str = ""  # a last line that is cut short, or nothing
 
     def to_dict(self) -> dict[str, Any]:
         return vars(self).copy()
@@ -96,11 +79,7 @@ def summarize(path: Path) -> tuple[JournalSummary, Table]:
 
 
 def owners_at(path: Path, tick: int) -> Table:
-    """The table as of the commit of a tick.
-
-    Raises:
-        JournalError: the same as `summarize`, or the journal has no such tick.
-    """
+    """The table as of the commit of a tick."""
     table, reader = Table(_zones(path)), JournalReader(path, drop_torn=True)
     for record in reader:
         _apply(table, record, reader)
@@ -117,11 +96,7 @@ def _apply(table: Table, record: Record, reader: JournalReader) -> None:
 
 
 def _zones(path: Path) -> set[int]:
-    """Zones that ever had a host.
-
-    Raises:
-        JournalError: no coordinator has begun this file.
-    """
+    """Zones that ever had a host."""
     reader = JournalReader(path, drop_torn=True)
     zones = set()
     for record in reader:

@@ -47,13 +47,6 @@ _NO_NEWS = _News()
 class LocalCoordinator(Coordinator):
     """Decides ownership, without messages.
 
-    Args:
-        directory: the owners.
-        journal: takes the records; None: not kept.
-        book: hands rows over.
-        counts: how many vehicles each zone owns now, by its rows.
-        transfers: told of all that goes on.
-
     Attributes:
         foretell: told at once of changes of owner that records tell of later.
     """
@@ -61,10 +54,10 @@ class LocalCoordinator(Coordinator):
     def __init__(
         self,
         directory: Directory,
-        journal: AnyJournal | None,
-        book: HandoffLog,
-        counts: Callable[[], list[int]],
-        transfers: TransferLog,
+        journal: AnyJournal | None,  # takes the records; None: not kept
+        book: HandoffLog,  # hands rows over
+        counts: Callable[[], list[int]],  # how many vehicles each zone owns now, by its rows
+        transfers: TransferLog,  # told of all that goes on
     ) -> None:
         super().__init__(directory, journal)
         self._book = book
@@ -91,23 +84,19 @@ class LocalCoordinator(Coordinator):
 
     @property
     def is_open(self) -> bool:
-        """Whether a tick has been begun and is not committed."""
         return self._is_open
 
     def entered(self, vehicles: Iterable[tuple[int, int]]) -> None:
-        """(id, zone) of vehicles that are new since the last BEGIN."""
         known = len(self._births)
         super().entered(vehicles)
         self._vehicles += len(self._births) - known
 
     def left(self, vehicles: Iterable[tuple[int, int]]) -> None:
-        """(id, reason) of vehicles that have left the world."""
         gone = list(vehicles)
         super().left(gone)
         self._vehicles -= len(gone)
 
     def reset(self) -> None:
-        """Begin an episode without vehicles."""
         directory = self.directory
         self.resume()
         self._is_open, self._changed, self._vehicles = False, 0, 0
@@ -191,12 +180,7 @@ class LocalCoordinator(Coordinator):
         self._transfers.count(acknowledged=acknowledged, aborted=aborted)
 
     def _settle(self, tick: int, changes: NDArray[np.void], news: _News, is_told: bool) -> None:
-        """Put what came of one tick, or of all up to one, on the table, and tell watchers of it.
-
-        Raises:
-            ProtocolError: a vehicle changed its owner that belonged to somebody else; a vehicle
-                entered that has been there.
-        """
+        """Put what came of one tick, or of all up to one, on the table, and tell watchers of it."""
         table = self._directory.table
         columns = (changes[name].tolist() for name in ("vehicle", "source", "target", "epoch"))
         switches = tuple(map(Switch, *columns, repeat(False)))
@@ -230,14 +214,7 @@ class LocalCoordinator(Coordinator):
         return Counter()
 
     def _check(self, births: Iterable[Birth]) -> None:
-        """Compare what zones should own with their rows, where all that have left are on record.
-
-        Args:
-            births: vehicles in the rows, which will be on record in the next tick.
-
-        Raises:
-            ProtocolError: a zone has more or fewer.
-        """
+        """Compare what zones should own with their rows, where all that have left are on record."""
         owned = list(self.directory.table.counts.values())
         for birth in births:
             owned[birth.zone] += 1
@@ -256,12 +233,7 @@ def _switch(change: OwnerChange) -> Switch:
 
 
 def _removed_with(changes: NDArray[np.void], left: Mapping[int, int]) -> list[bool]:
-    """Whether each vehicle left the world in the tick in which it changed.
-
-    Args:
-        changes: CHANGE (n,).
-        left: vehicle → tick, of those that have left.
-    """
+    """Whether each vehicle left the world in the tick in which it changed."""
     if not left:
         return [False] * len(changes)
     pairs = zip(changes["vehicle"].tolist(), changes["tick"].tolist(), strict=True)
@@ -276,8 +248,10 @@ def _rows(changes: NDArray[np.void], episode: int, removed: list[bool]) -> list[
 def _row(change: OwnerChange, episode: int, removed: bool) -> Transfer:
     release_m = change.release_depth_m
     return Transfer(
-        episode, change.tick, change.vehicle, change.source, change.target, change.epoch,
-        False, removed, change.approached, 0, change.tick - change.approached, 0,
-        change.prepare_depth_m, change.switch_depth_m,
-        None if release_m != release_m else release_m, change.ms,
+        episode=episode, tick=change.tick, vehicle=change.vehicle,
+        source=change.source, target=change.target, epoch=change.epoch,
+        forced=False, removed=removed, approached=change.approached, waited=0,
+        offers=change.tick - change.approached, state_bytes=0,
+        prepare_depth_m=change.prepare_depth_m, switch_depth_m=change.switch_depth_m,
+        release_depth_m=None if release_m != release_m else release_m, ms=change.ms,
     )  # fmt: skip

@@ -24,14 +24,7 @@ Place = tuple[int, np.void]
 
 
 class Violations:
-    """The state of a world that is wrong somewhere.
-
-    Args:
-        division: of the rows.
-        w: which world.
-        clock: of the check that found it.
-        before: what the check before wrote.
-    """
+    """The state of a world that is wrong somewhere."""
 
     def __init__(self, division: Division, w: int, clock: CheckTime, before: Kept) -> None:
         self._division = division
@@ -46,17 +39,7 @@ class Violations:
     def explain(
         self, kind: int, vehicle: int, owners: Mapping[int, Owner], births: Sequence[Birth]
     ) -> None:
-        """Say what is wrong.
-
-        Args:
-            kind: KIND_* of the check's finding.
-            vehicle: that it is about.
-            owners: on record, vehicle → (zone, epoch).
-            births: vehicles that have entered since.
-
-        Raises:
-            ProtocolError: always.
-        """
+        """Say what is wrong."""
         expected = {**owners, **{birth.vehicle: (birth.zone, 0) for birth in births}}
         for words in (
             self._doubled(),

@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import JournalError, ProtocolError
+from cavmarl.core.records.arrays import Common, Zoned
 from cavmarl.ownership.messages import Birth, Removed
 from cavmarl.ownership.safeguards import ALL_ON, Safeguards
-from cavmarl.shards.shard import COMMON, Shard
+from cavmarl.shards.shard import Shard
+from cavmarl.shards.state import Use, arrays_of, names_of
 
-# Counts of `Worlds` that each shard has of its own.
-COUNTS = ("num_owned", "num_rows", "num_through", "num_touching", "num_contacts")
+COUNTS = names_of(Zoned, Use.COMMITTED)  # of `Worlds` that each shard has of its own
 
 Array = NDArray[Any]
 Arrays = list[Array]
@@ -28,34 +29,23 @@ Notes = tuple[tuple[Birth, ...], tuple[Removed, ...]]
 
 
 class CommittedImage(NamedTuple):
-    """A copy of everything.
+    """A copy of everything."""
 
-    Attributes:
-        counts: by shard, those of `COUNTS`.
-        rows: by shard and world, VEHICLE (n,), owned rows and ghosts.
-        shared: what the shards have in common, and what is kept beside them.
-        notes: by world.
-    """
-
-    counts: list[Arrays]
-    rows: list[Arrays]
-    shared: Arrays
-    notes: tuple[Notes, ...]
+    counts: list[Arrays]  # by shard, those of `COUNTS`
+    rows: list[Arrays]  # by shard and world, VEHICLE (n,), owned rows and ghosts
+    shared: Arrays  # what the shards have in common, and what is kept beside them
+    notes: tuple[Notes, ...]  # by world
 
 
 class CommittedStore:
-    """Two copies of the worlds.
-
-    Args:
-        shards: whose rows are kept.
-        shared: the arrays beside theirs that a tick changes, as they are now.
-        safeguards: remedies of the protocol; without `double_buffer` there is one copy only.
-    """
+    """Two copies of the worlds."""
 
     def __init__(
         self,
-        shards: Sequence[Shard],
+        shards: Sequence[Shard],  # whose rows are kept
+        # the arrays beside theirs that a tick changes, as they are now
         shared: Callable[[], Iterable[Array]],
+        # remedies of the protocol; without `double_buffer` there is one copy only
         safeguards: Safeguards = ALL_ON,
     ) -> None:
         self._has_two = safeguards.double_buffer
@@ -65,11 +55,7 @@ class CommittedStore:
         self._next: CommittedImage | None = None
 
     def write(self, notes: tuple[Notes, ...]) -> None:
-        """Copy what there is now; the truth stays what it was.
-
-        Args:
-            notes: by world.
-        """
+        """Copy what there is now; the truth stays what it was."""
         counts: list[Arrays] = []
         rows: list[Arrays] = []
         for shard in self._shards:
@@ -82,11 +68,7 @@ class CommittedStore:
             self._committed = self._next
 
     def flip(self) -> None:
-        """Make what was written last the truth.
-
-        Raises:
-            ProtocolError: nothing has been written since.
-        """
+        """Make what was written last the truth."""
         if self._next is None:
             raise ProtocolError("nothing has been written to the store since it was flipped")
         self._committed, self._next = self._next, None
@@ -105,11 +87,7 @@ class CommittedStore:
         return image.notes
 
     def adopt(self, image: CommittedImage) -> tuple[Notes, ...]:
-        """Take the worlds to what another store has kept of such worlds; the notes of each.
-
-        Raises:
-            JournalError: those worlds were not such ones.
-        """
+        """Take the worlds to what another store has kept of such worlds; the notes of each."""
         shared = list(self.shared())
         if (len(image.rows), len(image.shared)) != (len(self._shards), len(shared)):
             raise JournalError(
@@ -127,11 +105,7 @@ class CommittedStore:
         return image.notes
 
     def written(self, zone: int, world: int) -> NDArray[np.void]:
-        """VEHICLE (n,), a zone's owned rows as they were written last.
-
-        Raises:
-            ProtocolError: nothing has been written since the store was flipped.
-        """
+        """VEHICLE (n,), a zone's owned rows as they were written last."""
         if self._next is None:
             raise ProtocolError("nothing has been written to the store since it was flipped")
         num = int(self._next.counts[zone][COUNTS.index("num_owned")][world])
@@ -139,29 +113,18 @@ class CommittedStore:
         return rows
 
     def shared(self) -> Iterator[Array]:
-        """What is kept beside the shards' own, as it is now."""
-        worlds = self._shards[0].worlds
-        for name in COMMON:
-            yield getattr(worlds, name)
+        yield from arrays_of(self._shards[0].worlds, Common, Use.COMMITTED)
         yield from self._others()
 
     def truth(self) -> CommittedImage:
-        """What is committed; not to be changed.
-
-        Raises:
-            ProtocolError: nothing is.
-        """
+        """What is committed; not to be changed."""
         if self._committed is None:
             raise ProtocolError("nothing is committed: reset the worlds first")
         return self._committed
 
 
 def _put(kept: Array, array: Array, what: str) -> None:
-    """Write what was kept into an array of the same meaning, which may have less room to spare.
-
-    Raises:
-        JournalError: it has another type or fewer places.
-    """
+    """Write what was kept into an array of the same meaning, which may have less room to spare."""
     if kept.dtype != array.dtype:
         raise JournalError(f"{what}: kept in another layout; use the version that wrote them")
     if kept.ndim != array.ndim or any(a < b for a, b in zip(kept.shape, array.shape, strict=True)):

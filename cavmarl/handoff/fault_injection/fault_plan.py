@@ -10,12 +10,10 @@ from typing import Any, TypeVar
 
 from cavmarl.core.errors import ConfigError
 from cavmarl.ownership.transport import FaultPlan, Rates, check_rate, check_whole
+from cavmarl.shards import phases
 
 MESSAGES = ("Step", "Done", "Prepare", "Ack", "Nack", "Abort", "Need")
-PHASES = (
-    "begin_step", "advance", "choose_goals", "leave", "resolve", "rank_lanes", "propose", "admit",
-    "commit", "detect", "sense", "credit",
-)  # fmt: skip
+PHASES = tuple(name for name, rule in phases.PHASES.items() if rule.may_die)
 ZONE_POINTS = (
     "PREPARE arrives", "ACK sent", "STEP arrives", "lease taken", *PHASES, "before DONE",
 )  # fmt: skip
@@ -101,11 +99,7 @@ class Faults:
         return bool(self.crashes) or self.crash_rate > 0.0
 
     def check_zones(self, count: int) -> None:
-        """See that the zones whose hosts die are there.
-
-        Raises:
-            ConfigError: one that is not.
-        """
+        """See that the zones whose hosts die are there."""
         for crash in self.crashes:
             if crash.zone is not None and crash.zone >= count:
                 raise ConfigError(
@@ -122,11 +116,7 @@ class Faults:
 
 
 def read_faults(text: str) -> Faults:
-    """A plan from JSON, or from a file of it; docs/faults.md says what stands in it.
-
-    Raises:
-        ConfigError: it cannot be read, or a key or value that cannot work.
-    """
+    """A plan from JSON, or from a file of it; docs/faults.md says what stands in it."""
     where = "faults"
     if not text.lstrip().startswith("{"):
         where = f"faults {text}"

@@ -12,11 +12,10 @@ from typing import Any, TypeAlias
 
 from cavmarl.core.errors import CavmarlError
 from cavmarl.handoff.fault_injection.fault_plan import PHASES, Crash, Faults
-from cavmarl.handoff.fault_injection.mailbox import Parcel
-from cavmarl.handoff.fault_injection.message_coordinator import MessageCoordinator
+from cavmarl.handoff.fault_injection.message_coordinator import MessageCoordinator, Parcel
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.messages import COORDINATOR, Begin, Commit, Output, Prepare, Step
-from cavmarl.shards.executor import Executor, Phase, SerialExecutor
+from cavmarl.shards.executor import Executor, SerialExecutor
 from cavmarl.shards.shard import Shard
 
 Visit: TypeAlias = tuple[int, str, int]
@@ -27,10 +26,7 @@ class ZoneDeath(CavmarlError):
     """The host of a zone has died.
 
     Attributes:
-        zone: which.
-        point: of the tick.
         lives_on: it only seemed so.
-        cause: of which.
     """
 
     def __init__(self, zone: int, point: str, lives_on: bool, cause: str = "on purpose") -> None:
@@ -50,16 +46,12 @@ class CoordinatorDeath(CavmarlError):
 class Crashes:
     """Says which processes die where, and counts.
 
-    Args:
-        faults: the plan.
-
     Attributes:
-        tick: of the run, that the world is on its way to; to be set.
         visits: (tick, point, party) of every point reached; None: not noted.
     """
 
     def __init__(self, faults: Faults) -> None:
-        self.tick = 0
+        self.tick = 0  # of the run, that the world is on its way to; to be set
         self.visits: set[Visit] | None = None
         self._plan = faults.plan()
         self._rate = faults.crash_rate
@@ -71,21 +63,11 @@ class Crashes:
         self._drawn: set[Visit] = set()
 
     def zone(self, point: str, zone: int) -> None:
-        """A zone's host is at a point.
-
-        Raises:
-            ZoneDeath: it dies there.
-        """
         crash = self._strikes(point, zone)
         if crash is not None:
             raise ZoneDeath(zone, point, crash.lives_on)
 
     def coordinator(self, point: str) -> None:
-        """The coordinator is at a point.
-
-        Raises:
-            CoordinatorDeath: it dies there.
-        """
         if self._strikes(point, COORDINATOR) is not None:
             raise CoordinatorDeath(point)
 
@@ -111,19 +93,14 @@ class Crashes:
 
 
 class FaultyPhases:
-    """Runs the phases of a tick zone by zone; hosts die in or after their part of one.
-
-    Args:
-        shards: all of them.
-        crashes: which processes die where.
-    """
+    """Runs the phases of a tick zone by zone; hosts die in or after their part of one."""
 
     def __init__(self, shards: Sequence[Shard], crashes: Crashes) -> None:
         self._hosts = [(shard.zone, SerialExecutor((shard,))) for shard in shards]
         self._crashes = crashes
         self.on = False
 
-    def each(self, phase: Phase, *arguments: Any) -> None:
+    def each(self, phase: str, *arguments: Any) -> None:
         """Call the method `phase` of every shard, in order, while all live."""
         watched = self.on and phase in PHASES
         for zone, host in self._hosts:
@@ -136,12 +113,8 @@ class FaultyPhases:
             self._crashes.coordinator(phase)
 
 
-def _call_hosted(zone: int, host: Executor, phase: Phase, arguments: tuple[Any, ...]) -> None:
-    """Run a phase in a host's process: an unexpected error ends the host and no more.
-
-    Raises:
-        ZoneDeath: something else than cavmarl's own errors was raised.
-    """
+def _call_hosted(zone: int, host: Executor, phase: str, arguments: tuple[Any, ...]) -> None:
+    """Run a phase in a host's process: an unexpected error ends the host and no more."""
     try:
         host.each(phase, *arguments)
     except CavmarlError:
@@ -151,12 +124,7 @@ def _call_hosted(zone: int, host: Executor, phase: Phase, arguments: tuple[Any, 
 
 
 class FaultyCoordinator(MessageCoordinator):
-    """A coordinator that dies, and whose zones' hosts die, at named points.
-
-    Args:
-        arguments: as of `MessageCoordinator`.
-        crashes: which processes die where.
-    """
+    """A coordinator that dies, and whose zones' hosts die, at named points."""
 
     def __init__(self, *arguments: Any, crashes: Crashes) -> None:
         super().__init__(*arguments)

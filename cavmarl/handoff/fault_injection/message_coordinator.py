@@ -3,30 +3,36 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
-from typing import Protocol
+from collections.abc import Callable, Iterable, Sequence
+from typing import Protocol, TypeAlias
 
 from cavmarl.core.errors import ProtocolError
 from cavmarl.handoff.coordinator.coordinator import ArrivingVehicle, Coordinator, Near
 from cavmarl.handoff.coordinator.journal import AnyJournal, MemoryJournal
-from cavmarl.handoff.fault_injection.mailbox import Parcel, Post
 from cavmarl.ownership.directory import SILENCE, Directory
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.limits import Limits
-from cavmarl.ownership.messages import (
-    COORDINATOR,
-    Begin,
-    Output,
-    Prepare,
-    Record,
-    Removed,
-)
+from cavmarl.ownership.messages import COORDINATOR, Begin, Message, Output, Prepare, Record, Removed
 from cavmarl.ownership.offers import Approach
 from cavmarl.ownership.reactions import Advance
 from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 
 PATIENCE = 10_000
 """So often a tick asks a zone that does not answer, before it gives up."""
+
+
+Parcel: TypeAlias = tuple[int, Message, bool]
+"""A message at its destination, and whether it is to be refused; see `transport.Delivery`."""
+
+
+class Post(Protocol):
+    """Carries messages; `ownership.transport.Network` is the one that loses some of them."""
+
+    def send(self, messages: Iterable[Message]) -> None:
+        """Take messages; each goes to all of its destinations."""
+        ...
+
+    def deliver(self) -> Sequence[Parcel]: ...
 
 
 class States(Protocol):
@@ -50,35 +56,24 @@ class States(Protocol):
 class MessageCoordinator(Coordinator):
     """Runs the protocol of one world over messages.
 
-    Args:
-        run: 16 bytes that no other run has.
-        zones: how many.
-        states: of vehicles at the committed tick.
-        limits: deadlines.
-        post: carries the messages.
-        journal: takes the records; None: not kept.
-        safeguards: remedies of the protocol; tests take one away.
-
     Attributes:
-        endpoints: zone → its host's side.
-        post: what carries the messages.
         resent: phase → messages that were sent again, since no answer had come: PREPARE; STEP, for
             a lease not taken; DONE, STEPs for an answer that had not come.
     """
 
     def __init__(
         self,
-        run: bytes,
+        run: bytes,  # 16 bytes that no other run has
         zones: int,
-        states: States,
+        states: States,  # of vehicles at the committed tick
         limits: Limits,
-        post: Post,
-        journal: AnyJournal | None = None,
-        safeguards: Safeguards = ALL_ON,
+        post: Post,  # carries the messages
+        journal: AnyJournal | None = None,  # takes the records; None: not kept
+        safeguards: Safeguards = ALL_ON,  # remedies of the protocol; tests take one away
     ) -> None:
         super().__init__(Directory(run, range(zones), states, limits, safeguards), journal)
-        self.endpoints: dict[int, Endpoint] = {}
-        self.post = post
+        self.endpoints: dict[int, Endpoint] = {}  # zone → its host's side
+        self.post = post  # what carries the messages
         self.resent: Counter[str] = Counter()
         self._states = states
         self._limits = limits
@@ -88,7 +83,6 @@ class MessageCoordinator(Coordinator):
 
     @property
     def is_open(self) -> bool:
-        """Whether a tick has been begun and is not committed."""
         return self.directory.table.plan is not None
 
     def dropped(self) -> Counter[tuple[str, str]]:
@@ -101,7 +95,6 @@ class MessageCoordinator(Coordinator):
     # Between ticks
 
     def reset(self) -> None:
-        """Begin an episode without vehicles."""
         self.resume()
         self._leases = {}
         self._do(self.directory.reset())
@@ -110,7 +103,6 @@ class MessageCoordinator(Coordinator):
                 self.host(zone)
 
     def host(self, zone: int) -> None:
-        """Give a zone to a new host, in this process."""
         output = self.directory.host(zone, worker=0)
         self.endpoints[zone] = Endpoint(
             self.directory.hosting(zone), self._limits, self._safeguards
@@ -151,10 +143,6 @@ class MessageCoordinator(Coordinator):
 
     def end(self, rows: Callable[[int], int], stored: Callable[[int], int] | None = None) -> None:
         """Every zone is through: DONE and COMMIT.
-
-        Args:
-            rows: zone → digest of its rows.
-            stored: zone → digest of its rows in the store; None: where `rows` are is the store.
 
         Raises:
             ProtocolError: a vehicle was lost or doubled; a zone does not answer.

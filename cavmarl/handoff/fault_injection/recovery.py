@@ -32,49 +32,30 @@ GARBAGE = 0xA5  # what is in a memory that is lost, byte by byte
 
 
 class Revival(NamedTuple):
-    """What it took to go on after a death.
+    """What it took to go on after a death."""
 
-    Attributes:
-        tick: of the run, that was on its way.
-        point: at which it died.
-        zone: whose host it was; None: the coordinator.
-        ms: from the death to the tick's next beginning.
-    """
-
-    tick: int
-    point: str
-    zone: int | None
-    ms: float
+    tick: int  # of the run, that was on its way
+    point: str  # at which it died
+    zone: int | None  # whose host it was; None: the coordinator
+    ms: float  # from the death to the tick's next beginning
 
 
 class Recovery:
-    """Runs ticks of one world until they are committed.
-
-    Args:
-        shards: whose hosts may die.
-        coordination: of the one world.
-        coordinator: its own.
-        store: the committed state.
-        phases: of the tick, in which hosts may die.
-        crashes: which processes die where.
-        repeats: new hosts that a zone may have for one tick, and new coordinators that may come to
-            the same point.
-
-    Attributes:
-        revivals: one for each death.
-    """
+    """Runs ticks of one world until they are committed."""
 
     def __init__(
         self,
-        shards: Sequence[Shard],
-        coordination: Coordinators,
-        coordinator: MessageCoordinator,
-        store: CommittedStore,
-        phases: FaultyPhases,
-        crashes: Crashes,
+        shards: Sequence[Shard],  # whose hosts may die
+        coordination: Coordinators,  # of the one world
+        coordinator: MessageCoordinator,  # its own
+        store: CommittedStore,  # the committed state
+        phases: FaultyPhases,  # of the tick, in which hosts may die
+        crashes: Crashes,  # which processes die where
+        # new hosts that a zone may have for one tick, and new coordinators that may come to the
+        # same point
         repeats: int,
     ) -> None:
-        self.revivals: list[Revival] = []
+        self.revivals: list[Revival] = []  # one for each death
         self._shards = tuple(shards)
         self._coordination = coordination
         self._coordinator = coordinator

@@ -34,47 +34,27 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class Reproducer:
-    """A tick of one world, and all that it is a function of.
+    """A tick of one world, and all that it is a function of."""
 
-    Attributes:
-        made_with: versions of what has run it.
-        config: the environment, as plain values.
-        sources: hashes of its roads, demand and zones.
-        seed: root of all random numbers.
-        first_world: number of the world among all worlds of the seed.
-        episode: number of the world's episode since the seed, from 1 on.
-        tick: of the run, that could not be reached.
-        zone: whose hosts died; None: the coordinators.
-        cause: what the error said.
-        is_first: whether the tick begins a step.
-        is_last: whether it ends one.
-        commands: of the agents, W = 1.
-        records: of the coordinator, as far as the episode needs them, up to the committed tick, and
-            the BEGIN of the one that could not be reached if there is one.
-        image: of the committed tick.
-    """
-
-    made_with: Mapping[str, str | None]
-    config: Mapping[str, Any]
-    sources: Mapping[str, str | None]
-    seed: int
-    first_world: int
-    episode: int
-    tick: int
-    zone: int | None
-    cause: str
-    is_first: bool
-    is_last: bool
-    commands: Commands
+    made_with: Mapping[str, str | None]  # versions of what has run it
+    config: Mapping[str, Any]  # the environment, as plain values
+    sources: Mapping[str, str | None]  # hashes of its roads, demand and zones
+    seed: int  # root of all random numbers
+    first_world: int  # number of the world among all worlds of the seed
+    episode: int  # number of the world's episode since the seed, from 1 on
+    tick: int  # of the run, that could not be reached
+    zone: int | None  # whose hosts died; None: the coordinators
+    cause: str  # what the error said
+    is_first: bool  # whether the tick begins a step
+    is_last: bool  # whether it ends one
+    commands: Commands  # of the agents, W = 1
+    # of the coordinator, as far as the episode needs them, up to the committed tick, and the BEGIN
+    # of the one that could not be reached if there is one
     records: tuple[Record, ...]
-    image: CommittedImage
+    image: CommittedImage  # of the committed tick
 
     def write(self, path: Path) -> None:
-        """Write the file, which must not exist.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """Write the file, which must not exist. Raises OSError: it cannot be written."""
         plain = {name: dict(getattr(self, name)) for name in ("made_with", "config", "sources")}
         names = ("seed", "first_world", "episode", "tick", "zone", "cause", "is_first", "is_last")
         content = {
@@ -91,11 +71,6 @@ class Reproducer:
 
 
 def read_reproducer(path: Path) -> Reproducer:
-    """The reproducer of a file.
-
-    Raises:
-        JournalError: it cannot be read, is damaged, or is none of this version.
-    """
     try:
         content = json.loads(path.read_text(encoding="ascii"))
     except OSError as error:
@@ -139,11 +114,6 @@ def _packed(array: Array) -> dict[str, Any]:
 
 
 def _unpacked(entry: Any) -> Array:
-    """The array of `_packed`.
-
-    Raises:
-        KeyError, TypeError, ValueError, zlib.error: it is none.
-    """
     dtype, shape = _dtype(entry["dtype"]), tuple(entry["shape"])
     data = zlib.decompressobj().decompress(base64.b64decode(entry["data"]), MAX_BYTES)
     return np.frombuffer(data, dtype=dtype).reshape(shape)

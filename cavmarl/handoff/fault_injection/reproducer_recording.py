@@ -26,40 +26,24 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 
 
 class RecordedTick(NamedTuple):
-    """A tick among all ticks.
+    """A tick among all ticks."""
 
-    Attributes:
-        seed: root of all random numbers.
-        first_world: number of the world among all worlds of the seed.
-        episode: number of the world's episode since the seed, from 1 on.
-        commands: of the agents.
-        is_first: whether the tick begins a step.
-        is_last: whether it ends one.
-    """
-
-    seed: int
-    first_world: int
-    episode: int
-    commands: Commands
-    is_first: bool
-    is_last: bool
+    seed: int  # root of all random numbers
+    first_world: int  # number of the world among all worlds of the seed
+    episode: int  # number of the world's episode since the seed, from 1 on
+    commands: Commands  # of the agents
+    is_first: bool  # whether the tick begins a step
+    is_last: bool  # whether it ends one
 
 
 class Keeper:
-    """Writes reproducers of one world.
-
-    Args:
-        config: the environment.
-        sources: hashes of what it names.
-        store: the committed state.
-        coordinator: of the world.
-    """
+    """Writes reproducers of one world."""
 
     def __init__(
         self,
         config: EnvConfig,
-        sources: Mapping[str, str | None],
-        store: CommittedStore,
+        sources: Mapping[str, str | None],  # hashes of what it names
+        store: CommittedStore,  # the committed state
         coordinator: Coordinator,
     ) -> None:
         self._config = config
@@ -69,10 +53,6 @@ class Keeper:
 
     def keep(self, error: LostTickError, moment: RecordedTick) -> Path | str:
         """Write a file from which the tick can be run again.
-
-        Args:
-            error: what has become of it.
-            moment: when it was.
 
         Returns:
             the file, or why there is none: another error is on its way already.

@@ -11,28 +11,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.math.rng import mix
-from cavmarl.core.numba import kernel
+from cavmarl.core.numba import inlined_kernel, kernel
+
+
+@inlined_kernel
+def row_digest(
+    words: NDArray[np.uint64], i: int, masks: NDArray[np.uint64], factors: NDArray[np.uint64]
+) -> np.uint64:
+    """That of one of the records, as whole words."""
+    row = words[i]  # so that several words are multiplied at once
+    total = np.uint64(0)
+    for n in range(row.shape[0]):
+        total += (row[n] & masks[n]) * factors[n]
+    return mix(total)
 
 
 @kernel
 def digest_rows(
-    words: NDArray[np.uint64], num: int, masks: NDArray[np.uint64], factors: NDArray[np.uint64]
+    words: NDArray[np.uint64],  # (C, n) the records of vehicles as whole words
+    num: int,  # how many count
+    masks: NDArray[np.uint64],  # (n,) which bits of each word count
+    factors: NDArray[np.uint64],  # (n,) odd random numbers
 ) -> tuple[np.uint64, np.uint64]:
-    """Upper and lower half of the sum of the digests of `words[:num]`, modulo 2**128.
-
-    Args:
-        words: (C, n) the records of vehicles as whole words.
-        num: how many count.
-        masks: (n,) which bits of each word count.
-        factors: (n,) odd random numbers.
-    """
+    """Upper and lower half of the sum of the digests of `words[:num]`, modulo 2**128."""
     upper = np.uint64(0)
     lower = np.uint64(0)
     for i in range(num):
-        total = np.uint64(0)
-        for n in range(words.shape[1]):
-            total += (words[i, n] & masks[n]) * factors[n]
-        part = mix(total)
+        part = row_digest(words, i, masks, factors)
         lower += part
         if lower < part:
             upper += np.uint64(1)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from cavmarl.core.math.rng import mix
 from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import Zoned
+from cavmarl.handoff.kernels.digests import row_digest
 from cavmarl.zones.kernels.zone_lookup import (
     Halo,
     ZoneArrays,
@@ -69,47 +70,29 @@ FINDING = np.dtype(
 
 
 class CheckTime(NamedTuple):
-    """When a check is made.
-
-    Attributes:
-        tick: of the world.
-        new_late: by how much the tick of a vehicle lags that was not there before.
-        limit_m: no vehicle moves further from one check to the next.
-    """
+    """When a check is made."""
 
     tick: int
-    new_late: int
-    limit_m: float
+    new_late: int  # by how much the tick of a vehicle lags that was not there before
+    limit_m: float  # no vehicle moves further from one check to the next
 
 
 class Kept(NamedTuple):
-    """What one check leaves for the next.
+    """What one check leaves for the next."""
 
-    Attributes:
-        rows: KEPT (k, C) of the vehicles that each zone owns, in the order of its rows.
-        num: (k,) how many.
-    """
-
+    # KEPT (k, C) of the vehicles that each zone owns, in the order of its rows
     rows: NDArray[np.void]
-    num: NDArray[np.int64]
+    num: NDArray[np.int64]  # (k,) how many
 
 
 class Strays(NamedTuple):
-    """Vehicles that are not where the last check has seen them; scratch of one check.
+    """Vehicles that are not where the last check has seen them; scratch of one check."""
 
-    Attributes:
-        table: LOST (a power of two,), a hash table; blank between two checks.
-        places: (n,) where in it a vehicle stands.
-        rows: (n, 2) zone and row where another stood.
-        entered: (n,) vehicles that the last check has not seen.
-        left: (n,) vehicles that this one has not seen.
-    """
-
-    table: NDArray[np.void]
-    places: NDArray[np.int64]
-    rows: NDArray[np.int64]
-    entered: NDArray[np.int64]
-    left: NDArray[np.int64]
+    table: NDArray[np.void]  # LOST (a power of two,), a hash table; blank between two checks
+    places: NDArray[np.int64]  # (n,) where in it a vehicle stands
+    rows: NDArray[np.int64]  # (n, 2) zone and row where another stood
+    entered: NDArray[np.int64]  # (n,) vehicles that the last check has not seen
+    left: NDArray[np.int64]  # (n,) vehicles that this one has not seen
 
 
 def make_kept(zones: int, capacity: int) -> Kept:
@@ -135,17 +118,6 @@ KIND_SUMS = 3  # zones own others, or see others, than they should
 def owner_hash(vehicle: int, epoch: int) -> np.uint64:
     """What a vehicle adds to the sum of those that a zone owns."""
     return mix(mix(np.uint64(vehicle)) + np.uint64(epoch))
-
-
-@inlined_kernel
-def _digest(
-    words: NDArray[np.uint64], i: int, masks: NDArray[np.uint64], factors: NDArray[np.uint64]
-) -> np.uint64:
-    row = words[i]  # so that several words are multiplied at once
-    total = np.uint64(0)
-    for n in range(row.shape[0]):
-        total += (row[n] & masks[n]) * factors[n]
-    return mix(total)
 
 
 @kernel
@@ -193,42 +165,24 @@ def _judge(found: np.void, last: np.void, now: np.void, limit_m: float) -> None:
 @kernel
 def watch(
     zones: ZoneArrays,
-    halo: Halo,
-    zoned: Zoned,
-    words: NDArray[np.uint64],
-    side: int,
+    halo: Halo,  # how far each zone sees over its borders
+    zoned: Zoned,  # the rows, owned ones and ghosts
+    words: NDArray[np.uint64],  # (2, k, W, C, n) the rows as whole words
+    side: int,  # where the committed rows are, 0 or 1
     w: int,
     clock: CheckTime,
-    masks: NDArray[np.uint64],
-    factors: NDArray[np.uint64],
-    before: Kept,
-    now: Kept,
-    strays: Strays,
-    live: int,
-    expected: NDArray[np.uint64],
-    tallies: NDArray[np.void],
+    masks: NDArray[np.uint64],  # (n,) which bits a ghost has in common with its owner's row
+    factors: NDArray[np.uint64],  # (n,) odd random numbers
+    before: Kept,  # what the last check wrote
+    now: Kept,  # overwritten, for the next check
+    strays: Strays,  # scratch; entered and left are overwritten
+    live: int,  # vehicles that there should be
+    expected: NDArray[np.uint64],  # (k,) what `TALLY["owned"]` should be of each zone
+    tallies: NDArray[np.void],  # TALLY (k,) overwritten
+    # FINDING (1,) overwritten: the one about the smallest id, if there is any
     found: NDArray[np.void],
 ) -> int:
-    """Look at all rows of one world after a tick; KIND_* of what is found.
-
-    Args:
-        zones: of the partition.
-        halo: how far each zone sees over its borders.
-        zoned: the rows, owned ones and ghosts.
-        words: (2, k, W, C, n) the rows as whole words.
-        side: where the committed rows are, 0 or 1.
-        w: which world.
-        clock: of it.
-        masks: (n,) which bits a ghost has in common with its owner's row.
-        factors: (n,) odd random numbers.
-        before: what the last check wrote.
-        now: overwritten, for the next check.
-        strays: scratch; entered and left are overwritten.
-        live: vehicles that there should be.
-        expected: (k,) what `TALLY["owned"]` should be of each zone.
-        tallies: TALLY (k,) overwritten.
-        found: FINDING (1,) overwritten: the one about the smallest id, if there is any.
-    """
+    """Look at all rows of one world after a tick; KIND_* of what is found."""
     finding = found[0]
     finding["kind"] = KIND_NONE
     count = zones.rects.shape[0]
@@ -269,7 +223,7 @@ def watch(
         tallies[zone]["owned"] = owned
         seen = np.uint64(0)
         for i in range(num_owned, zoned.num_rows[zone, w]):
-            seen += _digest(own_words, i, masks, factors)
+            seen += row_digest(own_words, i, masks, factors)
         tallies[zone]["seen"] = seen
     _match(before, now, clock, strays, missing, moved, finding)
     if finding["kind"] == KIND_NONE:
@@ -339,6 +293,6 @@ def _owe_ghosts(
         other = halo.near[n]
         if other != zone and is_seen(halo, other, row, squared_distance(zones.rects, other, x, y)):
             if sought:  # many out here are seen by none
-                digest = _digest(words, i, masks, factors)
+                digest = row_digest(words, i, masks, factors)
                 sought = False
             tallies[other]["due"] += digest

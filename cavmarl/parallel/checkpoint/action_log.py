@@ -1,4 +1,4 @@
-"""`ActionLog` records all inputs of some worlds since they were made, for a fresh successor.
+"""`ActionLog` records all inputs of some worlds since they were made; `ActionLogJob` keeps one.
 
 A checkpoint log keeps images, and ownership is in none of them: a successor gives each vehicle to
 the zone that it is in. That changes no result, but a journal would tell of it, and a plan of faults
@@ -8,46 +8,37 @@ would strike others. So the successor of such worlds goes through everything aga
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import WorkerError
-from cavmarl.shards.shard import Commands
+from cavmarl.handoff.coordinator.journal import Journal
+from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds_job import Task, WorldsJob
+from cavmarl.shards.shard import COMMANDS, Commands
 
-_COMMANDS = ("controls", "meta_actions", "declared")
 _READ_AT_ONCE = 64  # entries
 
 
 class LoggedAction(NamedTuple):
-    """One order.
-
-    Attributes:
-        is_reset: or else a step.
-        seed: of a reset; None: none was given.
-        first_world: of a reset, as the command has it.
-        chosen: (W,) which worlds a reset is about.
-        commands: of the agents in a step.
-    """
-
-    is_reset: bool
-    seed: int | None
-    first_world: int
-    chosen: NDArray[np.bool_]
-    commands: Commands
+    is_reset: bool  # or else a step
+    seed: int | None  # of a reset; None: none was given
+    first_world: int  # of a reset, as the command has it
+    chosen: NDArray[np.bool_]  # (W,) which worlds a reset is about
+    commands: Commands  # of the agents in a step
 
 
 class ActionLog:
-    """Entries one behind the other, in memory that outlives its writers.
+    """Entries one behind the other, in memory that outlives its writers."""
 
-    Args:
-        fd: of that memory, which grows.
-        like: what agents do, in arrays of the shapes and dtypes that they always have.
-    """
-
-    def __init__(self, fd: int, like: Commands) -> None:
+    def __init__(
+        self,
+        fd: int,  # of that memory, which grows
+        like: Commands,  # what agents do, in arrays of the shapes and dtypes that they always have
+    ) -> None:
         self._fd = fd
         worlds = len(like.controls)
         fields: list[tuple[str, str, tuple[int, ...]]] = [
@@ -57,23 +48,19 @@ class ActionLog:
             ("first_world", "<i8", ()),
             ("chosen", "|b1", (worlds,)),
         ]
-        for name in _COMMANDS:
+        for name in COMMANDS:
             array = getattr(like, name)
             fields.append((name, array.dtype.str, array.shape))
         self._row = np.zeros(1, dtype=np.dtype(fields))
-        self._commands = Commands(*(np.zeros_like(getattr(like, name)) for name in _COMMANDS))
+        self._commands = Commands(*(np.zeros_like(getattr(like, name)) for name in COMMANDS))
 
     def write(self, number: int, entry: LoggedAction) -> None:
-        """Put down an entry, in the place of that and all later ones.
-
-        Raises:
-            WorkerError: there is no more memory.
-        """
+        """Put down an entry, in the place of that and all later ones."""
         row = self._row
         row["is_reset"], row["has_seed"] = entry.is_reset, entry.seed is not None
         row["seed"], row["first_world"] = entry.seed or 0, entry.first_world
         row["chosen"] = entry.chosen
-        for name in _COMMANDS:
+        for name in COMMANDS:
             row[name] = getattr(entry.commands, name)
         try:
             os.pwrite(self._fd, row.tobytes(), number * row.itemsize)
@@ -90,8 +77,72 @@ class ActionLog:
             some = min(count - first, _READ_AT_ONCE)
             raw = os.pread(self._fd, some * size, first * size)
             for row in np.frombuffer(raw, dtype=self._row.dtype):
-                for name in _COMMANDS:  # whose arrays kernels know: aligned and writable
+                for name in COMMANDS:  # whose arrays kernels know: aligned and writable
                     getattr(self._commands, name)[...] = row[name]
                 seed = int(row["seed"]) if row["has_seed"] else None
                 is_reset, first_world = bool(row["is_reset"]), int(row["first_world"])
                 yield LoggedAction(is_reset, seed, first_world, row["chosen"], self._commands)
+
+
+class ActionLogJob(WorldsJob):
+    """Some of the worlds, next to each other, whose successor begins at their beginning.
+
+    They are made where they run, not where workers are forked: a journal belongs to one process.
+    """
+
+    def __init__(self, make: Callable[[], LocalWorlds], first: int, tape: ActionLog) -> None:
+        self._make = make
+        self._first = first
+        self._tape = tape
+        self._count = np.zeros(1, dtype=np.int64)  # entries that the state follows from
+        self._is_there = False  # where the tape ends
+
+    def perform(self, task: int, letter: Any) -> Any:
+        if not self._is_there:
+            self._begin_anew()
+        if task not in (Task.STEP, Task.RESET):
+            return super().perform(task, letter)
+        is_reset = task == Task.RESET
+        seed = letter["seed"] if is_reset else None
+        first_world = letter["first_world"] if is_reset else 0
+        chosen = self._worlds.arrays.chosen
+        count = self._count.item()
+        self._tape.write(count, LoggedAction(is_reset, seed, first_world, chosen, self._commands))
+        self._is_there = False
+        super().perform(task, letter)
+        self._count[0] = count + 1
+        self._is_there = True
+        return None
+
+    def _begin_anew(self) -> None:
+        self._end()
+        self._take(self._make(), self._first)
+        worlds = self._worlds
+        chosen = worlds.arrays.chosen
+        present = chosen.copy()  # of the command that waits
+        for entry in self._tape.read(self._count.item()):
+            if entry.is_reset:
+                chosen[:] = entry.chosen
+                worlds.reset(entry.seed, entry.first_world + self._first)
+            else:
+                worlds.step(entry.commands)
+        chosen[:] = present
+        self._is_there = True
+
+    def _end(self) -> None:
+        """Let go what the worlds of this process hold, if there are any."""
+        if not hasattr(self, "_worlds"):
+            return
+        for coordinator in self._worlds.simulation.coordinators:
+            if isinstance(coordinator.journal, Journal):
+                coordinator.journal.close()
+        self._worlds.close()
+
+    def save(self) -> list[NDArray[Any]]:
+        """How much of the tape is committed."""
+        return [self._count]
+
+    def load(self, saved: Sequence[NDArray[Any]]) -> None:
+        """Go on from what `save` gave; the way there waits for a task."""
+        self._count[:] = saved[0]
+        self._is_there = False

@@ -17,14 +17,6 @@ AGAIN_S = 0.04  # a successor goes through no more steps again than take that lo
 
 
 class CheckpointJob(WorldsJob):
-    """Some of the worlds, next to each other.
-
-    Args:
-        worlds: that write their part of the shared arrays.
-        first: number of the first one among all.
-        diary: the checkpoint log in which they leave their state.
-    """
-
     def __init__(self, worlds: LocalWorlds, first: int, diary: CheckpointLog) -> None:
         super().__init__(worlds, first)
         self._diary = diary
@@ -34,7 +26,6 @@ class CheckpointJob(WorldsJob):
         self._again_s = 0.0  # that the steps of the diary take
 
     def perform(self, task: int, letter: Any) -> Any:
-        """Do a task; the answer of those that have one."""
         self._catch_up(task)
         if task not in (Task.STEP, Task.RESET):
             return super().perform(task, letter)
@@ -78,11 +69,7 @@ class CheckpointJob(WorldsJob):
         self._again_s = 0.0
 
     def _catch_up(self, task: int) -> None:
-        """Go through the steps of the log, if they are not behind it.
-
-        Raises:
-            SumoError: as of `Simulation.load`; but all worlds may be reset.
-        """
+        """Go through the steps of the log, if they are not behind it."""
         if self._lost is not None:
             error, self._lost = self._lost, None
             if task != Task.RESET or not self._worlds.arrays.chosen.all():

@@ -16,12 +16,11 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.parallel.checkpoint.sumo_log import FIRST_LOG_BYTES, KeptLog
 from cavmarl.parallel.processes.shared_memory import Layout, Segment, arrays_in, size_of
 from cavmarl.parallel.processes.state_image import Arrays, Image
-from cavmarl.shards.shard import Commands
+from cavmarl.shards.shard import COMMANDS, Commands
 from cavmarl.traffic.sumo.sumo_history import ToldLog
 
 STEPS = 16  # from one image to the next: a successor repeats that many at most
 _FIRST_IMAGE_BYTES = 1 << 12
-_COMMANDS = ("controls", "meta_actions", "declared")
 
 
 def make_segments(config: EnvConfig, num_worlds: int) -> list[Segment]:
@@ -42,26 +41,20 @@ class CheckpointLog:
     There are two images, each with room for the steps after it: while one is written, the other one
     is what was committed begins with. What SUMOs were told is kept beside each of them.
 
-    Args:
-        config: the environment.
-        num_worlds: how many.
-        descriptors: of what `make_segments` has made.
-
     Attributes:
         place: (2,) which image it begins with, and how many steps follow; to be committed.
         entries: what the agents do in each of the steps that there is room for, of both images.
-        is_prepared: the other image is that of the state at the end of the log.
     """
 
     def __init__(self, config: EnvConfig, num_worlds: int, descriptors: list[int]) -> None:
         *images, steps = (Segment(fd, 0) for fd in descriptors[:3])
         self.place = np.zeros(2, dtype=np.int64)
-        self.is_prepared = False
+        self.is_prepared = False  # the other image is that of the state at the end of the log
         self._images = [Image(segment) for segment in images]
         kept = [KeptLog(Segment(fd, 0)) for fd in descriptors[3:]]
         self._logs = kept[::2], kept[1::2]  # of each image, by world
         arrays = arrays_in(steps.map(), _layout(config, num_worlds))
-        self.entries = tuple(map(Commands, *(arrays[name] for name in _COMMANDS)))
+        self.entries = tuple(map(Commands, *(arrays[name] for name in COMMANDS)))
 
     def __len__(self) -> int:
         return self.place.item(1)
@@ -74,19 +67,13 @@ class CheckpointLog:
     def note(self, commands: Commands) -> None:
         """Write down what the agents do in one more step."""
         entry = self.entries[self.place.item(0) * STEPS + len(self)]
-        entry.controls[:] = commands.controls
-        entry.meta_actions[:] = commands.meta_actions
-        entry.declared[:] = commands.declared
+        for name in COMMANDS:
+            getattr(entry, name)[...] = getattr(commands, name)
         self.place[1] += 1
         self.is_prepared = False
 
     def prepare(self, state: Arrays, logs: Sequence[ToldLog] = ()) -> None:
-        """Write the image of the present state that it will begin anew with.
-
-        Args:
-            state: what is to be in it.
-            logs: what the SUMO of each world was told; none: no SUMO is told anything.
-        """
+        """Write the image of the present state that it will begin anew with."""
         image = 1 - self.place.item(0)
         self._images[image].write(state)
         for kept, log in zip(self._logs[image], logs, strict=True):
@@ -129,5 +116,5 @@ class CheckpointLog:
 def _layout(config: EnvConfig, num_worlds: int) -> Layout:
     agents: tuple[int, ...] = (2 * STEPS, num_worlds, config.population.num_ids)
     return dict(
-        zip(_COMMANDS, (("<f8", (*agents, 2)), ("<i8", agents), ("<i4", agents)), strict=True)
+        zip(COMMANDS, (("<f8", (*agents, 2)), ("<i8", agents), ("<i4", agents)), strict=True)
     )

@@ -25,23 +25,15 @@ MakeWorlds = Callable[[int, int], LocalWorlds]
 
 
 class MovingJob(WorldsJob):
-    """Some of the worlds, next to each other, and which ones may change.
-
-    Args:
-        make: worlds from a number to before another one.
-        bounds: the first world of each worker, and the end of the last one's.
-        number: of this worker.
-        cases: of all workers, in which they leave worlds for others.
-        spent_s: (W,) where the processor time of each world is added up.
-    """
+    """Some of the worlds, next to each other, and which ones may change."""
 
     def __init__(
         self,
-        make: MakeWorlds,
-        bounds: Sequence[int],
-        number: int,
-        cases: Sequence[Image],
-        spent_s: NDArray[np.float64],
+        make: MakeWorlds,  # worlds from a number to before another one
+        bounds: Sequence[int],  # the first world of each worker, and the end of the last one's
+        number: int,  # of this worker
+        cases: Sequence[Image],  # of all workers, in which they leave worlds for others
+        spent_s: NDArray[np.float64],  # (W,) where the processor time of each world is added up
     ) -> None:
         self._make = make
         self._number = number
@@ -56,7 +48,6 @@ class MovingJob(WorldsJob):
         return first, last
 
     def perform(self, task: int, letter: Any) -> Any:
-        """Do a task; the answer of those that have one."""
         if task == Task.PACK:
             self._pack(letter)
         elif task == Task.UNPACK:

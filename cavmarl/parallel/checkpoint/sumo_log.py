@@ -20,9 +20,6 @@ class KeptLog:
 
     A log only grows in an episode, so what is added costs no more than what happened since the last
     time, however long the episode is.
-
-    Args:
-        segment: that holds it; it grows as the log does.
     """
 
     def __init__(self, segment: Segment) -> None:
@@ -32,11 +29,7 @@ class KeptLog:
         self._size = 0
 
     def write(self, log: ToldLog) -> None:
-        """Bring it up to date.
-
-        Raises:
-            OSError: there is no memory for it.
-        """
+        """Bring it up to date. Raises OSError: there is no memory for it."""
         words = log.words
         # One word in front says how many there are: it is written last.
         self._make_room(1 + len(words))
@@ -47,11 +40,7 @@ class KeptLog:
         self._episode, self._size = log.episode, len(words)
 
     def read(self) -> NDArray[np.int64]:
-        """(n,) `ToldLog.words` of the last time, a view.
-
-        Raises:
-            WorkerError: it was not written.
-        """
+        """(n,) `ToldLog.words` of the last time, a view."""
         self._map_all()
         size = self._words.item(0)
         if not ToldLog.HEAD <= size < len(self._words):

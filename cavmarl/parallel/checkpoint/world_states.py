@@ -15,30 +15,20 @@ Bytes = NDArray[np.uint8]
 
 
 class WorldMove(NamedTuple):
-    """What becomes of the worlds of one host, which follow each other before and after.
+    """What becomes of the worlds of one host, which follow each other before and after."""
 
-    Attributes:
-        first: of those that it keeps, as it has counted up to now.
-        last: the one after the last that it keeps.
-        before: how many come that stand before those.
-        coming: how many come.
-        bytes: of their cases.
-    """
-
-    first: int
-    last: int
-    before: int = 0
-    coming: int = 0
-    bytes: int = 0
+    first: int  # of those that it keeps, as it has counted up to now
+    last: int  # the one after the last that it keeps
+    before: int = 0  # how many come that stand before those
+    coming: int = 0  # how many come
+    bytes: int = 0  # of their cases
 
 
-def moves_of(before: Sequence[int], after: Sequence[int]) -> list[WorldMove]:
-    """What each host keeps, and how many worlds come to it.
-
-    Args:
-        before: (m + 1,) the first world of each host, and the end of the last one's.
-        after: the same, when all have moved.
-    """
+def moves_of(
+    before: Sequence[int],  # (m + 1,) the first world of each host, and the end of the last one's
+    after: Sequence[int],  # the same, when all have moved
+) -> list[WorldMove]:
+    """What each host keeps, and how many worlds come to it."""
     moves = []
     for k in range(len(before) - 1):
         own, wanted = range(*before[k : k + 2]), range(*after[k : k + 2])
@@ -59,12 +49,7 @@ def buffers(count: int, size: int) -> tuple[NDArray[np.int64], Bytes]:
 
 
 def pack(image: Image, worlds: Sequence[Sequence[Array]]) -> tuple[NDArray[np.int64], Bytes]:
-    """Cases of some worlds, as `buffers` has room for.
-
-    Args:
-        image: to write each into.
-        worlds: arrays of each, of the same dtypes.
-    """
+    """Cases of some worlds, as `buffers` has room for."""
     cases = []
     for arrays in worlds:
         image.write(arrays)
@@ -76,17 +61,7 @@ def pack(image: Image, worlds: Sequence[Sequence[Array]]) -> tuple[NDArray[np.in
 def unpack(
     image: Image, sizes: NDArray[np.int64], content: Bytes, dtypes: Sequence[np.dtype[Any]]
 ) -> list[list[Array]]:
-    """The arrays of each of some worlds.
-
-    Args:
-        image: to read each from.
-        sizes: of the cases.
-        content: their bytes.
-        dtypes: of the arrays of each.
-
-    Raises:
-        WorkerError: they are not what was packed.
-    """
+    """The arrays of each of some worlds. Raises WorkerError: they are not what was packed."""
     worlds = []
     for case in np.split(content, np.cumsum(sizes)[:-1]) if sizes.size else []:
         image.put(case)

@@ -49,27 +49,16 @@ class Kind(IntEnum):
 
 
 class Dialect(NamedTuple):
-    """What both ends of a connection agree on.
+    """What both ends of a connection agree on."""
 
-    Attributes:
-        magic: four bytes that every frame begins with.
-        version: of everything that is said.
-        kinds: of frames.
-        max_letter: bytes of the longest payload.
-        max_data: bytes of the most data.
-        write: a payload's bytes.
-        read: the payload again; a ValueError says that it is none.
-        cure: what to do about another version.
-    """
-
-    magic: bytes
-    version: int
-    kinds: type[IntEnum]
-    max_letter: int
-    max_data: int
-    write: Callable[[Any], bytes]
-    read: Callable[[bytes], Any]
-    cure: str
+    magic: bytes  # four bytes that every frame begins with
+    version: int  # of everything that is said
+    kinds: type[IntEnum]  # of frames
+    max_letter: int  # bytes of the longest payload
+    max_data: int  # bytes of the most data
+    write: Callable[[Any], bytes]  # a payload's bytes
+    read: Callable[[bytes], Any]  # the payload again; a ValueError says that it is none
+    cure: str  # what to do about another version
 
 
 def _as_json(letter: Any) -> bytes:
@@ -89,35 +78,27 @@ HOSTS = Dialect(
 
 
 class Frame(NamedTuple):
-    """What stands before a frame's data.
+    """What stands before a frame's data."""
 
-    Attributes:
-        kind: what it says.
-        order: which order it belongs to.
-        letter: as the dialect reads it; None: nothing.
-        size: bytes of data.
-        checksum: of them.
-    """
-
-    kind: IntEnum
-    order: int
-    letter: Any
-    size: int
-    checksum: int
+    kind: IntEnum  # what it says
+    order: int  # which order it belongs to
+    letter: Any  # as the dialect reads it; None: nothing
+    size: int  # bytes of data
+    checksum: int  # of them
 
 
 class FramedSocket:
     """One end of a connection; everything blocks, at most as long as the socket's timeout.
 
-    Args:
-        connection: a socket of a stream, which the wire owns from here on.
-        dialect: that both ends speak.
-
     Attributes:
         is_torn: a frame was begun and not ended, so what follows cannot be understood.
     """
 
-    def __init__(self, connection: socket.socket, dialect: Dialect = HOSTS) -> None:
+    def __init__(
+        self,
+        connection: socket.socket,  # a socket of a stream, which the wire owns from here on
+        dialect: Dialect = HOSTS,  # that both ends speak
+    ) -> None:
         if connection.family != socket.AF_UNIX:
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._socket = connection
@@ -126,23 +107,12 @@ class FramedSocket:
         self.is_torn = False
 
     def fileno(self) -> int:
-        """The socket's descriptor."""
         return self._socket.fileno()
 
     def send(
         self, kind: IntEnum, order: int, letter: Any = None, arrays: Sequence[Array] = ()
     ) -> None:
-        """Send one frame.
-
-        Args:
-            kind: what it says.
-            order: which order it belongs to.
-            letter: as the dialect can write it.
-            arrays: contiguous.
-
-        Raises:
-            OSError: the other end is gone, or does not read.
-        """
+        """Send one frame. Raises OSError: the other end is gone, or does not read."""
         dialect = self._dialect
         text = b"" if letter is None else dialect.write(letter)
         data = [array.data.cast("B") for array in arrays if array.nbytes]
@@ -160,7 +130,6 @@ class FramedSocket:
         Raises:
             EOFError: the other end has ended.
             OSError: it is gone, or sends nothing.
-            MessageError: this is no frame.
         """
         dialect = self._dialect
         self.is_torn = True
@@ -181,16 +150,15 @@ class FramedSocket:
         self._frame = _frame(dialect, kind, order, text, size, checksum)
         return self._frame
 
-    def take(self, arrays: Sequence[Array]) -> None:
+    def take(
+        self,
+        arrays: Sequence[Array],  # contiguous; they are filled one after the other
+    ) -> None:
         """Read the data of the frame that was received.
-
-        Args:
-            arrays: contiguous; they are filled one after the other.
 
         Raises:
             EOFError: the other end has ended.
             OSError: it is gone, or sends no more.
-            MessageError: these are not the data that were sent, or as many.
         """
         frame = self._frame
         assert frame is not None
@@ -234,11 +202,7 @@ class FramedSocket:
 
 
 def _frame(dialect: Dialect, kind: int, order: int, text: bytes, size: int, checksum: int) -> Frame:
-    """The same, understood.
-
-    Raises:
-        MessageError: it says nothing that is known.
-    """
+    """The same, understood."""
     try:
         letter = dialect.read(text) if text else None
         return Frame(dialect.kinds(kind), order, letter, size, checksum)

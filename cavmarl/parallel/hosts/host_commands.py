@@ -19,70 +19,42 @@ Say = Callable[[int, bool], tuple[Any, Arrays]]
 
 @dataclass(frozen=True)
 class HostProgram:
-    """What hosts run.
+    """What hosts run."""
 
-    Attributes:
-        parts: of the job, in words.
-        sizes: of each part to begin with, as the job counts.
-        tasks: names of the job's tasks.
-        noted: the task whose inputs are noted, in the place of an image.
-        code: what all machines have to have in common.
-    """
-
-    parts: tuple[str, ...]
-    sizes: tuple[int, ...]
-    tasks: tuple[str, ...]
-    noted: int
-    code: str
+    parts: tuple[str, ...]  # of the job, in words
+    sizes: tuple[int, ...]  # of each part to begin with, as the job counts
+    tasks: tuple[str, ...]  # names of the job's tasks
+    noted: int  # the task whose inputs are noted, in the place of an image
+    code: str  # what all machines have to have in common
 
 
 @dataclass
 class OpenOrder:
-    """A command that is being carried out.
+    """A command that is being carried out."""
 
-    Attributes:
-        number: of the order.
-        task: of the job.
-        say: what is said to each part.
-        outputs: part, answer → arrays that what comes out is written to.
-        sizes: of the parts once it has been carried out.
-        saves: an image is to come of each part.
-        ordered_s: when it was given, by `time.monotonic`.
-        first_death: how many hosts had died before.
-        pending: parts that have not carried it out.
-        is_void: it was interrupted, and only has to come to its end.
-        answers: of the parts that have.
-        images: of theirs.
-        failure: the exception of the first part that had one.
-    """
-
-    number: int
+    number: int  # of the order
     task: int
-    say: Say
-    outputs: Callable[[int, Any], Arrays]
-    sizes: Sequence[int]
-    saves: bool
-    ordered_s: float
-    first_death: int
-    pending: set[int]
-    is_void: bool = False
-    answers: dict[int, Any] = field(default_factory=dict)
-    images: dict[int, Array] = field(default_factory=dict)
-    failure: WorkerFailureError | None = None
+    say: Say  # what is said to each part
+    outputs: Callable[[int, Any], Arrays]  # part, answer → arrays that what comes out is written to
+    sizes: Sequence[int]  # of the parts once it has been carried out
+    saves: bool  # an image is to come of each part
+    ordered_s: float  # when it was given, by `time.monotonic`
+    first_death: int  # how many hosts had died before
+    pending: set[int]  # parts that have not carried it out
+    is_void: bool = False  # it was interrupted, and only has to come to its end
+    answers: dict[int, Any] = field(default_factory=dict)  # of the parts that have
+    images: dict[int, Array] = field(default_factory=dict)  # of theirs
+    failure: WorkerFailureError | None = None  # the exception of the first part that had one
 
 
 @dataclass
 class CommittedState:
-    """What is committed of one part.
+    """What is committed of one part."""
 
-    Attributes:
-        size: of the part, as the job counts.
-        image: (n,) bytes of an image of its state; none: it has not begun yet.
-        since: (n,) bytes of the inputs of each command since.
-    """
-
-    size: int
+    size: int  # of the part, as the job counts
+    # (n,) bytes of an image of its state; none: it has not begun yet
     image: Array = field(default_factory=lambda: np.zeros(0, dtype=np.uint8))
+    # (n,) bytes of the inputs of each command since
     since: list[Array] = field(default_factory=list)
 
     def after(self, order: OpenOrder, part: int) -> CommittedState:

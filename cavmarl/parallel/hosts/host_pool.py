@@ -19,12 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from cavmarl.core.errors import (
-    MessageError,
-    WorkerDeathError,
-    WorkerError,
-    WorkerFailureError,
-)
+from cavmarl.core.errors import MessageError, WorkerDeathError, WorkerError, WorkerFailureError
 from cavmarl.parallel.hosts.framed_socket import Frame, Kind
 from cavmarl.parallel.hosts.host_commands import Arrays, CommittedState, HostProgram, OpenOrder, Say
 from cavmarl.parallel.hosts.host_process import Order
@@ -46,15 +41,6 @@ IMAGE_EVERY = 8  # commands that are noted: a successor repeats as many at most
 class HostPool:
     """m parts of a job over at least as many hosts.
 
-    Args:
-        launcher: starts the hosts.
-        program: what they run.
-        timeout_s: for so long a host may be busy with one order.
-        repeats: how often a command is begun again because a host has died.
-
-    Attributes:
-        deaths: all that there were of hosts with a part.
-
     Raises:
         WorkerError: they do not come.
         WorkerFailureError: an exception while they made their jobs.
@@ -63,7 +49,7 @@ class HostPool:
     def __init__(
         self, launcher: Launcher, program: HostProgram, timeout_s: float, repeats: int
     ) -> None:
-        self.deaths: list[Death] = []
+        self.deaths: list[Death] = []  # all that there were of hosts with a part
         self._launcher = launcher
         self._program = program
         self._timeout_s = timeout_s
@@ -96,15 +82,10 @@ class HostPool:
         return tuple(truth.size for truth in self._truths)
 
     def rename(self, names: Sequence[str]) -> None:
-        """Say in other words what the parts are."""
         self._names = tuple(names)
 
-    def signal(self, part: int, how: signal.Signals) -> bool:
-        """Send a signal to the process of a part, which has to be on this machine.
-
-        Returns:
-            whether there is one at the moment.
-        """
+    def signal(self, part: int, how: signal.Signals) -> bool:  # whether there is one at the moment
+        """Send a signal to the process of a part, which has to be on this machine."""
         host = self._hosts.get(part)
         if host is not None:
             os.kill(host.pid, how)
@@ -117,24 +98,15 @@ class HostPool:
     def run(
         self,
         task: int,
-        letters: Sequence[Any],
-        inputs: Sequence[Arrays],
+        letters: Sequence[Any],  # what is said to each part, as JSON knows it
+        inputs: Sequence[Arrays],  # arrays for each part
+        # part, answer → arrays that what comes out is written to
         outputs: Callable[[int, Any], Arrays],
-        commits: bool = True,
+        commits: bool = True,  # the task changes their state
+        # of the parts after it, where it changes them; such a task is not the noted one
         sizes: Sequence[int] | None = None,
-    ) -> list[Any]:
+    ) -> list[Any]:  # what each part has answered
         """Let all hosts do a task.
-
-        Args:
-            task: of the job.
-            letters: what is said to each part, as JSON knows it.
-            inputs: arrays for each part.
-            outputs: part, answer → arrays that what comes out is written to.
-            commits: the task changes their state.
-            sizes: of the parts after it, where it changes them; such a task is not the noted one.
-
-        Returns:
-            what each part has answered.
 
         Raises:
             WorkerDeathError: too many hosts died of it; the pool is closed.
@@ -143,20 +115,19 @@ class HostPool:
         """
         return self._command(self._all, task, _said(letters, inputs), outputs, commits, sizes)
 
-    def tell(self, task: int, say: Say, outputs: Callable[[int, Any], Arrays]) -> list[Any]:
+    def tell(
+        self,
+        task: int,
+        # called for each host that is given the order, and told whether it has carried out the last
+        # one; what it returns is sent at once
+        say: Say,
+        # part, answer → arrays that what comes out is written to
+        outputs: Callable[[int, Any], Arrays],
+    ) -> list[Any]:  # what each part has answered; errors as of `run`
         """Let all hosts do a task for a caller that keeps the state of all parts itself.
 
         Nothing is committed: the successor of a dead host is told all that it
         needs.
-
-        Args:
-            task: of the job.
-            say: called for each host that is given the order, and told whether it has carried out
-                the last one; what it returns is sent at once.
-            outputs: part, answer → arrays that what comes out is written to.
-
-        Returns:
-            what each part has answered; errors as of `run`.
         """
         return self._command(self._all, task, say, outputs, False)
 
@@ -178,7 +149,7 @@ class HostPool:
         """
         began = time.monotonic()
         nothing = OpenOrder(
-            self._number, NOTHING, _say_nothing, _no_arrays, (), saves=False, ordered_s=began,
+            self._number, NOTHING, _say_nothing, _no_arrays, sizes=(), saves=False, ordered_s=began,
             first_death=len(self.deaths), pending=set(), is_void=True,
         )  # fmt: skip
         while not self._company.free:
@@ -267,8 +238,8 @@ class HostPool:
         before = [truth.image, *truth.since] if is_behind and truth.image.size else []
         said, inputs = order.say(k, host.knows)
         letter = Order(
-            order.task, said, truth.size, before[0].size if before else 0,
-            max(len(before) - 1, 0), program.noted, order.saves,
+            order.task, said, size=truth.size, image=before[0].size if before else 0,
+            repeats=max(len(before) - 1, 0), repeated=program.noted, saves=order.saves,
         )  # fmt: skip
         host.part, host.knows = k, host.knows and order.task == NOTHING
         host.given_s = host.heard_s = time.monotonic()
@@ -318,11 +289,7 @@ class HostPool:
             order.failure = WorkerFailureError(k, self._names[k], **frame.letter)
 
     def _lose(self, order: OpenOrder, k: int, cause: str, restart: bool) -> None:
-        """A host is gone, or taken for it: another one goes on in its place.
-
-        Raises:
-            WorkerDeathError: too many have.
-        """
+        """A host is gone, or taken for it: another one goes on in its place."""
         host = self._hosts.pop(k)
         self._company.drop(host, restart)
         if order.is_void:
@@ -338,12 +305,6 @@ class HostPool:
             raise WorkerDeathError(k, self._names[k], order.number, what, causes)
 
     def _check(self, order: OpenOrder) -> None:
-        """Check the hosts that are waited for.
-
-        Raises:
-            WorkerDeathError: too many have died.
-            WorkerError: there is no host left, and none comes.
-        """
         now = time.monotonic()
         for k in sorted(order.pending):
             host = self._hosts.get(k)
@@ -368,11 +329,7 @@ class HostPool:
             self._complain(time.monotonic() - began, there)
 
     def _complain(self, waited_s: float, where: str) -> None:
-        """Give up if no host will come.
-
-        Raises:
-            WorkerError: so it is.
-        """
+        """Give up if no host will come."""
         trouble = self._launcher.trouble()
         if trouble is None and waited_s > COMES_S:
             trouble = f"none has come within {COMES_S:g} s; ray status tells what Ray waits for"

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Any, NamedTuple, NoReturn, Protocol
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple, NoReturn
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,74 +31,67 @@ _FIRST_IMAGE_BYTES = 1 << 12
 
 
 class Order(NamedTuple):
-    """The payload of a command; its data are an image, what was done since, and what to do now.
+    """The payload of a command; its data are an image, what was done since, and what to do now."""
 
-    Attributes:
-        task: what to do.
-        letter: what is said to it.
-        size: of the part that it is about, before it.
-        image: bytes of the image to begin from; 0: go on from where you are.
-        repeats: how often what was done since has to be done again; each has data of its own.
-        repeated: the task that is.
-        saves: an image is to be sent of what comes out.
-    """
-
-    task: int
-    letter: Any
-    size: int
-    image: int
-    repeats: int
-    repeated: int
-    saves: bool
+    task: int  # what to do
+    letter: Any  # what is said to it
+    size: int  # of the part that it is about, before it
+    image: int  # bytes of the image to begin from; 0: go on from where you are
+    repeats: int  # how often what was done since has to be done again; each has data of its own
+    repeated: int  # the task that is
+    saves: bool  # an image is to be sent of what comes out
 
 
 class TaskOutcome(NamedTuple):
-    """What comes out of a task.
+    """What comes out of a task."""
 
-    Attributes:
-        answer: what the caller is to know, as JSON knows it; mostly nothing.
-        arrays: that it is sent; of what shapes follows from the task and the answer.
-    """
-
-    answer: Any
-    arrays: Sequence[Array]
+    answer: Any  # what the caller is to know, as JSON knows it; mostly nothing
+    arrays: Sequence[Array]  # that it is sent; of what shapes follows from the task and the answer
 
 
-class RemoteJob(Protocol):
+@cache
+def code_stamp() -> str:
+    """What this machine runs: digest of all sources, and the libraries that compute."""
+    package = Path(__file__).resolve().parents[2]
+    digest = hashlib.sha256()
+    for source in sorted(package.rglob("*.py")):
+        name = source.relative_to(package).as_posix()
+        if not name.startswith("data/"):  # which only a wheel has
+            digest.update(name.encode() + b"\0" + source.read_bytes())
+    sources = digest.hexdigest()[:12]
+    return f"cavmarl of sources {sources}, numpy {np.__version__}, numba {numba.__version__}"
+
+
+class RemoteJob:
     """What a host does; every host can take up every part of it."""
 
     @property
     def code(self) -> str:
         """What has to be the same on all machines for the same to come out."""
-        ...
+        return code_stamp()
 
     def fit(self, size: int) -> None:
         """Be ready for a part of that size."""
-        ...
 
     def inputs(self, task: int, letter: Any) -> Sequence[Array]:
         """Arrays that a command of this task fills, as many as its payload says."""
-        ...
+        raise NotImplementedError
 
-    def perform(self, task: int, letter: Any) -> TaskOutcome: ...
+    def perform(self, task: int, letter: Any) -> TaskOutcome:
+        raise NotImplementedError
 
     def save(self) -> Sequence[Array]:
-        """All that another host needs to go on from here."""
-        ...
+        """All that another host needs to go on from here; nothing where the caller keeps it."""
+        return []
 
-    def load(self, saved: Sequence[Array]) -> None: ...
+    def load(self, saved: Sequence[Array]) -> None:
+        """Go on from what `save` gave."""
 
 
 def serve(
     make_job: Callable[[], RemoteJob], place: tuple[str, int], secret: bytes, number: int
 ) -> NoReturn:
     """The whole life of a host; its process ends with the connection.
-
-    Args:
-        make_job: with every kernel loaded.
-        place: where the caller listens.
-        secret: shared by its hosts.
-        number: of this host.
 
     Raises:
         OSError: the caller cannot be reached.
@@ -162,9 +159,6 @@ class _Line:
 
     A thread says so as long as the other one uses the processor. A process that is stopped says
     nothing, and neither does one that sleeps where it should work.
-
-    Args:
-        wire: to the caller.
     """
 
     def __init__(self, wire: FramedSocket) -> None:

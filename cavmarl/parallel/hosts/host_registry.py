@@ -19,20 +19,12 @@ SILENCE_S = 0.8  # of a host that is at work, and tells so every `host.BEAT_S`
 
 
 class Launcher(Protocol):
-    """Starts hosts, and starts those again that die.
+    """Starts hosts, and starts those again that die."""
 
-    Attributes:
-        address: of this machine, under which they reach it.
-    """
-
-    address: str
+    address: str  # of this machine, under which they reach it
 
     def start(self, place: tuple[str, int], secret: bytes) -> None:
-        """Start all of them; each runs `host.serve`.
-
-        Raises:
-            WorkerError: they cannot be started.
-        """
+        """Start all of them; each runs `host.serve`. Raises WorkerError: they cannot be started."""
         ...
 
     def restart(self, number: int) -> None:
@@ -48,31 +40,18 @@ class Launcher(Protocol):
 
 @dataclass
 class HostConnection:
-    """One host.
-
-    Attributes:
-        wire: to it.
-        number: of those that were started.
-        pid: of its process, on its machine.
-        machine: its name.
-        is_ready: it can be given commands.
-        is_gone: its connection has ended, and this is not noticed yet.
-        knows: its memory is what is committed.
-        part: that it has; -1: none.
-        given_s: when it was given its last command, by `time.monotonic`.
-        heard_s: when something was heard of it.
-    """
+    """One host."""
 
     wire: FramedSocket
-    number: int
-    pid: int = 0
-    machine: str = ""
-    is_ready: bool = False
-    is_gone: bool = False
-    knows: bool = False
-    part: int = -1
-    given_s: float = 0.0
-    heard_s: float = 0.0
+    number: int  # of those that were started
+    pid: int = 0  # of its process, on its machine
+    machine: str = ""  # its name
+    is_ready: bool = False  # it can be given commands
+    is_gone: bool = False  # its connection has ended, and this is not noticed yet
+    knows: bool = False  # its memory is what is committed
+    part: int = -1  # that it has; -1: none
+    given_s: float = 0.0  # when it was given its last command, by `time.monotonic`
+    heard_s: float = 0.0  # when something was heard of it
 
     def __str__(self) -> str:
         return f"host {self.number} on {self.machine or 'its machine'}"
@@ -81,19 +60,12 @@ class HostConnection:
 class HostRegistry:
     """Lets hosts in and watches all connections at once.
 
-    Args:
-        launcher: starts them.
-        code: what they have to have in common with this process; see `host.RemoteJob`.
-
-    Attributes:
-        free: hosts that are ready and have no part.
-
     Raises:
         WorkerError: nobody can listen, or hosts cannot be started.
     """
 
     def __init__(self, launcher: Launcher, code: str) -> None:
-        self.free: list[HostConnection] = []
+        self.free: list[HostConnection] = []  # hosts that are ready and have no part
         self._launcher = launcher
         self._code = code
         self._hosts: dict[int, HostConnection] = {}
@@ -109,9 +81,6 @@ class HostRegistry:
 
     def look(self, wait_s: float) -> list[HostConnection]:
         """Wait until something has happened.
-
-        Args:
-            wait_s: at most so long.
 
         Returns:
             hosts with a part that have something to say, or have ended.
@@ -137,12 +106,6 @@ class HostRegistry:
         return speaking
 
     def drop(self, host: HostConnection, restart: bool) -> None:
-        """Forget a host.
-
-        Args:
-            host: the one.
-            restart: its process may still run.
-        """
         self.mute(host)
         host.wire.close()
         if self._hosts.get(host.number) is host:

@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterator, Sequence
-from functools import cache, partial
-from pathlib import Path
+from functools import partial
 from typing import Any, NoReturn
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config.env import EnvConfig
-from cavmarl.core.errors import WorkerError
-from cavmarl.core.extensions import load_extensions
-from cavmarl.engine.world_setup import make_world
+from cavmarl.engine.kernels.step_results import Results
 from cavmarl.parallel.checkpoint.world_states import WorldMove, buffers, pack, unpack
-from cavmarl.parallel.hosts.host_process import TaskOutcome, serve
+from cavmarl.parallel.hosts.host_process import RemoteJob, TaskOutcome, serve
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.processes.shared_memory import Segment
 from cavmarl.parallel.processes.state_image import Image
+from cavmarl.parallel.recipe import ELSEWHERE, world_of
 from cavmarl.parallel.step_arrays import StepArrays
-from cavmarl.parallel.worlds_job import Task, WorldsJob, fingerprint
+from cavmarl.parallel.worlds_job import Task, WorldsJob
 from cavmarl.sensors.mounted.frames import Frames
 
 Array = NDArray[Any]
@@ -31,10 +26,7 @@ Array = NDArray[Any]
 _CASE_BYTES = 1 << 12
 
 # Fields of `StepArrays` that every step writes.
-_STEPPED = (
-    "observations", "rewards", "terminations", "truncations", "acted", "vehicle_done", "mask",
-    "vehicle_ids", "terms", "arrivals", "ticks", "episode_over",
-)  # fmt: skip
+_STEPPED = ("observations", "ticks", *Results._fields)
 # Those that a reset writes, of the worlds that it is about.
 _BEGUN = ("observations", "mask", "vehicle_ids", "vehicle_done", "terms", "ticks", "episode_over")
 
@@ -46,14 +38,12 @@ def inputs_of(task: int, arrays: StepArrays) -> list[Array]:
     return [arrays.chosen] if task == Task.RESET else []
 
 
-def results_of(task: int, arrays: StepArrays, ended: Sequence[int] | None) -> list[Array]:
-    """What comes out of a task, at both ends.
-
-    Args:
-        task: the task.
-        arrays: of the worlds that have done it.
-        ended: worlds in which something ended; None: none.
-    """
+def results_of(
+    task: int,
+    arrays: StepArrays,  # of the worlds that have done it
+    ended: Sequence[int] | None,  # worlds in which something ended; None: none
+) -> list[Array]:
+    """What comes out of a task, at both ends."""
     if task == Task.STEP:
         finals = [arrays.final_observations, *_sensed(arrays.final_frames)]
         last = [array[w] for w in ended or () for array in finals]
@@ -70,36 +60,13 @@ def _sensed(frames: Frames) -> Iterator[Array]:
         yield from sensor
 
 
-@cache
-def code_stamp() -> str:
-    """What this machine runs: digest of all sources, and the libraries that compute."""
-    package = Path(__file__).resolve().parents[2]
-    digest = hashlib.sha256()
-    for source in sorted(package.rglob("*.py")):
-        name = source.relative_to(package).as_posix()
-        if not name.startswith("data/"):  # which only a wheel has
-            digest.update(name.encode() + b"\0" + source.read_bytes())
-    sources = digest.hexdigest()[:12]
-    return f"cavmarl of sources {sources}, numpy {np.__version__}, numba {numba.__version__}"
-
-
 def host_worlds(recipe: str, place: tuple[str, int], secret: bytes, number: int) -> NoReturn:
-    """The whole life of a process that hosts worlds; see `hosts.host.serve`.
-
-    Args:
-        recipe: what `remote.RemoteWorlds` writes.
-        place: where it listens.
-        secret: of its hosts.
-        number: of this one.
-    """
+    """The whole life of a process that hosts worlds; see `hosts.host.serve`."""
     serve(partial(HostedWorlds, json.loads(recipe)), place, secret, number)
 
 
-class HostedWorlds:
+class HostedWorlds(RemoteJob):
     """Some of the worlds, next to each other; which ones, only their caller knows.
-
-    Args:
-        recipe: environment, and how many worlds there will be.
 
     Raises:
         WorkerError: this machine's files are not the caller's.
@@ -110,34 +77,18 @@ class HostedWorlds:
     _job: WorldsJob
 
     def __init__(self, recipe: dict[str, Any]) -> None:
-        from cavmarl.config.io import validate  # pydantic is slow to import
-
-        load_extensions(recipe["extensions"])
-        config = validate(EnvConfig, recipe["config"], "the environment")
-        self._world = make_world(config, Path(recipe["base_dir"]))
-        if fingerprint(self._world) != recipe["fingerprint"]:
-            raise WorkerError(
-                f"the files of '{config.name}' in {recipe['base_dir']} are not the caller's: copy "
-                "them to all machines"
-            )
+        self._world = world_of(recipe, ELSEWHERE)
         self._in_next_step: bool = recipe["in_next_step"]
         self._measures: bool = recipe["measures"]
         self._one = LocalWorlds(self._world, 1, warm=True)
         self._case = Image(Segment.make(_CASE_BYTES))
         self._make(recipe["size"])
 
-    @property
-    def code(self) -> str:
-        """What has to be the same on all machines for the same to come out."""
-        return code_stamp()
-
     def fit(self, size: int) -> None:
-        """Have that many worlds."""
         if size != len(self._worlds.arrays.mask):
             self._make(size)
 
     def inputs(self, task: int, letter: Any) -> list[Array]:
-        """Arrays that a command of this task fills."""
         if task == Task.UNPACK:
             move = WorldMove(*letter)
             self._coming = buffers(move.coming, move.bytes)
@@ -200,12 +151,10 @@ class HostedWorlds:
         return [*(array[w : w + 1] for array in begun), *self._worlds.share_of(w)]
 
     def save(self) -> list[Array]:
-        """All that the next task depends on."""
         begun = results_of(Task.RESET, self._worlds.arrays, None)
         return [*begun, *(log.words for log in self._logs), *self._worlds.save()]
 
     def load(self, saved: Sequence[Array]) -> None:
-        """Go on from what `save` gave."""
         begun = results_of(Task.RESET, self._worlds.arrays, None)
         rest = iter(saved[len(begun) :])
         for log in self._logs:
@@ -215,7 +164,6 @@ class HostedWorlds:
             array[:] = kept
 
     def close(self) -> None:
-        """End the processes that the worlds have."""
         self._worlds.close()
         self._one.close()
 

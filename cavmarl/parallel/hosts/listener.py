@@ -30,28 +30,18 @@ _HELLO = struct.Struct(f"<4sHI{NONCE}s")
 
 
 class PendingConnection:
-    """A caller that has not proved its identity yet.
-
-    Args:
-        connection: to it.
-        secret: that it has to know.
-
-    Attributes:
-        until_s: for so long it may take, by `time.monotonic`.
-        number: that it says it has; -1: it has said nothing.
-    """
+    """A caller that has not proved its identity yet."""
 
     def __init__(self, connection: socket.socket, secret: bytes) -> None:
         connection.setblocking(False)
-        self.until_s = time.monotonic() + GREETING_S
-        self.number = -1
+        self.until_s = time.monotonic() + GREETING_S  # for so long it may take, by `time.monotonic`
+        self.number = -1  # that it says it has; -1: it has said nothing
         self._socket = connection
         self._secret = secret
         self._heard = b""
         self._expected = b""
 
     def fileno(self) -> int:
-        """The socket's descriptor."""
         return self._socket.fileno()
 
     def listen(self) -> socket.socket | None:
@@ -59,8 +49,6 @@ class PendingConnection:
 
         Raises:
             OSError: it is gone.
-            EOFError: it has ended.
-            MessageError: it is a stranger, or of another version.
         """
         wanted = PROOF if self._expected else _HELLO.size
         heard = self._socket.recv(wanted - len(self._heard))
@@ -95,30 +83,18 @@ class PendingConnection:
 
 
 class Listener:
-    """Listens.
-
-    Args:
-        address: of this machine, under which hosts reach it.
-
-    Attributes:
-        place: address and port.
-        secret: that hosts have to know.
-
-    Raises:
-        WorkerError: nobody can listen there.
-    """
+    """Listens."""
 
     def __init__(self, address: str) -> None:
-        self.secret = secrets.token_bytes(SECRET)
+        self.secret = secrets.token_bytes(SECRET)  # that hosts have to know
         try:
             self._listener = socket.create_server((address, 0), backlog=MAX_GUESTS)
         except OSError as error:
             raise WorkerError(f"cannot listen on {address}: {error}") from error
         self._listener.setblocking(False)
-        self.place: tuple[str, int] = self._listener.getsockname()[:2]
+        self.place: tuple[str, int] = self._listener.getsockname()[:2]  # address and port
 
     def fileno(self) -> int:
-        """The socket's descriptor."""
         return self._listener.fileno()
 
     def open(self) -> PendingConnection | None:
@@ -136,15 +112,8 @@ class Listener:
 def knock(place: tuple[str, int], secret: bytes, number: int) -> FramedSocket:
     """Call as a host; the caller may be busy for long before it answers.
 
-    Args:
-        place: address and port of the door.
-        secret: shared by the run's processes.
-        number: of the host.
-
     Raises:
         OSError: nobody listens there.
-        EOFError: whoever listens there does not want us.
-        MessageError: it does not know the secret.
     """
     connection = socket.create_connection(place, CALL_S)
     try:

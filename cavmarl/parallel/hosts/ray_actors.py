@@ -30,12 +30,6 @@ class RayActors:
     and makes the same call again. Ray carries no step: it hands over what to run, where the caller
     is, and the secret.
 
-    Args:
-        main: what each runs; a function of a module, which every node has to have.
-        recipe: what that is told, by the number of workers.
-        workers: actors with a CPU of their own; None: as many as there are free CPUs.
-        at_most: so many are of use.
-
     Attributes:
         address: of this node.
         workers: how many there are.
@@ -48,7 +42,11 @@ class RayActors:
     """
 
     def __init__(
-        self, main: Main, recipe: Callable[[int], str], workers: int | None, at_most: int
+        self,
+        main: Main,  # what each runs; a function of a module, which every node has to have
+        recipe: Callable[[int], str],  # what that is told, by the number of workers
+        workers: int | None,  # actors with a CPU of their own; None: as many as there are free CPUs
+        at_most: int,  # so many are of use
     ) -> None:
         self._main = main
         self._actors: list[Any] = []
@@ -69,11 +67,6 @@ class RayActors:
         self._recipe = recipe(self.workers)
 
     def start(self, place: tuple[str, int], secret: bytes) -> None:
-        """Start all of them.
-
-        Raises:
-            WorkerError: Ray cannot.
-        """
         for number, node in enumerate(self._nodes):
             try:
                 self._start(number, node, place, secret)

@@ -21,35 +21,23 @@ _joined = 0  # how many have joined by `join`, where the program itself had not
 
 @dataclass(frozen=True)
 class Node:
-    """A node of the cluster; shares are those reserved with Ray.
-
-    Attributes:
-        name: its id.
-        cpus: free ones.
-        use: what is reserved.
-        hosted: how many hosts it has been given.
-    """
+    """A node of the cluster; shares are those reserved with Ray."""
 
     name: str
-    cpus: int
-    use: Utilisation
-    hosted: int = 0
+    cpus: int  # free ones
+    use: Utilisation  # what is reserved
+    hosted: int = 0  # how many hosts it has been given
 
 
-def join() -> bool:
+def join() -> bool:  # whether `leave` has to be called
     """Join the cluster that this program belongs to, or start one on this machine.
 
     A program that has called `ray.init` is a member already. Else it is the cluster of
     `RAY_ADDRESS`, the one that `ray start` has started here, or a new one that ends with its last
     user.
 
-    Returns:
-        whether `leave` has to be called.
-
     Raises:
         MissingExtraError: Ray is not installed.
-        ConfigError: the program is only a client of a cluster.
-        WorkerError: there is no cluster at the address.
     """
     global _joined
     ray = require("ray", "ray")
@@ -75,11 +63,7 @@ def join() -> bool:
 
 
 def _call(address: str) -> None:
-    """Check that a process listens there: Ray would try for minutes.
-
-    Raises:
-        OSError: none does.
-    """
+    """Check that a process listens there: Ray would try for minutes."""
     host, colon, port = address.rpartition(":")
     if colon and port.isdigit():
         socket.create_connection((host, int(port)), CALL_S).close()
@@ -116,18 +100,10 @@ def nodes_with(cpus: int) -> list[Node]:
         time.sleep(0.1)
 
 
-def choose_nodes(known: Sequence[Node], workers: int) -> list[str]:
+def choose_nodes(known: Sequence[Node], workers: int) -> list[str]:  # names of nodes
     """A node for each host: admissible, of the lowest LoadScore, with the fewest hosts so far.
 
-    Args:
-        known: all nodes.
-        workers: hosts with a CPU of their own.
-
-    Returns:
-        names of nodes.
-
     Raises:
-        ConfigError: more workers than free CPUs.
         NoAdmissibleWorkerError: the rest of the CPUs is on nodes that are too busy.
     """
     free = sum(node.cpus for node in known)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
@@ -13,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.config.env import WorkersConfig
 from cavmarl.core.errors import ConfigError, WorkerFailureError
-from cavmarl.core.extensions import extension_modules
 from cavmarl.engine.compilation import compiled_before
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
@@ -22,37 +21,23 @@ from cavmarl.parallel.checkpoint.world_states import WorldMove, buffers, moves_o
 from cavmarl.parallel.commanded_worlds import OrderedWorlds, own_error
 from cavmarl.parallel.hosts.host_commands import Arrays, HostProgram
 from cavmarl.parallel.hosts.host_pool import HostPool
-from cavmarl.parallel.hosts.hosted_worlds_job import code_stamp, host_worlds, inputs_of, results_of
+from cavmarl.parallel.hosts.host_process import code_stamp
+from cavmarl.parallel.hosts.hosted_worlds_job import host_worlds, inputs_of, results_of
 from cavmarl.parallel.hosts.ray_actors import RayActors
 from cavmarl.parallel.journaled_worlds import refuse_watched, unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.mover import Mover
-from cavmarl.parallel.processes.worker_pool import Death
+from cavmarl.parallel.recipe import recipe_of
 from cavmarl.parallel.step_arrays import StepArrays, layout_of
 from cavmarl.parallel.step_placement import StepPlacement
 from cavmarl.parallel.work_shares import Part, parts_of
-from cavmarl.parallel.worlds_job import Task, fingerprint
+from cavmarl.parallel.worlds_job import TASK_NAMES, Task
 
 Array = NDArray[np.uint8]
 
 
 class RemoteWorlds(OrderedWorlds):
     """W worlds over m hosts, whole worlds each.
-
-    Args:
-        world: what each is made of.
-        base_dir: the folder that its relative files start from, on every machine.
-        num_worlds: W.
-        workers: m, from 1 to W; None: as many as the cluster has free CPUs.
-        in_next_step: when worlds begin anew; see `SteppedWorlds`.
-
-    Attributes:
-        world: what each is made of.
-        arrays: of this process; what hosts send is written to them.
-        pool: the hosts.
-        in_next_step: when worlds begin anew.
-        placement: which host runs what.
-        mover: has that changed; None: it does not change.
 
     Raises:
         MissingExtraError: Ray is not installed.
@@ -61,13 +46,15 @@ class RemoteWorlds(OrderedWorlds):
         WorkerError: no cluster, or no host comes.
     """
 
+    pool: HostPool
+
     def __init__(
         self,
-        world: World,
-        base_dir: Path,
-        num_worlds: int,
-        workers: int | None,
-        in_next_step: bool = False,
+        world: World,  # what each is made of
+        base_dir: Path,  # the folder that its relative files start from, on every machine
+        num_worlds: int,  # W
+        workers: int | None,  # m, from 1 to W; None: as many as the cluster has free CPUs
+        in_next_step: bool = False,  # when worlds begin anew; see `SteppedWorlds`
     ) -> None:
         self.world = world
         self.in_next_step = in_next_step
@@ -75,28 +62,13 @@ class RemoteWorlds(OrderedWorlds):
         refuse_watched(
             config.zones, "of worlds on hosts", "run them on this machine; leave out hosts"
         )
-        if config.workers.monitor_cpu:
-            raise ConfigError(
-                "workers.monitor_cpu = True, hosts = 'ray': sees one machine; leave it out "
-                "(Ray tells what is reserved on each node), or leave out the hosts"
-            )
-        if config.workers.sensors:
-            raise ConfigError(
-                f"workers.sensors = {config.workers.sensors}, hosts = 'ray': sensor workers are on "
-                "the machine of the worlds; leave it 0, or leave out the hosts"
-            )
+        refuse_on_hosts(config.workers)
         if not compiled_before():
             LocalWorlds(unwatched(world), 1, warm=True)
         layout = layout_of(config, world.capacity, num_worlds).items()
         self.arrays = StepArrays.of({name: np.zeros(shape, kind) for name, (kind, shape) in layout})
-        recipe = {
-            "config": asdict(config),
-            "extensions": extension_modules(config.registered),
-            "base_dir": str(base_dir.resolve()),
-            "fingerprint": fingerprint(world),
-            "in_next_step": in_next_step,
-            "measures": bool(config.workers.balance_steps),
-        }
+        measures = bool(config.workers.balance_steps)
+        recipe = recipe_of(world, base_dir, in_next_step=in_next_step, measures=measures)
 
         def told(count: int) -> str:
             return json.dumps({**recipe, "size": -(-num_worlds // count)})
@@ -111,7 +83,7 @@ class RemoteWorlds(OrderedWorlds):
         program = HostProgram(
             _names(parts),
             tuple(part.last - part.first for part in parts),
-            tuple(task.name.lower().replace("_", " ") for task in Task),
+            TASK_NAMES,
             Task.STEP,
             code_stamp(),
         )
@@ -126,20 +98,8 @@ class RemoteWorlds(OrderedWorlds):
 
     @property
     def simulation(self) -> Simulation:
-        """Refused: the worlds live elsewhere.
-
-        Raises:
-            ConfigError: always.
-        """
+        """Refused: the worlds live elsewhere."""
         raise ConfigError("the worlds live on other machines: use workers=0 to look into them")
-
-    @property
-    def deaths(self) -> list[Death]:
-        return self.pool.deaths
-
-    def close(self) -> None:
-        """End the hosts, and the cluster if it was started for them."""
-        self.pool.close()
 
     def _pids(self) -> Mapping[int, int]:
         return dict.fromkeys(range(len(self._mine)), 0)  # not measured: they run elsewhere
@@ -180,7 +140,6 @@ class RemoteWorlds(OrderedWorlds):
             self._spent_s[:, 0] += np.concatenate(spent_s)
 
     def _pack(self, bounds: Sequence[int]) -> None:
-        """Let hosts send the worlds that are to be another's."""
         moves = moves_of(self._bounds, bounds)
         found = [buffers(0, 0) for _ in moves]
 
@@ -223,6 +182,20 @@ class RemoteWorlds(OrderedWorlds):
         k = bisect_right(self._bounds, number) - 1
         number -= self._bounds[k]
         return self.pool.ask(k, task, number if more is None else [number, more])
+
+
+def refuse_on_hosts(workers: WorkersConfig) -> None:
+    """Refuse what worlds on several machines cannot have."""
+    if workers.monitor_cpu:
+        raise ConfigError(
+            "workers.monitor_cpu = True, hosts = 'ray': sees one machine; leave it out "
+            "(Ray tells what is reserved on each node), or leave out the hosts"
+        )
+    if workers.sensors:
+        raise ConfigError(
+            f"workers.sensors = {workers.sensors}, hosts = 'ray': sensor workers are on the "
+            "machine of the worlds; leave it 0, or leave out the hosts"
+        )
 
 
 def _names(parts: Sequence[Part]) -> tuple[str, ...]:

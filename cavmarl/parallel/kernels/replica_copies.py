@@ -49,19 +49,14 @@ def _note(memory: Words, known: Words, begin: int, end: int, out: Words, at: int
 
 
 @kernel
-def note_spans(memory: Words, known: Words, spans: NDArray[np.int64], out: Words, at: int) -> int:
-    """Note what has changed between some bytes.
-
-    Args:
-        memory: what there is.
-        known: what the other process has; made the same.
-        spans: (n, 2) first byte and the one after the last.
-        out: the stream, with a word to spare behind all changes.
-        at: its words so far.
-
-    Returns:
-        its words now.
-    """
+def note_spans(
+    memory: Words,  # what there is
+    known: Words,  # what the other process has; made the same
+    spans: NDArray[np.int64],  # (n, 2) first byte and the one after the last
+    out: Words,  # the stream, with a word to spare behind all changes
+    at: int,  # its words so far
+) -> int:  # its words now
+    """Note what has changed between some bytes."""
     for n in range(spans.shape[0]):
         at = _note(memory, known, spans[n, 0], spans[n, 1], out, at)
     return at
@@ -69,27 +64,17 @@ def note_spans(memory: Words, known: Words, spans: NDArray[np.int64], out: Words
 
 @kernel
 def note_rows(
-    memory: Words,
-    known: Words,
-    first: int,
+    memory: Words,  # what there is
+    known: Words,  # what the other process has; made the same
+    first: int,  # byte of the first row of zone 0 in world 0
+    # (3,) bytes from zone to zone, from world to world, from row to row
     strides: NDArray[np.int64],
     zones: NDArray[np.int64],
-    counts: NDArray[np.int64],
-    out: Words,
-    at: int,
+    counts: NDArray[np.int64],  # (k, W) rows to look at
+    out: Words,  # as for `note_spans`
+    at: int,  # as for `note_spans`
 ) -> int:
-    """Note what has changed in the first rows of some zones; the stream's words afterwards.
-
-    Args:
-        memory: what there is.
-        known: what the other process has; made the same.
-        first: byte of the first row of zone 0 in world 0.
-        strides: (3,) bytes from zone to zone, from world to world, from row to row.
-        zones: which ones.
-        counts: (k, W) rows to look at.
-        out: as for `note_spans`.
-        at: as for `note_spans`.
-    """
+    """Note what has changed in the first rows of some zones; the stream's words afterwards."""
     for zone in zones:
         for w in range(counts.shape[1]):
             begin = first + zone * strides[0] + w * strides[1]
@@ -100,25 +85,15 @@ def note_rows(
 
 @kernel
 def note_agents(
-    memory: Words,
-    known: Words,
-    first: int,
-    size: int,
-    marks: NDArray[np.bool_],
-    out: Words,
-    at: int,
+    memory: Words,  # what there is
+    known: Words,  # what the other process has; made the same
+    first: int,  # byte at which an array (W, A, …) begins
+    size: int,  # bytes of each agent in it
+    marks: NDArray[np.bool_],  # (W, A) which agents
+    out: Words,  # as for `note_spans`
+    at: int,  # as for `note_spans`
 ) -> int:
-    """Note what has changed at the indices of some agents; the stream's words afterwards.
-
-    Args:
-        memory: what there is.
-        known: what the other process has; made the same.
-        first: byte at which an array (W, A, …) begins.
-        size: bytes of each agent in it.
-        marks: (W, A) which agents.
-        out: as for `note_spans`.
-        at: as for `note_spans`.
-    """
+    """Note what has changed at the indices of some agents; the stream's words afterwards."""
     for w in range(marks.shape[0]):
         for agent in range(marks.shape[1]):
             if marks[w, agent]:
@@ -129,19 +104,12 @@ def note_agents(
 
 @kernel
 def mark_agents(
-    rows: NDArray[np.void],
-    num_owned: NDArray[np.int64],
+    rows: NDArray[np.void],  # VEHICLE (k, W, C)
+    num_owned: NDArray[np.int64],  # (k, W)
     zones: NDArray[np.int64],
-    marks: NDArray[np.bool_],
+    marks: NDArray[np.bool_],  # (W, A) is written
 ) -> None:
-    """Find the agents whose vehicles some zones own.
-
-    Args:
-        rows: VEHICLE (k, W, C).
-        num_owned: (k, W).
-        zones: which ones.
-        marks: (W, A) is written.
-    """
+    """Find the agents whose vehicles some zones own."""
     marks[:] = False
     for zone in zones:
         for w in range(num_owned.shape[1]):
@@ -152,19 +120,14 @@ def mark_agents(
 
 
 @kernel
-def take_changes(stream: Words, first: int, last: int, memory: Words, known: Words) -> bool:
-    """Put changes of another process where they belong.
-
-    Args:
-        stream: what `note_spans` and the others have written.
-        first: where in it the groups of this memory begin.
-        last: and where they end.
-        memory: is written.
-        known: what the other process has; is written, too.
-
-    Returns:
-        whether they fit there; if not, some may have been written.
-    """
+def take_changes(
+    stream: Words,  # what `note_spans` and the others have written
+    first: int,  # where in it the groups of this memory begin
+    last: int,  # and where they end
+    memory: Words,  # is written
+    known: Words,  # what the other process has; is written, too
+) -> bool:  # whether they fit there; if not, some may have been written
+    """Put changes of another process where they belong."""
     at = first
     size = memory.size
     while at < last:

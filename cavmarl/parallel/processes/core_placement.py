@@ -16,16 +16,11 @@ from cavmarl.parallel.processes.process_barrier import usable_cores
 UNKNOWN = -1  # as `barrier.present_core` says it where nothing is compiled
 
 
-def homes(cores: Sequence[int], usable: set[int]) -> list[int]:
-    """A core for each process, where it has been unless one before it has been there, too.
-
-    Args:
-        cores: where each has been found.
-        usable: all that there are.
-
-    Returns:
-        as many different cores, or none if there are not so many.
-    """
+def homes(
+    cores: Sequence[int],  # where each has been found
+    usable: set[int],  # all that there are
+) -> list[int]:  # as many different cores, or none if there are not so many
+    """A core for each process, where it has been unless one before it has been there, too."""
     free = sorted(usable - set(cores))
     found: list[int] = []
     for core in cores:
@@ -38,13 +33,11 @@ def homes(cores: Sequence[int], usable: set[int]) -> list[int]:
     return found
 
 
-def keep_apart(pids: Sequence[int], cores: Sequence[int]) -> None:
-    """Keep each of some processes off the cores of the others, if two have been on one.
-
-    Args:
-        pids: of processes that work at the same time.
-        cores: where each has been found; -1: unknown.
-    """
+def keep_apart(
+    pids: Sequence[int],  # of processes that work at the same time
+    cores: Sequence[int],  # where each has been found; -1: unknown
+) -> None:
+    """Keep each of some processes off the cores of the others, if two have been on one."""
     if len(set(cores)) == len(cores) or UNKNOWN in cores:
         return
     usable = usable_cores()

@@ -46,19 +46,12 @@ class ServerGoneError(Exception):
 
 @dataclass
 class Process:
-    """One worker's process.
+    """One worker's process."""
 
-    Attributes:
-        pid: its number, not given again until it is reaped.
-        pidfd: readable when it has ended.
-        wire: socket to it.
-        mail: what it has sent, unread.
-    """
-
-    pid: int
-    pidfd: int
-    wire: socket.socket
-    mail: list[bytes] = field(default_factory=list)
+    pid: int  # its number, not given again until it is reaped
+    pidfd: int  # readable when it has ended
+    wire: socket.socket  # socket to it
+    mail: list[bytes] = field(default_factory=list)  # what it has sent, unread
 
     def collect(self) -> None:
         """Take what has come through the wire; calls to wake up are forgotten."""
@@ -92,18 +85,15 @@ class Process:
 class ForkServer:
     """Starts the process and asks it for workers.
 
-    Args:
-        program: module that is run, and calls `worker.serve`.
-        start: what it is told, as JSON knows it; descriptors by number.
-        descriptors: that it and its workers get.
-
     Raises:
-        WorkerError: it did not come up.
         WorkerFailureError: an exception in it.
     """
 
     def __init__(
-        self, program: str, start: Mapping[str, Any], descriptors: tuple[int, ...]
+        self,
+        program: str,  # module that is run, and calls `worker.serve`
+        start: Mapping[str, Any],  # what it is told, as JSON knows it; descriptors by number
+        descriptors: tuple[int, ...],  # that it and its workers get
     ) -> None:
         ours, theirs = _wires()
         told = {
@@ -136,12 +126,7 @@ class ForkServer:
         return self._process.pid
 
     def fork(self, number: int) -> Process:
-        """A new process for a worker.
-
-        Raises:
-            ServerGoneError: nobody answers.
-            WorkerError: this process has no descriptors left.
-        """
+        """A new process for a worker. Raises WorkerError: this process has no descriptors left."""
         ours, theirs = _wires()
         try:
             pid = int(self._ask({"fork": number}, theirs.fileno())["pid"])
@@ -164,7 +149,6 @@ class ForkServer:
         return int(self._ask({"bury": process.pid})["status"])
 
     def close(self) -> None:
-        """End the process, and with it all workers."""
         self._wire.close()
         try:
             self._process.wait(END_S)
@@ -203,11 +187,7 @@ class ForkServer:
 
 
 def _wires() -> tuple[socket.socket, socket.socket]:
-    """The two ends of a wire that carries messages.
-
-    Raises:
-        WorkerError: no descriptors are left.
-    """
+    """The two ends of a wire that carries messages."""
     try:
         return socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     except OSError as error:

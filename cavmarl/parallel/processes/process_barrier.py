@@ -28,7 +28,7 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from cavmarl.core.numba import kernel
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 
 Words = NDArray[np.int64]
 
@@ -162,11 +162,11 @@ _has, _set, _look, _pass, present_core = (
     (_plain_has, _plain_set, _plain_look, _plain_pass, _plain_core)
     if _IS_PYTHON
     else (
-        repeated(_compiled_has),
-        repeated(_compiled_set),
-        repeated(_compiled_look),
-        repeated(_compiled_pass),
-        repeated(_compiled_core),
+        specialized(_compiled_has, checks=False),
+        specialized(_compiled_set, checks=False),
+        specialized(_compiled_look, checks=False),
+        specialized(_compiled_pass, checks=False),
+        specialized(_compiled_core, checks=False),
     )
 )
 
@@ -186,17 +186,14 @@ def post(mine: Words, number: int) -> None:
     _set(mine, NUMBER, number, mine)
 
 
-def wait_for(theirs: Words, number: int, is_apart: bool = False) -> None:
-    """Return when the other side comes to a number, which it does soon unless it is dead.
-
-    Args:
-        theirs: (WORDS,) that the other side writes.
-        number: to wait for.
-        is_apart: the other side was on another core when it was seen last. Then the core is not
-            yielded for a while: of other programs that have the same core, one that is may keep it
-                for
-            milliseconds.
-    """
+def wait_for(
+    theirs: Words,  # (WORDS,) that the other side writes
+    number: int,  # to wait for
+    # the other side was on another core when it was seen last. Then the core is not yielded for a
+    # while: of other programs that have the same core, one that is may keep it for milliseconds
+    is_apart: bool = False,
+) -> None:
+    """Return when the other side comes to a number, which it does soon unless it is dead."""
     if _look(theirs, number, False):
         return
     now = time.perf_counter()
@@ -208,23 +205,22 @@ def wait_for(theirs: Words, number: int, is_apart: bool = False) -> None:
 
 
 class Meeting:
-    """One side of a place where two processes wait for each other.
+    """One side of a place where two processes wait for each other."""
 
-    Args:
-        mine: (WORDS,) that this side writes.
-        theirs: (WORDS,) that the other one writes.
-        wire: socket to the other side; a sleeping side is woken through it.
-        crowded: more processes take part than there are cores, so a polling side lets others run.
-    """
-
-    def __init__(self, mine: Words, theirs: Words, wire: socket.socket, crowded: bool) -> None:
+    def __init__(
+        self,
+        mine: Words,  # (WORDS,) that this side writes
+        theirs: Words,  # (WORDS,) that the other one writes
+        wire: socket.socket,  # socket to the other side; a sleeping side is woken through it
+        # more processes take part than there are cores, so a polling side lets others run
+        crowded: bool,
+    ) -> None:
         self.mine = mine
         self.theirs = theirs
         self.wire = wire
         self._crowded = crowded
 
     def post(self, number: int) -> None:
-        """Tell the other side that this one has come to a number."""
         if self.announce(number):
             self.wake()
         if self._crowded:
@@ -235,26 +231,24 @@ class Meeting:
         return _set(self.mine, NUMBER, number, self.theirs)
 
     def wake(self) -> None:
-        """Wake the other side."""
         with suppress(BrokenPipeError, ConnectionResetError):  # its process has ended
             self.wire.send(WAKE)
 
     def has(self, number: int) -> bool:
-        """Whether the other side has come to a number."""
         return _has(self.theirs, number)
 
-    def watch(self, number: int, last_s: float, work_s: float = 0.0, is_soon: bool = False) -> bool:
+    def watch(
+        self,
+        number: int,  # to wait for
+        last_s: float,  # how long it has had to wait the last time
+        work_s: float = 0.0,  # since this side waited last
+        is_soon: bool = False,  # it is known that it does not take long
+    ) -> bool:
         """Look for a moment whether the other side comes to a number.
 
         A side that waited for long the last time does not poll for long, nor one that worked for
         long: the system puts waking processes on free cores, and leaves polling ones where they
         are, two on one core if it comes to that.
-
-        Args:
-            number: to wait for.
-            last_s: how long it has had to wait the last time.
-            work_s: since this side waited last.
-            is_soon: it is known that it does not take long.
         """
         if _look(self.theirs, number, self._crowded):
             return True
@@ -280,5 +274,4 @@ class Meeting:
         return True
 
     def get_up(self) -> None:
-        """Say that this side is awake."""
         _set(self.mine, ASLEEP, 0, self.theirs)

@@ -26,28 +26,19 @@ _LINE = 64  # bytes of a cache line: no two arrays share one
 
 
 class Segment:
-    """Memory of a number of bytes, all of them had.
+    """Memory of a number of bytes, all of them had."""
 
-    Args:
-        fd: descriptor, which the segment owns from here on.
-        size: bytes.
-
-    Attributes:
-        fd: to be passed to other processes.
-        size: bytes.
-    """
-
-    def __init__(self, fd: int, size: int) -> None:
-        self.fd = fd
+    def __init__(
+        self,
+        fd: int,  # descriptor, which the segment owns from here on
+        size: int,  # bytes
+    ) -> None:
+        self.fd = fd  # to be passed to other processes
         self.size = size
 
     @classmethod
     def make(cls, size: int) -> Segment:
-        """A new one, of zeros.
-
-        Raises:
-            WorkerError: there is not so much memory.
-        """
+        """A new one, of zeros."""
         try:
             free = _free_bytes()
             if free is not None and size > free:
@@ -73,11 +64,7 @@ class Segment:
             self.size = size
 
     def map(self) -> mmap.mmap:
-        """Its bytes, as many as there are by now, as this process reads and writes them.
-
-        Raises:
-            WorkerError: there is no room for them in this process.
-        """
+        """Its bytes, as many as there are by now, as this process reads and writes them."""
         self.size = os.fstat(self.fd).st_size
         try:
             return mmap.mmap(self.fd, self.size)

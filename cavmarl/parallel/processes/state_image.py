@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import WorkerError
 from cavmarl.core.numba import kernel
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.parallel.processes.shared_memory import Segment
 
 Array = NDArray[Any]
@@ -27,25 +27,15 @@ _IS_PYTHON = bool(_settings.DISABLE_JIT)
 
 
 class _Place(NamedTuple):
-    """Where an array goes in an image.
-
-    Attributes:
-        shape: of the array.
-        end: of it, in words from the image's begin.
-        target: the place itself, as raw items.
-    """
+    """Where an array goes in an image."""
 
     shape: tuple[int, ...]
-    end: int
-    target: Array
+    end: int  # of it, in words from the image's begin
+    target: Array  # the place itself, as raw items
 
 
 class Image:
-    """Arrays as they were at one moment.
-
-    Args:
-        segment: that holds it; it grows as the arrays do.
-    """
+    """Arrays as they were at one moment."""
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
@@ -54,6 +44,7 @@ class Image:
         self._begin = 0  # of the first array
         self._places: list[_Place] = []
         self._written: Arrays = ()  # the last time
+        self._seal = specialized(_sealed)
         self._copies: list[tuple[Array, Array]] = []  # to where, from where
 
     def write(self, arrays: Arrays) -> None:
@@ -69,10 +60,9 @@ class Image:
         if _IS_PYTHON:
             self._words[1] = _checksum(self._words[2 : self._words.item(0)])
         else:
-            _seal(self._unsigned)
+            self._seal(self._unsigned)
 
     def _find_places(self, arrays: Arrays) -> None:
-        """Say what has to be copied where."""
         shapes = [array.shape for array in arrays]
         same = _num_same(shapes, self._places)
         if len(arrays) != len(self._places):
@@ -114,14 +104,7 @@ class Image:
             at = end
 
     def read(self, dtypes: Sequence[np.dtype[Any]]) -> Iterator[Array]:
-        """The arrays, in their order, as views.
-
-        Args:
-            dtypes: of each.
-
-        Raises:
-            WorkerError: they are not what was written.
-        """
+        """The arrays, in their order, as views."""
         self._map_all()
         words = self._words
         size = int(words[0]) if len(words) else 0
@@ -193,9 +176,6 @@ def _sealed(words: NDArray[np.uint64]) -> None:
     words[1] = _mixed(words[2 : int(words[0])])
 
 
-_mix, _seal = repeated(_mixed), repeated(_sealed)
-
-
 def _num_words(array: Array) -> int:
     return -(-array.nbytes // _WORD)
 
@@ -211,11 +191,11 @@ def _num_same(shapes: Sequence[tuple[int, ...]], places: Sequence[_Place]) -> in
 def _checksum(words: NDArray[np.int64]) -> int:
     if _IS_PYTHON:
         return zlib.crc32(words.data)
-    return int(np.uint64(_mix(words.view(np.uint64))).view(np.int64))
+    return int(np.uint64(_mixed(words.view(np.uint64))).view(np.int64))
 
 
 def load_kernels() -> None:
     """Have the checksum ready, for this process and those that it forks."""
     words = np.full(_HEAD, _HEAD, dtype=np.int64)
     _checksum(words)
-    _seal(words.view(np.uint64))
+    _sealed(words.view(np.uint64))

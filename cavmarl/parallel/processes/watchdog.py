@@ -15,13 +15,13 @@ class Watchdog:
 
     A process that has work to do uses the processor, or waits for it or for a disk. If it is
     stopped, or sleeps, it does not go on by itself, unless processes that it has started do.
-
-    Args:
-        pid: of the process.
-        timeout_s: for so long it may work; unwatched times do not count.
     """
 
-    def __init__(self, pid: int, timeout_s: float) -> None:
+    def __init__(
+        self,
+        pid: int,  # of the process
+        timeout_s: float,  # for so long it may work; unwatched times do not count
+    ) -> None:
         self._pid = pid
         self._timeout_s = timeout_s
         self._spent = -1

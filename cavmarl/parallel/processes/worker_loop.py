@@ -24,7 +24,7 @@ import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from typing import Any, NoReturn, Protocol
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -50,26 +50,23 @@ MAX_TRACEBACK = 16_000  # characters, six bytes each at most; the end of a longe
 _PR_SET_PDEATHSIG = 1
 
 
-class Job(Protocol):
+class Job:
     """What one worker does."""
 
-    def perform(self, task: int, letter: Any) -> Any:
-        """Do a task.
-
-        Args:
-            task: which one; numbers from 0 on are the job's own.
-            letter: what the pool has to say to it, as JSON knows it; mostly nothing.
-
-        Returns:
-            what the pool is to know, as JSON knows it; mostly nothing.
-        """
-        ...
+    def perform(
+        self,
+        task: int,  # which one; numbers from 0 on are the job's own
+        letter: Any,  # what the pool has to say to it, as JSON knows it; mostly nothing
+    ) -> Any:
+        """Do a task; the answer, as JSON knows it, of those that have one."""
+        raise NotImplementedError
 
     def save(self) -> Arrays:
         """All that a successor needs to go on from here; nothing if there is no such thing."""
-        ...
+        return []
 
-    def load(self, arrays: Sequence[Any]) -> None: ...
+    def load(self, saved: Sequence[Any]) -> None:
+        """Go on from what `save` gave."""
 
     def afterwards(self) -> None:
         """Called after a command's answer is sent: for work that is not waited for.
@@ -77,14 +74,12 @@ class Job(Protocol):
         What it makes must not be needed before another command is carried out: that one may be
         carried out by a successor, which finds what was committed.
         """
-        ...
 
     def prepare(self) -> None:
         """Called where workers are forked, before each fork that is to do this job.
 
         The worker that did it is dead; so are those it shares memory with, if it is their first.
         """
-        ...
 
 
 MakeJobs = Callable[[Mapping[str, Any]], Sequence[Job]]
@@ -96,11 +91,7 @@ def die_with_parent() -> None:
 
 
 def serve(make_jobs: MakeJobs) -> NoReturn:
-    """The whole life of the forking process.
-
-    Args:
-        make_jobs: from what the pool says about them.
-    """
+    """The whole life of the forking process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the pool, which sees to the rest
     faulthandler.enable()
     start = json.loads(sys.argv[1])
@@ -127,11 +118,7 @@ def serve(make_jobs: MakeJobs) -> NoReturn:
 
 
 def _refuse_threads() -> None:
-    """A process with threads must not fork.
-
-    Raises:
-        RuntimeError: there are some.
-    """
+    """A process with threads must not fork."""
     threads = len(os.listdir("/proc/self/task"))
     if threads > 1:
         names = [thread.name for thread in threading.enumerate()]
@@ -254,18 +241,13 @@ def _obey(job: Job, meeting: Meeting, slots: Sequence[Image]) -> NoReturn:
                 os._exit(OUT_OF_MEMORY)
 
 
-def _await(meeting: Meeting, order: int, last_s: float, work_s: float) -> float:
-    """Return when there is a command; end with the pool.
-
-    Args:
-        meeting: with the pool.
-        order: its number.
-        last_s: how long the last wait was that was one.
-        work_s: how long was worked since.
-
-    Returns:
-        how long the last wait was, which may be this one.
-    """
+def _await(
+    meeting: Meeting,  # with the pool
+    order: int,
+    last_s: float,  # how long the last wait was that was one
+    work_s: float,  # how long was worked since
+) -> float:  # how long the last wait was, which may be this one
+    """Return when there is a command; end with the pool."""
     if meeting.has(order):
         return last_s
     began = time.perf_counter()

@@ -29,45 +29,32 @@ __all__ = ["Death", "Pool", "Program"]
 
 @dataclass
 class Death:
-    """What became of one process and of what it did; times are those of `time.monotonic`.
+    """What became of one process and of what it did; times are those of `time.monotonic`."""
 
-    Attributes:
-        worker: whose process it was.
-        order: that was to be carried out.
-        cause: signal or exit status, or why it was taken for dead.
-        ordered_s: when the command was given.
-        noticed_s: when that was noticed.
-        replaced_s: when its successor had its order.
-        done_s: when that was carried out; nan: not yet.
-    """
-
-    worker: int
-    order: int
-    cause: str
-    ordered_s: float
-    noticed_s: float
-    replaced_s: float
-    done_s: float = nan
+    worker: int  # whose process it was
+    order: int  # that was to be carried out
+    cause: str  # signal or exit status, or why it was taken for dead
+    ordered_s: float  # when the command was given
+    noticed_s: float  # when that was noticed
+    replaced_s: float  # when its successor had its order
+    done_s: float = nan  # when that was carried out; nan: not yet
 
 
 class Pool:
     """m worker processes.
-
-    Args:
-        program: what they run.
-        timeout_s: for so long a worker may be busy with one order.
-        repeats: how often a command is begun again because a worker has died.
-
-    Attributes:
-        deaths: all that there were.
 
     Raises:
         WorkerError: no process, or no memory.
         WorkerFailureError: an exception while the jobs were made.
     """
 
-    def __init__(self, program: Program, timeout_s: float, repeats: int) -> None:
-        self.deaths: list[Death] = []
+    def __init__(
+        self,
+        program: Program,
+        timeout_s: float,  # for so long a worker may be busy with one order
+        repeats: int,  # how often a command is begun again because a worker has died
+    ) -> None:
+        self.deaths: list[Death] = []  # all that there were
         self._program = program
         self._timeout_s = timeout_s
         self._repeats = repeats
@@ -94,16 +81,10 @@ class Pool:
         return self._program.team_of(worker)
 
     def processor_s(self) -> list[float]:
-        """Processor time that each worker's process has taken."""
         return [processor_s(pid) for pid in self.pids]
 
     def run(self, task: int, letter: Any = None, commits: bool = True) -> list[Any]:
         """Let all workers do a task.
-
-        Args:
-            task: of the job.
-            letter: what is said to all, as JSON knows it.
-            commits: the task changes their state.
 
         Returns:
             what each has answered.
@@ -123,7 +104,6 @@ class Pool:
         self.run(NOTHING, commits=False)
 
     def rename(self, parts: tuple[str, ...]) -> None:
-        """Say anew what each worker hosts, in words."""
         self._program = self._program._replace(parts=parts)
 
     def close(self) -> None:
@@ -177,17 +157,6 @@ class Pool:
     def _await(
         self, workers: tuple[int, ...], mail: bytes | None, expected_s: float, sleeps: bool
     ) -> None:
-        """Return when all workers have carried out their order.
-
-        Args:
-            workers: the workers that have one.
-            mail: that came with it.
-            expected_s: how long it has taken the last time.
-            sleeps: they know that the caller does not poll.
-
-        Raises:
-            WorkerDeathError: too many processes died of it; the pool is closed.
-        """
         pending = list(workers)
         if not sleeps:
             pending = [k for k in workers if not self._crew.watch(k, expected_s)]
@@ -251,11 +220,6 @@ class Pool:
         raise WorkerDeathError(k, part, number, what, causes)
 
     def _read(self, workers: tuple[int, ...]) -> list[Any]:
-        """What the workers have answered.
-
-        Raises:
-            WorkerFailureError: of the first in which something went wrong, not because of another.
-        """
         answers: list[Any] = []
         failure: WorkerFailureError | None = None
         for k in workers:
@@ -269,13 +233,7 @@ class Pool:
 
 
 class _Guard:
-    """Checks the workers that are waited for, from time to time.
-
-    Args:
-        crew: that they belong to.
-        timeout_s: for so long each may be busy.
-        since_s: when they were given their command, by `time.monotonic`.
-    """
+    """Checks the workers that are waited for, from time to time."""
 
     def __init__(self, crew: WorkerProcesses, timeout_s: float, since_s: float) -> None:
         self._crew = crew

@@ -35,26 +35,17 @@ _FIRST_IMAGE_BYTES = 1 << 12
 
 
 class Program(NamedTuple):
-    """What the workers of a pool run.
+    """What the workers of a pool run."""
 
-    Attributes:
-        module: that is run as a program and calls `worker.serve`.
-        recipe: from which it makes the jobs, as JSON knows it.
-        parts: what each worker hosts, in words.
-        segments: that the jobs share with the pool, and the pool gives back; the recipe names their
-            descriptors.
-        tasks: what each task is called, by its number.
-        pins: each worker stays on a core of its own, as far as there are so many.
-        teams: workers that share their state, by rising numbers: none of them can go on without the
-            others. A worker in no team is alone.
-    """
-
-    module: str
-    recipe: Mapping[str, Any]
-    parts: tuple[str, ...]
+    module: str  # that is run as a program and calls `worker.serve`
+    recipe: Mapping[str, Any]  # from which it makes the jobs, as JSON knows it
+    parts: tuple[str, ...]  # what each worker hosts, in words
+    # that the jobs share with the pool, and the pool gives back; the recipe names their descriptors
     segments: tuple[Segment, ...]
-    tasks: tuple[str, ...]
-    pins: bool = False
+    tasks: tuple[str, ...]  # what each task is called, by its number
+    pins: bool = False  # each worker stays on a core of its own, as far as there are so many
+    # workers that share their state, by rising numbers: none of them can go on without the others.
+    # A worker in no team is alone
     teams: tuple[tuple[int, ...], ...] = ()
 
     def team_of(self, worker: int) -> tuple[int, ...]:
@@ -65,14 +56,10 @@ class Program(NamedTuple):
 class WorkerProcesses:
     """m worker processes and the one that forks them.
 
-    Args:
-        program: what they run.
-
     Attributes:
         orders: (m, WORDS) the lines that this side writes.
 
     Raises:
-        WorkerError: no process, or no memory.
         WorkerFailureError: an exception while the jobs were made.
     """
 
@@ -112,23 +99,17 @@ class WorkerProcesses:
     def order(
         self,
         workers: Sequence[int],
-        head: tuple[int, ...],
-        stale: Sequence[bool],
-        mail: bytes | None,
+        head: tuple[int, ...],  # words of the command, from TASK to TRUTH
+        stale: Sequence[bool],  # of all workers, whose memory is not what is committed
+        mail: bytes | None,  # what goes with it
+        # this side goes to sleep at once: what it does from here on it does on a core on which a
+        # worker waits to begin
         sleeps: bool = False,
     ) -> None:
         """Send the next command; dead workers are detected in `wait`.
 
         Polling workers have it before any is woken, and the worker that may take the core that
         this process is on is woken last.
-
-        Args:
-            workers: which ones.
-            head: words of the command, from TASK to TRUTH.
-            stale: of all workers, whose memory is not what is committed.
-            mail: what goes with it.
-            sleeps: this side goes to sleep at once: what it does from here on it does on a core on
-                which a worker waits to begin.
         """
         if sleeps:
             for k in workers:
@@ -148,36 +129,19 @@ class WorkerProcesses:
             self._meetings[k].wake()
 
     def number(self, k: int) -> int:
-        """Number of the last command that a worker was given."""
         return self.orders.item(k, NUMBER)
 
     def has(self, k: int) -> bool:
-        """Whether a worker has carried it out."""
         return self._meetings[k].has(self.number(k))
 
     def watch(self, k: int, last_s: float = 0.0, is_soon: bool = False) -> bool:
-        """The same, but look for a moment; a longer one if it cannot take long.
-
-        Args:
-            k: which worker.
-            last_s: how long such a command has taken the last time.
-            is_soon: it is known that it does not take long.
-        """
+        """The same, but look for a moment; a longer one if it cannot take long."""
         return self._meetings[k].watch(self.number(k), last_s, is_soon=is_soon)
 
     def sleep(
         self, pending: Sequence[int], limit_s: float, is_lying: bool = False
-    ) -> dict[int, Process]:
-        """Sleep until one of those is done, or one is dead, but not for ever.
-
-        Args:
-            pending: the workers waited for.
-            limit_s: for no longer than that.
-            is_lying: they know it from `order`.
-
-        Returns:
-            the dead, by worker.
-        """
+    ) -> dict[int, Process]:  # the dead, by worker
+        """Sleep until one of those is done, or one is dead, but not for ever."""
         ready: list[tuple[int, int]] = []
         if self._hears_nobody(pending) if is_lying else self._lie_down(pending):
             ready = self._poll.poll(1000.0 * limit_s)
@@ -250,11 +214,6 @@ class WorkerProcesses:
     def replace(self, k: int, mail: bytes | None, ordered: Collection[int]) -> str:
         """Give a worker's team new processes, and those the command, if it is not carried out yet.
 
-        Args:
-            k: the worker.
-            mail: that came with the order.
-            ordered: all workers that were given it.
-
         Returns:
             what the old process of the worker died of, if nothing else is known.
         """
@@ -301,10 +260,6 @@ class WorkerProcesses:
 
     def _start_anew(self, dead: dict[int, Process], ordered: Collection[int]) -> dict[int, Process]:
         """The process that forks is gone, or hangs: another one, and new workers for all.
-
-        Args:
-            dead: processes that have been dismissed.
-            ordered: all workers that were given the present order.
 
         Returns:
             the old processes of all workers.
@@ -382,11 +337,7 @@ def _say(status: int) -> str:
 
 
 class _Held:
-    """What has to be given back, in any case.
-
-    Args:
-        segments: of the program.
-    """
+    """What has to be given back, in any case."""
 
     def __init__(self, segments: list[Segment]) -> None:
         self.segments = segments

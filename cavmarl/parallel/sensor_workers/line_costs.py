@@ -11,11 +11,7 @@ PARTS = 32  # of a frame, in each of which lines are taken to cost the same
 
 
 class LineCosts:
-    """At first every line of a frame costs the same.
-
-    Args:
-        num_lines: of a frame of each sensor.
-    """
+    """At first every line of a frame costs the same."""
 
     def __init__(self, num_lines: Sequence[int]) -> None:
         self._num_lines = tuple(num_lines)
@@ -32,15 +28,13 @@ class LineCosts:
         return round(float(place) / PARTS * self._num_lines[sensor])
 
     def learn(
-        self, sensor: int, lines: Sequence[tuple[int, int]], spent_s: Sequence[float]
+        self,
+        sensor: int,
+        # [begin, end) of each part; together all lines, each once
+        lines: Sequence[tuple[int, int]],
+        spent_s: Sequence[float],  # of each; where all are 0 nothing is learnt
     ) -> None:
-        """Correct it by the time that each part of a frame has taken.
-
-        Args:
-            sensor: its number.
-            lines: [begin, end) of each part; together all lines, each once.
-            spent_s: of each; where all are 0 nothing is learnt.
-        """
+        """Correct it by the time that each part of a frame has taken."""
         total_s = sum(spent_s)
         if not total_s > 0.0:
             return

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from enum import IntEnum
 from time import perf_counter, thread_time
 from typing import Any
@@ -10,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.engine.simulation import Simulation
-from cavmarl.parallel.processes.state_image import Arrays
+from cavmarl.parallel.processes.worker_loop import Job
 from cavmarl.parallel.sensor_workers.sensor_scene import SceneArrays
 from cavmarl.sensors.kernels.sensor_share import put_first, take_rows
 from cavmarl.sensors.mounted.frames import Frames
@@ -25,19 +24,16 @@ class SensorTask(IntEnum):
     SENSE = 0
 
 
-class SensorJob:
-    """Senses for the agents that are its share, as a zone would that owned them and saw all others.
-
-    Args:
-        simulation: undivided worlds of the same environment, without vehicles: the roads,
-            and room for rows.
-        shared: what there is to see.
-        frames: where the samples go.
-        number: of the worker.
-    """
+class SensorJob(Job):
+    """Senses for the agents of its share, as a zone would that owned them and saw all others."""
 
     def __init__(
-        self, simulation: Simulation, shared: SceneArrays, frames: Frames, number: int
+        self,
+        # undivided worlds of the same environment, without vehicles: the roads, and room for rows
+        simulation: Simulation,
+        shared: SceneArrays,  # what there is to see
+        frames: Frames,  # where the samples go
+        number: int,
     ) -> None:
         mounted = simulation.mounted
         assert mounted is not None
@@ -52,8 +48,8 @@ class SensorJob:
             if not sensor.stamps_itself
         ]
         self._spare = np.zeros(1, dtype=VEHICLE)
-        self._take_rows = repeated(take_rows)
-        self._put_first = repeated(put_first)
+        self._take_rows = specialized(take_rows)
+        self._put_first = specialized(put_first)
 
     def warm(self) -> None:
         """Have the kernels of all sensors ready; no vehicle is there to be sensed."""
@@ -63,14 +59,7 @@ class SensorJob:
             sensor.lines = lines
             sensor.sense(self._scenes, due, frames)
 
-    def afterwards(self) -> None:
-        """Nothing to do."""
-
-    def prepare(self) -> None:
-        """Nothing to do."""
-
     def perform(self, task: int, letter: Any) -> None:
-        """Sense what is due."""
         began = perf_counter()
         self._look()
         shared, number = self._shared, self._number
@@ -84,13 +73,6 @@ class SensorJob:
             shared.spent_s[number, place] = thread_time() - spent
             shared.delivered[number, place] = shared.ticks
         shared.busy_s[number] = perf_counter() - began
-
-    def save(self) -> Arrays:
-        """Nothing: all that it needs comes with an order."""
-        return []
-
-    def load(self, arrays: Sequence[Any]) -> None:
-        """Nothing to do."""
 
     def _look(self) -> None:
         """Take the tick that is to be sensed."""

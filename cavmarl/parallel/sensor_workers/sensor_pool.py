@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import WorkersConfig
 from cavmarl.core.errors import WorkerError
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.parallel.processes.shared_memory import Segment, size_of
 from cavmarl.parallel.processes.worker_pool import Death, Pool, Program
 from cavmarl.parallel.sensor_workers.line_costs import LineCosts
@@ -35,48 +35,28 @@ NEW_COST = 0.5  # weight of the latest costs from then on; what is first measure
 
 
 class SensorWorkerPlan(NamedTuple):
-    """What processes are made of.
+    """What processes are made of."""
 
-    Attributes:
-        module: that they run.
-        recipe: from which it makes its jobs; `shape` and `scene` are added.
-        frames: memory that samples are written to; it goes with the farm.
-        shape: of what is shared.
-        num_lines: (S,) into how many lines a frame of each sensor can be divided.
-        workers: how they are watched, and how sensing is shared out.
-    """
-
-    module: str
-    recipe: Mapping[str, Any]
-    frames: Segment
-    shape: SceneShape
-    num_lines: tuple[int, ...]
-    workers: WorkersConfig
+    module: str  # that they run
+    recipe: Mapping[str, Any]  # from which it makes its jobs; `shape` and `scene` are added
+    frames: Segment  # memory that samples are written to; it goes with the farm
+    shape: SceneShape  # of what is shared
+    num_lines: tuple[int, ...]  # (S,) into how many lines a frame of each sensor can be divided
+    workers: WorkersConfig  # how they are watched, and how sensing is shared out
 
 
 @dataclass
 class SensorWorkerTimes:
-    """Sums over all ticks in which sensors were due.
+    """Sums over all ticks in which sensors were due."""
 
-    Attributes:
-        publish_s: writing down what there is to see, and which worker senses what.
-        own_s: sensing what stays here.
-        wait_s: from the command until all frames were there.
-        busy_s: of that, while the busiest worker sensed.
-        ticks: how many.
-        sent_bytes: that the workers were given to read.
-        got_bytes: of frames that they have written.
-        messages: commands and answers.
-    """
-
-    publish_s: float = 0.0
-    own_s: float = 0.0
-    wait_s: float = 0.0
-    busy_s: float = 0.0
+    publish_s: float = 0.0  # writing down what there is to see, and which worker senses what
+    own_s: float = 0.0  # sensing what stays here
+    wait_s: float = 0.0  # from the command until all frames were there
+    busy_s: float = 0.0  # of that, while the busiest worker sensed
     ticks: int = 0
-    sent_bytes: int = 0
-    got_bytes: int = 0
-    messages: int = 0
+    sent_bytes: int = 0  # that the workers were given to read
+    got_bytes: int = 0  # of frames that they have written
+    messages: int = 0  # commands and answers
 
     def since(self, before: SensorWorkerTimes) -> SensorWorkerTimes:
         """What has come to it since it was a copy of `before`."""
@@ -89,20 +69,16 @@ class _Sharing:
     """Which worker senses what of the same sensors, and the time it has taken since then.
 
     Attributes:
-        shares: which worker senses what.
-        uses: ticks, in all.
         spent_s: (n, S) processor time since then, of each worker for each sensor.
-        agents: that have been sensed for, summed over these ticks.
     """
 
     def __init__(self, shares: Shares, sensors: int) -> None:
-        self.shares = shares
-        self.uses = 0
+        self.shares = shares  # which worker senses what
+        self.uses = 0  # ticks, in all
         self.spent_s = np.zeros((shares.workers, sensors))
-        self.agents = 0
+        self.agents = 0  # that have been sensed for, summed over these ticks
 
     def note(self, spent_s: NDArray[np.float64], agents: int) -> None:
-        """Add what a tick has taken."""
         self.uses += 1
         self.spent_s += spent_s
         self.agents += agents
@@ -119,7 +95,6 @@ class _Sharing:
         return often and self.agents > 0
 
     def forget(self) -> None:
-        """Begin to measure anew."""
         self.spent_s[:] = 0.0
         self.agents = 0
 
@@ -131,18 +106,14 @@ class SensorWorkers:
     returns when each sensor that is due has delivered the frame of this tick. A late one is waited
     for; a dead one is replaced, and its successor senses the same again.
 
-    Args:
-        plan: what the processes are made of.
-
     Attributes:
-        times: where the time has gone.
         shared: with the processes, once they have been started.
     """
 
     shared: SceneArrays
 
     def __init__(self, plan: SensorWorkerPlan) -> None:
-        self.times = SensorWorkerTimes()
+        self.times = SensorWorkerTimes()  # where the time has gone
         self._plan = plan
         self._pool: Pool | None = None
         self._unused = weakref.finalize(self, plan.frames.close)
@@ -150,7 +121,7 @@ class SensorWorkers:
         self._line_costs = LineCosts(plan.num_lines)
         self._sharings: dict[tuple[int, ...], _Sharing] = {}
         self._written: Shares | None = None
-        self._gather = repeated(gather_rows)
+        self._gather = specialized(gather_rows)
 
     @property
     def pool(self) -> Pool | None:
@@ -159,7 +130,6 @@ class SensorWorkers:
 
     @property
     def deaths(self) -> list[Death]:
-        """Of sensor workers, up to now."""
         return [] if self._pool is None else self._pool.deaths
 
     @property
@@ -168,12 +138,7 @@ class SensorWorkers:
         return self._costs_s.copy()
 
     def __call__(self, scenes: Sequence[SensedScene], turns: Sequence[Turn]) -> None:
-        """Write the samples of all turns.
-
-        Raises:
-            WorkerError: a frame is not that of the tick; workers cannot be started, or die again
-                and again.
-        """
+        """Write the samples of all turns."""
         theirs = [turn for turn in turns if not turn.sensor.stamps_itself]
         if not theirs:
             sense_here(scenes, turns)
@@ -192,7 +157,6 @@ class SensorWorkers:
         self._note(began, published, sensed, ended, theirs)
 
     def close(self) -> None:
-        """End the processes."""
         self._unused()
         if self._pool is not None:
             self._pool.close()
@@ -234,11 +198,7 @@ class SensorWorkers:
         shared.spent_s[:] = 0.0
 
     def check(self, turns: Sequence[Turn]) -> None:
-        """See that every worker has delivered every frame that is due, of this tick.
-
-        Raises:
-            WorkerError: the first that is not.
-        """
+        """See that every worker has delivered every frame that is due, of this tick."""
         shared = self.shared
         wrong = (shared.delivered != shared.ticks) & (shared.due[:, 0] > 0)  # (n, S, W)
         if not wrong.any():
@@ -297,12 +257,7 @@ class SensorWorkers:
         sharing.forget()
 
     def _note(
-        self,
-        began: float,
-        published: float,
-        sensed: float,
-        ended: float,
-        turns: Sequence[Turn],
+        self, began: float, published: float, sensed: float, ended: float, turns: Sequence[Turn]
     ) -> None:
         """Add up what a tick has taken; times are those of `time.perf_counter`."""
         times, shared = self.times, self.shared

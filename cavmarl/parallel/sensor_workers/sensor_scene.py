@@ -19,23 +19,14 @@ NEVER = -1  # a tick that there is not
 
 
 class SceneShape(NamedTuple):
-    """How large it is.
+    """How large it is."""
 
-    Attributes:
-        worlds: W.
-        capacity: C, rows of a world.
-        agents: A.
-        signals: of the map.
-        sensors: S, of the rig.
-        workers: n.
-    """
-
-    worlds: int
-    capacity: int
+    worlds: int  # W
+    capacity: int  # C, rows of a world
     agents: int
     signals: int
-    sensors: int
-    workers: int
+    sensors: int  # S, of the rig
+    workers: int  # n
 
     @property
     def layout(self) -> Layout:

@@ -28,21 +28,13 @@ LEAST_S = 2e-4  # that has to be saved to divide frames: what stands around is l
 
 
 class Unit(NamedTuple):
-    """One sensor of some agents; those of all worlds are counted one after the other.
+    """One sensor of some agents; those of all worlds are counted one after the other."""
 
-    Attributes:
-        sensor: its number in the rig.
-        first: agent.
-        last: the one after the last.
-        begin: line of their frames.
-        end: the one after the last.
-    """
-
-    sensor: int
-    first: int
-    last: int
-    begin: int = 0
-    end: int = 1
+    sensor: int  # its number in the rig
+    first: int  # agent
+    last: int  # the one after the last
+    begin: int = 0  # line of their frames
+    end: int = 1  # the one after the last
 
 
 class LineWorth(Protocol):
@@ -57,19 +49,12 @@ class LineWorth(Protocol):
 
 @dataclass(frozen=True)
 class Shares:
-    """Which worker senses what.
+    """Which worker senses what."""
 
-    Attributes:
-        units: what is shared out.
-        homes: the worker of each.
-        costs_s: what each costs; equal where nothing has been measured.
-        workers: how many there are.
-    """
-
-    units: tuple[Unit, ...]
-    homes: tuple[int, ...]
-    costs_s: tuple[float, ...]
-    workers: int
+    units: tuple[Unit, ...]  # what is shared out
+    homes: tuple[int, ...]  # the worker of each
+    costs_s: tuple[float, ...]  # what each costs; equal where nothing has been measured
+    workers: int  # how many there are
 
     @property
     def loads_s(self) -> list[float]:
@@ -121,13 +106,7 @@ def share_in_turn(units: Sequence[Unit], costs_s: Sequence[float], workers: int)
 
 
 def share_by_cost(units: Sequence[Unit], costs_s: Sequence[float], workers: int) -> Shares:
-    """The costliest first to the worker through first, then moves and swaps that help.
-
-    Args:
-        units: by rising sensor and agent.
-        costs_s: of each.
-        workers: how many.
-    """
+    """The costliest first to the worker through first, then moves and swaps that help."""
     shards = tuple(
         ShardCost(unit.sensor, number, cost_s)
         for number, (unit, cost_s) in enumerate(zip(units, costs_s, strict=True))

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from cavmarl.config.env import EnvConfig, WorkersConfig, ZonesConfig
-from cavmarl.core.extensions import extension_modules, load_extensions
+from cavmarl.config.env import WorkersConfig, ZonesConfig
 from cavmarl.engine.simulation import Simulation
-from cavmarl.engine.world_setup import World, make_world
+from cavmarl.engine.world_setup import World
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.processes.process_barrier import usable_cores
 from cavmarl.parallel.processes.shared_memory import Segment, arrays_in, size_of
+from cavmarl.parallel.recipe import recipe_of, world_of
 from cavmarl.parallel.sensor_workers.sensor_job import SensorJob
 from cavmarl.parallel.sensor_workers.sensor_pool import SensorWorkerPlan, SensorWorkers
 from cavmarl.parallel.sensor_workers.sensor_scene import SceneArrays, SceneShape
@@ -28,12 +28,6 @@ def local_worlds(
     world: World, base_dir: Path, num_worlds: int, in_next_step: bool = False
 ) -> LocalWorlds:
     """Worlds of this process, with as many sensor workers as `workers.sensors` says.
-
-    Args:
-        world: what each is made of.
-        base_dir: the folder that its relative files start from.
-        num_worlds: W.
-        in_next_step: when worlds begin anew; see `SteppedWorlds`.
 
     Raises:
         WorkerError: there is no memory that processes could share.
@@ -65,15 +59,7 @@ def warn_if_crowded(sensor_workers: int, times: int) -> None:
 def farm_of(
     world: World, base_dir: Path, arrays: Segment, part: tuple[int, int], num_worlds: int
 ) -> SensorWorkers:
-    """The sensor workers of some worlds, to be started when they are needed.
-
-    Args:
-        world: what each is made of.
-        base_dir: the folder that its relative files start from.
-        arrays: the memory of the `StepArrays` of all worlds; it goes with the farm.
-        part: the first of its worlds, and the one after the last.
-        num_worlds: in all.
-    """
+    """The sensor workers of some worlds, to be started when they are needed."""
     config = world.config
     first, last = part
     shape = SceneShape(
@@ -84,28 +70,17 @@ def farm_of(
         sensors=len(config.rig),
         workers=config.workers.sensors,
     )
-    recipe = {
-        "config": asdict(_undivided(config)),
-        "extensions": extension_modules(_undivided(config).registered),
-        "base_dir": str(base_dir.resolve()),
-        "part": part,
-        "num_worlds": num_worlds,
-    }
+    # The same environment with all zones in one, and no sensor workers.
+    undivided = replace(config, zones=ZonesConfig(), workers=WorkersConfig())
+    recipe = recipe_of(world._replace(config=undivided), base_dir, part=part, num_worlds=num_worlds)
     lines = tuple(type_of(name, sensor).num_lines(sensor) for name, sensor in config.rig.items())
     return SensorWorkers(SensorWorkerPlan(PROGRAM, recipe, arrays, shape, lines, config.workers))
 
 
 def make_sensor_jobs(recipe: Mapping[str, Any]) -> list[SensorJob]:
-    """The jobs of all sensor workers, every kernel loaded.
-
-    Args:
-        recipe: of `farm_of`, with what the farm has added.
-    """
-    from cavmarl.config.io import validate  # pydantic is slow to import
-
-    load_extensions(recipe["extensions"])
-    config = validate(EnvConfig, recipe["config"], "the environment")
-    world = make_world(config, Path(recipe["base_dir"]))
+    """The jobs of all sensor workers, every kernel loaded."""
+    world = world_of(recipe)
+    config = world.config
     shape = SceneShape(*recipe["shape"])
     layout = layout_of(config, shape.capacity, recipe["num_worlds"])
     arrays = StepArrays.of(arrays_in(Segment(recipe["frames"], 0).map(), layout))
@@ -115,8 +90,3 @@ def make_sensor_jobs(recipe: Mapping[str, Any]) -> list[SensorJob]:
     jobs = [SensorJob(simulation, shared, frames, number) for number in range(shape.workers)]
     jobs[0].warm()
     return jobs
-
-
-def _undivided(config: EnvConfig) -> EnvConfig:
-    """The same environment with all zones in one, and no sensor workers."""
-    return replace(config, zones=ZonesConfig(), workers=WorkersConfig())

@@ -6,57 +6,44 @@ import json
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cavmarl.balance.balance_plan import Plan
 from cavmarl.balance.plan_text import describe_plan
 from cavmarl.core.errors import ConfigError, SumoError, WorkerError, WorkerFailureError
-from cavmarl.core.extensions import extension_modules
-from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
 from cavmarl.handoff.coordinator.coordinator_setup import check_faults
 from cavmarl.parallel.commanded_worlds import own_error, uncopied
-from cavmarl.parallel.driven_vehicles import Driven
 from cavmarl.parallel.hosts.host_commands import HostProgram
 from cavmarl.parallel.hosts.host_pool import HostPool
-from cavmarl.parallel.hosts.hosted_worlds_job import code_stamp
+from cavmarl.parallel.hosts.host_process import code_stamp
 from cavmarl.parallel.hosts.ray_actors import RayActors
+from cavmarl.parallel.hosts.remote_worlds import refuse_on_hosts
+from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.mover import Mover
 from cavmarl.parallel.processes.worker_pool import Death
+from cavmarl.parallel.recipe import recipe_of
 from cavmarl.parallel.split_hosts.zone_leader import ZoneLeader
-from cavmarl.parallel.split_hosts.zones_job import host_zones, make_replicated
+from cavmarl.parallel.split_hosts.zones_job import host_zones, replicated_arrays
 from cavmarl.parallel.step_placement import StepPlacement
 from cavmarl.parallel.work_shares import Part, parts_of
-from cavmarl.parallel.worlds_job import Task, fingerprint
+from cavmarl.parallel.worlds_job import Task
 from cavmarl.shards.shard import Commands, Shard
 
 log = logging.getLogger("cavmarl.workers")
 
 
-class DividedWorlds:
+class DividedWorlds(LocalWorlds):
     """W worlds that this process leads, and m hosts that run their zones, the same of all worlds.
 
-    Args:
-        world: what each is made of.
-        base_dir: the folder that its relative files start from, on every machine.
-        num_worlds: W.
-        workers: m, from 2 to the zones of a world.
-        in_next_step: when worlds begin anew; see `SteppedWorlds`.
-
     Attributes:
-        world: what each is made of.
         arrays: of this process.
-        pool: the hosts.
         in_next_step: when worlds begin anew.
-        placement: which host has which zones.
         leader: runs the phases.
         spent_s: (1, zones) processor time of each zone of all worlds, if hosts measure it.
-        mover: has that changed; None: it does not change.
 
     Raises:
         MissingExtraError: Ray is not installed.
@@ -66,23 +53,23 @@ class DividedWorlds:
 
     def __init__(
         self,
-        world: World,
-        base_dir: Path,
-        num_worlds: int,
-        workers: int,
-        in_next_step: bool = False,
+        world: World,  # what each is made of
+        base_dir: Path,  # the folder that its relative files start from, on every machine
+        num_worlds: int,  # W
+        workers: int,  # m, from 2 to the zones of a world
+        in_next_step: bool = False,  # when worlds begin anew; see `SteppedWorlds`
     ) -> None:
         _check(world, num_worlds, workers)
         config = world.config
-        self.world = world
-        self.in_next_step = in_next_step
-        self.placement = StepPlacement(world, 1, workers)
+        self.placement = StepPlacement(world, 1, workers)  # which host has which zones
         (part,) = parts_of(self.placement.plans, world.partition.count)
-        self._worlds, memory, inputs = make_replicated(world, num_worlds, in_next_step, warm=True)
-        self.arrays = self._worlds.arrays
+        memory, arrays, inputs = replicated_arrays(world, num_worlds)
+        super().__init__(
+            world, num_worlds, arrays, warm=True, in_next_step=in_next_step, zeros=memory.zeros
+        )
         self._is_torn = False
         self.spent_s = np.zeros((1, world.partition.count))
-        self.mover: Mover | None = None
+        self.mover: Mover | None = None  # has that changed; None: it does not change
         if every := config.workers.balance_steps:
             self.mover = Mover(self.placement, world.partition.count, every, self.spent_s)
 
@@ -90,19 +77,14 @@ class DividedWorlds:
             self.leader = ZoneLeader(shards, memory, inputs, part.zones, self.spent_s[0])
             return self.leader
 
-        simulation = self._worlds.simulation
+        simulation = self.simulation
         simulation.host(lead, gathers=False)
         if simulation.mounted is not None:
             simulation.mounted.rig.sense = self.leader.sense
-        recipe = {
-            "config": asdict(config),
-            "extensions": extension_modules(config.registered),
-            "base_dir": str(base_dir.resolve()),
-            "fingerprint": fingerprint(world),
-            "in_next_step": in_next_step,
-            "num_worlds": num_worlds,
-            "measures": self.mover is not None,
-        }
+        recipe = recipe_of(
+            world, base_dir, in_next_step=in_next_step, num_worlds=num_worlds,
+            measures=self.mover is not None,
+        )  # fmt: skip
         actors = RayActors(host_zones, lambda count: json.dumps(recipe), workers, workers)
         program = HostProgram(_names(part), (1,) * workers, ("phase",), -1, code_stamp())
         try:
@@ -115,11 +97,6 @@ class DividedWorlds:
 
     def __reduce__(self) -> tuple[Any, ...]:
         raise uncopied()
-
-    @property
-    def simulation(self) -> Simulation:
-        """The worlds: this process has all of them between two phases."""
-        return self._worlds.simulation
 
     @property
     def plans(self) -> tuple[Plan, ...]:
@@ -137,7 +114,7 @@ class DividedWorlds:
         """
         everywhere = bool(self.arrays.chosen.all())
         with self._whole(begins_anew=everywhere):
-            self._worlds.reset(seed, first_world)
+            super().reset(seed, first_world)
         if everywhere:
             log.info("%s", "\n\n".join(map(describe_plan, self.plans)))
 
@@ -150,7 +127,7 @@ class DividedWorlds:
         if self.mover is not None:
             self.mover.before_step(self._host, self._pids)
         with self._whole():
-            self._worlds.step(commands)
+            super().step(commands)
 
     def _host(self, task: Task, zones: Sequence[Sequence[Sequence[int]]], commits: bool) -> None:
         """Let zones have other hosts: they are sent whole with the next phase."""
@@ -164,43 +141,16 @@ class DividedWorlds:
     def suggest(self) -> None:
         """Write what the built-in driver would do in the agents' place."""
         with self._whole():
-            self._worlds.suggest()
-
-    def write_states(self) -> None:
-        """Write the global state of each world."""
-        self._worlds.write_states()
-
-    def ticks(self) -> NDArray[np.int64]:
-        """(W,) ticks since each world's reset."""
-        return self._worlds.ticks()
-
-    def state_hash(self, world: int) -> str:
-        return self._worlds.state_hash(world)
-
-    def traffic_stats(self, world: int) -> dict[str, float]:
-        """Traffic of one world since its reset."""
-        return self._worlds.traffic_stats(world)
-
-    def driven(self, world: int, agents: Sequence[int]) -> list[Driven]:
-        """The vehicles of some agents of one world, in no order."""
-        return self._worlds.driven(world, agents)
-
-    def signal_phases(self, world: int) -> NDArray[np.int32]:
-        """(num_signals,) PHASE rows that are on in one world."""
-        return self._worlds.signal_phases(world)
+            super().suggest()
 
     def close(self) -> None:
         """End the hosts, and the cluster if it was started for them."""
         self.pool.close()
-        self._worlds.close()
+        super().close()
 
     @contextmanager
     def _whole(self, begins_anew: bool = False) -> Iterator[None]:
-        """The time in which worlds change; an interrupt then leaves them half changed.
-
-        Raises:
-            WorkerError: so it is.
-        """
+        """The time in which worlds change; an interrupt then leaves them half changed."""
         if self._is_torn and not begins_anew:
             raise WorkerError(
                 "the worlds were interrupted in the middle of a step: reset all of them"
@@ -224,11 +174,6 @@ def _names(part: Part) -> tuple[str, ...]:
 
 
 def _check(world: World, num_worlds: int, workers: int) -> None:
-    """Refuse what such worlds cannot have.
-
-    Raises:
-        ConfigError: so it is.
-    """
     config, count = world.config, world.partition.count
     if workers > count:
         raise ConfigError(
@@ -236,16 +181,7 @@ def _check(world: World, num_worlds: int, workers: int) -> None:
             "more hosts than worlds run the same zones of all worlds, so at most as many as zones; "
             "use fewer workers, more zones or more worlds"
         )
-    if config.workers.monitor_cpu:
-        raise ConfigError(
-            "workers.monitor_cpu = True, hosts = 'ray': sees one machine; leave it out "
-            "(Ray tells what is reserved on each node), or leave out the hosts"
-        )
-    if config.workers.sensors:
-        raise ConfigError(
-            f"workers.sensors = {config.workers.sensors}, hosts = 'ray': sensor workers are on the "
-            "machine of the worlds; leave it 0, or leave out the hosts"
-        )
+    refuse_on_hosts(config.workers)
     _, deaths = check_faults(config.zones, count, num_worlds)
     if deaths:
         raise ConfigError(

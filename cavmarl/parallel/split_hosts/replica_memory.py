@@ -8,7 +8,7 @@ other end: what it knows of this memory, what is to be sent, and what has come (
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from math import prod
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from cavmarl.core.errors import MessageError
 from cavmarl.core.huge_pages import huge_zeros
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.parallel.kernels.replica_copies import (
     GROUP,
     note_agents,
@@ -35,15 +35,8 @@ _WORD = 8
 
 
 class Place(NamedTuple):
-    """Where an array lies.
-
-    Attributes:
-        arena: in which part of the memory.
-        first: byte of it.
-    """
-
-    arena: int
-    first: int
+    arena: int  # in which part of the memory
+    first: int  # byte of it
 
 
 Spans = Sequence[tuple[int, NDArray[np.int64]]]
@@ -51,14 +44,10 @@ Spans = Sequence[tuple[int, NDArray[np.int64]]]
 
 
 class ReplicaMemory:
-    """The arrays of one process.
-
-    Attributes:
-        arenas: (n,) words each; what arrays lie in.
-    """
+    """The arrays of one process."""
 
     def __init__(self) -> None:
-        self.arenas: list[Words] = []
+        self.arenas: list[Words] = []  # (n,) words each; what arrays lie in
         self._starts: list[int] = []
         self._used = ARENA  # bytes of the arena that small arrays share
         self._shared = -1  # its number
@@ -86,11 +75,7 @@ class ReplicaMemory:
         return len(self.arenas) - 1
 
     def find(self, array: Array) -> Place | None:
-        """Where an array lies; None: somewhere else.
-
-        Args:
-            array: contiguous.
-        """
+        """Where an array lies; None: somewhere else."""
         at = _address(array)
         for number, (start, arena) in enumerate(zip(self._starts, self.arenas, strict=True)):
             if start <= at and at + array.nbytes <= start + arena.nbytes:
@@ -98,11 +83,6 @@ class ReplicaMemory:
         return None
 
     def place_of(self, array: Array) -> Place:
-        """Where an array of this memory lies.
-
-        Raises:
-            ValueError: it is none.
-        """
         place = self.find(array)
         if place is None:
             raise ValueError(f"an array {array.shape} of {array.dtype} is no part of this memory")
@@ -140,21 +120,20 @@ def _address(array: Array) -> int:
 
 
 class MemoryReplica:
-    """What one other process knows of a memory.
+    """What one other process knows of a memory."""
 
-    Args:
-        memory: whose arrays are all made.
-        pieces: how many there can be at most in a stream that are not next to each other.
-    """
-
-    def __init__(self, memory: ReplicaMemory, pieces: int) -> None:
+    def __init__(
+        self,
+        memory: ReplicaMemory,  # whose arrays are all made
+        pieces: int,  # how many there can be at most in a stream that are not next to each other
+    ) -> None:
         self._memory = memory
         self._stream: Words = np.empty(memory.most_words + 6 * pieces + 1, dtype=np.uint64)
         self._size = 0
-        self._note_spans = repeated(note_spans)
-        self._note_rows = repeated(note_rows)
-        self._note_agents = repeated(note_agents)
-        self._take_changes = repeated(take_changes)
+        self._note_spans = specialized(note_spans)
+        self._note_rows = specialized(note_rows)
+        self._note_agents = specialized(note_agents)
+        self._take_changes = specialized(take_changes)
         self.forget()
 
     def forget(self) -> None:
@@ -164,7 +143,6 @@ class MemoryReplica:
         ]
 
     def begin(self) -> None:
-        """Begin a stream."""
         self._size = 0
 
     @property
@@ -173,11 +151,8 @@ class MemoryReplica:
         return self._stream[: self._size]
 
     def note(self, spans: Spans) -> None:
-        """Note what has changed in some arrays."""
         for arena, bounds in spans:
-            at = self._open(arena)
-            memory, known = self._memory.arenas[arena], self._known[arena]
-            self._close(self._note_spans(memory, known, bounds, self._stream, at))
+            self._write(arena, self._note_spans, bounds)
 
     def note_rows(
         self,
@@ -187,24 +162,14 @@ class MemoryReplica:
         counts: NDArray[np.int64],
     ) -> None:
         """Note what has changed in the first rows of zones; see `kernels.replicas.note_rows`."""
-        at = self._open(place.arena)
-        memory, known = self._memory.arenas[place.arena], self._known[place.arena]
-        self._close(
-            self._note_rows(memory, known, place.first, strides, zones, counts, self._stream, at)
-        )
+        self._write(place.arena, self._note_rows, place.first, strides, zones, counts)
 
     def note_agents(self, place: Place, size: int, marks: NDArray[np.bool_]) -> None:
         """Note what has changed of some agents; see `kernels.replicas.note_agents`."""
-        at = self._open(place.arena)
-        memory, known = self._memory.arenas[place.arena], self._known[place.arena]
-        self._close(self._note_agents(memory, known, place.first, size, marks, self._stream, at))
+        self._write(place.arena, self._note_agents, place.first, size, marks)
 
     def take(self, stream: Words) -> None:
-        """Make the changes that the other process has sent.
-
-        Raises:
-            MessageError: they are not of this memory.
-        """
+        """Make the changes that the other process has sent."""
         at = 0
         while at < stream.size:
             arena, end = (stream.item(at), stream.item(at + 1)) if at + 2 <= stream.size else (0, 0)
@@ -215,13 +180,11 @@ class MemoryReplica:
                 raise MessageError("changes of a memory that is not like this one")
             at = end
 
-    def _open(self, arena: int) -> int:
-        """Begin with the changes of one part of the memory; where its groups begin."""
-        self._stream[self._size] = arena
-        return self._size + 2
-
-    def _close(self, at: int) -> None:
-        """End it there; without groups it was none."""
-        if at > self._size + 2:
+    def _write(self, arena: int, note: Callable[..., int], *what: Any) -> None:
+        """Let a kernel write the changes of one part of the memory; without groups it was none."""
+        memory, known, first = self._memory.arenas[arena], self._known[arena], self._size + 2
+        at = note(memory, known, *what, self._stream, first)
+        if at > first:
+            self._stream[self._size] = arena
             self._stream[self._size + 1] = at
             self._size = at

@@ -15,7 +15,6 @@ from cavmarl.parallel.split_hosts.zone_phases import PhaseInputs, ZonePhase, Zon
 from cavmarl.parallel.split_hosts.zones_job import PhaseOrder
 from cavmarl.sensors.mounted.mounted_sensor import SensedScene
 from cavmarl.sensors.mounted.sensor_rig import Turn, sense_here
-from cavmarl.shards.executor import Phase
 from cavmarl.shards.shard import Commands, Shard
 from cavmarl.shards.shard_group import ShardGroup
 
@@ -29,24 +28,15 @@ class ZoneLeader:
 
     What goes from zone to zone it does itself: ownership, ghosts, the gate, the signals. So it
     has all rows at the end of each phase, and a host that is lost costs no more than its phase.
-
-    Args:
-        shards: one a zone.
-        memory: in which their arrays lie.
-        inputs: what phases are called with.
-        zones: of each host.
-        spent_s: (k,) where the processor time of each zone is added up, if hosts measure it.
-
-    Attributes:
-        zones: of each host.
     """
 
     def __init__(
         self,
-        shards: Sequence[Shard],
-        memory: ReplicaMemory,
-        inputs: PhaseInputs,
-        zones: Sequence[Sequence[int]],
+        shards: Sequence[Shard],  # one a zone
+        memory: ReplicaMemory,  # in which their arrays lie
+        inputs: PhaseInputs,  # what phases are called with
+        zones: Sequence[Sequence[int]],  # of each host
+        # (k,) where the processor time of each zone is added up, if hosts measure it
         spent_s: NDArray[np.float64],
     ) -> None:
         self._everybody = ShardGroup(shards)
@@ -62,19 +52,14 @@ class ZoneLeader:
         self.host(zones)
 
     def host(self, zones: Sequence[Sequence[int]]) -> None:
-        """From now on each host has these zones."""
         self.zones = [np.array(sorted(own), dtype=np.int64) for own in zones]
 
     def let_work(self, pool: HostPool) -> None:
         """From now on there are hosts; before, all was done here."""
         self._pool = pool
 
-    def each(self, phase: Phase, *arguments: Any) -> None:
-        """Run a phase on every shard.
-
-        Raises:
-            WorkerError: hosts cannot go on.
-        """
+    def each(self, phase: str, *arguments: Any) -> None:
+        """Run a phase on every shard. Raises WorkerError: hosts cannot go on."""
         inputs = self._inputs
         if self._pool is None:
             self._everybody.each(phase, *arguments)
@@ -135,11 +120,7 @@ class ZoneLeader:
             turn = ZoneTurn(phase, zones, side, next_side, self._begins_step, sensors)
             self._phases.note_inputs(replica, turn)
             stream = replica.stream
-            order = PhaseOrder(
-                is_new, stream.size, phase, zones.tolist(), side, next_side,
-                self._begins_step, list(sensors),
-            )  # fmt: skip
-            return order, [stream]
+            return PhaseOrder(is_new, stream.size, turn.told()), [stream]
 
         def outputs(k: int, answer: Any) -> Arrays:
             if answer[0] > self._room[k].size:  # memory that is new has to be had page by page

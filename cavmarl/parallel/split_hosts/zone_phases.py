@@ -14,13 +14,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.numba.repeated import repeated
-from cavmarl.core.records.arrays import Common
+from cavmarl.core.numba.specialized import specialized
+from cavmarl.core.records.arrays import Common, Outputs, Zoned
 from cavmarl.parallel.kernels.replica_copies import mark_agents
 from cavmarl.parallel.split_hosts.replica_memory import MemoryReplica, Place, ReplicaMemory
 from cavmarl.sensors.kernels.rig_frames import POSE, Due
 from cavmarl.sensors.mounted.frames import Frames
 from cavmarl.shards.shard import Commands, Shard
+from cavmarl.shards.state import Use, arrays_of
+from cavmarl.v2x.kernels.v2x_records import Mail
 
 Array = NDArray[Any]
 
@@ -35,36 +37,18 @@ class ZonePhase(IntEnum):
     MOUNTED = 4  # the sensors of the rig
 
 
-# Fields of `Zoned` (k, W), of `Mail` that agents read, of `Outputs` that zones write.
-NUMBERS = (
-    "num_owned", "num_rows", "num_near", "num_through", "num_touching", "num_contacts", "num_outer",
-)  # fmt: skip
-INBOXES = ("objects", "events", "signals")
-SENSED = (
-    "observations", "terms", "terminated", "present", "acted", "events", "vehicle_ids",
-)  # fmt: skip
-
 CLEARED = 1 << 16  # words that are made 0 at once
 
 
 class PhaseInputs(NamedTuple):
-    """What phases are called with, at the same place in all processes.
+    """What phases are called with, at the same place in all processes."""
 
-    Attributes:
-        commands: of the agents.
-        chosen: (W,) worlds in which agents sense.
-        suggested: (W, A, 2) what the built-in driver would do.
-        before: POSE (W, A) of all agents in the tick before.
-        due: (S, 3, W) of each sensor of the rig, see `Due`.
-        frames: what the rigs sense.
-    """
-
-    commands: Commands
-    chosen: NDArray[np.bool_]
-    suggested: NDArray[np.float64]
-    before: NDArray[np.void]
-    due: NDArray[np.int64]
-    frames: Frames
+    commands: Commands  # of the agents
+    chosen: NDArray[np.bool_]  # (W,) worlds in which agents sense
+    suggested: NDArray[np.float64]  # (W, A, 2) what the built-in driver would do
+    before: NDArray[np.void]  # POSE (W, A) of all agents in the tick before
+    due: NDArray[np.int64]  # (S, 3, W) of each sensor of the rig, see `Due`
+    frames: Frames  # what the rigs sense
 
     @classmethod
     def make(
@@ -87,23 +71,27 @@ class PhaseInputs(NamedTuple):
 
 
 class ZoneTurn(NamedTuple):
-    """One phase on some zones.
-
-    Attributes:
-        phase: which one.
-        zones: on which, rising.
-        side: where their rows are.
-        next_side: where the next ones are.
-        begins_step: before it moves, the accounts of a step are opened.
-        sensors: of the rig, by number, that are due.
-    """
+    """One phase on some zones."""
 
     phase: ZonePhase
-    zones: NDArray[np.int64]
-    side: int
-    next_side: int
-    begins_step: bool = False
-    sensors: tuple[int, ...] = ()
+    zones: NDArray[np.int64]  # on which, rising
+    side: int  # where their rows are
+    next_side: int  # where the next ones are
+    begins_step: bool = False  # before it moves, the accounts of a step are opened
+    sensors: tuple[int, ...] = ()  # of the rig, by number, that are due
+
+    def told(self) -> list[Any]:
+        """The same, as JSON knows it."""
+        return list(self._replace(zones=self.zones.tolist()))
+
+    @classmethod
+    def heard(cls, told: Sequence[Any]) -> ZoneTurn:
+        turn = cls(*told)
+        return turn._replace(
+            phase=ZonePhase(turn.phase),
+            zones=np.array(turn.zones, dtype=np.int64),
+            sensors=tuple(turn.sensors),
+        )
 
 
 class _Rows(NamedTuple):
@@ -123,13 +111,7 @@ class _OfAgents(NamedTuple):
 class ZonePhases:
     """What is sent before and after the phases of some worlds.
 
-    Args:
-        shards: one a zone.
-        memory: in which the arrays lie that they write.
-        inputs: what phases are called with.
-
     Attributes:
-        inputs: the same.
         pieces: of a stream there are at most so many that do not lie next to each other.
     """
 
@@ -139,13 +121,13 @@ class ZonePhases:
         self._memory = memory
         self._zoned = zoned = first.zoned
         self._marks = np.zeros(inputs.commands.meta_actions.shape, dtype=np.bool_)
-        self._mark_agents = repeated(mark_agents)
+        self._mark_agents = specialized(mark_agents)
         common = [
-            *(getattr(first.worlds, name) for name in Common._fields if name != "pending"),
+            *arrays_of(first.worlds, Common, Use.SENT),
             *(array for array in _ways_on_the_way(first) if memory.find(array) is not None),
         ]
-        numbers = [getattr(zoned, name) for name in NUMBERS]
-        inboxes = [] if first.mail is None else [getattr(first.mail, name) for name in INBOXES]
+        numbers = list(arrays_of(zoned, Zoned, Use.SENT))
+        inboxes = [] if first.mail is None else list(arrays_of(first.mail, Mail, Use.SENT))
         acts = inputs.commands.meta_actions if first.discrete else inputs.commands.controls
         reads = {
             ZonePhase.MOVE: [*common, *numbers, acts],
@@ -157,10 +139,9 @@ class ZonePhases:
         of_agents = {
             ZonePhase.MOVE: [first.worlds.pending],
             ZonePhase.SENSE: [
-                array
-                for array in (getattr(first.outputs, name) for name in SENSED)
-                if memory.find(array)
-                is not None  # with `observation.mode: sensors` some are not seen
+                array  # with `observation.mode: sensors` some are not seen
+                for array in arrays_of(first.outputs, Outputs, Use.SENT)
+                if memory.find(array) is not None
             ],
             ZonePhase.SUGGEST: [inputs.suggested],
             ZonePhase.MOUNTED: [frames.data for frames in inputs.frames.values()],

@@ -6,25 +6,21 @@ import json
 import time
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config.env import EnvConfig
-from cavmarl.core.errors import WorkerError
-from cavmarl.core.extensions import load_extensions
-from cavmarl.engine.world_setup import World, make_world
-from cavmarl.parallel.hosts.host_process import TaskOutcome, serve
-from cavmarl.parallel.hosts.hosted_worlds_job import code_stamp
+from cavmarl.engine.world_setup import World
+from cavmarl.parallel.hosts.host_process import RemoteJob, TaskOutcome, serve
 from cavmarl.parallel.journaled_worlds import unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.recipe import ELSEWHERE, world_of
 from cavmarl.parallel.split_hosts.replica_memory import MemoryReplica, ReplicaMemory
 from cavmarl.parallel.split_hosts.zone_phases import PhaseInputs, ZonePhase, ZonePhases, ZoneTurn
 from cavmarl.parallel.step_arrays import StepArrays, layout_of
 from cavmarl.parallel.team.hosted_zones import HostedZones
-from cavmarl.parallel.worlds_job import commands_of, fingerprint
+from cavmarl.parallel.worlds_job import commands_of
 from cavmarl.sensors.kernels.rig_frames import Due
 from cavmarl.sensors.mounted.sensor_rig import Turn, sense_here
 
@@ -32,68 +28,31 @@ Array = NDArray[Any]
 
 
 class PhaseOrder(NamedTuple):
-    """The payload of a command: a phase on some zones, and how much has changed before it.
+    """The payload of a command: a phase on some zones, and how much has changed before it."""
 
-    Attributes:
-        is_new: the host is to forget what it has.
-        words: of changes.
-        phase: a `ZonePhase`.
-        zones: see `ZoneTurn`, as the rest.
-        side: where the rows are.
-        next_side: where the next ones are.
-        begins_step: whether a step begins.
-        sensors: that are due.
-    """
-
-    is_new: bool
-    words: int
-    phase: int
-    zones: list[int]
-    side: int
-    next_side: int
-    begins_step: bool
-    sensors: list[int]
+    is_new: bool  # the host is to forget what it has
+    words: int  # of changes
+    turn: list[Any]  # a `ZoneTurn`, as JSON knows it
 
 
 def host_zones(recipe: str, place: tuple[str, int], secret: bytes, number: int) -> NoReturn:
-    """The whole life of a process that hosts zones; see `hosts.host.serve`.
-
-    Args:
-        recipe: what `divided.DividedWorlds` writes.
-        place: where it listens.
-        secret: of its hosts.
-        number: of this one.
-    """
+    """The whole life of a process that hosts zones; see `hosts.host.serve`."""
     serve(partial(ZonesJob, json.loads(recipe)), place, secret, number)
 
 
-def make_replicated(
-    world: World, num_worlds: int, in_next_step: bool, warm: bool
-) -> tuple[LocalWorlds, ReplicaMemory, PhaseInputs]:
-    """Worlds whose arrays lie at the same places wherever they are made.
-
-    Args:
-        world: what each is made of.
-        num_worlds: W.
-        in_next_step: when worlds begin anew; see `SteppedWorlds`.
-        warm: have all kernels ready now.
-    """
+def replicated_arrays(
+    world: World, num_worlds: int
+) -> tuple[ReplicaMemory, StepArrays, PhaseInputs]:
+    """Arrays that lie at the same places wherever they are made; the memory makes the others."""
     memory = ReplicaMemory()
-    config = world.config
-    layout = layout_of(config, world.capacity, num_worlds).items()
+    layout = layout_of(world.config, world.capacity, num_worlds).items()
     arrays = StepArrays.of({name: memory.zeros(shape, kind) for name, (kind, shape) in layout})
     inputs = PhaseInputs.make(memory, commands_of(arrays), arrays.suggested, arrays.frames)
-    worlds = LocalWorlds(
-        world, num_worlds, arrays, warm=warm, in_next_step=in_next_step, zeros=memory.zeros
-    )
-    return worlds, memory, inputs
+    return memory, arrays, inputs
 
 
-class ZonesJob:
+class ZonesJob(RemoteJob):
     """Some zones of all worlds; which ones, each command says.
-
-    Args:
-        recipe: environment, and how many worlds there are.
 
     Raises:
         WorkerError: this machine's files are not the caller's.
@@ -101,19 +60,12 @@ class ZonesJob:
     """
 
     def __init__(self, recipe: dict[str, Any]) -> None:
-        from cavmarl.config.io import validate  # pydantic is slow to import
-
-        load_extensions(recipe["extensions"])
-        config = validate(EnvConfig, recipe["config"], "the environment")
-        world = make_world(config, Path(recipe["base_dir"]))
-        if fingerprint(world) != recipe["fingerprint"]:
-            raise WorkerError(
-                f"the files of '{config.name}' in {recipe['base_dir']} are not the caller's: copy "
-                "them to all machines"
-            )
-        self._worlds, memory, self._inputs = make_replicated(
-            unwatched(world), recipe["num_worlds"], recipe["in_next_step"], warm=True
-        )
+        world, num_worlds = unwatched(world_of(recipe, ELSEWHERE)), recipe["num_worlds"]
+        memory, arrays, self._inputs = replicated_arrays(world, num_worlds)
+        self._worlds = LocalWorlds(
+            world, num_worlds, arrays, warm=True, in_next_step=recipe["in_next_step"],
+            zeros=memory.zeros,
+        )  # fmt: skip
         simulation = self._worlds.simulation
         shards = simulation.shards
         self._mounted = simulation.mounted
@@ -125,16 +77,7 @@ class ZonesJob:
         self._coming: Array = np.zeros(0, dtype=np.uint64)
         self._rehearse(np.arange(len(shards)))
 
-    @property
-    def code(self) -> str:
-        """What has to be the same on all machines for the same to come out."""
-        return code_stamp()
-
-    def fit(self, size: int) -> None:
-        """Nothing to do: each command says how much it is about."""
-
     def inputs(self, task: int, letter: Any) -> list[Array]:
-        """Where the changes of a command go."""
         self._coming = np.empty(PhaseOrder(*letter).words, dtype=np.uint64)
         return [self._coming]
 
@@ -148,14 +91,11 @@ class ZonesJob:
         if order.is_new:
             self._phases.clear()
             self._caller.forget()
-        if order.is_new or order.zones != self._zones:
-            self._zones = order.zones
-            self._hosted.take(order.zones)
+        turn = ZoneTurn.heard(order.turn)
+        if order.is_new or order.turn[1] != self._zones:
+            self._zones = turn.zones.tolist()
+            self._hosted.take(self._zones)
         self._caller.take(self._coming)
-        turn = ZoneTurn(
-            ZonePhase(order.phase), np.array(order.zones, dtype=np.int64), order.side,
-            order.next_side, order.begins_step, tuple(order.sensors),
-        )  # fmt: skip
         self._run(turn)
         self._phases.note_results(self._caller, turn)
         stream = self._caller.stream
@@ -204,15 +144,7 @@ class ZonesJob:
             sense_here([scene], turns)
             self._spent_s[zone] += 1e-9 * (time.thread_time_ns() - began_ns)
 
-    def save(self) -> list[Array]:
-        """Nothing: the caller keeps all of it."""
-        return []
-
-    def load(self, saved: Sequence[Array]) -> None:
-        """Nothing to do."""
-
     def close(self) -> None:
-        """End the processes that the worlds have."""
         self._worlds.close()
 
     def _rehearse(self, zones: NDArray[np.int64]) -> None:

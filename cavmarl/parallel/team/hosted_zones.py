@@ -16,18 +16,13 @@ TIMED = 16  # one tick of so many is run zone by zone, with a clock
 
 
 class HostedZones:
-    """Runs phases on some shards of a world.
-
-    Args:
-        shards: all of the world, one a zone; every process knows them.
-        zones: that are run here; none is fine, too.
-        spent_s: (k,) where the processor time of each zone is added up; None: not measured.
-    """
+    """Runs phases on some shards of a world."""
 
     def __init__(
         self,
-        shards: Sequence[Shard],
-        zones: Sequence[int],
+        shards: Sequence[Shard],  # all of the world, one a zone; every process knows them
+        zones: Sequence[int],  # that are run here; none is fine, too
+        # (k,) where the processor time of each zone is added up; None: not measured
         spent_s: NDArray[np.float64] | None = None,
     ) -> None:
         self._all = shards

@@ -31,7 +31,7 @@ from cavmarl.parallel.processes.process_barrier import (
 )
 from cavmarl.parallel.processes.shared_memory import shared_zeros
 from cavmarl.parallel.team.hosted_zones import HostedZones
-from cavmarl.shards.executor import Phase
+from cavmarl.shards.phases import PHASES
 from cavmarl.shards.shard import Shard
 from cavmarl.shards.shard_group import ShardGroup
 
@@ -43,13 +43,8 @@ FAILED = 2
 CORE = 5  # a word of both: where the process was when it began with a phase
 
 # Methods of `ShardGroup` and `Shard` that are run together, by their code.
-TOGETHER = ("begin_step", "move", "gather", "resolve", "sense", "credit", "suggest")
+TOGETHER = tuple(rule.together for rule in PHASES.values() if rule.together)
 END = len(TOGETHER)
-# After which the next phase only asks that it has been run on the same zone: there is no wait
-# before a phase reads what other zones have made of it.
-WAITED_FOR_LATER = ("begin_step", "resolve")
-# What the leader runs on all zones, and what asks for nothing that those write.
-AT_ANY_TIME = ("commit", "detect")
 
 
 class LeftAloneError(Exception):
@@ -57,21 +52,16 @@ class LeftAloneError(Exception):
 
 
 class Team:
-    """The workers of one world and their zones; made before the processes start.
-
-    Args:
-        shards: one a zone, in the order of zones; their arrays are shared.
-        zones: of each worker, to begin with; the first leads.
-        known: what phases are called with that are run together, by their names: for each phase all
-            that there is to choose from; the arrays among it are shared.
-        spent_s: (k,) where the processor time of each zone is added up; None: not measured.
-    """
+    """The workers of one world and their zones; made before the processes start."""
 
     def __init__(
         self,
-        shards: Sequence[Shard],
-        zones: Sequence[Sequence[int]],
+        shards: Sequence[Shard],  # one a zone, in the order of zones; their arrays are shared
+        zones: Sequence[Sequence[int]],  # of each worker, to begin with; the first leads
+        # what phases are called with that are run together, by their names: for each phase all that
+        # there is to choose from; the arrays among it are shared
         known: Mapping[str, Sequence[tuple[Any, ...]]],
+        # (k,) where the processor time of each zone is added up; None: not measured
         spent_s: NDArray[np.float64] | None = None,
     ) -> None:
         self.known = {name: tuple(known.get(name, ((),))) for name in TOGETHER}
@@ -87,11 +77,7 @@ class Team:
 
 
 class Leader:
-    """Runs each phase on all shards of a world, with the help of the followers; an `Executor`.
-
-    Args:
-        team: that it leads.
-    """
+    """Runs each phase on all shards of a world, with the help of the followers; an `Executor`."""
 
     def __init__(self, team: Team) -> None:
         self._known = team.known
@@ -117,7 +103,7 @@ class Leader:
         finally:
             self._dismiss()
 
-    def end_after(self, phase: Phase | str) -> None:
+    def end_after(self, phase: str) -> None:
         """Let the followers end the command with the next phase of that name that they run."""
         self._last = phase
 
@@ -131,19 +117,14 @@ class Leader:
         """From now on these zones are its own; the others are the followers'."""
         self._own.take(zones)
 
-    def each(self, phase: Phase, *arguments: Any) -> None:
-        """Run a phase on every shard.
-
-        Raises:
-            LeftAloneError: a follower has failed.
-        """
-        name: str = phase
-        if phase == "advance":
+    def each(self, phase: str, *arguments: Any) -> None:
+        """Run a phase on every shard. Raises LeftAloneError: a follower has failed."""
+        rule = PHASES[phase]
+        name = rule.together or phase
+        if name == "move":
             self._everybody.turn()
-            name = "move"
         which = self._which(name, arguments)
-        is_late = name in WAITED_FOR_LATER
-        if (which < 0 and name not in AT_ANY_TIME) or is_late:
+        if (which < 0 and not rule.is_early) or rule.is_late:
             self.meet()
         if which < 0:
             self._everybody.each(name, *arguments)
@@ -151,18 +132,14 @@ class Leader:
         self._announce(self._codes[name], which)
         self._is_ahead = True
         self._own.each(name, *arguments)
-        if is_late:
+        if rule.is_late:
             return
         self.meet()
         if name == self._last:
             self._dismiss()
 
     def meet(self) -> None:
-        """Wait until the followers are through with the last phase, whatever it was.
-
-        Raises:
-            LeftAloneError: a follower has failed.
-        """
+        """Wait until the followers are through with the last phase, whatever it was."""
         if not self._is_ahead:
             return
         self._wait()
@@ -194,12 +171,7 @@ class Leader:
 
 
 class TeamFollower:
-    """Runs the phases that the leader announces on its own shards.
-
-    Args:
-        team: that it belongs to.
-        number: in the team, from 1.
-    """
+    """Runs the phases that the leader announces on its own shards."""
 
     def __init__(self, team: Team, number: int) -> None:
         self._known = team.known
@@ -231,7 +203,6 @@ class TeamFollower:
             raise failure
 
     def take(self, zones: Sequence[int]) -> None:
-        """From now on these zones are its own."""
         self._own.take(zones)
 
     def _get_out_of_the_way(self) -> None:

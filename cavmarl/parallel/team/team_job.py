@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from cavmarl.parallel.checkpoint.checkpoint_job import CheckpointJob
 from cavmarl.parallel.checkpoint.checkpoint_log import CheckpointLog
 from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.processes.worker_loop import Job
 from cavmarl.parallel.team.team import Leader, Team, TeamFollower
 from cavmarl.parallel.worlds_job import Task, WorldsJob
 from cavmarl.shards.shard import Shard
@@ -23,22 +24,15 @@ ALONE = (Task.STATE_HASH, Task.TRAFFIC_STATS, Task.DRIVEN, Task.SIGNAL_PHASES)
 
 
 class LeaderJob(CheckpointJob):
-    """One world that several workers run, of which this one leads.
-
-    Args:
-        worlds: the one; what its shards write is shared.
-        first: its number among all.
-        zones: that each worker hosts, to begin with; the leader's first.
-        diary: the checkpoint log in which it leaves the state behind.
-        spent_s: (k,) where the processor time of each zone is added up; None: not measured.
-    """
+    """One world that several workers run, of which this one leads."""
 
     def __init__(
         self,
-        worlds: LocalWorlds,
-        first: int,
-        zones: Sequence[Sequence[int]],
-        diary: CheckpointLog,
+        worlds: LocalWorlds,  # the one; what its shards write is shared
+        first: int,  # its number among all
+        zones: Sequence[Sequence[int]],  # that each worker hosts, to begin with; the leader's first
+        diary: CheckpointLog,  # the checkpoint log in which it leaves the state behind
+        # (k,) where the processor time of each zone is added up; None: not measured
         spent_s: NDArray[np.float64] | None = None,
     ) -> None:
         super().__init__(worlds, first, diary)
@@ -72,7 +66,6 @@ class LeaderJob(CheckpointJob):
         self._team.forget()
 
     def perform(self, task: int, letter: Any) -> Any:
-        """Do a task; the answer of those that have one."""
         if task in ALONE:
             return super().perform(task, letter)
         if task == Task.HOST:
@@ -103,15 +96,8 @@ class LeaderJob(CheckpointJob):
         super().load([place])
 
 
-class FollowerJob:
-    """Some zones of one world, of which other workers have the rest.
-
-    Args:
-        follower: that runs their phases.
-        world: the world's number among all.
-        number: in the team, from 1.
-        hosts: (k,) number in the team of each zone's worker.
-    """
+class FollowerJob(Job):
+    """Some zones of one world, of which other workers have the rest."""
 
     def __init__(
         self, follower: TeamFollower, world: int, number: int, hosts: NDArray[np.int64]
@@ -120,12 +106,6 @@ class FollowerJob:
         self._world = world
         self._number = number
         self._hosts = hosts
-
-    def afterwards(self) -> None:
-        """Nothing to do."""
-
-    def prepare(self) -> None:
-        """Nothing to do."""
 
     def perform(self, task: int, letter: Any) -> None:
         if task == Task.HOST:
@@ -146,11 +126,7 @@ class FollowerJob:
 
 
 def _hosts(zones: Sequence[Sequence[int]]) -> NDArray[np.int64]:
-    """(k,) number in the team of each zone's worker.
-
-    Args:
-        zones: of each worker.
-    """
+    """(k,) number in the team of each zone's worker."""
     hosts = np.zeros(sum(map(len, zones)), dtype=np.int64)
     for number, hosted in enumerate(zones):
         hosts[list(hosted)] = number

@@ -113,22 +113,12 @@ def _delay(roads: RoadArrays, row: np.void, step_s: float) -> float:
 @kernel
 def write_terms(
     roads: RoadArrays,
-    rows: NDArray[np.void],
-    i: int,
-    grid: Grid,
-    step_s: float,
-    out: NDArray[np.float32],
+    rows: NDArray[np.void],  # VEHICLE (C,) at the end of the step
+    i: int,  # row of the agent's vehicle
+    grid: Grid,  # filled from these rows
+    step_s: float,  # seconds a step
+    out: NDArray[np.float32],  # (NUM_TERMS,) in the order of `config.TERMS`
 ) -> None:
-    """Write row i's terms.
-
-    Args:
-        roads: the road arrays.
-        rows: VEHICLE (C,) at the end of the step.
-        i: row of the agent's vehicle.
-        grid: filled from these rows.
-        step_s: seconds a step.
-        out: (NUM_TERMS,) in the order of `config.TERMS`.
-    """
     row = rows[i]
     out[0] = _progress(row, step_s)
     out[1] = _speed(roads, row)

@@ -13,7 +13,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from cavmarl.config.rig import MountedConfig, SampledConfig
 from cavmarl.core.math.neighbors import Grid
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.core.records.arrays import LaneGrid, RoadArrays, Travel, Worlds
 from cavmarl.roads.kernels.backdrop_pieces import Backdrop
 from cavmarl.roads.network import RoadNetwork
@@ -75,7 +75,7 @@ class MountedSensor(ABC, Generic[C]):
         self.lines = np.zeros((platform.num_worlds, platform.num_agents, 2), dtype=np.int32)
         self.lines[..., 1] = self.num_lines(config)
         check_place(name, config, platform.body)
-        self._measure = repeated(type(self).kernel)
+        self._measure = specialized(type(self).kernel)
 
     @cached_property
     def noise(self) -> Noise:

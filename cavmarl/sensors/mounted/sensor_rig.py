@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.rig import MountedConfig, SampledConfig, cadence
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.sensors.kernels.rig_frames import (
     POSE,
     Due,
@@ -71,8 +71,8 @@ class Rig:
         self.sense: Sense = sense_here
         self._is_new = True
         self._everywhere = np.ones(len(ids), dtype=np.bool_)
-        self._call_roll = repeated(call_roll)
-        self._note_poses = repeated(note_poses)
+        self._call_roll = specialized(call_roll)
+        self._note_poses = specialized(note_poses)
 
     @property
     def sensors(self) -> list[MountedSensor[Any]]:
@@ -146,8 +146,8 @@ class _Mounted:
         self._sim_dt_s = platform.sim_dt_s
         self._stream = stream_of(sensor.name)
         self._bytes = frames.data.reshape((*frames.lost.shape, -1)).view(np.uint8)
-        self._call_due = repeated(call_due)
-        self._deliver = repeated(deliver)
+        self._call_due = specialized(call_due)
+        self._deliver = specialized(deliver)
 
     def clear(self, chosen: NDArray[np.bool_]) -> None:
         """Write zeros for some worlds (W,), or agents (W, A)."""

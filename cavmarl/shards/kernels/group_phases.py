@@ -67,25 +67,25 @@ def _worlds(members: Members, zone: int, side: int, next_side: int) -> Worlds:
     zoned = members.zoned
     common = members.common
     return Worlds(
-        zoned.rows[side, zone],
-        zoned.rows[next_side, zone],
-        zoned.num_owned[zone],
-        zoned.num_rows[zone],
-        common.ticks,
-        common.keys,
-        common.signal_phase,
-        common.controllers,
-        common.detected_s,
-        zoned.num_through[zone],
-        common.pending,
-        zoned.num_near[zone],
-        zoned.num_touching[zone],
-        zoned.num_contacts[zone],
-        zoned.step[zone],
-        zoned.step_at[zone],
-        zoned.outer[zone],
-        zoned.num_outer[zone],
-        common.cues,
+        rows=zoned.rows[side, zone],
+        next_rows=zoned.rows[next_side, zone],
+        num_owned=zoned.num_owned[zone],
+        num_rows=zoned.num_rows[zone],
+        ticks=common.ticks,
+        keys=common.keys,
+        signal_phase=common.signal_phase,
+        controllers=common.controllers,
+        detected_s=common.detected_s,
+        num_through=zoned.num_through[zone],
+        pending=common.pending,
+        num_near=zoned.num_near[zone],
+        num_touching=zoned.num_touching[zone],
+        num_contacts=zoned.num_contacts[zone],
+        step=zoned.step[zone],
+        step_at=zoned.step_at[zone],
+        outer=zoned.outer[zone],
+        num_outer=zoned.num_outer[zone],
+        cues=common.cues,
     )
 
 
@@ -94,17 +94,17 @@ def _grid(frame: np.void, room: Grid) -> Grid:
     """A zone's spatial index, in the room of the largest one."""
     cells = frame["num_x"] * frame["num_y"]
     return Grid(
-        frame["min_x"],
-        frame["min_y"],
-        frame["cells_per_m"],
-        frame["num_x"],
-        frame["num_y"],
-        room.start[: cells + 1],
-        room.bodies,
-        room.cell,
-        room.largest,
-        room.newest[:cells],
-        room.spots,
+        min_x=frame["min_x"],
+        min_y=frame["min_y"],
+        cells_per_m=frame["cells_per_m"],
+        num_x=frame["num_x"],
+        num_y=frame["num_y"],
+        start=room.start[: cells + 1],
+        bodies=room.bodies,
+        cell=room.cell,
+        largest=room.largest,
+        newest=room.newest[:cells],
+        spots=room.spots,
     )
 
 
@@ -150,21 +150,11 @@ def gather_each(members: Members, side: int, touching_m: float, border_m: float)
     """`gather` in each zone; zones of other calls may run beside it."""
     for w in range(members.common.ticks.size):
         for zone in members.numbers:
-            gather(
-                members.zones,
-                members.halo,
-                touching_m,
-                border_m,
-                members.zoned,
-                side,
-                zone,
-                w,
-            )
+            gather(members.zones, members.halo, touching_m, border_m, members.zoned, side, zone, w)
 
 
 @kernel
 def resolve_each(members: Members, side: int, next_side: int, scratch: Scratch, room: Grid) -> None:
-    """`resolve` in each zone."""
     for n in range(members.numbers.size):
         worlds = _worlds(members, members.numbers[n], side, next_side)
         resolve(worlds, scratch, _grid(members.frames[n], room))
@@ -179,7 +169,6 @@ def begin_step_each(
     meta_actions: NDArray[np.int64],
     target_speeds: NDArray[np.float64],
 ) -> None:
-    """`begin_step` in each zone."""
     for zone in members.numbers:
         worlds = _worlds(members, zone, side, side)
         begin_step(roads, worlds, discrete, meta_actions, target_speeds)
@@ -187,7 +176,6 @@ def begin_step_each(
 
 @kernel
 def detect_each(members: Members, side: int, roads: RoadArrays, dt: float) -> None:
-    """`detect` in each zone."""
     for zone in members.numbers:
         worlds = _worlds(members, zone, side, side)
         detect(
@@ -215,29 +203,16 @@ def sense_each(
     chosen: NDArray[np.bool_],
     outputs: Outputs,
 ) -> None:
-    """`sense` in each zone."""
     for n in range(members.numbers.size):
         worlds = _worlds(members, members.numbers[n], side, side)
         grid = _grid(members.frames[n], room)
-        sense(
-            roads,
-            plans,
-            travel,
-            worlds,
-            grid,
-            sensors,
-            tick_s,
-            ticks_per_step,
-            chosen,
-            outputs,
-        )
+        sense(roads, plans, travel, worlds, grid, sensors, tick_s, ticks_per_step, chosen, outputs)
 
 
 @kernel
 def credit_each(
     members: Members, side: int, rewards: NDArray[np.float32], chosen: NDArray[np.bool_]
 ) -> None:
-    """`credit` in each zone."""
     for zone in members.numbers:
         worlds = _worlds(members, zone, side, side)
         credit(worlds.rows, worlds.num_owned, rewards, chosen)
@@ -255,7 +230,6 @@ def choose_goals_each(
     gate: Gate,
     dt: float,
 ) -> None:
-    """`choose_goals` in each zone."""
     for zone in members.numbers:
         worlds = _worlds(members, zone, side, next_side)
         choose_goals(demand, roads, travel, num_goals, gate, worlds, dt)
@@ -271,7 +245,6 @@ def rank_lanes_each(
     gate: Gate,
     scratch: Scratch,
 ) -> None:
-    """`rank_lanes` in each zone."""
     for zone in members.numbers:
         worlds = _worlds(members, zone, side, next_side)
         rank_lanes(roads, travel, members.zones, zone, gate, worlds, scratch)
@@ -288,7 +261,6 @@ def propose_each(
     gate: Gate,
     scratch: Scratch,
 ) -> None:
-    """`propose` in each zone."""
     for zone in members.numbers:
         worlds = _worlds(members, zone, side, next_side)
         propose(demand, roads, travel, members.zones, zone, gate, worlds, scratch)
@@ -296,7 +268,6 @@ def propose_each(
 
 @kernel
 def admit_each(members: Members, side: int, next_side: int, gate: Gate) -> None:
-    """`admit` in each zone."""
     for zone in members.numbers:
         worlds = _worlds(members, zone, side, next_side)
         admit(members.zones, members.halo, zone, gate, worlds)
@@ -312,7 +283,6 @@ def retire_each(members: Members, side: int, gate: Gate, ticks_per_step: int) ->
 
 @kernel
 def forget_each(members: Members, side: int, gate: Gate) -> None:
-    """`drop_ghosts` in each zone."""
     for zone in members.numbers:
         worlds = _worlds(members, zone, side, side)
         drop_ghosts(gate, worlds, worlds.rows)

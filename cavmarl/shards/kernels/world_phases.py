@@ -45,20 +45,12 @@ from cavmarl.zones.kernels.zone_lookup import is_inside, note_outer
 @kernel
 def begin_step(
     roads: RoadArrays,
-    worlds: Worlds,
-    discrete: bool,
-    meta_actions: NDArray[np.int64],
-    target_speeds: NDArray[np.float64],
+    worlds: Worlds,  # the rows of agents are written
+    discrete: bool,  # whether actions are meta-actions
+    meta_actions: NDArray[np.int64],  # (W, A), ACTION_*; not read for continuous actions
+    target_speeds: NDArray[np.float64],  # m/s, rising
 ) -> None:
-    """Clear the accounts of the step and, with discrete actions, set the controllers' targets.
-
-    Args:
-        roads: the road arrays.
-        worlds: the rows of agents are written.
-        discrete: whether actions are meta-actions.
-        meta_actions: (W, A), ACTION_*; not read for continuous actions.
-        target_speeds: m/s, rising.
-    """
+    """Clear the accounts of the step and, with discrete actions, set the controllers' targets."""
     for w in range(worlds.ticks.shape[0]):
         for i in range(worlds.num_owned[w]):
             row = worlds.rows[w, i]
@@ -150,39 +142,21 @@ def _drive_agent(
 @kernel
 def advance(
     roads: RoadArrays,
-    plans: NDArray[np.void],
+    plans: NDArray[np.void],  # PLAN (G, L)
     travel: Travel,
-    lane_grid: LaneGrid,
-    worlds: Worlds,
-    inner: NDArray[np.float64],
+    lane_grid: LaneGrid,  # which lanes lie near a place
+    worlds: Worlds,  # next_rows is written
+    inner: NDArray[np.float64],  # the part of the zone that no other one sees; see `Halo`
     scratch: Scratch,
+    # (W, A, 2) throttle in m/s² and steering in rad of continuous actions
     commands: NDArray[np.float64],
-    discrete: bool,
-    accel_limit: float,
-    steering_limit: float,
-    dt: float,
-    in_place: bool,
-) -> int:
-    """Decide all controls from the committed rows, then move every owned row into `next_rows`.
-
-    Args:
-        roads: the road arrays.
-        plans: PLAN (G, L).
-        travel: types and ways.
-        lane_grid: which lanes lie near a place.
-        worlds: next_rows is written.
-        inner: the part of the zone that no other one sees; see `Halo`.
-        scratch: room.
-        commands: (W, A, 2) throttle in m/s² and steering in rad of continuous actions.
-        discrete: whether agents are driven by the controllers instead.
-        accel_limit: m/s², of the agents' throttle.
-        steering_limit: rad, of the agents' front wheels.
-        dt: seconds of the tick.
-        in_place: whether `next_rows` is `rows`; if not, rows are put in the order of the lanes.
-
-    Returns:
-        how many background vehicles have arrived, in all worlds.
-    """
+    discrete: bool,  # whether agents are driven by the controllers instead
+    accel_limit: float,  # m/s², of the agents' throttle
+    steering_limit: float,  # rad, of the agents' front wheels
+    dt: float,  # seconds of the tick
+    in_place: bool,  # whether `next_rows` is `rows`; if not, rows are put in the order of the lanes
+) -> int:  # how many background vehicles have arrived, in all worlds
+    """Decide all controls from the committed rows, then move every owned row into `next_rows`."""
     arrived = 0
     for w in range(worlds.ticks.shape[0]):
         rows = worlds.rows[w]
@@ -263,15 +237,14 @@ def advance(
 
 
 @kernel
-def resolve(worlds: Worlds, scratch: Scratch, grid: Grid) -> None:
-    """Mark contacts in `next_rows`.
-
-    Args:
-        worlds: events and hit of the owned next_rows are written; num_contacts rises by one for
-            each vehicle when it begins to touch another.
-        scratch: room.
-        grid: spatial index over the vehicles of one world, filled here as far as it is needed.
-    """
+def resolve(
+    # events and hit of the owned next_rows are written; num_contacts rises by one for each vehicle
+    # when it begins to touch another
+    worlds: Worlds,
+    scratch: Scratch,
+    grid: Grid,  # spatial index over the vehicles of one world, filled here as far as it is needed
+) -> None:
+    """Mark contacts in `next_rows`."""
     for w in range(worlds.ticks.shape[0]):
         rows = worlds.next_rows[w]
         touch = find_contacts(rows, worlds.num_near[w], grid, scratch.hit)
@@ -290,31 +263,19 @@ def resolve(worlds: Worlds, scratch: Scratch, grid: Grid) -> None:
 @kernel
 def suggest(
     roads: RoadArrays,
-    plans: NDArray[np.void],
+    plans: NDArray[np.void],  # PLAN (G, L)
     travel: Travel,
-    worlds: Worlds,
+    worlds: Worlds,  # not written
     scratch: Scratch,
-    discrete: bool,
-    target_speeds: NDArray[np.float64],
-    lookahead_s: float,
-    dt: float,
+    discrete: bool,  # whether to answer with meta-actions
+    target_speeds: NDArray[np.float64],  # m/s, rising; discrete only
+    lookahead_s: float,  # horizon in which a target speed is to be reached; discrete only
+    dt: float,  # seconds of a tick
+    # (W, A, 2): throttle in m/s² and steering in rad, or the meta-action in [..., 0]. Rows of
+    # absent agents are left as they are
     out: NDArray[np.float64],
 ) -> None:
-    """What the built-in driver would do in the agents' place.
-
-    Args:
-        roads: the road arrays.
-        plans: PLAN (G, L).
-        travel: types and ways.
-        worlds: not written.
-        scratch: room.
-        discrete: whether to answer with meta-actions.
-        target_speeds: m/s, rising; discrete only.
-        lookahead_s: horizon in which a target speed is to be reached; discrete only.
-        dt: seconds of a tick.
-        out: (W, A, 2): throttle in m/s² and steering in rad, or the meta-action in [..., 0]. Rows
-            of absent agents are left as they are.
-    """
+    """What the built-in driver would do in the agents' place."""
     for w in range(worlds.ticks.shape[0]):
         rows = worlds.rows[w]
         owned = worlds.num_owned[w]

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import CapacityError, SumoError
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.core.records.arrays import Gate, RoadArrays, Travel, Worlds, Zoned
 from cavmarl.core.records.codes import COUNT_REROUTED, LANE_GIVEN, POS_GIVEN, SPEED_MAX
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
@@ -122,10 +122,10 @@ class SumoTraffic:
         self._dt = demand.dt_s
         self._replay_bytes = demand.replay_bytes
         self._shown = ShownSignals(network, num_worlds)
-        self._mirror = repeated(mirror)
-        self._greet = repeated(greet)
-        self._list_others = repeated(list_others)
-        self._send_on = repeated(send_on)
+        self._mirror = specialized(mirror)
+        self._greet = specialized(greet)
+        self._list_others = specialized(list_others)
+        self._send_on = specialized(send_on)
         self._others = np.zeros(capacity, dtype=zoned.rows.dtype)
         lanes, links = network.lanes, network.links
         leads_to = np.where(lanes["internal"], links["to_lane"][lanes["link"]], -1)

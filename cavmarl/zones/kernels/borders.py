@@ -37,27 +37,20 @@ class Borders(NamedTuple):
 @kernel
 def find_near(
     zones: ZoneArrays,
-    borders: Borders,
-    zoned: Zoned,
-    side: int,
+    borders: Borders,  # when a vehicle is near one
+    zoned: Zoned,  # the rows of all zones
+    side: int,  # whose rows, 0 or 1
     w: int,
+    # whether to look at all owned rows, and not only at those that `exchange` has found near a
+    # border
     everybody: bool,
+    # NEAR (2 C,) overwritten: by zones and rows, a crossing before an approach
     out: NDArray[np.void],
 ) -> int:
     """The owned rows that other zones have to be told of; how many entries there are.
 
     A vehicle is near a zone that it lies in, further than the hysteresis outside of its own, and
     one that it would lie in so after `ahead_s` at its present velocity.
-
-    Args:
-        zones: of the partition.
-        borders: when a vehicle is near one.
-        zoned: the rows of all zones.
-        side: whose rows, 0 or 1.
-        w: in which world.
-        everybody: whether to look at all owned rows, and not only at those that `exchange` has
-            found near a border.
-        out: NEAR (2 C,) overwritten: by zones and rows, a crossing before an approach.
     """
     found = 0
     for zone in range(zones.rects.shape[0]):
@@ -127,21 +120,18 @@ def _note(
 
 @kernel
 def pass_on(
-    vehicle: int, source: int, row: int, target: int, epoch: int, zoned: Zoned, side: int, w: int
+    vehicle: int,
+    source: int,  # the zone that owns it
+    row: int,  # where it probably is there
+    target: int,  # the zone that will own it
+    epoch: int,  # from then on
+    zoned: Zoned,  # the rows of all zones, and how many they are
+    side: int,  # whose rows, 0 or 1
+    w: int,
 ) -> int:
     """Make a vehicle a ghost of the zone that owned it, and an owned row where it was a ghost.
 
     The new row says what the old one does, but for its owner and epoch.
-
-    Args:
-        vehicle: its id.
-        source: the zone that owns it.
-        row: where it probably is there.
-        target: the zone that will own it.
-        epoch: from then on.
-        zoned: the rows of all zones, and how many they are.
-        side: whose rows, 0 or 1.
-        w: in which world.
 
     Returns:
         its row at the target; -1: the source does not own it; -2: the target has no ghost of it.

@@ -34,32 +34,22 @@ ROW_LINES = 6  # of memory, that a VEHICLE row takes
 @kernel
 def exchange(
     zones: ZoneArrays,
-    halo: Halo,
-    touching_m: float,
-    borders: Borders,
+    halo: Halo,  # from `roads.zone_halo.zone_halo`, for the same partition
+    touching_m: float,  # no ghost further outside of a zone can touch one of its vehicles
+    borders: Borders,  # when a vehicle is near one
+    # the ghosts and how many there are, border and num_border are written. Of the owned rows those
+    # in `outer` are looked at; they are noted here, if they are not yet
     zoned: Zoned,
-    side: int,
-    first: int,
-    last: int,
-    book: BorderRecords,
+    side: int,  # whose rows, 0 or 1
+    first: int,  # the first world
+    last: int,  # the one after the last
+    book: BorderRecords,  # vehicles near a border are written
 ) -> None:
     """Renew all ghosts of some worlds from the owned rows, and note vehicles near a border.
 
     Zone z needs a vehicle if and only if a driver there may ask about it (`zones.is_seen`). A
     vehicle that has left its own zone's rectangle, because its transfer is late, is published like
     any other, to the zone that it is in as well.
-
-    Args:
-        zones: of the partition.
-        halo: from `roads.zone_halo.zone_halo`, for the same partition.
-        touching_m: no ghost further outside of a zone can touch one of its vehicles.
-        borders: when a vehicle is near one.
-        zoned: the ghosts and how many there are, border and num_border are written. Of the owned
-            rows those in `outer` are looked at; they are noted here, if they are not yet.
-        side: whose rows, 0 or 1.
-        first: the first world.
-        last: the one after the last.
-        book: vehicles near a border are written.
     """
     # No other vehicle can be behind a border by then.
     border_m = borders.max_speed_mps * borders.ahead_s
@@ -78,28 +68,19 @@ def exchange(
 @kernel
 def gather(
     zones: ZoneArrays,
-    halo: Halo,
-    touching_m: float,
-    border_m: float,
+    halo: Halo,  # as for `exchange`
+    touching_m: float,  # as for `exchange`
+    border_m: float,  # within that of another zone an owned row is at a border, m
+    # the ghosts of this zone and how many there are, its border and num_border are written; outer
+    # and num_outer stay
     zoned: Zoned,
-    side: int,
-    zone: int,
+    side: int,  # whose rows, 0 or 1
+    zone: int,  # whose ghosts
     w: int,
 ) -> None:
     """Renew the ghosts of one zone from all others' owned rows, and note vehicles at a border.
 
     It writes what is this zone's alone, and reads of the others what no other call of it writes.
-
-    Args:
-        zones: of the partition.
-        halo: as for `exchange`.
-        touching_m: as for `exchange`.
-        border_m: within that of another zone an owned row is at a border, m.
-        zoned: the ghosts of this zone and how many there are, its border and num_border are
-            written; outer and num_outer stay.
-        side: whose rows, 0 or 1.
-        zone: whose ghosts.
-        w: in which world.
     """
     near_limit = touching_m * touching_m
     border_limit = min(halo.halo_m * halo.halo_m, border_m * border_m)
@@ -142,17 +123,13 @@ def gather(
 
 @kernel
 def note_gathered(
-    zones: ZoneArrays, borders: Borders, zoned: Zoned, side: int, book: BorderRecords
+    zones: ZoneArrays,
+    borders: Borders,  # when a vehicle is near one
+    zoned: Zoned,  # num_outer is written: rows may change from here on
+    side: int,  # whose rows, 0 or 1
+    book: BorderRecords,  # vehicles near a border are written
 ) -> None:
-    """All zones have gathered their ghosts: note vehicles near a border, as `exchange` does.
-
-    Args:
-        zones: of the partition.
-        borders: when a vehicle is near one.
-        zoned: num_outer is written: rows may change from here on.
-        side: whose rows, 0 or 1.
-        book: vehicles near a border are written.
-    """
+    """All zones have gathered their ghosts: note vehicles near a border, as `exchange` does."""
     for w in range(zoned.num_outer.shape[1]):
         for zone in range(zones.rects.shape[0]):
             zoned.num_outer[zone, w] = -1
@@ -225,12 +202,7 @@ def _publish(
 
 @inlined_kernel
 def _note_due(
-    due: np.void,
-    outer: np.void,
-    zone: int,
-    squared: float,
-    near_limit: float,
-    border_limit: float,
+    due: np.void, outer: np.void, zone: int, squared: float, near_limit: float, border_limit: float
 ) -> None:
     """Note a row for a zone that is so far away, as squares of m; it counts if its place stays."""
     due["row"] = outer["row"]
@@ -297,13 +269,10 @@ def _take_ghost(
 @kernel
 def take_own(
     zones: ZoneArrays, zone: int, source: NDArray[np.void], num: int, rows: NDArray[np.void]
-) -> int:
+) -> int:  # how many
     """Copy the rows of `source[:num]` that lie in a zone, as its own, to the front of `rows`.
 
     `source` and `rows` may be the same array.
-
-    Returns:
-        how many.
     """
     found = 0
     for i in range(num):

@@ -95,13 +95,6 @@ class BorderRecords(NamedTuple):
 
 
 def make_book(num_worlds: int, capacity: int) -> BorderRecords:
-    """An empty one.
-
-    Args:
-        num_worlds: W.
-        capacity: rows that a zone can hold.
-    """
-
     def numbers(*shape: int) -> NDArray[np.int64]:
         return np.zeros((num_worlds, *shape), np.int64)
 
@@ -128,26 +121,15 @@ def make_book(num_worlds: int, capacity: int) -> BorderRecords:
 @kernel
 def look(
     zones: ZoneArrays,
-    borders: Borders,
-    zoned: Zoned,
-    side: int,
+    borders: Borders,  # when a vehicle is near one
+    zoned: Zoned,  # the rows of all zones
+    side: int,  # whose rows, 0 or 1
     w: int,
-    everybody: bool,
-    num_newborn: int,
-    book: BorderRecords,
+    everybody: bool,  # whether to look at all owned rows, see `find_near`
+    num_newborn: int,  # `book.newborn[w, :num_newborn]` stay where they are
+    book: BorderRecords,  # `near` and `coming` are written
 ) -> None:
-    """Note vehicles near a border, and those of them that have crossed it.
-
-    Args:
-        zones: of the partition.
-        borders: when a vehicle is near one.
-        zoned: the rows of all zones.
-        side: whose rows, 0 or 1.
-        w: in which world.
-        everybody: whether to look at all owned rows, see `find_near`.
-        num_newborn: `book.newborn[w, :num_newborn]` stay where they are.
-        book: `near` and `coming` are written.
-    """
+    """Note vehicles near a border, and those of them that have crossed it."""
     near = book.near[w]
     found = find_near(zones, borders, zoned, side, w, everybody, near)
     num = 0
@@ -182,25 +164,15 @@ def look_on(
 @kernel
 def hand_over(
     zones: ZoneArrays,
-    borders: Borders,
-    zoned: Zoned,
-    side: int,
+    borders: Borders,  # when a vehicle is near one
+    zoned: Zoned,  # the rows of all zones
+    side: int,  # whose rows, 0 or 1
     w: int,
-    everybody: bool,
-    num_newborn: int,
-    book: BorderRecords,
+    everybody: bool,  # whether rows have changed since `look_on`
+    num_newborn: int,  # see `look`
+    book: BorderRecords,  # written
 ) -> int:
     """Give every vehicle that lies beyond its zone's hysteresis to the zone that it is in.
-
-    Args:
-        zones: of the partition.
-        borders: when a vehicle is near one.
-        zoned: the rows of all zones.
-        side: whose rows, 0 or 1.
-        w: in which world.
-        everybody: whether rows have changed since `look_on`.
-        num_newborn: see `look`.
-        book: written.
 
     Returns:
         how many have changed, by rising ids at the end of `book.changes`; or NOT_OWNED or NOT_SEEN,
@@ -334,24 +306,14 @@ def _change(zoned: Zoned, side: int, w: int, near: np.void, book: BorderRecords)
 @kernel
 def release(
     zones: ZoneArrays,
-    zoned: Zoned,
-    side: int,
+    zoned: Zoned,  # the rows of all zones
+    side: int,  # whose rows, 0 or 1
     w: int,
-    changed: int,
-    now_ms: float,
-    book: BorderRecords,
+    changed: int,  # how many there are of them
+    now_ms: float,  # of a clock
+    book: BorderRecords,  # `changes` is written
 ) -> None:
-    """Note when the tick of the newest changes is over, and how far from their old zones they are.
-
-    Args:
-        zones: of the partition.
-        zoned: the rows of all zones.
-        side: whose rows, 0 or 1.
-        w: in which world.
-        changed: how many there are of them.
-        now_ms: of a clock.
-        book: `changes` is written.
-    """
+    """Note when the tick of the newest changes ends, and how far from their old zone they are."""
     last = book.num_changes[w]
     for n in range(last - changed, last):
         change = book.changes[w, n]

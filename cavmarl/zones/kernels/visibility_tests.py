@@ -47,7 +47,6 @@ class VisibilityScratch(NamedTuple):
 
 
 def make_room(num_lanes: int, num_links: int) -> VisibilityScratch:
-    """Room for a map."""
     first, last, ahead, behind, to_line, beyond = np.full((6, num_lanes), np.inf)
     asked, foe = np.zeros((2, num_links), dtype=np.bool_)
     waits, following = np.zeros(num_lanes, dtype=np.bool_), np.zeros(num_lanes, dtype=np.int32)
@@ -143,21 +142,14 @@ def _begin(
 @kernel
 def _spread(
     roads: RoadArrays,
+    # in the direction of driving, to the starts of lanes; if not, back to their ends
     forwards: bool,
-    limit_m: float,
+    limit_m: float,  # of a way
+    # (L,) m, finite where ways begin, inf elsewhere; those that are longer are left as they are
     ways: NDArray[np.float64],
-    room: VisibilityScratch,
+    room: VisibilityScratch,  # `waits` and `following` are used
 ) -> None:
-    """Shortest ways along the roads, from where they begin to all lanes within a limit.
-
-    Args:
-        roads: the road arrays.
-        forwards: in the direction of driving, to the starts of lanes; if not, back to their ends.
-        limit_m: of a way.
-        ways: (L,) m, finite where ways begin, inf elsewhere; those that are longer are left as
-            they are.
-        room: `waits` and `following` are used.
-    """
+    """Shortest ways along the roads, from where they begin to all lanes within a limit."""
     head = -1
     tail = -1
     for lane in range(ways.size):
@@ -312,25 +304,16 @@ def _look_at_junctions(
 @kernel
 def find_looks(
     roads: RoadArrays,
+    # (4,) min_x, min_y, max_x, max_y in m: where drivers of the zone, and departures that it lets
+    # in, can be
     rect: NDArray[np.float64],
-    view_m: float,
-    see_m: float,
-    half_m: float,
-    room: VisibilityScratch,
-    looks: NDArray[np.void],
+    view_m: float,  # how far any driver looks for others along the road
+    see_m: float,  # how far before a line its centre is when a driver first asks about the junction
+    half_m: float,  # half the length of the longest vehicle
+    room: VisibilityScratch,  # see `make_room`
+    looks: NDArray[np.void],  # LOOK (L,), overwritten
 ) -> None:
-    """Say for each lane where vehicles are that matter to the drivers of one zone.
-
-    Args:
-        roads: the road arrays.
-        rect: (4,) min_x, min_y, max_x, max_y in m: where drivers of the zone, and departures that
-            it lets in, can be.
-        view_m: how far any driver looks for others along the road.
-        see_m: how far before a line its centre is when a driver first asks about the junction.
-        half_m: half the length of the longest vehicle.
-        room: see `make_room`.
-        looks: LOOK (L,), overwritten.
-    """
+    """Say for each lane where vehicles are that matter to the drivers of one zone."""
     for lane in range(roads.lanes.shape[0]):
         looks[lane]["head"] = -math.inf
         looks[lane]["tail"] = math.inf
@@ -372,16 +355,12 @@ def _farther(
 
 @kernel
 def farthest_m(
-    roads: RoadArrays, rects: NDArray[np.float64], zone: int, looks: NDArray[np.void]
+    roads: RoadArrays,
+    rects: NDArray[np.float64],  # (k, 4) all zones, as in `ZoneArrays`
+    zone: int,
+    looks: NDArray[np.void],  # LOOK (L,) what `find_looks` has found for it
 ) -> float:
-    """How far outside of a zone the farthest place lies that its drivers may ask about.
-
-    Args:
-        roads: the road arrays.
-        rects: (k, 4) all zones, as in `ZoneArrays`.
-        zone: which one.
-        looks: LOOK (L,) what `find_looks` has found for it.
-    """
+    """How far outside of a zone the farthest place lies that its drivers may ask about."""
     squared = 0.0
     for lane in range(roads.lanes.shape[0]):
         look = looks[lane]

@@ -97,15 +97,13 @@ def zone_of(zones: ZoneArrays, x: float, y: float) -> int:
 
 
 @kernel
-def zones_of(zones: ZoneArrays, rows: NDArray[np.void], num: int, out: NDArray[np.int32]) -> None:
-    """`zone_of` for many.
-
-    Args:
-        zones: of the partition.
-        rows: records with `x` and `y` in metres, such as VEHICLE.
-        num: how many of them, `rows[:num]`.
-        out: (num,) or longer, overwritten.
-    """
+def zones_of(
+    zones: ZoneArrays,
+    rows: NDArray[np.void],  # records with `x` and `y` in metres, such as VEHICLE
+    num: int,  # how many of them, `rows[:num]`
+    out: NDArray[np.int32],  # (num,) or longer, overwritten
+) -> None:
+    """`zone_of` for many."""
     for i in range(num):
         out[i] = zone_of(zones, rows[i]["x"], rows[i]["y"])
 
@@ -146,13 +144,7 @@ def note_outer(outer: np.void, row: np.void, i: int) -> None:
 
 @inlined_kernel
 def is_asked_about(halo: Halo, watch: np.void, row: np.void) -> bool:
-    """Whether some driver of a zone that watches a vehicle's lane may ask about it.
-
-    Args:
-        halo: of all zones.
-        watch: WATCH of the lane.
-        row: VEHICLE or OUTER.
-    """
+    """Whether some driver of a zone that watches a vehicle's lane may ask about it."""
     # Answers are unpredictable: branches would cost more than all that they leave out.
     s = row["s"]
     reach_m = announced_m(row["speed"])
@@ -165,15 +157,13 @@ def is_asked_about(halo: Halo, watch: np.void, row: np.void) -> bool:
 
 
 @inlined_kernel
-def is_seen(halo: Halo, zone: int, row: np.void, squared: float) -> bool:
-    """Whether a zone has to see a vehicle whose `squared_distance` from it is known.
-
-    Args:
-        halo: of all zones.
-        zone: that sees, or not.
-        row: VEHICLE or OUTER.
-        squared: m².
-    """
+def is_seen(
+    halo: Halo,
+    zone: int,  # that sees, or not
+    row: np.void,  # VEHICLE or OUTER
+    squared: float,  # m²
+) -> bool:
+    """Whether a zone has to see a vehicle whose `squared_distance` from it is known."""
     if squared > halo.seen_m * halo.seen_m:
         return False
     if squared <= halo.sure_m * halo.sure_m:

@@ -44,13 +44,6 @@ class _Document:
 
 
 def read_zones(path: str | Path) -> ZonePartition:
-    """The partition of a zone file.
-
-    Raises:
-        ConfigError: unreadable, not YAML or JSON, an unknown or a doubled key, a wrong type; a
-            doubled or missing id, too many zones, or rectangles that overlap, leave a gap, leave
-            the bounds or are not finite; names the file, the zones, the place and the cure.
-    """
     from cavmarl.config.io import read_yaml, validate
 
     path = Path(path)
@@ -75,12 +68,7 @@ def read_zones(path: str | Path) -> ZonePartition:
 
 
 def zones_for(network: RoadNetwork, path: str | Path, count: int | None) -> ZonePartition:
-    """The partition of a zone file, which has to be of this map and have `count` zones, if given.
-
-    Raises:
-        ConfigError: see `read_zones`; see `read_zones`; another number of zones; roads beyond the
-            bounds.
-    """
+    """The partition of a zone file; has to be of this map, with `count` zones if that is given."""
     partition = read_zones(path)
     if count is not None and partition.count != count:
         raise ConfigError(
@@ -98,24 +86,13 @@ def zones_for(network: RoadNetwork, path: str | Path, count: int | None) -> Zone
 
 def named_zones(
     network: RoadNetwork,
-    layout: str,
-    count: int | None,
+    layout: str,  # one of ZONE_LAYOUTS, or a path
+    count: int | None,  # how many zones; None: as many as the file has, of a layout 4
     *,
-    avoid_junctions: bool = False,
-    weight: str = "lane_length",
+    avoid_junctions: bool = False,  # of `cut_map`
+    weight: str = "lane_length",  # of `cut_map`
 ) -> ZonePartition:
-    """The partition that a layout's name or the path of a zone file stands for.
-
-    Args:
-        network: the map.
-        layout: one of ZONE_LAYOUTS, or a path.
-        count: how many zones; None: as many as the file has, of a layout 4.
-        avoid_junctions: of `cut_map`.
-        weight: of `cut_map`.
-
-    Raises:
-        ConfigError: neither a layout nor a zone file; see `cut_map` and `zones_for`.
-    """
+    """The partition that a layout's name or the path of a zone file stands for."""
     if layout in ZONE_LAYOUTS:
         return cut_map(
             network,
@@ -133,11 +110,6 @@ def named_zones(
 
 
 def write_zones(path: str | Path, partition: ZonePartition) -> None:
-    """Write a partition as JSON, one zone a line.
-
-    Raises:
-        ConfigError: the file cannot be written.
-    """
     zones = ",\n".join(
         "  " + json.dumps({"id": zone, "rect_m": rect})
         for zone, rect in enumerate(partition.rects.tolist())

@@ -20,11 +20,7 @@ _ROUNDING_M = 1e-6
 
 
 def zone_halo(partition: ZonePartition, halo_m: float) -> Halo:
-    """What `kernels.exchange.exchange` takes, where all vehicles within the halo are seen.
-
-    Raises:
-        ConfigError: `halo_m` is negative or not finite.
-    """
+    """What `kernels.exchange.exchange` takes, where all vehicles within the halo are seen."""
     if not (math.isfinite(halo_m) and halo_m >= 0.0):
         raise ConfigError(f"halo_m = {halo_m!r}: must be a finite number from 0")
     rects = partition.reaching
@@ -46,16 +42,12 @@ def zone_halo(partition: ZonePartition, halo_m: float) -> Halo:
 
 
 def lane_watchers(
-    partition: ZonePartition, lanes: NDArray[np.void], looks: NDArray[np.void], within_m: float
+    partition: ZonePartition,  # of k zones
+    lanes: NDArray[np.void],  # LANE (L,)
+    looks: NDArray[np.void],  # LOOK (k, L), the vehicles that each zone may ask about
+    within_m: float,  # zones that are nearer to a lane's bounding box watch it in any case
 ) -> tuple[NDArray[np.int32], NDArray[np.void]]:
-    """`watcher_start` and `watchers` of a `Halo`.
-
-    Args:
-        partition: of k zones.
-        lanes: LANE (L,).
-        looks: LOOK (k, L), the vehicles that each zone may ask about.
-        within_m: zones that are nearer to a lane's bounding box watch it in any case.
-    """
+    """`watcher_start` and `watchers` of a `Halo`."""
     asked = looks["head"] > -np.inf
     for place in ("tail", "back", "line"):
         asked |= looks[place] < np.inf

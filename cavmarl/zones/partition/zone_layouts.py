@@ -35,43 +35,26 @@ _CLEAR_M = 1.0
 
 @dataclass(frozen=True)
 class _Area:
-    """What is cut: the map's box, what counts in it, and what to keep whole.
+    """What is cut: the map's box, what counts in it, and what to keep whole."""
 
-    Attributes:
-        bounds: the box.
-        samples: (n, 3) x, y and weight; none: area counts.
-        junctions: (m, 4) boxes that cuts avoid.
-    """
-
-    bounds: Bounds
-    samples: Floats | None
-    junctions: Floats
+    bounds: Bounds  # the box
+    samples: Floats | None  # (n, 3) x, y and weight; none: area counts
+    junctions: Floats  # (m, 4) boxes that cuts avoid
 
 
 def cut_map(
     network: RoadNetwork,
-    layout: str,
-    count: int,
+    layout: str,  # `grid`, `strips` or `bisection`
+    count: int,  # k
     *,
+    # move cuts aside, by at most a quarter of a zone's side (bisection: a tenth of the weight),
+    # where that keeps junctions whole
     avoid_junctions: bool = False,
-    weight: str = "lane_length",
+    weight: str = "lane_length",  # what bisection shares out: `lane_length`, or `uniform` for area
+    # (n, 3) x and y in m, and a weight: shared out instead, such as expected vehicles
     density: Floats | None = None,
 ) -> ZonePartition:
-    """Divide a map into `count` zones.
-
-    Args:
-        network: the map.
-        layout: `grid`, `strips` or `bisection`.
-        count: k.
-        avoid_junctions: move cuts aside, by at most a quarter of a zone's side (bisection: a tenth
-            of the weight), where that keeps junctions whole.
-        weight: what bisection shares out: `lane_length`, or `uniform` for area.
-        density: (n, 3) x and y in m, and a weight: shared out instead, such as expected vehicles.
-
-    Raises:
-        ConfigError: no such layout or weight, more zones than there can be or than the map can
-            hold, or a density that is none.
-    """
+    """Divide a map into `count` zones."""
     if layout not in ZONE_LAYOUTS:
         raise ConfigError(f"layout '{layout}': there are {', '.join(ZONE_LAYOUTS)}")
     if weight not in _WEIGHTS:
@@ -209,15 +192,14 @@ def _quantile(rect: Rect, samples: Floats | None, axis: int) -> Callable[[float]
     return place
 
 
-def _quiet_cut(area: _Area, rect: Rect, axis: int, window: tuple[float, float, float]) -> float:
-    """The cut within a window that divides the fewest junctions; of several the nearest.
-
-    Args:
-        area: whose junctions are kept whole.
-        rect: what is cut.
-        axis: 0: between left and right, 1: between below and above.
-        window: where it may begin, where the cut is wanted, where it may end.
-    """
+def _quiet_cut(
+    area: _Area,  # whose junctions are kept whole
+    rect: Rect,  # what is cut
+    axis: int,  # 0: between left and right, 1: between below and above
+    # where it may begin, where the cut is wanted, where it may end
+    window: tuple[float, float, float],
+) -> float:
+    """The cut within a window that divides the fewest junctions; of several the nearest."""
     first, wanted, last = window
     across = 1 - axis
     boxes = area.junctions

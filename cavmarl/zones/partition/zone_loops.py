@@ -11,12 +11,7 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 
 
 def zones_without_loop(network: RoadNetwork, partition: ZonePartition) -> tuple[int, ...]:
-    """The zones that hold no closed way: no edges, with the junctions between them, wholly inside.
-
-    Args:
-        network: the map.
-        partition: of the map.
-    """
+    """The zones that hold no closed way: no edges with the junctions between them wholly inside."""
     lanes, links = network.lanes, network.links
     places = np.stack([network.points["x"], network.points["y"]], axis=1)
     zones = partition.zones_of(places)

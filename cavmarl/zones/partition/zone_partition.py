@@ -26,32 +26,23 @@ _PLACE = np.dtype([("x", np.float64), ("y", np.float64)])
 
 @dataclass(frozen=True)
 class Neighbor:
-    """A zone that touches another.
-
-    Attributes:
-        zone: which.
-        corner: they share a corner and no more.
-    """
+    """A zone that touches another."""
 
     zone: int
-    corner: bool
+    corner: bool  # they share a corner and no more
 
 
 @dataclass(frozen=True, eq=False)
 class ZonePartition:
     """k zones, numbered from 0, that cover the plane without overlap.
 
-    Attributes:
-        bounds: the box of the map that was divided. Sides of zones on it count as the rim.
-        rects: (k, 4) min_x, min_y, max_x, max_y in metres, within `bounds` and together all of it;
-            read-only.
-
     Raises:
         ConfigError: the rectangles overlap, leave a gap, leave `bounds` or are none; the message
             names the zones and the place.
     """
 
-    bounds: Bounds
+    bounds: Bounds  # the box of the map that was divided. Sides of zones on it count as the rim
+    # (k, 4) min_x, min_y, max_x, max_y in metres, within `bounds` and together all of it; read-only
     rects: NDArray[np.float64]
 
     def __post_init__(self) -> None:

@@ -28,25 +28,16 @@ def imbalance(values: Sequence[float]) -> float:
 
 @dataclass(frozen=True)
 class ZoneStatistics:
-    """Figures of a partition; tuples go by zone.
+    """Figures of a partition; tuples go by zone."""
 
-    Attributes:
-        lane_km: length of lanes outside of junctions.
-        junctions: in which ways cross or merge.
-        junctions_cut: of these, in more than one zone.
-        cut_junctions: of the cut ones, how many each zone has a part of.
-        vehicles: owned by place; zeros without positions.
-        ghosts: that each zone is given at most, all within its halo; zeros without positions.
-        narrow: zones with a side shorter than the halo. They are exact; most of what they simulate
-            are ghosts.
-    """
-
-    lane_km: tuple[float, ...]
-    junctions: int
-    junctions_cut: int
-    cut_junctions: tuple[int, ...]
-    vehicles: tuple[int, ...]
+    lane_km: tuple[float, ...]  # length of lanes outside of junctions
+    junctions: int  # in which ways cross or merge
+    junctions_cut: int  # of these, in more than one zone
+    cut_junctions: tuple[int, ...]  # of the cut ones, how many each zone has a part of
+    vehicles: tuple[int, ...]  # owned by place; zeros without positions
+    # that each zone is given at most, all within its halo; zeros without positions
     ghosts: tuple[int, ...]
+    # zones with a side shorter than the halo. They are exact; most of what they simulate are ghosts
     narrow: tuple[int, ...]
 
     @property
@@ -68,17 +59,9 @@ def zone_statistics(
     partition: ZonePartition,
     network: RoadNetwork,
     *,
-    halo_m: float = 0.0,
-    positions: Floats | None = None,
+    halo_m: float = 0.0,  # how far zones see over their borders
+    positions: Floats | None = None,  # (n, 2) x and y of vehicles in m
 ) -> ZoneStatistics:
-    """Count what is in each zone.
-
-    Args:
-        partition: of the map.
-        network: the map.
-        halo_m: how far zones see over their borders.
-        positions: (n, 2) x and y of vehicles in m.
-    """
     places = np.empty((0, 2)) if positions is None else np.asarray(positions, dtype=np.float64)
     owners = partition.zones_of(places)
     boxes = junction_boxes(network)

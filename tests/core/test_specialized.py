@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from cavmarl.core.numba import kernel
-from cavmarl.core.numba.repeated import repeated
+from cavmarl.core.numba.specialized import specialized
 
 settings: Any = numba.core.config
 compiled_only = pytest.mark.skipif(
@@ -29,7 +29,7 @@ def rise(pair: Pair, by: int) -> int:
 
 
 def test_it_does_what_the_kernel_does_with_other_arrays_of_the_same_types() -> None:
-    call = repeated(rise)
+    call = specialized(rise)
     for number in (1, 3):
         counts = np.arange(number)
         assert call(Pair(counts, 0.5), 4) == 4
@@ -43,7 +43,7 @@ def test_types_are_looked_at_in_the_first_call_alone(monkeypatch: pytest.MonkeyP
     looked = []
     typeof: Any = numba.typeof
     monkeypatch.setattr(numba, "typeof", lambda value: looked.append(value) or typeof(value))
-    call = repeated(rise)
+    call = specialized(rise)
     for _ in range(3):
         call(Pair(np.arange(2), 0.5), 1)
     assert len(looked) == 2
@@ -54,4 +54,36 @@ def test_where_kernels_are_checked_the_kernel_itself_is_called(
     setting: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(settings, setting, 1)
-    assert repeated(rise) is rise
+    assert specialized(rise) is rise
+
+
+@compiled_only
+@pytest.mark.parametrize(
+    "other",
+    [
+        Pair(np.arange(3, dtype=np.int32), 0.5),
+        Pair(np.arange(3, dtype=np.float64), 0.5),  # type: ignore[arg-type]
+        Pair(np.arange(6)[::2], 0.5),
+        Pair(np.arange(6).reshape(2, 3), 0.5),
+        Pair(np.arange(3), 1),
+        (np.arange(3), 0.5),
+    ],
+)
+def test_another_type_is_an_error_and_nothing_is_written(other: Any) -> None:
+    call = specialized(rise)
+    call(Pair(np.arange(2), 0.5), 1)
+    before = other[0].copy()
+    with pytest.raises(TypeError, match="rise: an argument of"):
+        call(other, 1)
+    assert (other[0] == before).all()
+    assert call(Pair(np.arange(2), 0.5), np.int64(1)) == 1  # type: ignore[arg-type]
+
+
+@compiled_only
+def test_an_array_that_cannot_be_written_is_an_error_where_the_first_one_could() -> None:
+    call = specialized(rise)
+    call(Pair(np.arange(2), 0.5), 1)
+    counts = np.arange(2)
+    counts.flags.writeable = False
+    with pytest.raises(TypeError, match="readonly"):
+        call(Pair(counts, 0.5), 1)

@@ -35,11 +35,7 @@ class Monitor:
         self._tick = -1
 
     def advanced(self, zone: int, incarnation: int, tick: int, vehicles: Iterable[int]) -> None:
-        """I1: in a tick one zone advances a vehicle, and each of its processes once.
-
-        Raises:
-            ProtocolError: somebody advanced it before.
-        """
+        """I1: in a tick one zone advances a vehicle, and each of its processes once."""
         if tick > self._tick:
             self._tick, self._writers = tick, {}
         if self._executed.get((zone, incarnation), -1) >= tick:
@@ -54,16 +50,7 @@ class Monitor:
             self._writers[vehicle] = (zone, incarnation)
 
     def check(self, directory: Directory, endpoints: Mapping[int, Endpoint], store: Store) -> None:
-        """I1 to I6 and I10, at any time.
-
-        Args:
-            directory: the coordinator.
-            endpoints: zone → its living host; dead ones are left out.
-            store: the committed store.
-
-        Raises:
-            ProtocolError: one of them does not hold.
-        """
+        """I1 to I6 and I10, at any time."""
         self._check_copies(directory, store)
         self._check_leases(directory, endpoints)
         self._check_retained(directory, endpoints)
@@ -73,11 +60,7 @@ class Monitor:
                 raise ProtocolError(f"I5: vehicle {vehicle} waits for {ticks} ticks")
 
     def committed(self, world: int, store: Store) -> None:
-        """I10: the digest of the world is the sum of the zones' digests.
-
-        Raises:
-            ProtocolError: it is not.
-        """
+        """I10: the digest of the world is the sum of the zones' digests."""
         if world != store.world():
             raise ProtocolError("I10: the committed world is not what the zones told of")
 

@@ -1,0 +1,49 @@
+"""What a process is told of the worlds that it is to run, and what it makes of that."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from cavmarl.config.env import EnvConfig
+from cavmarl.core.errors import WorkerError
+from cavmarl.core.extensions import extension_modules, load_extensions
+from cavmarl.engine.world_setup import World, make_world
+
+CHANGED = "have changed while workers were started: try again"
+ELSEWHERE = "in {} are not the caller's: copy them to all machines"
+
+
+def recipe_of(world: World, base_dir: Path, **more: Any) -> dict[str, Any]:
+    """The recipe of a world, and more, as JSON knows it."""
+    return {
+        "config": asdict(world.config),
+        "extensions": extension_modules(world.config.registered),
+        "base_dir": str(base_dir.resolve()),
+        "fingerprint": fingerprint(world),
+        **more,
+    }
+
+
+def world_of(recipe: Mapping[str, Any], trouble: str = "") -> World:
+    """The world of a recipe, made anew; `trouble` says what it means if its files differ.
+
+    Raises:
+        CavmarlError: they cannot be read.
+    """
+    from cavmarl.config.io import validate  # pydantic is slow to import
+
+    load_extensions(recipe["extensions"])
+    config = validate(EnvConfig, recipe["config"], "the environment")
+    world = make_world(config, Path(recipe["base_dir"]))
+    if trouble and fingerprint(world) != recipe["fingerprint"]:
+        raise WorkerError(f"the files of '{config.name}' {trouble.format(recipe['base_dir'])}")
+    return world
+
+
+def fingerprint(world: World) -> str:
+    """Differs between two readings of the same files if one was changed in between."""
+    made_of = (world.network, world.demand, world.partition)
+    return " ".join("none" if part is None else part.content_hash for part in made_of)
