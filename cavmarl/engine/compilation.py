@@ -26,7 +26,9 @@ class _Announcer(_Listener):  # type: ignore[misc]
 
     def on_start(self, event: Any) -> None:
         module = event.data["dispatcher"].py_func.__module__
-        if not self.has_told and module.startswith("cavmarl."):
+        # Those of processes are small, and compiled in workers, after the caller has told.
+        is_long = module.startswith("cavmarl.") and not module.startswith("cavmarl.parallel.")
+        if is_long and not self.has_told:
             self.has_told = True
             print(
                 "cavmarl: compiling the kernels that this world uses, once for this version: up to "

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from cavmarl import TERMS, CavEnv, ConfigError, make_vec, parallel_env
+from cavmarl import TERMS, CavEnv, parallel_env
 from cavmarl.sensors.observed import layout
 
 ENDS = ("arrival", "collision", "off_road")
@@ -442,36 +442,3 @@ def test_tools_that_look_change_nothing() -> None:
     env.close()
     env.step(env.suggest_actions())
     assert env.state_hash() != before
-
-
-@pytest.mark.parametrize("mode", ["closed", "open", "respawn"])
-def test_fewer_steps_than_the_environment_was_made_for(mode: str) -> None:
-    env = parallel_env("ring", agents=3, max_cycles=20, overrides={"population.mode": mode})
-    env.max_cycles = 7
-    for seed in range(2):
-        env.reset(seed=seed)
-        steps = 0
-        while env.agents:
-            *_, truncations, _ = env.step({a: env.action_space(a).sample() for a in env.agents})
-            steps += 1
-        assert steps <= 7
-        if mode == "respawn":
-            assert steps == 7
-            assert all(truncations.values())
-    for wrong in (0, 21, 3.0, None):
-        with pytest.raises(ConfigError, match=r"from 1 to 20.*max_cycles to parallel_env"):
-            env.max_cycles = wrong  # type: ignore[assignment]
-    assert env.max_cycles == 7
-
-
-def test_the_sign_of_zero_is_no_action_of_its_own() -> None:
-    hashes = set()
-    for zero in (0.0, -0.0):
-        env = parallel_env("ring", agents=2, background=0)
-        env.reset(seed=0)
-        env.step({agent: np.full(2, zero, np.float32) for agent in env.agents})
-        vec = make_vec("ring", num_envs=1, agents=2, background=0)
-        vec.reset(seed=0)
-        vec.step(np.full(vec.action_space.shape, zero, np.float32))
-        hashes |= {env.simulation.state_hash(), vec.state_hash(0)}
-    assert len(hashes) == 1
