@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import subprocess
 from contextlib import suppress
 from pathlib import Path
@@ -9,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from cavmarl.config.registry import find_entry
-from cavmarl.core.errors import ConfigError
+from cavmarl.core.errors import ConfigError, MapError
+from cavmarl.roads.sumo_net.reader import read_network
 from cavmarl.traffic.sumo.sumo_input import command_words, read_input
 
 sumo = pytest.importorskip("sumo", reason="needs the extra 'sumo'")
@@ -22,7 +24,6 @@ TRIP = '<vType id="t"/><trip id="a" type="t" depart="0" from="{}" to="{}"/>'
 @pytest.fixture(scope="module")
 def trip() -> str:
     """A trip over two edges of the map."""
-    from cavmarl.roads.sumo_net.reader import read_network
 
     network = read_network(MAP)
     link = network.links[0]
@@ -54,7 +55,6 @@ ADDITIONAL = {
 
 @pytest.mark.parametrize("element", ADDITIONAL.values(), ids=ADDITIONAL)
 def test_additional_files_write_nothing(tmp_path: Path, element: str, trip: str) -> None:
-    from cavmarl.roads.sumo_net.reader import read_network
 
     network = read_network(MAP)
     text = element.format(
@@ -140,3 +140,20 @@ def test_a_file_that_includes_another_is_refused(tmp_path: Path, trip: str) -> N
     (tmp_path / "r.rou.xml").write_text(f'<routes><include href="x"/>{trip}</routes>')
     with pytest.raises(ConfigError, match="<include> is not followed"):
         run(tmp_path, "r.rou.xml")
+
+
+def test_a_small_file_with_a_large_text_is_refused(
+    tmp_path: Path, trip: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bomb = tmp_path / "r.rou.xml.gz"
+    bomb.write_bytes(gzip.compress(b"<routes>" + b" " * 50_000_000 + b"</routes>"))
+    assert bomb.stat().st_size < 100_000
+    monkeypatch.setenv("CAVMARL_MAX_XML_BYTES", "1000000")
+    with pytest.raises(ConfigError, match=r"larger than 1000000 bytes.*CAVMARL_MAX_XML_BYTES"):
+        read_input([bomb])
+    bomb.write_bytes(gzip.compress(b"<net>" + b" " * 50_000_000 + b"</net>"))
+    with pytest.raises(MapError, match=r"larger than 1000000 bytes.*CAVMARL_MAX_XML_BYTES"):
+        read_network(bomb)
+    monkeypatch.setenv("CAVMARL_MAX_XML_BYTES", "much")
+    with pytest.raises(ConfigError, match="whole number of bytes"):
+        read_network(bomb)

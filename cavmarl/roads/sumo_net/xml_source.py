@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import io
+import os
 import re
 import zlib
 from pathlib import Path
@@ -13,10 +14,11 @@ from xml.sax.handler import ContentHandler
 import defusedxml.sax
 from defusedxml.common import DefusedXmlException
 
-from cavmarl.core.errors import CavmarlError, MapError
+from cavmarl.core.errors import CavmarlError, ConfigError, MapError
 
 # A country in OSM is larger than this, but no world that one machine can drive.
 MAX_XML_BYTES = 1 << 30
+LIMIT = "CAVMARL_MAX_XML_BYTES"  # the environment's variable with another limit
 
 # What XML files of maps and demand come in; UTF-16 is told by its first bytes.
 _ENCODINGS = frozenset(
@@ -34,7 +36,7 @@ class _Limited(io.RawIOBase):
     def __init__(self, stream: io.BufferedIOBase, failure: type[CavmarlError]) -> None:
         self._stream = stream
         self._failure = failure
-        self._left = MAX_XML_BYTES
+        self._most = self._left = most_bytes()
 
     def readable(self) -> bool:
         return True
@@ -43,7 +45,9 @@ class _Limited(io.RawIOBase):
         data = self._stream.read(size)
         self._left -= len(data)
         if self._left < 0:
-            raise self._failure(f"the XML is larger than {MAX_XML_BYTES} bytes: cut it first")
+            raise self._failure(
+                f"the XML is larger than {self._most} bytes: cut it first, or set {LIMIT}"
+            )
         return data
 
 
@@ -94,7 +98,28 @@ def _check_encoding(path: Path, stream: io.BufferedIOBase, failure: type[Cavmarl
 def read_bytes(path: Path) -> bytes:
     """The XML text of a plain or gzipped file.
 
-    Raises OSError: the file cannot be read.
+    Raises:
+        OSError: the file cannot be read, or its text is larger than `most_bytes`.
     """
-    content = path.read_bytes()
-    return gzip.decompress(content) if content.startswith(_GZIP_MAGIC) else content
+    most = most_bytes()
+    with path.open("rb") as raw:
+        packed = raw.read(2) == _GZIP_MAGIC
+        raw.seek(0)
+        content = (gzip.GzipFile(fileobj=raw) if packed else raw).read(most + 1)
+    if len(content) > most:
+        raise OSError(f"larger than {most} bytes: cut it first, or set {LIMIT}")
+    return content
+
+
+def most_bytes() -> int:
+    """How large the text of one file may be: `CAVMARL_MAX_XML_BYTES`, or 1 GiB.
+
+    Raises:
+        ConfigError: that is no number above 0.
+    """
+    given = os.environ.get(LIMIT, "")
+    if not given:
+        return MAX_XML_BYTES
+    if not given.isdecimal() or int(given) < 1:
+        raise ConfigError(f"{LIMIT} = {given!r}: must be a whole number of bytes, above 0")
+    return int(given)
