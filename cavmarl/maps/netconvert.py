@@ -11,8 +11,10 @@ import gzip
 import hashlib
 import os
 import re
+import shutil
 import subprocess
 import tempfile
+import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -24,6 +26,7 @@ from xml.sax.handler import ContentHandler
 
 from cavmarl.core.cache_folder import cache_dir
 from cavmarl.core.errors import ConfigError, MapError, require
+from cavmarl.core.processes import die_with_parent
 from cavmarl.roads.sumo_net.reader import map_name, read_network, source_hash
 from cavmarl.roads.sumo_net.xml_source import read_bytes, read_xml
 
@@ -124,6 +127,7 @@ _OPTIONS = {"sumo": (), "osm": OSM_OPTIONS, "opendrive": OPENDRIVE_OPTIONS}
 
 _COMMENT = re.compile(rb"<!-- generated on .*?-->\s*", re.DOTALL)
 _SHOWN_LINES = 10
+_LEFT_S = 86_400.0  # a build that is older than this was killed
 
 
 @dataclass(frozen=True)
@@ -239,6 +243,9 @@ def _build(
     if place.exists() and place.samefile(source):
         raise MapError(f"{place}: the target is the source: give another target")
     place.parent.mkdir(parents=True, exist_ok=True)
+    for left in place.parent.glob(".build-*"):  # by a process that was killed
+        if time.time() - left.stat().st_mtime > _LEFT_S:
+            shutil.rmtree(left, ignore_errors=True)
     with tempfile.TemporaryDirectory(dir=place.parent, prefix=".build-") as folder:
         draft = Path(folder) / f"{map_name(place)}.net.xml"
         log = BuildLog()
@@ -276,6 +283,7 @@ def _run(
             timeout=timeout_s,
             env=os.environ | own,
             check=False,
+            preexec_fn=die_with_parent,
         )
     except subprocess.TimeoutExpired as error:
         raise MapError(

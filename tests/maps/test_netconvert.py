@@ -1,11 +1,16 @@
 from __future__ import annotations
 
 import gzip
+import os
+import signal
 import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
 
+from cavmarl.config.registry import find_entry
 from cavmarl.core.errors import ConfigError, MapError
 from cavmarl.maps import netconvert
 from cavmarl.maps.netconvert import OSM_OPTIONS, build_network, map_file
@@ -208,3 +213,48 @@ def test_without_sumo_the_extra_is_named(
     monkeypatch.setattr(netconvert, "require", missing)
     with pytest.raises(MapError, match="no sumo, install sumo"):
         build_network(town, tmp_path / "out.net.xml")
+
+
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
+def test_netconvert_ends_with_the_process_that_runs_it(tmp_path: Path, how: signal.Signals) -> None:
+    slow = tmp_path / "bin" / "netconvert"
+    slow.parent.mkdir()
+    slow.write_text(f"#!/bin/sh\necho $$ > {tmp_path}/pid\nexec sleep 600\n")
+    slow.chmod(0o755)
+    source = tmp_path / "a.osm"
+    source.write_text("<osm/>")
+    program = (
+        "import sys; from pathlib import Path; from types import SimpleNamespace; "
+        "from cavmarl.maps import netconvert; "
+        f"netconvert.require = lambda *_: SimpleNamespace(SUMO_HOME={str(tmp_path)!r}); "
+        f"netconvert.build_network({str(source)!r}, {str(tmp_path / 'a.net.xml')!r})"
+    )
+    with subprocess.Popen([sys.executable, "-c", program]) as caller:
+        told = tmp_path / "pid"
+        until_s = time.monotonic() + 30.0
+        while not (told.exists() and told.read_text().strip()) and time.monotonic() < until_s:
+            time.sleep(0.02)
+        pid = int(told.read_text())
+        assert Path(f"/proc/{pid}").exists()
+        caller.send_signal(how)
+        caller.wait(10.0)
+    while _runs(pid) and time.monotonic() < until_s:
+        time.sleep(0.02)
+    assert not _runs(pid)
+
+
+def _runs(pid: int) -> bool:
+    try:
+        return ") Z" not in Path(f"/proc/{pid}/stat").read_text()
+    except FileNotFoundError:
+        return False
+
+
+def test_what_a_killed_build_has_left_is_removed(tmp_path: Path) -> None:
+    left, fresh = tmp_path / ".build-old", tmp_path / ".build-new"
+    for folder in (left, fresh):
+        folder.mkdir()
+    os.utime(left, (0, 0))
+    build_network(find_entry("ring") / "map" / "map.net.xml", tmp_path / "copy.net.xml")
+    assert not left.exists()
+    assert fresh.exists(), "another process may be at it"

@@ -10,7 +10,6 @@ hears no more of it, and the system kills the workers with the process that fork
 
 from __future__ import annotations
 
-import ctypes
 import faulthandler
 import gc
 import json
@@ -28,6 +27,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from cavmarl.core.processes import die_with_parent
 from cavmarl.parallel.processes import process_barrier as barrier
 from cavmarl.parallel.processes import state_image as images
 from cavmarl.parallel.processes.process_barrier import NUMBER, WAKE, WORDS, Meeting, present_core
@@ -46,8 +46,6 @@ OUT_OF_MEMORY = 77  # exit status
 MAX_MESSAGE = 1 << 17
 MAIL = b"="  # begins a message with something in it
 MAX_TRACEBACK = 16_000  # characters, six bytes each at most; the end of a longer one is sent
-
-_PR_SET_PDEATHSIG = 1
 
 
 class Job:
@@ -83,11 +81,6 @@ class Job:
 
 
 MakeJobs = Callable[[Mapping[str, Any]], Sequence[Job]]
-
-
-def die_with_parent() -> None:
-    """Let the system kill this process when the thread that started it ends."""
-    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
 
 
 def serve(make_jobs: MakeJobs) -> NoReturn:

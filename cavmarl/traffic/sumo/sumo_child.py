@@ -10,7 +10,6 @@ is closed before the next is started.
 
 from __future__ import annotations
 
-import ctypes
 import importlib
 import json
 import os
@@ -23,6 +22,8 @@ from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
+
+from cavmarl.core.processes import die_with_parent
 
 HEAD = np.dtype([("kind", "<i4"), ("records", "<i4"), ("letters", "<i4"), ("line", "<i4")])
 START, STEP, LOOK_UP = 0, 1, 2  # kinds of orders
@@ -42,8 +43,6 @@ _FIELDS_SEEN = {
     "lat": "getLateralLanePosition",
     "signals": "getSignals",
 }
-
-_PR_SET_PDEATHSIG = 1
 
 
 class SumoSimulation:
@@ -334,7 +333,7 @@ def main() -> None:
     number, parent, dies_with_thread = map(int, sys.argv[1:])
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the other side, which closes
     if dies_with_thread:
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
+        die_with_parent()
     if os.getppid() == parent:
         _serve(socket.socket(fileno=number))
 
