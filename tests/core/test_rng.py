@@ -70,7 +70,7 @@ def test_each_argument_changes_the_number() -> None:
 
 
 def test_streams_do_not_share_draws() -> None:
-    streams = sorted(getattr(rng, name) for name in rng.__all__ if name.startswith("STREAM_"))
+    streams = sorted(getattr(rng, name) for name in vars(rng) if name.startswith("STREAM_"))
     assert np.all(np.diff(streams) >= rng.DRAWS_PER_STREAM)
 
 
