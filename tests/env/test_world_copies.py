@@ -38,20 +38,28 @@ def actions_of(env: cavmarl.CavEnv, step: int) -> dict[str, np.ndarray]:
     }
 
 
+def flat(value: Any) -> Any:
+    """What a call has returned, for ==: arrays as their bytes."""
+    if isinstance(value, dict):
+        return [(key, flat(item)) for key, item in value.items()]
+    if isinstance(value, tuple):
+        return [flat(item) for item in value]
+    return np.asarray(value).tobytes()
+
+
 def drive(env: cavmarl.CavEnv, first: int, steps: int) -> list[Any]:
     """All that comes out, and the state at the end."""
     seen: list[Any] = []
     for step in range(first, first + steps):
         if not env.agents:
             env.reset()
-        seen.append(repr(env.step(actions_of(env, step))))
+        seen.append(flat(env.step(actions_of(env, step))))
     return [*seen, env.simulation.state_hash()]
 
 
 @pytest.mark.parametrize("how", COPIES)
 @pytest.mark.parametrize("name", WORLDS)
 def test_a_copy_goes_on_as_the_first_one(name: str, how: str) -> None:
-    np.set_printoptions(threshold=sys.maxsize, floatmode="unique")
     env = cavmarl.parallel_env(**WORLDS[name])
     env.reset(seed=3)
     drive(env, 0, 15)
@@ -60,7 +68,7 @@ def test_a_copy_goes_on_as_the_first_one(name: str, how: str) -> None:
     assert other.agents == env.agents
     first = drive(env, 15, 12)
     assert drive(other, 15, 12) == first
-    assert repr(other.reset()) == repr(env.reset()), "the next episode is the same, too"
+    assert flat(other.reset()) == flat(env.reset()), "the next episode is the same, too"
 
 
 @pytest.mark.parametrize("how", COPIES)
@@ -80,7 +88,7 @@ def test_a_copy_before_the_first_reset(how: str) -> None:
     other = COPIES[how](env)
     with pytest.raises(cavmarl.EpisodeError):
         other.step({})
-    assert repr(other.reset()) == repr(env.reset())
+    assert flat(other.reset()) == flat(env.reset())
     assert drive(other, 0, 5) == drive(env, 0, 5)
 
 
@@ -109,7 +117,7 @@ def test_one_vehicle_and_agents_in_turn() -> None:
     one.step(np.zeros(2, np.float32))
     other = copy.deepcopy(one)
     for _ in range(5):
-        assert repr(other.step(np.zeros(2, np.float32))) == repr(one.step(np.zeros(2, np.float32)))
+        assert flat(other.step(np.zeros(2, np.float32))) == flat(one.step(np.zeros(2, np.float32)))
     turns = cavmarl.env("ring", agents=2)
     turns.reset(seed=4)
     turns.step(np.zeros(2))
@@ -117,7 +125,7 @@ def test_one_vehicle_and_agents_in_turn() -> None:
     for _ in range(5):
         for env in (turns, later):
             env.step(np.zeros(2))
-        assert repr(later.last()) == repr(turns.last())
+        assert flat(later.last()) == flat(turns.last())
 
 
 def test_a_world_that_is_sent_to_another_process() -> None:

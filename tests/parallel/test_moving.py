@@ -50,7 +50,7 @@ def uneven(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return moved
 
 
-@pytest.mark.parametrize(("number", "env"), enumerate(sorted(entries())))
+@pytest.mark.parametrize(("number", "env"), list(enumerate(sorted(entries()))))
 def test_worlds_that_move_are_the_same(
     make: Make, uneven: list[int], number: int, env: str
 ) -> None:

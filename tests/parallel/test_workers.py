@@ -18,7 +18,7 @@ from tests.support.vec_runs import STEPS, Make, drive, pool_of, same
 pytestmark = pytest.mark.filterwarnings("ignore:workers = 3:RuntimeWarning")
 
 
-@pytest.mark.parametrize(("number", "env"), enumerate(sorted(entries())))
+@pytest.mark.parametrize(("number", "env"), list(enumerate(sorted(entries()))))
 def test_workers_change_nothing(make: Make, number: int, env: str) -> None:
     """Their number takes turns over the entries; all are there with zones, too."""
     wanted = {"num_envs": 5, "max_cycles": 8}
