@@ -225,11 +225,7 @@ class _Whole(_Library):  # type: ignore[misc]
         for function in self.get_defined_functions():
             if function.name not in self._own:
                 function.linkage = "internal"
-        if self.counts:
-            super()._optimize_final_module()
-        else:  # Numba's first round prepares for the pruning of counts
-            passes, builder = self._codegen._module_pass_manager()
-            passes.run(self._final_module, builder)
+        super()._optimize_final_module()
 
 
 class _Part(_Library):  # type: ignore[misc]
