@@ -26,7 +26,7 @@ from xml.sax.handler import ContentHandler
 
 from cavmarl.core.cache_folder import cache_dir
 from cavmarl.core.errors import ConfigError, MapError, require
-from cavmarl.core.processes import die_with_parent
+from cavmarl.core.processes import dying_with_parent
 from cavmarl.roads.sumo_net.reader import map_name, read_network, source_hash
 from cavmarl.roads.sumo_net.xml_source import read_bytes, read_xml
 
@@ -276,14 +276,13 @@ def _run(
     own = {"SUMO_HOME": str(home), "PROJ_DATA": projections, "PROJ_LIB": projections}
     try:
         done = subprocess.run(
-            command,
+            dying_with_parent(command),
             capture_output=True,
             text=True,
             errors="replace",
             timeout=timeout_s,
             env=os.environ | own,
             check=False,
-            preexec_fn=die_with_parent,
         )
     except subprocess.TimeoutExpired as error:
         raise MapError(

@@ -1,4 +1,4 @@
-"""The state of worlds: which arrays outlive a tick, and who keeps which of them, in one table.
+"""The state of worlds: which arrays outlive a tick, and which part keeps which, in one table.
 
 What saves, moves, commits, sends or digests worlds takes its arrays from here. Beside these there
 are the owned rows, the arrays of rerouting, and those of attached parts (`Attached.arrays`).

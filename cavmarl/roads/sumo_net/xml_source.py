@@ -87,12 +87,16 @@ def read_xml(path: Path, handler: ContentHandler, failure: type[CavmarlError] = 
 
 def _check_encoding(path: Path, stream: io.BufferedIOBase, failure: type[CavmarlError]) -> None:
     """Refuse encodings for which the parser would raise errors of other kinds."""
-    declared = _DECLARED.match(stream.read(_DECLARATION_BYTES))
+    declared = declared_encoding(stream.read(_DECLARATION_BYTES))
     stream.seek(0)
-    if declared and declared[1].decode("latin-1").lower() not in _ENCODINGS:
-        raise failure(
-            f"{path}, line 1: encoding '{declared[1].decode('latin-1')}': save the file as UTF-8"
-        )
+    if declared and declared.lower() not in _ENCODINGS:
+        raise failure(f"{path}, line 1: encoding '{declared}': save the file as UTF-8")
+
+
+def declared_encoding(content: bytes) -> str:
+    """The encoding that the first line of an XML file names; empty: none."""
+    declared = _DECLARED.match(content)
+    return declared[1].decode("latin-1") if declared else ""
 
 
 def read_bytes(path: Path) -> bytes:

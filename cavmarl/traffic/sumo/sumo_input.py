@@ -19,7 +19,7 @@ import defusedxml.ElementTree
 from defusedxml.common import DefusedXmlException
 
 from cavmarl.core.errors import ConfigError, SumoError, require
-from cavmarl.roads.sumo_net.xml_source import read_bytes
+from cavmarl.roads.sumo_net.xml_source import declared_encoding, read_bytes
 
 _INPUTS = {
     "net-file": "net-file",
@@ -55,7 +55,6 @@ _REPORTS = re.compile(
 _MAY_WRITE = re.compile(rb"\bfile\b|dest|output|&#|include", re.IGNORECASE)
 _READ_FILES = {"rerouter", "variableSpeedSign"}  # elements whose `file` is read
 _NOWHERE = "NUL"  # as SUMO calls it
-_ENCODING = re.compile(rb"""<\?xml[^>]*?encoding\s*=\s*["']([\w.:-]+)["']""")
 _ASCII_BELOW = {"utf-8", "utf8", "ascii", "us-ascii", "iso-8859-1", "latin-1", "windows-1252"}
 
 
@@ -106,8 +105,7 @@ def without_outputs(path: Path, folder: Path) -> Path:
         ConfigError: it includes another file, or its encoding cannot be searched.
     """
     content = read_bytes(path)
-    given = _ENCODING.match(content)
-    encoding = given[1].decode().lower() if given else "utf-8"
+    encoding = declared_encoding(content).lower() or "utf-8"
     if encoding not in _ASCII_BELOW or 0 in content[:4]:  # UTF-16 and 32 begin with such a byte
         raise ConfigError(f"{path}: encoded as {encoding} or UTF-16: save it as UTF-8")
     if not _MAY_WRITE.search(content):
