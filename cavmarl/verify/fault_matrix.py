@@ -86,7 +86,7 @@ class MatrixLine:
     name: str  # what happens
     points: str  # where, or how often
     plans: tuple[Faults, ...]  # one a run
-    unmet: tuple[str, ...] = ()  # points that nobody came to in that role
+    unmet: tuple[str, ...] = ()  # points that no run reached in that role
     poison: bool = False  # whether it has to end in `LostTickError`
 
 

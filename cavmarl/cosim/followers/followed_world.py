@@ -210,7 +210,7 @@ class FollowedWorld:
     def _indices(self, vehicles: Sequence[str]) -> tuple[int, ...]:
         """The agents that a newcomer wants.
 
-        Raises FollowerError: there are none of that name, or somebody else drives them.
+        Raises FollowerError: there are none of that name, or another follower drives them.
         """
         known = {agent: k for k, agent in enumerate(self.env.possible_agents)}
         taken = {k: seat.clock.name for seat in self._seats for k in seat.agents}

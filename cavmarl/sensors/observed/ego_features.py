@@ -177,8 +177,8 @@ def messages(config: SensorsConfig) -> list[Feature]:
         ("event_y", "place to the left, ego frame", scale),
         ("event_age", "how long ago", "10 s"),
         ("event_collision", "1 if it is a collision", ""),
-        ("event_braking", "1 if somebody brakes hard", ""),
-        ("event_stationary", "1 if somebody stands", ""),
+        ("event_braking", "1 if a message tells of hard braking", ""),
+        ("event_stationary", "1 if a message tells of a standing vehicle", ""),
         ("event_other", "1 if it is anything else", ""),
     )
     return [
