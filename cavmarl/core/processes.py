@@ -5,8 +5,13 @@ from __future__ import annotations
 import ctypes
 import os
 import signal
+import subprocess
 import sys
+import threading
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Any
 
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
@@ -33,3 +38,20 @@ def dying_with_parent(command: Sequence[str]) -> list[str]:
         return list(command)
     numbers = (_PR_SET_PDEATHSIG, int(signal.SIGKILL), os.getpid())
     return [sys.executable, "-I", "-S", "-c", _WRAPPER, *map(str, numbers), *command]
+
+
+def start_dying_with_process(command: Sequence[str], **options: Any) -> subprocess.Popen[bytes]:
+    """Start a command that ends with this process, not with the thread that asks for it.
+
+    The system watches the thread that starts a process: that is the main one, or one that stays.
+    """
+    command = dying_with_parent(command)
+    if threading.current_thread() is threading.main_thread():
+        return subprocess.Popen(command, **options)
+    return _staying_thread(os.getpid()).submit(subprocess.Popen, command, **options).result()
+
+
+@cache
+def _staying_thread(_: int) -> ThreadPoolExecutor:
+    """One for each process: a fork does not take it along."""
+    return ThreadPoolExecutor(1, "starts-processes")

@@ -269,6 +269,41 @@ def test_the_process_that_forks_may_die_or_be_stopped(make: Make) -> None:
     assert totals(pool) == [[9.0, 3 * MORE]] * 2
 
 
+def test_a_start_that_is_killed_is_begun_again(tmp_path: Path) -> None:
+    files = [str(tmp_path / name) for name in "abc"]
+    for file in files[:2]:
+        Path(file).touch()
+    pool = Pool(program(2, dies_while=files), 60.0, 2)
+    pool.run(ADD)
+    assert totals(pool) == [[3.0, MORE]] * 2
+    for file in files:
+        Path(file).touch()
+    pids = pool.pids
+    os.kill(pool.server_pid, signal.SIGKILL)
+    assert gone_soon(pids)
+    descriptors = len(os.listdir("/proc/self/fd"))
+    with pytest.raises(WorkerError, match="ended 3 times .* SIGKILL, SIGKILL, SIGKILL"):
+        pool.run(ADD)
+    assert gone(pids)
+    assert len(os.listdir("/proc/self/fd")) < descriptors
+
+
+def test_a_pool_of_another_thread_ends_with_the_process_and_not_before() -> None:
+    text = LONER.format(root=str(ROOT), then="").replace(
+        "pool = Pool(program(2), 60.0, 3)",
+        "from concurrent.futures import Future\nfrom threading import Thread\nmade = Future()\n"
+        "maker = Thread(target=lambda: made.set_result(Pool(program(2), 60.0, 3)))\n"
+        "maker.start()\nmaker.join()\npool = made.result()",
+    )
+    text += "import os\nos.kill(pool.server_pid, signal.SIGSTOP)\npool.run(ADD)\n"
+    text += "os.kill(os.getpid(), signal.SIGKILL)\n"
+    loner = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True)
+    pids = [int(word) for word in loner.stdout.split()]
+    assert loner.returncode == -signal.SIGKILL, loner.stderr
+    assert len(pids) == 3
+    assert gone_soon(pids)  # also the one that was stopped
+
+
 def gone_soon(pids: list[int]) -> bool:
     """Whether all have ended, buried or not."""
     for pid in pids:

@@ -9,7 +9,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -17,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from cavmarl.core.errors import WorkerError, WorkerFailureError
+from cavmarl.core.processes import start_dying_with_process
 from cavmarl.parallel.processes.process_barrier import WAKE
 from cavmarl.parallel.processes.worker_loop import MAIL, MAX_MESSAGE
 
@@ -86,6 +86,7 @@ class ForkServer:
     """Starts the process and asks it for workers.
 
     Raises:
+        ServerGoneError: it was killed before it was ready.
         WorkerFailureError: an exception in it.
     """
 
@@ -100,11 +101,10 @@ class ForkServer:
             **start,
             "pool": theirs.fileno(),
             "parent": os.getpid(),
-            "dies_with_thread": threading.current_thread() is threading.main_thread(),
         }
         self._wire = ours
         try:
-            self._process = subprocess.Popen(
+            self._process = start_dying_with_process(
                 [sys.executable, "-P", "-m", program, json.dumps(told)],
                 stdin=subprocess.DEVNULL,
                 pass_fds=(theirs.fileno(), *descriptors),
@@ -160,6 +160,8 @@ class ForkServer:
         message = self._wire.recv(MAX_MESSAGE)
         if not message:
             status = self._process.wait()
+            if status < 0:
+                raise ServerGoneError(signal.Signals(-status).name)
             raise WorkerError(
                 f"the process that starts workers ended with {status} before it was ready; what it "
                 "printed stands on standard error"

@@ -89,8 +89,6 @@ def serve(make_jobs: MakeJobs) -> NoReturn:
     faulthandler.enable()
     start = json.loads(sys.argv[1])
     pool = socket.socket(fileno=start["pool"])
-    if start["dies_with_thread"]:
-        die_with_parent()
     parent = os.pidfd_open(start["parent"])
     if os.getppid() != start["parent"]:
         os._exit(0)

@@ -52,7 +52,7 @@ class Pool:
         self,
         program: Program,
         timeout_s: float,  # for so long a worker may be busy with one order
-        repeats: int,  # how often a command is begun again because a worker has died
+        repeats: int,  # how often a start, or a command, is begun again because a process has died
     ) -> None:
         self.deaths: list[Death] = []  # all that there were
         self._program = program
@@ -65,7 +65,7 @@ class Pool:
         self._ordered_s = 0.0
         self._lasted: dict[int, float] = {}  # how long each task has taken the last time, s
         self._pid = os.getpid()
-        self._crew = WorkerProcesses(program)
+        self._crew = WorkerProcesses(program, repeats)
         self._finalizer = weakref.finalize(self, self._crew.release)
 
     @property

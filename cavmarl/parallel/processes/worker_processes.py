@@ -60,11 +60,17 @@ class WorkerProcesses:
         orders: (m, WORDS) the lines that this side writes.
 
     Raises:
+        WorkerError: no process, or those that start were killed too often.
         WorkerFailureError: an exception while the jobs were made.
     """
 
-    def __init__(self, program: Program) -> None:
+    def __init__(
+        self,
+        program: Program,
+        repeats: int,  # how often a start that is killed is begun again
+    ) -> None:
         self._program = program
+        self._repeats = repeats
         self._count = len(program.parts)
         self._crowded = self._count + 1 > len(usable_cores())
         self._poll = select.poll()
@@ -275,7 +281,13 @@ class WorkerProcesses:
         old = {**self.processes, **dead}
         for team in {self._program.team_of(k) for k in old}:
             self._take_back(team, ordered)
-        self._start()
+        try:
+            self._start()
+        except BaseException:
+            for k, process in old.items():
+                if self.processes.get(k) is not process:
+                    process.release()
+            raise
         return old
 
     def _send(self, k: int, mail: bytes | None) -> None:
@@ -309,14 +321,31 @@ class WorkerProcesses:
     def _start(self) -> None:
         """Start the process that forks, and a process for every worker."""
         fds = tuple(segment.fd for segment in self._held.segments)
-        self._held.server = ForkServer(self._program.module, self._told, fds)
-        try:
-            for k in range(self._count):
-                self._fork(k)
-        except ServerGoneError as error:
-            raise WorkerError(
-                "the process that starts workers ended before it had started all"
-            ) from error
+        causes: list[str] = []
+        while len(causes) <= self._repeats:
+            try:
+                self._held.server = ForkServer(self._program.module, self._told, fds)
+                for k in range(self._count):
+                    self._fork(k)
+                return
+            except ServerGoneError as error:
+                causes.append(str(error) or "no answer")
+                self._clear()
+        raise WorkerError(
+            f"the process that starts workers ended {len(causes)} times before all were there: "
+            f"{', '.join(causes)}"
+        )
+
+    def _clear(self) -> None:
+        """Give back what a start that came to nothing has left."""
+        for process in self.processes.values():
+            if process.wire.fileno() in self._owners:
+                self._dismiss(process)
+                process.release()
+        self.processes.clear()
+        if self._held.server is not None:
+            self._held.server.close()
+            self._held.server = None
 
     def _fork(self, k: int) -> None:
         assert self._held.server is not None
