@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import resource
 import socket
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -92,19 +95,71 @@ def test_one_that_says_nothing_is_let_go(address: Path, monkeypatch: pytest.Monk
         world.reset(seed=1)
         silent = call(address)
         hashes(world, 3)
-        assert "said nothing" in refusal(silent)
+        assert "not introduced itself" in refusal(silent)
 
 
-def test_one_that_stops_in_the_middle_of_a_word_does_not_hold_the_world_for_long(
+def test_one_that_speaks_byte_by_byte_is_not_waited_for(
     address: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(reception, "HEARING_S", 0.05)
+    words = hello_in(1)
     with FollowedWorld(make_env(), address) as world:
         world.reset(seed=1)
+        slow = call(address)
+        for k in range(len(words) - 1):
+            slow.sendall(words[k : k + 1])
+            world._admit(0.0)
+        assert not world.master.followers
+        slow.sendall(words[-1:])
+        world._admit(0.0)
+        assert [follower.name for follower in world.master.followers] == ["x"]
+        monkeypatch.setattr(reception, "GREETING_S", 0.0)
         half = call(address)
-        half.sendall(hello_in(1)[:20])
-        hashes(world, 3)
-        assert "within 0.05 s" in refusal(half)
+        half.sendall(words[:20])
+        world._admit(0.0)
+        assert "not introduced itself" in refusal(half)
+        slow.close()
+
+
+def test_a_crowd_does_not_keep_a_follower_out(address: Path) -> None:
+    with FollowedWorld(make_env(), address) as world:
+        world.reset(seed=1)
+        crowd = [call(address) for _ in range(reception.MAX_GUESTS)]
+        world._admit(0.0)
+        late = call(address)
+        late.sendall(hello_in(1))
+        world._admit(0.0)  # takes the place of the first of the crowd
+        world._admit(0.0)
+        assert [follower.name for follower in world.master.followers] == ["x"]
+        assert "too many callers" in refusal(crowd[0])
+        for connection in (*crowd, late):
+            connection.close()
+
+
+def test_a_world_without_descriptors_lets_the_oldest_caller_go(address: Path) -> None:
+    with FollowedWorld(make_env(), address) as world:
+        world.reset(seed=1)
+        first = call(address)
+        world._admit(0.0)
+        later, words = call(address), hello_in(1)
+        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+        used = max(int(name) for name in os.listdir("/proc/self/fd"))
+        filling = []
+        resource.setrlimit(resource.RLIMIT_NOFILE, (used + 2, hard))
+        try:
+            with suppress(OSError):
+                while True:
+                    filling.append(os.open(os.devnull, os.O_RDONLY))
+            world._admit(0.0)
+            assert "no descriptors" in refusal(first)
+            world._admit(0.0)
+            later.sendall(words)
+            world._admit(0.0)
+            assert [follower.name for follower in world.master.followers] == ["x"]
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+            for descriptor in filling:
+                os.close(descriptor)
+            later.close()
 
 
 @pytest.mark.parametrize(

@@ -15,9 +15,11 @@ import numpy as np
 import pytest
 
 import cavmarl.parallel.hosts.host_pool as pool_module
+import cavmarl.parallel.hosts.listener as listener
 from cavmarl.core.errors import WorkerDeathError, WorkerError, WorkerFailureError
 from cavmarl.parallel.hosts.host_commands import HostProgram
 from cavmarl.parallel.hosts.host_pool import HostPool
+from cavmarl.parallel.hosts.listener import MAX_GUESTS
 from tests.support.toy_hosts import ADD, DOZE, FAIL, FALL, TASKS, TOIL, TOTAL, WRITE, Processes
 
 SIZES = (3, 2)
@@ -184,6 +186,21 @@ def test_strangers_at_the_door_disturb_nobody(make: Make) -> None:
     for caller in callers:
         caller.close()
     assert adder.pool.deaths == []
+
+
+def test_a_crowd_at_the_door_does_not_keep_a_successor_out(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(listener, "GREETING_S", 600.0)  # the silent ones leave for no other reason
+    adder = make(count=2)
+    adder.run(WRITE)
+    crowd = [socket.create_connection(adder.processes.place) for _ in range(3 * MAX_GUESTS)]
+    adder.run()
+    adder.kill(0)
+    adder.run()
+    assert len(adder.pool.deaths) == 1
+    for caller in crowd:
+        caller.close()
 
 
 def test_a_job_that_cannot_be_made() -> None:

@@ -282,7 +282,7 @@ def test_a_start_that_is_killed_is_begun_again(tmp_path: Path) -> None:
     os.kill(pool.server_pid, signal.SIGKILL)
     assert gone_soon(pids)
     descriptors = len(os.listdir("/proc/self/fd"))
-    with pytest.raises(WorkerError, match="ended 3 times .* SIGKILL, SIGKILL, SIGKILL"):
+    with pytest.raises(WorkerError, match=r"ended 3 times .* SIGKILL, SIGKILL, SIGKILL"):
         pool.run(ADD)
     assert gone(pids)
     assert len(os.listdir("/proc/self/fd")) < descriptors

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import selectors
 import socket
@@ -32,7 +33,7 @@ from cavmarl.cosim.followers.follower_messages import (
     letter_of,
     read_letter,
 )
-from cavmarl.parallel.hosts.framed_socket import FramedSocket
+from cavmarl.parallel.hosts.framed_socket import HEAD_BYTES, FramedSocket, bytes_before_data
 
 Array = NDArray[Any]
 
@@ -55,9 +56,25 @@ class ReceivedFrame(NamedTuple):
 
 
 class _Patient(socket.socket):
-    """A socket that has until a deadline for all calls together."""
+    """A socket that has until a deadline for all calls together, and can read ahead."""
 
     until_s: float | None = None  # by `time.monotonic`; None: for ever
+    ahead = b""  # has been read, and is taken next
+
+    def read_ahead(self, size: int) -> bool:
+        """Whether so many bytes have come by now, which are kept; this does not wait.
+
+        Raises:
+            EOFError: the other end has ended.
+        """
+        self.settimeout(0.0)
+        with suppress(BlockingIOError):
+            while len(self.ahead) < size:
+                more = self.recv(size - len(self.ahead))
+                if not more:
+                    raise EOFError("the connection has ended")
+                self.ahead += more
+        return len(self.ahead) >= size
 
     def _hurry(self) -> None:
         if self.until_s is None:
@@ -68,9 +85,13 @@ class _Patient(socket.socket):
             raise TimeoutError("timed out")
         self.settimeout(left_s)
 
-    def recv_into(self, *arguments: Any, **named: Any) -> int:
+    def recv_into(self, buffer: Any, *arguments: Any, **named: Any) -> int:
+        if self.ahead:
+            count = min(len(buffer), len(self.ahead))
+            buffer[:count], self.ahead = self.ahead[:count], self.ahead[count:]
+            return count
         self._hurry()
-        return super().recv_into(*arguments, **named)
+        return super().recv_into(buffer, *arguments, **named)
 
     def sendmsg(self, *arguments: Any, **named: Any) -> int:
         self._hurry()
@@ -126,6 +147,17 @@ class FollowerConnection:
         with self._blaming("answered", within_s):
             frame = self._wire.receive()
         return ReceivedFrame(Say(frame.kind), frame.letter, frame.size)
+
+    def has_come(self) -> bool:
+        """Whether the next frame is here but for its data, so that `hear` does not wait.
+
+        Raises FollowerError: as of `hear`.
+        """
+        with self._blaming("introduced itself", None):
+            if not self._socket.read_ahead(HEAD_BYTES):
+                return False
+            head = self._socket.ahead[:HEAD_BYTES]
+            return self._socket.read_ahead(bytes_before_data(head, FOLLOWERS))
 
     def skip(self, heard: ReceivedFrame) -> None:
         """Leave out the data of what was heard.
@@ -273,7 +305,8 @@ def _remove_leftover(path: Path) -> None:
 
 
 GREETING_S = 5.0  # for a caller to introduce itself
-HEARING_S = 1.0  # for what has begun to arrive
+REFUSING_S = 0.01  # for the words of a refusal, which the system takes at once
+NO_DESCRIPTORS_S = 0.05  # until the next attempt to accept
 MAX_GUESTS = 64  # not introduced yet
 GOES_ON = (
     "the world is whole and can be stepped on, with the built-in driver in its place or another "
@@ -324,11 +357,18 @@ class Reception:
                 self._open()
                 continue
             line = key.data
-            self._forget(line)
+            if line not in self._since:  # made room for another one
+                continue
             try:
-                yield line, self._greeting(line)
+                if not line.has_come():
+                    continue
+                hello = self._greeting(line)
             except FollowerError as error:
+                self._forget(line)
                 self.turn_away(line, str(error))
+                continue
+            self._forget(line)
+            yield line, hello
         self._dismiss_the_silent()
 
     def turn_away(self, line: FollowerConnection, reason: str) -> None:
@@ -344,19 +384,34 @@ class Reception:
         self._listener.close()
 
     def _open(self) -> None:
-        try:
-            connection, _ = self._listener.accept()
-        except OSError:  # it is gone already
-            return
-        line = FollowerConnection(connection, "a caller", GOES_ON)
-        if len(self._since) == MAX_GUESTS:
-            self.turn_away(line, "too many callers have not introduced themselves")
-            return
-        self._since[line] = time.monotonic()
-        self._selector.register(line, selectors.EVENT_READ, line)
+        """Accept all that call now; one too many takes the place of the one that waits longest."""
+        for _ in range(MAX_GUESTS):
+            try:
+                connection, _ = self._listener.accept()
+            except OSError as error:  # none calls any more, or it is gone already
+                if error.errno in (errno.EMFILE, errno.ENFILE):
+                    self._find_descriptor()
+                return
+            line = FollowerConnection(connection, "a caller", GOES_ON)
+            if len(self._since) == MAX_GUESTS:
+                self._dismiss_the_oldest("too many callers have not introduced themselves")
+            self._since[line] = time.monotonic()
+            self._selector.register(line, selectors.EVENT_READ, line)
+
+    def _find_descriptor(self) -> None:
+        """This process has none left: the next caller gets one of another caller, or waits."""
+        if self._since:
+            self._dismiss_the_oldest("this process has no descriptors left")
+        else:
+            time.sleep(NO_DESCRIPTORS_S)
+
+    def _dismiss_the_oldest(self, reason: str) -> None:
+        line = next(iter(self._since))
+        self._forget(line)
+        self.turn_away(line, reason)
 
     def _greeting(self, line: FollowerConnection) -> Hello:
-        heard = line.hear(HEARING_S)
+        heard = line.hear()
         if heard.kind is not Say.HELLO:
             raise FollowerError(f"a caller begins with {heard.kind.name}: HELLO comes first")
         line.skip(heard)
@@ -374,7 +429,7 @@ class Reception:
         for line, since in list(self._since.items()):
             if time.monotonic() - since > GREETING_S:
                 self._forget(line)
-                self.turn_away(line, f"said nothing within {GREETING_S:g} s")
+                self.turn_away(line, f"has not introduced itself within {GREETING_S:g} s")
 
     def _forget(self, line: FollowerConnection) -> None:
         del self._since[line]
@@ -384,5 +439,5 @@ class Reception:
 def refuse(line: FollowerConnection, reason: str) -> None:
     """Tell a follower why it is not gone on with, if it still listens, and hang up."""
     with suppress(FollowerError):
-        line.say(Say.REFUSAL, FollowerRefusal(reason), within_s=HEARING_S)
+        line.say(Say.REFUSAL, FollowerRefusal(reason), within_s=REFUSING_S)
     line.close()

@@ -35,7 +35,7 @@ MAX_PIECES = 512  # buffers in one call of the system
 
 _HEAD = struct.Struct("<4sHHQIQI")
 _SUM = struct.Struct("<I")
-_HEAD_BYTES = _HEAD.size + _SUM.size
+HEAD_BYTES = _HEAD.size + _SUM.size
 
 
 class Kind(IntEnum):
@@ -133,17 +133,9 @@ class FramedSocket:
         """
         dialect = self._dialect
         self.is_torn = True
-        raw = self._read(_HEAD_BYTES)
+        raw = self._read(HEAD_BYTES)
         head = bytes(raw[: _HEAD.size])
-        magic, version, kind, order, letter_size, size, checksum = _HEAD.unpack(head)
-        if magic != dialect.magic:
-            raise MessageError(f"{head[:4]!r} begins no frame")
-        if version != dialect.version:
-            raise MessageError(
-                f"a frame of version {version}, this is {dialect.version}: {dialect.cure}"
-            )
-        if letter_size > dialect.max_letter or size > dialect.max_data:
-            raise MessageError(f"a frame of {letter_size} + {size} bytes is none")
+        kind, order, letter_size, size, checksum = _understood(head, dialect)
         text = bytes(self._read(letter_size))
         if _SUM.unpack(raw[_HEAD.size :])[0] != zlib.crc32(text, zlib.crc32(head)):
             raise MessageError("the head of a frame is not what was sent")
@@ -199,6 +191,28 @@ class FramedSocket:
             if not got:
                 raise EOFError("the connection has ended")
             piece = piece[got:]
+
+
+def bytes_before_data(head: bytes, dialect: Dialect) -> int:
+    """How long a frame's head and payload are together, by its first HEAD_BYTES.
+
+    Raises MessageError: no frame of the dialect begins so.
+    """
+    return HEAD_BYTES + _understood(head[: _HEAD.size], dialect)[2]
+
+
+def _understood(head: bytes, dialect: Dialect) -> tuple[int, int, int, int, int]:
+    """Kind, order, bytes of the payload, bytes and checksum of the data."""
+    magic, version, kind, order, letter_size, size, checksum = _HEAD.unpack(head)
+    if magic != dialect.magic:
+        raise MessageError(f"{head[:4]!r} begins no frame")
+    if version != dialect.version:
+        raise MessageError(
+            f"a frame of version {version}, this is {dialect.version}: {dialect.cure}"
+        )
+    if letter_size > dialect.max_letter or size > dialect.max_data:
+        raise MessageError(f"a frame of {letter_size} + {size} bytes is none")
+    return kind, order, letter_size, size, checksum
 
 
 def _frame(dialect: Dialect, kind: int, order: int, text: bytes, size: int, checksum: int) -> Frame:

@@ -95,7 +95,8 @@ class HostRegistry:
                 case Listener():
                     self._welcome()
                 case PendingConnection():
-                    self._listen(key.data)
+                    if key.data in self._guests:  # not shown out meanwhile
+                        self._listen(key.data)
                 case HostConnection() as host if host.part >= 0:
                     speaking.append(host)
                 case HostConnection() as host:
@@ -132,12 +133,16 @@ class HostRegistry:
         self._selector.close()
 
     def _welcome(self) -> None:
-        guest = self._door.open()
-        if guest is not None and len(self._guests) == MAX_GUESTS:
-            guest.close()
-        elif guest is not None:
+        """Accept all that call; where they are too many, the silent ones leave first."""
+        for _ in range(MAX_GUESTS):
+            guest = self._door.open()
+            if guest is None:
+                return
+            if len(self._guests) == MAX_GUESTS:
+                self._show_out(min(self._guests, key=lambda each: (each.number >= 0, each.until_s)))
             self._guests.append(guest)
             self._selector.register(guest, selectors.EVENT_READ, guest)
+            self._listen(guest)
 
     def _listen(self, guest: PendingConnection) -> None:
         try:

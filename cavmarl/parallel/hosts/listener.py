@@ -26,6 +26,7 @@ SECRET = 32
 GREETING_S = 5.0  # for a guest to prove its identity
 CALL_S = 5.0  # for the system to connect
 MAX_GUESTS = 64  # not authenticated yet
+BACKLOG = 1024  # callers that the system holds until they are accepted
 _HELLO = struct.Struct(f"<4sHI{NONCE}s")
 
 
@@ -45,13 +46,16 @@ class PendingConnection:
         return self._socket.fileno()
 
     def listen(self) -> socket.socket | None:
-        """Take what it says; its connection, once it has proved that it knows the secret.
+        """Take what it has said; its connection, once it has proved that it knows the secret.
 
         Raises:
             OSError: it is gone.
         """
         wanted = PROOF if self._expected else _HELLO.size
-        heard = self._socket.recv(wanted - len(self._heard))
+        try:
+            heard = self._socket.recv(wanted - len(self._heard))
+        except BlockingIOError:
+            return None
         if not heard:
             raise EOFError("the connection has ended")
         self._heard += heard
@@ -88,7 +92,7 @@ class Listener:
     def __init__(self, address: str) -> None:
         self.secret = secrets.token_bytes(SECRET)  # that hosts have to know
         try:
-            self._listener = socket.create_server((address, 0), backlog=MAX_GUESTS)
+            self._listener = socket.create_server((address, 0), backlog=BACKLOG)
         except OSError as error:
             raise WorkerError(f"cannot listen on {address}: {error}") from error
         self._listener.setblocking(False)
@@ -98,7 +102,7 @@ class Listener:
         return self._listener.fileno()
 
     def open(self) -> PendingConnection | None:
-        """Accept a caller; None: it is gone already."""
+        """Accept a caller; None: there is none any more."""
         try:
             connection, _ = self._listener.accept()
         except OSError:
