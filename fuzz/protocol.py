@@ -16,7 +16,7 @@ from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.ledger import OwnedTally
 from cavmarl.ownership.limits import Limits
-from cavmarl.ownership.log_records import record_to_line, records_from_lines, replay, sealed
+from cavmarl.ownership.log_records import lines_of, records_from_lines, replay, sealed
 from cavmarl.ownership.messages import (
     Abort,
     Ack,
@@ -72,13 +72,14 @@ def _messages() -> tuple[bytes, ...]:
 
 
 def _log(content: bytes) -> object:
-    lines = []
+    lines, last = [], ""
     for line in content.decode("utf-8", errors="replace").splitlines(keepends=True):
         lines.append(line)
         with suppress(ValueError, RecursionError):
             found = json.loads(line)
             if isinstance(found, dict):
-                lines[-1] = json.dumps(sealed(found)) + "\n"
+                found = sealed(found, last)
+                lines[-1], last = json.dumps(found) + "\n", found["checksum"]
     return replay(records_from_lines("".join(lines)))
 
 
@@ -102,7 +103,7 @@ def _logs() -> tuple[bytes, ...]:
             directory.on_message(endpoint.complete(0, gone))
         log += directory.commit({0: 0, 1: 0}).records
         store.committed = {7: b"state"}
-    lines = [record_to_line(record, sequence) for sequence, record in enumerate(log)]
+    lines = lines_of(log)
     return ("".join(lines).encode(), "".join(lines[:4]).encode())
 
 

@@ -45,10 +45,13 @@ def start_dying_with_process(command: Sequence[str], **options: Any) -> subproce
 
     The system watches the thread that starts a process: that is the main one, or one that stays.
     """
-    command = dying_with_parent(command)
+
+    def start() -> subprocess.Popen[bytes]:
+        return subprocess.Popen(dying_with_parent(command), **options)
+
     if threading.current_thread() is threading.main_thread():
-        return subprocess.Popen(command, **options)
-    return _staying_thread(os.getpid()).submit(subprocess.Popen, command, **options).result()
+        return start()
+    return _staying_thread(os.getpid()).submit(start).result()
 
 
 @cache

@@ -1,9 +1,11 @@
 """Log records as JSON lines, and back.
 
-A line is an object with the keys `schema` ("cavmarl.ownership/1"), `sequence` (0, 1, 2, …),
+A line is an object with the keys `schema` ("cavmarl.ownership/2"), `sequence` (0, 1, 2, …),
 `kind` (RESET, BEGIN, COMMIT, FENCE, HOST), `episode`, `tick`, the fields of that kind, and
-`checksum`: BLAKE2b of 8 bytes, in hex, over the line as it would be without that key. Bytes are
-written in hex, digests of rows and sets too. A list of entries is a list of lists.
+`checksum`: BLAKE2b of 8 bytes, in hex, over the checksum of the line before, if there is one, and
+the line as it would be without that key. So a line of another log, or of an earlier one, is none of
+this one. Bytes are written in hex, digests of rows and sets too. A list of entries is a list of
+lists.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from cavmarl.core.errors import JournalError
 from cavmarl.ownership.messages import Begin, Commit, Fence, Host, Record, Reset
 from cavmarl.ownership.table import Table
 
-SCHEMA = "cavmarl.ownership/1"
+SCHEMA = "cavmarl.ownership/2"
 KINDS: dict[str, type[Record]] = {
     "RESET": Reset,
     "BEGIN": Begin,
@@ -32,55 +34,81 @@ _LARGEST = 1 << 63
 _WIDE = frozenset({"world", "rows", "digest"})
 
 
-def record_to_dict(record: Record, sequence: int) -> dict[str, Any]:
-    return sealed(_content(record, sequence))
+class LogChain:
+    """Where a log stands: writes its next line, or reads it.
+
+    Attributes:
+        sequence: the number of the next line.
+        last: the checksum of the line before; of the first line nothing.
+    """
+
+    def __init__(self) -> None:
+        self.sequence, self.last = 0, ""
+
+    def write(self, record: Record) -> str:
+        body = _json(_content(record, self.sequence))
+        self._advance(_checksum(self.last, body))
+        return f'{body[:-1]},"checksum":"{self.last}"}}\n'
+
+    def to_dict(self, record: Record) -> dict[str, Any]:
+        line = sealed(_content(record, self.sequence), self.last)
+        self._advance(line["checksum"])
+        return line
+
+    def read(self, line: str | bytes) -> Record:
+        try:
+            content = json.loads(line)
+        except (ValueError, RecursionError) as error:
+            raise JournalError(f"line {self.sequence + 1} of the log: {error}") from error
+        if not isinstance(content, dict):
+            raise JournalError(f"line {self.sequence + 1} of the log is no JSON object")
+        return self.from_dict(content)
+
+    def from_dict(self, line: dict[str, Any]) -> Record:
+        where = f"line {self.sequence + 1} of the log"
+        if line.get("schema") != SCHEMA:
+            raise JournalError(f"{where} has schema {line.get('schema')!r}, not {SCHEMA!r}")
+        if line.get("sequence") != self.sequence:
+            raise JournalError(f"{where} has number {line.get('sequence')}: lines are missing")
+        checksum = line.get("checksum")
+        if checksum != sealed(line, self.last)["checksum"]:
+            raise JournalError(
+                f"{where} does not match its checksum: it is damaged, or of another log"
+            )
+        kind = KINDS.get(str(line.get("kind")))
+        if kind is None:
+            raise JournalError(f"{where} is of kind {line.get('kind')!r}, which is none")
+        try:
+            values = [parse(line[name]) for name, parse in _PARSE[kind]]
+        except (KeyError, TypeError, ValueError) as error:
+            raise JournalError(f"{where}: {error!r}") from error
+        self._advance(str(checksum))
+        return kind(*values)
+
+    def _advance(self, checksum: str) -> None:
+        self.sequence += 1
+        self.last = checksum
 
 
-def sealed(line: dict[str, Any]) -> dict[str, Any]:
-    """A line with the checksum of what stands in it."""
+def sealed(line: dict[str, Any], last: str = "") -> dict[str, Any]:
+    """A line with the checksum of what stands in it, behind a line with the checksum `last`."""
     content = {key: value for key, value in line.items() if key != "checksum"}
-    return content | {"checksum": _checksum(_json(content))}
+    return content | {"checksum": _checksum(last, _json(content))}
 
 
-def record_from_dict(line: dict[str, Any], sequence: int) -> Record:
-    where = f"line {sequence + 1} of the log"
-    if line.get("schema") != SCHEMA:
-        raise JournalError(f"{where} has schema {line.get('schema')!r}, not {SCHEMA!r}")
-    if line.get("checksum") != sealed(line)["checksum"]:
-        raise JournalError(f"{where} does not match its checksum")
-    if line.get("sequence") != sequence:
-        raise JournalError(f"{where} has number {line.get('sequence')}: lines are missing")
-    kind = KINDS.get(str(line.get("kind")))
-    if kind is None:
-        raise JournalError(f"{where} is of kind {line.get('kind')!r}, which is none")
-    try:
-        values = [parse(line[name]) for name, parse in _PARSE[kind]]
-    except (KeyError, TypeError, ValueError) as error:
-        raise JournalError(f"{where}: {error!r}") from error
-    return kind(*values)
-
-
-def record_to_line(record: Record, sequence: int) -> str:
-    body = _json(_content(record, sequence))
-    return f'{body[:-1]},"checksum":"{_checksum(body)}"}}\n'
-
-
-def record_from_line(line: str | bytes, sequence: int) -> Record:
-    try:
-        content = json.loads(line)
-    except (ValueError, RecursionError) as error:
-        raise JournalError(f"line {sequence + 1} of the log: {error}") from error
-    if not isinstance(content, dict):
-        raise JournalError(f"line {sequence + 1} of the log is no JSON object")
-    return record_from_dict(content, sequence)
+def lines_of(records: Iterable[Record]) -> list[str]:
+    """A log from its first line on."""
+    chain = LogChain()
+    return [chain.write(record) for record in records]
 
 
 def records_from_lines(text: str) -> tuple[Record, ...]:
+    chain = LogChain()
     records = []
-    for sequence, line in enumerate(text.splitlines(keepends=True)):
+    for line in text.splitlines(keepends=True):
         if not line.endswith("\n"):
-            raise JournalError(f"line {sequence + 1} of the log is cut short: {line[:40]!r}")
-        records.append(record_from_line(line, sequence))
+            raise JournalError(f"line {chain.sequence + 1} of the log is cut short: {line[:40]!r}")
+        records.append(chain.read(line))
     return tuple(records)
 
 
@@ -148,8 +176,8 @@ def _checked(name: str, kind: type[int], value: Any) -> int:
     return value
 
 
-def _checksum(body: str) -> str:
-    return blake2b(body.encode(), digest_size=8).hexdigest()
+def _checksum(last: str, body: str) -> str:
+    return blake2b((last + body).encode(), digest_size=8).hexdigest()
 
 
 _json = json.JSONEncoder(separators=(",", ":")).encode

@@ -25,7 +25,7 @@ from cavmarl.handoff.coordinator.journal import (
 )
 from cavmarl.handoff.coordinator.journal_summary import owners_at, summarize
 from cavmarl.ownership.directory import Directory
-from cavmarl.ownership.log_records import KINDS, record_to_line, replay
+from cavmarl.ownership.log_records import KINDS, lines_of, replay
 from cavmarl.ownership.messages import Begin, Record
 from tests.ownership.bench import Bench
 from tests.ownership.test_simulator import campaign
@@ -140,8 +140,8 @@ def test_two_runs_do_not_write_one_journal(tmp_path: Path) -> None:
 
 def test_a_line_that_is_cut_short_is_named_and_dropped_at_every_byte(tmp_path: Path) -> None:
     log, path = eventful().log, tmp_path / "run.journal"
-    last = record_to_line(log[4], 4).encode()
-    whole = "".join(record_to_line(record, k) for k, record in enumerate(log[:4])).encode()
+    *before, last = [line.encode() for line in lines_of(log[:5])]
+    whole = b"".join(before)
     for length in range(1, len(last)):
         path.write_bytes(whole + last[:length])
         with pytest.raises(JournalError, match=re.escape(f"{path}: line 5 is cut short")):
@@ -294,8 +294,7 @@ def test_what_no_coordinator_writes_is_refused_with_its_line(tmp_path: Path) -> 
 def lines_of_all_kinds() -> dict[str, str]:
     """Of each kind of record the longest line of a run with hand-offs."""
     found: dict[str, str] = {}
-    for sequence, record in enumerate(eventful().log):
-        line = record_to_line(record, sequence)
+    for line in lines_of(eventful().log):
         kind = json.loads(line)["kind"]
         if len(line) > len(found.get(kind, "")):
             found[kind] = line

@@ -14,7 +14,7 @@ from cavmarl.ownership.directory import Directory, StoreError
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.ledger import row_hash, world_digest
 from cavmarl.ownership.limits import Limits
-from cavmarl.ownership.log_records import record_to_line, records_from_lines, whole_lines
+from cavmarl.ownership.log_records import LogChain, whole_lines
 from cavmarl.ownership.messages import (
     COORDINATOR,
     Birth,
@@ -83,7 +83,7 @@ class Simulator:
         self.network = Network(plan)
         self.store = MemoryStore(safeguards)
         self.trace, self.monitor = Trace(), Monitor(self.limits)
-        self.log, self.sequence, self.log_tick = "", 0, 0
+        self.log, self.chain, self.log_tick = "", LogChain(), 0
         self.digests: list[int] = []
         self.deaths: Counter[str] = Counter()
         self.switches, self.forced, self.deferred = 0, 0, 0
@@ -142,7 +142,6 @@ class Simulator:
         self._decide(born)
         if self._strikes("torn log", COORDINATOR):  # it was never acted upon
             self.log = self.log[: -len(self.log.splitlines()[-1]) // 2]
-            self.sequence -= 1
             self.trace.entries.pop()
             self._restart()
             self._decide(born)
@@ -198,7 +197,8 @@ class Simulator:
     def _restart(self) -> None:
         self.deaths["coordinator"] += 1
         self.log = whole_lines(self.log)
-        records = records_from_lines(self.log)
+        self.chain = LogChain()
+        records = tuple(self.chain.read(line) for line in self.log.splitlines())
         zones, limits = self.world.zones, self.limits
         self.directory = Directory.restore(records, zones, self.store, limits, self.safeguards)
         self._flip()
@@ -213,14 +213,13 @@ class Simulator:
 
     def _write(self, output: Output) -> None:
         for record in output.records:
-            self.log += record_to_line(record, self.sequence)
-            self.sequence += 1
+            self.log += self.chain.write(record)
             if isinstance(record, Commit):
                 self.last_commit = record
         self.trace.logged(output.records)
 
     def _host(self, zone: int) -> None:
-        output = self.directory.host(zone, worker=self.sequence)
+        output = self.directory.host(zone, worker=self.chain.sequence)
         self._write(output)
         hosting = self.directory.hosting(zone)
         rows = {vehicle: self.store.state(vehicle) for vehicle in hosting.owned}

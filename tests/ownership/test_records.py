@@ -13,9 +13,8 @@ from cavmarl.core.errors import (
 )
 from cavmarl.ownership.log_records import (
     SCHEMA,
-    record_from_dict,
-    record_to_dict,
-    record_to_line,
+    LogChain,
+    lines_of,
     records_from_lines,
     replay,
     sealed,
@@ -44,10 +43,9 @@ def test_a_line_says_what_it_is(log: str) -> None:
 
 def test_records_come_back_equal(log: str) -> None:
     records = records_from_lines(log)
-    assert "".join(record_to_line(record, k) for k, record in enumerate(records)) == log
-    assert [record_from_dict(record_to_dict(r, k), k) for k, r in enumerate(records)] == list(
-        records
-    )
+    assert "".join(lines_of(records)) == log
+    written, read = LogChain(), LogChain()
+    assert [read.from_dict(written.to_dict(record)) for record in records] == list(records)
 
 
 def test_every_prefix_can_be_replayed(log: str) -> None:
@@ -81,8 +79,20 @@ def test_a_missing_doubled_or_swapped_line_is_noticed(log: str) -> None:
             records_from_lines("".join(wrong))
 
 
+@pytest.mark.parametrize("at", [8, 20, 40])
+def test_a_line_of_another_log_is_noticed(log: str, at: int) -> None:
+    """Its number, its kind and its checksum are right, but it follows another line."""
+    other = campaign(5, "corner")
+    other.run(15)
+    lines, foreign = log.splitlines(keepends=True), other.log.splitlines(keepends=True)
+    assert lines[at] != foreign[at]
+    mixed = [*lines[:at], foreign[at], *lines[at + 1 :]]
+    with pytest.raises(JournalError, match="another log"):
+        records_from_lines("".join(mixed))
+
+
 def changed(**change: object) -> dict[str, object]:
-    return sealed(record_to_dict(Host(0, 0, 1, 1, 1), 0) | change)
+    return sealed(LogChain().to_dict(Host(0, 0, 1, 1, 1)) | change)
 
 
 @pytest.mark.parametrize(
@@ -98,7 +108,7 @@ def changed(**change: object) -> dict[str, object]:
 )
 def test_a_line_of_another_kind_is_refused(change: dict[str, object], why: str) -> None:
     with pytest.raises(JournalError, match=why):
-        record_from_dict(changed(**change), 0)
+        LogChain().from_dict(changed(**change))
 
 
 def test_lines_that_are_no_objects_are_refused() -> None:

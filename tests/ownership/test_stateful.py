@@ -8,7 +8,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 
 from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.limits import Limits
-from cavmarl.ownership.log_records import record_to_line, records_from_lines, replay
+from cavmarl.ownership.log_records import lines_of, records_from_lines, replay
 from cavmarl.ownership.messages import COORDINATOR, Abort, Ack, Message, Nack, Prepare, Step
 from tests.ownership.bench import Bench
 
@@ -123,7 +123,7 @@ class Ownership(RuleBasedStateMachine):
             return
         bench = self.bench
         bench.judge()
-        text = "".join(record_to_line(record, k) for k, record in enumerate(bench.log))
+        text = "".join(lines_of(bench.log))
         assert replay(records_from_lines(text)).owners == bench.directory.table.owners
 
 

@@ -11,12 +11,13 @@ import os
 import sys
 import weakref
 from collections.abc import Iterable, Iterator, Sequence
+from copy import copy
 from pathlib import Path
 from types import TracebackType
 from typing import Literal, Self, TypeAlias, get_args
 
 from cavmarl.core.errors import ConfigError, JournalError
-from cavmarl.ownership.log_records import record_from_line, record_to_line
+from cavmarl.ownership.log_records import LogChain
 from cavmarl.ownership.messages import Record
 
 if sys.platform != "win32":
@@ -29,7 +30,7 @@ class JournalReader:
     """The records of a file, one after the other.
 
     Attributes:
-        lines: whole lines that have been read.
+        chain: where the whole lines end that have been read.
         size: bytes of them.
         torn: the number of the line that was dropped and how it begins, or nothing.
     """
@@ -43,12 +44,17 @@ class JournalReader:
         drop_torn: bool = False,
     ) -> None:
         self.path = path
-        self.lines, self.size, self.torn = 0, 0, ""
+        self.chain, self.size, self.torn = LogChain(), 0, ""
         self._drop_torn = drop_torn
+
+    @property
+    def lines(self) -> int:
+        """Whole lines that have been read."""
+        return self.chain.sequence
 
     def __iter__(self) -> Iterator[Record]:
         """From the first line on."""
-        self.lines, self.size, self.torn = 0, 0, ""
+        self.chain, self.size, self.torn = LogChain(), 0, ""
         try:
             with self.path.open("rb") as file:
                 for line in file:
@@ -61,15 +67,14 @@ class JournalReader:
 
     def _record(self, line: bytes) -> Record:
         try:
-            record = record_from_line(line, self.lines)
+            record = self.chain.read(line)
         except JournalError as error:
             raise JournalError(f"{self.path}: {error}") from error
-        self.lines += 1
         self.size += len(line)
         return record
 
     def _end_torn(self, line: bytes) -> None:
-        self.torn = f"line {self.lines + 1} is cut short: {line[:40]!r}"
+        self.torn = f"line {self.chain.sequence + 1} is cut short: {line[:40]!r}"
         if not self._drop_torn:
             raise JournalError(f"{self.path}: {self.torn}; it was never acted upon")
 
@@ -78,7 +83,6 @@ class Journal:
     """A file that records are appended to, by one run at a time.
 
     Attributes:
-        sequence: the number of the next line.
         dropped: the line that was dropped, or nothing.
     """
 
@@ -99,7 +103,8 @@ class Journal:
         if sync not in get_args(Sync):
             raise ConfigError(f"sync is {sync!r}: it has to be one of {get_args(Sync)}")
         self.path = path
-        self.sequence, self.dropped = 0, ""
+        self.dropped = ""
+        self._chain = LogChain()
         self._fsync = sync == "fsync"
         if resume and not path.is_file():
             raise JournalError(f"{path}: is no file to go on with; begin one without resume")
@@ -123,9 +128,14 @@ class Journal:
             self._file.close()
             raise
 
+    @property
+    def sequence(self) -> int:
+        """The number of the next line."""
+        return self._chain.sequence
+
     def append(self, records: Iterable[Record]) -> None:
         """Write records down; when it returns, messages may be sent."""
-        lines = [record_to_line(record, self.sequence + k) for k, record in enumerate(records)]
+        lines = [self._chain.write(record) for record in records]
         if not lines:
             return
         if self._file.closed:
@@ -139,7 +149,6 @@ class Journal:
         except OSError as error:
             self._file.close()
             raise self._unwritable(error) from error
-        self.sequence += len(lines)
 
     def close(self) -> None:
         """Close the file; once more does nothing."""
@@ -157,7 +166,7 @@ class Journal:
 
     def tear(self, records: Sequence[Record]) -> None:
         """Write as a process does that dies meanwhile: half of the first line."""
-        line = record_to_line(records[0], self.sequence).encode()
+        line = copy(self._chain).write(records[0]).encode()
         self._file.write(line[: len(line) // 2])
 
     def __enter__(self) -> Self:
@@ -190,7 +199,7 @@ class Journal:
         reader = JournalReader(self.path, drop_torn=True)
         for _ in reader:
             pass
-        self.sequence, self.dropped = reader.lines, reader.torn
+        self._chain, self.dropped = reader.chain, reader.torn
         if self.dropped:
             try:
                 os.truncate(self.path, reader.size)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import JournalError
 from cavmarl.handoff.fault_injection.committed_store import COUNTS, CommittedImage, Notes
-from cavmarl.ownership.log_records import record_from_dict, record_to_dict
+from cavmarl.ownership.log_records import LogChain
 from cavmarl.ownership.messages import Birth, Fence, Host, Record, Removed, Reset
 from cavmarl.shards.shard import Commands
 
@@ -56,13 +56,14 @@ class Reproducer:
     def write(self, path: Path) -> None:
         """Write the file, which must not exist. Raises OSError: it cannot be written."""
         plain = {name: dict(getattr(self, name)) for name in ("made_with", "config", "sources")}
+        chain = LogChain()
         names = ("seed", "first_world", "episode", "tick", "zone", "cause", "is_first", "is_last")
         content = {
             "schema": SCHEMA,
             **plain,
             **{name: getattr(self, name) for name in names},
             "commands": [_packed(array) for array in vars(self.commands).values()],
-            "records": [record_to_dict(record, k) for k, record in enumerate(self.records)],
+            "records": [chain.to_dict(record) for record in self.records],
             "image": _image_to_plain(self.image),
         }
         body = _json(content)
@@ -86,9 +87,8 @@ def read_reproducer(path: Path) -> Reproducer:
     del content["schema"]
     try:
         content["commands"] = Commands(*(_unpacked(entry) for entry in content["commands"]))
-        content["records"] = tuple(
-            record_from_dict(line, number) for number, line in enumerate(content["records"])
-        )
+        chain = LogChain()
+        content["records"] = tuple(chain.from_dict(line) for line in content["records"])
         content["image"] = _image_from_plain(content["image"])
         return Reproducer(**content)
     except (JournalError, KeyError, TypeError, ValueError, zlib.error) as error:
