@@ -324,6 +324,8 @@ class Simulation(WorldViews):
     def close(self) -> None:
         if self._tick.sumo is not None:
             self._tick.sumo.close()
+        for coordinator in self.coordinators:
+            coordinator.close()
 
     def retire_agents(self) -> None:
         """Take out the agents whose trip ended in the last step; to be called after it is read."""

@@ -102,9 +102,12 @@ def test_a_journal_that_is_there_is_left_alone(make: Make, tmp_path: Path) -> No
     assert path.read_text() == "somebody's"
 
 
-def test_a_journal_belongs_to_its_worker(make: Make, tmp_path: Path) -> None:
+@pytest.mark.parametrize("workers", [0, 1])
+def test_a_journal_is_locked_until_its_world_is_closed(
+    make: Make, tmp_path: Path, workers: int
+) -> None:
     path = tmp_path / "run.jsonl"
-    vec = make("grid4x4", zones=2, workers=1, overrides={**BUSY, "zones.journal": str(path)})
+    vec = make("grid4x4", zones=2, workers=workers, overrides={**BUSY, "zones.journal": str(path)})
     vec.reset(seed=0)
     with pytest.raises(JournalError, match="another run is writing"):
         Journal(path, resume=True)

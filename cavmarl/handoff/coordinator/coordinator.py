@@ -135,6 +135,11 @@ class Coordinator(ABC):
     def dropped(self) -> Counter[tuple[str, str]]:
         """(kind, reason) → messages or entries that did not count, at any of the parties."""
 
+    def close(self) -> None:
+        """Close the journal."""
+        if self.journal is not None:
+            self.journal.close()
+
     def _record(self, *records: Record) -> None:
         if self.journal is not None:
             self.journal.append(records)
