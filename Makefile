@@ -7,17 +7,13 @@ READY := .venv/.ready
 VENV_PACKAGE := { test "$$(id -u)" = 0 && apt-get update && apt-get install --yes python3-venv; }
 OLDEST := .venv-oldest
 LIBRARIES := .venv-libraries
-RAY := .venv-ray
 # What old versions of others will no longer do is no news; the rest stays an error.
 OLDEST_WARNINGS := -W default::DeprecationWarning -W default::PendingDeprecationWarning
 OLDEST_TESTS := tests/core tests/driving tests/engine tests/handoff tests/rewards tests/roads tests/sensors \
     tests/traffic tests/v2x tests/zones tests/config tests/env/test_registration.py \
     tests/env/test_parallel_env.py tests/env/test_vector_env.py tests/parallel/test_worker_pool.py \
     tests/test_bad_input.py tests/test_public_api.py tests/adapters
-RAY_TESTS := tests/parallel/test_ray_cluster.py tests/parallel/test_remote_worlds.py \
-    tests/parallel/test_remote_start.py
-LIBRARIES_TESTS := tests/adapters tests/train/test_programs.py tests/parallel/test_framed_socket.py \
-    tests/parallel/test_host_pool.py $(RAY_TESTS)
+LIBRARIES_TESTS := tests/adapters tests/train/test_programs.py
 # Compiled by one process before two of them run tests.
 KERNELS := -c 'from cavmarl import make_vec; make_vec("grid4x4", workers=1).close()'
 TWO := -n 2 --dist loadfile
@@ -40,7 +36,7 @@ demo: $(READY) ## train on merge, evaluate, drive through town, leave a video (s
 
 test: $(READY) ## the tests but the slow ones; those of kernels that have a twin also without the compiler
 	$(BIN)/python $(KERNELS)
-	$(BIN)/pytest $(TWO) -m "not slow and not alone"
+	$(BIN)/pytest $(TWO) -m "not slow and not alone and not ray"
 	$(BIN)/pytest -m "alone and not slow"
 	NUMBA_DISABLE_JIT=1 $(BIN)/pytest $(TWO) -m "twin and not slow"
 
@@ -48,8 +44,9 @@ quick: $(READY) ## unit tests of what has changed since main, the nearest first,
 	$(BIN)/python $(KERNELS)
 	$(BIN)/python -m tests.support.touched
 
-ray: $(RAY)/.ready ## what needs Ray, in an environment of its own (1.5 GB)
-	$(RAY)/bin/pytest $(RAY_TESTS)
+ray: $(READY) ## the tests that start a Ray cluster
+	$(BIN)/python $(KERNELS)
+	$(BIN)/pytest -m "ray and not slow"
 
 check: $(READY) ## style, types, and the direction of imports
 	$(BIN)/ruff check .
@@ -62,7 +59,7 @@ bench: $(READY) ## run a benchmark, as NAME=step ARGS='--agents 10'; without a N
 
 bounds: $(READY) ## the tests with every index of the kernels checked
 	NUMBA_BOUNDSCHECK=1 $(BIN)/python $(KERNELS)
-	NUMBA_BOUNDSCHECK=1 $(BIN)/pytest $(TWO) -m "not slow and not alone"
+	NUMBA_BOUNDSCHECK=1 $(BIN)/pytest $(TWO) -m "not slow and not alone and not ray"
 	NUMBA_BOUNDSCHECK=1 $(BIN)/pytest -m "alone and not slow"
 
 soak: $(READY) ## the slow tests: long episodes, memory, the wheel
@@ -80,7 +77,7 @@ fuzz: $(READY) ## each file parser, FUZZ_SECONDS long; what crashes one stays in
 oldest: $(OLDEST)/.ready ## the heart of the tests with the oldest versions that are allowed
 	$(OLDEST)/bin/pytest $(OLDEST_WARNINGS) $(OLDEST_TESTS)
 
-libraries: $(LIBRARIES)/.ready ## what needs Ray, RLlib or BenchMARL, in an environment of its own (2 GB)
+libraries: $(LIBRARIES)/.ready ## what needs RLlib or BenchMARL, in an environment of its own (2 GB)
 	$(LIBRARIES)/bin/pytest $(LIBRARIES_TESTS)
 
 # Without the comment that netconvert and netgenerate begin with (date, version, options), the same
@@ -97,7 +94,7 @@ pictures: $(READY) ## draw the pictures of the README, the cards and the pages a
 	$(BIN)/python -m docs.pictures.moving docs/images
 
 clean: ## remove .venv, builds and caches; runs/ stays
-	rm -rf .venv $(OLDEST) $(LIBRARIES) $(RAY) fuzz/corpus build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf .venv $(OLDEST) $(LIBRARIES) fuzz/corpus build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find cavmarl agents benchmarks train tests -name __pycache__ -prune -exec rm -rf {} +
 
 # torch comes first and alone, so that a CPU build that pip is told of (PIP_EXTRA_INDEX_URL,
@@ -116,12 +113,6 @@ $(OLDEST)/.ready: pyproject.toml constraints-oldest.txt
 	"$(PYTHON)" -m venv --clear $(OLDEST)
 	$(OLDEST)/bin/python -m pip install --editable '.[sumo]' pytest hypothesis \
 	    --constraint constraints-oldest.txt
-	@touch $@
-
-$(RAY)/.ready: pyproject.toml constraints-libraries.txt
-	"$(PYTHON)" -m venv --clear $(RAY)
-	$(RAY)/bin/python -m pip install --editable '.[sumo,ray,followers]' pytest hypothesis \
-	    --constraint constraints-libraries.txt
 	@touch $@
 
 $(LIBRARIES)/.ready: pyproject.toml constraints-libraries.txt

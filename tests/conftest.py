@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from tests.support.cpu_time import CpuTimes
+from tests.support.cpu_time import CpuTimes, known_costs, rare_variants
 from tests.support.tiers import ProcessWatch, mark, skip_if_late
 
 
@@ -25,8 +25,11 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark each test with its tier."""
+    rare = rare_variants((item.nodeid for item in items), known_costs())
     for item in items:
         mark(item)
+        if item.nodeid in rare:
+            item.add_marker(pytest.mark.slow)
 
 
 def pytest_runtest_setup() -> None:

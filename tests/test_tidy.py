@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.cpu_time import known_costs, rare_variants
+
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("cavmarl", "tests", "train", "agents", "fuzz", "docs", "examples", "benchmarks")
 
@@ -123,3 +125,16 @@ def test_things_are_not_called_persons(folder: str) -> None:
         texts = [text for _, text in sources(folder)]
     found = sum(len(PERSONS.findall(text)) for text in texts)
     assert found <= PERSONS_AT_MOST[folder], "say vehicle, zone, worker, message"
+
+
+def test_of_dear_variants_the_first_ones_are_in_every_run() -> None:
+    costs = {"a[1]": 2.0, "a[2]": 0.9, "a[3]": 0.2, "b[1]": 9.0, "b[2]": 0.0, "c": 9.0}
+    assert rare_variants(costs, costs) == {"a[3]"}
+    assert rare_variants([*costs, "b[3]"], costs | {"b[3]": 0.5}) == {"a[3]", "b[3]"}
+
+
+def test_the_file_of_costs_names_tests_that_are_there() -> None:
+    for name in known_costs():
+        path, test = name.split("::", 1)
+        function = test.split("[", 1)[0].split("::")[-1]
+        assert re.search(rf"\b{function}\b", (ROOT / path).read_text(encoding="utf-8")), name

@@ -20,6 +20,7 @@ from typing import Any, ClassVar, Unpack
 from cavmarl.bench.harness import Result, check_range
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import EvaluationError
+from cavmarl.core.processes import start_dying_with_process
 from cavmarl.cosim.followers.followed_world import FollowedWorld
 from cavmarl.cosim.time_master import OwnTicks
 from cavmarl.env.parallel import parallel_env
@@ -117,7 +118,7 @@ def measure_drift(
 def _followed(world: FollowedWorld, steps: int, rogue: float) -> tuple[list[int], dict[str, Any]]:
     """The master's ticks after each step since the follower has joined, and what that has read."""
     command = [sys.executable, "-m", PROGRAM, str(world.address), str(rogue)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    with start_dying_with_process(command, stdout=subprocess.PIPE, text=True) as process:
         try:
             world.wait_for(1, JOINS_S)
             joined = world.master.tick

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import multiprocessing
+import signal
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -205,7 +206,11 @@ def measure_ceiling(
             ours, theirs = context.Pipe()
             given = (theirs, spec, last - first, 0 if alike else first)
             processes.append(context.Process(target=_serve, args=given, daemon=True))
-            processes[-1].start()
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # for the program
+            try:
+                processes[-1].start()
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
             theirs.close()
             wires.append(ours)
         for wire in wires:

@@ -28,6 +28,7 @@ from cavmarl.cli import (
 from cavmarl.cli.output import about, print_error
 from cavmarl.cli.verify import determinism as verify_determinism
 from cavmarl.core.errors import CavmarlError
+from cavmarl.core.tracebacks import print_traceback
 
 __all__ = ["app", "main"]
 
@@ -71,9 +72,15 @@ def _exit_codes(
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Run a command; an error that cavmarl raises on purpose is one line and exit code 2."""
+    """Run a command; an error that cavmarl raises on purpose is one line and exit code 2.
+
+    Of an exception in the code of a user, the frames of that code are shown.
+    """
     try:
         app(args=None if words is None else list(words))
     except CavmarlError as error:
         print_error(str(error))
         sys.exit(2)
+    except Exception as error:
+        print_traceback(error)
+        sys.exit(1)

@@ -15,7 +15,16 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from cavmarl.cli.output import JsonPath, about, grid, make_folder, number, with_world, write_json
+from cavmarl.cli.output import (
+    JsonPath,
+    about,
+    about_file,
+    grid,
+    make_folder,
+    number,
+    with_world,
+    write_json,
+)
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import require
 
@@ -26,7 +35,7 @@ if TYPE_CHECKING:
     from cavmarl.ownership.transfer_summary import TransferSummary
 
 HtmlPath = Annotated[
-    Path | None, about("Write a page with tables, plots and the map here.", "--html")
+    Path | None, about_file("Write a page with tables, plots and the map here.", "--html")
 ]
 
 

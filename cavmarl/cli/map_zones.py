@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from cavmarl.cli.output import Environment, JsonPath, about, write_json
+from cavmarl.cli.output import Environment, JsonPath, about, about_file, write_json
 from cavmarl.config.env import ZONE_LAYOUTS
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import find_map
@@ -36,8 +36,8 @@ def zones(
         str, about("What bisection shares out: lane_length, or uniform for area.")
     ] = "lane_length",
     halo: Annotated[float, about("How far zones see over their borders, m.", min=0.0)] = 100.0,
-    out: Annotated[Path | None, about("Write a zone file here.", "--out", "-o")] = None,
-    picture: Annotated[Path | None, about("Draw the map with its zones here, a .png.")] = None,
+    out: Annotated[Path | None, about_file("Write a zone file here.", "--out", "-o")] = None,
+    picture: Annotated[Path | None, about_file("Draw the map with its zones here, a .png.")] = None,
     json_path: JsonPath = None,
 ) -> None:
     """Divide a map into zones; print what is in each, and how evenly lanes are shared out."""

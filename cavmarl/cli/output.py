@@ -25,12 +25,14 @@ if TYPE_CHECKING:
     from cavmarl.verify.differences import Difference
 
 
-def writable(path: Path | None) -> Path | None:
+def _writable(option: typer.CallbackParam, path: Path | None) -> Path | None:
     """Refuse a path that cannot be written before any work is done for it."""
     if path is None:
         return None
     if not path.parent.is_dir():
-        raise ConfigError(f"--json {path}: cannot be written (there is no folder {path.parent})")
+        raise ConfigError(
+            f"{option.opts[0]} {path}: cannot be written (there is no folder {path.parent})"
+        )
     try:
         there = path.exists()
         with path.open("ab"):
@@ -57,6 +59,11 @@ def about(text: str, *names: str, **more: Any) -> Any:
     return typer.Option(*names, help=text, **more)
 
 
+def about_file(text: str, *names: str) -> Any:
+    """An option that takes a file to write, which is tried at once."""
+    return about(text, *names, callback=_writable)
+
+
 Environment = Annotated[
     str, typer.Argument(metavar="ENV", help="Environment: a name, folder or map file.")
 ]
@@ -75,9 +82,7 @@ Background = Annotated[int | None, about("Background vehicles a world; default: 
 Settings = Annotated[
     list[str] | None, about("Any key of env.yaml; may be repeated.", "--set", metavar="KEY=VALUE")
 ]
-JsonPath = Annotated[
-    Path | None, about("Write the result here as JSON.", "--json", callback=writable)
-]
+JsonPath = Annotated[Path | None, about_file("Write the result here as JSON.", "--json")]
 AtLeast = Annotated[
     float | None, about("Exit with 1 if it is not so many times as fast.", callback=check_bound)
 ]

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Column, Table
 
-from cavmarl.cli.output import JsonPath, about, number, with_world, write_json
+from cavmarl.cli.output import JsonPath, about, about_file, number, with_world, write_json
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
 
@@ -72,8 +72,8 @@ def run(
     zones: Annotated[
         int | None, about("Zones of the world; default: as the environment says.")
     ] = None,
-    picture: Annotated[Path | None, about("Write a .png of the closest moment here.")] = None,
-    video: Annotated[Path | None, about("Write an .mp4 of the run here.")] = None,
+    picture: Annotated[Path | None, about_file("Write a .png of the closest moment here.")] = None,
+    video: Annotated[Path | None, about_file("Write an .mp4 of the run here.")] = None,
     json_path: JsonPath = None,
 ) -> None:
     """Play a scenario to a driver; exit code 1 unless all come through and hurt no one."""

@@ -1,4 +1,7 @@
-"""Processes that end with the one that has started them, however that ends."""
+"""Processes that end with the one that has started them, however that ends.
+
+Ctrl-C in a terminal is for that one, which sees to the rest: they do not hear it.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,8 @@ def die_with_parent() -> None:
 
 # Runs in a fresh interpreter: code between fork and exec may hang where there are threads.
 _WRAPPER = """
-import ctypes, os, sys
+import ctypes, os, signal, sys
+signal.signal(signal.SIGINT, signal.SIG_IGN)
 ctypes.CDLL(None).prctl(int(sys.argv[1]), int(sys.argv[2]), 0, 0, 0)
 if os.getppid() == int(sys.argv[3]):
     os.execv(sys.argv[4], sys.argv[4:])
@@ -40,13 +44,13 @@ def dying_with_parent(command: Sequence[str]) -> list[str]:
     return [sys.executable, "-I", "-S", "-c", _WRAPPER, *map(str, numbers), *command]
 
 
-def start_dying_with_process(command: Sequence[str], **options: Any) -> subprocess.Popen[bytes]:
+def start_dying_with_process(command: Sequence[str], **options: Any) -> subprocess.Popen[Any]:
     """Start a command that ends with this process, not with the thread that asks for it.
 
     The system watches the thread that starts a process: that is the main one, or one that stays.
     """
 
-    def start() -> subprocess.Popen[bytes]:
+    def start() -> subprocess.Popen[Any]:
         return subprocess.Popen(dying_with_parent(command), **options)
 
     if threading.current_thread() is threading.main_thread():

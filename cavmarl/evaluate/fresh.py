@@ -14,6 +14,8 @@ from functools import partial
 from typing import Any, BinaryIO, TypeVar
 
 from cavmarl.core import errors
+from cavmarl.core.processes import start_dying_with_process
+from cavmarl.core.tracebacks import print_traceback
 
 Found = TypeVar("Found")
 Tell = Callable[..., None]
@@ -29,7 +31,7 @@ def call_in_fresh_process(
     With `hear`, `call` gets a last argument, too: what that is called with is told to `hear`. If
     the process dies, an `EvaluationError` says `what` that was.
     """
-    program = subprocess.Popen(
+    program = start_dying_with_process(
         [sys.executable, "-c", PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     )
     assert program.stdin is not None
@@ -72,6 +74,9 @@ def main() -> None:
         found = call(*given, partial(_tell, out, "told")) if tells else call(*given)
     except errors.CavmarlError as error:
         _tell(out, "error", type(error).__name__, str(error))
+    except Exception as error:
+        print_traceback(error)
+        sys.exit(1)
     else:
         _tell(out, "found", found)
 

@@ -24,6 +24,7 @@ import numpy as np
 from cavmarl.config.checks import check_count
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import EvaluationError
+from cavmarl.core.processes import start_dying_with_process
 from cavmarl.evaluate.fresh import told_error
 from cavmarl.verify.differences import Arrays, Difference, find_difference
 
@@ -104,7 +105,7 @@ class _Program:
     def __init__(self, job: dict[str, Any], hash_seed: str) -> None:
         self._hash_seed = hash_seed
         self._line = ""
-        self._process = subprocess.Popen(
+        self._process = start_dying_with_process(
             [sys.executable, "-m", "cavmarl.verify.lockstep"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -160,7 +161,7 @@ class _Program:
 @contextmanager
 def _load_beside() -> Iterator[None]:
     """A process that uses a core and has nothing to do with the rest."""
-    busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+    busy = start_dying_with_process([sys.executable, "-c", "while True: pass"])
     try:
         yield
     finally:

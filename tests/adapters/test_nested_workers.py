@@ -90,7 +90,7 @@ def test_in_the_workers_of_stable_baselines3(workers: int) -> None:
 @pytest.mark.filterwarnings("ignore")  # Ray's warnings of itself are many
 @pytest.mark.parametrize("workers", WORKERS)
 def test_in_an_actor_of_ray(workers: int) -> None:
-    ray = pytest.importorskip("ray", reason="needs the extra: rllib (make libraries)")
+    ray = pytest.importorskip("ray", reason="needs the extra: ray")
     ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
     try:
         here, there = OneRow(workers), ray.remote(OneRow).remote(workers)

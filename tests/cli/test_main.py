@@ -216,7 +216,7 @@ def test_verify_determinism_fails_and_names_the_first_difference(
         (("evaluate", "merge", "--episodes", "many"), "valid integer"),
         (("evaluate", "merge", "--repeats", "0"), "repeats = 0: must be from 1"),
         (("evaluate", "merge", "-p", "idm", "-p", "idm"), "one stands there twice"),
-        (("evaluate", "merge", "--html", "/dev/null/x.html"), "/dev/null: cannot be written"),
+        (("evaluate", "merge", "--html", "/dev/null/x.html"), "/dev/null/x.html: cannot be written"),
         (("evaluate", "merge", "--out", "/dev/null/x", *QUICK), "/dev/null/x: cannot be made"),
         (("suite", "nothing"), "no suite or file 'nothing'"),
         (("suite", "--maps", "no-folder"), "is no environment and no file in no-folder"),
@@ -298,6 +298,24 @@ def test_a_json_path_is_tried_before_any_work(
     assert "Is a directory" in refusal(capsys, *words, "--json", str(tmp_path))
 
 
+@pytest.mark.parametrize(
+    ("words", "option"),
+    [
+        (("evaluate", "nowhere"), "--html"),
+        (("bench", "traffic", "nowhere", "--demand", "x.rou.xml"), "--plot"),
+        (("bench", "sensors", "nowhere"), "--csv"),
+        (("bench", "sensors", "nowhere"), "--plot"),
+        (("map", "zones", "nowhere"), "--out"),
+        (("scenario", "run", "nowhere"), "--picture"),
+    ],
+)
+def test_other_files_are_tried_before_any_work_too(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, words: tuple[str, ...], option: str
+) -> None:
+    missing = tmp_path / "missing" / "x.png"
+    assert f"{option} {missing}: cannot be written" in refusal(capsys, *words, option, str(missing))
+
+
 def test_trying_a_json_path_leaves_no_trace(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -372,3 +390,22 @@ def test_the_demo_of_a_wheel_says_what_is_missing(
 ) -> None:
     monkeypatch.setattr("cavmarl.cli.demo._SCRIPT", tmp_path / "ippo_torch.py")
     assert "run it in a checkout" in refusal(capsys, "demo")
+
+
+def test_a_fault_of_a_policy_shows_the_lines_of_the_policy(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    script = tmp_path / "mine.py"
+    script.write_text(
+        "from cavmarl import Policy\n\n"
+        "class Mine(Policy):\n"
+        "    def act_batch(self, observations, mask):\n"
+        "        return 1 / 0\n\n"
+        "def make_policy(env):\n    return Mine(env)\n"
+    )
+    words = ("evaluate", "ring", "--policy", str(script), "--episodes", "1", *QUICK)
+    assert run(*words, "--out", str(tmp_path / "out")) == 1
+    told = capsys.readouterr().err
+    assert told.count('  File "') == 1
+    assert 'mine.py", line 5, in act_batch' in told
+    assert "ZeroDivisionError" in told

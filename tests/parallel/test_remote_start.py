@@ -12,7 +12,7 @@ import yaml
 from cavmarl import ConfigError, make_vec
 from cavmarl.core.errors import WorkerError
 
-pytest.importorskip("ray", reason="needs the extra: ray (make ray)")
+pytest.importorskip("ray", reason="needs the extra: ray")
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's warnings of itself are many
 

@@ -26,7 +26,7 @@ from tests.parallel.test_parallel_worlds import drive as drive_view
 from tests.parallel.test_parallel_worlds import settings
 from tests.support.vec_runs import STEPS, Make, drive, same
 
-ray = pytest.importorskip("ray", reason="needs the extra: ray (make ray)")
+ray = pytest.importorskip("ray", reason="needs the extra: ray")
 
 __all__ = ["uneven"]
 

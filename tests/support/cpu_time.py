@@ -1,20 +1,55 @@
 """What tests cost: seconds of processor, of their process and of the children it has waited for.
 
 Seconds of processor say the same on a busy machine as on a quiet one; seconds of a clock do not.
+`tests/costs.txt` has those of dear tests, as they were when it was made:
+
+    CAVMARL_TEST_COSTS=tests/costs.txt pytest -n 2 --dist loadfile -m "not alone"
 """
 
 from __future__ import annotations
 
 import os
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-__all__ = ["CpuTimes"]
+__all__ = ["CpuTimes", "known_costs", "rare_variants"]
 
 ARGUED_S = 2.0  # a test that costs more is marked `slow`, or listed at the end of a run
+LISTED_S = 0.5  # a test that costs less is not in the file of costs
+OFTEN_S = (
+    3.0  # of the variants of a test, so many seconds are in every run, and one of them at least
+)
+COSTS = Path(__file__).resolve().parents[1] / "costs.txt"
+
+
+@cache
+def known_costs() -> dict[str, float]:
+    """Seconds of processor by test, of those that are in the file."""
+    lines = COSTS.read_text(encoding="utf-8").splitlines() if COSTS.exists() else []
+    return {name: float(cost_s) for cost_s, name in (line.split(" ", 1) for line in lines)}
+
+
+def rare_variants(names: Iterable[str], costs: Mapping[str, float]) -> set[str]:
+    """Which tests are variants of others, and too dear to be in every run.
+
+    Args:
+        names: of all tests, in their order; variants of one test differ behind the bracket.
+        costs: seconds of processor by name, of those that are known.
+    """
+    spent: dict[str, float] = {}
+    rare = set()
+    for name in names:
+        test, cost_s = name.split("[", 1)[0], costs.get(name, 0.0)
+        if test in spent and spent[test] + cost_s > OFTEN_S and cost_s:
+            rare.add(name)
+        else:
+            spent[test] = spent.get(test, 0.0) + cost_s
+    return rare
 
 
 class CpuTimes:
@@ -44,6 +79,10 @@ class CpuTimes:
         """Say the sum, and the dearest tests."""
         if not self.seconds:
             return
+        if path := os.environ.get("CAVMARL_TEST_COSTS"):
+            listed = sorted((name, s) for name, s in self.seconds.items() if s >= LISTED_S)
+            lines = [f"{cost_s:.1f} {name}\n" for name, cost_s in listed]
+            Path(path).write_text("".join(lines), encoding="utf-8")
         dear = sorted(((s, name) for name, s in self.seconds.items() if s > ARGUED_S), reverse=True)
         total_s = sum(self.seconds.values())
         terminalreporter.write_line(

@@ -1,8 +1,9 @@
 """Which tests are dear: those that start processes, or read SUMO or real maps.
 
 A test is `integration` where its file says so by what it imports or calls, or where a fixture of
-it makes a map; it is `slow` where it is marked so; the rest are unit tests. A test is `alone`
-where it measures time, memory or cores, or kills: nothing may run beside it.
+it makes a map; it is `slow` where it is marked so, or is a dear variant of a test of which others
+are in every run (`cpu_time.py`); the rest are unit tests. A test is `alone` where it measures time,
+memory or cores, or kills: nothing may run beside it.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ _OF_PROCESSES = re.compile(
 _STARTS = {"subprocess.Popen", "os.fork", "os.posix_spawn", "os.system"}
 _MAP_FIXTURES = {"shared_maps", "built_map", "town", "town_file"}
 _DEAR_FOLDERS = ("tests/cosim/", "tests/train/")
+
+RAY_FILES = ("tests/parallel/test_remote_start.py", "tests/parallel/test_remote_worlds.py")
 
 # They measure time, memory or cores, or count on being let run at once.
 ALONE_FILES: tuple[str, ...] = (
@@ -60,6 +63,8 @@ def mark(item: pytest.Item) -> None:
         item.add_marker(pytest.mark.twin)
     if path in ALONE_FILES:
         item.add_marker(pytest.mark.alone)
+    if path in RAY_FILES or item.name.startswith("test_in_an_actor_of_ray"):
+        item.add_marker(pytest.mark.ray)
 
 
 @cache

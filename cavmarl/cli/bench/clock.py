@@ -14,8 +14,8 @@ from cavmarl.cli.output import (
     JsonPath,
     OptionalEnvironment,
     about,
+    about_file,
     with_world,
-    writable,
     write_json,
 )
 from cavmarl.config.world_spec import WorldSpec
@@ -36,9 +36,7 @@ def clock(
         Literal["obey", "refuse", "ignore"],
         about("What the master does with such a tick; obey: the world really ticks."),
     ] = "obey",
-    csv_path: Annotated[
-        Path | None, about("Write the table here.", "--csv", callback=writable)
-    ] = None,
+    csv_path: Annotated[Path | None, about_file("Write the table here.", "--csv")] = None,
     json_path: JsonPath = None,
 ) -> None:
     """Read a master's clock and that of a follower in another process, after the same steps."""

@@ -16,6 +16,7 @@ from cavmarl.cli.output import (
     JsonPath,
     OptionalEnvironment,
     about,
+    about_file,
     check_bound,
     end_below,
     with_world,
@@ -45,8 +46,10 @@ def sensors(
     rig: Annotated[str, about("Sensors: a name in configs/rigs/, or a .yaml.")] = "ten_sensors",
     agents: Annotated[int, about("Vehicles with sensors.")] = 1,
     background: Annotated[int, about("Vehicles without sensors.")] = 0,
-    csv_path: Annotated[Path | None, about("Write every step of every run here.", "--csv")] = None,
-    plot: Annotated[Path | None, about("Write the figure here (.png, .svg, .pdf).")] = None,
+    csv_path: Annotated[
+        Path | None, about_file("Write every step of every run here.", "--csv")
+    ] = None,
+    plot: Annotated[Path | None, about_file("Write the figure here (.png, .svg, .pdf).")] = None,
     at_least: Annotated[
         float | None,
         about(

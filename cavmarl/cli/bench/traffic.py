@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cavmarl.bench.harness import make_table, measuring
-from cavmarl.cli.output import JsonPath, MapName, Seed, about, number, write_json
+from cavmarl.cli.output import JsonPath, MapName, Seed, about, about_file, number, write_json
 from cavmarl.core.errors import ConfigError, require
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def traffic(
     seed: Seed = 0,
     teleports: Annotated[bool, about("Let SUMO teleport vehicles that stand for too long.")] = True,
     plot: Annotated[
-        Path | None, about("Draw the fundamental diagram here (.png, .svg, .pdf).")
+        Path | None, about_file("Draw the fundamental diagram here (.png, .svg, .pdf).")
     ] = None,
     speed: Annotated[
         bool, about("Measure how fast both are, not what they do.", "--speed")

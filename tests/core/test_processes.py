@@ -1,0 +1,45 @@
+"""Processes that end with their caller, and leave Ctrl-C to it."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import subprocess
+import sys
+
+from cavmarl.core.processes import start_dying_with_process
+
+READY = "print('ready', flush=True); input(); print('heard nothing', flush=True)"
+
+
+def test_an_interrupt_is_left_to_the_caller() -> None:
+    process = start_dying_with_process(
+        [sys.executable, "-c", READY], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    with process:
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(signal.SIGINT)
+        process.stdin.write("\n")
+        process.stdin.flush()
+        assert process.stdout.readline() == "heard nothing\n"
+    assert process.returncode == 0
+
+
+def test_a_process_ends_with_its_caller_while_it_still_starts() -> None:
+    caller = (
+        "import os, signal, sys\n"
+        "from cavmarl.core.processes import start_dying_with_process as start\n"
+        "process = start([sys.executable, '-c', 'import time; time.sleep(60)'])\n"
+        "print(process.pid, flush=True)\n"
+        "os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", caller], stdout=subprocess.PIPE, text=True)
+    try:
+        pidfd = os.pidfd_open(int(done.stdout))
+    except ProcessLookupError:  # ended already
+        return
+    try:
+        assert select.select([pidfd], [], [], 10.0)[0]
+    finally:
+        os.close(pidfd)
