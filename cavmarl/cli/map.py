@@ -46,6 +46,7 @@ def build(
         str | None,
         about("Keep roads within min,min,max,max: degrees lon,lat for OSM, else metres."),
     ] = None,
+    timeout_s: Annotated[float, about("Seconds that netconvert may take.", min=1.0)] = 600.0,
     json_path: JsonPath = None,
 ) -> None:
     """Make a SUMO network of a map file; its statistics go beside it, to NAME.stats.json."""
@@ -56,7 +57,8 @@ def build(
         )
     console = Console()
     with console.status(f"building {target} …"):
-        result = build_network(source, target, bbox=_box(bbox), tolerant=tolerant)
+        box = _box(bbox)
+        result = build_network(source, target, bbox=box, tolerant=tolerant, timeout_s=timeout_s)
         report = check_map(result.path)
     document = {"build": result.to_dict(), "map": report.to_dict()}
     _print_build(console, result)

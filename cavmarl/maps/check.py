@@ -157,7 +157,10 @@ class _Cars:
 
     def problems(self) -> list[str]:
         if not len(self.edges):
-            return ["no edge is open to passenger cars: check permissions (--keep-edges.by-vclass)"]
+            return [
+                "no edge is open to passenger cars: check permissions (netconvert's "
+                "--keep-edges.by-vclass)"
+            ]
         if not len(self.links) and len(self.edges) > 1:
             return ["no edge leads to another: the map has no connections (build it again)"]
         return []

@@ -287,7 +287,7 @@ def _run(
     except subprocess.TimeoutExpired as error:
         raise MapError(
             f"{source}: netconvert took longer than {timeout_s:g} s: crop the map "
-            f"(cavmarl map build {source} --bbox …) or allow more time"
+            f"(cavmarl map build {source} --bbox …) or allow more time (--timeout-s)"
         ) from error
     log = BuildLog(done.stdout, done.stderr)
     if done.returncode != 0 or not draft.exists():

@@ -216,7 +216,10 @@ def test_verify_determinism_fails_and_names_the_first_difference(
         (("evaluate", "merge", "--episodes", "many"), "valid integer"),
         (("evaluate", "merge", "--repeats", "0"), "repeats = 0: must be from 1"),
         (("evaluate", "merge", "-p", "idm", "-p", "idm"), "one stands there twice"),
-        (("evaluate", "merge", "--html", "/dev/null/x.html"), "/dev/null/x.html: cannot be written"),
+        (
+            ("evaluate", "merge", "--html", "/dev/null/x.html"),
+            "/dev/null/x.html: cannot be written",
+        ),
         (("evaluate", "merge", "--out", "/dev/null/x", *QUICK), "/dev/null/x: cannot be made"),
         (("suite", "nothing"), "no suite or file 'nothing'"),
         (("suite", "--maps", "no-folder"), "is no environment and no file in no-folder"),

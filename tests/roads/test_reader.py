@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cavmarl.core.errors import MapError
+from cavmarl.core.errors import ConfigError, MapError
 from cavmarl.roads.network import SIGNAL_STATES, VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network
 
@@ -287,3 +287,15 @@ def test_size_is_limited(crossing: Crossing, monkeypatch: pytest.MonkeyPatch) ->
 
     with pytest.raises(MapError, match="larger than 100 bytes"):
         read_network(crossing())
+
+
+def test_points_of_a_lane_are_limited(crossing: Crossing, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = crossing()
+    monkeypatch.setenv("CAVMARL_MAX_LANE_POINTS", "1")
+    with pytest.raises(
+        MapError, match=r"line \d+: <lane .* points, more than 1 \(CAVMARL_MAX_LANE"
+    ):
+        read_network(path)
+    monkeypatch.setenv("CAVMARL_MAX_LANE_POINTS", "none")
+    with pytest.raises(ConfigError, match="CAVMARL_MAX_LANE_POINTS = 'none': must be a whole"):
+        read_network(path)

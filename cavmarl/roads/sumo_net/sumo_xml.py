@@ -17,7 +17,10 @@ from sumolib.net import NetReader
 
 from cavmarl.core.errors import MapError
 from cavmarl.roads.sumo_net.programs import ProgramReader, SignalProgram
-from cavmarl.roads.sumo_net.xml_source import read_xml
+from cavmarl.roads.sumo_net.xml_source import limit, read_xml
+
+MAX_LANE_POINTS = 100_000
+MOST_POINTS = "CAVMARL_MAX_LANE_POINTS"  # the environment's variable with another limit
 
 _REQUIRED = {
     "edge": ("id",),
@@ -43,6 +46,7 @@ class _CheckedReader(ContentHandler):
         self._seen: set[tuple[str, str]] = set()
         self._edge = ""
         self._next_lane = 0
+        self._most_points = limit(MOST_POINTS, MAX_LANE_POINTS)
         self._root = ""
         self._locator: Any = None
 
@@ -118,7 +122,14 @@ class _CheckedReader(ContentHandler):
         if attrs["id"] != expected:
             raise self._error("lane", attrs, f"stands where '{expected}' should")
         self._next_lane += 1
-        for point in attrs["shape"].split():
+        points = attrs["shape"].split()
+        if len(points) > self._most_points:
+            raise self._error(
+                "lane",
+                attrs,
+                f"has {len(points)} points, more than {self._most_points} ({MOST_POINTS})",
+            )
+        for point in points:
             try:
                 numbers = [float(part) for part in point.split(",")]
             except ValueError:

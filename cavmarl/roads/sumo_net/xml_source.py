@@ -121,9 +121,18 @@ def most_bytes() -> int:
     Raises:
         ConfigError: that is no number above 0.
     """
-    given = os.environ.get(LIMIT, "")
+    return limit(LIMIT, MAX_XML_BYTES)
+
+
+def limit(variable: str, usual: int) -> int:
+    """A limit of the environment, or the usual one.
+
+    Raises:
+        ConfigError: it is no number above 0.
+    """
+    given = os.environ.get(variable, "")
     if not given:
-        return MAX_XML_BYTES
+        return usual
     if not given.isdecimal() or int(given) < 1:
-        raise ConfigError(f"{LIMIT} = {given!r}: must be a whole number of bytes, above 0")
+        raise ConfigError(f"{variable} = {given!r}: must be a whole number above 0")
     return int(given)
