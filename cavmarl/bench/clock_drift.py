@@ -22,7 +22,7 @@ from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import EvaluationError
 from cavmarl.core.processes import start_dying_with_process
 from cavmarl.cosim.followers.followed_world import FollowedWorld
-from cavmarl.cosim.time_master import OwnTicks
+from cavmarl.cosim.time_master import OwnTicks, Pacer, RealTime, Unpaced
 from cavmarl.env.parallel import parallel_env
 
 PROGRAM = "cavmarl.cosim.followers.clock_reader"
@@ -42,6 +42,9 @@ class DriftRow:
     normalised_s: float  # the same since it has joined
     delta_s: float  # by how much that is ahead of the master's
     ratio: float  # of the two
+    # by how much the clock of the follower's own process, by which it does not go, is ahead of the
+    # master's; None: steps are not paced by a clock
+    own_delta_s: float | None
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,9 @@ class ClockDrift(Result):
     dt_s: float  # seconds a tick, which is a step here
     rogue: float  # the share of steps in which the follower ticked by itself
     answer: OwnTicks  # what the master did about that
+    pace: (
+        float | None
+    )  # simulated seconds a second of the master's process; None: as fast as it goes
     rows: tuple[DriftRow, ...]  # at steps 100, 500, 1000, 5000 and so on, and the last one
     own_ticks: int  # how often it did, by its own count
     counted: int  # the same by the master's
@@ -74,9 +80,15 @@ def measure_drift(
     steps: int,
     rogue: float = 0.0,
     answer: OwnTicks = "obey",
+    pace: float | None = None,
     **keys: Unpack[WorldKeys],
 ) -> ClockDrift:
-    """Run a world as master, with a follower in a process of its own that reads its clock."""
+    """Run a world as master, with a follower in a process of its own that reads its clock.
+
+    With `pace` the master's steps wait for the wall clock, and the table says how far a follower
+    would be off that went by the clock of its own process instead of the master's.
+    """
+    pacer = _FromJoining(Unpaced() if pace is None else RealTime(pace))
     check_range(steps=(steps, 1, math.inf), rogue=(rogue, 0.0, 1.0))
     spec = WorldSpec.of(env, **keys)
     settings = {"population.mode": "respawn", **spec.overrides}
@@ -91,12 +103,13 @@ def measure_drift(
             timeout_s=TIMEOUT_S,
             own_ticks=answer,
             on_drift="record",
+            pacer=pacer,
         ) as world,
     ):
         world.reset(spec.seed)
         for _ in range(BEFORE):
             world.step()
-        clock, read = _followed(world, steps, rogue)
+        clock, read = _followed(world, pacer, steps, rogue)
         master = world.master
     own, drifts = (
         [event.tick for event in master.events if event.kind == kind]
@@ -107,7 +120,8 @@ def measure_drift(
         dt_s=dt_s,
         rogue=rogue,
         answer=answer,
-        rows=rows_of(clock, read["ticks"], dt_s),
+        pace=pace,
+        rows=rows_of(clock, read["ticks"], dt_s, own_s(read["own_s"], pace)),
         own_ticks=read["own_ticks"],
         counted=master.own_ticks,
         drift_events=master.drifts,
@@ -115,13 +129,27 @@ def measure_drift(
     )
 
 
-def _followed(world: FollowedWorld, steps: int, rogue: float) -> tuple[list[int], dict[str, Any]]:
+class _FromJoining:
+    """Paces steps from when the follower has joined on."""
+
+    def __init__(self, then: Pacer) -> None:
+        self._then = then
+        self.has_joined = False
+
+    def wait(self, elapsed_s: float) -> None:
+        if self.has_joined:
+            self._then.wait(elapsed_s)
+
+
+def _followed(
+    world: FollowedWorld, pacer: _FromJoining, steps: int, rogue: float
+) -> tuple[list[int], dict[str, Any]]:
     """The master's ticks after each step since the follower has joined, and what that has read."""
     command = [sys.executable, "-m", PROGRAM, str(world.address), str(rogue)]
     with start_dying_with_process(command, stdout=subprocess.PIPE, text=True) as process:
         try:
             world.wait_for(1, JOINS_S)
-            joined = world.master.tick
+            joined, pacer.has_joined = world.master.tick, True
             clock = [0]
             for _ in range(steps):
                 world.step()
@@ -136,8 +164,22 @@ def _followed(world: FollowedWorld, steps: int, rogue: float) -> tuple[list[int]
     return clock, json.loads(told)
 
 
-def rows_of(master: list[int], follower: list[int], dt_s: float) -> tuple[DriftRow, ...]:
-    """Table II of two series of ticks, from when the follower has joined on."""
+def own_s(seconds: list[float], pace: float | None) -> list[float] | None:
+    """What a clock of the follower's own says in simulated seconds, where there is one."""
+    return None if pace is None else [pace * since_s for since_s in seconds]
+
+
+def rows_of(
+    master: list[int], follower: list[int], dt_s: float, own_s: list[float] | None = None
+) -> tuple[DriftRow, ...]:
+    """Table II of two series of ticks, from when the follower has joined on.
+
+    Args:
+        master: its tick after each step.
+        follower: the tick that the follower has then.
+        dt_s: seconds a tick.
+        own_s: what a clock of the follower's own says after each step.
+    """
     last = len(master) - 1
     marks = [mark for n in range(2, 9) for mark in (10**n, 5 * 10**n) if mark < last]
     rows = []
@@ -151,6 +193,7 @@ def rows_of(master: list[int], follower: list[int], dt_s: float) -> tuple[DriftR
                 normalised_s=seen * dt_s,
                 delta_s=(seen - elapsed) * dt_s,
                 ratio=float(Fraction(seen, elapsed)),
+                own_delta_s=None if own_s is None else own_s[step] - elapsed * dt_s,
             )
         )
     return tuple(rows)

@@ -54,6 +54,17 @@ def test_a_rogue_follower(answer: OwnTicks, tmp_path: Path) -> None:
     assert float(read["ratio"]) == row.ratio
 
 
+def test_a_clock_of_its_own_is_compared_with_the_masters() -> None:
+    rows = rows_of([0, 1, 2, 3], [7, 8, 9, 10], 0.5, [0.0, 0.4, 1.2, 1.75])
+    assert [row.own_delta_s for row in rows] == [0.25]
+    found = measure_drift("ring", steps=20, pace=1e6)  # which no machine keeps
+    (row,) = found.rows
+    assert (row.delta_s, found.holds) == (0.0, True)
+    assert row.own_delta_s is not None
+    assert row.own_delta_s > 1.0
+    assert measure_drift("ring", steps=2).rows[0].own_delta_s is None
+
+
 def test_a_follower_that_only_follows() -> None:
     found = measure_drift("ring", steps=40)
     assert found.holds

@@ -36,6 +36,10 @@ def clock(
         Literal["obey", "refuse", "ignore"],
         about("What the master does with such a tick; obey: the world really ticks."),
     ] = "obey",
+    pace: Annotated[
+        float | None,
+        about("Simulated seconds a second; then a clock of the follower's own is read, too."),
+    ] = None,
     csv_path: Annotated[Path | None, about_file("Write the table here.", "--csv")] = None,
     json_path: JsonPath = None,
 ) -> None:
@@ -45,7 +49,7 @@ def clock(
     console = Console()
     with measuring(console) as say:
         say(f"{steps} steps")
-        found = measure_drift(world, steps=steps, rogue=rogue, answer=own_ticks)
+        found = measure_drift(world, steps=steps, rogue=rogue, answer=own_ticks, pace=pace)
     console.print(_table(found))
     console.print(_verdict(found), highlight=False)
     if csv_path is not None:
@@ -59,8 +63,18 @@ def _table(found: ClockDrift) -> Table:
     rows = []
     for row in found.rows:
         seconds = (row.master_s, row.follower_s, row.normalised_s, row.delta_s)
-        rows.append((str(row.step), *(f"{time_s:.1f}" for time_s in seconds), f"{row.ratio:.2f}"))
-    heads = ("step", "master, s", "follower, s", "normalised, s", "Δ, s", "ratio")
+        own = "-" if row.own_delta_s is None else f"{row.own_delta_s:+.4f}"
+        told = [f"{time_s:.1f}" for time_s in seconds]
+        rows.append((str(row.step), *told, f"{row.ratio:.2f}", own))
+    heads = (
+        "step",
+        "master, s",
+        "follower, s",
+        "normalised, s",
+        "Δ, s",
+        "ratio",
+        "own clock, Δ, s",
+    )
     return make_table(f"{found.environment}, {1000.0 * found.dt_s:g} ms a step", heads, rows)
 
 

@@ -3,14 +3,16 @@
     python -m cavmarl.cosim.followers.clock_reader ADDRESS SHARE
 
 At the end it prints one line of JSON: the world's tick when it joined, then after each step, as the
-follower has it then, and how many of its own ticks were refused. It ticks by itself in SHARE of the
-steps, spread as evenly as can be.
+follower has it then, what the clock of its own process says meanwhile (seconds since it joined),
+and how many of its own ticks were refused. It ticks by itself in SHARE of the steps, spread as
+evenly as can be.
 """
 
 from __future__ import annotations
 
 import json
 import sys
+import time
 from fractions import Fraction
 
 from cavmarl.core.errors import ClockError
@@ -24,6 +26,7 @@ def is_due(step: int, share: Fraction) -> bool:
 
 def _main(place: str, share: Fraction) -> None:
     ticks: list[int] = []
+    own_s: list[float] = []
     own = refused = 0
     with Follower(int(place) if place.isdecimal() else place, name="clock reader") as follower:
         for sight in follower:
@@ -35,9 +38,11 @@ def _main(place: str, share: Fraction) -> None:
                 except ClockError:
                     refused += 1
             ticks.append(tick)
+            own_s.append(time.monotonic())
             if not sight.snapshot.is_over:
                 follower.answer({})
-    print(json.dumps({"ticks": ticks, "own_ticks": own, "refused": refused}))
+    since_s = [now_s - own_s[0] for now_s in own_s]
+    print(json.dumps({"ticks": ticks, "own_s": since_s, "own_ticks": own, "refused": refused}))
 
 
 if __name__ == "__main__":
