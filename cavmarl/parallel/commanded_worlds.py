@@ -102,6 +102,12 @@ class OrderedWorlds(ABC):
     def write_states(self) -> None:
         self._order(Task.WRITE_STATES, commits=False)
 
+    def save_worlds(self) -> list[bytes]:
+        raise uncopied()
+
+    def load_worlds(self, cases: Sequence[bytes]) -> None:
+        raise uncopied()
+
     def ticks(self) -> NDArray[np.int64]:
         return self.arrays.ticks.copy()
 
