@@ -71,7 +71,7 @@ def read_checkpoint(folder: Path) -> RunState:
     try:
         return RunState(**torch.load(io.BytesIO(content), weights_only=True))
     except (RuntimeError, ValueError, EOFError, KeyError, TypeError, UnpicklingError) as error:
-        raise _broken(path, str(error)) from error
+        raise _broken(path, str(error).partition("\n")[0]) from error
 
 
 def _broken(path: Path, why: str) -> TrainingError:

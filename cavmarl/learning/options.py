@@ -82,9 +82,7 @@ def check_shares(settings: object, names: Iterable[str]) -> None:
             raise ConfigError(f"{_option(name)} {value}: must be from 0 to 1")
 
 
-def run_folder(
-    runs: str, name: str, env: str, program: str, seed: int, resume: str = ""
-) -> Path:
+def run_folder(runs: str, name: str, env: str, program: str, seed: int, resume: str = "") -> Path:
     """Where a run lies: RUNS/NAME, without a name RUNS/ENV_PROGRAM_SEED; or RESUME."""
     if resume:
         return Path(resume)

@@ -14,6 +14,7 @@ from cavmarl.learning.options import (
     run_folder,
 )
 
+
 @dataclass(frozen=True)
 class PpoSettings:
     """The settings of a run; each is an option of the command line.

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
@@ -143,19 +145,26 @@ def _network_config(settings: PpoSettings, vec: CavVectorEnv) -> NetworkConfig:
     )
 
 
-def train(settings: PpoSettings, console: Console) -> Path:
-    """Run PPO until its decisions or its minutes are used up; returns the folder of the run."""
+@contextmanager
+def opened(settings: PpoSettings) -> Iterator[Run]:
+    """A run in its worlds and its folder, which nobody else writes until it is closed."""
     vec = make_worlds(settings)
     try:
         with RunFolder(settings, vec.worlds.world, vec.plans) as folder:
             run = Run(settings, vec, folder)
             try:
-                _improve(run, console)
+                yield run
             finally:
                 run.close()
-            return folder.end(plans=vec.plans)
     finally:
         vec.close()
+
+
+def train(settings: PpoSettings, console: Console) -> Path:
+    """Run PPO until its decisions or its minutes are used up; returns the folder of the run."""
+    with opened(settings) as run:
+        _improve(run, console)
+        return run.folder.end(plans=run.vec.plans)
 
 
 def _improve(run: Run, console: Console) -> None:

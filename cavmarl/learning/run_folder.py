@@ -165,6 +165,10 @@ class RunFolder:
         """That the run has taken, without those between its end and its going on."""
         return self.began.seconds + time.perf_counter() - self._began_at
 
+    def has_time(self, minutes: float) -> bool:
+        """Whether the run has taken less than these; 0: no limit."""
+        return not minutes or self.seconds < 60.0 * minutes
+
     def resume(self) -> Parts:
         """What `save` was given, with all random numbers as they were; empty: the run begins."""
         if self.began.random:

@@ -66,10 +66,11 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
             bounds = [part.first for part in parts] + [parts[-1].last]
             whole_s = spent_s[:, 0]
             moving = [MovingJob(make, bounds, k, cases, whole_s) for k in range(len(parts))]
-            for job, fd in zip(moving, recipe["cases"], strict=True):
-                job.case = WorldCases(Segment(fd, 0))
+            for mover_job, fd in zip(moving, recipe["cases"], strict=True):
+                mover_job.case = WorldCases(Segment(fd, 0))
             return list(moving)
     jobs: list[Job] = []
+    job: CheckpointJob
     for part, descriptors, case in zip(parts, recipe["diaries"], recipe["cases"], strict=True):
         if recipe["runs"]:
             (tape,) = descriptors
@@ -85,11 +86,12 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
             )
             theirs = None if spent_s is None else spent_s[part.first]
             leader = LeaderJob(hire(worlds, part), part.first, part.zones, diary, theirs)
+            job = leader
             jobs += [leader, *leader.followers()]
         else:
-            leader = CheckpointJob(hire(make(part.first, part.last), part), part.first, diary)
-            jobs.append(leader)
-        leader.case = WorldCases(Segment(case, 0))
+            job = CheckpointJob(hire(make(part.first, part.last), part), part.first, diary)
+            jobs.append(job)
+        job.case = WorldCases(Segment(case, 0))
     return jobs
 
 

@@ -59,6 +59,6 @@ class WorldCases:
 
     def take(self) -> list[bytes]:
         """Raises WorkerError: it is not what was put there."""
-        dtypes = [np.dtype(np.int64), np.dtype(np.uint8)]
+        dtypes: list[np.dtype[Any]] = [np.dtype(np.int64), np.dtype(np.uint8)]
         sizes, content = self._image.read(dtypes)
         return [case.tobytes() for case in np.split(content, np.cumsum(sizes)[:-1])]
