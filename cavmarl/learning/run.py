@@ -59,10 +59,10 @@ class Run:
         self.collector = Collector(vec, self.network, settings.num_steps, seed, generator)
         self._aside = ThreadPoolExecutor(1) if settings.overlap else None
         self._next: Future[Batch] | None = None
+        if not folder.began.parts:
+            self.save()  # a run that is killed early begins from here
         if parts := folder.resume():
             self._load(parts)
-        else:
-            self.save()
 
     def _load(self, parts: Parts) -> None:
         self.learner.load(parts["learner"])

@@ -170,7 +170,11 @@ class RunFolder:
         return not minutes or self.seconds < 60.0 * minutes
 
     def resume(self) -> Parts:
-        """What `save` was given, with all random numbers as they were; empty: the run begins."""
+        """What `save` was given, with all random numbers as they were; empty: the run begins.
+
+        Its clock begins to run here.
+        """
+        self._began_at = time.perf_counter()
         if self.began.random:
             set_random_states(self.began.random)
         return self.began.parts

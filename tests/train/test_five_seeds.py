@@ -1,0 +1,52 @@
+"""What five_seeds.py leaves behind when it is ended in the middle: no process, no traceback."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import psutil
+import pytest
+
+from tests.support.training import TRAIN
+
+pytest.importorskip("torch", reason="needs the extra: torch")
+
+WAIT_MS = 60_000  # until what is waited for is taken not to come
+
+
+@pytest.mark.parametrize("ended_by", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_trainings_end_with_the_program(tmp_path: Path, ended_by: signal.Signals) -> None:
+    config = tmp_path / "long.yaml"
+    config.write_text("env: ring\nnum_envs: 2\ntotal_agent_steps: 1000000000\n")
+    words = ["--config", "long.yaml", "--seeds", "0", "1", "--jobs", "2"]
+    program = subprocess.Popen(
+        [sys.executable, str(TRAIN / "five_seeds.py"), *words],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    with program:
+        assert program.stdout
+        said = {program.stdout.readline() for _ in range(2)}
+        assert said == {"training seed 0\n", "training seed 1\n"}
+        trainings = [os.pidfd_open(child.pid) for child in psutil.Process(program.pid).children()]
+        assert len(trainings) == 2
+        program.send_signal(ended_by)
+        _, errors = program.communicate()
+    for training in trainings:
+        ends = select.poll()
+        ends.register(training, select.POLLIN)
+        assert ends.poll(WAIT_MS), "it trains on"
+        os.close(training)
+    assert "Traceback" not in errors
+    if ended_by is signal.SIGINT:
+        assert program.returncode == 130
+        assert errors.startswith("interrupted: the same command goes on")
+    else:
+        assert program.returncode == -ended_by
