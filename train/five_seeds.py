@@ -31,9 +31,8 @@ from cavmarl.config.io import read_yaml
 from cavmarl.core.errors import CavmarlError, ConfigError, require
 from cavmarl.core.processes import dying_with_parent
 from cavmarl.evaluate import EvaluationReport, evaluate
-from cavmarl.evaluate.provenance.training_record import is_trained
+from cavmarl.evaluate.provenance.training_record import CHECKPOINT_FILE, is_trained
 from cavmarl.evaluate.statistics import Interval, mean_interval
-from cavmarl.learning.checkpoint import CHECKPOINT_FILE
 
 PROGRAM = Path(__file__).with_name("ippo_torch.py")
 SCRIPTED = ("idm", "random_actions")

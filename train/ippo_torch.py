@@ -11,9 +11,9 @@ is `cavmarl.learning`, where PPO itself stands in `collector.py`, `batch.py` and
 
 A run's folder holds the driver (`model.safetensors` and `config.json`, which
 `cavmarl evaluate --policy FOLDER` takes), `manifest.json` (what it was trained with),
-`progress.csv`, TensorBoard's files, and what `--resume` needs. With the same seed, threads and
-machine a run repeats itself for any number of workers, unless the clock ends it (`--minutes`). A
-resumed run begins new episodes.
+`progress.csv`, TensorBoard's files, and `checkpoint.pt`, from which `--resume` goes on. With the
+same seed, threads and machine a run repeats itself for any number of workers, unless the clock ends
+it (`--minutes`); so does one that was cut short and goes on. It is never overwritten.
 """
 
 from __future__ import annotations

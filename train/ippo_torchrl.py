@@ -4,8 +4,9 @@
 
 TorchRL's collector, advantages and clipped loss, on `cavmarl.adapters.torchrl_env`; the network is
 ours. The run's folder holds it as `model.safetensors` and `config.json`, which
-`cavmarl evaluate --policy FOLDER` takes, `progress.csv` with the columns of `ippo_torch.py`, and
-`manifest.json`, which says what it was trained with.
+`cavmarl evaluate --policy FOLDER` takes, `progress.csv` with the columns of `ippo_torch.py`,
+`manifest.json`, which says what it was trained with, and `checkpoint.pt`. `--resume FOLDER` goes on
+from that, in new episodes: TorchRL's collector keeps the state of its worlds to itself.
 """
 
 from __future__ import annotations
@@ -292,6 +293,8 @@ def learn(args: Args, folder: RunFolder, worlds: CavTorchRLEnv, network: ActorCr
     def save() -> None:
         folder.save(decisions, curve.updates, {"learner": learner.save(), "curve": curve.save()})
 
+    if not folder.began.parts:
+        save()
     steps = iter(collector)
     while decisions < args.total_agent_steps and folder.has_time(args.minutes):
         batch = next(steps)

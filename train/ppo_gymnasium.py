@@ -5,7 +5,8 @@
 Every agent is a row of `gymnasium.make_vec`; rows begin anew in the next step, so that what follows
 a row's last step is its last observation. The run's folder holds the driver (`model.safetensors`
 and `config.json`, which `cavmarl evaluate --policy FOLDER` takes), `progress.csv` with the columns
-of `ippo_torch.py`, and `manifest.json`, which says what it was trained with.
+of `ippo_torch.py`, `manifest.json`, which says what it was trained with, and `checkpoint.pt`, from
+which `--resume FOLDER` goes on bit for bit.
 """
 
 from __future__ import annotations
@@ -240,6 +241,8 @@ def train(args: Args) -> Path:
     with RunFolder(args, vec.worlds.world, vec.plans) as folder:
         learner = Learner(rows, network, args)
         decisions, updates = folder.began.agent_steps, folder.began.updates
+        if not folder.began.parts:
+            folder.save(0, 0, learner.save())
         if parts := folder.resume():
             learner.load(parts)
         while decisions < args.total_agent_steps and folder.has_time(args.minutes):

@@ -6,7 +6,7 @@ The library's own PPO, learning rate, batches and network; what is ours is the v
 (`cavmarl.adapters.sb3_vec_env`). The run's folder holds stable-baselines3's `model.zip`,
 `progress.csv` with the columns of `ippo_torch.py`, and the same network as `model.safetensors` and
 `config.json`, which `cavmarl evaluate --policy FOLDER` takes; `manifest.json` says what it was
-trained with.
+trained with. From `checkpoint.pt`, `--resume FOLDER` goes on bit for bit.
 """
 
 from __future__ import annotations
@@ -94,6 +94,10 @@ class Curve(BaseCallback):
         own["ended"] = [(float(returned), bool(arrived)) for returned, arrived in self._ended]
         parts = {"curve": own, "model": state_of(self.model)}
         self._folder.save(self.num_timesteps, self._updates, parts)
+
+    def _on_training_start(self) -> None:
+        if not self._folder.began.parts:
+            self._save()
 
     def _on_rollout_start(self) -> None:
         if self._updates > self._folder.began.updates and self._folder.is_due(self._updates):

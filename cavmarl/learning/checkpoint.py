@@ -18,8 +18,8 @@ from torch import Tensor
 
 from cavmarl.core.errors import TrainingError
 from cavmarl.core.whole_file import write_whole
+from cavmarl.evaluate.provenance.training_record import CHECKPOINT_FILE
 
-CHECKPOINT_FILE = "checkpoint.pt"
 _HEAD = b"cavmarl checkpoint 1\n"  # then a SHA-256 of the rest
 _DIGEST_BYTES = 32
 
@@ -87,9 +87,11 @@ def writing(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
+        cure = "make room for it, then begin again"
+        if (path.parent / CHECKPOINT_FILE).exists():
+            cure = f"make room for it, then go on from the last checkpoint: --resume {path.parent}"
         raise TrainingError(
-            f"{path}: cannot be written ({error.strerror or error}): make room for it, then go on "
-            f"with --resume {path.parent}; a checkpoint written before is whole"
+            f"{path}: cannot be written ({error.strerror or error}): {cure}"
         ) from error
 
 

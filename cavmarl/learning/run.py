@@ -147,7 +147,7 @@ def _network_config(settings: PpoSettings, vec: CavVectorEnv) -> NetworkConfig:
 
 @contextmanager
 def opened(settings: PpoSettings) -> Iterator[Run]:
-    """A run in its worlds and its folder, which nobody else writes until it is closed."""
+    """A run in its worlds and its folder, which are closed at the end."""
     vec = make_worlds(settings)
     try:
         with RunFolder(settings, vec.worlds.world, vec.plans) as folder:
@@ -172,7 +172,7 @@ def _improve(run: Run, console: Console) -> None:
         console.print(run.vec.plan_text(), highlight=False)
     with progress_bar(console) as bar:
         task = bar.add_task("", total=1.0)
-        done = run.done()
+        done = run.done() if run.updates else 0.0
         while done < 1.0:
             row = run.update()
             done = run.done()

@@ -21,9 +21,13 @@ from cavmarl.core.whole_file import remove_drafts
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
 from cavmarl.evaluate.provenance.manifest import MANIFEST_FILE
-from cavmarl.evaluate.provenance.training_record import begin_training, end_training, is_trained
-from cavmarl.learning.checkpoint import (
+from cavmarl.evaluate.provenance.training_record import (
     CHECKPOINT_FILE,
+    begin_training,
+    end_training,
+    is_trained,
+)
+from cavmarl.learning.checkpoint import (
     Parts,
     RunState,
     random_states,
@@ -85,7 +89,7 @@ def parse_run(kind: type[S], words: Sequence[str] | None, text: str | None) -> S
 
 
 class RunFolder:
-    """The folder of a run, from its first file to its last; `with` it, nobody else writes there.
+    """The folder of a run, from its first file to its last; one process has it at a time.
 
     Args:
         settings: of the run; if they have `resume` and it is not empty, the run goes on.
@@ -148,12 +152,15 @@ class RunFolder:
         return state
 
     def _refuse_begun(self) -> None:
-        if any((self.path / name).exists() for name in (CHECKPOINT_FILE, MANIFEST_FILE, CSV_FILE)):
-            goes_on = f"go on with it (--resume {self.path}), or "
+        can_go_on = hasattr(self._settings, "resume")
+        left = [self.path / name for name in (CHECKPOINT_FILE, WEIGHTS_FILE)]
+        left += [] if can_go_on else [self.path / MANIFEST_FILE]
+        table = self.path / CSV_FILE
+        if any(path.exists() for path in left) or (table.exists() and table.stat().st_size):
+            cure = f"go on with it (--resume {self.path}), or " if can_go_on else ""
             raise TrainingError(
-                f"{self.path}: a run has begun here, which is not overwritten: "
-                f"{goes_on if hasattr(self._settings, 'resume') else ''}give this one another "
-                "--name"
+                f"{self.path}: a run has begun here, which is not overwritten: {cure}give this one "
+                "another --name"
             )
 
     @cached_property

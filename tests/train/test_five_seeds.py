@@ -8,18 +8,19 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
 
-from tests.support.training import TRAIN
+from tests.support.training import TRAIN, load_program
 
 pytest.importorskip("torch", reason="needs the extra: torch")
 
 WAIT_MS = 60_000  # until what is waited for is taken not to come
 
 
-@pytest.mark.parametrize("ended_by", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("ended_by", [signal.SIGKILL, signal.SIGINT])
 def test_trainings_end_with_the_program(tmp_path: Path, ended_by: signal.Signals) -> None:
     config = tmp_path / "long.yaml"
     config.write_text("env: ring\nnum_envs: 2\ntotal_agent_steps: 1000000000\n")
@@ -50,3 +51,21 @@ def test_trainings_end_with_the_program(tmp_path: Path, ended_by: signal.Signals
         assert errors.startswith("interrupted: the same command goes on")
     else:
         assert program.returncode == -ended_by
+
+
+def test_a_seed_that_was_cut_short_goes_on(tmp_path: Path) -> None:
+    program = load_program("five_seeds")
+    commands: list[list[str]] = []
+
+    class Noted:
+        def run(self, command: list[str], said: str) -> int:
+            commands.append(command)
+            return 0
+
+    args: Any = program.parse_args(["--config", "long.yaml", "--out", str(tmp_path)])
+    (tmp_path / "seed_1").mkdir()
+    (tmp_path / "seed_1" / "checkpoint.pt").touch()
+    for seed in (0, 1):
+        program.train_seed(args, seed, Noted())
+    assert commands[0][-2:] == ["--name", "seed_0"]
+    assert commands[1][-2:] == ["--resume", str(tmp_path / "seed_1")]

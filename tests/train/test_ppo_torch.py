@@ -19,8 +19,9 @@ from cavmarl.config.registry import entries
 from cavmarl.core.errors import ConfigError
 from cavmarl.env.vector import make_vec
 from cavmarl.evaluate.provenance.manifest import read_closed
+from cavmarl.evaluate.provenance.training_record import CHECKPOINT_FILE
 from cavmarl.learning.batch import Batch
-from cavmarl.learning.checkpoint import CHECKPOINT_FILE, read_checkpoint, write_checkpoint
+from cavmarl.learning.checkpoint import read_checkpoint, write_checkpoint
 from cavmarl.learning.collector import Collector
 from cavmarl.learning.run_folder import parse_run
 from cavmarl.parallel.pooled_worlds import PooledWorlds

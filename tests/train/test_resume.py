@@ -20,8 +20,8 @@ import pytest
 pytest.importorskip("torch", reason="needs the extra: torch")
 
 from cavmarl.core.errors import ConfigError, TrainingError
-from cavmarl.evaluate.provenance.training_record import is_trained
-from cavmarl.learning.checkpoint import CHECKPOINT_FILE, read_checkpoint
+from cavmarl.evaluate.provenance.training_record import CHECKPOINT_FILE, is_trained
+from cavmarl.learning.checkpoint import read_checkpoint
 from cavmarl.learning.log import Log
 from cavmarl.learning.run import Run
 from cavmarl.learning.run_folder import parse_run
@@ -150,7 +150,12 @@ def test_a_run_that_died_before_its_manifest_was_closed_is_ended(
     before = learnt(here / "runs" / "run")
     assert ippo.main(["--resume", "runs/run"]) == 0
     assert learnt(here / "runs" / "run") == before
-    assert "--total-agent-steps 60: the run has 61; ask for more" in refusal("--resume", "runs/run")
+    more = ["--resume", "runs/run"]
+    assert "--total-agent-steps 60: the run has 61; ask for more" in refusal(*more)
+    more += ["--total-agent-steps", "90"]
+    assert "--minutes 1e-05: the run has" in refusal(*more, "--minutes", "1e-5")
+    assert ippo.main(more) == 0
+    assert len(learnt(here / "runs" / "run")[1]) > len(before[1])
 
 
 def test_a_folder_has_one_run_and_one_process(
@@ -197,7 +202,7 @@ def test_a_full_disk_leaves_the_last_checkpoint_whole(
         patch.setattr(os, "fsync", fsync_on_a_full_disk)
         said = refusal(*words, "--name", "cut")
     assert f"runs/cut/{full}: cannot be written (No space left on device): make room" in said
-    assert "--resume runs/cut" in said
+    assert "go on from the last checkpoint: --resume runs/cut" in said
     assert not list((here / "runs" / "cut").glob(".checkpoint*"))
     assert read_checkpoint(here / "runs" / "cut").updates == 0
     assert ippo.main(["--resume", "runs/cut"]) == 0
@@ -210,6 +215,20 @@ def test_a_row_that_finds_no_room_is_a_typed_error(here: Path) -> None:
     with pytest.raises(TrainingError, match=r"progress\.csv: cannot be written \(No space left"):
         log.write({"updates": 1.0})
     log.close()
+
+
+def test_a_run_that_found_no_room_at_all_can_be_begun_again(
+    ippo: ModuleType, here: Path, refusal: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_room(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    words = [*TINY, "--total-agent-steps", "20", "--name", "run"]
+    with monkeypatch.context() as patch:
+        patch.setattr("cavmarl.learning.run_folder.write_checkpoint", no_room)
+        assert "checkpoint.pt: cannot be written" in refusal(*words)
+    assert "--resume runs/run: no checkpoint there" in refusal("--resume", "runs/run")
+    assert ippo.main(words) == 0
 
 
 def test_what_is_damaged_or_of_another_run_is_refused(
@@ -267,3 +286,41 @@ def test_tensorboard_is_cut_where_the_checkpoint_is(
     cut(ippo, [*words, "--name", "cut"], monkeypatch)
     assert ippo.main(["--resume", "runs/cut"]) == 0
     assert points("cut") == points("whole") != []
+
+
+@pytest.mark.parametrize(
+    ("name", "module"),
+    [("ppo_gymnasium", "gymnasium"), ("ppo_sb3", "stable_baselines3"), ("ippo_torchrl", "torchrl")],
+)
+@pytest.mark.filterwarnings("ignore")  # what the libraries warn of themselves
+def test_a_librarys_run_goes_on(
+    here: Path, monkeypatch: pytest.MonkeyPatch, name: str, module: str
+) -> None:
+    pytest.importorskip(module)
+    program, write = load_program(name), Log.write
+
+    def write_and_end(self: Log, row: dict[str, float]) -> None:
+        write(self, row)
+        if row["updates"] == CUT_AFTER:
+            raise Cut
+
+    words = ["--env", "ring", "--num-worlds", "2", "--num-steps", "8", "--hidden", "8"]
+    words += ["--epochs", "1", "--minibatches", "2", "--checkpoint-updates", "2"]
+    words += ["--num-envs", "8"] if name == "ppo_gymnasium" else []
+    words += ["--total-agent-steps", "400"]
+    assert program.main([*words, "--name", "whole"]) == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(Log, "write", write_and_end)
+        with pytest.raises(Cut):
+            program.main([*words, "--name", "cut"])
+    assert program.main([*words, "--name", "cut"]) == 2
+    assert program.main(["--resume", "runs/cut"]) == 0
+    assert is_trained(here / "runs" / "cut")
+    whole, resumed = learnt(here / "runs" / "whole"), learnt(here / "runs" / "cut")
+    if name == "ippo_torchrl":  # whose collector keeps its worlds: they begin new episodes
+        whole, resumed = (whole[1][:4], whole[2]), (resumed[1][:4], resumed[2])
+        rows = (here / "runs" / "cut" / "progress.csv").read_text().splitlines()
+        updates = [int(row.partition(",")[0]) for row in rows[1:]]
+        assert updates == list(range(1, len(rows)))
+        assert len(rows) > 1 + CUT_AFTER
+    assert resumed == whole
