@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,8 @@ from cavmarl.env.declared_events import DeclaredEvents
 from cavmarl.parallel.checkpoint.world_cases import from_bytes, to_bytes
 from cavmarl.parallel.local_worlds import every_array, kept_elsewhere
 from cavmarl.parallel.step_arrays import SteppedWorlds
+
+_DIGEST_BYTES = 32
 
 
 class SavedState:
@@ -43,17 +46,25 @@ class SavedState:
         cases = self.worlds.save_worlds()
         sizes = np.array([len(case) for case in cases], dtype=np.int64)
         joined = np.frombuffer(b"".join(cases), dtype=np.uint8)
-        return to_bytes([*self._memory(), sizes, joined])
+        content = to_bytes([*self._memory(), sizes, joined])
+        return hashlib.sha256(content).digest() + content
 
     def load_state(self, saved: bytes) -> None:
         """Go on from what `save_state` gave; zones and workers may be others than they were.
 
         Raises:
-            ConfigError: it is of other worlds, of another number of them, or of another version.
+            ConfigError: it is damaged, of other worlds, of another number of them, or of another
+                version.
         """
+        digest, content = saved[:_DIGEST_BYTES], saved[_DIGEST_BYTES:]
+        if digest != hashlib.sha256(content).digest():
+            raise ConfigError(
+                "the state of worlds is damaged: its checksum is not that of its content; save it "
+                "again"
+            )
         memory = self._memory()
         like = [*memory, np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.uint8)]
-        *arrays, sizes, joined = from_bytes(saved, like)
+        *arrays, sizes, joined = from_bytes(content, like)
         if [array.shape for array in arrays] != [array.shape for array in memory]:
             raise ConfigError(
                 "the state is one of other worlds, or of another number of them: make the "

@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import Any
 
 import numpy as np
@@ -46,9 +45,12 @@ def write_checkpoint(folder: Path, state: RunState) -> None:
     """Raises OSError: it cannot be written; the one before is as it was."""
     file = io.BytesIO()
     torch.save(vars(state), file)
-    content = file.getvalue()
-    digest = hashlib.sha256(content).digest()
-    write_whole(folder / CHECKPOINT_FILE, _HEAD + digest + content)
+    write_whole(folder / CHECKPOINT_FILE, sealed(file.getvalue()))
+
+
+def sealed(content: bytes) -> bytes:
+    """What a checkpoint's file holds: its version and checksum, and the content."""
+    return _HEAD + hashlib.sha256(content).digest() + content
 
 
 def read_checkpoint(folder: Path) -> RunState:
@@ -66,11 +68,11 @@ def read_checkpoint(folder: Path) -> RunState:
             "or begin one without --resume"
         ) from error
     content = raw[len(_HEAD) + _DIGEST_BYTES :]
-    if raw != _HEAD + hashlib.sha256(content).digest() + content:
+    if raw != sealed(content):
         raise _broken(path, "its checksum is not that of its content")
     try:
         return RunState(**torch.load(io.BytesIO(content), weights_only=True))
-    except (RuntimeError, ValueError, EOFError, KeyError, TypeError, UnpicklingError) as error:
+    except Exception as error:  # torch's reader raises what it meets
         raise _broken(path, str(error).partition("\n")[0]) from error
 
 
