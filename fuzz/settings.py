@@ -1,4 +1,4 @@
-"""Targets that read settings and records: env.yaml, overrides, drivers, manifests, plans."""
+"""Targets that read settings and records: entries, overrides, drivers, checkpoints, plans."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import tempfile
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+
+import torch
 
 from cavmarl.balance.balance_plan import make_plan, replan
 from cavmarl.balance.load_snapshot import idle_snapshot
@@ -23,6 +25,8 @@ from cavmarl.evaluate.provenance.manifest import (
     open_manifest,
     read_closed,
 )
+from cavmarl.evaluate.provenance.training_record import CHECKPOINT_FILE
+from cavmarl.learning.checkpoint import RunState, read_checkpoint, sealed, write_checkpoint
 from cavmarl.policies.networks import (
     CONFIG_FILE,
     WEIGHTS_FILE,
@@ -33,7 +37,7 @@ from cavmarl.policies.networks import (
 )
 from fuzz.files import ROOT, Target, scratch, seed
 
-__all__ = ["DRIVERS", "ENTRIES", "MANIFESTS", "OVERRIDES", "PLANS"]
+__all__ = ["CHECKPOINTS", "DRIVERS", "ENTRIES", "MANIFESTS", "OVERRIDES", "PLANS"]
 
 # Between the two files of a driver, in one input.
 _BORDER = b"\n----\n"
@@ -110,8 +114,24 @@ def _drivers() -> tuple[bytes, ...]:
     return tuple(found)
 
 
+def _checkpoint(content: bytes) -> None:
+    """Damage that no checksum tells."""
+    read_checkpoint(scratch(f"run/{CHECKPOINT_FILE}", sealed(content)).parent)
+
+
+@cache
+def _checkpoints() -> tuple[bytes, ...]:
+    parts = {"weights": torch.zeros(2, 3), "trips": [1.0, 2.0], "next": None}
+    state = RunState("ippo_torch.py", {"seed": 0}, "ring", logs={"progress.csv": 9}, parts=parts)
+    with tempfile.TemporaryDirectory() as name:
+        write_checkpoint(Path(name), state)
+        whole = (Path(name) / CHECKPOINT_FILE).read_bytes()
+    return (whole[len(sealed(b"")) :],)
+
+
 ENTRIES = Target(_entry, _entries)
 OVERRIDES = Target(_overrides, lambda: (seed("overrides.txt"),))
 MANIFESTS = Target(_manifest, _manifests)
 PLANS = Target(_plan, _plans)
 DRIVERS = Target(_driver, _drivers)
+CHECKPOINTS = Target(_checkpoint, _checkpoints)

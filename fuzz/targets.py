@@ -5,7 +5,7 @@ from __future__ import annotations
 from fuzz.followers import FOLLOWER
 from fuzz.protocol import LOGS, MESSAGES
 from fuzz.roads import BUILDINGS, CACHED, MAPS, NETWORKS, PROGRAMS, ZONES
-from fuzz.settings import DRIVERS, ENTRIES, MANIFESTS, OVERRIDES, PLANS
+from fuzz.settings import CHECKPOINTS, DRIVERS, ENTRIES, MANIFESTS, OVERRIDES, PLANS
 from fuzz.traffic import DEMAND, SUMO_CONFIGS
 
 __all__ = ["TARGETS"]
@@ -22,6 +22,7 @@ TARGETS = {
     "entry": ENTRIES,
     "overrides": OVERRIDES,
     "driver": DRIVERS,
+    "checkpoint": CHECKPOINTS,
     "manifest": MANIFESTS,
     "plan": PLANS,
     "message": MESSAGES,

@@ -5,7 +5,8 @@
 Trains with each seed (`ippo_torch.py`, one core each), lets all drivers and the scripted ones
 drive the same episodes, which no training has seen, and writes into the folder: `table.md`,
 `result.json`, `curves.svg`, `evaluation/` with its manifest and raw tables, and the runs, each with
-its own manifest. A seed that is trained already is not trained again.
+its own manifest. A seed that is trained already is not trained again, and one that was cut short
+goes on from its checkpoint. Trainings end with this program, however it ends.
 
 Of the trained drivers the interval is that of the mean over training seeds; of a scripted one, that
 of the mean over evaluation runs; both 95 %, by Student's t.
@@ -22,13 +23,15 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from threading import Lock
 
 import numpy as np
 
 from cavmarl.config.io import read_yaml
 from cavmarl.core.errors import CavmarlError, ConfigError, require
+from cavmarl.core.processes import dying_with_parent
 from cavmarl.evaluate import EvaluationReport, evaluate
-from cavmarl.evaluate.provenance.training_record import is_trained
+from cavmarl.evaluate.provenance.training_record import CHECKPOINT_FILE, is_trained
 from cavmarl.evaluate.statistics import Interval, mean_interval
 
 PROGRAM = Path(__file__).with_name("ippo_torch.py")
@@ -87,21 +90,69 @@ class Row:
 
 
 def train(args: Args) -> dict[int, Path]:
-    """The folder of each seed's run, trained unless it is there and complete."""
+    """The folder of each seed's run: trained unless it is complete, gone on with if it is begun."""
     folders = {seed: args.out / f"seed_{seed}" for seed in args.seeds}
     missing = [seed for seed in args.seeds if not is_trained(folders[seed])]
-
-    def run(seed: int) -> None:
-        words = ["--config", str(args.config), "--seed", str(seed), "--runs", str(args.out)]
-        command = [sys.executable, str(PROGRAM), *words, "--name", f"seed_{seed}"]
-        print(f"training seed {seed}", flush=True)
-        done = subprocess.run(command, stdout=subprocess.DEVNULL, check=False)
-        if done.returncode != 0:
-            raise ConfigError(f"training with seed {seed} failed: {' '.join(command)}")
-
+    children = Children()
     with ThreadPoolExecutor(args.jobs) as pool:
-        list(pool.map(run, missing))
+        try:
+            for done in [pool.submit(train_seed, args, seed, children) for seed in missing]:
+                done.result()
+        except BaseException:
+            children.end()
+            raise
     return folders
+
+
+def train_seed(args: Args, seed: int, children: Children) -> None:
+    """Train with a seed.
+
+    Raises:
+        ConfigError: it has failed.
+    """
+    folder = args.out / f"seed_{seed}"
+    if (folder / CHECKPOINT_FILE).exists():
+        words = ["--resume", str(folder)]
+    else:
+        words = ["--config", str(args.config), "--seed", str(seed), "--runs", str(args.out)]
+        words += ["--name", folder.name]
+    command = [sys.executable, str(PROGRAM), *words]
+    if children.run(command, f"training seed {seed}"):
+        raise ConfigError(f"training with seed {seed} failed: {' '.join(command)}")
+
+
+class Children:
+    """Processes that end with this one, however it ends, or when they are told to.
+
+    They are of sessions of their own: Ctrl-C is for this process.
+    """
+
+    def __init__(self) -> None:
+        self._running: set[subprocess.Popen[bytes]] = set()
+        self._lock = Lock()
+        self._are_to_end = False
+
+    def run(self, command: Sequence[str], said: str) -> int:
+        """Start one, say so and wait for it: how it has ended."""
+        with self._lock:
+            if self._are_to_end:
+                return 0
+            child = subprocess.Popen(
+                dying_with_parent(command), stdout=subprocess.DEVNULL, start_new_session=True
+            )
+            self._running.add(child)
+        print(said, flush=True)
+        try:
+            return child.wait()
+        finally:
+            self._running.discard(child)
+
+    def end(self) -> None:
+        """End all, and start no others."""
+        with self._lock:
+            self._are_to_end = True
+            for child in tuple(self._running):
+                child.kill()
 
 
 def summarise(report: EvaluationReport, args: Args) -> dict[str, dict[str, Row]]:
@@ -190,7 +241,7 @@ def draw_curves(path: Path, folders: Sequence[Path], others: Sequence[Path], tit
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Train, evaluate, write; 0: done, 2: wrong use."""
+    """Train, evaluate, write; 0: done, 2: wrong use, 130: interrupted."""
     try:
         args = parse_args(words)
         settings = read_yaml(args.config)
@@ -218,6 +269,9 @@ def main(words: Sequence[str] | None = None) -> int:
     except CavmarlError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("interrupted: the same command goes on from the last checkpoints", file=sys.stderr)
+        return 130
     print(text)
     return 0
 

@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import torch
 from benchmarl.algorithms import algorithm_config_registry
@@ -24,13 +24,14 @@ from benchmarl.models.mlp import MlpConfig
 
 from cavmarl.adapters.benchmarl_task import CavTaskClass
 from cavmarl.core.errors import ConfigError
-from cavmarl.evaluate.provenance.training_record import begin_training, end_training
+from cavmarl.learning.checkpoint import writing
 from cavmarl.learning.options import (
     check_at_least,
     parse_settings,
     run_folder,
     run_program,
 )
+from cavmarl.learning.run_folder import RunFolder
 
 POLICY_FILE = "policy.pt"
 
@@ -38,6 +39,8 @@ POLICY_FILE = "policy.pt"
 @dataclass(frozen=True)
 class Args:
     """The settings of a run; each is an option of the command line."""
+
+    program: ClassVar[str] = "ippo_benchmarl.py"
 
     env: Annotated[str, "environment: a name, a folder or a map file"] = "merge"
     algorithm: Annotated[str, "as BenchMARL calls it"] = "ippo"
@@ -105,12 +108,11 @@ def train(args: Args) -> Path:
     torch.set_num_threads(1)  # more cost small networks more than they bring
     args.folder.mkdir(parents=True, exist_ok=True)
     experiment = make_experiment(args)
-    world = experiment.test_env.base_env.vec.worlds.world
-    begin_training(args.folder, "ippo_benchmarl.py", asdict(args), world)
-    experiment.run()
-    torch.save(experiment.policy.state_dict(), args.folder / POLICY_FILE)
-    end_training(args.folder, (POLICY_FILE,))
-    return args.folder
+    with RunFolder(args, experiment.test_env.base_env.vec.worlds.world) as folder:
+        experiment.run()
+        with writing(args.folder / POLICY_FILE):
+            torch.save(experiment.policy.state_dict(), args.folder / POLICY_FILE)
+        return folder.end((POLICY_FILE,))
 
 
 def main(words: Sequence[str] | None = None) -> int:

@@ -11,9 +11,9 @@ is `cavmarl.learning`, where PPO itself stands in `collector.py`, `batch.py` and
 
 A run's folder holds the driver (`model.safetensors` and `config.json`, which
 `cavmarl evaluate --policy FOLDER` takes), `manifest.json` (what it was trained with),
-`progress.csv`, TensorBoard's files, and what `--resume` needs. With the same seed, threads and
-machine a run repeats itself for any number of workers, unless the clock ends it (`--minutes`). A
-resumed run begins new episodes.
+`progress.csv`, TensorBoard's files, and `checkpoint.pt`, from which `--resume` goes on. With the
+same seed, threads and machine a run repeats itself for any number of workers, unless the clock ends
+it (`--minutes`); so does one that was cut short and goes on. It is never overwritten.
 """
 
 from __future__ import annotations
@@ -26,8 +26,9 @@ from typing import ClassVar
 from rich.console import Console
 
 from cavmarl.learning.options import run_program
-from cavmarl.learning.ppo_settings import PpoSettings, parse_ppo
+from cavmarl.learning.ppo_settings import PpoSettings
 from cavmarl.learning.run import train
+from cavmarl.learning.run_folder import parse_run
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class Args(PpoSettings):
 
 def main(words: Sequence[str] | None = None) -> int:
     """Train; 0: trained, 2: wrong use."""
-    return run_program(lambda: train(parse_ppo(Args, words, __doc__), Console()))
+    return run_program(lambda: train(parse_run(Args, words, __doc__), Console()))
 
 
 if __name__ == "__main__":

@@ -4,19 +4,19 @@
 
 TorchRL's collector, advantages and clipped loss, on `cavmarl.adapters.torchrl_env`; the network is
 ours. The run's folder holds it as `model.safetensors` and `config.json`, which
-`cavmarl evaluate --policy FOLDER` takes, `progress.csv` with the columns of `ippo_torch.py`, and
-`manifest.json`, which says what it was trained with.
+`cavmarl evaluate --policy FOLDER` takes, `progress.csv` with the columns of `ippo_torch.py`,
+`manifest.json`, which says what it was trained with, and `checkpoint.pt`. `--resume FOLDER` goes on
+from that, in new episodes: TorchRL's collector keeps the state of its worlds to itself.
 """
 
 from __future__ import annotations
 
 import sys
-import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import torch
 from tensordict import TensorDict
@@ -29,21 +29,11 @@ from torchrl.objectives.value import GAE
 
 from cavmarl.adapters.torchrl_env import GROUP, CavTorchRLEnv
 from cavmarl.config.registry import load_config
-from cavmarl.evaluate.provenance.training_record import begin_training, end_training
-from cavmarl.learning.log import CSV_FILE, WINDOW, Log, curve_row
-from cavmarl.learning.options import (
-    check_at_least,
-    parse_settings,
-    run_folder,
-    run_program,
-)
-from cavmarl.policies.networks import (
-    CONFIG_FILE,
-    WEIGHTS_FILE,
-    ActorCritic,
-    NetworkConfig,
-    save_network,
-)
+from cavmarl.learning.checkpoint import Parts
+from cavmarl.learning.log import WINDOW, curve_row
+from cavmarl.learning.options import RESUME, check_at_least, run_folder, run_program
+from cavmarl.learning.run_folder import RunFolder, parse_run
+from cavmarl.policies.networks import ActorCritic, NetworkConfig
 
 LEAST_DEVIATION = 0.02  # of an observation; those that hardly change are not blown up
 OBSERVATION, MASK, ACTION, LOG_PROB, VALUE = (
@@ -54,6 +44,8 @@ OBSERVATION, MASK, ACTION, LOG_PROB, VALUE = (
 @dataclass(frozen=True)
 class Args:
     """The settings of a run; each is an option of the command line."""
+
+    program: ClassVar[str] = "ippo_torchrl.py"
 
     env: Annotated[str, "environment: a name, a folder or a map file"] = "merge"
     num_worlds: Annotated[int, "worlds that are stepped together"] = 32
@@ -70,15 +62,18 @@ class Args:
     initial_std: Annotated[float, "standard deviation of continuous actions at the start"] = 0.3
     runs: Annotated[str, "folder of all runs"] = "runs"
     name: Annotated[str, "folder of this run; empty: ENV_torchrl_SEED"] = ""
+    checkpoint_updates: Annotated[int, "updates between two checkpoints"] = 20
+    resume: Annotated[str, RESUME] = ""
 
     def __post_init__(self) -> None:
         least_one = ("num_worlds", "total_agent_steps", "num_steps", "epochs", "minibatches")
-        check_at_least(self, dict.fromkeys(least_one, 1))
+        check_at_least(self, dict.fromkeys((*least_one, "checkpoint_updates"), 1))
 
     @property
     def folder(self) -> Path:
         """Where this run lies."""
-        return run_folder(self.runs, self.name, self.env, "torchrl", self.seed)
+        name = (self.name, self.env, "torchrl", self.seed)
+        return run_folder(self.runs, *name, resume=self.resume)
 
 
 class Policy(nn.Module):
@@ -156,7 +151,17 @@ class Learner:
         ends = {name: (GROUP, name) for name in ("reward", "done", "terminated")}
         self._advantages.set_keys(value=VALUE, **ends)
         self._loss.set_keys(value=VALUE, action=ACTION, sample_log_prob=LOG_PROB, **ends)
+        self._network = network
         self._optimizer = torch.optim.Adam(network.parameters(), eps=1e-5)
+
+    def save(self) -> Parts:
+        """The network and its optimiser."""
+        return {"network": self._network.state_dict(), "optimizer": self._optimizer.state_dict()}
+
+    def load(self, saved: Parts) -> None:
+        """Go on from what `save` gave."""
+        self._network.load_state_dict(saved["network"])
+        self._optimizer.load_state_dict(saved["optimizer"])
 
     def update(self, batch: TensorDict, left: float) -> int:
         """Learn from (W, T) steps; `left` is the share of the run to come. How many decisions."""
@@ -187,13 +192,23 @@ class Curve:
         folder: of the run.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self._log = Log(folder)
+    def __init__(self, folder: RunFolder) -> None:
+        self._folder = folder
         self._ended: deque[tuple[float, bool]] = deque(maxlen=WINDOW)
         self._returns: Any = 0.0
-        self._trips = self._updates = 0
+        self._trips = 0
+        self.updates = folder.began.updates
 
-    def write(self, batch: TensorDict, decisions: int, seconds: float) -> None:
+    def save(self) -> Parts:
+        """The last trips; those under way are not gone on with."""
+        return {"ended": list(self._ended), "trips": self._trips}
+
+    def load(self, saved: Parts) -> None:
+        """Go on from what `save` gave."""
+        self._ended.extend(saved["ended"])
+        self._trips = saved["trips"]
+
+    def write(self, batch: TensorDict, decisions: int) -> None:
         """Add an update's line, with the trips that ended in its (W, T) steps."""
         after = batch["next", GROUP]
         arrived = after["info", "arrival"] > 0.0
@@ -206,12 +221,9 @@ class Curve:
             self._ended.extend(trips)
             self._trips += int(ended.sum())
             self._returns[after["done"][:, step]] = 0.0
-        self._updates += 1
-        self._log.write(curve_row(self._updates, decisions, seconds, self._trips, self._ended))
-
-    def close(self) -> None:
-        """Close the table."""
-        self._log.close()
+        self.updates += 1
+        counts = (self.updates, decisions, self._folder.seconds, self._trips)
+        self._folder.log.write(curve_row(*counts, self._ended))
 
 
 def make_worlds(args: Args) -> CavTorchRLEnv:
@@ -259,30 +271,45 @@ def train(args: Args) -> Path:
     torch.manual_seed(args.seed)
     worlds = make_worlds(args)
     network, config = make_network(args, worlds)
-    args.folder.mkdir(parents=True, exist_ok=True)
     stepped = worlds.vec.worlds
-    begin_training(args.folder, "ippo_torchrl.py", asdict(args), stepped.world, stepped.plans)
-    learner, curve = Learner(network, args), Curve(args.folder)
+    with RunFolder(args, stepped.world, stepped.plans) as folder:
+        decisions = learn(args, folder, worlds, network)
+        folder.save_driver(network, replace(config, agent_steps=decisions))
+        return folder.end()
+
+
+def learn(args: Args, folder: RunFolder, worlds: CavTorchRLEnv, network: ActorCritic) -> int:
+    """Improve the network by steps of the worlds; how many decisions of the run there are."""
+    learner, curve = Learner(network, args), Curve(folder)
+    decisions = folder.began.agent_steps
+    if folder.began.parts:  # the collector keeps its worlds to itself: they begin new episodes
+        worlds.set_seed(args.seed + curve.updates)
     frames = args.num_worlds * args.num_steps
     collector = Collector(worlds, learner.actor, frames_per_batch=frames, total_frames=-1)
-    limit_s = 60.0 * args.minutes if args.minutes else float("inf")
-    began_at, decisions = time.perf_counter(), 0
-    for batch in collector:
+    if parts := folder.resume():
+        learner.load(parts["learner"])
+        curve.load(parts["curve"])
+
+    def save() -> None:
+        folder.save(decisions, curve.updates, {"learner": learner.save(), "curve": curve.save()})
+
+    if not folder.began.parts:
+        save()
+    steps = iter(collector)
+    while decisions < args.total_agent_steps and folder.has_time(args.minutes):
+        batch = next(steps)
         decisions += learner.update(batch, max(1.0 - decisions / args.total_agent_steps, 0.0))
-        seconds = time.perf_counter() - began_at
-        curve.write(batch, decisions, seconds)
-        if decisions >= args.total_agent_steps or seconds >= limit_s:
-            break
+        curve.write(batch, decisions)
+        if folder.is_due(curve.updates):
+            save()
+    save()
     collector.shutdown()
-    curve.close()
-    save_network(args.folder, network, NetworkConfig(**{**vars(config), "agent_steps": decisions}))
-    end_training(args.folder, (WEIGHTS_FILE, CONFIG_FILE, CSV_FILE))
-    return args.folder
+    return decisions
 
 
 def main(words: Sequence[str] | None = None) -> int:
     """Train; 0: trained, 2: wrong use."""
-    return run_program(lambda: train(parse_settings(Args, words, __doc__)))
+    return run_program(lambda: train(parse_run(Args, words, __doc__)))
 
 
 if __name__ == "__main__":

@@ -18,21 +18,23 @@ from typing import ClassVar
 from rich.console import Console
 
 from cavmarl.learning.options import run_program
-from cavmarl.learning.ppo_settings import PpoSettings, parse_ppo
+from cavmarl.learning.ppo_settings import PpoSettings
 from cavmarl.learning.run import train
+from cavmarl.learning.run_folder import parse_run
 
 
 @dataclass(frozen=True)
 class Args(PpoSettings):
     """The critic sees the whole world."""
 
+    program: ClassVar[str] = "mappo_torch.py"
     algorithm: ClassVar[str] = "mappo"
     central_critic: ClassVar[bool] = True
 
 
 def main(words: Sequence[str] | None = None) -> int:
     """Train; 0: trained, 2: wrong use."""
-    return run_program(lambda: train(parse_ppo(Args, words, __doc__), Console()))
+    return run_program(lambda: train(parse_run(Args, words, __doc__), Console()))
 
 
 if __name__ == "__main__":

@@ -5,47 +5,40 @@
 Every agent is a row of `gymnasium.make_vec`; rows begin anew in the next step, so that what follows
 a row's last step is its last observation. The run's folder holds the driver (`model.safetensors`
 and `config.json`, which `cavmarl evaluate --policy FOLDER` takes), `progress.csv` with the columns
-of `ippo_torch.py`, and `manifest.json`, which says what it was trained with.
+of `ippo_torch.py`, `manifest.json`, which says what it was trained with, and `checkpoint.pt`, from
+which `--resume FOLDER` goes on bit for bit.
 """
 
 from __future__ import annotations
 
 import sys
-import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import gymnasium
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
+from numpy.typing import NDArray
 from torch import Tensor
 
 from cavmarl.core.errors import ConfigError
-from cavmarl.evaluate.provenance.training_record import begin_training, end_training
-from cavmarl.learning.log import CSV_FILE, WINDOW, Log, curve_row
-from cavmarl.learning.options import (
-    check_at_least,
-    parse_settings,
-    run_folder,
-    run_program,
-)
-from cavmarl.policies.networks import (
-    CONFIG_FILE,
-    WEIGHTS_FILE,
-    ActorCritic,
-    NetworkConfig,
-    save_network,
-)
+from cavmarl.learning.checkpoint import Parts, bytes_of, tensor_of
+from cavmarl.learning.log import WINDOW, curve_row
+from cavmarl.learning.options import RESUME, check_at_least, run_folder, run_program
+from cavmarl.learning.run_folder import RunFolder, parse_run
+from cavmarl.policies.networks import ActorCritic, NetworkConfig
 
 
 @dataclass(frozen=True)
 class Args:
     """The settings of a run; each is an option of the command line."""
+
+    program: ClassVar[str] = "ppo_gymnasium.py"
 
     env: Annotated[str, "environment: the name of an entry"] = "merge"
     num_envs: Annotated[int, "rows, so agents of all worlds"] = 512
@@ -64,15 +57,18 @@ class Args:
     initial_std: Annotated[float, "standard deviation of continuous actions at the start"] = 0.3
     runs: Annotated[str, "folder of all runs"] = "runs"
     name: Annotated[str, "folder of this run; empty: ENV_gymnasium_SEED"] = ""
+    checkpoint_updates: Annotated[int, "updates between two checkpoints"] = 20
+    resume: Annotated[str, RESUME] = ""
 
     def __post_init__(self) -> None:
         least_one = ("total_agent_steps", "num_steps", "epochs", "minibatches")
-        check_at_least(self, dict.fromkeys(least_one, 1))
+        check_at_least(self, dict.fromkeys((*least_one, "checkpoint_updates"), 1))
 
     @property
     def folder(self) -> Path:
         """Where this run lies."""
-        return run_folder(self.runs, self.name, self.env, "gymnasium", self.seed)
+        name = (self.name, self.env, "gymnasium", self.seed)
+        return run_folder(self.runs, *name, resume=self.resume)
 
 
 def make_rows(args: Args) -> Any:
@@ -110,6 +106,40 @@ class Learner:
         self._active = torch.from_numpy(infos["active"].copy())
         self.trips: deque[tuple[float, bool]] = deque(maxlen=WINDOW)
         self.num_trips = 0
+
+    def save(self) -> Parts:
+        """All that later updates depend on, but for torch's random numbers."""
+        seen = self._rows.obs_rms
+        return {
+            "network": self._network.state_dict(),
+            "optimizer": self._optimizer.state_dict(),
+            "observations": self._observations,
+            "active": self._active,
+            "trips": [(float(returned), bool(arrived)) for returned, arrived in self.trips],
+            "num_trips": self.num_trips,
+            "rows": tensor_of(self._rows.unwrapped.vec.save_state()),
+            "seen": [torch.from_numpy(seen.mean), torch.from_numpy(seen.var), float(seen.count)],
+            "recorded": {name: torch.from_numpy(array) for name, array in self._recorded().items()},
+        }
+
+    def load(self, saved: Parts) -> None:
+        """Go on from what `save` gave."""
+        self._network.load_state_dict(saved["network"])
+        self._optimizer.load_state_dict(saved["optimizer"])
+        self._observations, self._active = saved["observations"], saved["active"]
+        self.trips.extend(saved["trips"])
+        self.num_trips = saved["num_trips"]
+        self._rows.unwrapped.vec.load_state(bytes_of(saved["rows"]))
+        mean, var, count = saved["seen"]
+        seen = self._rows.obs_rms
+        seen.mean, seen.var, seen.count = mean.numpy(), var.numpy(), count
+        for name, array in self._recorded().items():
+            array[:] = saved["recorded"][name].numpy()
+
+    def _recorded(self) -> dict[str, NDArray[Any]]:
+        """What the wrapper that records trips has of those under way."""
+        names = ("episode_returns", "episode_lengths", "prev_dones")
+        return {name: getattr(self._rows.env, name) for name in names}
 
     def update(self, left: float) -> int:
         """Collect and learn; `left` is the share of the run to come. How many decisions."""
@@ -181,11 +211,11 @@ class Learner:
         self._optimizer.step()
 
 
-def save_driver(args: Args, network: ActorCritic, config: NetworkConfig, rows: Any) -> None:
+def save_driver(folder: RunFolder, network: ActorCritic, config: NetworkConfig, rows: Any) -> None:
     """Save the network with the wrapper's normalisation, which it did not see, as its own."""
     network.mean.copy_(torch.from_numpy(rows.obs_rms.mean))
     network.deviation.copy_(torch.from_numpy(np.sqrt(rows.obs_rms.var + rows.epsilon)))
-    save_network(args.folder, network, config)
+    folder.save_driver(network, config)
 
 
 def train(args: Args) -> Path:
@@ -207,26 +237,29 @@ def train(args: Args) -> Path:
         seed=args.seed,
     )
     network = ActorCritic(config, initial_std=(args.initial_std, args.initial_std))
-    args.folder.mkdir(parents=True, exist_ok=True)
     vec = rows.unwrapped.vec
-    begin_training(args.folder, "ppo_gymnasium.py", asdict(args), vec.worlds.world, vec.plans)
-    learner = Learner(rows, network, args)
-    limit_s = 60.0 * args.minutes if args.minutes else float("inf")
-    began_at, updates, decisions, seconds = time.perf_counter(), 0, 0, 0.0
-    log = Log(args.folder)
-    while decisions < args.total_agent_steps and seconds < limit_s:
-        decisions += learner.update(max(1.0 - decisions / args.total_agent_steps, 0.0))
-        updates, seconds = updates + 1, time.perf_counter() - began_at
-        log.write(curve_row(updates, decisions, seconds, learner.num_trips, learner.trips))
-    log.close()
-    save_driver(args, network, replace(config, agent_steps=decisions), rows)
-    end_training(args.folder, (WEIGHTS_FILE, CONFIG_FILE, CSV_FILE))
-    return args.folder
+    with RunFolder(args, vec.worlds.world, vec.plans) as folder:
+        learner = Learner(rows, network, args)
+        decisions, updates = folder.began.agent_steps, folder.began.updates
+        if not folder.began.parts:
+            folder.save(0, 0, learner.save())
+        if parts := folder.resume():
+            learner.load(parts)
+        while decisions < args.total_agent_steps and folder.has_time(args.minutes):
+            decisions += learner.update(max(1.0 - decisions / args.total_agent_steps, 0.0))
+            updates += 1
+            counts = (updates, decisions, folder.seconds, learner.num_trips)
+            folder.log.write(curve_row(*counts, learner.trips))
+            if folder.is_due(updates):
+                folder.save(decisions, updates, learner.save())
+        folder.save(decisions, updates, learner.save())
+        save_driver(folder, network, replace(config, agent_steps=decisions), rows)
+        return folder.end()
 
 
 def main(words: Sequence[str] | None = None) -> int:
     """Train; 0: trained, 2: wrong use."""
-    return run_program(lambda: train(parse_settings(Args, words, __doc__)))
+    return run_program(lambda: train(parse_run(Args, words, __doc__)))
 
 
 if __name__ == "__main__":

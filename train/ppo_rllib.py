@@ -11,12 +11,11 @@ an `RLModule`. The run's folder holds it as `model.safetensors` and `config.json
 from __future__ import annotations
 
 import sys
-import time
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import ray
 import torch
@@ -30,21 +29,15 @@ from torch import Tensor
 
 from cavmarl.adapters.rllib_env import CavRllibEnv
 from cavmarl.env.parallel import parallel_env
-from cavmarl.evaluate.provenance.training_record import begin_training, end_training
-from cavmarl.learning.log import CSV_FILE, WINDOW, Log, curve_row
+from cavmarl.learning.log import WINDOW, curve_row
 from cavmarl.learning.options import (
     check_at_least,
     parse_settings,
     run_folder,
     run_program,
 )
-from cavmarl.policies.networks import (
-    CONFIG_FILE,
-    WEIGHTS_FILE,
-    ActorCritic,
-    NetworkConfig,
-    save_network,
-)
+from cavmarl.learning.run_folder import RunFolder
+from cavmarl.policies.networks import ActorCritic, NetworkConfig, save_network
 
 DRIVER = "driver"  # the policy that all agents share
 
@@ -52,6 +45,8 @@ DRIVER = "driver"  # the policy that all agents share
 @dataclass(frozen=True)
 class Args:
     """The settings of a run; each is an option of the command line."""
+
+    program: ClassVar[str] = "ppo_rllib.py"
 
     env: Annotated[str, "environment: a name, a folder or a map file"] = "merge"
     num_runners: Annotated[int, "processes that step worlds; 0: this one does"] = 0
@@ -175,31 +170,27 @@ def train(args: Args) -> Path:
         hidden=(args.hidden, args.hidden),
         seed=args.seed,
     )
-    args.folder.mkdir(parents=True, exist_ok=True)
-    begin_training(args.folder, "ppo_rllib.py", asdict(args), world.simulation)
-    ray.init(num_cpus=args.num_runners + 1, include_dashboard=False, log_to_driver=False)
-    algorithm = make_algorithm(args, network)
-    limit_s = 60.0 * args.minutes if args.minutes else float("inf")
-    began_at, updates, decisions, seconds = time.perf_counter(), 0, 0, 0.0
-    log = Log(args.folder)
-    while decisions < args.total_agent_steps and seconds < limit_s:
-        found = algorithm.train()["env_runners"]
-        updates, seconds = updates + 1, time.perf_counter() - began_at
-        decisions = int(found["num_module_steps_sampled_lifetime"][DRIVER])
-        means = tuple(found.get(name, float("nan")) for name in ("trip_return", "success"))
-        log.write(curve_row(updates, decisions, seconds, found.get("trips", 0), [means]))
-    log.close()
-    algorithm.learner_group.foreach_learner(
-        lambda learner: save_network(
-            args.folder.absolute(),
-            learner.module[DRIVER].network,
-            replace(network, agent_steps=decisions),
+    with RunFolder(args, world.simulation) as folder:
+        ray.init(num_cpus=args.num_runners + 1, include_dashboard=False, log_to_driver=False)
+        algorithm = make_algorithm(args, network)
+        updates, decisions = 0, 0
+        while decisions < args.total_agent_steps and folder.has_time(args.minutes):
+            found = algorithm.train()["env_runners"]
+            updates += 1
+            decisions = int(found["num_module_steps_sampled_lifetime"][DRIVER])
+            means = tuple(found.get(name, float("nan")) for name in ("trip_return", "success"))
+            counts = (updates, decisions, folder.seconds, found.get("trips", 0))
+            folder.log.write(curve_row(*counts, [means]))
+        algorithm.learner_group.foreach_learner(
+            lambda learner: save_network(
+                args.folder.absolute(),
+                learner.module[DRIVER].network,
+                replace(network, agent_steps=decisions),
+            )
         )
-    )
-    algorithm.stop()
-    ray.shutdown()
-    end_training(args.folder, (WEIGHTS_FILE, CONFIG_FILE, CSV_FILE))
-    return args.folder
+        algorithm.stop()
+        ray.shutdown()
+        return folder.end()
 
 
 def main(words: Sequence[str] | None = None) -> int:

@@ -6,18 +6,17 @@ The library's own PPO, learning rate, batches and network; what is ours is the v
 (`cavmarl.adapters.sb3_vec_env`). The run's folder holds stable-baselines3's `model.zip`,
 `progress.csv` with the columns of `ippo_torch.py`, and the same network as `model.safetensors` and
 `config.json`, which `cavmarl evaluate --policy FOLDER` takes; `manifest.json` says what it was
-trained with.
+trained with. From `checkpoint.pt`, `--resume FOLDER` goes on bit for bit.
 """
 
 from __future__ import annotations
 
 import sys
-import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import torch
@@ -28,22 +27,11 @@ from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 from cavmarl.adapters.sb3_vec_env import CavSb3VecEnv
 from cavmarl.config.registry import load_config
-from cavmarl.evaluate.provenance.training_record import begin_training, end_training
-from cavmarl.learning.log import CSV_FILE, WINDOW, Log, curve_row
-from cavmarl.learning.options import (
-    check_at_least,
-    parse_settings,
-    run_folder,
-    run_program,
-)
-from cavmarl.policies.networks import (
-    CONFIG_FILE,
-    MAX_DEVIATIONS,
-    WEIGHTS_FILE,
-    ActorCritic,
-    NetworkConfig,
-    save_network,
-)
+from cavmarl.learning.checkpoint import Parts, bytes_of, tensor_of, writing
+from cavmarl.learning.log import WINDOW, curve_row
+from cavmarl.learning.options import RESUME, check_at_least, run_folder, run_program
+from cavmarl.learning.run_folder import DRIVER_FILES, RunFolder, parse_run
+from cavmarl.policies.networks import MAX_DEVIATIONS, ActorCritic, NetworkConfig
 
 MODEL_FILE = "model.zip"
 
@@ -51,6 +39,8 @@ MODEL_FILE = "model.zip"
 @dataclass(frozen=True)
 class Args:
     """The settings of a run; each is an option of the command line."""
+
+    program: ClassVar[str] = "ppo_sb3.py"
 
     env: Annotated[str, "environment: a name, a folder or a map file"] = "merge"
     num_worlds: Annotated[int, "worlds that are stepped together"] = 32
@@ -66,33 +56,52 @@ class Args:
     initial_std: Annotated[float, "standard deviation of continuous actions at the start"] = 0.3
     runs: Annotated[str, "folder of all runs"] = "runs"
     name: Annotated[str, "folder of this run; empty: ENV_sb3_SEED"] = ""
+    checkpoint_updates: Annotated[int, "updates between two checkpoints"] = 20
+    resume: Annotated[str, RESUME] = ""
 
     def __post_init__(self) -> None:
         least_one = ("num_worlds", "total_agent_steps", "num_steps", "epochs", "minibatches")
-        check_at_least(self, dict.fromkeys(least_one, 1))
+        check_at_least(self, dict.fromkeys((*least_one, "checkpoint_updates"), 1))
 
     @property
     def folder(self) -> Path:
         """Where this run lies."""
-        return run_folder(self.runs, self.name, self.env, "sb3", self.seed)
+        name = (self.name, self.env, "sb3", self.seed)
+        return run_folder(self.runs, *name, resume=self.resume)
 
 
 class Curve(BaseCallback):
-    """Writes a line for every update, and stops the run when its time is over.
+    """Writes a line for every update, and checkpoints, and stops the run when its time is over.
 
     Trips that the horizon cut count neither here nor in `ippo_torch.py`.
     """
 
-    def __init__(self, folder: Path, minutes: float) -> None:
+    def __init__(self, folder: RunFolder, minutes: float) -> None:
         super().__init__()
         self._folder = folder
-        self._limit_s = 60.0 * minutes if minutes else float("inf")
+        self._minutes = minutes
         self._ended: deque[tuple[float, bool]] = deque(maxlen=WINDOW)
-        self._decisions = self._trips = self._updates = 0
+        self._decisions = self._trips = 0
+        self._updates = folder.began.updates
+
+    def load(self, saved: Parts) -> None:
+        """Go on from a checkpoint."""
+        self._ended.extend(saved["ended"])
+        self._decisions, self._trips = saved["decisions"], saved["trips"]
+
+    def _save(self) -> None:
+        own = {"ended": [], "decisions": self._decisions, "trips": self._trips}
+        own["ended"] = [(float(returned), bool(arrived)) for returned, arrived in self._ended]
+        parts = {"curve": own, "model": state_of(self.model)}
+        self._folder.save(self.num_timesteps, self._updates, parts)
 
     def _on_training_start(self) -> None:
-        self._began_at = time.perf_counter()
-        self._log = Log(self._folder)
+        if not self._folder.began.parts:
+            self._save()
+
+    def _on_rollout_start(self) -> None:
+        if self._updates > self._folder.began.updates and self._folder.is_due(self._updates):
+            self._save()
 
     def _on_step(self) -> bool:
         infos: list[dict[str, Any]] = self.locals["infos"]
@@ -101,16 +110,48 @@ class Curve(BaseCallback):
             if "episode" in info and not info["TimeLimit.truncated"]:
                 self._ended.append((info["episode"]["r"], info["is_success"]))
                 self._trips += 1
-        return time.perf_counter() - self._began_at < self._limit_s
+        in_time = self._folder.has_time(self._minutes)
+        if not in_time:  # the library leaves here, before it has noted what it sees now
+            self.model._last_obs = self.locals["new_obs"]
+            self.model._last_episode_starts = self.locals["dones"]
+        return in_time
 
     def _on_rollout_end(self) -> None:
         self._updates += 1
-        seconds = time.perf_counter() - self._began_at
-        counts = (self._updates, self._decisions, seconds, self._trips)
-        self._log.write(curve_row(*counts, self._ended))
+        counts = (self._updates, self._decisions, self._folder.seconds, self._trips)
+        self._folder.log.write(curve_row(*counts, self._ended))
 
     def _on_training_end(self) -> None:
-        self._log.close()
+        self._save()
+
+
+def state_of(model: Any) -> Parts:
+    """All that the library's next update depends on, but for random numbers."""
+    worlds, seen = model.env, model.env.obs_rms
+    return {
+        "parameters": model.get_parameters(),
+        "timesteps": model.num_timesteps,
+        "observations": torch.from_numpy(model._last_obs),
+        "starts": torch.from_numpy(model._last_episode_starts),
+        "worlds": tensor_of(worlds.env_method("save_state")[0]),
+        "seen": [torch.from_numpy(seen.mean), torch.from_numpy(seen.var), float(seen.count)],
+        "returns": torch.from_numpy(worlds.venv.episode_returns),
+        "lengths": torch.from_numpy(worlds.venv.episode_lengths),
+    }
+
+
+def put_state(model: Any, saved: Parts) -> None:
+    """Let a new model go on from what `state_of` gave."""
+    worlds, seen = model.env, model.env.obs_rms
+    model.set_parameters(saved["parameters"])
+    model.num_timesteps = saved["timesteps"]
+    model._last_obs = saved["observations"].numpy()
+    model._last_episode_starts = saved["starts"].numpy()
+    worlds.env_method("load_state", bytes_of(saved["worlds"]))
+    mean, var, count = saved["seen"]
+    seen.mean, seen.var, seen.count = mean.numpy(), var.numpy(), count
+    worlds.venv.episode_returns[:] = saved["returns"].numpy()
+    worlds.venv.episode_lengths[:] = saved["lengths"].numpy()
 
 
 def make_model(args: Args) -> tuple[PPO, VecNormalize]:
@@ -135,7 +176,7 @@ def make_model(args: Args) -> tuple[PPO, VecNormalize]:
     return model, worlds
 
 
-def save_driver(args: Args, model: PPO, worlds: VecNormalize) -> None:
+def save_driver(args: Args, folder: RunFolder, model: PPO, worlds: VecNormalize) -> None:
     """The library's network as one of ours, which is built alike: the seats' driver."""
     env = load_config(args.env)[0]
     config = NetworkConfig(
@@ -165,7 +206,7 @@ def save_driver(args: Args, model: PPO, worlds: VecNormalize) -> None:
     weights["mean"] = torch.from_numpy(seen.mean)
     weights["deviation"] = torch.from_numpy(np.sqrt(seen.var + worlds.epsilon))
     network.load_state_dict(weights)
-    save_network(args.folder, network, config)
+    folder.save_driver(network, config)
 
 
 def train(args: Args) -> Path:
@@ -176,19 +217,24 @@ def train(args: Args) -> Path:
     """
     torch.set_num_threads(1)  # more cost small networks more than they bring
     model, worlds = make_model(args)
-    args.folder.mkdir(parents=True, exist_ok=True)
     stepped = worlds.get_attr("worlds")[0]
-    begin_training(args.folder, "ppo_sb3.py", asdict(args), stepped.world, stepped.plans)
-    model.learn(args.total_agent_steps, Curve(args.folder, args.minutes))
-    model.save(args.folder / MODEL_FILE)
-    save_driver(args, model, worlds)
-    end_training(args.folder, (WEIGHTS_FILE, CONFIG_FILE, CSV_FILE, MODEL_FILE))
-    return args.folder
+    with RunFolder(args, stepped.world, stepped.plans) as folder:
+        curve = Curve(folder, args.minutes)
+        parts = folder.resume()
+        if parts:
+            put_state(model, parts["model"])
+            curve.load(parts["curve"])
+        left = args.total_agent_steps - model.num_timesteps
+        model.learn(left, curve, reset_num_timesteps=not parts)
+        with writing(args.folder / MODEL_FILE):
+            model.save(args.folder / MODEL_FILE)
+        save_driver(args, folder, model, worlds)
+        return folder.end((*DRIVER_FILES, MODEL_FILE))
 
 
 def main(words: Sequence[str] | None = None) -> int:
     """Train; 0: trained, 2: wrong use."""
-    return run_program(lambda: train(parse_settings(Args, words, __doc__)))
+    return run_program(lambda: train(parse_run(Args, words, __doc__)))
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -124,7 +124,7 @@ def measure_training(
     for module, extra in needs.items():
         require(module, extra)
     from cavmarl.bench.highway_rows import HighwayRows
-    from cavmarl.learning.run import Run
+    from cavmarl.learning.run import opened
 
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -134,9 +134,9 @@ def measure_training(
         theirs = _theirs(rows, workers, OUR_STEPS * worlds // workers)
         settings = _settings(folder, agents, worlds, workers)
         say("starting ours")
-        plain = stack.enter_context(closing(Run(settings)))
+        plain = stack.enter_context(opened(settings))
         overlap = replace(settings, overlap=True, name="overlap")
-        other = stack.enter_context(closing(Run(overlap)))
+        other = stack.enter_context(opened(overlap))
         sides = [_ours("cavmarl", plain), _ours("cavmarl_overlap", other), theirs]
         stepping = []
         for turn in range(repeats + 1):

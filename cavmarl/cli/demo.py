@@ -47,12 +47,13 @@ def demo(
     make_folder(out)
     console = Console()
     console.print(f"[bold]1. train[/] on merge, {minutes:g} min")
-    trained = _train(out, minutes, seed)
+    stamp = f"{datetime.now():%Y%m%d-%H%M%S-%f}"
+    trained = _train(out, f"driver-{stamp}", minutes, seed)
 
     console.print("[bold]2. evaluate[/] on merge, on other seeds")
     drivers = {"trained": str(trained), "idm": "idm", "random_actions": "random_actions"}
     world = WorldSpec(env="merge", seed=EVALUATION_SEED)
-    folder = out / f"evaluation-{datetime.now():%Y%m%d-%H%M%S-%f}"
+    folder = out / f"evaluation-{stamp}"
     found = evaluate_showing(console, world, drivers, out=folder, episodes=EPISODES)
     console.print(report_table(found))
 
@@ -78,14 +79,14 @@ def demo(
     )
 
 
-def _train(out: Path, minutes: float, seed: int) -> Path:
+def _train(out: Path, name: str, minutes: float, seed: int) -> Path:
     """Run the training program; the folder of the driver."""
     command = [sys.executable, str(_SCRIPT), "--config", str(_SETTINGS), "--minutes", str(minutes)]
-    command += ["--seed", str(seed), "--runs", str(out), "--name", "driver"]
+    command += ["--seed", str(seed), "--runs", str(out), "--name", name]
     done = subprocess.run(command, check=False)
     if done.returncode:
         raise typer.Exit(done.returncode)
-    return out / "driver"
+    return out / name
 
 
 def _traffic(stats: dict[str, float]) -> str:

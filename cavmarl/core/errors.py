@@ -15,6 +15,7 @@
     ├── CapacityError          more vehicles or seats than the world can take
     ├── EvaluationError        an evaluation that failed, or worlds that differ and must not
     │   └── ManifestError         results whose origin is not on record
+    ├── TrainingError          a run of training that cannot begin, go on or be written
     ├── ProtocolError          the hand-off protocol was broken, or cannot go on
     │   ├── LostTickError         a tick that every process died of
     │   ├── MessageError          bytes that are no message or vehicle of this run
@@ -102,6 +103,14 @@ class EvaluationError(CavmarlError):
 
 class ManifestError(EvaluationError):
     """Results without a manifest, with one that was never closed, or with one of other results."""
+
+
+class TrainingError(CavmarlError):
+    """A run of training that cannot begin, go on or be written.
+
+    Another process writes its folder, another run lies there, its checkpoint is damaged, or the
+    disk is full.
+    """
 
 
 class ProtocolError(CavmarlError):

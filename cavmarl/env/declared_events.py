@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ActionError, ConfigError
@@ -19,6 +20,16 @@ class DeclaredEvents:
         self._enabled = config.v2x.enabled
         self._causes = np.zeros((num_worlds, config.population.num_ids), dtype=np.int32)
         self._are_any = False
+
+    @property
+    def memory(self) -> NDArray[np.int32]:
+        """(W, A) what has been declared for the next step."""
+        return self._causes
+
+    @memory.setter
+    def memory(self, causes: NDArray[np.int32]) -> None:
+        self._causes[:] = causes
+        self._are_any = bool(causes.any())
 
     def declare(self, world: int, agent: int, cause: str) -> None:
         if not self._enabled:

@@ -27,6 +27,7 @@ from cavmarl.engine.spaces import (
 from cavmarl.engine.world_setup import check_agents, make_world
 from cavmarl.env.actions import ActionDecoder
 from cavmarl.env.declared_events import DeclaredEvents
+from cavmarl.env.saved_state import SavedState
 from cavmarl.env.world_copies import CopiedWithWorlds
 from cavmarl.parallel.backends import check_hosts, make_worlds
 from cavmarl.parallel.step_arrays import SteppedWorlds
@@ -124,7 +125,7 @@ def _in_next_step(mode: AutoresetMode | str) -> bool:
     return found is AutoresetMode.NEXT_STEP
 
 
-class CavVectorEnv(CopiedWithWorlds):
+class CavVectorEnv(CopiedWithWorlds, SavedState):
     """W worlds with A agent seats each; ground truth is flat, whatever `observation.kind` says.
 
     With `observation.mode: sensors` and `observation.kind: dict`, observations are dicts: an array

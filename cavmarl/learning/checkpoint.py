@@ -1,82 +1,123 @@
-"""Checkpoints: the driver, and what a run goes on from."""
+"""Checkpoints: one file with all that a run goes on from, whole or not there."""
 
 from __future__ import annotations
 
-import json
-import os
-from dataclasses import asdict, dataclass, replace
+import hashlib
+import io
+import random
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
-from pickle import UnpicklingError
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any
 
+import numpy as np
 import torch
+from torch import Tensor
 
-from cavmarl.config.io import validate
-from cavmarl.core.errors import ConfigError, PolicyError
-from cavmarl.policies.networks import ActorCritic, NetworkConfig, load_network, save_network
+from cavmarl.core.errors import TrainingError
+from cavmarl.core.whole_file import write_whole
+from cavmarl.evaluate.provenance.training_record import CHECKPOINT_FILE
 
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
+_HEAD = b"cavmarl checkpoint 1\n"  # then a SHA-256 of the rest
+_DIGEST_BYTES = 32
 
-OPTIMIZER_FILE = "optimizer.pt"
-STATE_FILE = "training.json"
-
-S = TypeVar("S", bound="DataclassInstance")
+Parts = dict[str, Any]
+"""Tensors, numbers, words, and lists and dicts of them: no code."""
 
 
 @dataclass(frozen=True)
 class RunState:
-    """How far a run has come."""
+    """Where a run stands after an update."""
 
-    args: dict[str, Any]  # its settings, by name
+    program: str  # that trains
+    settings: Parts  # by name
+    environment: str  # digest of it
     agent_steps: int = 0  # decisions that it learned from
     updates: int = 0  # of the network
     seconds: float = 0.0  # spent on them
+    logs: dict[str, int] = field(default_factory=dict)  # bytes of each file of them
+    random: Parts = field(default_factory=dict)  # see `random_states`
+    parts: Parts = field(default_factory=dict)  # of the program
 
-    def settings(self, kind: type[S]) -> S:
-        return validate(kind, self.args, STATE_FILE)
+
+def write_checkpoint(folder: Path, state: RunState) -> None:
+    """Raises OSError: it cannot be written; the one before is as it was."""
+    file = io.BytesIO()
+    torch.save(vars(state), file)
+    write_whole(folder / CHECKPOINT_FILE, sealed(file.getvalue()))
 
 
-def read_state(folder: Path) -> RunState:
-    path = folder / STATE_FILE
+def sealed(content: bytes) -> bytes:
+    """What a checkpoint's file holds: its version and checksum, and the content."""
+    return _HEAD + hashlib.sha256(content).digest() + content
+
+
+def read_checkpoint(folder: Path) -> RunState:
+    """The checkpoint of a run's folder.
+
+    Raises:
+        TrainingError: there is none, or it is not what was written.
+    """
+    path = folder / CHECKPOINT_FILE
     try:
-        raw = json.loads(path.read_text(encoding="utf-8"))
+        raw = path.read_bytes()
     except OSError as error:
-        raise ConfigError(f"--resume {folder}: no checkpoint there ({error.strerror})") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: is broken ({error})") from error
-    return validate(RunState, raw, str(path))
-
-
-def save_checkpoint(
-    folder: Path,
-    network: ActorCritic,
-    optimizer: torch.optim.Optimizer,
-    config: NetworkConfig,
-    state: RunState,
-) -> None:
-    """The driver, and what goes on from here; an interrupted write leaves the old files whole."""
-    save_network(folder, network, replace(config, agent_steps=state.agent_steps))
-    path = folder / f".{OPTIMIZER_FILE}"
-    torch.save(optimizer.state_dict(), path)
-    os.replace(path, folder / OPTIMIZER_FILE)
-    noted = folder / f".{STATE_FILE}"
-    noted.write_text(json.dumps(asdict(state), indent=2) + "\n", encoding="utf-8")
-    os.replace(noted, folder / STATE_FILE)
-
-
-def load_checkpoint(
-    folder: Path, network: ActorCritic, optimizer: torch.optim.Optimizer, config: NetworkConfig
-) -> None:
-    """Put a run's weights and its optimiser's state into others."""
-    loaded, saved = load_network(folder)
-    if replace(saved, agent_steps=0) != config:
-        raise PolicyError(
-            f"--resume {folder}: the environment's sensors or actions have changed since that run"
-        )
-    network.load_state_dict(loaded.state_dict())
-    path = folder / OPTIMIZER_FILE
+        raise TrainingError(
+            f"--resume {folder}: no checkpoint there ({error.strerror}); give the folder of a run, "
+            "or begin one without --resume"
+        ) from error
+    content = raw[len(_HEAD) + _DIGEST_BYTES :]
+    if raw != sealed(content):
+        raise _broken(path, "its checksum is not that of its content")
     try:
-        optimizer.load_state_dict(torch.load(path, weights_only=True))
-    except (OSError, RuntimeError, ValueError, EOFError, KeyError, UnpicklingError) as error:
-        raise PolicyError(f"{path}: cannot be read ({error})") from error
+        return RunState(**torch.load(io.BytesIO(content), weights_only=True))
+    except Exception as error:  # torch's reader raises what it meets
+        raise _broken(path, str(error).partition("\n")[0]) from error
+
+
+def _broken(path: Path, why: str) -> TrainingError:
+    return TrainingError(
+        f"{path}: is damaged, or of another version ({why}): put a copy of it in its place, or "
+        "train anew under another --name"
+    )
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """The time in which a file of a run's folder is written: full disks are typed errors."""
+    try:
+        yield
+    except OSError as error:
+        cure = "make room for it, then begin again"
+        if (path.parent / CHECKPOINT_FILE).exists():
+            cure = f"make room for it, then go on from the last checkpoint: --resume {path.parent}"
+        raise TrainingError(
+            f"{path}: cannot be written ({error.strerror or error}): {cure}"
+        ) from error
+
+
+def random_states() -> Parts:
+    """Where the generators of torch, NumPy and Python stand."""
+    kind, keys, *rest = np.random.get_state()
+    return {
+        "torch": torch.get_rng_state(),
+        "numpy": [kind, torch.from_numpy(np.array(keys, dtype=np.int64)), *rest],
+        "python": random.getstate(),
+    }
+
+
+def set_random_states(states: Parts) -> None:
+    torch.set_rng_state(states["torch"])
+    kind, keys, *rest = states["numpy"]
+    np.random.set_state((kind, keys.numpy().astype(np.uint32), *rest))
+    random.setstate(states["python"])
+
+
+def tensor_of(content: bytes) -> Tensor:
+    """Bytes, as a checkpoint takes them."""
+    return torch.frombuffer(bytearray(content), dtype=torch.uint8)
+
+
+def bytes_of(tensor: Tensor) -> bytes:
+    return tensor.numpy().tobytes()

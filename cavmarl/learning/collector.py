@@ -16,7 +16,9 @@ from torch import Tensor
 from cavmarl.config.env import TERMS
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.learning.batch import Batch
+from cavmarl.learning.checkpoint import Parts, bytes_of, tensor_of
 from cavmarl.learning.log import WINDOW
+from cavmarl.parallel.local_worlds import kept_elsewhere
 from cavmarl.policies.networks import ActorCritic
 
 # Worlds that step; what goes between them and the tensors; what the network decides; the updates.
@@ -62,6 +64,15 @@ class Trips:
         self._ended.extend(np.column_stack([self._returns[done], ends]).tolist())
         self._count += len(ends)
         self._returns[done | cut] = 0.0
+
+    def save(self) -> Parts:
+        returns = torch.from_numpy(self._returns)
+        return {"returns": returns, "ended": list(self._ended), "count": self._count}
+
+    def load(self, saved: Parts) -> None:
+        self._returns[:] = saved["returns"].numpy()
+        self._ended.extend(saved["ended"])
+        self._count = saved["count"]
 
     def means(self) -> dict[str, float]:
         """Of the last trips; and how many there have been."""
@@ -114,6 +125,24 @@ class Collector:
         elsewhere_s = sum(spent_s.values()) - before_s
         spent_s["transfer"] += time.perf_counter() - began - elsewhere_s
         return batch
+
+    def save(self) -> Parts:
+        """Where worlds, trips and the random numbers of its own stand; not those of torch."""
+        generator = None if self._generator is None else self._generator.get_state()
+        kept = {"trips": self.trips.save(), "generator": generator}
+        if kept_elsewhere(self.vec.config):
+            return kept
+        return {**kept, "worlds": tensor_of(self.vec.save_state()), "mask": self._mask.clone()}
+
+    def load(self, saved: Parts) -> None:
+        """Go on from what `save` gave; worlds that it could not save have begun new episodes."""
+        self.trips.load(saved["trips"])
+        if self._generator is not None:
+            self._generator.set_state(saved["generator"])
+        if "worlds" in saved:
+            self.vec.load_state(bytes_of(saved["worlds"]))
+            self._mask = saved["mask"]
+            self._states = self._look()
 
     def _empty(self, with_suggested: bool) -> Batch:
         shape = (self._num_steps, *self._mask.shape)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from cavmarl.learning.batch import Batch
+from cavmarl.learning.checkpoint import Parts
 from cavmarl.learning.ppo_settings import PpoSettings
 from cavmarl.policies.networks import ActorCritic
 
@@ -36,6 +37,13 @@ class Learner:
         self.network = network
         self.optimizer = torch.optim.Adam(network.parameters(), lr=settings.learning_rate, eps=1e-5)
         self._settings = settings
+
+    def save(self) -> Parts:
+        return {"network": self.network.state_dict(), "optimizer": self.optimizer.state_dict()}
+
+    def load(self, saved: Parts) -> None:
+        self.network.load_state_dict(saved["network"])
+        self.optimizer.load_state_dict(saved["optimizer"])
 
     def imitation_weight(self, left: float) -> float:
         """How much the built-in driver's example counts with `left` of the run to go."""
@@ -112,15 +120,18 @@ class Learner:
 
 
 class Scales:
-    """Keeps the network's mean and deviation of observations: of all decisions of a run so far.
+    """Keeps the network's mean and deviation of observations: of all decisions of a run so far."""
 
-    They are of `count` decisions already.
-    """
-
-    def __init__(self, network: ActorCritic, count: int) -> None:
+    def __init__(self, network: ActorCritic) -> None:
         self._network = network
-        self._count = count
-        self._squares = network.deviation.square() * count
+        self._count = 0
+        self._squares = torch.zeros_like(network.deviation)
+
+    def save(self) -> Parts:
+        return {"count": self._count, "squares": self._squares}
+
+    def load(self, saved: Parts) -> None:
+        self._count, self._squares = saved["count"], saved["squares"]
 
     def add(self, observations: Tensor) -> None:
         """Take in the observations (N, D) of new decisions (Chan et al. 1979)."""

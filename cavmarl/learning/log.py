@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Collection
+import os
+from collections.abc import Collection, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +13,11 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from cavmarl.core.errors import require
+from cavmarl.core.errors import TrainingError, require
+from cavmarl.learning.checkpoint import writing
 
 CSV_FILE = "progress.csv"
-
+BOARD_FILES = "events.out.tfevents.*"
 
 WINDOW = 400  # trips that a row's means are of
 
@@ -41,30 +44,70 @@ def curve_row(
 class Log:
     """Writes the numbers of every update to CSV, and to TensorBoard where asked for."""
 
-    def __init__(self, folder: Path, goes_on: bool = False, tensorboard: bool = False) -> None:
-        self._file = (folder / CSV_FILE).open("a" if goes_on else "w", encoding="utf-8", newline="")
+    def __init__(self, folder: Path, tensorboard: bool = False) -> None:
+        self._path = folder / CSV_FILE
         self._writer: csv.DictWriter[str] | None = None
-        self._with_header = not goes_on
         self._board: Any = None
-        if tensorboard:
-            board = require("torch.utils.tensorboard", "torch")
-            self._board = board.SummaryWriter(str(folder))
+        with writing(self._path):
+            self._file = self._path.open("a", encoding="utf-8", newline="")
+            if tensorboard:
+                board = require("torch.utils.tensorboard", "torch")
+                self._board = board.SummaryWriter(str(folder))
 
     def write(self, row: dict[str, float]) -> None:
-        if self._writer is None:
-            self._writer = csv.DictWriter(self._file, list(row))
-            if self._with_header:
-                self._writer.writeheader()
-        self._writer.writerow({name: f"{value:.6g}" for name, value in row.items()})
-        self._file.flush()
-        if self._board is not None:
-            for name, value in row.items():
-                self._board.add_scalar(name, value, int(row["agent_steps"]))
+        with writing(self._path):
+            if self._writer is None:
+                self._writer = csv.DictWriter(self._file, list(row))
+                if not self._path.stat().st_size:
+                    self._writer.writeheader()
+            self._writer.writerow({name: f"{value:.6g}" for name, value in row.items()})
+            self._file.flush()
+            if self._board is not None:
+                for name, value in row.items():
+                    self._board.add_scalar(name, value, int(row["agent_steps"]))
+
+    def sync(self) -> dict[str, int]:
+        """Have everything on the disk; the bytes of each file."""
+        sizes = {}
+        with writing(self._path):
+            if self._board is not None:
+                self._board.flush()
+            for path in _files(self._path.parent):
+                with path.open("rb") as file:
+                    os.fsync(file.fileno())
+                    sizes[path.name] = os.fstat(file.fileno()).st_size
+        return sizes
 
     def close(self) -> None:
-        self._file.close()
-        if self._board is not None:
-            self._board.close()
+        """To be called once all is written: what a full disk has refused is not tried again."""
+        with suppress(OSError):
+            self._file.close()
+        with suppress(OSError):
+            if self._board is not None:
+                self._board.close()
+
+
+def cut_logs(folder: Path, sizes: Mapping[str, int]) -> None:
+    """Let logs be what they were when `Log.sync` gave these sizes.
+
+    Raises:
+        TrainingError: rows are missing.
+    """
+    for path in _files(folder):
+        if path.name not in sizes:
+            path.unlink()
+        elif path.stat().st_size > sizes[path.name]:
+            os.truncate(path, sizes[path.name])
+    table = folder / CSV_FILE
+    if not table.is_file() or table.stat().st_size < sizes[CSV_FILE]:
+        raise TrainingError(
+            f"{table}: rows are missing that were there at the checkpoint: put a copy of it in its "
+            "place, or train anew under another --name"
+        )
+
+
+def _files(folder: Path) -> list[Path]:
+    return [*folder.glob(CSV_FILE), *folder.glob(BOARD_FILES)]
 
 
 def progress_bar(console: Console) -> Progress:

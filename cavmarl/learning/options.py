@@ -19,6 +19,7 @@ from cavmarl.core.errors import CavmarlError, ConfigError
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
+RESUME = "folder of a run to go on with; its settings hold but for the length"
 DRIVER = "driver: {folder}  (cavmarl evaluate ENV --policy {folder})"
 
 S = TypeVar("S", bound="DataclassInstance")
@@ -81,19 +82,27 @@ def check_shares(settings: object, names: Iterable[str]) -> None:
             raise ConfigError(f"{_option(name)} {value}: must be from 0 to 1")
 
 
-def run_folder(runs: str, name: str, env: str, program: str, seed: int) -> Path:
-    """Where a run lies: RUNS/NAME, without a name RUNS/ENV_PROGRAM_SEED."""
+def run_folder(runs: str, name: str, env: str, program: str, seed: int, resume: str = "") -> Path:
+    """Where a run lies: RUNS/NAME, without a name RUNS/ENV_PROGRAM_SEED; or RESUME."""
+    if resume:
+        return Path(resume)
     stem = Path(env).name.split(".")[0]
     return Path(runs) / (name or f"{stem}_{program}_{seed}")
 
 
 def run_program(train: Callable[[], Path], said: str = DRIVER) -> int:
-    """Train, and say where that lies which `train` has made; 0: trained, 2: wrong use."""
+    """Train, and say where that lies which `train` has made.
+
+    0: trained, 2: wrong use, or what stands in the way; 130: interrupted.
+    """
     try:
         folder = train()
     except CavmarlError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("interrupted: --resume goes on from the last checkpoint", file=sys.stderr)
+        return 130
     print(said.format(folder=folder))
     return 0
 

@@ -2,25 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, TypeVar
+from typing import Annotated, ClassVar
 
-from cavmarl.core.errors import ConfigError
-from cavmarl.learning.checkpoint import read_state
 from cavmarl.learning.options import (
+    RESUME,
     check_above_zero,
     check_at_least,
     check_shares,
-    given_options,
     run_folder,
-    settings_of,
-)
-
-# Settings that a resumed run may be given anew.
-CAN_CHANGE = frozenset(
-    "total_agent_steps minutes resume threads zones workers tensorboard checkpoint_updates".split()
 )
 
 
@@ -32,6 +23,7 @@ class PpoSettings:
     sees the state of the whole world.
     """
 
+    program: ClassVar[str] = "ippo_torch.py"
     algorithm: ClassVar[str] = "ippo"
     central_critic: ClassVar[bool] = False
 
@@ -67,9 +59,7 @@ class PpoSettings:
     checkpoint_updates: Annotated[int, "updates between two checkpoints"] = 20
     runs: Annotated[str, "folder of all runs"] = "runs"
     name: Annotated[str, "folder of this run; empty: ENV_ALGORITHM_SEED"] = ""
-    resume: Annotated[
-        str, "folder of a run to go on with; its settings hold but for the length"
-    ] = ""
+    resume: Annotated[str, RESUME] = ""
     tensorboard: Annotated[bool, "write TensorBoard's files"] = False
 
     def __post_init__(self) -> None:
@@ -89,21 +79,5 @@ class PpoSettings:
 
     @property
     def folder(self) -> Path:
-        if self.resume:
-            return Path(self.resume)
-        return run_folder(self.runs, self.name, self.env, self.algorithm, self.seed)
-
-
-S = TypeVar("S", bound=PpoSettings)
-
-
-def parse_ppo(kind: type[S], words: Sequence[str] | None, text: str | None) -> S:
-    """As `options.parse_settings`; of a resumed run, the settings that it began with."""
-    given = given_options(kind, words, text)
-    if not given.get("resume"):
-        return settings_of(kind, given)
-    given.pop("config", None)
-    if refused := given.keys() - CAN_CHANGE:
-        names = ", ".join(f"--{name.replace('_', '-')}" for name in sorted(refused))
-        raise ConfigError(f"{names}: cannot change when a run is resumed")
-    return replace(read_state(Path(given["resume"])).settings(kind), **given)
+        name = (self.name, self.env, self.algorithm, self.seed)
+        return run_folder(self.runs, *name, resume=self.resume)

@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from copy import deepcopy
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 from gymnasium.vector import AutoresetMode
 from rich.console import Console
 
-from cavmarl.core.errors import ConfigError
 from cavmarl.env.vector import CavVectorEnv, make_vec
-from cavmarl.evaluate.provenance.training_record import begin_training, end_training
 from cavmarl.learning.batch import Batch
-from cavmarl.learning.checkpoint import RunState, load_checkpoint, read_state, save_checkpoint
+from cavmarl.learning.checkpoint import Parts
 from cavmarl.learning.collector import Collector
 from cavmarl.learning.learner import Learner, Scales
-from cavmarl.learning.log import CSV_FILE, Log, describe, progress_bar
+from cavmarl.learning.log import describe, progress_bar
 from cavmarl.learning.ppo_settings import PpoSettings
-from cavmarl.policies.networks import CONFIG_FILE, WEIGHTS_FILE, ActorCritic, NetworkConfig
+from cavmarl.learning.run_folder import RunFolder
+from cavmarl.policies.networks import ActorCritic, NetworkConfig
 
 
 def make_worlds(settings: PpoSettings) -> CavVectorEnv:
@@ -42,47 +43,40 @@ def make_worlds(settings: PpoSettings) -> CavVectorEnv:
 class Run:
     """A run of PPO: where it stands and how it goes on."""
 
-    def __init__(self, settings: PpoSettings) -> None:
-        folder = settings.folder
-        self.began = read_state(folder) if settings.resume else RunState({})
-        self.agent_steps, self.updates = self.began.agent_steps, self.began.updates
-        if self.agent_steps >= settings.total_agent_steps:
-            raise ConfigError(
-                f"--total-agent-steps {settings.total_agent_steps}: the run has {self.agent_steps}"
-            )
-        self.settings = settings
+    def __init__(self, settings: PpoSettings, vec: CavVectorEnv, folder: RunFolder) -> None:
+        self.settings, self.vec, self.folder = settings, vec, folder
+        began = folder.began
+        self.agent_steps, self.updates = began.agent_steps, began.updates
         torch.set_num_threads(settings.threads)
         seed = settings.seed + self.updates
         torch.manual_seed(seed)
-        self.vec = vec = make_worlds(settings)
         self.config = _network_config(settings, vec)
         self.network = ActorCritic(self.config, (settings.throttle_std, settings.steering_std))
         self.learner = Learner(self.network, settings)
-        if settings.resume:
-            load_checkpoint(folder, self.network, self.learner.optimizer, self.config)
-        self.scales = Scales(self.network, self.agent_steps)
+        self.scales = Scales(self.network)
         # A process that collects while another learns draws from numbers of its own.
         generator = torch.Generator().manual_seed(seed) if settings.overlap else None
         self.collector = Collector(vec, self.network, settings.num_steps, seed, generator)
         self._aside = ThreadPoolExecutor(1) if settings.overlap else None
         self._next: Future[Batch] | None = None
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            program = f"{settings.algorithm}_torch.py"
-            begin_training(folder, program, asdict(settings), vec.worlds.world, vec.plans)
-            self.log = Log(folder, bool(settings.resume), settings.tensorboard)
-        except OSError as error:
-            reason = error.strerror or error
-            raise ConfigError(f"{folder}: cannot be written ({reason})") from error
-        self._began_at = time.perf_counter()
+        if not folder.began.parts:
+            self.save()  # a run that is killed early begins from here
+        if parts := folder.resume():
+            self._load(parts)
+
+    def _load(self, parts: Parts) -> None:
+        self.learner.load(parts["learner"])
+        self.scales.load(parts["scales"])
+        self.collector.load(parts["collector"])
+        if parts["next"] is not None:
+            self._next = Future()
+            self._next.set_result(Batch(**parts["next"]))
 
     def done(self) -> float:
         """The share of the run that is over, by decisions or by the clock."""
-        already = self.began.agent_steps
-        done = (self.agent_steps - already) / (self.settings.total_agent_steps - already)
+        done = self.agent_steps / self.settings.total_agent_steps
         if self.settings.minutes:
-            seconds = time.perf_counter() - self._began_at
-            done = max(done, seconds / (60.0 * self.settings.minutes))
+            done = max(done, self.folder.seconds / (60.0 * self.settings.minutes))
         return min(done, 1.0)
 
     def update(self) -> dict[str, float]:
@@ -106,14 +100,14 @@ class Run:
         row = {
             "updates": self.updates,
             "agent_steps": self.agent_steps,
-            "seconds": self.began.seconds + now - self._began_at,
+            "seconds": self.folder.seconds,
             "agent_steps_per_s": new / (now - started),
             **trips,
             **numbers,
             "std": network.log_std.detach().exp().mean().item() if network.continuous else 0.0,
             **{f"{phase}_s": seconds for phase, seconds in spent_s.items()},
         }
-        self.log.write(row)
+        self.folder.log.write(row)
         return row
 
     def _collected(self, left: float) -> Batch:
@@ -122,19 +116,21 @@ class Run:
     def _collect(self, left: float) -> Batch:
         return self.collector.collect(self.learner.imitation_weight(left) > 0.0)
 
-    def save(self, row: dict[str, float]) -> None:
-        """A checkpoint after the update that gave `row`."""
-        settings = replace(self.settings, resume="")
-        state = RunState(asdict(settings), self.agent_steps, self.updates, row["seconds"])
-        save_checkpoint(
-            self.settings.folder, self.network, self.learner.optimizer, self.config, state
-        )
+    def save(self) -> None:
+        """A checkpoint of what is now, with the batch that is being collected; and the driver."""
+        following = None if self._next is None else vars(self._next.result())
+        parts = {
+            "learner": self.learner.save(),
+            "scales": self.scales.save(),
+            "collector": self.collector.save(),
+            "next": following,
+        }
+        self.folder.save(self.agent_steps, self.updates, parts)
+        self.folder.save_driver(self.network, replace(self.config, agent_steps=self.agent_steps))
 
     def close(self) -> None:
         if self._aside is not None:
             self._aside.shutdown()
-        self.vec.close()
-        self.log.close()
 
 
 def _network_config(settings: PpoSettings, vec: CavVectorEnv) -> NetworkConfig:
@@ -149,23 +145,37 @@ def _network_config(settings: PpoSettings, vec: CavVectorEnv) -> NetworkConfig:
     )
 
 
+@contextmanager
+def opened(settings: PpoSettings) -> Iterator[Run]:
+    """A run in its worlds and its folder, which are closed at the end."""
+    vec = make_worlds(settings)
+    try:
+        with RunFolder(settings, vec.worlds.world, vec.plans) as folder:
+            run = Run(settings, vec, folder)
+            try:
+                yield run
+            finally:
+                run.close()
+    finally:
+        vec.close()
+
+
 def train(settings: PpoSettings, console: Console) -> Path:
     """Run PPO until its decisions or its minutes are used up; returns the folder of the run."""
-    run = Run(settings)
+    with opened(settings) as run:
+        _improve(run, console)
+        return run.folder.end(plans=run.vec.plans)
+
+
+def _improve(run: Run, console: Console) -> None:
     if run.vec.plans:
         console.print(run.vec.plan_text(), highlight=False)
-    try:
-        with progress_bar(console) as bar:
-            task = bar.add_task("", total=1.0)
-            done = 0.0
-            while done < 1.0:
-                row = run.update()
-                done = run.done()
-                if done == 1.0 or run.updates % settings.checkpoint_updates == 0:
-                    run.save(row)
-                bar.update(task, completed=done, description=describe(row))
-    finally:
-        run.close()
-    files = (WEIGHTS_FILE, CONFIG_FILE, CSV_FILE)
-    end_training(settings.folder, files, run.vec.plans)
-    return settings.folder
+    with progress_bar(console) as bar:
+        task = bar.add_task("", total=1.0)
+        done = run.done() if run.updates else 0.0
+        while done < 1.0:
+            row = run.update()
+            done = run.done()
+            if done == 1.0 or run.folder.is_due(run.updates):
+                run.save()
+            bar.update(task, completed=done, description=describe(row))

@@ -102,6 +102,12 @@ class OrderedWorlds(ABC):
     def write_states(self) -> None:
         self._order(Task.WRITE_STATES, commits=False)
 
+    def save_worlds(self) -> list[bytes]:
+        raise unsaved()
+
+    def load_worlds(self, cases: Sequence[bytes]) -> None:
+        raise unsaved()
+
     def ticks(self) -> NDArray[np.int64]:
         return self.arrays.ticks.copy()
 
@@ -138,6 +144,13 @@ def uncopied() -> ConfigError:
     return ConfigError(
         "workers: worlds that worker processes run cannot be copied; use workers=0, or make the "
         "environment once more, with the same seed"
+    )
+
+
+def unsaved() -> ConfigError:
+    """What saving worlds on other machines ends in."""
+    return ConfigError(
+        "hosts: worlds on the machines of a cluster are not saved; use workers of this machine"
     )
 
 

@@ -13,6 +13,7 @@ from cavmarl.parallel.checkpoint.action_log import ActionLog, ActionLogJob
 from cavmarl.parallel.checkpoint.checkpoint_job import CheckpointJob
 from cavmarl.parallel.checkpoint.checkpoint_log import CheckpointLog
 from cavmarl.parallel.checkpoint.moving_job import MovingJob
+from cavmarl.parallel.checkpoint.world_cases import WorldCases
 from cavmarl.parallel.journaled_worlds import runs_of, unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.processes.shared_huge_pages import huge_shared_zeros
@@ -64,9 +65,13 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
         if cases:
             bounds = [part.first for part in parts] + [parts[-1].last]
             whole_s = spent_s[:, 0]
-            return [MovingJob(make, bounds, k, cases, whole_s) for k in range(len(parts))]
+            moving = [MovingJob(make, bounds, k, cases, whole_s) for k in range(len(parts))]
+            for mover_job, fd in zip(moving, recipe["cases"], strict=True):
+                mover_job.case = WorldCases(Segment(fd, 0))
+            return list(moving)
     jobs: list[Job] = []
-    for part, descriptors in zip(parts, recipe["diaries"], strict=True):
+    job: CheckpointJob
+    for part, descriptors, case in zip(parts, recipe["diaries"], recipe["cases"], strict=True):
         if recipe["runs"]:
             (tape,) = descriptors
             commands = commands_of(arrays.part(part.first, part.last))
@@ -81,9 +86,12 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
             )
             theirs = None if spent_s is None else spent_s[part.first]
             leader = LeaderJob(hire(worlds, part), part.first, part.zones, diary, theirs)
+            job = leader
             jobs += [leader, *leader.followers()]
         else:
-            jobs.append(CheckpointJob(hire(make(part.first, part.last), part), part.first, diary))
+            job = CheckpointJob(hire(make(part.first, part.last), part), part.first, diary)
+            jobs.append(job)
+        job.case = WorldCases(Segment(case, 0))
     return jobs
 
 

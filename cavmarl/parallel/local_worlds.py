@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.balance.balance_plan import Plan
+from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.extensions import extension_modules, load_extensions
 from cavmarl.core.huge_pages import huge_zeros
@@ -20,6 +21,7 @@ from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.spaces import global_state, state_space, write_sensed
 from cavmarl.engine.world_setup import World
 from cavmarl.handoff.coordinator.coordinator_setup import WorldRun
+from cavmarl.parallel.checkpoint.world_cases import from_bytes, to_bytes
 from cavmarl.parallel.sensor_workers.sensor_pool import SensorWorkers
 from cavmarl.parallel.step_arrays import Driven, StepArrays, layout_of
 from cavmarl.sensors.registry import frame_layout
@@ -220,21 +222,13 @@ class LocalWorlds:
                 could not be registered where a pickle is read.
         """
         config = self.world.config
-        zones = config.zones
-        for is_so, key in (
-            (self.simulation.sumo is not None, "traffic.source = sumo…"),
-            (self.farm is not None, "workers.sensors"),
-            (bool(zones.journal), "zones.journal"),
-            (bool(zones.faults), "zones.faults"),
-            (bool(zones.reproducers), "zones.reproducers"),
-        ):
-            if is_so:
-                raise ConfigError(
-                    f"{key}: worlds with processes or files of their own cannot be copied; make "
-                    "the environment once more, with the same seed"
-                )
+        if key := kept_elsewhere(config):
+            raise ConfigError(
+                f"{key}: worlds with processes or files of their own cannot be copied; make "
+                "the environment once more, with the same seed"
+            )
         saved = [array.copy() for array in self.save()]
-        shown = [array.copy() for array in _every_array(self.arrays)]
+        shown = [array.copy() for array in every_array(self.arrays)]
         modules = extension_modules(config.registered)
         return _made_again, (modules, self.world, self.in_next_step, saved, shown)
 
@@ -258,6 +252,23 @@ class LocalWorlds:
         """What `load` takes, of worlds of which each share has been one by itself."""
         ended = [np.concatenate([share[n] for share in shares]) for n in range(2)]
         return [*ended, *self.simulation.join([share[2:] for share in shares])]
+
+    def save_worlds(self) -> list[bytes]:
+        """The state of each world, for `load_worlds` of any number of zones and workers."""
+        zones = self.world.partition.count
+        shares = (self.share_of(world) for world in range(len(self._steps)))
+        return [to_bytes([*share[:-zones], np.concatenate(share[-zones:])]) for share in shares]
+
+    def load_worlds(self, cases: Sequence[bytes]) -> None:
+        """Go on from what `save_worlds` gave; `arrays` stay as they are.
+
+        Raises:
+            ConfigError: it is of other worlds.
+        """
+        zones = self.world.partition.count
+        like = self.share_of(0)
+        shares = [from_bytes(case, [*like[:-zones], like[-1]]) for case in cases]
+        self.load(self.join([[*share, *[share[-1][:0]] * (zones - 1)] for share in shares]))
 
     @property
     def num_parts(self) -> int:
@@ -292,12 +303,25 @@ def _made_again(
     load_extensions(modules)
     worlds = LocalWorlds(world, len(saved[0]), in_next_step=in_next_step)
     worlds.load(saved)
-    for array, before in zip(_every_array(worlds.arrays), shown, strict=True):
+    for array, before in zip(every_array(worlds.arrays), shown, strict=True):
         array[...] = before
     return worlds
 
 
-def _every_array(arrays: StepArrays) -> Iterator[NDArray[Any]]:
+def kept_elsewhere(config: EnvConfig) -> str:
+    """The key by which worlds have state that is in none of their arrays; empty: none."""
+    zones = config.zones
+    kept = {
+        "traffic.source = sumo…": config.traffic.source == "sumo-traffic",
+        "workers.sensors": config.workers.sensors,
+        "zones.journal": zones.journal,
+        "zones.faults": zones.faults,
+        "zones.reproducers": zones.reproducers,
+    }
+    return next((key for key, is_so in kept.items() if is_so), "")
+
+
+def every_array(arrays: StepArrays) -> Iterator[NDArray[Any]]:
     *plain, frames, final_frames = arrays
     yield from plain
     for rig in (frames, final_frames):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from cavmarl.engine.compilation import compiled_before
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
 from cavmarl.parallel.checkpoint.checkpoint_log import make_segments
+from cavmarl.parallel.checkpoint.world_cases import WorldCases
 from cavmarl.parallel.commanded_worlds import OrderedWorlds, own_error
 from cavmarl.parallel.journaled_worlds import check_watched, is_watched, runs_as_text, unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
@@ -90,6 +92,7 @@ class PooledWorlds(OrderedWorlds):
             else make_segments(config, part.last - part.first)
             for part in parts
         ]
+        cases = [Segment.make(0) for _ in parts]
         recipe = recipe_of(
             world,
             base_dir,
@@ -99,19 +102,22 @@ class PooledWorlds(OrderedWorlds):
             in_next_step=in_next_step,
             parts=parts,
             diaries=[[one.fd for one in diary] for diary in diaries],
+            cases=[case.fd for case in cases],
             runs=runs_as_text(config.zones, num_worlds),
             mover=None if memory is None else memory.recipe,
         )
         leaders = [0, *accumulate(len(part.zones) for part in parts)]
         teams = tuple(tuple(range(*bounds)) for bounds in pairwise(leaders))
         moving = () if memory is None else memory.segments
-        segments = (segment, *(one for diary in diaries for one in diary), *moving)
+        segments = (segment, *(one for diary in diaries for one in diary), *moving, *cases)
         pins = config.workers.pin
         what = Program(program or PROGRAM, recipe, _names(parts), segments, TASK_NAMES, pins, teams)
         try:
             self.pool = Pool(what, config.workers.timeout_s, config.workers.max_retries)
         except WorkerFailureError as failure:
             raise own_error(failure) from failure
+        self._cases = [WorldCases(case) for case in cases]
+        self._parts = parts
         self._asked = _leaders(parts)
         self.placement.watch(self._pids())
 
@@ -130,7 +136,17 @@ class PooledWorlds(OrderedWorlds):
         """Refused: the worlds live in other processes."""
         raise ConfigError("the worlds live in worker processes: use workers=0 to look into them")
 
+    def save_worlds(self) -> list[bytes]:
+        self._order(Task.SAVE, commits=False)
+        return [world for case in self._cases for world in case.take()]
+
+    def load_worlds(self, cases: Sequence[bytes]) -> None:
+        for case, part in zip(self._cases, self._parts, strict=True):
+            case.put(cases[part.first : part.last])
+        self._order(Task.LOAD)
+
     def _settle(self, parts: list[Part]) -> None:
+        self._parts = parts
         self._asked = _leaders(parts)
         self.pool.rename(_names(parts))
 

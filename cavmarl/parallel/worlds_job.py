@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.parallel.checkpoint.world_cases import WorldCases
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.processes.worker_loop import Job
 from cavmarl.parallel.step_arrays import StepArrays
@@ -30,6 +31,8 @@ class Task(IntEnum):
     WRITE_STATES = 8
     DRIVEN = 9
     SIGNAL_PHASES = 10
+    SAVE = 11
+    LOAD = 12
 
 
 TASK_NAMES = tuple(task.name.lower().replace("_", " ") for task in Task)
@@ -37,6 +40,8 @@ TASK_NAMES = tuple(task.name.lower().replace("_", " ") for task in Task)
 
 class WorldsJob(Job):
     """Some of the worlds, next to each other."""
+
+    case: WorldCases  # where they are left, and found, as bytes
 
     def __init__(self, worlds: LocalWorlds, first: int) -> None:
         self._take(worlds, first)
@@ -64,6 +69,10 @@ class WorldsJob(Job):
             return worlds.driven(letter[0] - self._first, letter[1])
         elif task == Task.SIGNAL_PHASES:
             return worlds.signal_phases(letter - self._first).tolist()
+        elif task == Task.SAVE:
+            self.case.put(worlds.save_worlds())
+        elif task == Task.LOAD:
+            worlds.load_worlds(self.case.take())
         return None
 
     def timed_step(self) -> NDArray[np.float64]:

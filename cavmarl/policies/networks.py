@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -18,12 +17,13 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from cavmarl.config.env import ActionConfig, SensorsConfig
 from cavmarl.config.io import validate
 from cavmarl.core.errors import ConfigError, PolicyError
+from cavmarl.core.whole_file import write_whole
 
 WEIGHTS_FILE = "model.safetensors"
 CONFIG_FILE = "config.json"
@@ -211,12 +211,10 @@ def _perceptron(sizes: tuple[int, ...], last_gain: float) -> nn.Sequential:
 def save_network(folder: Path, network: ActorCritic, config: NetworkConfig) -> None:
     """Write weights and config into `folder`; an interrupted write leaves the old files whole."""
     folder.mkdir(parents=True, exist_ok=True)
-    weights = folder / f".{WEIGHTS_FILE}"
-    save_file({name: tensor.contiguous() for name, tensor in network.state_dict().items()}, weights)
-    text = folder / f".{CONFIG_FILE}"
-    text.write_text(json.dumps(asdict(config), indent=2) + "\n", encoding="utf-8")
-    os.replace(weights, folder / WEIGHTS_FILE)
-    os.replace(text, folder / CONFIG_FILE)
+    weights = {name: tensor.contiguous() for name, tensor in network.state_dict().items()}
+    write_whole(folder / WEIGHTS_FILE, save(weights))
+    text = json.dumps(asdict(config), indent=2) + "\n"
+    write_whole(folder / CONFIG_FILE, text.encode())
 
 
 def load_network(folder: Path) -> tuple[ActorCritic, NetworkConfig]:

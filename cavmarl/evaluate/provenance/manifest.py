@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import sys
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -21,6 +20,7 @@ from typing import Any
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ManifestError
 from cavmarl.core.numba import kernel_cache_dir
+from cavmarl.core.whole_file import write_whole
 from cavmarl.evaluate.provenance.machine import describe_machine
 from cavmarl.policies.policy import policy_files
 from cavmarl.roads.network import RoadNetwork
@@ -150,12 +150,7 @@ def hash_of_file(path: Path) -> str:
 
 def write_text(path: Path, text: str) -> None:
     """Write a file that is there whole or not at all."""
-    rough = path.with_name(f".{path.name}.{os.getpid()}")
-    with rough.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    rough.replace(path)
+    write_whole(path, text.encode())
 
 
 def _is_typed(document: Document) -> bool:

@@ -23,6 +23,8 @@ from cavmarl.evaluate.provenance.manifest import (
     read_closed,
 )
 
+CHECKPOINT_FILE = "checkpoint.pt"  # what a run goes on from; see `learning.checkpoint`
+
 
 def begin_training(
     folder: Path,

@@ -27,9 +27,9 @@ class CheckpointJob(WorldsJob):
 
     def perform(self, task: int, letter: Any) -> Any:
         self._catch_up(task)
-        if task not in (Task.STEP, Task.RESET):
+        if task not in (Task.STEP, Task.RESET, Task.LOAD):
             return super().perform(task, letter)
-        if task == Task.RESET:
+        if task != Task.STEP:
             super().perform(task, letter)
             self._begin_anew()
             return None

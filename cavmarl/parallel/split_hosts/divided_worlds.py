@@ -16,7 +16,7 @@ from cavmarl.balance.plan_text import describe_plan
 from cavmarl.core.errors import ConfigError, SumoError, WorkerError, WorkerFailureError
 from cavmarl.engine.world_setup import World
 from cavmarl.handoff.coordinator.coordinator_setup import check_faults
-from cavmarl.parallel.commanded_worlds import own_error, uncopied
+from cavmarl.parallel.commanded_worlds import own_error, uncopied, unsaved
 from cavmarl.parallel.hosts.host_commands import HostProgram
 from cavmarl.parallel.hosts.host_pool import HostPool
 from cavmarl.parallel.hosts.host_process import code_stamp
@@ -97,6 +97,12 @@ class DividedWorlds(LocalWorlds):
 
     def __reduce__(self) -> tuple[Any, ...]:
         raise uncopied()
+
+    def save_worlds(self) -> list[bytes]:
+        raise unsaved()
+
+    def load_worlds(self, cases: Sequence[bytes]) -> None:
+        raise unsaved()
 
     @property
     def plans(self) -> tuple[Plan, ...]:

@@ -77,7 +77,7 @@ class LeaderJob(CheckpointJob):
                 self._note_step()
             self._leader.end_after(LAST.get(Task(task), ""))
             WorldsJob.perform(self, task, letter)
-        if task == Task.RESET:
+        if task in (Task.RESET, Task.LOAD):
             self._begin_anew()
         return None
 

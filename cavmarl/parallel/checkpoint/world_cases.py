@@ -1,0 +1,64 @@
+"""Worlds as bytes: what goes into a file, whichever zones and workers run them before and after."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import ConfigError
+from cavmarl.parallel.processes.shared_memory import Segment
+from cavmarl.parallel.processes.state_image import Image
+
+Array = NDArray[Any]
+
+
+def to_bytes(arrays: Sequence[Array]) -> bytes:
+    """Arrays with their types and shapes."""
+    file = BytesIO()
+    for array in arrays:
+        np.lib.format.write_array(file, array, allow_pickle=False)
+    return file.getvalue()
+
+
+def from_bytes(content: bytes, like: Sequence[Array]) -> list[Array]:
+    """What `to_bytes` was given, of the types and numbers of axes of others.
+
+    Raises:
+        ConfigError: it was something else.
+    """
+    file, found = BytesIO(content), []
+    try:
+        for other in like:
+            array = np.lib.format.read_array(file, allow_pickle=False)
+            if array.dtype != other.dtype or array.ndim != other.ndim:
+                raise ValueError(f"{array.dtype} for {other.dtype}")
+            found.append(array.astype(other.dtype, copy=False))
+        if file.read(1):
+            raise ValueError("more arrays than there are")
+    except ValueError as error:
+        raise ConfigError(
+            "the state is one of other worlds, or of another version of cavmarl, which keeps "
+            f"other arrays ({error}): use the environment and the version that saved it"
+        ) from error
+    return found
+
+
+class WorldCases:
+    """Some worlds as bytes, in memory that processes share."""
+
+    def __init__(self, segment: Segment) -> None:
+        self._image = Image(segment)
+
+    def put(self, cases: Sequence[bytes]) -> None:
+        sizes = np.array([len(case) for case in cases], dtype=np.int64)
+        self._image.write([sizes, np.frombuffer(b"".join(cases), dtype=np.uint8)])
+
+    def take(self) -> list[bytes]:
+        """Raises WorkerError: it is not what was put there."""
+        dtypes: list[np.dtype[Any]] = [np.dtype(np.int64), np.dtype(np.uint8)]
+        sizes, content = self._image.read(dtypes)
+        return [case.tobytes() for case in np.split(content, np.cumsum(sizes)[:-1])]

@@ -1,0 +1,77 @@
+"""A vector environment goes on bit for bit from bytes, whatever zones and workers run it then."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cavmarl.core.errors import ConfigError, EpisodeError
+from cavmarl.env.vector import CavVectorEnv, make_vec
+
+WORLDS, HORIZON = 2, 15
+
+
+def make(mode: str = "SameStep", num_envs: int = WORLDS, **arguments: Any) -> CavVectorEnv:
+    return make_vec(
+        "ring",
+        num_envs=num_envs,
+        agents=3,
+        background=4,
+        max_cycles=HORIZON,
+        autoreset_mode=mode,
+        **arguments,
+    )
+
+
+def drive(vec: CavVectorEnv, steps: range) -> list[bytes]:
+    """Everything that comes of steps, their numbers among the seeds of what agents do."""
+    found = []
+    for step in steps:
+        actions = np.random.default_rng(step).uniform(-1.0, 1.0, (vec.num_envs, vec.num_agents, 2))
+        *results, infos = vec.step(actions.astype(np.float32))
+        found += [array.tobytes() for array in (*results, *infos.values(), vec.state())]
+    return [*found, *(vec.state_hash(world).encode() for world in range(vec.num_envs))]
+
+
+@pytest.mark.parametrize(
+    ("mode", "zones", "workers", "balance_steps"),
+    [("SameStep", 1, 0, 0), ("NextStep", 2, 0, 0), ("NextStep", 2, 4, 0), ("SameStep", 1, 2, 3)],
+)
+@pytest.mark.filterwarnings("ignore:workers = ")
+def test_worlds_go_on_bit_for_bit(mode: str, zones: int, workers: int, balance_steps: int) -> None:
+    before, middle, after = range(HORIZON + 4), range(20, 30), range(30, 50)
+    whole = make(mode)
+    whole.reset(seed=3)
+    drive(whole, before)
+    saved = whole.save_state()
+    expected = drive(whole, middle), drive(whole, after)
+    moves = {"workers.balance_steps": balance_steps}
+    other = make(mode, zones=zones, workers=workers, overrides=moves)
+    try:
+        other.load_state(saved)
+        found = drive(other, middle)
+        again = other.save_state()
+        assert (found, drive(other, after)) == expected
+    finally:
+        other.close()
+    whole.load_state(again)
+    assert drive(whole, after) == expected[1]
+
+
+def test_what_cannot_be_saved_or_loaded_is_refused() -> None:
+    vec = make()
+    with pytest.raises(EpisodeError, match=r"save_state\(\) before reset"):
+        vec.save_state()
+    vec.reset(seed=0)
+    saved = vec.save_state()
+    for other in (make(num_envs=3), make_vec("merge", num_envs=WORLDS, agents=3, background=4)):
+        with pytest.raises(ConfigError, match="the state is one of other worlds, or of another"):
+            other.load_state(saved)
+    for damaged in (saved[:-1], saved[:50] + b"x" + saved[51:], b""):
+        with pytest.raises(ConfigError, match="the state of worlds is damaged"):
+            vec.load_state(damaged)
+    journaled = make(zones=2, overrides={"zones.faults": "{}"})
+    with pytest.raises(ConfigError, match=r"zones\.faults: worlds with processes or files"):
+        journaled.save_state()

@@ -1,0 +1,21 @@
+"""The training programs as modules."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+TRAIN = Path(__file__).resolve().parents[2] / "train"
+
+
+def load_program(name: str) -> ModuleType:
+    """A program as a module: a file that is read, for `train` is no package."""
+    spec = importlib.util.spec_from_file_location(name, TRAIN / f"{name}.py")
+    assert spec
+    assert spec.loader
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module

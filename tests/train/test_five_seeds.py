@@ -1,0 +1,81 @@
+"""What five_seeds.py leaves behind when it is ended in the middle: no process, no traceback."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from tests.support.training import TRAIN, load_program
+
+pytest.importorskip("torch", reason="needs the extra: torch")
+
+WAIT_MS = 20_000  # until what is waited for is taken not to come
+
+
+@pytest.mark.parametrize("ended_by", [signal.SIGKILL, signal.SIGINT])
+def test_trainings_end_with_the_program(tmp_path: Path, ended_by: signal.Signals) -> None:
+    config = tmp_path / "long.yaml"
+    config.write_text("env: ring\nnum_envs: 2\ntotal_agent_steps: 1000000000\n")
+    words = ["--config", "long.yaml", "--seeds", "0", "1", "--jobs", "2"]
+    errors = tmp_path / "errors"
+    with errors.open("w") as file:  # a pipe would be open as long as they train
+        program = subprocess.Popen(
+            [sys.executable, str(TRAIN / "five_seeds.py"), *words],
+            cwd=tmp_path,
+            stdout=subprocess.PIPE,
+            stderr=file,
+            text=True,
+        )
+    with program:
+        assert program.stdout
+        said = {program.stdout.readline() for _ in range(2)}
+        assert said == {"training seed 0\n", "training seed 1\n"}
+        trainings = [os.pidfd_open(child.pid) for child in psutil.Process(program.pid).children()]
+        assert len(trainings) == 2
+        program.send_signal(ended_by)
+        ended = [has_ended(training) for training in trainings]
+        assert ended == [True, True], "they train on"
+    assert "Traceback" not in errors.read_text()
+    if ended_by is signal.SIGINT:
+        assert program.returncode == 130
+        assert errors.read_text().startswith("interrupted: the same command goes on")
+    else:
+        assert program.returncode == -ended_by
+
+
+def has_ended(pidfd: int) -> bool:
+    """Whether a process ends in time; afterwards it has, anyway."""
+    ends = select.poll()
+    ends.register(pidfd, select.POLLIN)
+    ended = bool(ends.poll(WAIT_MS))
+    with suppress(ProcessLookupError):
+        signal.pidfd_send_signal(pidfd, signal.SIGKILL)
+    os.close(pidfd)
+    return ended
+
+
+def test_a_seed_that_was_cut_short_goes_on(tmp_path: Path) -> None:
+    program = load_program("five_seeds")
+    commands: list[list[str]] = []
+
+    class Noted:
+        def run(self, command: list[str], said: str) -> int:
+            commands.append(command)
+            return 0
+
+    args: Any = program.parse_args(["--config", "long.yaml", "--out", str(tmp_path)])
+    (tmp_path / "seed_1").mkdir()
+    (tmp_path / "seed_1" / "checkpoint.pt").touch()
+    for seed in (0, 1):
+        program.train_seed(args, seed, Noted())
+    assert commands[0][-2:] == ["--name", "seed_0"]
+    assert commands[1][-2:] == ["--resume", str(tmp_path / "seed_1")]

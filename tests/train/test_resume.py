@@ -1,0 +1,339 @@
+"""Runs that are cut short go on bit for bit, and nothing is overwritten or mixed on the way.
+
+The one that is really killed is a program of its own, which takes 2 s to be there.
+"""
+
+from __future__ import annotations
+
+import csv
+import errno
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+pytest.importorskip("torch", reason="needs the extra: torch")
+
+from cavmarl.core.errors import ConfigError, TrainingError
+from cavmarl.evaluate.provenance.training_record import CHECKPOINT_FILE, is_trained
+from cavmarl.learning.checkpoint import read_checkpoint
+from cavmarl.learning.log import Log
+from cavmarl.learning.run import Run
+from cavmarl.learning.run_folder import parse_run
+from tests.support.training import TRAIN, load_program
+
+TIMES = {"seconds", "agent_steps_per_s", "simulation_s", "transfer_s", "inference_s", "learning_s"}
+TINY = [
+    "--env", "ring", "--num-envs", "2", "--agents", "2", "--background", "2", "--hidden", "8",
+    "--num-steps", "8", "--epochs", "1", "--minibatches", "2", "--checkpoint-updates", "2",
+]  # fmt: skip
+LENGTH = ["--total-agent-steps", "200"]
+CUT_AFTER = 5  # updates, of seven or more; the checkpoint is that of update 4
+
+# A program that is killed by the system after a row of its log.
+KILLED = """\
+import os, runpy, signal, sys
+from cavmarl.learning.log import Log
+write = Log.write
+def write_and_die(self, row):
+    write(self, row)
+    if row["updates"] == 5:
+        os.kill(os.getpid(), signal.SIGKILL)
+Log.write = write_and_die
+sys.argv = sys.argv[1:]
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+
+
+Learnt = tuple[bytes, list[dict[str, str]], set[str]]
+
+
+class Cut(BaseException):
+    """Ends a run in the middle, and is caught by nothing."""
+
+
+@pytest.fixture(scope="module")
+def ippo() -> ModuleType:
+    return load_program("ippo_torch")
+
+
+@pytest.fixture(scope="module")
+def whole(ippo: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Learnt:
+    """What a run learns that nothing cuts short."""
+    runs = tmp_path_factory.mktemp("runs")
+    assert ippo.main([*TINY, *LENGTH, "--runs", str(runs), "--name", "whole"]) == 0
+    return learnt(runs / "whole")
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def refusal(ippo: ModuleType, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    def call(*words: str) -> str:
+        assert ippo.main(list(words)) == 2
+        return " ".join(capsys.readouterr().err.split())
+
+    return call
+
+
+def learnt(folder: Path) -> Learnt:
+    """The weights, the curve without what it took, and which files there are."""
+    with (folder / "progress.csv").open(newline="") as file:
+        rows = [{key: row[key] for key in row.keys() - TIMES} for row in csv.DictReader(file)]
+    return (folder / "model.safetensors").read_bytes(), rows, {p.name for p in folder.iterdir()}
+
+
+def cut(program: ModuleType, words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a run end after `CUT_AFTER` updates."""
+    update = Run.update
+
+    def update_and_end(self: Run) -> dict[str, float]:
+        row = update(self)
+        if self.updates == CUT_AFTER:
+            raise Cut
+        return row
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Run, "update", update_and_end)
+        with pytest.raises(Cut):
+            program.main(words)
+
+
+def test_a_run_that_is_killed_goes_on_bit_for_bit(
+    ippo: ModuleType, here: Path, whole: Learnt
+) -> None:
+    words = [*TINY, *LENGTH]
+    command = [sys.executable, "-c", KILLED, str(TRAIN / "ippo_torch.py"), *words, "--name", "cut"]
+    killed = subprocess.run(command, capture_output=True, check=False)
+    assert killed.returncode == -signal.SIGKILL
+    assert not is_trained(here / "runs" / "cut")
+    state = read_checkpoint(here / "runs" / "cut")
+    assert state.updates == 4
+    rows = (here / "runs" / "cut" / "progress.csv").read_text().splitlines()
+    assert len(rows) == 1 + CUT_AFTER
+    (here / "runs" / "cut" / f".{CHECKPOINT_FILE}.1").touch()  # killed while it was written
+    # The driver is for others: a run does not go on from it.
+    (here / "runs" / "cut" / "model.safetensors").write_bytes(b"of another step")
+    assert ippo.main(["--resume", "runs/cut"]) == 0
+    assert learnt(here / "runs" / "cut") == whole
+    assert is_trained(here / "runs" / "cut")
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "others"),
+    [
+        ("ippo_torch", ["--overlap", "--imitation-weight", "1"], []),
+        ("mappo_torch", [], ["--zones", "2"]),
+        ("mappo_torch", ["--overlap"], ["--workers", "2"]),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:workers = 2")
+def test_a_run_goes_on_bit_for_bit_in_every_way_to_collect(
+    here: Path, monkeypatch: pytest.MonkeyPatch, name: str, words: list[str], others: list[str]
+) -> None:
+    program = load_program(name)
+    words = [*TINY, *LENGTH, *words]
+    assert program.main([*words, "--name", "whole"]) == 0
+    cut(program, [*words, "--name", "cut"], monkeypatch)
+    assert program.main(["--resume", "runs/cut", *others]) == 0
+    assert learnt(here / "runs" / "cut") == learnt(here / "runs" / "whole")
+
+
+def test_a_run_that_died_before_its_manifest_was_closed_is_ended(
+    ippo: ModuleType, here: Path, refusal: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def die(*_: object, **__: object) -> None:
+        raise Cut
+
+    words = [*TINY, "--total-agent-steps", "60", "--name", "run"]
+    with monkeypatch.context() as patch:
+        patch.setattr("cavmarl.learning.run_folder.end_training", die)
+        with pytest.raises(Cut):
+            ippo.main(words)
+    before = learnt(here / "runs" / "run")
+    assert ippo.main(["--resume", "runs/run"]) == 0
+    assert learnt(here / "runs" / "run") == before
+    more = ["--resume", "runs/run"]
+    assert "--total-agent-steps 60: the run has 61; ask for more" in refusal(*more)
+    more += ["--total-agent-steps", "90"]
+    assert "--minutes 1e-05: the run has" in refusal(*more, "--minutes", "1e-5")
+    assert ippo.main(more) == 0
+    assert len(learnt(here / "runs" / "run")[1]) > len(before[1])
+
+
+def test_a_folder_has_one_run_and_one_process(
+    ippo: ModuleType, here: Path, refusal: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = [*TINY, "--total-agent-steps", "60", "--name", "run"]
+    locked: list[str] = []
+    update = Run.update
+
+    def update_beside_another(self: Run) -> dict[str, float]:
+        if not locked:
+            locked.append("")
+            locked[0] = refusal(*words) + refusal("--resume", "runs/run")
+        return update(self)
+
+    monkeypatch.setattr(Run, "update", update_beside_another)
+    assert ippo.main(words) == 0
+    assert locked[0].count(f"runs/run: process {os.getpid()} trains here: wait until") == 2
+    before = learnt(here / "runs" / "run")
+    assert "runs/run: a run has begun here, which is not overwritten: go on" in refusal(*words)
+    assert learnt(here / "runs" / "run") == before
+
+
+@pytest.mark.parametrize("full", ["checkpoint.pt", "progress.csv"])
+def test_a_full_disk_leaves_the_last_checkpoint_whole(
+    ippo: ModuleType,
+    here: Path,
+    whole: Learnt,
+    refusal: Callable[..., str],
+    monkeypatch: pytest.MonkeyPatch,
+    full: str,
+) -> None:
+    fsync, calls = os.fsync, []
+
+    def fsync_on_a_full_disk(fd: int) -> None:
+        if full in os.readlink(f"/proc/self/fd/{fd}"):
+            calls.append(fd)
+            if len(calls) == 2:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        fsync(fd)
+
+    words = [*TINY, *LENGTH]
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", fsync_on_a_full_disk)
+        said = refusal(*words, "--name", "cut")
+    assert f"runs/cut/{full}: cannot be written (No space left on device): make room" in said
+    assert "go on from the last checkpoint: --resume runs/cut" in said
+    assert not list((here / "runs" / "cut").glob(".checkpoint*"))
+    assert read_checkpoint(here / "runs" / "cut").updates == 0
+    assert ippo.main(["--resume", "runs/cut"]) == 0
+    assert learnt(here / "runs" / "cut") == whole
+
+
+def test_a_row_that_finds_no_room_is_a_typed_error(here: Path) -> None:
+    (here / "progress.csv").symlink_to("/dev/full")
+    log = Log(here)
+    with pytest.raises(TrainingError, match=r"progress\.csv: cannot be written \(No space left"):
+        log.write({"updates": 1.0})
+    log.close()
+
+
+def test_a_run_that_found_no_room_at_all_can_be_begun_again(
+    ippo: ModuleType, here: Path, refusal: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_room(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    words = [*TINY, "--total-agent-steps", "20", "--name", "run"]
+    with monkeypatch.context() as patch:
+        patch.setattr("cavmarl.learning.run_folder.write_checkpoint", no_room)
+        assert "checkpoint.pt: cannot be written" in refusal(*words)
+    assert "--resume runs/run: no checkpoint there" in refusal("--resume", "runs/run")
+    assert ippo.main(words) == 0
+
+
+def test_what_is_damaged_or_of_another_run_is_refused(
+    ippo: ModuleType, here: Path, refusal: Callable[..., str]
+) -> None:
+    assert ippo.main([*TINY, "--total-agent-steps", "20", "--name", "run"]) == 0
+    resume = ("--resume", "runs/run", "--total-agent-steps", "60")
+    path = here / "runs" / "run" / CHECKPOINT_FILE
+    written = path.read_bytes()
+    flipped = bytearray(written)
+    flipped[len(written) // 2] ^= 1
+    for broken in (written[:-1], bytes(flipped), b"", b"of another version\n" + written):
+        path.write_bytes(broken)
+        assert "runs/run/checkpoint.pt: is damaged, or of another version" in refusal(*resume)
+    path.write_bytes(written)
+    mappo = load_program("mappo_torch")
+    with pytest.raises(ConfigError, match=r"is a run of ippo_torch\.py: go on with that one"):
+        parse_run(mappo.Args, resume, "")
+    (path.parent / "progress.csv").write_text("rows\n")
+    assert "progress.csv: rows are missing that were there at the checkpoint" in refusal(*resume)
+
+
+def test_another_world_is_refused(
+    ippo: ModuleType, here: Path, refusal: Callable[..., str]
+) -> None:
+    entry = here / "envs" / "small"
+    entry.mkdir(parents=True)
+    source = TRAIN.parent / "envs" / "ring" / "map" / "map.net.xml"
+    text = f"name: small\nmap: {{source: {source}}}\npopulation: {{mode: respawn}}\n"
+    (entry / "env.yaml").write_text(text)
+    words = ["small" if word == "ring" else word for word in TINY]
+    assert ippo.main([*words, "--total-agent-steps", "20", "--name", "run"]) == 0
+    (entry / "env.yaml").write_text(text + "horizon_s: 33.0\n")
+    said = refusal("--resume", "runs/run", "--total-agent-steps", "60")
+    assert "--resume runs/run: the environment has changed since that run" in said
+
+
+def test_tensorboard_is_cut_where_the_checkpoint_is(
+    ippo: ModuleType, here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
+
+    def points(name: str) -> list[tuple[int, str, str]]:
+        return sorted(
+            (event.step, value.tag, repr(value.tensor.float_val[0]))
+            for path in (here / "runs" / name).glob("events.*")
+            for event in EventFileLoader(str(path)).Load()
+            for value in event.summary.value
+            if value.tag not in TIMES
+        )
+
+    words = [*TINY, *LENGTH, "--tensorboard"]
+    assert ippo.main([*words, "--name", "whole"]) == 0
+    cut(ippo, [*words, "--name", "cut"], monkeypatch)
+    assert ippo.main(["--resume", "runs/cut"]) == 0
+    assert points("cut") == points("whole") != []
+
+
+@pytest.mark.parametrize(
+    ("name", "module"),
+    [("ppo_gymnasium", "gymnasium"), ("ppo_sb3", "stable_baselines3"), ("ippo_torchrl", "torchrl")],
+)
+@pytest.mark.filterwarnings("ignore")  # what the libraries warn of themselves
+def test_a_librarys_run_goes_on(
+    here: Path, monkeypatch: pytest.MonkeyPatch, name: str, module: str
+) -> None:
+    pytest.importorskip(module)
+    program, write = load_program(name), Log.write
+
+    def write_and_end(self: Log, row: dict[str, float]) -> None:
+        write(self, row)
+        if row["updates"] == CUT_AFTER:
+            raise Cut
+
+    words = ["--env", "ring", "--num-worlds", "2", "--num-steps", "8", "--hidden", "8"]
+    words += ["--epochs", "1", "--minibatches", "2", "--checkpoint-updates", "2"]
+    words += ["--num-envs", "8"] if name == "ppo_gymnasium" else []
+    words += ["--total-agent-steps", "400"]
+    assert program.main([*words, "--name", "whole"]) == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(Log, "write", write_and_end)
+        with pytest.raises(Cut):
+            program.main([*words, "--name", "cut"])
+    assert program.main([*words, "--name", "cut"]) == 2
+    assert program.main(["--resume", "runs/cut"]) == 0
+    assert is_trained(here / "runs" / "cut")
+    uncut, resumed = learnt(here / "runs" / "whole"), learnt(here / "runs" / "cut")
+    if name == "ippo_torchrl":  # whose collector keeps its worlds: they begin new episodes
+        assert (resumed[1][:4], resumed[2]) == (uncut[1][:4], uncut[2])
+        rows = (here / "runs" / "cut" / "progress.csv").read_text().splitlines()
+        updates = [int(row.partition(",")[0]) for row in rows[1:]]
+        assert updates == list(range(1, len(rows)))
+        assert len(rows) > 1 + CUT_AFTER
+    else:
+        assert resumed == uncut
