@@ -7,6 +7,7 @@ READY := .venv/.ready
 VENV_PACKAGE := { test "$$(id -u)" = 0 && apt-get update && apt-get install --yes python3-venv; }
 OLDEST := .venv-oldest
 LIBRARIES := .venv-libraries
+TOOLS := .venv-tools
 # What old versions of others will no longer do is no news; the rest stays an error.
 OLDEST_WARNINGS := -W default::DeprecationWarning -W default::PendingDeprecationWarning
 OLDEST_TESTS := tests/core tests/driving tests/engine tests/handoff tests/rewards tests/roads tests/sensors \
@@ -25,7 +26,7 @@ MAPS := envs/ring/map/map.net.xml envs/merge/map/map.net.xml envs/grid4x4/map/ma
 # Tests start many processes: none is to parse the sources anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help demo test quick ray check bench bounds soak model fuzz oldest libraries maps pictures clean
+.PHONY: help demo test quick ray check bench bounds soak model fuzz oldest libraries maps lock sbom audit pictures clean
 .DEFAULT_GOAL := help
 
 help: ## say what there is
@@ -88,13 +89,23 @@ maps: $(READY) ## make the maps of ring, merge and grid4x4 anew from the options
 	cd envs/grid4x4/map && ../../../$(BIN)/netgenerate --configuration-file map.netgcfg
 	sed --in-place '2,/^-->$$/d' $(MAPS)
 
+lock: $(READY) ## write constraints-hashes.txt: each file of an installation with its hash
+	$(BIN)/python -m docs.supply_chain lock
+
+sbom: $(READY) $(TOOLS)/.ready ## list all parts of an installation, in CycloneDX's form
+	mkdir -p dist
+	$(TOOLS)/bin/cyclonedx-py environment --output-file dist/cavmarl.cdx.json .venv
+
+audit: $(READY) $(TOOLS)/.ready ## look all parts up among the known vulnerabilities; needs the network
+	$(TOOLS)/bin/pip-audit --path .venv/lib/python*/site-packages
+
 pictures: $(READY) ## draw the pictures of the README, the cards and the pages anew
 	$(BIN)/python -m docs.pictures.pictures docs/images
 	$(BIN)/python -m docs.pictures.sensor_pictures docs/images
 	$(BIN)/python -m docs.pictures.moving docs/images
 
 clean: ## remove .venv, builds and caches; runs/ stays
-	rm -rf .venv $(OLDEST) $(LIBRARIES) fuzz/corpus build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf .venv $(OLDEST) $(LIBRARIES) $(TOOLS) fuzz/corpus build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find cavmarl agents benchmarks train tests -name __pycache__ -prune -exec rm -rf {} +
 
 # torch comes first and alone, so that a CPU build that pip is told of (PIP_EXTRA_INDEX_URL,
@@ -107,6 +118,11 @@ $(READY): pyproject.toml constraints.txt
 	test -x $(BIN)/pip || "$(PYTHON)" -m venv --clear .venv
 	$(BIN)/python -m pip install $$(grep '^torch==' constraints.txt) --constraint constraints.txt
 	$(BIN)/python -m pip install --editable '.[dev]' --constraint constraints.txt
+	@touch $@
+
+$(TOOLS)/.ready:
+	"$(PYTHON)" -m venv --clear $(TOOLS)
+	$(TOOLS)/bin/python -m pip install --quiet cyclonedx-bom pip-audit
 	@touch $@
 
 $(OLDEST)/.ready: pyproject.toml constraints-oldest.txt

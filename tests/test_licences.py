@@ -1,0 +1,44 @@
+"""What an installation brings: its licences are told, its files have hashes."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from docs.supply_chain import LOCKED, licences
+from tests.support.generated import check_block
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def test_the_page_tells_the_licence_of_each_package() -> None:
+    rows = list(licences())
+    if not {"ray", "torchrl", "stable-baselines3"} <= {name for name, *_ in rows}:
+        pytest.skip("an installation of less than cavmarl[dev]: `make test` has all of it")
+    lines = ["| package | needed by | licence |", "|---|---|---|"]
+    lines += ["| {} |".format(" | ".join(row)) for row in rows]
+    check_block(ROOT / "docs" / "licences.md", "licences", "\n".join(lines))
+
+
+def test_each_locked_file_has_the_version_of_the_constraints() -> None:
+    exact = dict(
+        line.lower().replace("_", "-").split("==")
+        for line in (ROOT / "constraints.txt").read_text().splitlines()
+        if not line.startswith("#")
+    )
+    locked = [
+        re.fullmatch(r"([a-z0-9-]+)==(\S+) --hash=sha256:[0-9a-f]{64}", line)
+        for line in (ROOT / "constraints-hashes.txt").read_text().splitlines()
+        if not line.startswith("#")
+    ]
+    assert all(locked)
+    assert all(exact[found[1]] == found[2] for found in locked if found is not None)
+    names = {found[1] for found in locked if found is not None}
+    needed = {
+        name
+        for name, extras, _ in licences()
+        if {*extras.split(", ")} & {"cavmarl", *LOCKED.split(",")}
+    }
+    assert needed <= names
