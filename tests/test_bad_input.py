@@ -229,9 +229,9 @@ def test_actions_after_the_end_are_refused() -> None:
     assert env.state_hash() == before
 
 
-def test_render_without_a_mode_is_refused() -> None:
-    with pytest.raises(ConfigError, match="render_mode"):
-        make().render()
+def test_render_without_a_mode_warns_as_other_environments_do() -> None:
+    with pytest.warns(UserWarning, match="without a render_mode"):
+        assert make().render() is None
 
 
 @pytest.mark.parametrize("seed", [-1, 2**63, 1.5, "0", True, np.nan, [1]])

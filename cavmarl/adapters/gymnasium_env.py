@@ -7,15 +7,16 @@ from typing import Any
 
 import gymnasium
 
-from cavmarl.adapters.observations import refuse_decided
+from cavmarl.adapters.observations import WithSpec, refuse_decided
 from cavmarl.config.registry import load_config
 from cavmarl.env.parallel import CavEnv, parallel_env
+from cavmarl.env.world_copies import OwnWorlds
 
 EGO = "car_0"
 DECIDED = ("agents", "population.agents", "population.budget")
 
 
-class CavEgoEnv(gymnasium.Env[Any, Any]):
+class CavEgoEnv(WithSpec, OwnWorlds, gymnasium.Env[Any, Any]):
     """One vehicle of a world; the built-in drivers drive all others.
 
     The entry's other agents become background vehicles, so that the traffic is as dense as there.
@@ -57,6 +58,7 @@ class CavEgoEnv(gymnasium.Env[Any, Any]):
             overrides={"population.mode": "closed", **wanted, "population.budget": 1},
             **arguments,
         )
+        self._horizon = self._env.max_cycles
         self.render_mode = render_mode
         self.metadata = self._env.metadata
         self.observation_space = self._env.observation_space(EGO)

@@ -71,3 +71,16 @@ def test_an_episode_is_one_trip_or_is_cut_at_the_horizon(mode: str) -> None:
 def test_one_vehicle_is_one_vehicle(arguments: dict[str, Any], key: str) -> None:
     with pytest.raises(ConfigError, match=f"^{key}: this view decides it"):
         gymnasium.make("cavmarl/ring-v0", **arguments)
+
+
+def test_the_spec_tells_the_horizon_and_makes_the_same_again() -> None:
+    world = make()
+    assert world.spec is not None
+    assert world.spec.max_episode_steps == 40
+    assert gymnasium.make(world.spec).unwrapped._env.max_cycles == 40
+    cut = gymnasium.make("cavmarl/ring-v0", max_episode_steps=2)
+    cut.reset(seed=0)
+    cut.step(cut.action_space.sample())
+    assert cut.step(cut.action_space.sample())[3], "Gymnasium's own limit works, too"
+    with pytest.warns(UserWarning, match="without a render_mode"):
+        assert cut.unwrapped.render() is None
