@@ -29,7 +29,6 @@ COMMANDS = (
     "follow",
     "view",
     "demo",
-    "train",
     "list",
     "map",
     "demand",
