@@ -506,7 +506,7 @@ def demanding(write: Write, body: str, **more: str) -> CavEnv:
         (
             '<trip id="t" depart="0" from="A0bottom0" to="bottom0A0"/>',
             RouteError,
-            ("A0bottom0", "bottom0A0", "duarouter"),
+            ("A0bottom0", "bottom0A0", "on_bad_route = skip"),
         ),
         ('<vType id="t" length="1e9"/>', DemandError, ("length", "at most 100")),
         ('<flow id="f" begin="9" end="3" number="2"/>', DemandError, ("f", "ends before")),
