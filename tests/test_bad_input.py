@@ -217,6 +217,25 @@ def test_step_and_render_before_reset_are_refused() -> None:
         make_vec("ring").step(np.zeros((1, 4, 2)))
 
 
+def test_a_lenient_world_takes_what_libraries_give_and_counts_it() -> None:
+    """All at once, for agents that have left and when everybody has, too."""
+    env = parallel_env("ring", agents=2, background=0, seed=0, max_cycles=3, lenient=True)
+    strict = parallel_env("ring", agents=2, background=0, seed=0, max_cycles=3)
+    env.reset()
+    strict.reset()
+    env.step({"car_0": np.array([9.0, 0.0])})
+    strict.step({"car_0": np.array([1.0, 0.0]), "car_1": np.zeros(2)})
+    assert env.state_hash() == strict.state_hash()
+    env.step({agent: np.array([0.0, -1.0]) for agent in env.possible_agents})
+    tolerated = {name: count for name, count in env.traffic_stats().items() if "actions_" in name}
+    assert tolerated == {"actions_clipped": 1, "actions_held": 1, "actions_ignored": 0}
+    env.step({})
+    assert env.step({"car_0": FINE}) == ({}, {}, {}, {}, {})
+    env.reset()
+    with pytest.raises(ActionError, match="must be finite"):
+        env.step({"car_0": np.array([np.nan, 0.0])})
+
+
 def test_actions_after_the_end_are_refused() -> None:
     env = parallel_env("ring", agents=2, background=0, seed=0, max_cycles=2)
     env.reset()

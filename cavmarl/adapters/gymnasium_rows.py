@@ -47,6 +47,7 @@ class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
         autoreset_mode: when rows and worlds that ended begin anew.
         max_episode_steps: Gymnasium's name of `max_cycles`.
         render_mode: `rgb_array` or None.
+        action_kind: shadows action.kind, `continuous` or `discrete`.
         overrides: values for any other key.
         arguments: other keywords of `make_vec`.
 
@@ -64,12 +65,15 @@ class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
+        action_kind: str | None = None,
         overrides: Mapping[str, Any] | None = None,
         **arguments: Any,
     ) -> None:
         self.closed = True  # until there is something to close: Gymnasium does so when it is freed
         refuse_decided(DECIDED, overrides, arguments)
         wanted = {"population.mode": "respawn", **(overrides or {})}
+        if action_kind is not None:
+            wanted.setdefault("action.kind", action_kind)
         if max_episode_steps is not None and arguments.get("max_cycles") is None:
             arguments["max_cycles"] = max_episode_steps
         self._vec = make_vec(

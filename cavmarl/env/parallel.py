@@ -26,7 +26,7 @@ from cavmarl.engine.spaces import (
     state_space,
 )
 from cavmarl.engine.world_setup import check_agents, make_world
-from cavmarl.env.actions import ActionDecoder
+from cavmarl.env.actions import LENIENT, ActionDecoder
 from cavmarl.env.declared_events import DeclaredEvents
 from cavmarl.env.drawn_worlds import RENDER_MODES, DrawnWorlds, check_rendering
 from cavmarl.env.world_copies import CopiedWithWorlds
@@ -52,6 +52,7 @@ def parallel_env(
     seed: int | None = None,
     max_cycles: int | None = None,
     render_mode: str | None = None,
+    lenient: bool = False,
     overrides: Mapping[str, Any] | None = None,
 ) -> CavEnv:
     """Make a PettingZoo parallel environment.
@@ -70,6 +71,9 @@ def parallel_env(
         seed: of the first reset, if that is given none.
         max_cycles: steps until truncation; shadows horizon_s.
         render_mode: `human`, `rgb_array` or None.
+        lenient: for libraries that act for absent agents, or beyond the bounds: values are clipped,
+            actions of agents that have left ignored, and missing ones are the last, or 0. Sets
+            action.out_of_range, .missing_action and .late_actions; traffic_stats() counts each.
         overrides: values for any other key, such as `{"sensors.lidar.rays": 32}`.
 
     Raises:
@@ -81,6 +85,8 @@ def parallel_env(
     check_hosts(workers, hosts)
     first_seed = None if seed is None else check_seed(seed)
     check_rendering(render_mode, 1, workers, hosts)
+    if lenient and isinstance(overrides, Mapping | None):
+        overrides = {**LENIENT, **(overrides or {})}
     config, base_dir = load_config(
         env,
         zones=zones,
@@ -247,7 +253,7 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
         if self._steps < 0:
             raise EpisodeError("step() before reset(): call env.reset(seed=…) first")
         if not self.agents:
-            if actions:
+            if actions and self.config.action.late_actions == "error":
                 raise EpisodeError("the episode is over: call env.reset()")
             return {}, {}, {}, {}, {}
         active = self.worlds.arrays.mask[0, self._listed]
