@@ -1,9 +1,9 @@
 """Multi-agent reinforcement learning for connected and automated vehicles on real road networks.
 
     import cavmarl
-    env = cavmarl.parallel_env("town", agents=25, background=100, seed=0)  # PettingZoo ParallelEnv
-    aec = cavmarl.env("town")                                              # PettingZoo AEC form
-    vec = cavmarl.make_vec("merge", num_envs=16)                           # batched arrays
+    env = cavmarl.parallel_env("merge", agents=25, background=100, seed=0)  # PettingZoo ParallelEnv
+    aec = cavmarl.env("merge")                                              # PettingZoo AEC form
+    vec = cavmarl.make_vec("merge", num_envs=16)                            # batched arrays
     policy = cavmarl.load_policy("idm", env)
 
 Importing it registers the entries of `envs/` with Gymnasium and PettingZoo.

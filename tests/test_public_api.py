@@ -107,7 +107,7 @@ def test_every_entry_has_its_ids() -> None:
         assert f"cavmarl/{name}-v0" in gymnasium.registry
         assert f"cavmarl/{name}Agents-v0" in gymnasium.registry
     ours = {spec for spec in gymnasium.registry if spec.startswith("cavmarl/")}
-    assert len(ours) == 2 * len(names)
+    assert len(ours) == 4 * len(names), "and each with meta-actions"
 
 
 def test_the_ids_make_environments() -> None:

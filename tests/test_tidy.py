@@ -24,7 +24,6 @@ LONG_FILES = {
     "cavmarl/core/errors.py",
     "cavmarl/driving/kernels/drivers.py",
     "cavmarl/engine/simulation.py",
-    "cavmarl/env/parallel.py",
     "cavmarl/handoff/division.py",
     "cavmarl/traffic/native.py",
     "tests/driving/test_junctions.py",

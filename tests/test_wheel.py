@@ -92,7 +92,16 @@ def test_the_installed_command_runs(elsewhere: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["envs", "agents", "configs"])
+def test_an_installed_wheel_trains(elsewhere: Path, tmp_path: Path) -> None:
+    command = [str(elsewhere / "cavmarl"), "train", "ippo_torch", "--config", "merge"]
+    small = {"agents": 2, "background": 0, "num-envs": 2, "num-steps": 8, "minibatches": 2}
+    words = [f"--{key}={value}" for key, value in {**small, "total-agent-steps": 40}.items()]
+    assert "driver:" in run([*command, *words, "--name", "tiny"], tmp_path)
+    assert (tmp_path / "runs" / "tiny" / "model.safetensors").is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["envs", "agents", "configs", "train"])
 def test_a_wheel_carries_the_data_folders_whole(site: Path, kind: str) -> None:
     assert files(site / "cavmarl" / "data" / kind) == files(ROOT / kind)
 

@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 
-from cavmarl.adapters.observations import refuse_decided
+from cavmarl.adapters.observations import WithSpec, refuse_decided
 from cavmarl.config.registry import load_config
+from cavmarl.core.errors import ConfigError
 from cavmarl.env.parallel import CavEnv, parallel_env
+from cavmarl.env.world_copies import OwnWorlds
 
 EGO = "car_0"
 DECIDED = ("agents", "population.agents", "population.budget")
 
 
-class CavEgoEnv(gymnasium.Env[Any, Any]):
+class CavEgoEnv(WithSpec, OwnWorlds, gymnasium.Env[Any, Any]):
     """One vehicle of a world; the built-in drivers drive all others.
 
     The entry's other agents become background vehicles, so that the traffic is as dense as there.
+    The infos also have highway-env's `speed` in m/s and `crashed`, and `is_success`, whether it has
+    arrived; `speed` of a vehicle that has left is the last one that was seen.
+
     An episode is the trip of one vehicle. In `closed` worlds, the default, the others leave one by
     one; in `entering` and `seats` worlds new ones come for those that leave.
 
@@ -27,6 +33,8 @@ class CavEgoEnv(gymnasium.Env[Any, Any]):
         render_mode: `human`, `rgb_array` or None.
         background: other vehicles; None: all of the entry but one.
         overrides: as for `parallel_env`.
+        config: the same, nested as in an env.yaml: `{"sensors": {"lidar": {"rays": 8}}}`.
+        action_kind: shadows action.kind, `continuous` or `discrete`.
         arguments: other keywords of `parallel_env`.
 
     Raises:
@@ -42,10 +50,16 @@ class CavEgoEnv(gymnasium.Env[Any, Any]):
         render_mode: str | None = None,
         background: int | None = None,
         overrides: dict[str, Any] | None = None,
+        config: Mapping[str, Any] | None = None,
+        action_kind: str | None = None,
         **arguments: Any,
     ) -> None:
-        refuse_decided(DECIDED, overrides, arguments)
-        wanted = overrides or {}
+        wanted: Any = overrides or {}
+        if config is not None and isinstance(wanted, Mapping):
+            wanted = {**dict(_dotted(config)), **wanted}
+        if action_kind is not None and isinstance(wanted, Mapping):
+            wanted = {"action.kind": action_kind, **wanted}
+        refuse_decided(DECIDED, wanted, arguments)
         population = load_config(env, overrides=wanted)[0].population
         if background is None and "population.background" not in wanted:
             background = population.background + population.agents - 1
@@ -57,10 +71,12 @@ class CavEgoEnv(gymnasium.Env[Any, Any]):
             overrides={"population.mode": "closed", **wanted, "population.budget": 1},
             **arguments,
         )
+        self._horizon = self._env.max_cycles
         self.render_mode = render_mode
         self.metadata = self._env.metadata
         self.observation_space = self._env.observation_space(EGO)
         self.action_space = self._env.action_space(EGO)
+        self._speed_mps = 0.0
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -68,14 +84,14 @@ class CavEgoEnv(gymnasium.Env[Any, Any]):
         """Begin an episode."""
         super().reset(seed=seed)
         observations, infos = self._env.reset(seed=seed, options=options)
-        return observations[EGO], dict(infos[EGO])
+        return observations[EGO], self._told(infos[EGO])
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Let the vehicle act."""
         observations, rewards, _, truncations, infos = self._env.step({EGO: action})
         ended = bool(infos[EGO]["vehicle_done"])  # a seat itself does not end
         cut = truncations[EGO] and not ended
-        return observations[EGO], rewards[EGO], ended, cut, dict(infos[EGO])
+        return observations[EGO], rewards[EGO], ended, cut, self._told(infos[EGO])
 
     def render(self) -> Any:
         """As `CavEnv.render`."""
@@ -84,3 +100,28 @@ class CavEgoEnv(gymnasium.Env[Any, Any]):
     def close(self) -> None:
         """As `CavEnv.close`."""
         self._env.close()
+
+    def _told(self, info: Mapping[str, float]) -> dict[str, Any]:
+        for vehicle in self._env.worlds.driven(0, [0]):
+            self._speed_mps = vehicle.speed_mps
+        return {
+            **info,
+            "speed": self._speed_mps,
+            "crashed": info["collision"] > 0.0,
+            "is_success": info["arrival"] > 0.0,
+        }
+
+
+def _dotted(keys: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+    """Nested keys as dotted ones.
+
+    Raises:
+        ConfigError: no mapping.
+    """
+    if not isinstance(keys, Mapping):
+        raise ConfigError(f"config = {keys!r}: must be a mapping of keys, as in an env.yaml")
+    for key, value in keys.items():
+        if isinstance(value, Mapping):
+            yield from _dotted(value, f"{above}{key}.")
+        else:
+            yield f"{above}{key}", value

@@ -11,15 +11,16 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from cavmarl.adapters.observations import ObservationForm, Observations, refuse_decided
+from cavmarl.adapters.observations import ObservationForm, Observations, WithSpec, refuse_decided
 from cavmarl.config.registry import load_config
 from cavmarl.core.errors import ConfigError
 from cavmarl.env.vector import CavVectorEnv, make_vec
+from cavmarl.env.world_copies import OwnWorlds
 
 DECIDED = ("agents", "population.budget")
 
 
-class CavAgentRows(VectorEnv[Any, Any, Any]):
+class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
     """The agents of one or more worlds as rows, for programs written for vectors of single agents.
 
     A row is an agent id of a world; row `w · A + a` is agent a of world w. In `seats` worlds, the
@@ -29,14 +30,24 @@ class CavAgentRows(VectorEnv[Any, Any, Any]):
 
     Rows end singly (terminations), and all that have a vehicle at the horizon (truncations).
     `infos["active"]` says which rows act next: the others' observations are 0 and their actions are
-    not read, but for a row that has just ended with `NEXT_STEP`: it shows its last observation.
-    With `SAME_STEP` that is in `infos["final_obs"]`. The infos also hold every term by its name.
+    not read, but for a row that has just ended with `NEXT_STEP` or `DISABLED`: it shows its last
+    observation. With `SAME_STEP` that is in `infos["final_obs"]`, and what the infos said of it in
+    `infos["final_info"]`. The infos also hold every term by its name.
+
+    With `DISABLED`, `reset(options={"reset_mask": …})` takes (num_envs,) rows: a world that is over
+    begins anew with any of its rows, one that goes on with all of them. A row that ended while its
+    world goes on waits as ever, and shows 0 until it has a vehicle.
+
+    A frame of a row is that of its world.
 
     Args:
         env: as for `make_vec`.
         num_envs: rows of all worlds together.
         num_worlds: how many worlds they are in.
         autoreset_mode: when rows and worlds that ended begin anew.
+        max_episode_steps: Gymnasium's name of `max_cycles`.
+        render_mode: `rgb_array` or None.
+        action_kind: shadows action.kind, `continuous` or `discrete`.
         overrides: values for any other key.
         arguments: other keywords of `make_vec`.
 
@@ -52,16 +63,24 @@ class CavAgentRows(VectorEnv[Any, Any, Any]):
         num_envs: int = 1,
         num_worlds: int = 1,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        max_episode_steps: int | None = None,
+        render_mode: str | None = None,
+        action_kind: str | None = None,
         overrides: Mapping[str, Any] | None = None,
         **arguments: Any,
     ) -> None:
         self.closed = True  # until there is something to close: Gymnasium does so when it is freed
         refuse_decided(DECIDED, overrides, arguments)
         wanted = {"population.mode": "respawn", **(overrides or {})}
+        if action_kind is not None:
+            wanted.setdefault("action.kind", action_kind)
+        if max_episode_steps is not None and arguments.get("max_cycles") is None:
+            arguments["max_cycles"] = max_episode_steps
         self._vec = make_vec(
             env,
             num_envs=num_worlds,
             autoreset_mode=autoreset_mode,
+            render_mode=render_mode,
             overrides=wanted | _rows_a_world(env, wanted, num_envs, num_worlds),
             **arguments,
         )
@@ -69,8 +88,11 @@ class CavAgentRows(VectorEnv[Any, Any, Any]):
         self._shape = (num_worlds, self._vec.num_agents)
         self._term_names = self._vec.config.terms.names
         self._form = ObservationForm(self._vec.config)
-        self._same_step = self._vec.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+        self.autoreset_mode: AutoresetMode = self._vec.metadata["autoreset_mode"]
+        self._horizon = self._vec.max_cycles
+        self.render_mode = render_mode
         self.num_envs = num_envs
+        self._over = np.zeros((2, num_envs), dtype=np.bool_)  # the row itself, and its world
         self.metadata = self._vec.metadata
         self.single_observation_space = self._form.space
         self.single_action_space = self._vec.single_action_space
@@ -87,8 +109,21 @@ class CavAgentRows(VectorEnv[Any, Any, Any]):
     ) -> tuple[Observations, dict[str, Any]]:
         """Begin an episode in every world."""
         super().reset(seed=seed)
+        chosen = (options or {}).get("reset_mask")
+        if chosen is not None:
+            options = {**(options or {}), "reset_mask": self._worlds_of(np.asarray(chosen))}
         observations, infos = self._vec.reset(seed=seed, options=options)
-        return self._form(self._rows(observations)), self._told({"active": infos["mask"]})
+        waits: NDArray[np.bool_] = np.zeros(self.num_envs, dtype=np.bool_)
+        if chosen is None:
+            self._over[:] = False
+        else:
+            ended, over = self._over
+            waits = chosen & ended & ~over
+            self._over[:, chosen] = False
+        shown = self._rows(observations)
+        if waits.any():
+            shown = np.where(waits[:, None], np.float32(0.0), shown)
+        return self._form(shown), self._told({"active": infos["mask"]})
 
     def step(
         self, actions: NDArray[Any]
@@ -103,9 +138,14 @@ class CavAgentRows(VectorEnv[Any, Any, Any]):
         terms = {name: infos["terms"][..., k] for k, name in enumerate(self._term_names)}
         told = self._told({"active": infos["mask"], "vehicle_done": infos["vehicle_done"], **terms})
         over = self._rows(ended | cut)
-        if self._same_step and over.any():
+        self._over = np.stack([over, infos["episode_over"].repeat(self._shape[1])])
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and over.any():
             told["final_obs"] = self._last(self._rows(infos["final_observations"]), over)
-            told["_final_obs"] = over
+            told["final_info"] = {}
+            for name, array in terms.items():
+                rows = self._rows(array)
+                told["final_info"] |= {name: np.where(over, rows, 0.0), f"_{name}": over}
+            told["_final_obs"] = told["_final_info"] = over
         return (
             self._form(self._rows(observations)),
             self._rows(rewards),
@@ -114,9 +154,38 @@ class CavAgentRows(VectorEnv[Any, Any, Any]):
             told,
         )
 
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """A frame (height, width, 3) a row, that of its world."""
+        frames = self._vec.render()
+        if frames is None:
+            return None
+        return tuple(frame for frame in frames for _ in range(self._shape[1]))
+
     def close_extras(self, **_: Any) -> None:
         """As `CavVectorEnv.close`."""
         self._vec.close()
+
+    def _worlds_of(self, rows: NDArray[Any]) -> NDArray[np.bool_]:
+        """(W,) the worlds that begin anew for these rows.
+
+        Raises:
+            ConfigError: not a mask of rows, or only a part of a world that goes on.
+        """
+        if rows.shape != (self.num_envs,) or rows.dtype != np.bool_:
+            raise ConfigError(
+                f"reset_mask has shape {rows.shape} and dtype {rows.dtype}: must be "
+                f"({self.num_envs},) and bool, one a row"
+            )
+        ended, over = self._over.reshape(2, *self._shape)
+        chosen = rows.reshape(self._shape)
+        worlds = np.logical_or(chosen.all(axis=1), (chosen & over).any(axis=1))
+        parts = chosen & ~ended & ~worlds[:, None]
+        if parts.any():
+            raise ConfigError(
+                f"reset_mask has row {int(parts.argmax())}, which has not ended: its world goes on "
+                f"for the other rows; choose all {self._shape[1]} of the world"
+            )
+        return worlds
 
     def _told(self, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
         """Infos of all rows, each with the mask of its rows, as Gymnasium's wrappers expect."""

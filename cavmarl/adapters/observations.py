@@ -1,11 +1,13 @@
-"""What the views share: observations in the form of `observation.kind`, keys that views decide."""
+"""What the views share: the form of observations, keys that views decide, specs with a horizon."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
@@ -22,6 +24,25 @@ def refuse_decided(keys: Iterable[str], *given: Mapping[str, Any] | None) -> Non
             raise ConfigError(
                 f"{key}: this view decides it; cavmarl.parallel_env and make_vec leave it to you"
             )
+
+
+class WithSpec:
+    """Base of a view whose spec, which Gymnasium sets, tells the horizon of this very one.
+
+    The ids have none: Gymnasium would cut at it what `max_cycles` or `horizon_s` makes longer.
+    """
+
+    _spec: EnvSpec | None = None
+    _horizon: int  # in steps
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """How it was made; None if not by Gymnasium."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = spec and dataclasses.replace(spec, max_episode_steps=self._horizon)
 
 
 class ObservationForm:

@@ -10,6 +10,7 @@ from typing import Any
 
 from cavmarl.core.errors import missing
 from cavmarl.env.parallel import parallel_env
+from cavmarl.env.world_copies import OwnWorlds
 
 try:
     from ray.rllib.env.multi_agent_env import MultiAgentEnv
@@ -21,7 +22,7 @@ Step = tuple[
 ]
 
 
-class CavRllibEnv(MultiAgentEnv):  # type: ignore[misc] # found in an environment of its own only
+class CavRllibEnv(OwnWorlds, MultiAgentEnv):  # type: ignore[misc] # found in an environment of its own only
     """One world; what `config` holds are the arguments of `parallel_env`.
 
         PPOConfig().environment(CavRllibEnv, env_config={"env": "town", "agents": 25})

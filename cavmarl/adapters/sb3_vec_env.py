@@ -10,13 +10,15 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.adapters.observations import ObservationForm, Observations, refuse_decided
+from cavmarl.adapters.observations import ObservationForm, Observations, WithSpec, refuse_decided
 from cavmarl.config.env import TERMS
 from cavmarl.core.errors import missing
 from cavmarl.env.vector import make_vec
+from cavmarl.env.world_copies import OwnWorlds
 
 try:
     from stable_baselines3.common.vec_env.base_vec_env import VecEnv
@@ -29,7 +31,7 @@ ARRIVAL = TERMS.index("arrival")
 Indices = int | Iterable[int] | None
 
 
-class CavSb3VecEnv(VecEnv):
+class CavSb3VecEnv(WithSpec, OwnWorlds, VecEnv):
     """W worlds with A agents each as W · A environments that share one policy; row w · A + a.
 
     In `seats` worlds, the default, a row whose vehicle ended gets a new one as soon as there is
@@ -39,13 +41,16 @@ class CavSb3VecEnv(VecEnv):
     A row that ended is `done` and carries its last observation as `terminal_observation`, whether
     the horizon cut it as `TimeLimit.truncated`, and whether it arrived as `is_success`. While a row
     waits for a vehicle its observation and reward are 0, its actions are not read and its info says
-    `inactive`.
+    `inactive`. With `render_mode="rgb_array"`, a picture has one tile a world.
 
     Args:
         env: as for `make_vec`.
         num_worlds: W.
         overrides: values for any other key.
         arguments: other keywords of `make_vec`.
+
+    Attributes:
+        spec: Gymnasium's of the entry's rows; None where there is no such id.
 
     Raises:
         ConfigError: a key, value or combination that cannot work.
@@ -72,6 +77,9 @@ class CavSb3VecEnv(VecEnv):
         super().__init__(
             num_worlds * self._vec.num_agents, self._form.space, self._vec.single_action_space
         )
+        self.metadata = self._vec.metadata
+        self._horizon = self._vec.max_cycles
+        self.spec = gymnasium.registry.get(f"cavmarl/{env}Agents-v{self._vec.config.version}")
 
     def reset(self) -> Observations:
         """Begin an episode in every world; the first row's seed is the root of all."""
@@ -109,10 +117,13 @@ class CavSb3VecEnv(VecEnv):
         """As `CavVectorEnv.close`."""
         self._vec.close()
 
+    def get_images(self) -> tuple[NDArray[np.uint8], ...]:
+        """A frame (height, width, 3) a world, which `render` makes one picture of."""
+        return self._vec.render() or ()
+
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
         """An attribute of the worlds, the same for every row."""
-        # The worlds draw nothing themselves; SB3 asks every VecEnv.
-        value = None if attr_name == "render_mode" else getattr(self._vec, attr_name)
+        value = self.spec if attr_name == "spec" else getattr(self._vec, attr_name)
         return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:

@@ -19,6 +19,7 @@ from cavmarl.adapters.observations import ObservationForm, refuse_decided
 from cavmarl.core.errors import missing
 from cavmarl.core.seeds import check_seed
 from cavmarl.env.vector import CavVectorEnv, make_vec
+from cavmarl.env.world_copies import OwnWorlds
 
 try:
     import torch
@@ -33,7 +34,7 @@ GROUP = "car"
 DECIDED = ("autoreset_mode", "copy")  # TorchRL resets worlds itself and keeps what it is given
 
 
-class CavTorchRLEnv(EnvBase):  # type: ignore[misc] # TorchRL is not typed
+class CavTorchRLEnv(OwnWorlds, EnvBase):  # type: ignore[misc] # TorchRL is not typed
     """W worlds with A agents each, of the batch size (W,); all agents are of the group `car`.
 
     Entries of a tensordict, with one axis more than the batch for the agents:

@@ -22,6 +22,7 @@ from cavmarl.cli import (
     plan,
     scenario,
     suite,
+    train,
     verify,
     view,
 )
@@ -49,6 +50,9 @@ app.command()(lead.lead)
 app.command()(follow.follow)
 app.command()(view.view)
 app.command()(demo.demo)
+app.command(context_settings={"ignore_unknown_options": True, "allow_interspersed_args": False})(
+    train.train
+)
 app.command("list")(listing.list_entries)
 app.add_typer(map.app, name="map")
 app.add_typer(demand.app, name="demand")

@@ -14,12 +14,9 @@ from rich.console import Console
 from cavmarl.cli.evaluate import evaluate_showing, report_table
 from cavmarl.cli.output import JsonPath, Seed, about, make_folder, write_json
 from cavmarl.cli.view import record
+from cavmarl.config.registry import find_settings, programs
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError, require
-
-_CHECKOUT = Path(__file__).resolve().parents[2]
-_SCRIPT = _CHECKOUT / "train" / "ippo_torch.py"
-_SETTINGS = _CHECKOUT / "configs" / "train" / "demo.yaml"
 
 EVALUATION_SEED = 1000  # far from the seeds of training
 EPISODES = 32
@@ -35,14 +32,10 @@ def demo(
     """Train on `merge`, evaluate beside `idm` and `random_actions`, drive `town`, leave videos."""
     from cavmarl.env.parallel import parallel_env
 
-    if not _SCRIPT.is_file():
-        raise ConfigError(
-            "the demo trains with train/ippo_torch.py, which an installed wheel does not carry: "
-            "run it in a checkout of the repository"
-        )
     if not 0.0 < minutes <= 600.0 or not 0.0 < seconds <= 3600.0:
         raise ConfigError("--minutes must be above 0, at most 600; --seconds above 0, at most 3600")
     require("torch", "torch")
+    require("sumo", "sumo")  # it has the map of town
     require("imageio_ffmpeg", "render")
     make_folder(out)
     console = Console()
@@ -81,8 +74,9 @@ def demo(
 
 def _train(out: Path, name: str, minutes: float, seed: int) -> Path:
     """Run the training program; the folder of the driver."""
-    command = [sys.executable, str(_SCRIPT), "--config", str(_SETTINGS), "--minutes", str(minutes)]
-    command += ["--seed", str(seed), "--runs", str(out), "--name", name]
+    settings = find_settings("train", "demo")
+    command = [sys.executable, str(programs()["ippo_torch"]), "--config", str(settings)]
+    command += ["--minutes", str(minutes), "--seed", str(seed), "--runs", str(out), "--name", name]
     done = subprocess.run(command, check=False)
     if done.returncode:
         raise typer.Exit(done.returncode)

@@ -33,9 +33,13 @@ _SUMO_PREFIX = "sumo:"
 
 def places(kind: str) -> list[Path]:
     """The folders that hold entries of `kind` (`envs`, `agents`, `configs`), first wins."""
+    return [place for place in (Path.cwd() / kind, _ours(kind)) if place.is_dir()]
+
+
+def _ours(kind: str) -> Path:
+    """Where the wheel has it, else the checkout."""
     packaged = _PACKAGE / "data" / kind
-    ours = packaged if packaged.is_dir() else _PACKAGE.parent / kind
-    return [place for place in (Path.cwd() / kind, ours) if place.is_dir()]
+    return packaged if packaged.is_dir() else _PACKAGE.parent / kind
 
 
 def entries() -> dict[str, Path]:
@@ -52,6 +56,12 @@ def agent_entries() -> dict[str, Path]:
     own = {name: path for name, path in _collect("agents", _agent_name).items() if path.is_dir()}
     ours = places("agents")[-1:]
     return dict(sorted((own | _named(ours, _agent_name)).items()))
+
+
+def programs() -> dict[str, Path]:
+    """The training programs: name → `train/NAME.py`; those of the working directory are not it."""
+    ours = _ours("train")
+    return {path.stem: path for path in sorted(ours.glob("*.py"))}
 
 
 def agent_here(name: str) -> Path | None:
@@ -163,14 +173,16 @@ def load_config(
 
 
 def find_settings(what: str, name: str) -> Path:
-    """The file that `name` means: a path, or a name in `configs/`: a `rig` or a `suite`."""
+    """The file that `name` means: a path, or a name in `configs/`: a `rig`, `suite` or `train`."""
     if Path(name).is_file():
         return Path(name)
+    folder, usual = {
+        "rig": ("rigs", "ten_sensors"), "suite": ("suites", "standard"), "train": ("train", "merge")
+    }[what]  # fmt: skip
     for place in places("configs"):
-        path = place / f"{what}s" / f"{name}.yaml"
+        path = place / folder / f"{name}.yaml"
         if path.is_file():
             return path
-    usual = {"rig": "ten_sensors", "suite": "standard"}[what]
     raise ConfigError(f"no {what} or file '{name}': give '{usual}' or the path of a .yaml")
 
 

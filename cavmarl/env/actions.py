@@ -15,6 +15,13 @@ from cavmarl.core.records.codes import ACTION_IDLE, ACTION_SLOWER
 from cavmarl.engine.kernels.decoding import decode_choices, decode_pairs
 from cavmarl.shards.shard import Commands
 
+# The keys of `parallel_env(lenient=True)`.
+LENIENT = {
+    "action.out_of_range": "clip",
+    "action.missing_action": "hold",
+    "action.late_actions": "ignore",
+}
+
 
 class ActionDecoder:
     """Checks and decodes the actions of W worlds with A agents each.

@@ -26,15 +26,13 @@ from cavmarl.engine.spaces import (
     state_space,
 )
 from cavmarl.engine.world_setup import check_agents, make_world
-from cavmarl.env.actions import ActionDecoder
+from cavmarl.env.actions import LENIENT, ActionDecoder
 from cavmarl.env.declared_events import DeclaredEvents
+from cavmarl.env.drawn_worlds import RENDER_MODES, DrawnWorlds, check_rendering
 from cavmarl.env.world_copies import CopiedWithWorlds
-from cavmarl.parallel.backends import check_hosts, keeps_state, make_worlds
+from cavmarl.parallel.backends import check_hosts, make_worlds
 from cavmarl.parallel.step_arrays import SteppedWorlds
-from cavmarl.render.topdown import WorldView
 from cavmarl.sensors.mounted.frames import SensorFrames
-
-RENDER_MODES = ("human", "rgb_array")
 
 # What an agent's info holds, behind the terms.
 _OF_VEHICLE = ("active", "vehicle_done", "vehicle_id")
@@ -54,6 +52,7 @@ def parallel_env(
     seed: int | None = None,
     max_cycles: int | None = None,
     render_mode: str | None = None,
+    lenient: bool = False,
     overrides: Mapping[str, Any] | None = None,
 ) -> CavEnv:
     """Make a PettingZoo parallel environment.
@@ -72,6 +71,9 @@ def parallel_env(
         seed: of the first reset, if that is given none.
         max_cycles: steps until truncation; shadows horizon_s.
         render_mode: `human`, `rgb_array` or None.
+        lenient: for libraries that act for absent agents, or beyond the bounds: values are clipped,
+            actions of agents that have left ignored, and missing ones are the last, or 0. Sets
+            action.out_of_range, .missing_action and .late_actions; traffic_stats() counts each.
         overrides: values for any other key, such as `{"sensors.lidar.rays": 32}`.
 
     Raises:
@@ -82,8 +84,9 @@ def parallel_env(
     """
     check_hosts(workers, hosts)
     first_seed = None if seed is None else check_seed(seed)
-    if render_mode is not None:
-        _check_rendering(render_mode, 0 if keeps_state(1, workers, hosts) else workers or hosts)
+    check_rendering(render_mode, 1, workers, hosts)
+    if lenient and isinstance(overrides, Mapping | None):
+        overrides = {**LENIENT, **(overrides or {})}
     config, base_dir = load_config(
         env,
         zones=zones,
@@ -99,23 +102,6 @@ def parallel_env(
     return CavEnv(worlds, seed=first_seed, render_mode=render_mode)
 
 
-def _check_rendering(render_mode: str, workers: int | str | None) -> None:
-    """Refuse what cannot be drawn.
-
-    Raises:
-        ConfigError: an unknown mode, or a world that only other processes have.
-    """
-    if render_mode not in RENDER_MODES:
-        raise ConfigError(
-            f"render_mode = {render_mode!r}: must be {' or '.join(RENDER_MODES)}, or None"
-        )
-    if workers:
-        raise ConfigError(
-            f"render_mode = {render_mode!r} with workers = {workers!r}: only a world of the "
-            "caller's process can be drawn; use workers=0"
-        )
-
-
 def _flags(agents: list[str], flags: NDArray[np.bool_]) -> dict[str, bool]:
     """One flag an agent; in most steps none is set."""
     if not flags.any():
@@ -123,7 +109,7 @@ def _flags(agents: list[str], flags: NDArray[np.bool_]) -> dict[str, bool]:
     return dict(zip(agents, flags.tolist(), strict=True))
 
 
-class CavEnv(CopiedWithWorlds, ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is not typed
+class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is not typed
     """One world.
 
     Observations, actions and rewards are described in docs/environments.md. The infos of each agent
@@ -182,7 +168,7 @@ class CavEnv(CopiedWithWorlds, ParallelEnv[str, Any, Any]):  # type: ignore[misc
         self._events = DeclaredEvents(config, 1)
         self._first_seed = seed
         self._steps = -1
-        self._view: WorldView | None = None
+        self._view = None
 
     @property
     def max_cycles(self) -> int:
@@ -267,7 +253,7 @@ class CavEnv(CopiedWithWorlds, ParallelEnv[str, Any, Any]):  # type: ignore[misc
         if self._steps < 0:
             raise EpisodeError("step() before reset(): call env.reset(seed=…) first")
         if not self.agents:
-            if actions:
+            if actions and self.config.action.late_actions == "error":
                 raise EpisodeError("the episode is over: call env.reset()")
             return {}, {}, {}, {}, {}
         active = self.worlds.arrays.mask[0, self._listed]
@@ -443,31 +429,18 @@ class CavEnv(CopiedWithWorlds, ParallelEnv[str, Any, Any]):  # type: ignore[misc
         """A frame (height, width, 3) for `rgb_array`; None and a window for `human`.
 
         A divided world is shown with its zones and owners, and with `ghosts_of` set to a zone,
-        what that one sees of the others.
+        what that one sees of the others. Without a render_mode: None, and a warning.
 
         Raises:
-            ConfigError: no render_mode, or no zone of that number.
+            ConfigError: no zone of that number.
             EpisodeError: before the first reset.
         """
-        if self.render_mode is None:
-            raise ConfigError("render() without a render_mode: make the environment with one")
-        if self._steps < 0:
-            raise EpisodeError("render() before reset(): call env.reset(seed=…) first")
-        if self._view is None:
-            self._view = WorldView(
-                self.simulation,
-                self.render_mode,
-                self.metadata["name"],
-                self.metadata["render_fps"],
-            )
-        return self._view.show(self.ghosts_of)
+        return self._frame(self._steps >= 0, ghosts_of=self.ghosts_of)
 
     def close(self) -> None:
         """Close the window and end the worker processes, if there are any.
 
         Without workers the environment can be used on.
         """
-        if self._view is not None:
-            self._view.close()
-            self._view = None
+        self._close_view()
         self.worlds.close()

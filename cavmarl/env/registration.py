@@ -3,7 +3,8 @@
 PettingZoo: the module functions `parallel_env`, `env` and `raw_env`, and, from 1.27 on, ids such
 as `cavmarl/merge-v0` in both its registries. Gymnasium: `cavmarl/merge-v0`, one vehicle of the
 world as a single-agent environment, and `cavmarl/mergeAgents-v0` for `gymnasium.make_vec`, all
-agents as rows.
+agents as rows; `cavmarl/mergeDiscrete-v0` and `cavmarl/mergeDiscreteAgents-v0` are the same with
+meta-actions.
 """
 
 from __future__ import annotations
@@ -68,19 +69,20 @@ def register_all() -> None:
         if not _ID.fullmatch(name):
             continue
         version = _version(folder)
-        one, rows = f"cavmarl/{name}-v{version}", f"cavmarl/{name}Agents-v{version}"
-        gymnasium.register(
-            one,
-            entry_point="cavmarl.adapters.gymnasium_env:CavEgoEnv",
-            kwargs={"env": name},
-            disable_env_checker=True,
-        )
-        gymnasium.register(
-            rows,
-            vector_entry_point="cavmarl.adapters.gymnasium_rows:CavAgentRows",
-            kwargs={"env": name},
-            disable_env_checker=True,
-        )
+        one = f"cavmarl/{name}-v{version}"
+        for word, kind in {"": {}, "Discrete": {"action_kind": "discrete"}}.items():
+            gymnasium.register(
+                f"cavmarl/{name}{word}-v{version}",
+                entry_point="cavmarl.adapters.gymnasium_env:CavEgoEnv",
+                kwargs={"env": name, **kind},
+                disable_env_checker=True,
+            )
+            gymnasium.register(
+                f"cavmarl/{name}{word}Agents-v{version}",
+                vector_entry_point="cavmarl.adapters.gymnasium_rows:CavAgentRows",
+                kwargs={"env": name, **kind},
+                disable_env_checker=True,
+            )
         if hasattr(pettingzoo, "register"):
             of_entry = {"env": name}
             pettingzoo.register(

@@ -26,7 +26,9 @@ from cavmarl.engine.spaces import (
 )
 from cavmarl.engine.world_setup import check_agents, make_world
 from cavmarl.env.actions import ActionDecoder
+from cavmarl.env.autoreset import known_mode, present_mode, refuse_over
 from cavmarl.env.declared_events import DeclaredEvents
+from cavmarl.env.drawn_worlds import DrawnWorlds, check_rendering
 from cavmarl.env.saved_state import SavedState
 from cavmarl.env.world_copies import CopiedWithWorlds
 from cavmarl.parallel.backends import check_hosts, make_worlds
@@ -58,6 +60,7 @@ def make_vec(
     max_cycles: int | None = None,
     autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
     copy: bool = True,
+    render_mode: str | None = None,
     overrides: Mapping[str, Any] | None = None,
 ) -> CavVectorEnv:
     """Make `num_envs` worlds of one environment that are stepped together.
@@ -77,9 +80,10 @@ def make_vec(
         background: shadows population.background.
         seed: of the first reset, if that is given none.
         max_cycles: steps until truncation; shadows horizon_s.
-        autoreset_mode: when a world that is over begins anew, in the `SameStep` or in the
-            `NextStep`; see `CavVectorEnv`.
+        autoreset_mode: when a world that is over begins anew: in the `SameStep`, in the `NextStep`,
+            or when `reset` says so (`Disabled`); see `CavVectorEnv`.
         copy: False returns observations without a copy; see `CavVectorEnv`.
+        render_mode: `rgb_array` or None.
         overrides: values for any other key.
 
     Raises:
@@ -88,13 +92,10 @@ def make_vec(
         WorkerError: worker processes cannot be started, or have no memory.
         MissingExtraError: hosts on Ray without Ray.
     """
-    if isinstance(num_envs, bool) or not isinstance(num_envs, (int, np.integer)):
-        raise ConfigError(f"num_envs = {num_envs!r}: must be a whole number")
-    if not 1 <= num_envs <= MAX_WORLDS:
-        raise ConfigError(f"num_envs = {num_envs}: must be from 1 to {MAX_WORLDS}")
-    num_envs = int(num_envs)
+    num_envs = _checked(num_envs)
     check_hosts(workers, hosts)
-    in_next_step = _in_next_step(autoreset_mode)
+    mode = known_mode(autoreset_mode)
+    check_rendering(render_mode, num_envs, workers, hosts, ("rgb_array",))
     first_seed = None if seed is None else check_seed(seed)
     config, base_dir = load_config(
         env,
@@ -107,25 +108,21 @@ def make_vec(
     )
     check_agents(config)
     world = make_world(config, base_dir)
+    in_next_step = mode is not AutoresetMode.SAME_STEP
     worlds = make_worlds(world, base_dir, num_envs, workers, hosts, in_next_step)
-    return CavVectorEnv(worlds, seed=first_seed, copy=copy)
+    forms: dict[str, Any] = {"copy": copy, "render_mode": render_mode}
+    return CavVectorEnv(worlds, seed=first_seed, disabled=mode is AutoresetMode.DISABLED, **forms)
 
 
-def _in_next_step(mode: AutoresetMode | str) -> bool:
-    """Whether worlds begin anew in the next step; an error for a mode that means no reset."""
-    try:
-        found = AutoresetMode(mode)
-    except ValueError:
-        found = AutoresetMode.DISABLED
-    if found is AutoresetMode.DISABLED:
-        raise ConfigError(
-            f"autoreset_mode = {mode!r}: must be 'SameStep' or 'NextStep'; reset() takes "
-            "options={'reset_mask': …} to begin some worlds anew earlier"
-        )
-    return found is AutoresetMode.NEXT_STEP
+def _checked(num_envs: int) -> int:
+    if isinstance(num_envs, bool) or not isinstance(num_envs, (int, np.integer)):
+        raise ConfigError(f"num_envs = {num_envs!r}: must be a whole number")
+    if not 1 <= num_envs <= MAX_WORLDS:
+        raise ConfigError(f"num_envs = {num_envs}: must be from 1 to {MAX_WORLDS}")
+    return int(num_envs)
 
 
-class CavVectorEnv(CopiedWithWorlds, SavedState):
+class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
     """W worlds with A agent seats each; ground truth is flat, whatever `observation.kind` says.
 
     With `observation.mode: sensors` and `observation.kind: dict`, observations are dicts: an array
@@ -134,13 +131,15 @@ class CavVectorEnv(CopiedWithWorlds, SavedState):
     Arrays have the shape (num_envs, num_agents, …). `infos["mask"]` says which agents have a
     vehicle and will be asked for the next action; the others' observations are 0 and their actions
     are not read. A world whose episode is over (truncated, or all agents gone and none to come) is
-    begun anew by itself, as Gymnasium's `AutoresetMode` says:
+    begun anew as Gymnasium's `AutoresetMode` says:
 
     - `SAME_STEP`: in the same step. The observations returned are those of the new episode,
       `infos["final_observations"]` keeps the last ones of the old, and of each agent that left.
     - `NEXT_STEP`: in the next step. The observations returned are the last ones, those of agents
       that leave too; in the next step the world's actions are not read, its rewards are 0 and the
       observations are those of the new episode.
+    - `DISABLED`: by `reset(options={"reset_mask": infos["episode_over"]})` before the next step,
+      and never by itself. What a step returns is that of `NEXT_STEP`.
 
     The worlds run in this process, or shared out over worker processes (docs/workers.md): what
     comes out is the same bit for bit.
@@ -150,6 +149,8 @@ class CavVectorEnv(CopiedWithWorlds, SavedState):
         seed: of the first reset, if that is given none.
         copy: False returns observations as a read-only view that the next step or reset overwrites;
             large ones are copied for longer than they are made.
+        disabled: worlds that are over wait for a reset; they are those of the next step.
+        render_mode: `rgb_array` or None.
 
     Attributes:
         simulated_s: time that all steps have taken up to now, without that for checking actions and
@@ -157,7 +158,13 @@ class CavVectorEnv(CopiedWithWorlds, SavedState):
     """
 
     def __init__(
-        self, worlds: SteppedWorlds, *, seed: int | None = None, copy: bool = True
+        self,
+        worlds: SteppedWorlds,
+        *,
+        seed: int | None = None,
+        copy: bool = True,
+        disabled: bool = False,
+        render_mode: str | None = None,
     ) -> None:
         self.worlds = worlds
         self.config = config = worlds.world.config
@@ -179,15 +186,19 @@ class CavVectorEnv(CopiedWithWorlds, SavedState):
         )
         self.metadata = {
             "name": f"cavmarl/{config.name}-v{config.version}",
-            "autoreset_mode": (
-                AutoresetMode.NEXT_STEP if worlds.in_next_step else AutoresetMode.SAME_STEP
-            ),
+            "autoreset_mode": present_mode(worlds.in_next_step, disabled),
+            "render_modes": ["rgb_array"],
+            "render_fps": max(1, round(1.0 / config.clock.ctrl_dt_s)),
         }
+        self.render_mode = render_mode
+        self._view = None
+        self._disabled = disabled
+        self._over = np.zeros(num_envs, dtype=np.bool_)  # and not begun anew yet
         arrays = worlds.arrays
         commands = Commands(arrays.controls, arrays.meta_actions)
         self._decoder = ActionDecoder(config.action, num_envs, self.possible_agents, commands)
-        self._view = arrays.observations.view()
-        self._view.flags.writeable = False
+        self._read_only = arrays.observations.view()
+        self._read_only.flags.writeable = False
         self._mask = np.zeros((num_envs, self.num_agents), dtype=np.bool_)
         self._events = DeclaredEvents(config, num_envs)
         self._first_seed = None if seed is None else check_seed(seed)
@@ -259,6 +270,7 @@ class CavVectorEnv(CopiedWithWorlds, SavedState):
         self.worlds.reset(seed, first_world)
         self._decoder.forget(chosen)
         self._mask = self.worlds.arrays.mask.copy()
+        self._over = self._over & ~chosen
         self._ready = True
         return self._observations(), {"mask": self._mask.copy()}
 
@@ -298,17 +310,20 @@ class CavVectorEnv(CopiedWithWorlds, SavedState):
             left: the same array as the observations in a step where none did.
 
         Raises:
-            EpisodeError: before the first reset.
+            EpisodeError: before the first reset, or, with `DISABLED`, before that of a world that
+                is over.
             ActionError: wrong shape, dtype or value; nothing has changed.
         """
         if not self._ready:
             raise EpisodeError("step() before reset(): call vec.reset(seed=…) first")
+        if self._disabled:
+            refuse_over(self._over)
         commands = self._decoder.from_array(actions, self._mask)
         began = time.perf_counter()
         self.worlds.step(self._events.add_to(commands))
         self.simulated_s += time.perf_counter() - began
         arrays = self.worlds.arrays
-        over = arrays.episode_over.copy()
+        over = self._over = arrays.episode_over.copy()
         terminations = arrays.terminations.copy()
         observations = final_observations = self._observations()
         if np.count_nonzero(over) or np.count_nonzero(terminations):
@@ -322,14 +337,14 @@ class CavVectorEnv(CopiedWithWorlds, SavedState):
             "final_observations": final_observations,
             "arrivals": arrays.arrivals.copy(),
             "mask": self._mask.copy(),
-            "episode_over": over,
+            "episode_over": over.copy(),
         }
         return observations, arrays.rewards.copy(), terminations, arrays.truncations.copy(), infos
 
     def _observations(self) -> Observations:
         arrays = self.worlds.arrays
         if not self._senses:
-            return arrays.observations.copy() if self._copy else self._view
+            return arrays.observations.copy() if self._copy else self._read_only
         left = arrays.terminations & ~arrays.episode_over[:, None]
         if self.worlds.in_next_step or not left.any():
             sensed = sensed_observation(arrays.frames)
@@ -411,8 +426,19 @@ class CavVectorEnv(CopiedWithWorlds, SavedState):
         """Traffic of one world since its reset, as `CavEnv.traffic_stats`."""
         return {**self.worlds.traffic_stats(world), **self._decoder.tolerated(world)}
 
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """A frame (height, width, 3) of each world; None and a warning without a render_mode.
+
+        Raises:
+            EpisodeError: before the first reset.
+        """
+        drawn = range(self.num_envs if self.render_mode else 1)  # one is enough to warn
+        frames = [self._frame(self._ready, world) for world in drawn]
+        return tuple(frame for frame in frames if frame is not None) or None
+
     def close(self) -> None:
         """End the worker processes, if there are any; arrays that were returned stay."""
+        self._close_view()
         self.worlds.close()
 
 

@@ -9,7 +9,15 @@ from cavmarl.env.actions import ActionDecoder
 from cavmarl.parallel.step_arrays import SteppedWorlds
 
 
-class CopiedWithWorlds:
+class OwnWorlds:
+    """Base of whatever holds worlds: a shallow copy would step those of the first one."""
+
+    def __copy__(self) -> Any:
+        """As `copy.deepcopy`: two environments never step the same worlds."""
+        return deepcopy(self)
+
+
+class CopiedWithWorlds(OwnWorlds):
     """Base of an environment that `copy` and `pickle` take apart into its worlds and the rest.
 
     Everything that refers to arrays of the worlds is made anew by `__init__`.
@@ -19,7 +27,9 @@ class CopiedWithWorlds:
     """
 
     # What `__init__` makes of the worlds, and is therefore not copied.
-    _MADE_OF_WORLDS: ClassVar = frozenset({"worlds", "config", "network", "_view", "_decoder"})
+    _MADE_OF_WORLDS: ClassVar = frozenset(
+        {"worlds", "config", "network", "_view", "_read_only", "_decoder"}
+    )
 
     worlds: SteppedWorlds
     _decoder: ActionDecoder
@@ -33,10 +43,6 @@ class CopiedWithWorlds:
     def __setstate__(self, state: tuple[dict[str, Any], Any]) -> None:
         kept, self._decoder.memory = state
         vars(self).update(kept)
-
-    def __copy__(self) -> Any:
-        """As `copy.deepcopy`: two environments never step the same worlds."""
-        return deepcopy(self)
 
 
 def _made_again(kind: type[Any], worlds: SteppedWorlds) -> Any:

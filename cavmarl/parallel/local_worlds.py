@@ -198,6 +198,7 @@ class LocalWorlds:
             rows["length"].astype(np.float64),
             rows["width"].astype(np.float64),
             simulation.goal_edges[rows["goal"]],
+            rows["speed"].astype(np.float64),
         )
         return [Driven(*row) for row in zip(*(column.tolist() for column in columns), strict=True)]
 

@@ -99,6 +99,7 @@ class Driven(NamedTuple):
     length_m: float  # of its body
     width_m: float  # of its body
     goal_edge: int  # EDGE row of where it is to go
+    speed_mps: float
 
 
 class SteppedWorlds(Protocol):

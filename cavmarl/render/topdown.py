@@ -263,7 +263,7 @@ class WorldView:
     """Draws one world of a simulation from above, into arrays or into a window.
 
     Args:
-        simulation: the worlds; the first one is shown.
+        simulation: the worlds.
         mode: `rgb_array` or `human`.
         title: for the picture's corner and the window.
         fps: pictures a second of the window.
@@ -279,13 +279,14 @@ class WorldView:
         self._fps = fps
         self._renderer = TopDownRenderer(simulation.network, goal_edges=simulation.goal_edges)
 
-    def show(self, ghosts_of: int | None = None) -> NDArray[np.uint8] | None:
-        """Draw the present moment: (height, width, 3) for `rgb_array`, None for `human`.
+    def show(self, ghosts_of: int | None = None, world: int = 0) -> NDArray[np.uint8] | None:
+        """Draw the present moment of a world: (height, width, 3) for `rgb_array`, None for `human`.
 
         A divided world is drawn with its zones, and vehicles in the colours of their owners.
 
         Args:
             ghosts_of: the zone whose sight and ghosts are outlined.
+            world: which of the simulation's.
 
         Raises:
             ConfigError: the world has no such zone.
@@ -295,11 +296,11 @@ class WorldView:
         if ghosts_of is not None and not 0 <= ghosts_of < count:
             raise ConfigError(f"ghosts_of = {ghosts_of}: the world has the zones 0 to {count - 1}")
         picture = self._renderer.draw(
-            simulation.vehicles(),
-            simulation.signal_phases(),
+            simulation.vehicles(world),
+            simulation.signal_phases(world),
             title=self._title,
-            clock_s=float(simulation.ticks()[0]) * simulation.config.clock.sim_dt_s,
-            zones=simulation.zone_view() if count > 1 else None,
+            clock_s=float(simulation.ticks()[world]) * simulation.config.clock.sim_dt_s,
+            zones=simulation.zone_view(world) if count > 1 else None,
             ghosts_of=ghosts_of,
         )
         if self._mode == "rgb_array":

@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import CapacityError, RouteError
 from cavmarl.core.records.codes import LANE_GIVEN, SPEED_GIVEN
-from cavmarl.roads.kernels.plans import plan_goal
-from cavmarl.roads.kernels.route_steps import plan_route, trace_edges
+from cavmarl.roads.kernels.route_steps import plan_route
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN
 from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.demand.drawing import speed_factors
 from cavmarl.traffic.departure_queue import DEPARTURE
+from cavmarl.traffic.trip_ways import TripWays
 
 MAX_STEPS = 50_000_000
-MAX_EDGES = 100_000  # of one way
 MAX_DETOUR_STEPS = 8_000_000
 DETOUR_CHANGE_WEIGHT = 100.0
 
@@ -40,7 +38,7 @@ class Schedule:
         self.demand = demand
         self._network: RoadNetwork = demand.network
         self._first_type = first_type
-        self._plans: dict[tuple[int, int], NDArray[np.void]] = {}
+        ways = TripWays(self._network)
         permissions = demand.types["permissions"].astype(np.int64)
         self._class_of_type = np.unique(permissions, return_inverse=True)[1]
         masks = np.unique(permissions)
@@ -50,7 +48,7 @@ class Schedule:
         begin = first_step
         self._longest = 0
         for route, mask_row in sorted(self._driven()):
-            edges = self._edges(route, int(masks[mask_row]))
+            edges = self._edges(route, int(masks[mask_row]), ways)
             steps = self._steps(edges, int(masks[mask_row]))
             first_lane = int(self._network.edges[edges[0]]["first_lane"])
             self._way[route, mask_row] = begin - first_lane
@@ -62,11 +60,10 @@ class Schedule:
                     f"the routes of the demand have over {MAX_STEPS} steps: fewer or shorter ones"
                 )
         self.first_detour = begin - first_step
-        parts.append(self._detours(masks))
+        parts.append(self._detours(masks, ways))
         self.steps = np.concatenate(parts)
-        self._plans.clear()
 
-    def _detours(self, masks: NDArray[np.int64]) -> NDArray[np.void]:
+    def _detours(self, masks: NDArray[np.int64], ways: TripWays) -> NDArray[np.void]:
         """Steps from everywhere to the last edges of the routes, with as few changes as can be.
 
         A vehicle that cannot make a lane change of its route goes on by them. Where they would take
@@ -85,7 +82,8 @@ class Schedule:
         plans = np.zeros((len(goals), num_lanes), dtype=PLAN)
         for row, (edge, mask_row) in enumerate(sorted(goals)):
             mask = int(masks[mask_row])
-            plan_goal(self._network.arrays, edge, mask, DETOUR_CHANGE_WEIGHT, plans[row])
+            turning = (edge, mask) in ways.turned
+            ways.plan(edge, mask, DETOUR_CHANGE_WEIGHT, turning, plans[row])
             self._goal[last == edge, mask_row] = row
         return plans.reshape(-1)
 
@@ -139,25 +137,19 @@ class Schedule:
     def detour_goal(self, route: int, vtype: int) -> int:
         return int(self._goal[route, self._class_of_type[vtype]])
 
-    def _edges(self, route: int, mask: int) -> NDArray[np.int32]:
+    def _edges(self, route: int, mask: int, ways: TripWays) -> NDArray[np.int32]:
         """The EDGE rows of a route, found where the file leaves them open."""
         row = self.demand.routes[route]
         named = self.demand.route_edges[row["first_edge"] : row["first_edge"] + row["num_edges"]]
         if row["exact"]:
             return named
-        found = [np.array([named[0]], dtype=np.int32)]
-        room = np.zeros(MAX_EDGES, dtype=np.int32)
-        for start, goal in pairwise(named):
-            number = trace_edges(self._network.arrays, self._plan(int(goal), mask), start, room)
-            if number <= 0:
-                names = self._network.edge_ids
-                raise RouteError(
-                    f"{self._place(route)}: no way from edge '{names[start]}' to edge "
-                    f"'{names[goal]}' of the map '{self._network.name}' for the class of a trip "
-                    "between them: change the trip or drop it (duarouter --ignore-errors)"
-                )
-            found.append(room[1:number].copy())
-        return np.concatenate(found)
+        try:
+            return ways.edges(named, mask)
+        except RouteError as error:
+            raise RouteError(
+                f"{self._place(route)}: {error} of the map '{self._network.name}' for the class of "
+                "a trip between them: change the trip, or skip such (traffic.on_bad_route = skip)"
+            ) from None
 
     def _place(self, route: int) -> str:
         """File and line of the first element that may have a route."""
@@ -165,14 +157,6 @@ class Schedule:
         choices = range(len(demand.route_choices))
         having = [c for c in choices if route in demand.route_choices.options(c)]
         return demand.place(int(np.isin(demand.elements["routes"], having).argmax()))
-
-    def _plan(self, goal: int, mask: int) -> NDArray[np.void]:
-        key = (goal, mask)
-        if key not in self._plans:
-            plan = np.zeros(len(self._network.lanes), dtype=PLAN)
-            plan_goal(self._network.arrays, goal, mask, 1.0, plan)
-            self._plans[key] = plan
-        return self._plans[key]
 
     def _steps(self, edges: NDArray[np.int32], mask: int) -> NDArray[np.void]:
         number = int(self._network.edges["num_lanes"][edges].sum())

@@ -71,3 +71,54 @@ def test_an_episode_is_one_trip_or_is_cut_at_the_horizon(mode: str) -> None:
 def test_one_vehicle_is_one_vehicle(arguments: dict[str, Any], key: str) -> None:
     with pytest.raises(ConfigError, match=f"^{key}: this view decides it"):
         gymnasium.make("cavmarl/ring-v0", **arguments)
+
+
+def test_the_spec_tells_the_horizon_and_makes_the_same_again() -> None:
+    world = make()
+    assert world.spec is not None
+    assert world.spec.max_episode_steps == 40
+    assert gymnasium.make(world.spec).unwrapped._env.max_cycles == 40
+    cut = gymnasium.make("cavmarl/ring-v0", max_episode_steps=2)
+    cut.reset(seed=0)
+    cut.step(cut.action_space.sample())
+    assert cut.step(cut.action_space.sample())[3], "Gymnasium's own limit works, too"
+    with pytest.warns(UserWarning, match="without a render_mode"):
+        assert cut.unwrapped.render() is None
+
+
+def test_the_infos_say_what_highway_envs_say() -> None:
+    """It drives as the built-in driver, or straight on at full throttle, into others."""
+    ends = {"crashed": 0, "is_success": 0}
+    for seed in range(4):
+        driven = seed % 2 == 0
+        world = gymnasium.make("cavmarl/merge-v0", background=0 if driven else 24)
+        _, info = world.reset(seed=seed)
+        env, done = world.unwrapped._env, False
+        while not done:
+            assert not info["crashed"]
+            assert not info["is_success"]
+            vehicles = env.simulation.vehicles()
+            speed = vehicles["speed"][vehicles["agent"] == 0]
+            assert info["speed"] == pytest.approx(float(speed[0]))
+            action = env.suggest_actions()["car_0"] if driven else np.array([1.0, 0.0])
+            _, _, ended, cut, info = world.step(action)
+            done = ended or cut
+        assert info["speed"] > 0.0
+        assert info["is_success"] == (info["arrival"] > 0.0)
+        assert info["crashed"] == (info["collision"] > 0.0)
+        for end in ends:
+            ends[end] += info[end]
+    assert min(ends.values()) > 0
+
+
+def test_config_holds_nested_keys_of_the_entry() -> None:
+    config = {"sensors": {"lidar": {"rays": 8}}, "terms": {"weights": {"collision": -9.0}}}
+    made = make(config=config).unwrapped._env.config
+    entry, _ = load_config("merge")
+    assert made.sensors.lidar.rays == 8
+    assert made.sensors.lanes == entry.sensors.lanes, "what it does not name stays"
+    assert made.terms.weights == {**entry.terms.weights, "collision": -9.0}
+    with pytest.raises(ConfigError, match="lanes_count"):
+        gymnasium.make("cavmarl/merge-v0", config={"lanes_count": 4})
+    with pytest.raises(ConfigError, match="must be a mapping of keys"):
+        gymnasium.make("cavmarl/merge-v0", config=[1])

@@ -79,6 +79,7 @@ def test_rows_are_the_worlds_agents(mode: str, autoreset: AutoresetMode) -> None
         last = infos["final_observations"].reshape(ROWS, -1)
         if autoreset is AutoresetMode.NEXT_STEP:
             assert "final_obs" not in told
+            assert "final_info" not in told
             np.testing.assert_array_equal(observations[over], last[over])
         else:
             assert not observations[~told["active"]].any()
@@ -86,6 +87,7 @@ def test_rows_are_the_worlds_agents(mode: str, autoreset: AutoresetMode) -> None
             for row in np.flatnonzero(over):
                 assert told["_final_obs"][row]
                 np.testing.assert_array_equal(told["final_obs"][row], last[row])
+                assert all(told["final_info"][term][row] == told[term][row] for term in TERMS)
     assert singly > 0
     assert cut_at_once > 0
 
@@ -179,10 +181,97 @@ def test_the_same_seed_gives_the_same_rows() -> None:
         ({"overrides": {"population.budget": 9}}, r"^population\.budget: this view"),
         ({"num_worlds": 3}, "num_envs = 8: must be a multiple of num_worlds = 3"),
         ({"num_worlds": 0}, "num_envs = 8: must be a multiple of num_worlds = 0"),
-        ({"autoreset_mode": "Disabled"}, "autoreset_mode = 'Disabled': must be"),
+        ({"autoreset_mode": "Never"}, "autoreset_mode = 'Never': must be"),
+        ({"render_mode": "human"}, "render_mode = 'human': must be rgb_array, or None"),
+        ({"render_mode": "rgb_array", "workers": 1}, "use workers=0"),
         ({"overrides": {"population.mode": "opened"}}, r"population\.mode"),
     ],
 )
 def test_rows_that_cannot_be_are_refused(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         gymnasium.make_vec("cavmarl/mergeAgents-v0", num_envs=ROWS, **arguments)
+
+
+def test_rows_without_autoreset_begin_anew_when_they_are_told_to() -> None:
+    """With one row a world each row by itself; the others go on."""
+    rows = make(num_worlds=ROWS, autoreset_mode="Disabled")
+    assert rows.autoreset_mode is AutoresetMode.DISABLED
+    seen, _ = rows.reset(seed=5)
+    rng = np.random.default_rng(0)
+    ended = 0
+    for _ in range(30):
+        seen, _, terminated, cut, _ = rows.step(wild(rng, ROWS))
+        over = terminated | cut
+        if over.any():
+            anew, told = rows.reset(options={"reset_mask": over})
+            assert told["active"][over].all()
+            assert (anew[over] != seen[over]).any(axis=1).all()
+            np.testing.assert_array_equal(anew[~over], seen[~over])
+            ended += int(over.sum())
+    assert ended > ROWS
+
+
+def test_rows_of_a_world_begin_anew_together() -> None:
+    rows = make(autoreset_mode="Disabled")
+    rows.reset(seed=5)
+    first = np.arange(ROWS) == 0
+    with pytest.raises(ConfigError, match="row 0, which has not ended: its world goes on"):
+        rows.reset(options={"reset_mask": first})
+    with pytest.raises(ConfigError, match=r"must be \(8,\) and bool, one a row"):
+        rows.reset(options={"reset_mask": first[:WORLDS]})
+    rng = np.random.default_rng(0)
+    whole = waiting = 0
+    for _ in range(40):
+        *_, terminated, cut, _ = rows.step(wild(rng, ROWS))
+        over = terminated | cut
+        if over.any():
+            seen, told = rows.reset(options={"reset_mask": over})
+            assert not seen[over & ~told["active"]].any(), "a row that waits shows nothing"
+            whole += bool(told["active"][over].all())
+            waiting += bool((over & ~told["active"]).any())
+    assert whole > 0
+    assert waiting > 0
+
+
+@pytest.mark.parametrize("autoreset", ["Disabled", "SameStep"])
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:torchrl")
+@pytest.mark.filterwarnings("ignore:Creating .* inherits from WeightUpdaterBase")
+def test_torchrls_wrapper_takes_the_rows(autoreset: str) -> None:
+    envs = pytest.importorskip("torchrl.envs", reason="needs the extra: torchrl")
+    wrapped = envs.GymWrapper(make(autoreset_mode=autoreset))
+    told = wrapped.rollout(30, break_when_any_done=False)
+    assert told["observation"].shape == (ROWS, 30, wrapped.observation_spec["observation"].shape[1])
+    assert told["next", "done"].any(dim=1).all(), "each row ends and goes on"
+
+
+def test_the_spec_tells_the_horizon_and_makes_the_same_again() -> None:
+    rows = make()
+    assert rows.spec.id == "cavmarl/mergeAgents-v0"
+    assert rows.spec.max_episode_steps == 12
+    again = gymnasium.make_vec(rows.spec)
+    assert (again.num_envs, again.vec.max_cycles) == (ROWS, 12)
+    shorter = gymnasium.make_vec("cavmarl/ringAgents-v0", num_envs=2, max_episode_steps=7)
+    assert shorter.vec.max_cycles == 7
+
+
+def test_gymnasium_records_a_video_of_the_rows(tmp_path: Any, recorded: Any) -> None:
+    rows = make(render_mode="rgb_array", autoreset_mode="NextStep")
+    film = wrappers.RecordVideo(rows, str(tmp_path / "film"), step_trigger=lambda step: step == 0)
+    film.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        film.step(wild(rng, ROWS))
+    frames = rows.render()
+    film.close()
+    assert len(frames) == ROWS
+    assert (frames[0] == frames[ROWS // WORLDS - 1]).all(), "rows of a world show that world"
+    assert (frames[0] != frames[-1]).any(), "and those of another that one"
+    (video,) = recorded
+    assert len(video.frames) == 3
+    assert video.fps == rows.metadata["render_fps"] == 5
+
+
+def test_rows_without_a_render_mode_warn_when_they_are_to_be_drawn() -> None:
+    rows = make()
+    with pytest.warns(UserWarning, match="without a render_mode"):
+        assert rows.render() is None

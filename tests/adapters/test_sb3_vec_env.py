@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -163,6 +164,33 @@ def test_attributes_and_methods_are_those_of_the_worlds(rows: Any) -> None:
     assert rows.env_is_wrapped(object) == [False] * rows.num_envs
     with pytest.raises(NotImplementedError, match="max_cycles: rows share"):
         rows.set_attr("max_cycles", 3)
+
+
+def test_sb3_records_a_video_of_the_worlds(tmp_path: Any, recorded: Any) -> None:
+    from stable_baselines3.common.vec_env import VecVideoRecorder
+
+    from cavmarl.adapters.sb3_vec_env import CavSb3VecEnv
+
+    rows = CavSb3VecEnv("merge", **SMALL, max_cycles=20, render_mode="rgb_array")
+    film = VecVideoRecorder(rows, str(tmp_path), lambda step: step == 0, video_length=2)
+    film.reset()
+    for _ in range(3):
+        film.step(np.zeros((rows.num_envs, 2), dtype=np.float32))
+    film.close()
+    (video,) = recorded
+    height, width, _ = rows.get_images()[0].shape
+    assert [frame.shape for frame in video.frames] == [(WORLDS * height, width, 3)] * 3
+    assert video.fps == 5
+
+
+def test_rows_have_the_spec_of_their_entry(rows: Any) -> None:
+    from cavmarl.adapters.sb3_vec_env import CavSb3VecEnv
+
+    assert rows.spec.id == "cavmarl/mergeAgents-v0"
+    assert rows.get_attr("spec", 0) == [rows.spec]
+    assert rows.spec.max_episode_steps == 20
+    folder = Path(__file__).parents[2] / "envs" / "ring"
+    assert CavSb3VecEnv(folder).spec is None, "which no id means"
 
 
 def test_wrong_use_is_refused(rows: Any) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from cavmarl.cli import main
+from cavmarl.config.registry import programs
 from cavmarl.engine.world_setup import find_map
 from cavmarl.handoff import shard_setup as dividing
 from cavmarl.roads.cache import load_network
@@ -33,6 +34,7 @@ COMMANDS = (
     "demand",
     "bench",
 )
+ROOT = Path(__file__).resolve().parents[2]
 QUICK = (
     "--set", "horizon_s=1", "--set", "clock.ctrl_dt_s=0.1", "--agents", "2", "--background", "2",
 )  # fmt: skip
@@ -388,11 +390,30 @@ def test_bench_compares_and_says_whether_it_held(
     assert json.loads(path.read_text())["ratio"] > 0.0
 
 
-def test_the_demo_of_a_wheel_says_what_is_missing(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_train_says_what_programs_there_are(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("train") == 0
+    shown = capsys.readouterr().out
+    assert set(programs()) == {path.stem for path in (ROOT / "train").glob("*.py")}
+    for name in programs():
+        assert name in shown
+    assert "ippo_torch" in refusal(capsys, "train", "ippo")
+    assert "merge" in refusal(capsys, "train", "ippo_torch", "--config", "nowhere")
+
+
+@pytest.mark.parametrize("config", [["--config", "demo"], ["--config=demo"]])
+def test_train_runs_a_program_with_its_own_options(
+    config: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("cavmarl.cli.demo._SCRIPT", tmp_path / "ippo_torch.py")
-    assert "run it in a checkout" in refusal(capsys, "demo")
+    """Away from the checkout, and whatever lies under its name in the working directory."""
+    ran: list[str] = []
+    monkeypatch.setattr("os.execv", lambda _, words: ran.extend(words))
+    (tmp_path / "train").mkdir()
+    (tmp_path / "train" / "ppo_sb3.py").touch()
+    monkeypatch.chdir(tmp_path)
+    assert run("train", "ppo_sb3", "--seed", "3", "--help", *config) == 0
+    settings = str(ROOT / "configs" / "train" / "demo.yaml")
+    wanted = [config[0], settings] if len(config) == 2 else [f"--config={settings}"]
+    assert ran[1:] == [str(ROOT / "train" / "ppo_sb3.py"), "--seed", "3", "--help", *wanted]
 
 
 def test_a_fault_of_a_policy_shows_the_lines_of_the_policy(

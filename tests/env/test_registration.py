@@ -23,12 +23,25 @@ ALL = sorted(entries())
 def test_every_entry_has_its_ids(name: str) -> None:
     assert f"cavmarl/{name}-v0" in gymnasium.registry
     assert f"cavmarl/{name}Agents-v0" in gymnasium.registry
+    assert f"cavmarl/{name}Discrete-v0" in gymnasium.registry
+    assert f"cavmarl/{name}DiscreteAgents-v0" in gymnasium.registry
     if not hasattr(pettingzoo, "make"):
         pytest.skip("this PettingZoo has no registry")
     for kind in ("parallel", "aec"):
         world = pettingzoo.make(kind, f"cavmarl/{name}-v0", max_cycles=3)
         world.reset(seed=0)
         assert world.agents
+
+
+def test_the_discrete_ids_have_meta_actions_whatever_else_is_set() -> None:
+    """Programs such as CleanRL's take an id and nothing else."""
+    five = gymnasium.spaces.Discrete(5)
+    assert gymnasium.make("cavmarl/ringDiscrete-v0").action_space == five
+    assert gymnasium.make("cavmarl/ring-v0").action_space != five
+    more = {"overrides": {"sensors.lidar.rays": 8}}
+    assert gymnasium.make("cavmarl/ringDiscrete-v0", **more).action_space == five
+    rows = gymnasium.make_vec("cavmarl/ringDiscreteAgents-v0", num_envs=2, **more)
+    assert rows.single_action_space == five
 
 
 def test_the_aec_form_refuses_a_wrong_action_and_goes_on() -> None:

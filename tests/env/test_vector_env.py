@@ -235,10 +235,29 @@ def test_a_wrong_reset_mask_is_refused(
         vec.reset(seed=seed, options=options)
 
 
-@pytest.mark.parametrize("mode", ["Disabled", "same_step", None])
+@pytest.mark.parametrize("mode", ["same_step", None])
 def test_a_wrong_autoreset_mode_is_refused(mode: Any) -> None:
-    with pytest.raises(ConfigError, match="must be 'SameStep' or 'NextStep'"):
+    with pytest.raises(ConfigError, match="must be 'SameStep', 'NextStep' or 'Disabled'"):
         make(1, autoreset_mode=mode)
+
+
+def test_without_autoreset_a_world_that_is_over_waits_for_a_reset() -> None:
+    """Up to there it is what the next step gives; the reset's episode is the next one."""
+    waits, late = make(2, autoreset_mode="Disabled"), make(2, autoreset_mode="NextStep")
+    assert waits.metadata["autoreset_mode"] is AutoresetMode.DISABLED
+    waits.reset(seed=4)
+    late.reset(seed=4)
+    actions = np.zeros(waits.action_space.shape, dtype=np.float32)
+    over = np.zeros(2, dtype=np.bool_)
+    while not over.any():
+        seen, *_, infos = waits.step(actions)
+        np.testing.assert_array_equal(seen, late.step(actions)[0])
+        over = infos["episode_over"]
+    with pytest.raises(EpisodeError, match=r"world 0 is over.*reset_mask"):
+        waits.step(actions)
+    seen, _ = waits.reset(options={"reset_mask": over})
+    np.testing.assert_array_equal(seen[over], late.step(actions)[0][over])
+    waits.step(actions)
 
 
 @pytest.mark.parametrize("mode", MODES)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.errors import RouteError
 from cavmarl.driving.vehicle_types import DEFAULT_TYPES
 from cavmarl.roads.network import VEHICLE_CLASSES
 from cavmarl.traffic.demand.definition_collector import DefinitionCollector
@@ -22,6 +24,10 @@ from cavmarl.traffic.demand.map_index import MapIndex
 from cavmarl.traffic.demand.rerouters import Rerouters, read_rerouters
 from cavmarl.traffic.demand.route_records import RouteTable, StopReader
 from cavmarl.traffic.demand.type_table import TypeTable
+from cavmarl.traffic.trip_ways import TripWays
+
+log = logging.getLogger(__name__)
+NAMED = 5  # of the ids that are left out
 
 # Classes with lanes of their own that road networks leave out: see `roads.selection`.
 _PARTLY_MAPPED = sum(1 << VEHICLE_CLASSES.index(name) for name in ("bicycle", "tram"))
@@ -39,6 +45,7 @@ class Resolver:
     def __init__(self, collector: DefinitionCollector, index: MapIndex, skip: bool) -> None:
         self._index = index
         self._skip = skip
+        self._ways = TripWays(index.network)
         self._report = collector.report
         self._named = named = collector.named
         self.types = TypeTable(named, self._report)
@@ -52,6 +59,7 @@ class Resolver:
         self._route_options = self._options_of(elements, list(collector.routes.values()))
         self._bad: set[tuple[int, int]] = set()
         keep = self._check(elements, ids)
+        self._tell_left_out([ids[row] for row in np.flatnonzero(~keep)])
         self._elements = elements[keep]
         self.ids = [ids[row] for row in np.flatnonzero(keep)]
         self._check_ids()
@@ -83,6 +91,12 @@ class Resolver:
         """Keys type * num_routes + route that cannot be driven."""
         num_routes = len(self.routes.names)
         return np.array(sorted(t * num_routes + r for t, r in self._bad), dtype=np.int64)
+
+    def _tell_left_out(self, ids: list[str]) -> None:
+        if ids:
+            some = ", ".join(ids[:NAMED]) + (", …" if len(ids) > NAMED else "")
+            files = ", ".join(self._report.files)
+            log.warning("%s: %d cannot drive their routes, left out: %s", files, len(ids), some)
 
     def _stub(self, elements: NDArray[np.void], ids: Sequence[str], row: int) -> Element:
         element = elements[row]
@@ -145,9 +159,7 @@ class Resolver:
         for vtype in self._options(self._type_options, types).rows:
             permissions = self.types.permissions(vtype)
             for route in self._options(self._route_options, routes).rows:
-                gap = self._index.gap(
-                    self.routes.edges(route), self.routes.exact(route), permissions
-                )
+                gap = self._gap(route, permissions)
                 if gap is None:
                     some = True
                 elif self._tolerates(vtype, user):
@@ -155,6 +167,17 @@ class Resolver:
                 else:
                     raise self._index.route_error(user, gap)
         return some
+
+    def _gap(self, route: int, permissions: int) -> str | None:
+        """Why a class cannot drive a route; trips have their ways looked for where one may lack."""
+        edges, exact = self.routes.edges(route), self.routes.exact(route)
+        gap = self._index.gap(edges, exact, permissions)
+        if gap is None and self._skip and not exact:
+            try:
+                self._ways.edges(np.asarray(edges, dtype=np.int32), permissions)
+            except RouteError as error:
+                return str(error)
+        return gap
 
     def _tolerates(self, vtype: int, user: Element) -> bool:
         """Whether vehicles of a type that have no way are left out, not refused."""
