@@ -181,9 +181,7 @@ def test_who_has_no_order_gets_none_when_its_team_is_replaced(make: Make) -> Non
 
 
 @pytest.mark.usefixtures("interruptible")
-def test_a_team_that_loses_somebody_while_its_order_is_given_up(
-    make: Make, tmp_path: Path
-) -> None:
+def test_a_team_that_loses_somebody_while_its_order_is_given_up(make: Make, tmp_path: Path) -> None:
     pool = make(workers=2, teams=((0, 1),))
     pool.run(ADD)
     pids = pool.pids
