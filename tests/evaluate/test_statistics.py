@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cavmarl.evaluate.metrics import METRICS, least_value
 from cavmarl.evaluate.statistics import (
     bounded_interval,
     gini_coefficient,
@@ -19,6 +20,7 @@ from cavmarl.evaluate.statistics import (
     student_quantile,
     within_run,
 )
+from cavmarl.evaluate.tables import TRIP
 
 
 @pytest.mark.parametrize(
@@ -121,6 +123,17 @@ def test_one_value_in_all_runs_is_no_interval() -> None:
         assert bounded_interval(np.full(3, value), 0.25) is None
     assert bounded_interval(np.ones(3), 1.0) is None, "one vehicle is always even"
     assert mean_interval(np.zeros(3)) is None
+
+
+def test_evenness_is_at_least_one_over_the_trips_of_an_episode() -> None:
+    trips = np.zeros(7, TRIP)
+    trips["episode"] = [0, 0, 0, 1, 1, 1, 1]
+    trips["run"] = [0, 1, 1, 0, 0, 0, 0]
+    trips["counted"] = [1, 1, 1, 1, 1, 1, 0]
+    metrics = {metric.name: metric for metric in METRICS}
+    assert least_value(metrics["jain_speed"], trips) == pytest.approx(1.0 / 3.0)
+    assert least_value(metrics["jain_speed"], trips[:0]) == 1.0
+    assert least_value(metrics["success"], trips) == 0.0
 
 
 VALUES = st.lists(st.floats(0.0, 1e3), min_size=1, max_size=12).map(np.array)
