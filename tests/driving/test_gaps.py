@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cavmarl.core.records.codes import HOLD_YIELD, SIGNAL_NONE
 from cavmarl.driving.kernels.approach import APPROACH
-from cavmarl.driving.kernels.junctions import _foe_blocks
+from cavmarl.driving.kernels.junctions import _foe_blocks, _ignores
 from cavmarl.roads.sumo_net.reader import read_network
+from tests.support.builders import vehicles
 from tests.support.crossing import crossing
 from tests.support.traffic import on_lane
 
@@ -74,3 +76,27 @@ def test_before_one_that_comes_it_is_a_second(blocks: Blocks) -> None:
     # Its front reaches the shared area in 4 s.
     assert blocks(3.05, "leave", 40.0)
     assert not blocks(2.95, "leave", 40.0)
+
+
+@pytest.mark.parametrize(
+    ("own_wait_s", "foe_wait_s", "own_id", "speed", "goes"),
+    [
+        (0.6, 0.2, 5, 0.0, True),
+        (0.4, 0.2, 5, 0.0, False),  # it has not stood for half a second
+        (0.6, 0.7, 0, 0.0, False),
+        (0.6, 0.6, 0, 0.0, True),
+        (0.6, 0.6, 5, 0.0, False),
+        (0.6, 0.2, 5, 1.0, False),  # it moves
+    ],
+)
+def test_of_two_that_give_way_to_each_other_the_one_goes_that_has_stood_longer(
+    own_wait_s: float, foe_wait_s: float, own_id: int, speed: float, goes: bool
+) -> None:
+    row, foe = vehicles(
+        [(0.0, 0.0, 0.0)] * 2,
+        id=[own_id, 3],
+        wait_s=[own_wait_s, foe_wait_s],
+        speed=[speed, 0.0],
+        hold=HOLD_YIELD,
+    )
+    assert _ignores(row, foe, 0, SIGNAL_NONE) == goes
