@@ -85,6 +85,11 @@ def test_runs_without_any_hit_or_miss_still_leave_room(
 def test_runs_that_happen_to_agree_say_no_more_than_their_trips() -> None:
     found, trips = run_share_interval(np.full(2, 0.3), 20), share_interval(6, 20)
     assert found == trips
+    # Of 100 trips: runs that nearly agree must not make their 30 % certain to a percent.
+    found = run_share_interval(np.array([0.3, 0.3, 0.3, 0.3, 0.31]), 100)
+    assert found is not None
+    assert found.low < 0.23
+    assert found.high > 0.39
 
 
 @pytest.mark.parametrize("runs", [2, 3, 5])
