@@ -42,26 +42,31 @@ LATE = (
 PROBE = """
 import json, sys, time
 start = time.process_time()
+import gymnasium, numba, numpy, pettingzoo
+between = time.process_time()
 import cavmarl
-spent = time.process_time() - start
-print(json.dumps([spent, sorted(name.split(".")[0] for name in sys.modules)]))
+share = (time.process_time() - between) / (between - start)
+print(json.dumps([share, sorted(name.split(".")[0] for name in sys.modules)]))
 """
 
 
 @pytest.fixture(scope="module")
 def imported() -> tuple[float, set[str]]:
-    """Least CPU seconds of three imports in fresh processes, and the packages that they load."""
+    """What `import cavmarl` costs over what its libraries do, and the packages that are loaded.
+
+    In time of the processor, the least of three in fresh processes.
+    """
     runs = []
     for _ in range(3):
         done = subprocess.run(
             [sys.executable, "-c", PROBE], cwd=ROOT, check=True, capture_output=True, text=True
         )
         runs.append(json.loads(done.stdout))
-    return min(spent for spent, _ in runs), set(runs[0][1])
+    return min(share for share, _ in runs), set(runs[0][1])
 
 
 def test_the_import_is_quick(imported: tuple[float, set[str]]) -> None:
-    assert imported[0] < 1.5
+    assert imported[0] < 5.0
 
 
 @pytest.mark.parametrize("package", LATE)

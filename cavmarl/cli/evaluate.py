@@ -224,9 +224,10 @@ def report_cell(metric: Metric, found: Found) -> str:
     if found.mean is None:
         return number(None)
     parts = [_figure(metric.scale * found.mean)]
-    if found.interval is not None and metric.share:
+    if found.interval is not None and metric.bounded:
         low, high = metric.scale * found.interval.low, metric.scale * found.interval.high
-        parts.append(f"[{low:.1f}, {high:.1f}]")
+        decimals = 1 if metric.scale > 1.0 else 3
+        parts.append(f"[{low:.{decimals}f}, {high:.{decimals}f}]")
     elif found.between_run_ci95 is not None:
         parts.append(f"±{_figure(metric.scale * (found.between_run_ci95.high - found.mean))}")
     if not metric.share and found.within_sd is not None:

@@ -26,6 +26,7 @@ class Metric:
     meaning: str  # one line
     better: Better = None  # which way is better; None where neither is
     share: bool = False  # the values are yes or no, and their mean is a share
+    bounded: bool = False  # the values lie from `least_value` to 1
     arrived: bool = False  # only trips that arrived have a value
     scale: float = 1.0  # values are shown times this
 
@@ -35,7 +36,7 @@ class Metric:
 
 
 def _share(name: str, label: str, meaning: str, better: Better) -> Metric:
-    return Metric(name, label, "%", "trip", meaning, better, share=True, scale=100.0)
+    return Metric(name, label, "%", "trip", meaning, better, share=True, bounded=True, scale=100.0)
 
 
 def _arrived(name: str, label: str, meaning: str, better: Better = None) -> Metric:
@@ -43,8 +44,8 @@ def _arrived(name: str, label: str, meaning: str, better: Better = None) -> Metr
     return Metric(name, label, "s", "trip", told, better, arrived=True)
 
 
-def _percent(name: str, label: str, per: Per, meaning: str, better: Better) -> Metric:
-    return Metric(name, label, "%", per, meaning, better, scale=100.0)
+def _percent(name: str, label: str, meaning: str, better: Better) -> Metric:
+    return Metric(name, label, "%", "episode", meaning, better, bounded=True, scale=100.0)
 
 
 METRICS = (
@@ -63,27 +64,28 @@ METRICS = (
     _arrived("delay_s", "delay", "time lost against driving at the limit", "less"),
     _arrived("duration_s", "duration", "from the first decision to the goal"),
     Metric("mean_speed_mps", "speed", "m/s", "trip", "way made towards the goal over time"),
-    _percent("mean_speeding", "speeding", "trip",
-             "mean speed above the limit, as a share of it", "less"),
+    Metric("mean_speeding", "speeding", "%", "trip",
+           "mean speed above the limit, as a share of it", "less", scale=100.0),
     Metric("mean_jerk_mps3", "jerk", "m/s³", "trip", "mean |jerk|", "less"),
     Metric("least_ttc_s", "least TTC", "s", "trip",
            "least time to collision of a trip; 4 stands for that and above", "more"),
     Metric("short_ttc_share", "TTC < 1.5 s", "% time", "trip",
-           "share of a trip with a time to collision below 1.5 s", "less", scale=100.0),
+           "share of a trip with a time to collision below 1.5 s", "less", bounded=True,
+           scale=100.0),
     Metric("least_pet_s", "least PET", "s", "trip",
            "least post-encroachment time of a trip that met crossing traffic within 10 s", "more"),
     Metric("jain_speed", "speeds, Jain", "", "episode",
-           "Jain's index of the agents' mean speeds: 1 is even", "more"),
+           "Jain's index of the agents' mean speeds: 1 is even", "more", bounded=True),
     Metric("gini_delay", "delays, Gini", "", "episode",
-           "Gini's coefficient of the agents' delays a kilometre: 0 is even", "less"),
+           "Gini's coefficient of the agents' delays a kilometre: 0 is even", "less", bounded=True),
     Metric("zone_imbalance", "zone imbalance", "", "episode",
            "vehicles of the fullest zone over those of a mean one, mean over the steps: 1 is even",
            "less"),
-    _percent("v2x_reception_ratio", "packets received", "episode",
+    _percent("v2x_reception_ratio", "packets received",
              "share of the packets within reach of a receiver that it received", "more"),
     Metric("v2x_latency_s", "latency of packets", "s", "episode",
            "mean time from sending to receiving", "less"),
-    _percent("v2x_busy_ratio", "channel busy ratio", "episode",
+    _percent("v2x_busy_ratio", "channel busy ratio",
              "share of the time in which receivers hear others send", "less"),
     *(
         Metric(reward_column(term), f"return from {term.replace('_', ' ')}", "", "episode",
@@ -103,3 +105,12 @@ def metric_values(
     if metric.arrived:
         rows = rows[rows["success"]]
     return np.asarray(rows[metric.name], dtype=np.float64)
+
+
+def least_value(metric: Metric, trips: NDArray[np.void]) -> float:
+    """The least that a bounded metric can be of an episode with these trips, some of all runs."""
+    if metric.name != "jain_speed":
+        return 0.0
+    counted = trips[trips["counted"]]
+    _, sizes = np.unique(counted[["run", "episode"]], return_counts=True)
+    return 1.0 / float(sizes.max(initial=1))

@@ -150,8 +150,14 @@ def _facts(manifest: Mapping[str, Any]) -> dict[str, str]:
         "kernels": str(world["kernels"]),
         "seeds of the runs": ", ".join(map(str, manifest["seeds"])),
         "processes": str(manifest["plan"]["processes"]),
-        "channel": str(world["channel"]),
+        "channel": _channel(world["channel"]),
     }
+
+
+def _channel(told: str | Mapping[str, Any]) -> str:
+    if isinstance(told, str):
+        return told
+    return ", ".join(f"{key} {value}" for key, value in told.items())
 
 
 def _figure(value: float | None, metric: Metric) -> str:

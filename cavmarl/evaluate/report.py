@@ -15,8 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.evaluate.episodes import Speed
-from cavmarl.evaluate.metrics import METRICS, Metric, metric_values
-from cavmarl.evaluate.statistics import Interval, Within, mean_interval, within_run
+from cavmarl.evaluate.metrics import METRICS, Metric, least_value, metric_values
+from cavmarl.evaluate.statistics import (
+    Interval,
+    Within,
+    bounded_interval,
+    mean_interval,
+    run_share_interval,
+    within_run,
+)
 from cavmarl.ownership.transfer_summary import TransferSummary
 
 NO_INTERVAL = "not available: one run says nothing about the next; use --repeats 2 or more"
@@ -27,8 +34,8 @@ class Found:
     """One metric of one policy."""
 
     mean: float | None  # of the run means; None without data
-    # interval of that mean over independent runs, by Student's t; None with fewer than two runs
-    # that have the metric
+    # interval of that mean over independent runs; None with fewer than two runs that have the
+    # metric, or if all have one value and it is no share
     between_run_ci95: Interval | None
     within_run: tuple[Within, ...]  # each run's own mean and spread, in the order of the runs
 
@@ -148,10 +155,12 @@ def _find(metric: Metric, trips: NDArray[np.void], episodes: NDArray[np.void], r
     means = np.array([run.mean for run in within if run.mean is not None])
     if not means.size:
         return Found(None, None, within)
-    interval = mean_interval(means)
-    if interval is not None and metric.share:
-        # The t distribution does not know that a share ends at 0 and 1; the mean of shares does.
-        interval = Interval(max(interval.low, 0.0), min(interval.high, 1.0))
+    if metric.share:
+        interval = run_share_interval(means, sum(run.n for run in within))
+    elif metric.bounded:
+        interval = bounded_interval(means, least_value(metric, trips))
+    else:
+        interval = mean_interval(means)
     return Found(float(means.mean()), interval, within)
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 Z_95 = 1.959963984540054
 TWO_SIDED = 0.975  # of the distribution lies below the upper end of a 95 % interval
+ROUNDING = 1e-12  # values that differ by less than this share of their size are one
 
 Values = NDArray[np.float64]
 
@@ -47,24 +48,60 @@ def within_run(values: Values, *, share: bool) -> Within:
 
 
 def mean_interval(means: Values) -> Interval | None:
-    """Interval of the mean of independent runs (R,) by Student's t; None for fewer than two.
+    """Interval of the mean of independent runs (R,) by Student's t.
 
-    mean ± t(0.975, R - 1) · sd / √R, where sd is that of the run means.
+    mean ± t(0.975, R - 1) · sd / √R, where sd is that of the run means. None for fewer than two
+    runs, or if all have one value, which says nothing of how others spread.
     """
-    if means.size < 2:
+    error = _error_of(means)
+    if error == 0.0:
         return None
     mean = float(means.mean())
-    error = float(means.std(ddof=1)) / math.sqrt(means.size)
     half = student_quantile(means.size - 1) * error
     return Interval(mean - half, mean + half)
 
 
+def bounded_interval(means: Values, least: float) -> Interval | None:
+    """`mean_interval` of values from `least` to 1, beyond which it does not reach.
+
+    Wilson's with Student's t, and for the number of trips one that has the error of the run means.
+    """
+    error = _error_of(means) / (1.0 - least) if least < 1.0 else 0.0
+    if error == 0.0:
+        return None
+    share = (float(means.mean()) - least) / (1.0 - least)
+    number = share * (1.0 - share) / error**2
+    found = _wilson(share, number, student_quantile(means.size - 1))
+    return Interval(least + (1.0 - least) * found.low, least + (1.0 - least) * found.high)
+
+
+def run_share_interval(shares: Values, total: int) -> Interval | None:
+    """Interval of the mean of shares (R,) of independent runs with so many trips in all.
+
+    The wider of two at each end: `bounded_interval`, and Wilson's of all trips, which runs that
+    happen to agree do not undercut. None for fewer than two runs.
+    """
+    if shares.size < 2 or total == 0:
+        return None
+    trips = _wilson(float(shares.mean()), total, Z_95)
+    runs = bounded_interval(shares, 0.0) or trips
+    return Interval(min(trips.low, runs.low), max(trips.high, runs.high))
+
+
+def _error_of(means: Values) -> float:
+    """Standard error of a mean of runs; 0 for fewer than two, or if they are one value."""
+    if means.size < 2 or float(np.ptp(means)) <= ROUNDING * float(np.abs(means).max()):
+        return 0.0
+    return float(means.std(ddof=1)) / math.sqrt(means.size)
+
+
 def share_interval(hits: int, total: int) -> Interval | None:
     """Interval of a share by Wilson's score (1927); None without a total."""
-    if total == 0:
-        return None
-    share = hits / total
-    weight = Z_95 * Z_95 / total
+    return _wilson(hits / total, total, Z_95) if total else None
+
+
+def _wilson(share: float, number: float, quantile: float) -> Interval:
+    weight = quantile * quantile / number
     centre = (share + weight / 2.0) / (1.0 + weight)
     half = math.sqrt(weight * (share * (1.0 - share) + weight / 4.0)) / (1.0 + weight)
     return Interval(max(centre - half, 0.0), min(centre + half, 1.0))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from cavmarl.bench.clock_drift import measure_drift, rows_of, write_rows
+from cavmarl.bench.clock_drift import ClockDrift, measure_drift, rows_of, write_rows
 from cavmarl.core.errors import ConfigError
 from cavmarl.cosim.followers.clock_reader import is_due
 from cavmarl.cosim.time_master import OwnTicks
@@ -24,6 +26,34 @@ def test_the_table_of_the_paper_from_raw_ticks() -> None:
     assert [row.master_s for row in rows] == [5.0, 25.0, 50.0, 250.0]
     assert {row.ratio for row in rows} == {1.92}
     assert rows[-1].follower_s == pytest.approx(482.0)
+
+
+def test_rows_stand_at_their_steps_and_the_last_step_once() -> None:
+    random = np.random.default_rng(0)
+    master, follower = (np.cumsum(random.integers(1, 9, 1001)).tolist() for _ in range(2))
+    for last, steps in ((100, [100]), (101, [100, 101]), (7, [7]), (1000, [100, 500, 1000])):
+        rows = rows_of(master[: last + 1], follower[: last + 1], 0.5)
+        assert [row.step for row in rows] == steps
+        for row in rows:
+            seen = follower[row.step] - follower[0]
+            assert (row.master_s, row.normalised_s) == (0.5 * master[row.step], 0.5 * seen)
+            assert row.follower_s == 0.5 * follower[row.step]
+            assert row.delta_s == 0.5 * (seen - master[row.step])
+            assert row.ratio == pytest.approx(seen / master[row.step])
+
+
+def test_what_is_measured_holds_only_if_own_ticks_are_noticed_or_change_nothing() -> None:
+    even = rows_of([0, 1, 2], [5, 6, 7], 0.1)
+    found = ClockDrift("ring", 0.1, 0.5, "obey", None, even, 4, 4, 4, 0)
+    assert found.holds
+    assert found.to_dict()["holds"]
+    for ticks, holds in ((1, True), (2, False), (1000, False), (None, False)):
+        assert replace(found, noticed_ticks=ticks).holds == holds
+    ahead = rows_of([0, 1, 2], [5, 6, 8], 0.1)
+    assert not replace(found, rows=ahead, answer="refuse").holds
+    assert not replace(found, rows=ahead, answer="ignore").holds
+    assert not replace(found, rows=ahead, own_ticks=0).holds
+    assert replace(found, answer="refuse").holds
 
 
 @pytest.mark.parametrize("share", ["0", "0.3", "0.92", "1"])

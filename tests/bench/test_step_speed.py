@@ -4,12 +4,23 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 
 from cavmarl.bench import step_speed
-from cavmarl.bench.highway_worlds import RUN_OUT_M, straight_road
-from cavmarl.bench.step_speed import MORE, measure_step_speed
+from cavmarl.bench.highway_worlds import (
+    IDLE,
+    RUN_OUT_M,
+    THEIR_KINEMATICS,
+    THEIR_LIDAR,
+    highway_env,
+    length_m,
+    straight_road,
+)
+from cavmarl.bench.step_speed import MORE, Row, _our_sides, measure_step_speed
 from cavmarl.core.errors import ConfigError, MissingExtraError
 from cavmarl.maps.check import check_map
 
@@ -23,16 +34,88 @@ def test_every_row_is_measured_each_turn() -> None:
     for row in found.rows:
         assert 0.0 < row.low <= row.median <= row.high
     assert rows["kinematics", "more"].agents == MORE * 3
-    batched, theirs = rows["lidar", "batched"], rows["lidar", "highway_env"]
-    assert (batched.worlds, theirs.worlds) == (2, 1)
-    assert found.ratio == batched.median / theirs.median
-    assert found.cost_of_more == pytest.approx(
-        rows["kinematics", "more"].agent_step_s / rows["kinematics", "batched"].agent_step_s
-    )
+    assert (rows["lidar", "batched"].worlds, rows["lidar", "highway_env"].worlds) == (2, 1)
     assert [text for text in told if text.startswith("measuring")] == [
         "measuring, 1 of 2",
         "measuring, 2 of 2",
     ]
+
+
+def test_both_sides_drive_as_many_vehicles_by_the_same_clock_and_look_alike(tmp_path: Path) -> None:
+    pytest.importorskip("highway_env")
+    theirs = {seen["type"]: highway_env(5, seen) for seen in (THEIR_LIDAR, THEIR_KINEMATICS)}
+    road_m = max(map(length_m, theirs.values()))
+    ours = _our_sides(tmp_path, road_m, agents=5, worlds=2)
+    for sensors, their in (("lidar", "LidarObservation"), ("kinematics", "Kinematics")):
+        vec, env = ours[sensors, "batched"][2].args[0], theirs[their]  # type: ignore[attr-defined]
+        seconds: list[float] = []
+        move = env.road.step
+        env.road.step = lambda dt, move=move, told=seconds: (told.append(dt), move(dt))
+        seen = env.step((IDLE,) * 5)[0]
+        clock = vec.config.clock
+        assert seconds == pytest.approx([clock.sim_dt_s] * round(clock.ctrl_dt_s / clock.sim_dt_s))
+        vec.reset(seed=0)
+        assert vec.num_agents == len(vec.simulation.vehicles()) == len(env.road.vehicles) == 5
+        assert len(seen) == 5
+        before = vec.simulation.ticks()[0]
+        vec.step(np.full((2, 5), np.int64(IDLE)))
+        assert vec.simulation.ticks()[0] - before == len(seconds)
+        lanes = vec.network.lanes
+        on_road = lanes[lanes["edge"] == vec.network.edge_ids.index("road")]
+        assert len(on_road) == len(env.road.network.lanes_list())
+        assert float(on_road["length_m"][0]) == pytest.approx(road_m, abs=0.01)
+    rays, speeds = np.shape(theirs["LidarObservation"].observation_space[0].sample())
+    lidar = ours["lidar", "batched"][2].args[0].config.sensors.lidar  # type: ignore[attr-defined]
+    assert (rays, speeds) == (lidar.rays, 1 + lidar.speeds)
+    assert lidar.range_m == THEIR_LIDAR["maximum_range"]
+
+
+class Clocked:
+    """A world of either side: a reset takes 100 s, a step 0.5 s, for 2 worlds of 3 agents."""
+
+    num_envs, num_agents = 2, 3
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now_s, self.steps, self.agents = 0.0, 0, ["a", "b", "c"]
+        clock = SimpleNamespace(process_time=lambda: self.now_s)
+        monkeypatch.setattr(step_speed, "time", clock)
+
+    def reset(self, seed: int) -> None:
+        self.now_s += 100.0
+
+    def step(self, actions: Any) -> Any:
+        self.now_s += 0.5
+        self.steps += 1
+        taken = actions.values() if isinstance(actions, dict) else np.ravel(actions)
+        assert set(taken) == {IDLE}
+        acted = {"acted": np.ones((2, 3), np.bool_)}
+        return (None, dict.fromkeys(self.agents, 0.0), None, None, acted)
+
+
+def test_rates_are_agent_steps_a_second_of_steps_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    world: Any = Clocked(monkeypatch)
+    assert step_speed._their_rate(world, agents=3) == 3 / 0.5
+    assert step_speed._dicts_rate(world) == 3 / 0.5
+    assert step_speed._batched_rate(world) == 2 * 3 / 0.5
+    assert world.steps == step_speed.THEIR_STEPS + 2 * step_speed.OUR_STEPS
+
+
+def test_ratios_are_ours_over_theirs() -> None:
+    medians = {
+        ("lidar", "batched"): 600.0,
+        ("lidar", "highway_env"): 20.0,
+        ("kinematics", "batched"): 1000.0,
+        ("kinematics", "single"): 500.0,
+        ("kinematics", "dicts"): 250.0,
+        ("kinematics", "more"): 800.0,
+        ("kinematics", "highway_env"): 10.0,
+        ("kinematics", "highway_env_raw"): 40.0,
+    }
+    rows = [Row(*key, 1, 1, 0.5 * rate, rate, 2.0 * rate) for key, rate in medians.items()]
+    found = step_speed._compare(500.0, 2, rows)
+    assert (found.ratio, found.ratio_kinematics, found.ratio_kinematics_raw) == (30.0, 100.0, 25.0)
+    assert found.cost_of_more == 1.25
+    assert found.dict_us == pytest.approx(2000.0)
 
 
 def test_the_road_can_be_driven(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from cavmarl.parallel.processes.worker_loop import TRUTH
 from cavmarl.parallel.processes.worker_processes import WorkerProcesses
+from cavmarl.verify import worker_kills
 from tests.cli.test_main import refusal, run
 
 SMALL = ("ring", "--agents", "3", "--background", "4", "--worlds", "2")
@@ -39,8 +40,18 @@ def test_a_successor_that_forgets_is_found_out(
         return replace(crew, k, mail, ordered)
 
     monkeypatch.setattr(WorkerProcesses, "replace", without_memory)
+    monkeypatch.setattr(worker_kills, "same_bytes", lambda *_: True)  # states tell it alone
     assert run("verify", *SMALL, "--kill", "5") == 1
     assert "different after step" in capsys.readouterr().out
+
+
+def test_results_that_differ_are_found_out_where_states_do_not(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    answers = iter([True, True, False])
+    monkeypatch.setattr(worker_kills, "same_bytes", lambda *_: next(answers))
+    assert run("verify", *SMALL, "--kill", "1") == 1
+    assert "different after step 2" in capsys.readouterr().out
 
 
 def test_the_workers_of_one_world_are_killed(capsys: pytest.CaptureFixture[str]) -> None:

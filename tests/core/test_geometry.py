@@ -41,6 +41,13 @@ def test_lane_pose_equals_twin(corners: NDArray[np.float64], share: float) -> No
     assert pose == pytest.approx(naive.lane_pose(corners, s), abs=1e-9)
 
 
+def test_at_a_corner_the_segment_that_begins_there_counts() -> None:
+    points = points_of(U_TURN)
+    found = [geometry.segment_at(points, 0, 4, s) for s in (-1.0, 0.0, 99.0, 100.0, 110.0, 300.0)]
+    assert found == [0, 0, 0, 1, 2, 2]
+    assert geometry.lane_pose(points, 0, 4, 100.0) == (100.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+
+
 def test_lane_pose_uses_only_its_polyline() -> None:
     points = np.concatenate([points_of(U_TURN), points_of(U_TURN + np.array([0.0, 50.0, 3.0]))])
     assert geometry.lane_pose(points, 4, 4, 30.0) == (30.0, 50.0, 3.0, 1.0, 0.0, 0.0)

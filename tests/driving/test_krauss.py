@@ -38,6 +38,15 @@ def test_imperfection_equals_twin(
     assert 0.0 <= left <= speed
 
 
+@pytest.mark.parametrize(
+    ("speed", "left"),
+    # Half of sigma, half of 2.6 m/s², in 0.1 s; below 2.6 m/s in proportion to the speed.
+    [(10.0, 9.935), (2.6, 2.535), (1.0, 0.975), (0.0, 0.0)],
+)
+def test_imperfection_takes_less_from_who_is_slow(speed: float, left: float) -> None:
+    assert dawdle(speed, 2.6, 0.5, 0.5, 0.1) == pytest.approx(left)
+
+
 @given(st.floats(0.0, 100.0), SPEEDS, DECELS, DECELS, TIMES)
 def test_who_brakes_after_the_reaction_does_not_touch_who_brakes_harder(
     gap: float, front_speed: float, decel: float, front_decel: float, reaction_s: float

@@ -139,12 +139,14 @@ def test_the_interval_between_runs_is_that_of_the_run_means(compared: Path) -> N
     assert found.between_run_ci95.high == pytest.approx(means.mean() + half)
 
 
-def test_an_interval_of_shares_stays_a_share(compared: Path) -> None:
+def test_intervals_of_what_is_bounded_stay_within_and_have_a_width(compared: Path) -> None:
     for policy in load_report(compared).policies.values():
         for metric in METRICS:
             interval = policy[metric.name].between_run_ci95
-            if metric.share and interval is not None:
-                assert 0.0 <= interval.low <= interval.high <= 1.0
+            if metric.share and policy[metric.name].mean is not None:
+                assert interval is not None
+            if metric.bounded and interval is not None:
+                assert 0.0 <= interval.low < interval.high <= 1.0
 
 
 def test_policies_are_compared_run_by_run(compared: Path) -> None:

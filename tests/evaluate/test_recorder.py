@@ -107,6 +107,16 @@ def test_a_meeting_after_ten_seconds_is_none() -> None:
     np.testing.assert_array_equal(worlds.trips["least_pet_s"], [9.9, np.nan])
 
 
+def test_who_has_touched_another_or_left_the_road_does_not_arrive_any_more() -> None:
+    worlds = Worlds()
+    worlds.add(collision=(1.0, 0.0), off_road=(0.0, 1.0))
+    worlds.add(done=(True, True), arrival=(1.0, 1.0))
+    trips = worlds.trips
+    assert trips["collision"].tolist() == [True, False]
+    assert trips["off_road"].tolist() == [False, True]
+    assert not (trips["success"] | trips["unfinished"]).any()
+
+
 def test_the_horizon_cuts_a_trip_and_it_is_neither() -> None:
     worlds = Worlds(max_steps=2)
     worlds.add()

@@ -9,14 +9,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cavmarl.evaluate.metrics import METRICS, least_value
 from cavmarl.evaluate.statistics import (
+    bounded_interval,
     gini_coefficient,
     jain_index,
     mean_interval,
+    run_share_interval,
     share_interval,
     student_quantile,
     within_run,
 )
+from cavmarl.evaluate.tables import TRIP
 
 
 @pytest.mark.parametrize(
@@ -65,6 +69,76 @@ def test_wilson_stays_a_share(hits: int) -> None:
     found = share_interval(hits, 10)
     assert found is not None
     assert 0.0 <= found.low < found.high <= 1.0
+
+
+@pytest.mark.parametrize(("share", "ends"), [(0.0, (0.0, 0.0410)), (1.0, (0.9590, 1.0))])
+def test_runs_without_any_hit_or_miss_still_leave_room(
+    share: float, ends: tuple[float, float]
+) -> None:
+    # Wilson's of 0 of 90: z² / (90 + z²).
+    found = run_share_interval(np.full(3, share), 90)
+    assert found is not None
+    assert (found.low, found.high) == pytest.approx(ends, abs=1e-4)
+    assert run_share_interval(np.full(1, share), 30) is None
+
+
+def test_runs_that_happen_to_agree_say_no_more_than_their_trips() -> None:
+    found, trips = run_share_interval(np.full(2, 0.3), 20), share_interval(6, 20)
+    assert found == trips
+    # Of 100 trips: runs that nearly agree must not make their 30 % certain to a percent.
+    found = run_share_interval(np.array([0.3, 0.3, 0.3, 0.3, 0.31]), 100)
+    assert found is not None
+    assert found.low < 0.23
+    assert found.high > 0.39
+
+
+@pytest.mark.parametrize("runs", [2, 3, 5])
+@pytest.mark.parametrize("share", [0.02, 0.3])
+@pytest.mark.parametrize("alike", [1e9, 20.0], ids=["like one run", "runs differ"])
+def test_an_interval_of_shares_covers_and_stays_inside(
+    runs: int, share: float, alike: float
+) -> None:
+    """Each run has a chance of its own, by a beta distribution, and 50 trips."""
+    random, hits = np.random.default_rng(runs), 0
+    for _ in range(1000):
+        chances = random.beta(alike * share, alike * (1.0 - share), runs)
+        found = run_share_interval(random.binomial(50, chances) / 50.0, 50 * runs)
+        assert found is not None
+        assert 0.0 <= found.low < found.high <= 1.0
+        hits += found.low <= share <= found.high
+    assert hits >= 900  # of 950; chances near 0 are far from normal
+
+
+def test_an_interval_of_evenness_stays_within_its_bounds() -> None:
+    for values in ([0.98, 1.0, 0.99], [0.99, 1.0], [0.26, 0.25], [0.3, 1.0]):
+        means = np.array(values)
+        found = bounded_interval(means, 0.25)
+        assert found is not None
+        assert 0.25 < found.low < means.mean() < found.high < 1.0
+    middle = np.array([0.60, 0.61, 0.59, 0.60])
+    found, plain = bounded_interval(middle, 0.25), mean_interval(middle)
+    assert found is not None
+    assert plain is not None
+    assert (found.low, found.high) == pytest.approx((plain.low, plain.high), abs=1e-3)
+
+
+def test_one_value_in_all_runs_is_no_interval() -> None:
+    for value in (1.0, 0.25, 0.7):
+        assert mean_interval(np.array([value, value, value * (1.0 + 1e-15)])) is None
+        assert bounded_interval(np.full(3, value), 0.25) is None
+    assert bounded_interval(np.ones(3), 1.0) is None, "one vehicle is always even"
+    assert mean_interval(np.zeros(3)) is None
+
+
+def test_evenness_is_at_least_one_over_the_trips_of_an_episode() -> None:
+    trips = np.zeros(7, TRIP)
+    trips["episode"] = [0, 0, 0, 1, 1, 1, 1]
+    trips["run"] = [0, 1, 1, 0, 0, 0, 0]
+    trips["counted"] = [1, 1, 1, 1, 1, 1, 0]
+    metrics = {metric.name: metric for metric in METRICS}
+    assert least_value(metrics["jain_speed"], trips) == pytest.approx(1.0 / 3.0)
+    assert least_value(metrics["jain_speed"], trips[:0]) == 1.0
+    assert least_value(metrics["success"], trips) == 0.0
 
 
 VALUES = st.lists(st.floats(0.0, 1e3), min_size=1, max_size=12).map(np.array)

@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from cavmarl.bench import traffic_speed
 from cavmarl.bench.traffic_speed import measure_traffic_speed
 from cavmarl.cli import main
 from cavmarl.core.errors import ConfigError
+from cavmarl.engine.simulation import Simulation
+from cavmarl.evaluate.traffic import sumo_side
 from cavmarl.evaluate.traffic.native_side import make_world
+from cavmarl.evaluate.traffic.sumo_side import SumoJob
 from cavmarl.evaluate.traffic.traffic_comparison import RATIOS, TrafficComparison, compare_traffic
 from cavmarl.evaluate.traffic.traffic_metrics import EDGE_MINUTE, TrafficFigures, TrafficRun
 from cavmarl.evaluate.traffic.traffic_plot import binned_means, plot_fundamental_diagram
@@ -88,7 +97,77 @@ def test_both_speeds_are_measured() -> None:
     for rates in (found.ours, found.sumo):
         assert 0.0 < rates.low <= rates.median <= rates.high
     assert found.sumo_vehicles > 1.0
-    assert found.ratio == found.ours.median / found.sumo.median
+
+
+class StillSumo:
+    """libsumo, whose seven vehicles stand for ever; what it was started with is on record."""
+
+    TraCIException = RuntimeError
+
+    def __init__(self) -> None:
+        self.words: list[str] = []
+        self.steps = 0
+        self.vehicle = SimpleNamespace(getIDCount=lambda: 7)
+
+    def start(self, words: list[str]) -> None:
+        self.words = words
+
+    def simulationStep(self) -> None:
+        self.steps += 1
+
+
+@pytest.fixture
+def still(monkeypatch: pytest.MonkeyPatch) -> StillSumo:
+    """In place of SUMO, in this process."""
+    found = StillSumo()
+
+    @contextmanager
+    def here(_: SumoJob) -> Iterator[Any]:
+        yield SimpleNamespace(
+            submit=lambda work, *given: SimpleNamespace(result=lambda: work(*given))
+        )
+
+    monkeypatch.setattr(sumo_side, "free_libsumo", lambda: found)
+    monkeypatch.setattr(traffic_speed, "require", lambda *_: found)
+    monkeypatch.setattr(traffic_speed, "sumo_process", here)
+    return found
+
+
+def test_both_sides_run_the_same_demand_as_long_and_write_nothing(
+    still: StillSumo, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    worlds: list[Simulation] = []
+    given: list[Any] = []
+
+    def noted(*made_of: Any) -> Simulation:
+        given.extend(made_of)
+        worlds.append(make_world(*made_of))
+        return worlds[-1]
+
+    monkeypatch.setattr(traffic_speed, "make_world", noted)
+    found = measure_traffic_speed(MAP, [ROUTES], dt_s=0.2, seed=4, after_s=10, repeats=2)
+    options = dict(word.removeprefix("--").split("=", 1) for word in still.words[1:])
+    assert (options["net-file"], options["route-files"]) == (str(given[0]), str(given[1][0]))
+    assert (float(options["step-length"]), int(options["seed"])) == (given[4], given[3])
+    assert (given[4], given[3], given[2]) == (0.2, 4, 30)
+    assert [name for name in options if re.search("output|log|dump", name)] == [
+        "no-step-log", "duration-log.disable", "error-log",
+    ]  # fmt: skip
+    assert still.steps == worlds[0].ticks()[0] == 150
+    assert worlds[0].config.clock.sim_dt_s == worlds[0].config.clock.ctrl_dt_s == 0.2
+    assert found.sumo_vehicles == 7.0
+
+
+def test_a_turn_counts_each_vehicle_once_a_step_on_both_sides(still: StillSumo) -> None:
+    moved: list[None] = []
+    world: Any = SimpleNamespace(
+        outputs=SimpleNamespace(present=np.zeros((1, 2))),
+        step=lambda _: moved.append(None),
+        vehicles=lambda: [None] * 7,
+    )
+    ours, theirs = traffic_speed._our_turn(world, 4), traffic_speed.turn_of_sumo(4)
+    assert ours.vehicle_steps == theirs.vehicle_steps == 28
+    assert len(moved) == still.steps == 4
 
 
 @pytest.mark.parametrize(

@@ -65,21 +65,33 @@ class Looks:
             self.zoned.rows[0, z, 0, : len(rows)] = rows
             self.zoned.num_owned[z, 0], self.zoned.num_rows[z, 0] = len(zone.owned), len(rows)
 
+    def look(
+        self,
+        zones: list[naive.Zone],
+        tick: int,
+        expected: NDArray[np.uint64],
+        new_late: int = 1,
+        missing: int = 0,
+    ) -> int:
+        """The kernel looks: KIND_*."""
+        self.put(zones)
+        told = watch(
+            PARTITION.arrays, HALO, self.zoned, self.words, 0, 0,
+            CheckTime(tick, new_late, LIMIT_M), MASKS, FACTORS, self.kept, self.unused, self.strays,
+            sum(len(zone.owned) for zone in zones) + missing, expected,
+            self.tallies, self.found,
+        )  # fmt: skip
+        self.kept, self.unused = self.unused, self.kept
+        return told
+
     def compare(
         self, zones: list[naive.Zone], tick: int, new_late: int = 1, missing: int = 0
     ) -> dict[int, str]:
         """Both look; what they find is the same. So many more vehicles are expected."""
-        self.put(zones)
         masks, factors = MASKS.tolist(), FACTORS.tolist()
         tallies = naive.tallies(zones, PARTITION.reaching, HALO_M, masks, factors)
         expected = np.array([owned for _, owned, _, _ in tallies], dtype=np.uint64)
-        told = watch(
-            PARTITION.arrays, HALO, self.zoned, self.words, 0, 0,
-            CheckTime(tick, new_late, LIMIT_M), MASKS, FACTORS, self.kept, self.unused, self.strays,
-            sum(len(zone.owned) for zone in zones) + missing, expected + self.foreign,
-            self.tallies, self.found,
-        )  # fmt: skip
-        self.kept, self.unused = self.unused, self.kept
+        told = self.look(zones, tick, expected + self.foreign, new_late, missing)
         wrong = naive.findings(zones, self.before, tick, new_late, LIMIT_M)
         kind, vehicle, _, _ = self.found[0].tolist()
         assert (kind == KIND_NONE) == (not wrong)
@@ -159,6 +171,16 @@ def test_a_run_is_looked_at_as_by_the_plain_twin(seed: int, stay: float) -> None
         kinds.update(looks.compare(dealt(rows), tick).values())
     assert kinds["tick"] > 5
     assert kinds["far"] > 2
+
+
+@pytest.mark.parametrize("name", ["x", "y"])
+def test_a_vehicle_that_is_nowhere_is_found(name: str) -> None:
+    looks, rng, rows = started(7)
+    zones = dealt(moved(rng, rows, 1.0))
+    lost = zones[2].owned[0]
+    lost[name] = np.nan
+    assert looks.look(zones, 11, looks.foreign) == KIND_FAR
+    assert looks.found["vehicle"] == lost["id"]
 
 
 def test_sums_tell_that_all_is_well() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -79,6 +80,21 @@ def test_an_append_is_there_when_it_returns(tmp_path: Path, sync: Sync) -> None:
         for number, record in enumerate(eventful().log):
             journal.append([record])
             assert path.read_text().count("\n") == number + 1
+
+
+@pytest.mark.parametrize("sync", ["flush", "fsync"])
+def test_only_with_fsync_an_append_is_written_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sync: Sync
+) -> None:
+    path, there = tmp_path / "run.journal", list[int]()
+    monkeypatch.setattr(os, "fsync", lambda _: there.append(path.read_text().count("\n")))
+    log = eventful().log
+    with Journal(path, sync=sync) as journal:
+        journal.append(log[:2])
+        journal.append(log[2:3])
+    with journal.reopened() as journal:
+        journal.append(log[3:4])
+    assert there == ([2, 3, 4] if sync == "fsync" else [])
 
 
 def test_a_file_that_exists_is_not_begun_anew(written: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import pytest
 import torch
 from torch import Tensor
@@ -46,3 +48,34 @@ def test_advantages_by_hand() -> None:
     first = 1.0 + 0.9 * 0.5 - 0.5 + 0.45 * ends
     fourth = 3.0 + 0.9 * 0.5 - 0.5 + 0.45 * cut
     assert found == pytest.approx([first, ends, 0.0, fourth, cut])
+
+
+def test_what_the_next_vehicle_gets_is_not_credited_to_the_one_before() -> None:
+    # No step lies between: one vehicle ends in step 0, the next has the seat from step 1 on.
+    batch = batch_of_one_seat(
+        rewards=[1.0, 50.0, -7.0],
+        acted=[True, True, True],
+        goes_on=[False, True, False],
+        cut_value=0.0,
+    )
+    found = batch.advantages(0.9, 0.5).flatten().tolist()
+    last = -7.0 - 0.5
+    second = 50.0 + 0.9 * 0.5 - 0.5 + 0.45 * last
+    assert found == pytest.approx([1.0 - 0.5, second, last])
+
+
+def test_seats_know_nothing_of_each_other() -> None:
+    one, other = (
+        batch_of_one_seat([r, 2.0 * r, 3.0], [True] * 3, [on, True, False], 1.0)
+        for r, on in ((1.0, True), (4.0, False))
+    )
+    together = Batch(
+        *(
+            torch.cat([getattr(one, field.name), getattr(other, field.name)], dim=1)
+            for field in fields(Batch)
+            if field.name != "suggested"
+        )
+    )
+    found = together.advantages(0.9, 0.5)
+    for seat, batch in enumerate((one, other)):
+        assert torch.equal(found[:, seat], batch.advantages(0.9, 0.5)[:, 0])

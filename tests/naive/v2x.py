@@ -61,21 +61,38 @@ def number(key: int, receiver: int, sender: int, tick: int, kind: int) -> float:
 def chance(config: ChannelConfig, distance_m: float, blocked: bool, busy: float) -> float:
     """Of a reception, by the formulas of docs/v2x.md."""
     result = 1.0 - config.loss
-    loss_1m = 20.0 * math.log10(4.0 * math.pi * 5.9e9 / 299_792_458.0)
-    margin = config.tx_power_dbm - loss_1m - config.sensitivity_dbm
-    sensing = math.inf
     if config.path_loss_exponent > 0.0:
         lost = 10.0 * config.path_loss_exponent * math.log10(max(distance_m, 1.0))
         lost += config.building_db if blocked else 0.0
-        result *= NormalDist().cdf((margin - lost) / config.shadowing_db)
-        sensing = 10.0 ** (margin / (10.0 * config.path_loss_exponent))
+        result *= NormalDist().cdf((_margin_db(config) - lost) / config.shadowing_db)
     if config.data_rate_mbps > 0.0:
-        sensing = min(sensing, config.range_m or math.inf)
+        sensing = sensing_m(config)
         if sensing < math.inf:
             half = min(0.5 * distance_m / sensing, 1.0)
             shared = 2.0 / math.pi * (math.acos(half) - half * math.sqrt(1.0 - half * half))
             result *= math.exp(-2.0 * busy * (1.0 - shared))
     return result
+
+
+def airtime_s(config: ChannelConfig) -> float:
+    """IEEE 802.11p in 10 MHz: 32 µs of training and 8 µs of signal field, then the bits."""
+    if config.data_rate_mbps == 0.0:
+        return 0.0
+    return 32e-6 + 8e-6 + config.packet_bytes * 8 / (config.data_rate_mbps * 1e6)
+
+
+def sensing_m(config: ChannelConfig) -> float:
+    """How far a station is heard: half of the packets are received there, or the range ends."""
+    sensing = config.range_m or math.inf
+    if config.path_loss_exponent > 0.0:
+        sensing = min(sensing, 10.0 ** (_margin_db(config) / (10.0 * config.path_loss_exponent)))
+    return sensing
+
+
+def _margin_db(config: ChannelConfig) -> float:
+    """What may be lost beyond the first metre until half of the packets are."""
+    loss_1m = 20.0 * math.log10(4.0 * math.pi * 5.9e9 / 299_792_458.0)
+    return config.tx_power_dbm - loss_1m - config.sensitivity_dbm
 
 
 def inbox(

@@ -46,6 +46,8 @@ def test_r01_a_host_advances_with_a_step_and_once() -> None:
     endpoint = bench.endpoints[0]
     with pytest.raises(ProtocolError, match="no lease"):
         endpoint.complete(0)
+    assert endpoint.on_message(replace(step, tick=2)).advance is None
+    assert endpoint.lease is None
     assert endpoint.on_message(step).advance is not None
     assert endpoint.lease == 1
     assert endpoint.on_message(step).advance is None

@@ -26,6 +26,7 @@ from cavmarl.core.errors import (
 )
 from cavmarl.parallel.processes.shared_memory import Segment
 from cavmarl.parallel.processes.worker_pool import Pool, Program
+from tests.support.toiling import toiling
 from tests.support.toy_job import ADD, DIE, DOZE, FAIL, FALL, POINTS, RUN_OUT, TASKS, TOIL, TOTAL
 
 MODULE = "tests.support.toy_job"
@@ -66,6 +67,10 @@ def make() -> Iterator[Make]:
         pool.close()
 
 
+def interrupt() -> None:
+    signal.raise_signal(signal.SIGINT)
+
+
 def totals(pool: Pool) -> list[list[float]]:
     return pool.run(TOTAL, commits=False)
 
@@ -75,7 +80,7 @@ def alive(pids: list[int]) -> list[int]:
     return [pid for pid in pids if Path(f"/proc/{pid}").exists()]
 
 
-def gone(pids: list[int], limit_s: float = 5.0) -> bool:
+def gone(pids: list[int], limit_s: float = 60.0) -> bool:
     end = time.monotonic() + limit_s
     while alive(pids) and time.monotonic() < end:
         time.sleep(0.01)
@@ -109,17 +114,16 @@ def test_one_that_dies_before_the_first_order(make: Make) -> None:
     assert totals(pool) == [[3.0, MORE]]
 
 
-def test_all_that_die_at_work(make: Make) -> None:
+def test_all_that_die_at_work(make: Make, tmp_path: Path) -> None:
     pool = make(workers=2)
     pool.run(ADD)
     pids = pool.pids
-    timer = threading.Timer(0.1, lambda: [os.kill(pid, signal.SIGKILL) for pid in pids])
-    timer.start()
-    pool.run(TOIL, 0.3)
-    timer.join()
+    with toiling(tmp_path, 2, lambda: [os.kill(pid, signal.SIGKILL) for pid in pids]) as place:
+        pool.run(TOIL, place)
     assert totals(pool) == [[6.0, 2 * MORE]] * 2
     assert sorted(death.worker for death in pool.deaths) == [0, 1]
-    assert all(0.3 < death.done_s - death.noticed_s < 3.0 for death in pool.deaths)
+    for death in pool.deaths:
+        assert death.ordered_s < death.noticed_s < death.replaced_s < death.done_s
 
 
 @pytest.mark.parametrize("point", range(len(POINTS)), ids=POINTS)
@@ -144,27 +148,23 @@ def test_an_image_that_is_not_what_was_written_is_refused(make: Make) -> None:
         pool.run(ADD)
 
 
-def test_the_answer_of_one_that_dies_after_it_is_not_lost(make: Make) -> None:
+def test_the_answer_of_one_that_dies_after_it_is_not_lost(make: Make, tmp_path: Path) -> None:
     pool = make(workers=2)
     pool.run(ADD)
     first, second = pool.pids
-    timer = threading.Timer(0.1, os.kill, (first, signal.SIGKILL))
-    timer.start()
-    pool.ask(1, TOIL, 0.3)  # it counts in the second alone, and is not committed
-    timer.join()
+    with toiling(tmp_path, 1, lambda: os.kill(first, signal.SIGKILL)) as place:
+        pool.ask(1, TOIL, place)  # it counts in the second alone, and is not committed
     assert pool.pids[1] == second
     assert pool.ask(0, TOTAL) == [3.0, MORE]
 
 
 @pytest.mark.parametrize("dying", [0, 1])
-def test_a_team_is_replaced_as_a_whole(make: Make, dying: int) -> None:
+def test_a_team_is_replaced_as_a_whole(make: Make, dying: int, tmp_path: Path) -> None:
     pool = make(workers=3, teams=((0, 1),))
     pool.run(ADD)
     before = pool.pids
-    timer = threading.Timer(0.1, os.kill, (before[dying], signal.SIGKILL))
-    timer.start()
-    pool.run(TOIL, 0.3)
-    timer.join()
+    with toiling(tmp_path, 3, lambda: os.kill(before[dying], signal.SIGKILL)) as place:
+        pool.run(TOIL, place)
     assert totals(pool) == [[6.0, 2 * MORE]] * 3
     assert [pid in before for pid in pool.pids] == [False, False, True]
     assert [death.worker for death in pool.deaths] == [dying]
@@ -181,16 +181,14 @@ def test_who_has_no_order_gets_none_when_its_team_is_replaced(make: Make) -> Non
 
 
 @pytest.mark.usefixtures("interruptible")
-def test_a_team_that_loses_somebody_while_its_order_is_given_up(make: Make) -> None:
+def test_a_team_that_loses_somebody_while_its_order_is_given_up(make: Make, tmp_path: Path) -> None:
     pool = make(workers=2, teams=((0, 1),))
     pool.run(ADD)
     pids = pool.pids
-    timer = threading.Timer(0.1, signal.raise_signal, (signal.SIGINT,))
-    timer.start()
-    with pytest.raises(KeyboardInterrupt):
-        pool.run(TOIL, 0.5)
-    timer.join()
-    os.kill(pids[1], signal.SIGKILL)
+    with toiling(tmp_path, 2, interrupt, ends=False) as place:
+        with pytest.raises(KeyboardInterrupt):
+            pool.run(TOIL, place)
+        os.kill(pids[1], signal.SIGKILL)
     assert totals(pool) == [[3.0, MORE]] * 2
 
 
@@ -200,12 +198,10 @@ def test_one_that_is_slow_is_let_be(make: Make) -> None:
     assert pool.deaths == []
 
 
-def test_one_that_hangs_is_noticed_within_a_second(make: Make) -> None:
+def test_one_that_hangs_is_noticed_after_less_than_a_second_of_sleep(make: Make) -> None:
     pool = make(workers=2, repeats=0)
-    began = time.monotonic()
-    with pytest.raises(WorkerDeathError, match=r"worker 0 \(part 0\).*doze.*asleep"):
+    with pytest.raises(WorkerDeathError, match=r"worker 0 \(part 0\).*doze.*asleep for 0\.8 s"):
         pool.run(DOZE, 60.0)
-    assert time.monotonic() - began < 2.0
 
 
 def test_one_that_toils_too_long_is_noticed(make: Make) -> None:
@@ -244,14 +240,11 @@ def test_an_exception_arrives_whole_and_changes_nothing(make: Make) -> None:
 
 
 @pytest.mark.usefixtures("interruptible")
-def test_an_interrupted_order_is_not_committed(make: Make) -> None:
+def test_an_interrupted_order_is_not_committed(make: Make, tmp_path: Path) -> None:
     pool = make(workers=2)
     pool.run(ADD)
-    timer = threading.Timer(0.2, signal.raise_signal, (signal.SIGINT,))
-    timer.start()
-    with pytest.raises(KeyboardInterrupt):
-        pool.run(TOIL, 1.0)
-    timer.join()
+    with toiling(tmp_path, 2, interrupt, ends=False) as place, pytest.raises(KeyboardInterrupt):
+        pool.run(TOIL, place)
     assert totals(pool) == [[3.0, MORE]] * 2
     assert pool.deaths == []
 
@@ -311,7 +304,7 @@ def gone_soon(pids: list[int]) -> bool:
             pidfd = os.pidfd_open(pid)
         except ProcessLookupError:
             continue
-        ended = bool(select.select([pidfd], [], [], 5.0)[0])
+        ended = bool(select.select([pidfd], [], [], 60.0)[0])
         os.close(pidfd)
         if not ended:
             return False
@@ -334,15 +327,20 @@ def test_nothing_is_burnt_while_nobody_asks(make: Make) -> None:
     pool = make(workers=2)
     for _ in range(1000):
         pool.ping()
-    time.sleep(0.1)
+    while any(stat_of(pid)[0] != "S" for pid in pool.pids):
+        time.sleep(0.001)  # they look for orders for a while before they sleep
     before = [ticks(pid) for pid in pool.pids]
     time.sleep(0.5)
     assert [ticks(pid) for pid in pool.pids] == before
 
 
 def ticks(pid: int) -> int:
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return int(fields[11]) + int(fields[12])
+    return int(stat_of(pid)[11]) + int(stat_of(pid)[12])
+
+
+def stat_of(pid: int) -> list[str]:
+    """Of a process: state, parent and so on."""
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
 
 
 def maps(pid: int) -> list[str]:
@@ -359,14 +357,12 @@ def test_nothing_is_left_behind(way: str) -> None:
     shared = [line for pid in pids for line in maps(pid) if "rw-s" in line]
     assert shared
     assert all("/memfd:cavmarl (deleted)" in line for line in shared)
-    began = time.monotonic()
     if way == "close":
         pool.close()
         pool.close()
     del pool
     gc.collect()
     assert not alive(pids)
-    assert time.monotonic() - began < 2.0
     assert len(os.listdir("/proc/self/fd")) == files
 
 
@@ -438,17 +434,19 @@ print(*pool.pids, pool.server_pid, flush=True)
 """
 
 
-@pytest.mark.parametrize("then", ["time.sleep(60)", "pool.run(TOIL, 60.0)"])
+@pytest.mark.parametrize("then", ["time.sleep(60)", "pool.run(TOIL, PLACE)"])
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
-def test_no_process_outlives_the_pools(how: signal.Signals, then: str) -> None:
-    text = LONER.format(root=str(ROOT), then=then)
+def test_no_process_outlives_the_pools(how: signal.Signals, then: str, tmp_path: Path) -> None:
+    text = LONER.format(root=str(ROOT), then=then.replace("PLACE", repr(str(tmp_path))))
     loner = subprocess.Popen(
         [sys.executable, "-c", text], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     )
     assert loner.stdout is not None
+    if "PLACE" in then:
+        with toiling(tmp_path, 2, lambda: loner.send_signal(how), ends=False):
+            loner.wait()
     pids = [int(word) for word in loner.stdout.readline().split()]
     assert len(pids) == 3
-    time.sleep(0.1)
     loner.send_signal(how)
     loner.wait()
     loner.stdout.close()
@@ -524,6 +522,7 @@ def test_a_thread_may_start_workers_and_end(make: Make) -> None:
     thread = threading.Thread(target=lambda: pools.append(make(workers=1)))
     thread.start()
     thread.join()
-    time.sleep(0.1)
+    while Path(f"/proc/self/task/{thread.native_id}").exists():
+        time.sleep(0.001)  # the system ends it a little later
     pools[0].run(ADD)
     assert pools[0].deaths == []

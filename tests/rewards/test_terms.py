@@ -52,11 +52,26 @@ def test_progress_is_the_way_towards_the_goal() -> None:
 
 
 @pytest.mark.parametrize(
-    ("before", "after"), [(80.0, 900.0), (80.0, math.inf), (math.inf, 80.0), (math.inf, math.inf)]
+    ("before", "after", "speed", "progress"),
+    # At most what is driven in two steps; who stands might have driven at 1 m/s.
+    [
+        (80.0, 900.0, 10.0, -2.0),
+        (900.0, 80.0, 10.0, 2.0),
+        (80.0, 81.9, 10.0, -1.9),
+        (80.0, 78.1, 10.0, 1.9),
+        (80.0, 900.0, 0.0, -0.2),
+        (900.0, 80.0, 0.5, 0.2),
+        (80.0, 79.85, 0.0, 0.15),
+        (80.0, math.inf, 10.0, -2.0),
+        (math.inf, 80.0, 10.0, 0.0),
+        (math.inf, math.inf, 10.0, 0.0),
+    ],
 )
-def test_another_plan_is_no_jump(before: float, after: float) -> None:
-    progress = terms(one(speed=10.0, step_to_go=before, to_go=after))["progress"]
-    assert abs(progress) <= 2.0 * 10.0 * STEP_S + 1e-6
+def test_another_plan_is_no_jump(
+    before: float, after: float, speed: float, progress: float
+) -> None:
+    found = terms(one(speed=speed, step_to_go=before, to_go=after))["progress"]
+    assert found == pytest.approx(progress, abs=1e-6)
 
 
 def test_speed_and_delay_are_measured_at_the_limit() -> None:
@@ -94,6 +109,11 @@ def test_time_to_collision_of_one_behind_another() -> None:
     rows = vehicles([(0.0, 0.0, 0.0), (25.0, 0.0, 0.0)], speed=[15.0, 5.0])
     assert terms(rows)["ttc_risk"] == pytest.approx(1.0 - 2.0 / TTC_HORIZON_S)
     assert terms(rows[::-1], 1)["ttc_risk"] == terms(rows)["ttc_risk"]
+    # A metre more of one of them is half a metre less between the bumpers.
+    for lengths in ((6.0, 5.0), (5.0, 6.0)):
+        longer = rows.copy()
+        longer["length"] = lengths
+        assert terms(longer)["ttc_risk"] == pytest.approx(1.0 - 1.95 / TTC_HORIZON_S)
     rows["speed"] = [5.0, 15.0]
     assert terms(rows)["ttc_risk"] == 0.0
     rows["speed"] = [15.0, 5.0]

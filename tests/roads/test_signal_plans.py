@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from fractions import Fraction
 from pathlib import Path
 
 import pytest
 
 from cavmarl.core.errors import MapError
 from cavmarl.maps.check import check_map
-from cavmarl.roads.kernels.signal_phases import switch_signals
+from cavmarl.roads.kernels.signal_phases import detect, switch_signals
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network
 from cavmarl.roads.sumo_net.signal_plans import with_outages, with_programs
 from cavmarl.shards.shard import make_worlds
+from tests.support.traffic import on_lane
 
 NIGHT = """<additional>
   <inductionLoop id="passed over" lane="s_0" pos="1" period="60" file="x"/>
@@ -46,16 +48,31 @@ def additional(tmp_path: Path) -> Callable[..., Path]:
     return write
 
 
-def states(network: RoadNetwork, times: list[int]) -> list[str]:
+def states(
+    network: RoadNetwork, ticks: Iterable[int], dt: float = 1.0, stands_m: float | None = None
+) -> list[str]:
+    """What is shown at these ticks, while a car stands so far along the main road, if it does."""
     worlds = make_worlds(1, 1, network)
+    if stands_m is not None:
+        worlds.rows[0, 0] = on_lane(network, network.lane_ids.index("w_1"), stands_m)[0]
+        worlds.num_owned[0] = 1
     shown = []
-    for time in times:
-        worlds.ticks[0] = time
+    for tick in ticks:
+        worlds.ticks[0] = tick
+        detect(
+            network.arrays.lane_place,
+            network.arrays.places,
+            worlds.rows,
+            worlds.num_owned,
+            worlds.ticks,
+            dt,
+            worlds.detected_s,
+        )
         switch_signals(
             network.arrays,
             worlds.ticks,
             worlds.detected_s,
-            1.0,
+            dt,
             worlds.controllers,
             worlds.signal_phase,
         )
@@ -77,6 +94,23 @@ def test_the_program_loaded_last_is_on(
     assert network.content_hash != plain.content_hash
     assert network.source_hash != plain.source_hash
     assert with_programs(plain) is plain
+
+
+def test_phases_change_at_their_tick_though_sums_of_ticks_are_not_exact(
+    crossing: Callable[..., Path],
+) -> None:
+    durations = ("0.7", "0.4", "1.9")
+    changes = zip(('duration="30"', 'duration="4"', 'duration="26"'), durations, strict=True)
+    network = read_network(
+        crossing(*((old, f'duration="{new}"') for old, new in changes), ('offset="3"', ""))
+    )
+    first, second, third = map(Fraction, durations)
+
+    def planned(tick: int) -> str:
+        left = Fraction(tick, 10) % (first + second + third)
+        return "Grr" if left < first else "yrr" if left < first + second else "rGg"
+
+    assert states(network, range(600), 0.1) == [planned(tick) for tick in range(600)]
 
 
 def test_of_several_programs_in_a_map_the_last_is_on(crossing: Callable[..., Path]) -> None:
@@ -163,6 +197,19 @@ def test_actuated_programs_get_detectors_where_the_green_empties(
     assert network.phases["green"].tolist() == [True, False, True]
     assert check_map(network).actuated_signals == 1
     assert network.phase_detectors.tolist() == [0]
+
+
+def test_an_actuated_green_ends_at_its_longest_to_the_millisecond(
+    crossing: Callable[..., Path],
+) -> None:
+    text = ('type="static" programID="0" offset="3"', 'type="actuated" programID="0" offset="0"')
+    green = ('duration="30"', 'duration="30" minDur="5" maxDur="12.5"')
+    network = read_network(crossing(text, green))
+    ticks = [*range(0, 12_400, 100), *range(12_400, 12_510)]
+
+    shown = states(network, ticks, 0.001, stands_m=75.0)
+    assert ticks[shown.index("yrr")] == 12_500
+    assert ticks[states(network, ticks, 0.001).index("yrr")] == 5_000, "nobody prolongs it"
 
 
 @pytest.mark.parametrize(

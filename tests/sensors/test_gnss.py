@@ -75,6 +75,28 @@ def test_an_antenna_is_where_it_is_mounted() -> None:
                 )
 
 
+def test_errors_of_an_antenna_are_other_ones_at_each_tick_and_for_each_vehicle() -> None:
+    gnss = {"type": "gnss", "rate_hz": 20}
+    rig = {"clean": gnss, "noisy": {**gnss, "noise": [2.0, 2.0, 0.0]}}
+    settings = {"rig": rig, "clock.ctrl_dt_s": 0.05, "population.mode": "respawn"}
+    vec = make_vec("grid4x4", agents=12, background=0, overrides=settings)
+    config = vec.config.rig["clean"]
+    assert isinstance(config, GnssConfig)
+    geodesy = geodesy_of(vec.network, config)
+    vec.reset(seed=0)
+    errors = []
+    for _ in range(20):
+        vec.step(vec.suggest_actions())
+        frames = vec.frames()
+        noisy, clean = (geodesy.to_map(frames[name].data[0, :, -1]) for name in ("noisy", "clean"))
+        errors.append(noisy - clean)
+    found = np.stack(errors)  # (ticks, agents, axes)
+    np.testing.assert_allclose(found[..., 2], 0.0, atol=1e-6)
+    for axis in range(2):
+        assert found[..., axis].std(axis=0).mean() == pytest.approx(2.0, rel=0.2), "over ticks"
+        assert found[..., axis].std(axis=1).mean() == pytest.approx(2.0, rel=0.2), "over vehicles"
+
+
 def test_an_offset_that_is_no_number_is_refused(tmp_path: Path, shared_maps: Path) -> None:
     text = (shared_maps / "net/mcity/mcity.net.xml").read_text(encoding="utf-8")
     broken = tmp_path / "m.net.xml"

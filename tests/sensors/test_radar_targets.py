@@ -74,6 +74,20 @@ def test_a_wall_at_ten_metres_is_one_target() -> None:
     assert (target["body"], target["id"]) == (0, 7)
 
 
+@pytest.mark.parametrize("azimuth", [-0.45, -0.2, 0.3, 0.5])
+def test_the_nearest_echo_may_come_from_any_ray(azimuth: float) -> None:
+    """Of a body that turns its corner to the sensor, wider than a ray on both sides."""
+    x, y = 20.0 * math.cos(azimuth), 20.0 * math.sin(azimuth)
+    rows = vehicles(
+        [(0.0, 0.0, 0.0), (x, y, azimuth + 0.25 * math.pi)], length=4.0, width=4.0, speed=[3.0, 7.0]
+    )
+    (target,) = echoes(rows, mount((0.0, 0.0, 0.5)))
+    assert target["azimuth"] == pytest.approx(azimuth)
+    assert target["range"] == pytest.approx(20.0 - math.sqrt(8.0))
+    own = 3.0 * math.cos(azimuth)
+    assert target["speed"] == pytest.approx(7.0 * math.cos(0.25 * math.pi) - own)
+
+
 def test_a_sensor_at_the_end_of_a_wall_is_in_it() -> None:
     walls = np.array([(0.0, 0.0, 0.0, 1.0, 8.0, 3), (10.0, -20.0, 10.0, 20.0, 8.0, 7)], WALL)
     targets = echoes(vehicles([(0.0, 0.0, 0.0)], speed=0.0), mount((0.0, 0.0, 0.5)), walls)
@@ -90,12 +104,20 @@ def test_radial_speeds_are_relative_and_positive_away() -> None:
     assert coming["speed"] == pytest.approx(-15.0 * math.cos(coming["azimuth"]))
 
 
-@given(st.floats(-1.0, 1.0), st.floats(-2.0, 2.0), st.floats(-1.0, 1.0))
-def test_a_turning_vehicle_moves_its_sensors(yaw_rate: float, x: float, y: float) -> None:
-    wall = np.array([(30.0, -90.0, 30.0, 90.0, 8.0, 0)], WALL)
+@given(st.floats(-1.0, 1.0), st.floats(-2.0, 2.0), st.floats(-1.0, 1.0), st.floats(-0.5, 0.5))
+def test_a_turning_vehicle_moves_its_sensors(
+    yaw_rate: float, x: float, y: float, normal: float
+) -> None:
+    """The nearest place of a long wall lies along its normal."""
+    cos, sin = math.cos(normal), math.sin(normal)
+    ends = [(30.0 * cos - side * sin, 30.0 * sin + side * cos) for side in (-90.0, 90.0)]
+    wall = np.array([(*ends[0], *ends[1], 8.0, 0)], WALL)
     rows = vehicles([(0.0, 0.0, 0.0)], speed=10.0, yaw_rate=yaw_rate)
     (target,) = echoes(rows, mount((x, y, 0.5)), wall)
     azimuth = target["azimuth"]
+    assert abs(azimuth - normal) <= 0.5 * AZIMUTHS[1] + 1e-9
+    away = 30.0 - x * cos - y * sin
+    assert target["range"] == pytest.approx(away / math.cos(azimuth - normal))
     velocity = (10.0 - yaw_rate * y, yaw_rate * x)
     assert target["speed"] == pytest.approx(
         -(velocity[0] * math.cos(azimuth) + velocity[1] * math.sin(azimuth))

@@ -20,6 +20,22 @@ ADD, TOTAL, FAIL, DIE, DOZE, TOIL, RUN_OUT, FALL = range(len(TASKS))
 POINTS = ("begun", "half done", "done", "image begun")
 
 
+AT_WORK, ENOUGH = "at work", "enough"  # files of those that toil
+
+
+def toil(letter: Any) -> None:
+    """For so many s; or in a folder: say that it has begun, and go on until it is enough."""
+    if isinstance(letter, str):
+        with open(os.path.join(letter, AT_WORK), "wb", buffering=0) as heard:
+            heard.write(b".")
+        while not os.path.exists(os.path.join(letter, ENOUGH)):
+            pass
+        return
+    end = time.perf_counter() + letter
+    while time.perf_counter() < end:
+        pass
+
+
 class Fatal(np.ndarray[Any, Any]):
     """Whoever copies it dies of it."""
 
@@ -59,9 +75,7 @@ class Adder:
         if task == DOZE:
             time.sleep(letter)
         if task == TOIL:
-            end = time.perf_counter() + letter
-            while time.perf_counter() < end:
-                pass
+            toil(letter)
         if task == RUN_OUT:
             raise MemoryError
         return None

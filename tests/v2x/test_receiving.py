@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cavmarl.v2x.channel import BUSY_LEVELS, airtime_s, make_channel
+from cavmarl.v2x.channel import airtime_s
 from cavmarl.v2x.kernels.v2x_records import (
     COUNT_NO_ACCESS,
     COUNT_OVERFLOW,
@@ -46,14 +46,13 @@ def heard_by(
     slot = (tick - config.latency_ticks) % slots
     mail = world.bus.mail
     packets = mail.packets[0, slot, : mail.num_packets[0, slot]]
-    channel = make_channel(config, 0.1, world.bus._channel.walls)
     near = np.hypot(packets["x"] - x, packets["y"] - y)
-    busy = airtime_s(config) / 0.1 * float((near <= channel.sensing_m).sum())
-    busy = math.floor(min(busy, 1.0) * (BUSY_LEVELS - 1) + 0.5) / (BUSY_LEVELS - 1)
+    busy = naive.airtime_s(config) / 0.1 * float((near <= naive.sensing_m(config)).sum())
+    busy = math.floor(64.0 * min(busy, 1.0) + 0.5) / 64.0  # chances are known in 64 steps
     said: list[naive.Said] = []
     reachable = received = 0
     for packet, distance in zip(packets, near.tolist(), strict=True):
-        if packet["sender"] == receiver or distance > channel.reach_m:
+        if packet["sender"] == receiver or distance > (config.range_m or math.inf):
             continue
         reachable += 1
         metre = int(distance)
@@ -145,17 +144,33 @@ def test_packets_beyond_the_capacity_are_those_of_the_larger_ids() -> None:
 
 
 def test_what_the_air_cannot_carry_is_dropped() -> None:
-    # 60 packets of 300 bytes in 100 ms at 0.5 Mbit/s: three times what there is time for.
+    # 60 packets of 300 bytes in 100 ms at 0.5 Mbit/s: 4.84 ms each, three times what there is time
+    # for.
     world = Standing(1, channel__data_rate_mbps=0.5)
     world.put(np.random.default_rng(2).uniform(0.0, 300.0, (60, 2)))
     world.tick()
     dropped = world.bus.mail.counts[0, COUNT_NO_ACCESS]
-    load = 60 * airtime_s(world.config.v2x.channel) / 0.1
-    assert load == pytest.approx(2.9, abs=0.05)
+    load = 2.904
     assert abs((60 - dropped) - 60 / load) < 4.0 * math.sqrt(60 / load)
     statistics = world.bus.statistics()
     assert 0.5 < statistics.busy_mean <= 1.0
     assert statistics.to_dict()["v2x_dropped"] == dropped
+
+
+@pytest.mark.parametrize(
+    ("bytes_", "rate_mbps", "airtime_us"),
+    # At 6 Mbit/s a symbol of 8 µs has 48 bits.
+    [(300, 6.0, 440.0), (300, 3.0, 840.0), (1500, 12.0, 1040.0), (300, 0.0, 0.0)],
+)
+def test_a_packet_takes_the_air_for_its_preamble_and_its_bits(
+    bytes_: int, rate_mbps: float, airtime_us: float
+) -> None:
+    world = Standing(1, channel__data_rate_mbps=rate_mbps, channel__packet_bytes=bytes_)
+    assert airtime_s(world.config.v2x.channel) == pytest.approx(1e-6 * airtime_us)
+    world.put(np.array([[0.0, 0.0], [10.0, 0.0], [20.0, 0.0]]))
+    world.tick()
+    busy = world.bus.statistics().busy_mean
+    assert busy == pytest.approx(3 * 1e-6 * airtime_us / 0.1, rel=1e-6)
 
 
 def test_more_traffic_means_fewer_receptions() -> None:

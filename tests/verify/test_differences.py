@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+import pytest
 
 from cavmarl import make_vec
 from cavmarl.driving.vehicles import VEHICLE
@@ -50,6 +53,22 @@ def test_arrays_of_another_shape_are_a_difference() -> None:
 def test_results_are_the_same_bytes_or_not() -> None:
     assert same_bytes({"a": np.array([np.nan])}, {"a": np.array([np.nan])})
     assert not same_bytes({"a": np.array([0.0])}, {"a": np.array([-0.0])})
+
+
+@pytest.mark.parametrize("name", ["rewards", "mask", "observations radar", "observations ego"])
+@pytest.mark.parametrize("place", [(0, 0), (1, 2)])
+def test_every_place_of_every_array_counts(name: str, place: tuple[int, int]) -> None:
+    def results(value: float) -> dict[str, Any]:
+        arrays = {
+            other: np.zeros((2, 3))
+            for other in ("rewards", "observations ego", "observations radar", "mask")
+        }
+        arrays[name][place] = value
+        sensors = {key.split()[1]: arrays.pop(key) for key in list(arrays) if " " in key}
+        return {"observations": sensors, **arrays}
+
+    assert same_bytes(results(1.0), results(1.0))
+    assert not same_bytes(results(0.0), results(1.0))
 
 
 def test_a_snapshot_is_of_one_world_with_its_vehicles_in_order() -> None:

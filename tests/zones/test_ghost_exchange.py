@@ -184,6 +184,28 @@ def note(noted: NDArray[np.void], rows: NDArray[np.void], places: NDArray[np.int
         noted[name][: len(places)] = rows[name][places]
 
 
+def test_what_an_owner_knows_of_its_way_goes_with_each_ghost() -> None:
+    """Some ghosts can touch and go before those that cannot, which make room for them."""
+    rng = np.random.default_rng(5)
+    xy = rng.uniform(-10.0, 50.0, (40, 2))
+    rows = vehicles([(x, y, 0.0) for x, y in xy.tolist()], id=np.arange(len(xy)))
+    owners = np.array([naive.owners(four().reaching, x, y)[0] for x, y in xy.tolist()])
+    zoned = zoned_of([rows[owners == zone] for zone in range(4)])
+    zoned.step_at[:] = -1
+    for zone in range(4):
+        own = np.flatnonzero(owners == zone)
+        zoned.step_at[zone, 0, : len(own)] = 1000 + own
+        zoned.step["next"][zone, 0, : len(own)] = own
+    book = make_book(1, zoned.rows.shape[-1] * 4)
+    exchange(four().arrays, zone_halo(four(), 30.0), 4.0, NO_BORDERS, zoned, SIDE, 0, 1, book)
+    assert (zoned.num_owned < zoned.num_near).any()
+    assert (zoned.num_near < zoned.num_rows).any()
+    for zone in range(4):
+        there = zoned.rows[SIDE, zone, 0, : zoned.num_rows[zone, 0]]["id"]
+        assert zoned.step_at[zone, 0, : len(there)].tolist() == (1000 + there).tolist()
+        assert zoned.step["next"][zone, 0, : len(there)].tolist() == there.tolist()
+
+
 def test_a_world_of_one_zone_has_no_ghosts() -> None:
     whole = ZonePartition((0.0, 0.0, 9.0, 9.0), np.array([[0.0, 0.0, 9.0, 9.0]]))
     zoned = exchanged(whole, 5.0, [cars(3)], touching_m=5.0)

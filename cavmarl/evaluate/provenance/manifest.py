@@ -55,7 +55,9 @@ def describe_world(
         "kernels": kernel_cache_dir().name,
         "zones": partition.count,
         "zones_content_sha256": partition.content_hash,
-        "channel": "none: there are no messages between vehicles",
+        "channel": asdict(config.v2x.channel)
+        if config.v2x.enabled
+        else "none: there are no messages between vehicles",
     }
 
 

@@ -164,7 +164,7 @@ def is_seen(
     squared: float,  # m²
 ) -> bool:
     """Whether a zone has to see a vehicle whose `squared_distance` from it is known."""
-    if squared > halo.seen_m * halo.seen_m:
+    if not squared <= halo.seen_m * halo.seen_m:  # nor where it is nowhere
         return False
     if squared <= halo.sure_m * halo.sure_m:
         return True
