@@ -115,10 +115,9 @@ def make_vec(
 
 
 def _checked(num_envs: int) -> int:
-    if isinstance(num_envs, bool) or not isinstance(num_envs, (int, np.integer)):
-        raise ConfigError(f"num_envs = {num_envs!r}: must be a whole number")
-    if not 1 <= num_envs <= MAX_WORLDS:
-        raise ConfigError(f"num_envs = {num_envs}: must be from 1 to {MAX_WORLDS}")
+    is_number = isinstance(num_envs, (int, np.integer)) and not isinstance(num_envs, bool)
+    if not (is_number and 1 <= num_envs <= MAX_WORLDS):
+        raise ConfigError(f"num_envs = {num_envs!r}: must be a whole number from 1 to {MAX_WORLDS}")
     return int(num_envs)
 
 
