@@ -25,6 +25,7 @@ from cavmarl.evaluate.traffic.traffic_comparison import RATIOS, TrafficCompariso
 from cavmarl.evaluate.traffic.traffic_metrics import EDGE_MINUTE, TrafficFigures, TrafficRun
 from cavmarl.evaluate.traffic.traffic_plot import binned_means, plot_fundamental_diagram
 from cavmarl.roads.sumo_net.reader import read_network
+from tests.support.netgenerate import netgenerate
 
 sumo = pytest.importorskip("sumo", reason="needs the extra 'sumo'")
 pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
@@ -214,3 +215,21 @@ def test_a_picture_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
     for name in ("gone/fd.png", "fd.xyz"):
         with pytest.raises(ConfigError, match="cannot be written"):
             plot_fundamental_diagram(found, tmp_path / name)
+
+
+def test_both_sides_drive_the_same_demand(tmp_path: Path) -> None:
+    """Bicycles on lanes of their own, and persons, are not read here: nor does SUMO count them."""
+    words = ("--grid", "--grid.number", "3", "--grid.length", "100", "--sidewalks.guess")
+    network = netgenerate(tmp_path / "bikes.net.xml", *words, "--bikelanes.guess")
+    demand = tmp_path / "mixed.rou.xml"
+    demand.write_text(
+        '<routes><vType id="bike" vClass="bicycle"/>'
+        '<route id="r" edges="A0A1 A1A2"/>'
+        '<flow id="cars" route="r" begin="0" end="40" number="5"/>'
+        '<flow id="bikes" type="bike" route="r" begin="0" end="40" number="7"/>'
+        '<person id="p" depart="1"><walk edges="A0A1 A1A2"/></person></routes>'
+    )
+    found = compare_traffic(network, [demand], seconds=90)
+    assert found.ours.figures.departed == found.sumo.figures.departed == 5
+    assert found.ours.figures.arrived == found.sumo.figures.arrived == 5
+    assert found.sumo.figures.waiting == 0

@@ -42,6 +42,15 @@ class SumoJob:
     # whether SUMO may put vehicles elsewhere that stand for too long (300 s unless the demand's
     # configuration says otherwise)
     teleports: bool = True
+    # vehicles and flows that ours drives, too: others, and persons, are taken out when they enter;
+    # None: all stay
+    shared: frozenset[str] | None = None
+
+    def is_shared(self, vehicle: str) -> bool:
+        """Whether ours drives a vehicle, or the flow that it is of, too."""
+        if self.shared is None:
+            return True
+        return vehicle in self.shared or vehicle.rpartition(".")[0] in self.shared
 
 
 def run_sumo(job: SumoJob) -> TrafficRun:
@@ -102,8 +111,8 @@ def _measure(job: SumoJob) -> TrafficRun:
         try:
             for tick in range(1, job.seconds * ticks_per_s + 1):
                 libsumo.simulationStep()
-                departed += libsumo.simulation.getDepartedNumber()
-                arrived += libsumo.simulation.getArrivedNumber()
+                departed += _keep_shared(libsumo, job)
+                arrived += sum(map(job.is_shared, libsumo.simulation.getArrivedIDList()))
                 teleports += libsumo.simulation.getStartingTeleportNumber()
                 rows = reader.rows()
                 meter.see(rows)
@@ -112,14 +121,27 @@ def _measure(job: SumoJob) -> TrafficRun:
                     meter.sample(rows, reader.signal_codes())
         except libsumo.TraCIException as error:
             raise _refusal(job, folder / "errors.log", error) from None
-        waiting = len(libsumo.simulation.getPendingVehicles())
+        waiting = sum(map(job.is_shared, libsumo.simulation.getPendingVehicles()))
         libsumo.close()
         delays = [
             float(trip.attrib["timeLoss"])
             for trip in defusedxml.ElementTree.parse(trips).iter("tripinfo")
+            if job.is_shared(trip.attrib["id"])
         ]
     delay = math.fsum(delays) / len(delays) if delays else None
     return meter.result(TrafficCounts(departed, waiting, arrived, delay, teleports))
+
+
+def _keep_shared(libsumo: Any, job: SumoJob) -> int:
+    """Take out what has entered and is not shared; how many vehicles have entered that are."""
+    entered = libsumo.simulation.getDepartedIDList()
+    for vehicle in entered:
+        if not job.is_shared(vehicle):
+            libsumo.vehicle.remove(vehicle)
+    if job.shared is not None:
+        for person in libsumo.simulation.getDepartedPersonIDList():
+            libsumo.person.removeStages(person)
+    return sum(map(job.is_shared, entered))
 
 
 class _VehicleReader:

@@ -65,7 +65,7 @@ def compare_traffic(
     teleports: bool = True,
     progress: Callable[[str], None] = lambda text: None,
 ) -> TrafficComparison:
-    """Run both and measure both alike.
+    """Run both and measure both alike: SUMO without what ours leaves out of the demand.
 
     Args:
         map_name: an environment's name or folder, or a map file.
@@ -92,7 +92,8 @@ def compare_traffic(
     # Ours first: it names file and line of what neither can drive.
     world = make_world(path, demand, seconds, seed, dt_s)
     progress("SUMO's run")
-    sumo = run_sumo(SumoJob(path, given, seconds, dt_s, seed, teleports))
+    shared = frozenset(world.demand.element_ids) if isinstance(world.demand, DemandFile) else None
+    sumo = run_sumo(SumoJob(path, given, seconds, dt_s, seed, teleports, shared))
     progress("our run")
     ours = run_native(world, seconds)
     name = path.name.removesuffix(".gz").removesuffix(".net.xml")
