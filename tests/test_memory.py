@@ -25,10 +25,7 @@ DEMAND = """<routes>
 </routes>
 """
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(not STATM.exists(), reason="memory is read from /proc"),
-]
+pytestmark = pytest.mark.skipif(not STATM.exists(), reason="memory is read from /proc")
 
 
 @pytest.fixture(params=["closed", "open", "respawn", "demand"])
@@ -56,6 +53,7 @@ def growth_mb(work: Callable[[], object], times: int) -> float:
     return resident_mb() - before
 
 
+@pytest.mark.slow
 def test_a_thousand_resets(world: dict[str, Any]) -> None:
     env = parallel_env(**world)
 
@@ -68,6 +66,7 @@ def test_a_thousand_resets(world: dict[str, Any]) -> None:
     assert growth_mb(episode, RESETS) < GROWTH_MB
 
 
+@pytest.mark.slow
 def test_a_million_agent_steps(world: dict[str, Any]) -> None:
     vec = make_vec(**world, num_envs=8)
     _, infos = vec.reset()
@@ -83,6 +82,7 @@ def test_a_million_agent_steps(world: dict[str, Any]) -> None:
     assert acted > AGENT_STEPS // 10, "too few agents drove for this to mean anything"
 
 
+@pytest.mark.slow
 def test_a_hundred_thousand_ticks_of_a_divided_city() -> None:
     # Divided and undivided side by side: equal after every step, to the end, and no larger.
     step_ticks = load_config("rush")[0].clock.ticks_per_step
@@ -100,8 +100,21 @@ def test_a_hundred_thousand_ticks_of_a_divided_city() -> None:
     assert max(memory_mb[2:]) - memory_mb[2] < GROWTH_MB
 
 
+@pytest.mark.slow
 def test_a_thousand_worlds_made() -> None:
     def make() -> None:
         parallel_env("ring", agents=2, background=2, seed=0).reset()
 
     assert growth_mb(make, 1000) < GROWTH_MB
+
+
+def test_a_hundred_resets_of_divided_worlds() -> None:
+    """The short form, which is in every run."""
+    vec = make_vec("grid4x4", num_envs=2, zones=4, agents=8, background=20, seed=0)
+
+    def episode() -> None:
+        vec.reset()
+        for _ in range(5):
+            vec.step(vec.suggest_actions())
+
+    assert growth_mb(episode, 100) < GROWTH_MB / 5

@@ -41,9 +41,9 @@ WHEEL = {
 }
 
 
-def compare(folder: Path, case: Case) -> None:
+def compare(folder: Path, case: Case, seconds: int = 900) -> None:
     files = [folder / name for name in case.demand]
-    found = compare_traffic(folder / case.roads, files, seconds=900, dt_s=0.1, seed=1)
+    found = compare_traffic(folder / case.roads, files, seconds=seconds, dt_s=0.1, seed=1)
     assert found.ours.figures.contacts == 0
     assert found.ours.figures.departed > 0
     for figure in case.near:
@@ -62,3 +62,8 @@ def test_on_real_maps_traffic_is_as_sumos(shared_maps: Path, name: str) -> None:
 @pytest.mark.parametrize("name", WHEEL)
 def test_on_the_wheels_maps_traffic_is_as_sumos(name: str) -> None:
     compare(GAME, WHEEL[name])
+
+
+def test_for_three_minutes_traffic_is_as_sumos() -> None:
+    """The short form, which is in every run."""
+    compare(GAME, WHEEL["kuehne"], 180)

@@ -19,8 +19,6 @@ from cavmarl.env.vector import make_vec
 from cavmarl.policies.policy import load_policy
 
 pytest.importorskip("torch")
-pytestmark = pytest.mark.slow
-
 SCRIPT = Path(__file__).resolve().parents[2] / "train" / "ippo_torch.py"
 CROSSING = Path(__file__).with_name("crossing")
 WORLDS = 64
@@ -64,6 +62,12 @@ def ends(driver: Path, agents: int) -> tuple[float, float]:
     return arrivals / trips, collisions / trips
 
 
+def test_the_first_rung(ippo: ModuleType, tmp_path: Path) -> None:
+    """The short form, which is in every run."""
+    assert ends(learn(ippo, tmp_path, agents=1, agent_steps=120_000), agents=1)[0] > 0.9
+
+
+@pytest.mark.slow
 def test_the_ladder(ippo: ModuleType, tmp_path: Path) -> None:
     alone = learn(ippo, tmp_path, agents=1, agent_steps=400_000)
     assert ends(alone, agents=1)[0] > 0.98
