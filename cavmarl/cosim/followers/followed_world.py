@@ -119,7 +119,8 @@ class FollowedWorld:
             if left_s <= 0.0:
                 raise FollowerLostError(
                     f"{len(self._seats)} of {followers} followers have called {self.address} "
-                    f"within {within_s:g} s: start them with `cavmarl follow {self.address}`",
+                    f"within {within_s:g} s: start them with `cavmarl follow "
+                    f"ENV --at {self.address}`",
                     is_late=True,
                 )
             self._admit(left_s)

@@ -46,6 +46,7 @@ class Kind(IntEnum):
     BEAT = 2  # it is working
     DONE = 3  # what has come out
     FAILED = 4  # an exception: its class, its words, its traceback
+    END = 5  # a host is needed no more
 
 
 class Dialect(NamedTuple):

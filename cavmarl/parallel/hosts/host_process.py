@@ -90,8 +90,10 @@ class RemoteJob:
 
 def serve(
     make_job: Callable[[], RemoteJob], place: tuple[str, int], secret: bytes, number: int
-) -> NoReturn:
-    """The whole life of a host; its process ends with the connection.
+) -> None:
+    """The whole life of a host: until it is needed no more.
+
+    If the connection ends before that, the process does, too.
 
     Raises:
         OSError: the caller cannot be reached.
@@ -111,6 +113,8 @@ def serve(
         taken, given = (Image(Segment.make(_FIRST_IMAGE_BYTES)) for _ in range(2))
         while True:
             frame, data = line.hear()
+            if frame.kind == Kind.END:
+                return
             try:
                 letter, arrays = _carry_out(job, Order(*frame.letter), data, taken, given)
             except MemoryError:

@@ -124,6 +124,9 @@ class HostRegistry:
 
     def close(self) -> None:
         """End all hosts, and accept no more."""
+        for host in self._hosts.values():
+            with suppress(OSError):  # it is gone, or stopped: the launcher kills it
+                host.wire.send(Kind.END, 0)
         self._launcher.close()
         self._door.close()
         for guest in self._guests:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,7 +60,7 @@ def _sensed(frames: Frames) -> Iterator[Array]:
         yield from sensor
 
 
-def host_worlds(recipe: str, place: tuple[str, int], secret: bytes, number: int) -> NoReturn:
+def host_worlds(recipe: str, place: tuple[str, int], secret: bytes, number: int) -> None:
     """The whole life of a process that hosts worlds; see `hosts.host.serve`."""
     serve(partial(HostedWorlds, json.loads(recipe)), place, secret, number)
 

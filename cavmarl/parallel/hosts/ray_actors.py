@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable, Sequence
-from typing import Any, NoReturn
+from typing import Any
 
 from cavmarl.core.errors import WorkerError, require
 from cavmarl.parallel.hosts.ray_cluster import choose_nodes, join, leave, nodes_with
 
+ENDS_S = 3.0  # for actors to return by themselves: Ray prints a complaint for each that is killed
 SPARES = 1  # hosts that wait for another one's death: a new actor takes seconds
 
-Main = Callable[[str, tuple[str, int], bytes, int], NoReturn]
+Main = Callable[[str, tuple[str, int], bytes, int], None]
 
 
 class RayHost:
@@ -53,7 +54,9 @@ class RayActors:
         self._calls: list[Any] = []
         self._ray: Any = require("ray", "ray")
         has_joined = join()
-        self._finalizer = weakref.finalize(self, _end, self._ray, self._actors, has_joined)
+        self._finalizer = weakref.finalize(
+            self, _end, self._ray, self._actors, self._calls, has_joined
+        )
         try:
             known = nodes_with(at_most if workers is None else workers)
             free = sum(node.cpus for node in known)
@@ -104,9 +107,11 @@ class RayActors:
         self._finalizer()
 
 
-def _end(ray: Any, actors: Sequence[Any], has_joined: bool) -> None:
+def _end(ray: Any, actors: Sequence[Any], calls: Sequence[Any], has_joined: bool) -> None:
     if not ray.is_initialized():  # the program has ended it
         return
+    if calls:
+        ray.wait(calls, num_returns=len(calls), timeout=ENDS_S)
     for actor in actors:
         ray.kill(actor, no_restart=True)
     if has_joined:

@@ -6,7 +6,7 @@ import json
 import time
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,7 @@ class PhaseOrder(NamedTuple):
     turn: list[Any]  # a `ZoneTurn`, as JSON knows it
 
 
-def host_zones(recipe: str, place: tuple[str, int], secret: bytes, number: int) -> NoReturn:
+def host_zones(recipe: str, place: tuple[str, int], secret: bytes, number: int) -> None:
     """The whole life of a process that hosts zones; see `hosts.host.serve`."""
     serve(partial(ZonesJob, json.loads(recipe)), place, secret, number)
 
