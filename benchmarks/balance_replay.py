@@ -157,25 +157,27 @@ def _summary(
 ) -> StrategyResult:
     times = np.array([one.time_s for one in found])
     ratios, beside = times / static, times / balanced
-    interval = mean_interval(ratios)
     cpu, ram, gpu = np.mean([one.weights for one in found], axis=0).tolist()
     return StrategyResult(
         name=name,
         ratio=float(ratios.mean()),
-        ratio95=interval,
+        ratio95=mean_interval(ratios),
         beside_balanced=float(beside.mean()),
         beside_balanced95=mean_interval(beside),
         imbalance=float(np.mean([one.imbalance for one in found])),
         moves=float(np.mean([one.moves for one in found])),
         handoffs=float(np.mean([one.handoffs for one in found])),
         weights=(cpu, ram, gpu),
-        verdict=_verdict(interval),
+        verdict=_verdict(ratios),
     )
 
 
-def _verdict(interval: Interval | None) -> Verdict:
-    if interval is None:
+def _verdict(ratios: NDArray[np.float64]) -> Verdict:
+    if len(ratios) < 2:
         return "one trace tells nothing"
-    if interval.high < 1.0:
+    low = high = float(ratios.mean())  # there is no interval where all are the same
+    if (interval := mean_interval(ratios)) is not None:
+        low, high = interval.low, interval.high
+    if high < 1.0:
         return "less than static"
-    return "more than static" if interval.low > 1.0 else "within noise of static"
+    return "more than static" if low > 1.0 else "within noise of static"
