@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -27,8 +26,8 @@ from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.evaluate.scenarios.criticality import (
     TRACE,
+    least_ttc_s,
     post_encroachment_s,
-    time_to_collision_s,
     trace_of,
 )
 from cavmarl.policies.policy import load_policy
@@ -197,6 +196,8 @@ class _Record:
         traces = {vehicle: np.array(t, TRACE) for vehicle, t in self._traces.items()}
         own = [traces.pop(agent) for agent in self._agents]
         touched = verdict == "collided"
+        # Over all agents and actors, and all moments in which both are there.
+        ttcs = [least_ttc_s(one, other) for one in own for other in traces.values()]
         pets = [post_encroachment_s(one, other) for one in own for other in traces.values()]
         rows = simulation.vehicles()
         waits = rows["wait_s"][rows["driver"] == DRIVER_BACKGROUND]
@@ -211,7 +212,7 @@ class _Record:
             background=config.population.background,
             verdict=verdict,
             verdicts=verdicts,
-            min_ttc_s=0.0 if touched else _finite(_least_ttc_s(own, traces.values())),
+            min_ttc_s=0.0 if touched else _finite(min(ttcs, default=math.inf)),
             pet_s=0.0 if touched else _finite(min(pets, default=math.inf)),
             collisions=simulation.traffic_stats().contacts,
             red_lights=self._red_lights,
@@ -231,16 +232,6 @@ class _Record:
     def _verdict(self, agent: int) -> str:
         events = int(self._events[agent])
         return next((name for name, event in VERDICTS.items() if events & event), "stuck")
-
-
-def _least_ttc_s(own: Iterable[NDArray[np.void]], others: Iterable[NDArray[np.void]]) -> float:
-    """Over all agents and actors, and all moments in which both are there."""
-    least = math.inf
-    for one, other in product(own, others):
-        _, here, there = np.intersect1d(one["time_s"], other["time_s"], return_indices=True)
-        for i, j in zip(here.tolist(), there.tolist(), strict=True):
-            least = min(least, time_to_collision_s(one[i], other[j]))
-    return least
 
 
 def _finite(value: float) -> float | None:
