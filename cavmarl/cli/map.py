@@ -124,6 +124,7 @@ def _print_report(console: Console, report: MapReport) -> None:
         "elevation": f"{report.elevation_m[0]:.1f} to {report.elevation_m[1]:.1f} m",
         "steepest grade": f"{report.max_grade:.1%}",
         "connected": f"{report.connected_edges}/{report.edges} edges ({share})",
+        "horizon without env.yaml": f"{report.horizon_s:g} s",
         "drivable": "yes" if report.drivable else "NO",
     }
     for key, value in rows.items():

@@ -162,7 +162,7 @@ def _table(found: ScenarioRun) -> Table:
         "scenario": f"{found.scenario} on {found.environment}, {found.place}",
         "driver": f"{found.driver} ({found.agents} agents), seed {found.seed}, "
         f"{found.background} others, {found.zones} zones",
-        "verdict": ", ".join(found.verdicts),
+        "verdict": ", ".join(found.verdicts) + (f"; failed: {found.clash}" if found.clash else ""),
         "least time to collision, s": number(found.min_ttc_s),
         "post-encroachment time, s": number(found.pet_s),
         "collisions": str(found.collisions),

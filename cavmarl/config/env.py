@@ -36,6 +36,7 @@ TERMS = (
     "delay",
 )
 
+BY_MAP = 0.0  # a horizon in s that the map says
 MAX_ZONES = 256  # of one map
 ZONE_LAYOUTS = ("grid", "strips", "bisection")
 ZONE_FILE_SUFFIXES = (".json", ".yaml", ".yml")
@@ -408,7 +409,7 @@ class EnvConfig(Section, key=""):
         name: of the entry, as its folder.
         version: goes up whenever results change that others may have reported.
         rig: sensors that are mounted on every agent's vehicle, by name; see docs/sensors.md.
-        horizon_s: when an episode is truncated.
+        horizon_s: when an episode is truncated; 0: after a time by the size of the map.
     """
 
     name: str
@@ -431,7 +432,8 @@ class EnvConfig(Section, key=""):
 
     def __post_init__(self) -> None:
         self.need("version", self.version >= 0, "must be 0 or more")
-        _check_finite("horizon_s", self.horizon_s, self.clock.ctrl_dt_s, 1e6)
+        if self.horizon_s != BY_MAP:
+            self._check_horizon()
         check_rig(self.rig, self.clock.sim_dt_s, self.clock.ticks_per_step)
         self.need(
             "workers.sensors",
@@ -448,13 +450,6 @@ class EnvConfig(Section, key=""):
             not self.scenario.name or self.population.agents >= 1,
             "must be 1 or more where there is a scenario: it is played to agents",
         )
-        steps = self.horizon_s / self.clock.ctrl_dt_s
-        self.need(
-            "horizon_s",
-            abs(steps - round(steps)) < 1e-6 * steps,
-            f"must be a whole number of steps of clock.ctrl_dt_s = {self.clock.ctrl_dt_s:g}; "
-            f"try {max(1, round(steps)) * self.clock.ctrl_dt_s:g}",
-        )
         if self.v2x.enabled:
             self.v2x.check_clock(self.clock.sim_dt_s)
         self._check_messages()
@@ -462,6 +457,17 @@ class EnvConfig(Section, key=""):
             self._keep_what_is_told()
         if self.traffic.source != "native":
             self._check_sumo()
+
+    def _check_horizon(self) -> None:
+        """Refuse a horizon that is no number of steps."""
+        _check_finite("horizon_s", self.horizon_s, self.clock.ctrl_dt_s, 1e6)
+        steps = self.horizon_s / self.clock.ctrl_dt_s
+        self.need(
+            "horizon_s",
+            abs(steps - round(steps)) < 1e-6 * steps,
+            f"must be a whole number of steps of clock.ctrl_dt_s = {self.clock.ctrl_dt_s:g}; "
+            f"try {max(1, round(steps)) * self.clock.ctrl_dt_s:g}",
+        )
 
     def _keep_what_is_told(self) -> None:
         """Switch the sensors off that look at others."""
@@ -531,5 +537,5 @@ class EnvConfig(Section, key=""):
 
     @property
     def max_steps(self) -> int:
-        """Steps until truncation."""
+        """Steps until truncation, of a configuration whose horizon is known."""
         return max(1, round(self.horizon_s / self.clock.ctrl_dt_s))

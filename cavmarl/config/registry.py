@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from cavmarl.config.env import ZONE_LAYOUTS, EnvConfig, MapConfig
+from cavmarl.config.env import BY_MAP, ZONE_LAYOUTS, EnvConfig, MapConfig
 from cavmarl.core.errors import (
     CavmarlError,
     ConfigError,
@@ -118,7 +118,8 @@ def load_config(
     """The configuration of an environment, and the folder that its map's source is relative to.
 
     Args:
-        env: what `find_entry` takes; a map file gets a default environment.
+        env: what `find_entry` takes; a map file gets a default environment, whose horizon
+            follows the map: see `make_world`.
         zones: shadows `zones.count`.
         sensor_workers: shadows `workers.sensors`.
         agents: shadows `population.agents`.
@@ -144,7 +145,9 @@ def load_config(
         config = validate(EnvConfig, with_current_names(keys), where)
     else:
         base_dir, where = found.parent, str(found)
-        config = EnvConfig(name=_map_name(found), map=MapConfig(source=found.name))
+        config = EnvConfig(
+            name=_map_name(found), map=MapConfig(source=found.name), horizon_s=BY_MAP
+        )
     keywords = {
         "zones.count": zones,
         "workers.sensors": sensor_workers,

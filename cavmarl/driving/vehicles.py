@@ -40,7 +40,7 @@ VEHICLE = np.dtype(
         ("rng_key", np.uint64),  # its random numbers: a function of (rng_key, id, tick, stream)
         ("link", np.int32),  # link it is on, or has entered last
         ("hold", np.int32),  # HOLD_*
-        ("stopped_at", np.int32),  # link before which it has stood last
+        ("stopped_at", np.int32),  # link before which it has stood last; an agent's: at a stop sign
         ("blinker", np.int32),  # lane change wanted: 1 left, -1 right
         ("stop", np.int32),  # STOP row that it makes next; -1 or stops_end: none
         ("stops_end", np.int32),

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from cavmarl.config.env import EnvConfig
+from cavmarl.config.env import BY_MAP, EnvConfig
 from cavmarl.config.registry import (
     entries,
     load_config,
@@ -22,6 +23,7 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.maps.buildings import with_buildings
 from cavmarl.maps.netconvert import map_file
 from cavmarl.roads.cache import load_network
+from cavmarl.roads.horizon import horizon_of
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.signal_plans import with_outages, with_programs
 from cavmarl.traffic.demand import DemandFile, read_demand
@@ -82,8 +84,14 @@ def load_world(
 
 
 def make_world(config: EnvConfig, base_dir: Path) -> World:
-    """What a configuration describes. Raises CavmarlError: as of `load_world`."""
+    """What a configuration describes, with its horizon if the map says it.
+
+    Raises CavmarlError: as of `load_world`.
+    """
     network = load_roads(config, base_dir)
+    if config.horizon_s == BY_MAP:
+        step_s = config.clock.ctrl_dt_s
+        config = replace(config, horizon_s=step_s * max(1, round(horizon_of(network) / step_s)))
     files = resolve_demand(config, base_dir)
     demand: DemandFile | SumoDemand | None = None
     if config.traffic.source != "native":

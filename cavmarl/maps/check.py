@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from cavmarl.maps.components import strong_components
 from cavmarl.roads.cache import load_network
+from cavmarl.roads.horizon import horizon_of
 from cavmarl.roads.network import SIGNAL_STATES, VEHICLE_CLASSES, RoadNetwork
 
 _CAR = 1 << VEHICLE_CLASSES.index("passenger")
@@ -45,6 +46,7 @@ class MapReport:
     max_grade: float  # steepest slope of a lane, as a ratio
     connected_edges: int  # edges in the largest part in which every edge reaches every other
     connected_share: float  # of all edges
+    horizon_s: float  # of an episode, where only the map is named
     dead_ends: tuple[str, ...]  # edges that lead nowhere
     lanes_without_successor: tuple[str, ...]  # lanes that lead nowhere on edges that go on
     junctions_without_right_of_way: tuple[str, ...]  # where lanes meet and the map has no rule
@@ -107,6 +109,7 @@ def check_map(source: str | Path | RoadNetwork) -> MapReport:
         max_grade=grade,
         connected_edges=connected,
         connected_share=share,
+        horizon_s=horizon_of(network),
         **findings,
         problems=tuple(cars.problems()),
         notes=tuple(_notes(findings, share, grade)),

@@ -44,6 +44,18 @@ def test_a_run_says_what_became_of_it(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "collided" in capsys.readouterr().out
 
 
+def test_a_run_in_which_actors_touch_one_another_has_failed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # A second at 4.9 m/s between the centres of cars of 5 m.
+    words = ["unprotected_left_turn", "--param=oncoming_mps=4.9", "--param=gap_s=1"]
+    words += ["--param=cars=2"]
+    assert code("scenario", "run", *words, "--json", str(tmp_path / "run.json")) == 1
+    assert "passed; failed: actors 0 and 1 touched at" in " ".join(capsys.readouterr().out.split())
+    found = json.loads((tmp_path / "run.json").read_text(encoding="utf-8"))
+    assert (found["verdict"], found["verdicts"]) == ("actors collided", ["passed"])
+
+
 def test_a_sweep_says_who_passes_where(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     kept = tmp_path / "sweep.json"
     words = ["scenario", "sweep", "road_closure", "--map", "grid4x4", "--map", "ring"]

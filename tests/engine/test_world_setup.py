@@ -4,15 +4,37 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig, ZonesConfig
 from cavmarl.config.registry import load_config
 from cavmarl.core.errors import ConfigError
-from cavmarl.engine.world_setup import load_roads, load_zones
+from cavmarl.engine.world_setup import load_roads, load_world, load_zones
+from cavmarl.env.vector import make_vec
+from cavmarl.maps.check import check_map
+from cavmarl.roads.cache import load_network
+from cavmarl.roads.horizon import horizon_of
 from cavmarl.zones.partition.zone_file import write_zones
 from cavmarl.zones.partition.zone_layouts import cut_map
+from tests.support.netgenerate import netgenerate
+
+
+class Of(NamedTuple):
+    """What a horizon is taken from."""
+
+    lanes: NDArray[np.void]
+    extent_m: tuple[float, float, float, float]
+
+
+@pytest.fixture(scope="module")
+def grid(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five roads by five, 200 m apart."""
+    path = tmp_path_factory.mktemp("grid") / "grid.net.xml"
+    return netgenerate(path, "--grid", "--grid.number=5", "--grid.length=200")
 
 
 def ring(layout: str) -> tuple[EnvConfig, Path]:
@@ -37,3 +59,41 @@ def test_zones_are_read_from_a_file_beside_the_entry(tmp_path: Path) -> None:
     write_zones(tmp_path / "zones.json", cut_map(network, "grid", 4))
     with pytest.raises(ConfigError, match=r"zones\.count = 1: .* has 4 zones; use 4"):
         load_zones(config, tmp_path, network)
+
+
+def test_a_bare_maps_horizon_follows_its_size(grid: Path) -> None:
+    # 4 · 200 m wide and as high, at SUMO's 13.89 m/s: 115.2 s across, and three times that.
+    worlds = [load_world(grid, agents=2, background=3, zones=zones) for zones in (1, 4)]
+    assert [world.config.horizon_s for world in worlds] == [350.0, 350.0]
+    assert check_map(grid).horizon_s == 350.0
+    assert load_world(grid, overrides={"clock.ctrl_dt_s": 0.15}).config.max_steps == 2333
+
+
+def test_a_horizon_that_is_stated_wins(grid: Path) -> None:
+    assert load_world(grid, overrides={"horizon_s": 42.0}).config.horizon_s == 42.0
+    assert load_world(grid, max_cycles=30).config.max_steps == 30
+    named = {"map.source": str(grid)}
+    assert load_world("ring", overrides=named).config.horizon_s == load_config("ring")[0].horizon_s
+    followed = load_world("ring", overrides={**named, "horizon_s": 0.0}).config
+    assert followed.horizon_s == 350.0
+
+
+def test_a_horizon_by_the_map_is_from_one_to_fifteen_minutes(grid: Path) -> None:
+    network = load_network(grid)
+    for extent_m, horizon_s in (((0, 0, 50, 50), 60.0), ((0, 0, 9e3, 9e3), 900.0)):
+        assert horizon_of(Of(network.lanes, extent_m)) == horizon_s  # type: ignore[arg-type]
+
+
+def test_each_process_and_episode_has_the_horizon_of_the_map(grid: Path) -> None:
+    settings = {"population.mode": "respawn", "clock.sim_dt_s": 0.2, "clock.ctrl_dt_s": 2.0}
+    vec = make_vec(grid, num_envs=1, workers=1, agents=1, background=0, overrides=settings)
+    try:
+        lengths = []
+        vec.reset(seed=0)
+        for step in range(350):
+            _, _, _, _, infos = vec.step(np.zeros((1, 1, 2)))
+            if infos["episode_over"].all():
+                lengths.append(step + 1)
+        assert lengths == [175, 350]
+    finally:
+        vec.close()

@@ -12,8 +12,8 @@ from cavmarl.core.math.geometry import boxes_overlap
 from cavmarl.evaluate.scenarios.criticality import (
     TRACE,
     _box,
+    least_ttc_s,
     post_encroachment_s,
-    time_to_collision_s,
 )
 
 
@@ -24,7 +24,7 @@ def body(
 
 
 def ttc(one: NDArray[np.void], other: NDArray[np.void]) -> float:
-    return time_to_collision_s(one[0], other[0])
+    return least_ttc_s(one, other)
 
 
 def test_times_that_one_can_reckon() -> None:

@@ -29,7 +29,7 @@ from cavmarl.driving.kernels.following import (
     response,
     wish,
 )
-from cavmarl.driving.kernels.junctions import may_enter, press_inside, waits_inside
+from cavmarl.driving.kernels.junctions import STOP_LINE_M, may_enter, press_inside, waits_inside
 from cavmarl.driving.kernels.lane_choice import choose_lane, needed_change, thinks_of_lanes
 from cavmarl.driving.kernels.lane_index import VIEW_M, ahead_on, beside_s, last_on
 from cavmarl.driving.kernels.stopping import way_to_stop
@@ -40,7 +40,6 @@ NEAR_M = 8.0  # to a leader so near the corner between matters,
 ASKEW_RAD = 0.7  # if it turns by so much,
 ASKEW_M = 2.5  # which takes this off the gap
 NEXT_LINE_M = 5.0  # and braking way: so near a line is minded by a vehicle with a leader
-STOP_LINE_M = 5.0  # standing with the front nearer than this counts as standing at the line
 LIMIT_DECEL = 2.0  # m/s², how a driver slows for a lower limit ahead,
 LIMIT_LEAD_S = 1.0  # to be down this time before it, as the model lags behind what is allowed
 FALL_IN_M = 100.0  # before the place where a lane change must be made

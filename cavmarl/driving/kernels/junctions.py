@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.numba import kernel
+from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
 from cavmarl.core.records.codes import (
     DRIVER_AGENT,
@@ -46,6 +46,7 @@ EXIT_LANES = 4  # looked along for room,
 EXIT_LOOK_M = 75.0  # and no further than this: ten cars stand there
 IMPATIENCE_S = 180.0  # after which a vehicle that gives way makes others brake
 FORCED_STOP = 4.5  # m/s², and how hard; less in proportion after less time
+STOP_LINE_M = 5.0  # standing with the front nearer than this counts as standing at the line
 STOP_SIGN_S = 0.5  # how long one stands at a stop sign, and before a tie is broken
 WAIT_SLACK_M = 0.5  # a front this far beyond a waiting position still waits there
 STATE_STOP = ord("s")
@@ -74,9 +75,31 @@ def _earliest(distance: float, speed: float, limit: float, accel: float) -> floa
     return (limit - speed) / accel + (distance - ramp) / limit
 
 
+@inlined_kernel
+def must_stop(roads: RoadArrays, link: int, signal: int) -> bool:
+    """Whether each vehicle has to stand once before `link`, whose signal shows `signal`."""
+    state = roads.links[link]["state"]
+    signed = signal == SIGNAL_NONE and (state == STATE_STOP or state == STATE_ALLWAY_STOP)
+    return signed or signal == SIGNAL_STOP_THEN_GO
+
+
+@inlined_kernel
+def _goes_on(row: np.void, link: int) -> bool:
+    """Whether a vehicle that has stood before `link` was let in. An agent's says so by moving."""
+    goes: bool = row["driver"] != DRIVER_AGENT or row["wait_s"] == 0.0
+    return goes and row["hold"] == HOLD_NONE and row["stopped_at"] == link
+
+
+@inlined_kernel
+def _gives_way(row: np.void, link: int) -> bool:
+    """Whether a standing vehicle waits before `link` for others: an agent's at its stop line."""
+    stands: bool = row["driver"] == DRIVER_AGENT and row["wait_s"] > 0.0
+    return row["hold"] == HOLD_YIELD or (stands and row["stopped_at"] == link)
+
+
 @kernel
-def _ignores(row: np.void, foe: np.void, link: int, signal: int) -> bool:
-    """Whether a driver at `link` need not wait for an approaching foe that has the right of way.
+def _ignores(row: np.void, foe: np.void, link: int, foe_link: int, signal: int) -> bool:
+    """Whether a driver at `link` need not wait for a foe at `foe_link` that has the right of way.
 
     `signal` is what the foe's own signal shows.
     """
@@ -86,10 +109,10 @@ def _ignores(row: np.void, foe: np.void, link: int, signal: int) -> bool:
         return True  # a vehicle that cannot stop any more was checked before
     if is_let_stand(foe):
         return True
-    if foe["speed"] > STANDING_MPS or foe["hold"] != HOLD_YIELD:
+    if foe["speed"] > STANDING_MPS or not _gives_way(foe, foe_link):
         return False
     # Both wait: the one that has stood longer goes first, and then goes on.
-    if row["hold"] == HOLD_NONE and row["stopped_at"] == link:
+    if _goes_on(row, link):
         return True
     if row["wait_s"] < STOP_SIGN_S or row["speed"] > STANDING_MPS:
         return False
@@ -128,10 +151,11 @@ def _is_harmless(
         return False
     if not (gives_way and conflict["must_yield"]):
         return True
-    if _ignores(row, rows[foe["row"]], link, link_signal(roads, conflict["foe"], phase)):
+    signal = link_signal(roads, conflict["foe"], phase)
+    if _ignores(row, rows[foe["row"]], link, conflict["foe"], signal):
         return True
     patience = min(row["wait_s"] / IMPATIENCE_S, 1.0)
-    if row["hold"] == HOLD_NONE and row["stopped_at"] == link:
+    if _goes_on(row, link):
         patience = 1.0  # it has been let in and goes on
     brakes: bool = foe["speed"] * foe["speed"] < 2.0 * FORCED_STOP * patience * front
     return brakes
@@ -283,11 +307,7 @@ def may_enter(
     target = roads.links[link]
     if target["num_conflicts"] == 0:
         return HOLD_NONE
-    state = target["state"]
-    must_stop = signal == SIGNAL_STOP_THEN_GO or (
-        signal == SIGNAL_NONE and (state == STATE_STOP or state == STATE_ALLWAY_STOP)
-    )
-    if must_stop and row["stopped_at"] != link:
+    if must_stop(roads, link, signal) and row["stopped_at"] != link:
         return HOLD_YIELD
     gives_way = signal != SIGNAL_GREEN_MAJOR and signal != SIGNAL_OFF
     if _blocked_by_foes(
@@ -297,6 +317,24 @@ def may_enter(
     if _exit_blocked(roads, travel, row, link, way, scratch):
         return HOLD_EXIT_BLOCKED
     return HOLD_NONE
+
+
+@inlined_kernel
+def note_stop(
+    roads: RoadArrays,
+    row: np.void,  # VEHICLE of an agent before its tick; stopped_at is written
+    link: int,  # that its plan takes at the end of its lane, or -1
+    phase: NDArray[np.int32],  # (num_signals,) PHASE rows that are on
+) -> None:
+    """Note before which stop sign an agent's vehicle has stood, until it leaves that lane."""
+    if row["stopped_at"] >= 0 and roads.links[row["stopped_at"]]["from_lane"] != row["lane"]:
+        row["stopped_at"] = -1
+    if link < 0 or row["wait_s"] < STOP_SIGN_S or roads.lanes[row["lane"]]["internal"]:
+        return
+    here = roads.lanes[row["lane"]]
+    to_line = here["length_m"] - row["s"] - 0.5 * row["length"] - here["stop_back_m"]
+    if to_line < STOP_LINE_M and must_stop(roads, link, link_signal(roads, link, phase)):
+        row["stopped_at"] = link
 
 
 @kernel

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.geometry import boxes_overlap
+from cavmarl.core.math.geometry import boxes_overlap, time_to_collision_s
 
 TRACE = np.dtype(
     [
@@ -32,36 +32,20 @@ def trace_of(row: np.void, time_s: float) -> tuple[float, ...]:
     return (time_s, *(float(row[name]) for name in names))
 
 
-def time_to_collision_s(one: np.void, other: np.void) -> float:
-    """When two bodies (TRACE) touch if both keep their velocities, in s; inf: never, 0: they do.
-
-    Hayward's time to collision ("Near miss determination through use of a scale of danger", Highway
-    Research Record 384, 1972) for rectangles that move and do not turn: they touch when their
-    shadows overlap on each of the four separating axes.
-    """
-    dx, dy = float(other["x"] - one["x"]), float(other["y"] - one["y"])
-    vx, vy = (
-        float(other["speed"]) * turn(float(other["heading"]))
-        - float(one["speed"]) * turn(float(one["heading"]))
-        for turn in (math.cos, math.sin)
-    )
-    begin, end = 0.0, math.inf
-    for body in (one, other):
-        for angle in (float(body["heading"]), float(body["heading"]) + 0.5 * math.pi):
-            cos, sin = math.cos(angle), math.sin(angle)
-            apart, rate = dx * cos + dy * sin, vx * cos + vy * sin
-            reach = sum(
-                0.5 * float(b["length"]) * abs(math.cos(float(b["heading"]) - angle))
-                + 0.5 * float(b["width"]) * abs(math.sin(float(b["heading"]) - angle))
-                for b in (one, other)
-            )
-            if abs(rate) < 1e-9:
-                if abs(apart) >= reach:
-                    return math.inf
-                continue
-            times = sorted(((-reach - apart) / rate, (reach - apart) / rate))
-            begin, end = max(begin, times[0]), min(end, times[1])
-    return begin if begin < end else math.inf
+def least_ttc_s(one: NDArray[np.void], other: NDArray[np.void]) -> float:
+    """The least `time_to_collision_s` of TRACE (n,) and (m,) over the moments that both have."""
+    _, here, there = np.intersect1d(one["time_s"], other["time_s"], return_indices=True)
+    least = math.inf
+    for i, j in zip(here.tolist(), there.tolist(), strict=True):
+        x1, y1, cos1, sin1, length1, width1 = _box(one[i])
+        x2, y2, cos2, sin2, length2, width2 = _box(other[j])
+        speed1, speed2 = float(one[i]["speed"]), float(other[j]["speed"])
+        ttc = time_to_collision_s(
+            x2 - x1, y2 - y1, speed2 * cos2 - speed1 * cos1, speed2 * sin2 - speed1 * sin1,
+            cos1, sin1, length1, width1, cos2, sin2, length2, width2,
+        )  # fmt: skip
+        least = min(least, ttc)
+    return least
 
 
 def post_encroachment_s(one: NDArray[np.void], other: NDArray[np.void]) -> float:

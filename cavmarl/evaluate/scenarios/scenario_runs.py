@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -27,8 +26,8 @@ from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.evaluate.scenarios.criticality import (
     TRACE,
+    least_ttc_s,
     post_encroachment_s,
-    time_to_collision_s,
     trace_of,
 )
 from cavmarl.policies.policy import load_policy
@@ -60,9 +59,11 @@ class ScenarioRun:
     agents: int  # how many
     background: int  # vehicles beside the agents and the actors
     # `passed` (all through, and none hurt), or what became of the worst of the agents: `collided`,
-    # `off road`, or `stuck`
+    # `off road`, or `stuck`; `actors collided`, with one another and not with an agent: the scene
+    # was not what it should be
     verdict: str
     verdicts: tuple[str, ...]  # of each agent, that to which the scene is played first
+    clash: str  # which actors were the first to touch one another, and when; empty: none
     # least time to collision of an agent with an actor, 0 after a collision with one; None: they
     # were never about to
     min_ttc_s: float | None
@@ -175,6 +176,7 @@ class _Record:
         self._events = np.zeros(len(agents), np.int64)
         self._driven_m, self._left_s = 0.0, 0.0
         self._red_lights = 0
+        self._clash = ""
 
     def take(self) -> None:
         now_s = self._now_s()
@@ -183,6 +185,7 @@ class _Record:
             self._traces.setdefault(int(row["id"]), []).append(trace_of(row, now_s))
         for row in rows[rows["id"] == self._agents[0]]:
             self._driven_m = float(row["distance_m"])
+        self._watch_actors(rows)
         self._red_lights += int(np.count_nonzero(self._now() & EVENT_RED_LIGHT))
 
     def note(self) -> None:
@@ -197,6 +200,9 @@ class _Record:
         traces = {vehicle: np.array(t, TRACE) for vehicle, t in self._traces.items()}
         own = [traces.pop(agent) for agent in self._agents]
         touched = verdict == "collided"
+        self._watch_actors(simulation.vehicles())
+        # Over all agents and actors, and all moments in which both are there.
+        ttcs = [least_ttc_s(one, other) for one in own for other in traces.values()]
         pets = [post_encroachment_s(one, other) for one in own for other in traces.values()]
         rows = simulation.vehicles()
         waits = rows["wait_s"][rows["driver"] == DRIVER_BACKGROUND]
@@ -209,9 +215,10 @@ class _Record:
             zones=simulation.partition.count,
             agents=len(self._agents),
             background=config.population.background,
-            verdict=verdict,
+            verdict="actors collided" if self._clash and not touched else verdict,
             verdicts=verdicts,
-            min_ttc_s=0.0 if touched else _finite(_least_ttc_s(own, traces.values())),
+            clash=self._clash,
+            min_ttc_s=0.0 if touched else _finite(min(ttcs, default=math.inf)),
             pet_s=0.0 if touched else _finite(min(pets, default=math.inf)),
             collisions=simulation.traffic_stats().contacts,
             red_lights=self._red_lights,
@@ -220,6 +227,13 @@ class _Record:
             time_s=self._now_s(),
             state_hash=self._vec.state_hash(),
         )
+
+    def _watch_actors(self, rows: NDArray[np.void]) -> None:
+        together = np.isin(rows["id"], self._actors) & np.isin(rows["hit"], self._actors)
+        if not self._clash and together.any():
+            first = rows[together][0]
+            one, other = sorted(map(self._actors.index, (int(first["id"]), int(first["hit"]))))
+            self._clash = f"actors {one} and {other} touched at {self._now_s():.1f} s"
 
     def _now_s(self) -> float:
         return float(self._simulation.ticks()[0]) * self._vec.config.clock.sim_dt_s
@@ -231,16 +245,6 @@ class _Record:
     def _verdict(self, agent: int) -> str:
         events = int(self._events[agent])
         return next((name for name, event in VERDICTS.items() if events & event), "stuck")
-
-
-def _least_ttc_s(own: Iterable[NDArray[np.void]], others: Iterable[NDArray[np.void]]) -> float:
-    """Over all agents and actors, and all moments in which both are there."""
-    least = math.inf
-    for one, other in product(own, others):
-        _, here, there = np.intersect1d(one["time_s"], other["time_s"], return_indices=True)
-        for i, j in zip(here.tolist(), there.tolist(), strict=True):
-            least = min(least, time_to_collision_s(one[i], other[j]))
-    return least
 
 
 def _finite(value: float) -> float | None:

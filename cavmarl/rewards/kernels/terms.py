@@ -11,6 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.math.geometry import time_to_collision_s
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
 from cavmarl.core.math.scalars import clamp
 from cavmarl.core.numba import kernel
@@ -26,7 +27,7 @@ from cavmarl.core.records.codes import (
 NUM_TERMS = 10
 TTC_HORIZON_S = 4.0  # times to collision above this do not count
 TTC_REACH_M = 60.0
-TTC_WIDTH_M = 2.2  # two vehicles that would pass further apart than this do not collide
+CIRCLE_MARGIN_M = 0.01  # around two circles that would not touch: more than rounding
 
 
 @kernel
@@ -61,15 +62,15 @@ def _comfort(row: np.void, step_s: float) -> float:
 
 
 @kernel
-def _time_to_collision(rows: NDArray[np.void], i: int, grid: Grid) -> float:
+def _ttc_risk(rows: NDArray[np.void], i: int, grid: Grid) -> float:
     """1 - ttc / TTC_HORIZON_S for the vehicle that would be hit first at constant velocities, or 0.
 
-    Vehicles count as discs: `ttc` is when the distance of centres falls to the two half lengths, if
-    their paths come within `TTC_WIDTH_M` (Hayward 1972, in the plane).
+    Asks only about those whose circumscribed circle could touch the own one before the horizon.
     """
     row = rows[i]
-    vx = row["speed"] * math.cos(row["heading"])
-    vy = row["speed"] * math.sin(row["heading"])
+    cos, sin = math.cos(row["heading"]), math.sin(row["heading"])
+    half_length, half_width = 0.5 * row["length"], 0.5 * row["width"]
+    radius = math.sqrt(half_length * half_length + half_width * half_width)
     least = TTC_HORIZON_S
     first_column, last_column = cell_columns(grid, row["x"], TTC_REACH_M)
     first_row, last_row = cell_rows(grid, row["y"], TTC_REACH_M)
@@ -85,17 +86,33 @@ def _time_to_collision(rows: NDArray[np.void], i: int, grid: Grid) -> float:
                 continue
             if abs(body["z"] - row["z"]) > LEVEL_HEIGHT_M:
                 continue
-            wx = body["speed"] * body["cos"] - vx
-            wy = body["speed"] * body["sin"] - vy
-            closing = -(dx * wx + dy * wy)
-            speed_squared = wx * wx + wy * wy
-            if closing <= 0.0 or speed_squared < 1e-6:
-                continue
-            if abs(dx * wy - dy * wx) > TTC_WIDTH_M * math.sqrt(speed_squared):
-                continue
-            distance = math.sqrt(squared)
-            gap = max(distance - body["half_length"] - 0.5 * row["length"], 0.0)
-            least = min(least, gap * distance / closing)
+            vx = body["speed"] * body["cos"] - row["speed"] * cos
+            vy = body["speed"] * body["sin"] - row["speed"] * sin
+            apart = radius + body["radius"] + CIRCLE_MARGIN_M
+            room = squared - apart * apart
+            if room > 0.0:
+                # The squared distance falls by less than 2 · closing a second.
+                closing = -(dx * vx + dy * vy)
+                across = dx * vy - dy * vx
+                if room > 2.0 * least * closing:
+                    continue
+                if across * across > apart * apart * (vx * vx + vy * vy):
+                    continue
+            ttc = time_to_collision_s(
+                dx,
+                dy,
+                vx,
+                vy,
+                cos,
+                sin,
+                half_length,
+                half_width,
+                body["cos"],
+                body["sin"],
+                body["half_length"],
+                body["half_width"],
+            )
+            least = min(least, ttc)
     return 1.0 - least / TTC_HORIZON_S
 
 
@@ -123,7 +140,7 @@ def write_terms(
     out[0] = _progress(row, step_s)
     out[1] = _speed(roads, row)
     out[2] = _comfort(row, step_s)
-    out[3] = _time_to_collision(rows, i, grid)
+    out[3] = _ttc_risk(rows, i, grid)
     out[4] = _event(row, EVENT_COLLIDED)
     out[5] = _event(row, EVENT_OFF_ROAD)
     out[6] = _event(row, EVENT_WRONG_WAY)

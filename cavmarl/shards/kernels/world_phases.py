@@ -32,7 +32,7 @@ from cavmarl.driving.kernels.approach import register_links
 from cavmarl.driving.kernels.contacts import find_contacts
 from cavmarl.driving.kernels.drivers import decide
 from cavmarl.driving.kernels.highway_control import speed_control
-from cavmarl.driving.kernels.junctions import STOP_SIGN_S
+from cavmarl.driving.kernels.junctions import STOP_SIGN_S, note_stop
 from cavmarl.driving.kernels.lane_choice import needed_change
 from cavmarl.driving.kernels.lane_index import index_lanes
 from cavmarl.driving.kernels.motion import move_agent, move_background
@@ -124,6 +124,7 @@ def _drive_agent(
     if row["events"] & EVENTS_THAT_END:
         row["tick"] += 1
         return
+    note_stop(roads, row, plans[row["goal"], row["lane"]]["link"], worlds.signal_phase[w])
     throttle = commands[w, row["agent"], 0]
     steering = commands[w, row["agent"], 1]
     if discrete:
