@@ -109,18 +109,18 @@ def test_every_public_error_is_one_of_ours() -> None:
 def test_every_entry_has_its_ids() -> None:
     names = list(registry.entries())
     for name in names:
-        assert f"cavmarl/{name}-v0" in gymnasium.registry
-        assert f"cavmarl/{name}Agents-v0" in gymnasium.registry
+        assert f"cavmarl/{name}-v1" in gymnasium.registry
+        assert f"cavmarl/{name}Agents-v1" in gymnasium.registry
     ours = {spec for spec in gymnasium.registry if spec.startswith("cavmarl/")}
     assert len(ours) == 4 * len(names), "and each with meta-actions"
 
 
 def test_the_ids_make_environments() -> None:
-    ego = gymnasium.make("cavmarl/ring-v0")
+    ego = gymnasium.make("cavmarl/ring-v1")
     observation, _ = ego.reset(seed=0)
     assert ego.observation_space.contains(observation)
     assert ego.step(ego.action_space.sample())[0].shape == observation.shape
-    rows = gymnasium.make_vec("cavmarl/ringAgents-v0")
+    rows = gymnasium.make_vec("cavmarl/ringAgents-v1")
     observations, _ = rows.reset(seed=0)
     assert observations.shape == rows.observation_space.shape
     ego.close()
@@ -129,6 +129,6 @@ def test_the_ids_make_environments() -> None:
 
 @pytest.mark.skipif(not hasattr(pettingzoo, "register"), reason="needs PettingZoo 1.27")
 def test_pettingzoo_makes_them_by_id() -> None:
-    env = pettingzoo.make("parallel", "cavmarl/ring-v0")
+    env = pettingzoo.make("parallel", "cavmarl/ring-v1")
     observations, _ = env.reset(seed=0)
     assert list(observations) == env.unwrapped.possible_agents

@@ -38,6 +38,7 @@ PROGRAM = Path(__file__).with_name("ippo_torch.py")
 SCRIPTED = ("idm", "random_actions")
 METRICS = {
     "success": "success, %",
+    "arrived": "arrived, %",
     "collision": "collision, %",
     "off_road": "off road, %",
     "red_light": "red light, %",
@@ -45,7 +46,7 @@ METRICS = {
     "delay_s": "delay of an arrival, s",
 }
 JUDGED = ("success", "episode_return")
-PERCENT = frozenset(("success", "collision", "off_road", "red_light"))
+PERCENT = frozenset(("success", "arrived", "collision", "off_road", "red_light"))
 
 
 @dataclass(frozen=True)

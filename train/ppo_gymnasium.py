@@ -73,8 +73,9 @@ class Args:
 
 def make_rows(args: Args) -> Any:
     """The rows, with their observations normalised and their trips recorded."""
-    name = f"cavmarl/{args.env}Agents-v0"
-    if name not in gymnasium.registry:
+    begin = f"cavmarl/{args.env}Agents-v"
+    name = next((known for known in gymnasium.registry if known.startswith(begin)), "")
+    if not name:
         raise ConfigError(f"--env {args.env}: no entry of that name; `cavmarl list` shows them")
     rows = gymnasium.make_vec(
         name,

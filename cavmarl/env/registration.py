@@ -1,9 +1,9 @@
 """The names under which other libraries find the environments.
 
 PettingZoo: the module functions `parallel_env`, `env` and `raw_env`, and, from 1.27 on, ids such
-as `cavmarl/merge-v0` in both its registries. Gymnasium: `cavmarl/merge-v0`, one vehicle of the
-world as a single-agent environment, and `cavmarl/mergeAgents-v0` for `gymnasium.make_vec`, all
-agents as rows; `cavmarl/mergeDiscrete-v0` and `cavmarl/mergeDiscreteAgents-v0` are the same with
+as `cavmarl/merge-v1` in both its registries. Gymnasium: `cavmarl/merge-v1`, one vehicle of the
+world as a single-agent environment, and `cavmarl/mergeAgents-v1` for `gymnasium.make_vec`, all
+agents as rows; `cavmarl/mergeDiscrete-v1` and `cavmarl/mergeDiscreteAgents-v1` are the same with
 meta-actions.
 """
 

@@ -51,7 +51,10 @@ def _percent(name: str, label: str, meaning: str, better: Better) -> Metric:
 METRICS = (
     Metric("episode_return", "return", "", "episode",
            "sum of rewards of an agent id over an episode, mean over the ids", "more"),
-    _share("success", "success", "trips that arrived", "more"),
+    _share("success", "success",
+           "trips that arrived within three times the free time, without a red light and never the "
+           "wrong way", "more"),
+    _share("arrived", "arrived", "trips that arrived", "more"),
     _share("collision", "collision", "trips that ended by touching a vehicle", "less"),
     _share("off_road", "off road", "trips that ended off the road", "less"),
     _share("unfinished", "unfinished", "trips that the horizon cut", "less"),
@@ -103,7 +106,7 @@ def metric_values(
         return np.asarray(episodes[metric.name], dtype=np.float64)
     rows = trips[trips["counted"]]
     if metric.arrived:
-        rows = rows[rows["success"]]
+        rows = rows[rows["arrived"]]
     return np.asarray(rows[metric.name], dtype=np.float64)
 
 

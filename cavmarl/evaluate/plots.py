@@ -22,7 +22,7 @@ Rows = NDArray[np.void]
 INK, MUTED, RULE, ROAD = "#1f2933", "#616e7c", "#d9dee5", "#cfd5dd"
 POLICIES = ("#2563eb", "#d97706", "#0f9d76", "#b4236f", "#7c3aed", "#0e7490")
 OUTCOMES = {
-    "success": ("arrived", "#0f9d76"),
+    "arrived": ("arrived", "#0f9d76"),
     "unfinished": ("cut by the horizon", "#c3cad4"),
     "collision": ("collision", "#d0342c"),
     "off_road": ("off the road", "#e59a2f"),

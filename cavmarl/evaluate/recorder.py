@@ -12,6 +12,7 @@ from cavmarl.rewards.kernels.terms import TTC_HORIZON_S
 
 SHORT_TTC_S = 1.5  # below this a driver has no time left to react (Hayward 1972; SSAM)
 PET_HORIZON_S = 10.0  # a later pass after another is no encounter
+SLOWEST = 3.0  # times what the way takes at the limit: a success takes no longer
 MIN_DISTANCE_M = 1.0  # of a trip whose delay a kilometre is compared
 JERK_UNIT_MPS3 = 10.0  # of the term `comfort`
 MESSAGE_COLUMNS = ("v2x_reception_ratio", "v2x_latency_s", "v2x_busy_ratio")
@@ -106,8 +107,8 @@ class Recorder:
         rows["collision"] = sums[:, _TERM["collision"]] > 0.0
         rows["off_road"] = (sums[:, _TERM["off_road"]] > 0.0) & ~rows["collision"]
         out = rows["collision"] | rows["off_road"]
-        rows["success"] = (sums[:, _TERM["arrival"]] > 0.0) & ~out
-        rows["unfinished"] = ~(rows["success"] | out)
+        rows["arrived"] = (sums[:, _TERM["arrival"]] > 0.0) & ~out
+        rows["unfinished"] = ~(rows["arrived"] | out)
         rows["red_light"] = sums[:, _TERM["red_light"]] > 0.0
         rows["wrong_way"] = sums[:, _TERM["wrong_way"]] > 0.0
         rows["reward"] = self._rewards[ended]
@@ -115,6 +116,9 @@ class Recorder:
         rows["distance_m"] = sums[:, _TERM["progress"]]
         rows["mean_speed_mps"] = rows["distance_m"] / rows["duration_s"]
         rows["delay_s"] = sums[:, _TERM["delay"]]
+        at_fault = rows["red_light"] | rows["wrong_way"]
+        free_s = rows["duration_s"] - rows["delay_s"]
+        rows["success"] = rows["arrived"] & ~at_fault & (rows["duration_s"] <= SLOWEST * free_s)
         rows["mean_jerk_mps3"] = JERK_UNIT_MPS3 * sums[:, _TERM["jerk"]] / steps
         rows["mean_speeding"] = sums[:, _TERM["speeding"]] / steps
         rows["least_ttc_s"] = TTC_HORIZON_S * (1.0 - self._worst_ttc[ended])

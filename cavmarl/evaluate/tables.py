@@ -30,10 +30,12 @@ TRIP = np.dtype(
         ("agent", np.int64),  # index of the agent that drove it
         ("began_s", np.float64),  # time of the episode at its first decision
         ("counted", np.bool_),  # began in the first half of its episode
-        ("success", np.bool_),  # how it ended: one of these four
+        ("arrived", np.bool_),  # how it ended: one of these four
         ("collision", np.bool_),
         ("off_road", np.bool_),
         ("unfinished", np.bool_),  # the horizon cut it
+        # arrived within SLOWEST times the free time, without a red light and never the wrong way
+        ("success", np.bool_),
         ("red_light", np.bool_),  # whether it ever passed one
         ("wrong_way", np.bool_),  # whether it ever drove against its lane
         ("reward", np.float64),  # sum over the trip

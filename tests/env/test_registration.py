@@ -21,14 +21,14 @@ ALL = sorted(entries())
 
 @pytest.mark.parametrize("name", ALL)
 def test_every_entry_has_its_ids(name: str) -> None:
-    assert f"cavmarl/{name}-v0" in gymnasium.registry
-    assert f"cavmarl/{name}Agents-v0" in gymnasium.registry
-    assert f"cavmarl/{name}Discrete-v0" in gymnasium.registry
-    assert f"cavmarl/{name}DiscreteAgents-v0" in gymnasium.registry
+    assert f"cavmarl/{name}-v1" in gymnasium.registry
+    assert f"cavmarl/{name}Agents-v1" in gymnasium.registry
+    assert f"cavmarl/{name}Discrete-v1" in gymnasium.registry
+    assert f"cavmarl/{name}DiscreteAgents-v1" in gymnasium.registry
     if not hasattr(pettingzoo, "make"):
         pytest.skip("this PettingZoo has no registry")
     for kind in ("parallel", "aec"):
-        world = pettingzoo.make(kind, f"cavmarl/{name}-v0", max_cycles=3)
+        world = pettingzoo.make(kind, f"cavmarl/{name}-v1", max_cycles=3)
         world.reset(seed=0)
         assert world.agents
 
@@ -36,11 +36,11 @@ def test_every_entry_has_its_ids(name: str) -> None:
 def test_the_discrete_ids_have_meta_actions_whatever_else_is_set() -> None:
     """Programs such as CleanRL's take an id and nothing else."""
     five = gymnasium.spaces.Discrete(5)
-    assert gymnasium.make("cavmarl/ringDiscrete-v0").action_space == five
-    assert gymnasium.make("cavmarl/ring-v0").action_space != five
+    assert gymnasium.make("cavmarl/ringDiscrete-v1").action_space == five
+    assert gymnasium.make("cavmarl/ring-v1").action_space != five
     more = {"overrides": {"sensors.lidar.rays": 8}}
-    assert gymnasium.make("cavmarl/ringDiscrete-v0", **more).action_space == five
-    rows = gymnasium.make_vec("cavmarl/ringDiscreteAgents-v0", num_envs=2, **more)
+    assert gymnasium.make("cavmarl/ringDiscrete-v1", **more).action_space == five
+    rows = gymnasium.make_vec("cavmarl/ringDiscreteAgents-v1", num_envs=2, **more)
     assert rows.single_action_space == five
 
 
@@ -125,7 +125,7 @@ def test_odd_folders_beside_fail_no_import(tmp_path: Path, monkeypatch: pytest.M
         [sys.executable, "-W", "error", "-c", told], capture_output=True, text=True, check=True
     )
     ids = set(done.stdout.splitlines())
-    assert {"cavmarl/fine-v999999999", "cavmarl/ring-v0"} <= ids
+    assert {"cavmarl/fine-v999999999", "cavmarl/ring-v1"} <= ids
     assert not any(" " in name or "-dash" in name for name in ids)
     with pytest.raises(cavmarl.ConfigError, match="latin"):
         cavmarl.parallel_env("latin")

@@ -41,7 +41,7 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_ends_of_trips_add_up(by_chance: EvaluationReport) -> None:
     found = by_chance["random_actions"]
-    ends = [found[name].mean for name in ("success", "collision", "off_road", "unfinished")]
+    ends = [found[name].mean for name in ("arrived", "collision", "off_road", "unfinished")]
     assert sum(end or 0.0 for end in ends) == pytest.approx(1.0)
     assert found.trips >= SMALL["episodes"] * SMALL["agents"]
     assert (found["off_road"].mean or 0.0) > 0.5

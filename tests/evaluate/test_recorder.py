@@ -62,7 +62,7 @@ def test_a_trip_is_the_sum_of_its_steps() -> None:
     )
     worlds.add(done=(True, True), progress=(6.0, 1.0), arrival=(1.0, 0.0), collision=(0.0, 1.0))
     trips = worlds.trips
-    assert trips["success"].tolist() == [True, False]
+    assert trips["arrived"].tolist() == [True, False]
     assert trips["collision"].tolist() == [False, True]
     assert trips["red_light"].tolist() == [True, False]
     assert trips["distance_m"].tolist() == [12.0, 3.0]
@@ -114,7 +114,7 @@ def test_who_has_touched_another_or_left_the_road_does_not_arrive_any_more() -> 
     trips = worlds.trips
     assert trips["collision"].tolist() == [True, False]
     assert trips["off_road"].tolist() == [False, True]
-    assert not (trips["success"] | trips["unfinished"]).any()
+    assert not (trips["success"] | trips["arrived"] | trips["unfinished"]).any()
 
 
 def test_the_horizon_cuts_a_trip_and_it_is_neither() -> None:
@@ -123,7 +123,25 @@ def test_the_horizon_cuts_a_trip_and_it_is_neither() -> None:
     worlds.add(over=(True, True))
     trips = worlds.trips
     assert trips["unfinished"].tolist() == [True, True]
-    assert not (trips["success"] | trips["collision"] | trips["off_road"]).any()
+    assert not (trips["arrived"] | trips["collision"] | trips["off_road"]).any()
+
+
+@pytest.mark.parametrize("fault", ["red_light", "wrong_way"])
+def test_a_success_keeps_the_rules(fault: str) -> None:
+    worlds = Worlds()
+    worlds.add(**{fault: (1.0, 0.0)})
+    worlds.add(done=(True, True), arrival=(1.0, 1.0))
+    assert worlds.trips["arrived"].tolist() == [True, True]
+    assert worlds.trips["success"].tolist() == [False, True]
+
+
+def test_a_success_takes_three_times_the_free_time_at_most() -> None:
+    worlds = Worlds()
+    worlds.add(delay=(STEP_S, STEP_S))
+    worlds.add(delay=(STEP_S, STEP_S))
+    worlds.add(done=(True, True), arrival=(1.0, 1.0), delay=(0.0, 0.01 * STEP_S))
+    assert worlds.trips["arrived"].tolist() == [True, True]
+    assert worlds.trips["success"].tolist() == [True, False]  # 3 steps, of which 1 and 0.99 free
 
 
 def test_trips_of_the_second_half_do_not_count_however_they_end() -> None:

@@ -29,7 +29,7 @@ from cavmarl.traffic.sumo.sumo_demand import SumoDemand
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
 MANIFEST_FILE = "manifest.json"
-SCHEMA = 1
+SCHEMA = 2
 
 Document = dict[str, Any]
 
