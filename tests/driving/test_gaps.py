@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cavmarl.core.records.codes import HOLD_YIELD, SIGNAL_NONE
+from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_BACKGROUND, HOLD_YIELD, SIGNAL_NONE
 from cavmarl.driving.kernels.approach import APPROACH
 from cavmarl.driving.kernels.junctions import _foe_blocks, _ignores
 from cavmarl.roads.sumo_net.reader import read_network
@@ -99,4 +99,17 @@ def test_of_two_that_give_way_to_each_other_the_one_goes_that_has_stood_longer(
         speed=[speed, 0.0],
         hold=HOLD_YIELD,
     )
-    assert _ignores(row, foe, 0, SIGNAL_NONE) == goes
+    assert _ignores(row, foe, 0, 1, SIGNAL_NONE) == goes
+
+
+@pytest.mark.parametrize(("stopped_at", "goes"), [(1, True), (2, False)])
+def test_an_agent_that_stands_at_its_stop_line_gives_way(stopped_at: int, goes: bool) -> None:
+    row, foe = vehicles(
+        [(0.0, 0.0, 0.0)] * 2,
+        id=[5, 3],
+        wait_s=[0.6, 0.2],
+        speed=0.0,
+        driver=[DRIVER_BACKGROUND, DRIVER_AGENT],
+        stopped_at=[-1, stopped_at],
+    )
+    assert _ignores(row, foe, 0, 1, SIGNAL_NONE) == goes
