@@ -110,6 +110,7 @@ class _Run:
         self._random = random.Random(spec.seed)
         self._nodes, self._kills = nodes, kills
         self._struck: set[int] = set()  # processes that were killed
+        self._timers: list[Timer] = []
         whole = make_vec(spec.env, num_envs=worlds, **spec.keywords)
         over = make_vec(spec.env, num_envs=worlds, zones=zones, nodes=nodes, **spec.keywords)
         assert isinstance(over.worlds, NodeWorlds)
@@ -122,7 +123,7 @@ class _Run:
 
     def compare(self, steps: int, note: Callable[[int], None]) -> NodeRun:
         struck = set(self._random.sample(range(FIRST_STEPS, steps), self._kills))
-        whole, over = (run.vec for run in self._runs)
+        over = self._runs[1].vec
         different: int | None = None
         calm_ms: list[float] = []
         recovery_ms: list[float] = []
@@ -134,13 +135,17 @@ class _Run:
                 before, began = self._worlds.recoveries, time.perf_counter()
                 second = self._runs[1].step()
                 took_ms = 1e3 * (time.perf_counter() - began)
-                hashes = [[vec.state_hash(w) for w in range(vec.num_envs)] for vec in (whole, over)]
-                if not same_bytes(first, second) or hashes[0] != hashes[1]:
+                one, other = self._hashes()
+                if not same_bytes(first, second) or one != other:
                     different = step
                     break
                 lost = self._worlds.recoveries > before
                 (recovery_ms if lost else calm_ms).append(took_ms)
                 note(step + 1)
+            for timer in self._timers:
+                timer.join()
+            one, other = self._hashes()  # a node that was killed last is missed now
+            different = steps if different is None and one != other else different
             migrations = self._worlds.migrations
             killed = sum(not zones for zones in self._worlds.zones)
         finally:
@@ -155,4 +160,9 @@ class _Run:
         pid = self._random.choice([pid for pid in pids if pid not in self._struck])
         self._struck.add(pid)
         delay_s = 1e-3 * self._random.uniform(0.0, LATEST * step_ms)
-        Timer(delay_s, os.kill, (pid, signal.SIGKILL)).start()
+        self._timers.append(Timer(delay_s, os.kill, (pid, signal.SIGKILL)))
+        self._timers[-1].start()
+
+    def _hashes(self) -> list[list[str]]:
+        vecs = [run.vec for run in self._runs]
+        return [[vec.state_hash(w) for w in range(vec.num_envs)] for vec in vecs]
