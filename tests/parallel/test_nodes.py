@@ -97,6 +97,19 @@ def test_nodes_that_are_lost_at_any_time(make: Make, env: str, seed: int) -> Non
     assert sum(map(bool, over_nodes(vec).zones)) == 1
 
 
+def test_a_node_that_stops_is_taken_for_lost(make: Make) -> None:
+    wanted = {**WANTED, "overrides": {"workers.timeout_s": 1.0}}
+    whole = drive(make("grid4x4", **wanted))
+    vec = make("grid4x4", zones=4, nodes=3, **wanted)
+
+    def strike(step: int) -> None:
+        if step == 5:
+            os.kill(over_nodes(vec).processes[1].pid, signal.SIGSTOP)
+
+    assert same(drive(vec, before=strike), whole)
+    assert over_nodes(vec).zones[1] == []
+
+
 def test_two_nodes_apart_are_lost_at_once(make: Make) -> None:
     whole = drive(make("grid4x4", **WANTED))
     vec = make("grid4x4", zones=4, nodes=4, **WANTED)

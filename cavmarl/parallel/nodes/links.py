@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterable, Sequence
 from enum import IntEnum
 from typing import NamedTuple, TypeAlias
 
-from cavmarl.core.errors import MessageError, WorkerError
+from cavmarl.core.errors import MessageError
 
 MAGIC = b"cavN"
 VERSION = 1
@@ -44,6 +44,8 @@ class FrameKind(IntEnum):
     KEEP = 10  # N → N: the state of a node's zones, for when it is lost
     RECOVER = 11  # C → N: nodes are lost; go back to a state that was kept
     SYNC = 12  # N → N: all before this is of no use any more
+    PING = 13  # C → N: answer at once
+    PONG = 14  # N → C: the answer
 
 
 class NodeFrame(NamedTuple):
@@ -54,9 +56,13 @@ class NodeFrame(NamedTuple):
     data: memoryview
 
 
-URGENT = frozenset({FrameKind.MESSAGES, FrameKind.KEEP})
+URGENT = frozenset({FrameKind.MESSAGES, FrameKind.KEEP, FrameKind.PING, FrameKind.PONG})
 Urgent: TypeAlias = Callable[[int, NodeFrame], None]
 """What is called with an urgent frame as soon as it has come, and the number of its sender."""
+
+
+class SilenceError(Exception):
+    """Nothing has come for long."""
 
 
 class LinkLostError(Exception):
@@ -205,7 +211,7 @@ class Links:
         Raises:
             LinkLostError: one of them has gone.
             MessageError: what came is no frame.
-            WorkerError: nothing has come in time.
+            SilenceError: nothing has come in time.
         """
         missing = set(wanted)
         found: dict[int, NodeFrame] = {}
@@ -222,7 +228,7 @@ class Links:
                 return found
             left_ms = None if until_s is None else 1e3 * max(until_s - time.monotonic(), 0.0)
             if left_ms == 0.0:
-                raise WorkerError(f"nodes {sorted(missing)} do not answer within {timeout_s:g} s")
+                raise SilenceError(f"nodes {sorted(missing)} do not answer within {timeout_s:g} s")
             self.pump(left_ms)
 
     def pump(self, timeout_ms: float | None) -> None:

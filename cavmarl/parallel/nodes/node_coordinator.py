@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 
@@ -11,7 +12,7 @@ from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import Ack, Begin, Birth, Message, Nack, Output
 from cavmarl.ownership.reactions import Hosting
-from cavmarl.parallel.nodes.links import FrameKind, Links, NodeFrame
+from cavmarl.parallel.nodes.links import FrameKind, Links, NodeFrame, SilenceError
 from cavmarl.parallel.nodes.zone_hosts import Report, packed, unpacked
 
 
@@ -135,10 +136,17 @@ class NodeCoordinator:
             world.states.digests = {v: bytes.fromhex(digest) for v, _, digest in movers}
             world.births += [Birth(v, zone, b"") for report in said for v, zone in report.births]
 
-    def begin(self) -> None:
-        """Decide the way to the next tick, once all offers are answered, and lease it."""
+    def begin(self, timeout_s: float) -> None:
+        """Decide the way to the next tick, once all offers are answered, and lease it.
+
+        Raises:
+            SilenceError: an offer is not answered in time.
+        """
+        until_s = time.monotonic() + timeout_s
         while any(not set(world.movers) <= world.answered for world in self._worlds):
-            self._links.pump(None)
+            if time.monotonic() > until_s:
+                raise SilenceError(f"offers are not answered within {timeout_s:g} s")
+            self._links.pump(1e3 * timeout_s)
         messages = []
         for w, world in enumerate(self._worlds):
             births, world.births = world.births, []

@@ -109,6 +109,8 @@ class NodeProgram:
         """Take an urgent frame."""
         if frame.kind is FrameKind.KEEP:
             self._kept.take(number, frame)
+        elif frame.kind is FrameKind.PING:
+            self._links.send(COORDINATOR, FrameKind.PONG, frame.number)
         else:
             self._hosts.hear(number, frame)
 

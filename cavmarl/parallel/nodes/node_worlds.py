@@ -30,7 +30,13 @@ from cavmarl.parallel.commanded_worlds import own_error, uncopied, unsaved
 from cavmarl.parallel.hosts.listener import Listener
 from cavmarl.parallel.journaled_worlds import unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
-from cavmarl.parallel.nodes.links import FrameKind, LinkLostError, Links, NodeFrame
+from cavmarl.parallel.nodes.links import (
+    FrameKind,
+    LinkLostError,
+    Links,
+    NodeFrame,
+    SilenceError,
+)
 from cavmarl.parallel.nodes.meeting import calls_of
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
 from cavmarl.parallel.nodes.node_frames import pieces_of, take_results
@@ -47,6 +53,7 @@ log = logging.getLogger("cavmarl.nodes")
 
 NODE = "cavmarl.parallel.nodes.node_process"  # the program of a node
 ADDRESS = "127.0.0.1"  # where nodes of this machine meet
+PONG_S = 1.0  # for a living node to answer
 KEEP_S = 0.2  # so much of work may have to be done again
 START_S = 120.0  # for nodes to load their world; compiling takes longest
 
@@ -106,6 +113,9 @@ class NodeWorlds:
         self._lost: list[int] = []
         self._is_torn = False
         self.recoveries = 0
+        self._timeout_s = config.workers.timeout_s
+        self._answered: set[int] = set()  # nodes that answered the last PING
+        self._pings = 0
         self._ticks_per_step = config.clock.ticks_per_step
         self._links = Links(_nothing)
         self.processes: list[subprocess.Popen[Any]] = []
@@ -118,7 +128,7 @@ class NodeWorlds:
             self._links,
             journals,
         )
-        self._links.urgent = self._coordinator.hear
+        self._links.urgent = self._hear
         hostings = self._coordinator.host()
         self._runs = [run.run.hex() for run in runs]
         job = {
@@ -134,6 +144,9 @@ class NodeWorlds:
             LocalWorlds(unwatched(world), 1, warm=True)
         try:
             self._start(nodes, json.dumps(job).encode())
+        except (LinkLostError, SilenceError) as error:
+            self.close()
+            raise WorkerError(f"{error} before it had begun; see standard error") from error
         except BaseException:
             self.close()
             raise
@@ -177,7 +190,7 @@ class NodeWorlds:
         """
         found: dict[int, NodeFrame] = {}
         while missing := [number for number in self._living if number not in found]:
-            for number, frame in self._links.take(missing, timeout_s).items():
+            for number, frame in self._links.take(missing, timeout_s or self._timeout_s).items():
                 if frame.kind is FrameKind.FAILED:
                     name, text, trace = json.loads(bytes(frame.data))
                     failure = WorkerFailureError(number, self._name(number), name, text, trace)
@@ -218,6 +231,8 @@ class NodeWorlds:
                 break
             except LinkLostError as lost:
                 self._lose(lost.peer)
+            except SilenceError as silence:
+                self._lose(self._silent(silence))
         if command.changes and self._opened is not None:
             self._state, self._opened = self._opened, None
             self._log = self._log[self._log.index(command) :]
@@ -238,9 +253,37 @@ class NodeWorlds:
             return [frame.data for frame in self._take(FrameKind.RESULT).values()]
         results: list[memoryview] = []
         for _ in range(command.ticks):
-            self._coordinator.begin()
+            self._coordinator.begin(self._timeout_s)
             results = self._commit()
         return results if command.ticks else self._commit()
+
+    def _hear(self, number: int, frame: NodeFrame) -> None:
+        """Take an urgent frame."""
+        if frame.kind is not FrameKind.PONG:
+            self._coordinator.hear(number, frame)
+        elif frame.number == self._pings:
+            self._answered.add(number)
+
+    def _silent(self, silence: SilenceError) -> int:
+        """A node that answers nothing: it has stopped.
+
+        Raises:
+            WorkerError: all answer, and yet nothing comes of the command.
+        """
+        self._pings += 1
+        self._answered.clear()
+        until_s = time.monotonic() + PONG_S
+        try:
+            for number in self._living:
+                self._links.send(number, FrameKind.PING, self._pings)
+            while time.monotonic() < until_s and len(self._answered) < len(self._living):
+                self._links.pump(1e3 * PONG_S)
+        except LinkLostError as lost:
+            return lost.peer
+        mute = [number for number in self._living if number not in self._answered]
+        if not mute:
+            raise WorkerError(f"{silence}, though they live") from silence
+        return mute[0]
 
     def _lose(self, number: int) -> None:
         """A node is gone: nothing of it counts any more."""
