@@ -200,6 +200,6 @@ def test_what_needs_the_worlds_here_is_refused(make: Make) -> None:
 
 
 def test_a_node_that_cannot_begin_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cavmarl.parallel.nodes.node_worlds.NODE", "cavmarl.nothing")
+    monkeypatch.setattr("cavmarl.parallel.nodes.node_pool.NODE", "cavmarl.nothing")
     with pytest.raises(WorkerError, match="before it had begun"):
         make_vec("grid4x4", zones=2, nodes=2)
