@@ -5,11 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import typer
 from rich.console import Console
 from rich.table import Table
 
 from cavmarl.bench.harness import make_table, measuring
-from cavmarl.cli.output import JsonPath, MapName, Seed, about, about_file, number, write_json
+from cavmarl.cli.bench.traffic_worlds import compare_worlds
+from cavmarl.cli.output import (
+    JsonPath,
+    Seed,
+    about,
+    about_file,
+    make_folder,
+    number,
+    write_json,
+)
 from cavmarl.core.errors import ConfigError, require
 
 if TYPE_CHECKING:
@@ -31,10 +41,13 @@ _ROWS = {
 
 
 def traffic(
-    map_name: MapName,
+    map_name: Annotated[
+        str, typer.Argument(metavar="[MAP]", help="A map file, or an environment's name or folder.")
+    ] = "",
     demand: Annotated[
-        list[Path], about("A .rou.xml, .add.xml or .sumocfg; may be repeated.", "--demand", "-d")
-    ],
+        list[Path] | None,
+        about("A .rou.xml, .add.xml or .sumocfg; may be repeated.", "--demand", "-d"),
+    ] = None,
     seconds: Annotated[int, about("Simulated seconds, from the demand's beginning.")] = 900,
     dt: Annotated[float, about("Step length of both, in seconds.")] = 0.1,
     seed: Seed = 0,
@@ -47,9 +60,31 @@ def traffic(
     ] = False,
     after: Annotated[int, about("With --speed: simulated seconds before the first turn.")] = 120,
     repeats: Annotated[int, about("With --speed: turns of 10 simulated seconds of each side.")] = 5,
+    worlds: Annotated[
+        int | None, about("Draw so many worlds by chance and compare all; no MAP.")
+    ] = None,
+    first_seed: Annotated[int, about("With --worlds: the first one's seed.")] = 0,
+    out: Annotated[
+        Path, about("With --worlds: folder of the results; rows that are there stay.")
+    ] = Path("traffic_worlds"),
+    without: Annotated[
+        list[str] | None, about("With --worlds: a feature to leave out; may be repeated.")
+    ] = None,
+    maps: Annotated[
+        Path | None, about("With --worlds: folder of maps to cut; default: SUMO's own.")
+    ] = None,
     json_path: JsonPath = None,
 ) -> None:
     """Our traffic beside SUMO's own run: same map, demand, seed and step length."""
+    if worlds is not None:
+        if map_name or demand or plot is not None or speed:
+            raise ConfigError("--worlds: draws maps and demands itself; leave out MAP, -d, --plot")
+        make_folder(out)
+        more = {"without": tuple(without or ()), "maps": maps}
+        compare_worlds(worlds, first_seed, out, seconds, dt, json_path, **more)
+        return
+    if not map_name or not demand:
+        raise ConfigError("give a MAP and its --demand FILE, or --worlds N to draw both by chance")
     from cavmarl.bench.traffic_speed import measure_traffic_speed
     from cavmarl.evaluate.traffic.traffic_comparison import compare_traffic
     from cavmarl.evaluate.traffic.traffic_plot import plot_fundamental_diagram
