@@ -22,6 +22,7 @@ from cavmarl.core.records.codes import (
     HOLD_SIGNAL,
     HOLD_YIELD,
     SIGNAL_GREEN_MAJOR,
+    SIGNAL_GREEN_MINOR,
     SIGNAL_NONE,
     SIGNAL_OFF,
     SIGNAL_RED,
@@ -44,11 +45,14 @@ LAST_CHANCE_M = 3.0  # with the front this near to the line
 ROOM_M = 3.0  # free way left behind a vehicle that clears a junction
 EXIT_LANES = 4  # looked along for room,
 EXIT_LOOK_M = 75.0  # and no further than this: ten cars stand there
-IMPATIENCE_S = 180.0  # after which a vehicle that gives way makes others brake
-FORCED_STOP = 4.5  # m/s², and how hard; less in proportion after less time
+IMPATIENCE_S = 180.0  # after which a vehicle that gives way counts on others to brake,
+FORCED_STOP = 4.5  # m/s², and how hard for one that is on its way
+STUCK_S = 60.0  # after which it passes others that stand and give way, too
 STOP_LINE_M = 5.0  # standing with the front nearer than this counts as standing at the line
-STOP_SIGN_S = 0.5  # how long one stands at a stop sign, and before a tie is broken
+STOP_SIGN_S = 0.1  # how long one stands at a stop sign, and before a tie is broken
 WAIT_SLACK_M = 0.5  # a front this far beyond a waiting position still waits there
+STATE_MAJOR = ord("M")
+STATE_EQUAL = ord("=")
 STATE_STOP = ord("s")
 STATE_ALLWAY_STOP = ord("w")
 
@@ -84,6 +88,19 @@ def must_stop(roads: RoadArrays, link: int, signal: int) -> bool:
 
 
 @inlined_kernel
+def is_minor(roads: RoadArrays, link: int, phase: NDArray[np.int32]) -> bool:
+    """Whether vehicles on `link` give way to others already before the junction."""
+    target = roads.links[link]
+    if target["num_conflicts"] == 0 or target["wait_m"] < math.inf:
+        return False
+    signal = link_signal(roads, link, phase)
+    gives_way: bool = signal == SIGNAL_GREEN_MINOR
+    if signal == SIGNAL_NONE:
+        gives_way = target["state"] != STATE_MAJOR
+    return gives_way
+
+
+@inlined_kernel
 def _goes_on(row: np.void, link: int) -> bool:
     """Whether a vehicle that has stood before `link` was let in. An agent's says so by moving."""
     goes: bool = row["driver"] != DRIVER_AGENT or row["wait_s"] == 0.0
@@ -98,10 +115,20 @@ def _gives_way(row: np.void, link: int) -> bool:
 
 
 @kernel
-def _ignores(row: np.void, foe: np.void, link: int, foe_link: int, signal: int) -> bool:
+def _ignores(
+    row: np.void,
+    foe: np.void,
+    link: int,
+    foe_link: int,
+    signal: int,
+    stops_first: bool,
+    in_turn: bool,
+    equal: bool,
+) -> bool:
     """Whether a driver at `link` need not wait for a foe at `foe_link` that has the right of way.
 
-    `signal` is what the foe's own signal shows.
+    `signal` is what the foe's own signal shows; `stops_first`: it has to stand once in any case;
+    `in_turn`: of two that wait the one goes that has stood longer, whatever road it is on.
     """
     if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW:
         return True
@@ -109,10 +136,12 @@ def _ignores(row: np.void, foe: np.void, link: int, foe_link: int, signal: int) 
         return True  # a vehicle that cannot stop any more was checked before
     if is_let_stand(foe):
         return True
-    if foe["speed"] > STANDING_MPS or not _gives_way(foe, foe_link):
+    if stops_first and foe["stopped_at"] != foe_link:
+        return True  # it stands once, too, and has not yet
+    if foe["speed"] > STANDING_MPS or not (_gives_way(foe, foe_link) and in_turn):
         return False
     # Both wait: the one that has stood longer goes first, and then goes on.
-    if _goes_on(row, link):
+    if equal or _goes_on(row, link):
         return True
     if row["wait_s"] < STOP_SIGN_S or row["speed"] > STANDING_MPS:
         return False
@@ -152,13 +181,14 @@ def _is_harmless(
     if not (gives_way and conflict["must_yield"]):
         return True
     signal = link_signal(roads, conflict["foe"], phase)
-    if _ignores(row, rows[foe["row"]], link, conflict["foe"], signal):
+    stops_first = signal == SIGNAL_NONE and roads.links[conflict["foe"]]["state"] == STATE_ALLWAY_STOP
+    state = roads.links[link]["state"]
+    in_turn = state == STATE_EQUAL or state == STATE_ALLWAY_STOP or row["wait_s"] > STUCK_S
+    if _ignores(row, rows[foe["row"]], link, conflict["foe"], signal, stops_first, in_turn, state == STATE_EQUAL):
         return True
-    patience = min(row["wait_s"] / IMPATIENCE_S, 1.0)
-    if _goes_on(row, link):
-        patience = 1.0  # it has been let in and goes on
-    brakes: bool = foe["speed"] * foe["speed"] < 2.0 * FORCED_STOP * patience * front
-    return brakes
+    # A vehicle that has been let in goes on, where others can still brake for it.
+    brakes: bool = foe["speed"] * foe["speed"] < 2.0 * FORCED_STOP * front
+    return brakes and _goes_on(row, link)
 
 
 @kernel
@@ -178,11 +208,11 @@ def _foe_blocks(
     to_clear = foe["dist"] + conflict["foe_leave_m"] + foe["half"]
     if to_clear <= 0.0:
         return False
+    target = roads.links[link]
     foe_link = roads.links[conflict["foe"]]
-    foe_lane = roads.lanes[foe_link["from_lane"]]
     # Its front before the line that it can still stop at: the stop line, or, where the shared
     # area lies beyond that, its waiting position inside.
-    front = foe["dist"] - foe["half"] - foe_lane["stop_back_m"]
+    front = foe["dist"] - foe["half"] - roads.lanes[foe_link["from_lane"]]["stop_back_m"]
     wait_m = foe_link["wait_m"]
     if front <= 0.0 and conflict["foe_enter_m"] >= wait_m - LINE_MARGIN_M:
         front += wait_m + WAIT_SLACK_M
@@ -193,13 +223,23 @@ def _foe_blocks(
     cleared = to_clear / max(foe["speed"], 0.1)
     time_in = _earliest(distance + conflict["enter_m"] - half, row["speed"], limit, FOE_ACCEL)
     if front <= 0.0:
+        if _goes_on(row, link) and distance + conflict["enter_m"] - half > ROOM_M:
+            return False  # it lost its turn if it stood once more, and can wait before the area
+        if foe["speed"] > STANDING_MPS:  # one that has just set off does not stay so slow
+            top = roads.lanes[roads.links[conflict["foe"]]["next_lane"]]["speed_mps"]
+            cleared = _earliest(to_clear, foe["speed"], top, OWN_ACCEL)
         inside: bool = cleared + 0.5 * GAP_S > time_in
         return inside
-    if cleared + GAP_S < time_in:
+    # A foe before its line, and the vehicle itself, are given the whole way over the junction.
+    over = target["wait_m"] if conflict["enter_m"] < target["wait_m"] else target["length_m"]
+    passed = (foe["dist"] + foe_link["length_m"] + foe["half"]) / max(foe["speed"], 0.1)
+    after_s = GAP_S if conflict["merging"] else 0.0
+    if passed + after_s < _earliest(distance - half, row["speed"], limit, FOE_ACCEL):
         return False
-    time_out = _earliest(distance + conflict["leave_m"] + half, row["speed"], limit, OWN_ACCEL)
-    to_area = foe["dist"] + conflict["foe_enter_m"] - foe["half"]
-    arrives = _earliest(to_area, foe["speed"], foe_lane["speed_mps"], FOE_ACCEL)
+    time_out = _earliest(distance + over + half, row["speed"], limit, OWN_ACCEL)
+    # With the speed that it has; it is counted on to brake by those who have waited for long.
+    arrives = (foe["dist"] - foe["half"]) / max(foe["speed"], STANDING_MPS)
+    arrives *= 1.0 + min(row["wait_s"] / IMPATIENCE_S, 1.0)
     return arrives < time_out + GAP_S
 
 
