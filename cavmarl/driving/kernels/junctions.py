@@ -21,6 +21,7 @@ from cavmarl.core.records.codes import (
     HOLD_NONE,
     HOLD_SIGNAL,
     HOLD_YIELD,
+    MODEL_KRAUSS,
     SIGNAL_GREEN_MAJOR,
     SIGNAL_GREEN_MINOR,
     SIGNAL_NONE,
@@ -37,7 +38,8 @@ from cavmarl.driving.kernels.ways import next_step
 
 FOE_ACCEL = 2.5  # m/s², how a driver thinks that others speed up over a junction,
 OWN_ACCEL = 1.8  # and, to be safe, itself
-COMFORT_STOP = 3.0  # m/s², a driver stops for yellow where this braking is enough
+# m/s², a driver stops for yellow where this braking is enough; Krauss's brakes as hard as it can
+COMFORT_STOP = 3.0
 HARD_STOP = 5.0  # m/s², a vehicle that needs more to stop before the line will not stop
 GAP_S = 1.0  # s between the last of one and the first of the other in a shared area
 STEERED_MPS = 5.0  # a steered car is taken to turn no faster than this
@@ -340,7 +342,9 @@ def may_enter(
     needed = row["speed"] * row["speed"] / (2.0 * front)
     if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW:
         return HOLD_SIGNAL
-    if (signal == SIGNAL_YELLOW_MINOR or signal == SIGNAL_YELLOW_MAJOR) and needed < COMFORT_STOP:
+    kind = travel.types[row["vtype"]]
+    stops = kind["decel"] if kind["model"] == MODEL_KRAUSS else COMFORT_STOP
+    if (signal == SIGNAL_YELLOW_MINOR or signal == SIGNAL_YELLOW_MAJOR) and needed < stops:
         # A vehicle that gave way at the line all through green goes now, as the others stop.
         if row["hold"] != HOLD_YIELD or front > LAST_CHANCE_M:
             return HOLD_SIGNAL
