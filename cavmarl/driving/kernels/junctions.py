@@ -51,7 +51,8 @@ IMPATIENCE_S = 180.0  # after which a vehicle that gives way counts on others to
 FORCED_STOP = 4.5  # m/s², and how hard for one that is on its way
 STUCK_S = 60.0  # after which it passes others that stand and give way, too
 STOP_LINE_M = 5.0  # standing with the front nearer than this counts as standing at the line
-STOP_SIGN_S = 0.1  # how long one stands at a stop sign, and before a tie is broken
+STOP_SIGN_S = 0.5  # how long one stands at a stop sign, and before a tie is broken;
+STOOD_S = 0.1  # background vehicles, as SUMO's, only for a moment
 WAIT_SLACK_M = 0.5  # a front this far beyond a waiting position still waits there
 STATE_MAJOR = ord("M")
 STATE_EQUAL = ord("=")
@@ -225,7 +226,9 @@ def _foe_blocks(
     cleared = to_clear / max(foe["speed"], 0.1)
     time_in = _earliest(distance + conflict["enter_m"] - half, row["speed"], limit, FOE_ACCEL)
     if front <= 0.0:
-        if _goes_on(row, link) and distance + conflict["enter_m"] - half > ROOM_M:
+        state = target["state"]
+        in_turn = state == STATE_EQUAL or state == STATE_ALLWAY_STOP
+        if in_turn and _goes_on(row, link) and distance + conflict["enter_m"] - half > ROOM_M:
             return False  # it lost its turn if it stood once more, and can wait before the area
         if foe["speed"] > STANDING_MPS:  # one that has just set off does not stay so slow
             top = roads.lanes[roads.links[conflict["foe"]]["next_lane"]]["speed_mps"]
