@@ -29,13 +29,8 @@ from cavmarl.driving.kernels.following import (
     response,
     wish,
 )
-from cavmarl.driving.kernels.junctions import (
-    STOP_LINE_M,
-    is_minor,
-    may_enter,
-    press_inside,
-    waits_inside,
-)
+from cavmarl.driving.kernels.gaps import is_minor
+from cavmarl.driving.kernels.junctions import STOP_LINE_M, may_enter, press_inside, waits_inside
 from cavmarl.driving.kernels.lane_choice import choose_lane, needed_change, thinks_of_lanes
 from cavmarl.driving.kernels.lane_index import VIEW_M, ahead_on, beside_s, last_on
 from cavmarl.driving.kernels.stopping import way_to_stop

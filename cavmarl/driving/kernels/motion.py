@@ -19,7 +19,7 @@ from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import LaneGrid, RoadArrays, Travel
 from cavmarl.core.records.codes import EVENT_ARRIVED, EVENT_RED_LIGHT, SIGNAL_RED, SIGNAL_RED_YELLOW
 from cavmarl.driving.kernels.bicycle import bicycle_step
-from cavmarl.driving.kernels.junctions import link_signal
+from cavmarl.driving.kernels.gaps import link_signal
 from cavmarl.driving.kernels.lane_index import beside_s
 from cavmarl.driving.kernels.stopping import make_stop
 from cavmarl.driving.kernels.tracking import locate, side_lane

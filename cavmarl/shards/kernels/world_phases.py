@@ -31,8 +31,9 @@ from cavmarl.core.records.rows import is_lost
 from cavmarl.driving.kernels.approach import register_links
 from cavmarl.driving.kernels.contacts import find_contacts
 from cavmarl.driving.kernels.drivers import decide
+from cavmarl.driving.kernels.gaps import STOOD_S
 from cavmarl.driving.kernels.highway_control import speed_control
-from cavmarl.driving.kernels.junctions import STOOD_S, note_stop
+from cavmarl.driving.kernels.junctions import note_stop
 from cavmarl.driving.kernels.lane_choice import needed_change
 from cavmarl.driving.kernels.lane_index import index_lanes
 from cavmarl.driving.kernels.motion import move_agent, move_background
