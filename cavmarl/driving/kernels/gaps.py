@@ -231,9 +231,11 @@ def foe_blocks(
     if passed + after_s < _earliest(distance - half, row["speed"], limit, BRISK_ACCEL):
         return False
     speed = row["speed"]
-    leaves_mps = min(math.sqrt(speed * speed + 2.0 * BRISK_ACCEL * over), max(limit, speed))
+    over += min(distance - half, 0.0)  # from a waiting position: the rest
+    reached = math.sqrt(speed * speed + 2.0 * BRISK_ACCEL * max(over, 0.0))
+    leaves_mps = min(reached, max(limit, speed))
     time_out = _earliest(distance - half, speed, limit, GENTLE_ACCEL)
-    time_out += 2.0 * (over + row["length"]) / (speed + leaves_mps)
+    time_out += 2.0 * (over + row["length"]) / max(speed + leaves_mps, STANDING_MPS)
     # With the speed that it has; it is counted on to brake by those who have waited for long.
     arrives = (foe["dist"] - foe["half"]) / max(foe["speed"], STANDING_MPS)
     arrives *= 1.0 + min(row["wait_s"] / IMPATIENCE_S, 1.0)
