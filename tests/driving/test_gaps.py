@@ -82,18 +82,18 @@ def test_one_that_comes_is_let_over_the_whole_junction(
     assert not blocks(over_s + 0.05, "line", 20.0)
 
 
-def test_before_one_that_comes_to_its_line_it_is_a_second(blocks: Blocks) -> None:
+def test_before_one_that_comes_to_its_line_it_is_two_seconds(blocks: Blocks) -> None:
     # Its front reaches its line in 4 s.
-    assert blocks(3.05, "out", 40.0)
-    assert not blocks(2.95, "out", 40.0)
+    assert blocks(2.05, "out", 40.0)
+    assert not blocks(1.95, "out", 40.0)
 
 
 @pytest.mark.parametrize(("wait_s", "arrives_s"), [(90.0, 6.0), (180.0, 8.0), (900.0, 8.0)])
 def test_one_that_has_waited_for_long_counts_on_others_to_brake(
     blocks: Blocks, wait_s: float, arrives_s: float
 ) -> None:
-    assert blocks(arrives_s - 0.95, "out", 40.0, wait_s)
-    assert not blocks(arrives_s - 1.05, "out", 40.0, wait_s)
+    assert blocks(arrives_s - 1.95, "out", 40.0, wait_s)
+    assert not blocks(arrives_s - 2.05, "out", 40.0, wait_s)
 
 
 def waiting_pair(**fields: Any) -> Any:
@@ -132,11 +132,13 @@ def test_at_an_all_way_stop_one_that_has_not_stood_yet_is_not_waited_for(
 
 
 def test_equals_that_wait_do_not_stop_one_another() -> None:
-    row, foe = waiting_pair(id=[5, 3], wait_s=[0.1, 9.0], speed=0.0)
+    row, foe = waiting_pair(id=[5, 3], wait_s=[3.1, 9.0], speed=0.0)
     assert ignores(row, foe, 0, 1, SIGNAL_NONE, EQUAL, EQUAL)
+    row["wait_s"] = 2.9
+    assert not ignores(row, foe, 0, 1, SIGNAL_NONE, EQUAL, EQUAL), "first the longer one"
 
 
-@pytest.mark.parametrize(("wait_s", "goes"), [(59.0, False), (61.0, True)])
+@pytest.mark.parametrize(("wait_s", "goes"), [(89.0, False), (91.0, True)])
 def test_a_road_comes_first_while_it_waits_itself_but_not_for_ever(
     wait_s: float, goes: bool
 ) -> None:

@@ -162,34 +162,18 @@ def test_the_side_road_waits_for_a_whole_column_and_then_goes(scene: Make) -> No
 
 @pytest.mark.parametrize(
     ("waited_s", "first"),
-    # It is at its line in 3.6 s, and as it is counted on to brake in twice the time after 180 s.
-    [(0.0, "main"), (30.0, "main"), (75.0, "main"), (150.0, "side"), (170.0, "side")],
+    # It is at its line in 5.5 s, and as it is counted on to brake in twice the time after 180 s.
+    [(0.0, "main"), (30.0, "main"), (150.0, "side"), (170.0, "side")],
 )
 def test_who_has_given_way_for_long_is_let_in_by_who_can_brake(
     scene: Make, waited_s: float, first: str
 ) -> None:
     here = scene("priority")
     here.put("side", "S_in_0", 1.0, "N_out", wait_s=waited_s)
-    here.put("main", "W_in_0", 40.0, "E_out", speed=11.0)
+    here.put("main", "W_in_0", 60.0, "E_out", speed=11.0)
     times = here.entries(25.0)
     assert set(times) == {"side", "main"}
     assert min(times, key=lambda name: times[name]) == first
-
-
-def test_one_that_gives_way_comes_ready_to_stop_and_goes_if_nobody_comes(scene: Make) -> None:
-    here = scene("priority")
-    here.put("side", "S_in_0", 60.0, "N_out", speed=13.0)
-    network = here.simulation.network
-    line_m = float(network.lanes["length_m"][network.lane_ids.index("S_in_0")])
-    at_m = {}
-    for _ in here.run(10.0):
-        car = here["side"]
-        if network.lane_ids[car["lane"]] == "S_in_0":
-            at_m[float(line_m - car["s"] - 2.5)] = float(car["speed"])
-    seen = max(front_m for front_m in at_m if front_m <= 4.5)
-    # It could still stop at the line there, and has not done so.
-    assert 4.0 < at_m[seen] < 6.8
-    assert min(at_m.values()) > 4.0
 
 
 def test_patience_does_not_run_into_who_cannot_brake_any_more(scene: Make) -> None:

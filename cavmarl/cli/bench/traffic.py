@@ -80,45 +80,69 @@ def traffic(
         if map_name or demand or plot is not None or speed:
             raise ConfigError("--worlds: draws maps and demands itself; leave out MAP, -d, --plot")
         make_folder(out)
-        more = {"without": tuple(without or ()), "maps": maps}
-        compare_worlds(worlds, first_seed, out, seconds, dt, json_path, **more)
+        chosen = tuple(without or ())
+        compare_worlds(worlds, first_seed, out, seconds, dt, json_path, chosen, maps)
         return
     if not map_name or not demand:
         raise ConfigError("give a MAP and its --demand FILE, or --worlds N to draw both by chance")
+    if speed and plot is not None:
+        raise ConfigError("--plot: draws flow and density, which --speed does not measure; use one")
+    if speed:
+        _measure_speed(map_name, demand, dt, seed, after, repeats, json_path)
+    else:
+        _compare(map_name, demand, seconds, dt, seed, teleports, plot, json_path)
+
+
+def _measure_speed(
+    map_name: str,
+    demand: list[Path],
+    dt: float,
+    seed: int,
+    after: int,
+    repeats: int,
+    json_path: Path | None,
+) -> None:
     from cavmarl.bench.traffic_speed import measure_traffic_speed
+
+    console = Console()
+    with measuring(console) as say:
+        turns = {"after_s": after, "repeats": repeats}
+        found = measure_traffic_speed(map_name, demand, dt_s=dt, seed=seed, progress=say, **turns)
+    console.print(_speeds(found))
+    write_json(json_path, found.to_dict())
+
+
+def _compare(
+    map_name: str,
+    demand: list[Path],
+    seconds: int,
+    dt: float,
+    seed: int,
+    teleports: bool,
+    plot: Path | None,
+    json_path: Path | None,
+) -> None:
     from cavmarl.evaluate.traffic.traffic_comparison import compare_traffic
     from cavmarl.evaluate.traffic.traffic_plot import plot_fundamental_diagram
 
-    if speed and plot is not None:
-        raise ConfigError("--plot: draws flow and density, which --speed does not measure; use one")
     if plot is not None:
         require("matplotlib", "report")
     console = Console()
-    found: TrafficComparison | TrafficSpeed
-    tolerated: tuple[str, ...] = ()
     with measuring(console) as say:
-        if speed:
-            turns = {"after_s": after, "repeats": repeats}
-            found = measure_traffic_speed(
-                map_name, demand, dt_s=dt, seed=seed, progress=say, **turns
-            )
-            table = _speeds(found)
-        else:
-            found = compare_traffic(
-                map_name,
-                demand,
-                seconds=seconds,
-                dt_s=dt,
-                seed=seed,
-                teleports=teleports,
-                progress=say,
-            )
-            table, tolerated = _figures(found), found.tolerated
-            if plot is not None:
-                plot_fundamental_diagram(found, plot)
-    console.print(table)
-    if tolerated:
-        console.print("tolerated in our reading of the demand:", *tolerated, sep="\n")
+        found = compare_traffic(
+            map_name,
+            demand,
+            seconds=seconds,
+            dt_s=dt,
+            seed=seed,
+            teleports=teleports,
+            progress=say,
+        )
+        if plot is not None:
+            plot_fundamental_diagram(found, plot)
+    console.print(_figures(found))
+    if found.tolerated:
+        console.print("tolerated in our reading of the demand:", *found.tolerated, sep="\n")
     write_json(json_path, found.to_dict())
 
 

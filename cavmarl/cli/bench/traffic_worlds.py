@@ -28,9 +28,9 @@ def compare_worlds(
 ) -> None:
     """Run the worlds that have no row yet; print what all rows come to, and the worst."""
     from cavmarl.evaluate.traffic.world_rows import by_feature, summary, worst
-    from cavmarl.evaluate.traffic.world_runs import KEPT, WorldsJob, run_worlds
+    from cavmarl.evaluate.traffic.world_runs import KEPT, WorldSeries, run_worlds
 
-    job = WorldsJob(out, worlds, first_seed, seconds, dt, without, maps)
+    job = WorldSeries(out, worlds, first_seed, seconds, dt, without, maps)
     console = Console()
     with counting(console, "worlds") as bar:
         rows = run_worlds(job, bar)

@@ -38,7 +38,8 @@ AHEAD_S = (
 GAP_S = 1.0  # s between the last of one and the first of the other in a shared area
 ROOM_M = 3.0  # free way left behind a vehicle that clears a junction
 IMPATIENCE_S = 180.0  # after which a vehicle that gives way counts on others to brake,
-FORCED_STOP = 4.5  # m/s², and how hard for one that is on its way
+FORCED_STOP = 4.5  # m/s², and how hard at most
+CRAWL_MPS = 5.0  # a stream that is slower lets others in
 STUCK_S = 90.0  # after which it passes others that stand and give way, too
 STOP_SIGN_S = 0.5  # how long one stands at a stop sign, and before a tie is broken;
 STOOD_S = 0.1  # background vehicles, as SUMO's, only for a moment
@@ -177,9 +178,13 @@ def _is_harmless(
     state, foe_state = roads.links[link]["state"], roads.links[conflict["foe"]]["state"]
     if ignores(row, rows[foe["row"]], link, conflict["foe"], signal, state, foe_state):
         return True
-    # A vehicle that has been let in goes on, where others can still brake for it.
-    brakes: bool = foe["speed"] * foe["speed"] < 2.0 * FORCED_STOP * front
-    return brakes and _goes_on(row, link)
+    # A vehicle that has been let in goes on, where others can still brake for it. A stream that
+    # crawls bumper to bumper lets one in that has waited: the longer, the harder it brakes.
+    patience = 1.0 if _goes_on(row, link) else 0.0
+    if conflict["merging"] and STANDING_MPS < foe["speed"] < CRAWL_MPS:
+        patience = max(patience, min(row["wait_s"] / IMPATIENCE_S, 1.0))
+    brakes: bool = foe["speed"] * foe["speed"] < 2.0 * FORCED_STOP * patience * front
+    return brakes
 
 
 @kernel
@@ -239,4 +244,5 @@ def foe_blocks(
     # With the speed that it has; it is counted on to brake by those who have waited for long.
     arrives = (foe["dist"] - foe["half"]) / max(foe["speed"], STANDING_MPS)
     arrives *= 1.0 + min(row["wait_s"] / IMPATIENCE_S, 1.0)
-    return arrives < time_out + AHEAD_S
+    blocks: bool = arrives < time_out + AHEAD_S
+    return blocks

@@ -27,7 +27,7 @@ from cavmarl.driving.kernels.ways import next_step, own_step, way_left
 
 LATERAL_MPS = 1.4  # fastest sideways motion of a lane change
 LATERAL_RATIO = 0.35  # and no faster than this share of the speed,
-LATERAL_MIN_MPS = 1.0  # but never stuck between two lanes
+LATERAL_MIN_MPS = 0.5  # but never stuck between two lanes
 MAX_DRIFT_RAD = 0.12  # largest angle between a car that changes lanes and its lane
 MAX_BODY_LANES = 8  # that a body may lie on, before and behind its centre
 STANDING_MPS = 0.1

@@ -14,7 +14,7 @@ import numpy as np
 
 from cavmarl.core.errors import ConfigError, MapError, require
 from cavmarl.core.processes import dying_with_parent
-from cavmarl.evaluate.traffic.drawn_worlds import DemandDraw, WorldDraw
+from cavmarl.evaluate.traffic.world_draw import DemandDraw, WorldDraw
 from cavmarl.maps.netconvert import MAP_ENDINGS, build_network, map_file
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
@@ -142,7 +142,8 @@ def _gap_s(demand: DemandDraw, network: RoadNetwork, found: Sequence[Element]) -
     passed = [len(str(route.get("edges")).split()) - 1 for one in found for route in one]
     # Lanes of one road share what a junction lets through.
     flow_per_h = demand.junction_per_h * lanes**0.5 * max(num_junctions, 1)
-    return 3600.0 * max(float(np.mean(passed)), 1.0) / flow_per_h
+    gap_s: float = 3600.0 * max(float(np.mean(passed)), 1.0) / flow_per_h
+    return gap_s
 
 
 def _routes_of(

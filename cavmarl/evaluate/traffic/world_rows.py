@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from cavmarl.evaluate.traffic.drawn_worlds import WorldDraw
 from cavmarl.evaluate.traffic.traffic_comparison import TrafficComparison
+from cavmarl.evaluate.traffic.world_draw import WorldDraw
 
 Row = dict[str, Any]  # a line of worlds.jsonl
 
@@ -78,13 +78,9 @@ def badness(row: Mapping[str, Any]) -> float:
     if "error" in row:
         return 1e6
     off = deviation(row, "mean_speed_mps")
-    left_out = deviation(row, "departed")
-    return (
-        100.0 * row["ours"]["contacts"]
-        + 10.0 * has_own_lock(row)
-        + abs(off or 0.0)
-        + abs(left_out or 0.0)
-    )
+    missing = deviation(row, "departed")
+    faults = 100.0 * row["ours"]["contacts"] + 10.0 * has_own_lock(row)
+    return float(faults + abs(off or 0.0) + abs(missing or 0.0))
 
 
 def worst(rows: Sequence[Row], count: int) -> list[Row]:

@@ -10,11 +10,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from cavmarl.config.env import ClockConfig
 from cavmarl.core.errors import CavmarlError, ConfigError, require
 from cavmarl.engine.simulation import Simulation
-from cavmarl.evaluate.traffic.drawn_worlds import WorldDraw, check_features, draw_world
 from cavmarl.evaluate.traffic.traffic_comparison import compare_traffic
 from cavmarl.evaluate.traffic.traffic_plot import plot_fundamental_diagram
+from cavmarl.evaluate.traffic.world_draw import WorldDraw, check_features, draw_world
 from cavmarl.evaluate.traffic.world_files import NET_FILE, ROUTES_FILE, cut_maps, make_files
 from cavmarl.evaluate.traffic.world_rows import Row, failed_row, row_of, worst
 from cavmarl.render.topdown import WorldView
@@ -25,7 +26,7 @@ SUMO_SEEDS = 3
 
 
 @dataclass(frozen=True)
-class WorldsJob:
+class WorldSeries:
     """Which worlds, and how they are run."""
 
     out: Path  # the folder of the results
@@ -42,6 +43,7 @@ class WorldsJob:
             raise ConfigError(f"worlds = {self.count}: must be at least 1")
         if self.first_seed < 0:
             raise ConfigError(f"first_seed = {self.first_seed}: must be 0 or more")
+        ClockConfig(self.dt_s, self.dt_s)
         check_features(self.without)
         require("libsumo", "sumo")
         object.__setattr__(self, "cut_from", cut_maps(self.maps))
@@ -57,7 +59,7 @@ class WorldsJob:
 
 
 def run_worlds(
-    job: WorldsJob, progress: Callable[[int, int], None] = lambda done, count: None
+    job: WorldSeries, progress: Callable[[int, int], None] = lambda done, count: None
 ) -> list[Row]:
     """Run the worlds that have no row yet; the rows of all that the job names, by seed.
 
@@ -107,7 +109,7 @@ def world_folder(out: Path, seed: int) -> Path:
     return out / f"world_{seed:06d}"
 
 
-def _check_settings(job: WorldsJob) -> None:
+def _check_settings(job: WorldSeries) -> None:
     path = job.out / SETTINGS_FILE
     text = json.dumps(job.settings())
     if not path.exists():
@@ -119,7 +121,7 @@ def _check_settings(job: WorldsJob) -> None:
         )
 
 
-def _run_world(job: WorldsJob, seed: int) -> Row:
+def _run_world(job: WorldSeries, seed: int) -> Row:
     draw = draw_world(seed, job.without)
     folder = world_folder(job.out, seed)
     shutil.rmtree(folder, ignore_errors=True)  # of a run that was ended
@@ -141,7 +143,7 @@ def _run_world(job: WorldsJob, seed: int) -> Row:
     return row_of(draw, found)
 
 
-def _write_commands(job: WorldsJob, draw: WorldDraw, folder: Path) -> None:
+def _write_commands(job: WorldSeries, draw: WorldDraw, folder: Path) -> None:
     """A README of what the world is, and how to run it again."""
     net, routes = folder / NET_FILE, folder / ROUTES_FILE
     words = ["cavmarl", "bench", "traffic", str(net), "--demand", str(routes)]
