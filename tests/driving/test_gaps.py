@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_BACKGROUND, HOLD_YIELD, SIGNAL_NONE
 from cavmarl.driving.kernels.approach import APPROACH
-from cavmarl.driving.kernels.junctions import _foe_blocks, _ignores
+from cavmarl.driving.kernels.gaps import foe_blocks, ignores
+from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network
 from tests.support.builders import vehicles
 from tests.support.crossing import crossing
@@ -20,40 +22,45 @@ __all__ = ["crossing"]
 
 SPEED_MPS = 10.0  # of both, all along: it is the limit
 HALF_M = 2.5
+FROM_WEST, FROM_SOUTH = 0, 1  # LINK rows
 
-Blocks = Callable[[float, str, float], bool]
+Blocks = Callable[..., bool]
+ALLWAY_STOP, EQUAL, MINOR, STOP = map(ord, "w=ms")
 
 
 @pytest.fixture
-def blocks(crossing: Callable[..., Path]) -> Blocks:
+def network(crossing: Callable[..., Path]) -> RoadNetwork:
+    return read_network(crossing())
+
+
+@pytest.fixture
+def blocks(network: RoadNetwork) -> Blocks:
     """Whether a car from the west blocks one from the south, which gives way to it."""
-    network = read_network(crossing())
-    from_south, from_west = 1, 0
-    first = int(network.links["first_conflict"][from_south])
-    conflicts = network.conflicts[first : first + int(network.links["num_conflicts"][from_south])]
-    (shared,) = conflicts[conflicts["foe"] == from_west]
+    link = network.links[FROM_SOUTH]
+    first = int(link["first_conflict"])
+    conflicts = network.conflicts[first : first + int(link["num_conflicts"])]
+    (shared,) = conflicts[conflicts["foe"] == FROM_WEST]
     row = on_lane(network, network.lane_ids.index("s_0"), 0.0, speed=SPEED_MPS, length=2.0 * HALF_M)
 
-    def ask(own_s: float, end: str, foe_m: float) -> bool:
-        """Of the area that both ways share, by how long and how far they are before it.
+    def ask(own_s: float, end: str, foe_m: float, wait_s: float = 0.0) -> bool:
+        """By how long and how far they are before what they share.
 
-        `own_s`: until the own front enters it, or the own rear leaves it, as `end` says. `foe_m`:
-        of the other one's front to it; negative: of its rear to its end.
+        `own_s`: until the own front enters the shared area or is at its `line`, or the own rear is
+        `out` of the junction, as `end` says. `foe_m`: of the other one's front to its line;
+        negative: of its rear to the end of the shared area.
         """
         foe = np.zeros(1, APPROACH)
-        foe["link"], foe["row"], foe["half"], foe["speed"] = from_west, 1, HALF_M, SPEED_MPS
+        foe["link"], foe["row"], foe["half"], foe["speed"] = FROM_WEST, 1, HALF_M, SPEED_MPS
         inside = foe_m < 0.0
         foe["dist"] = -shared["foe_leave_m"] - HALF_M - foe_m if inside else foe_m + HALF_M
-        to_area = float(shared["enter_m"]) - HALF_M
-        if end == "leave":
-            to_area = float(shared["leave_m"]) + HALF_M
-        if not inside:
-            foe["dist"] -= shared["foe_enter_m"]
-        distance = own_s * SPEED_MPS - to_area
+        ahead = {"enter": shared["enter_m"] - HALF_M, "line": -HALF_M}
+        ahead["out"] = link["length_m"] + HALF_M
+        row["wait_s"] = wait_s
         return bool(
-            _foe_blocks(
-                network.arrays, np.concatenate([row, row]), row[0], from_south, distance,
-                SPEED_MPS, shared, foe[0], True, np.zeros(1, np.int32),
+            foe_blocks(
+                network.arrays, np.concatenate([row, row]), row[0], FROM_SOUTH,
+                own_s * SPEED_MPS - float(ahead[end]), SPEED_MPS, shared, foe[0], True,
+                np.zeros(1, np.int32),
             )
         )  # fmt: skip
 
@@ -66,16 +73,32 @@ def test_behind_one_that_is_on_the_junction_half_a_second_is_enough(blocks: Bloc
     assert not blocks(1.15, "enter", -6.0)
 
 
-def test_behind_one_that_comes_it_is_a_second(blocks: Blocks) -> None:
-    # It reaches the shared area of 5.5 m in 2 s, and with its 5 m it has left it in 3.05 s.
-    assert blocks(4.0, "enter", 20.0)
-    assert not blocks(4.1, "enter", 20.0)
+def test_one_that_comes_is_let_over_the_whole_junction(
+    blocks: Blocks, network: RoadNetwork
+) -> None:
+    # Its front has 20 m to its line, and its rear 5 m more to the end of its way over.
+    over_s = (25.0 + float(network.links["length_m"][FROM_WEST])) / SPEED_MPS
+    assert blocks(over_s - 0.05, "line", 20.0)
+    assert not blocks(over_s + 0.05, "line", 20.0)
 
 
-def test_before_one_that_comes_it_is_a_second(blocks: Blocks) -> None:
-    # Its front reaches the shared area in 4 s.
-    assert blocks(3.05, "leave", 40.0)
-    assert not blocks(2.95, "leave", 40.0)
+def test_before_one_that_comes_to_its_line_it_is_two_seconds(blocks: Blocks) -> None:
+    # Its front reaches its line in 4 s.
+    assert blocks(2.05, "out", 40.0)
+    assert not blocks(1.95, "out", 40.0)
+
+
+@pytest.mark.parametrize(("wait_s", "arrives_s"), [(90.0, 6.0), (180.0, 8.0), (900.0, 8.0)])
+def test_one_that_has_waited_for_long_counts_on_others_to_brake(
+    blocks: Blocks, wait_s: float, arrives_s: float
+) -> None:
+    assert blocks(arrives_s - 1.95, "out", 40.0, wait_s)
+    assert not blocks(arrives_s - 2.05, "out", 40.0, wait_s)
+
+
+def waiting_pair(**fields: Any) -> Any:
+    """One that asks, and its foe at link 1: both stand and give way."""
+    return vehicles([(0.0, 0.0, 0.0)] * 2, hold=HOLD_YIELD, stopped_at=[-1, 1], **fields)
 
 
 @pytest.mark.parametrize(
@@ -89,17 +112,38 @@ def test_before_one_that_comes_it_is_a_second(blocks: Blocks) -> None:
         (0.6, 0.2, 5, 1.0, False),  # it moves
     ],
 )
-def test_of_two_that_give_way_to_each_other_the_one_goes_that_has_stood_longer(
+def test_at_an_all_way_stop_the_one_goes_that_has_stood_longer(
     own_wait_s: float, foe_wait_s: float, own_id: int, speed: float, goes: bool
 ) -> None:
+    waits = [own_wait_s, foe_wait_s]
+    row, foe = waiting_pair(id=[own_id, 3], wait_s=waits, speed=[speed, 0.0])
+    assert ignores(row, foe, 0, 1, SIGNAL_NONE, ALLWAY_STOP, ALLWAY_STOP) == goes
+
+
+@pytest.mark.parametrize(("stopped_at", "goes"), [(1, False), (-1, True)])
+def test_at_an_all_way_stop_one_that_has_not_stood_yet_is_not_waited_for(
+    stopped_at: int, goes: bool
+) -> None:
     row, foe = vehicles(
-        [(0.0, 0.0, 0.0)] * 2,
-        id=[own_id, 3],
-        wait_s=[own_wait_s, foe_wait_s],
-        speed=[speed, 0.0],
-        hold=HOLD_YIELD,
+        [(0.0, 0.0, 0.0)] * 2, speed=[0.0, 8.0], wait_s=[0.6, 0.0], stopped_at=[0, stopped_at]
     )
-    assert _ignores(row, foe, 0, 1, SIGNAL_NONE) == goes
+    assert ignores(row, foe, 0, 1, SIGNAL_NONE, ALLWAY_STOP, ALLWAY_STOP) == goes
+    assert not ignores(row, foe, 0, 1, SIGNAL_NONE, STOP, STOP), "a stop sign of a side road"
+
+
+def test_equals_that_wait_do_not_stop_one_another() -> None:
+    row, foe = waiting_pair(id=[5, 3], wait_s=[3.1, 9.0], speed=0.0)
+    assert ignores(row, foe, 0, 1, SIGNAL_NONE, EQUAL, EQUAL)
+    row["wait_s"] = 2.9
+    assert not ignores(row, foe, 0, 1, SIGNAL_NONE, EQUAL, EQUAL), "first the longer one"
+
+
+@pytest.mark.parametrize(("wait_s", "goes"), [(89.0, False), (91.0, True)])
+def test_a_road_comes_first_while_it_waits_itself_but_not_for_ever(
+    wait_s: float, goes: bool
+) -> None:
+    row, foe = waiting_pair(id=[5, 3], wait_s=[wait_s, 9.0], speed=0.0)
+    assert ignores(row, foe, 0, 1, SIGNAL_NONE, MINOR, MINOR) == goes
 
 
 @pytest.mark.parametrize(("stopped_at", "goes"), [(1, True), (2, False)])
@@ -112,4 +156,4 @@ def test_an_agent_that_stands_at_its_stop_line_gives_way(stopped_at: int, goes: 
         driver=[DRIVER_BACKGROUND, DRIVER_AGENT],
         stopped_at=[-1, stopped_at],
     )
-    assert _ignores(row, foe, 0, 1, SIGNAL_NONE) == goes
+    assert ignores(row, foe, 0, 1, SIGNAL_NONE, ALLWAY_STOP, STOP) == goes

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from cavmarl.config.sensors import LanesConfig, SensorsConfig
 from cavmarl.core.math.neighbors import fill_grid, make_grid
 from cavmarl.core.records.codes import SIGNAL_RED, SIGNAL_RED_YELLOW
-from cavmarl.driving.kernels.junctions import link_signal
+from cavmarl.driving.kernels.gaps import link_signal
 from cavmarl.sensors.kernels.observing_lanes import LANES_FEATURES, observe_lanes
 from cavmarl.sensors.observed import layout, sensor_arrays
 from tests.naive import observing_lanes as naive

@@ -29,6 +29,7 @@ from cavmarl.driving.kernels.following import (
     response,
     wish,
 )
+from cavmarl.driving.kernels.gaps import is_minor
 from cavmarl.driving.kernels.junctions import STOP_LINE_M, may_enter, press_inside, waits_inside
 from cavmarl.driving.kernels.lane_choice import choose_lane, needed_change, thinks_of_lanes
 from cavmarl.driving.kernels.lane_index import VIEW_M, ahead_on, beside_s, last_on
@@ -36,6 +37,7 @@ from cavmarl.driving.kernels.stopping import way_to_stop
 from cavmarl.driving.kernels.ways import leave, next_step
 
 SEE_LINE_M = 8.0
+SEE_FOES_M = 4.5  # before a line, a driver who has to give way is ready to stop, as SUMO's are
 NEAR_M = 8.0  # to a leader so near the corner between matters,
 ASKEW_RAD = 0.7  # if it turns by so much,
 ASKEW_M = 2.5  # which takes this off the gap
@@ -208,6 +210,8 @@ def _at_line(
     hold = may_enter(roads, travel, rows, i, link, distance, way, phase, scratch)
     if hold != HOLD_NONE:
         return before_line(kind, speed, to_line, dt), hold, True
+    if front > SEE_FOES_M and kind["model"] == MODEL_KRAUSS and is_minor(roads, link, phase):
+        return before_line(kind, speed, front + LINE_MARGIN_M, dt), HOLD_NONE, False
     waits = waits_inside(roads, travel, rows, i, link, distance, way, phase, scratch)
     if waits != HOLD_NONE:
         to_wait = front + roads.links[link]["wait_m"]

@@ -21,186 +21,33 @@ from cavmarl.core.records.codes import (
     HOLD_NONE,
     HOLD_SIGNAL,
     HOLD_YIELD,
+    MODEL_KRAUSS,
     SIGNAL_GREEN_MAJOR,
-    SIGNAL_NONE,
     SIGNAL_OFF,
     SIGNAL_RED,
     SIGNAL_RED_YELLOW,
-    SIGNAL_STOP_THEN_GO,
     SIGNAL_YELLOW_MAJOR,
     SIGNAL_YELLOW_MINOR,
 )
-from cavmarl.driving.kernels.announcing import IMPATIENT_S, STANDING_MPS, is_let_stand
+from cavmarl.driving.kernels.announcing import STANDING_MPS
 from cavmarl.driving.kernels.following import LINE_MARGIN_M, before_line, behind, no_press
+from cavmarl.driving.kernels.gaps import (
+    ROOM_M,
+    STOP_SIGN_S,
+    WAIT_SLACK_M,
+    foe_blocks,
+    link_signal,
+    must_stop,
+)
 from cavmarl.driving.kernels.ways import next_step
 
-FOE_ACCEL = 2.5  # m/s², how a driver thinks that others speed up over a junction,
-OWN_ACCEL = 1.8  # and, to be safe, itself
-COMFORT_STOP = 3.0  # m/s², a driver stops for yellow where this braking is enough
-HARD_STOP = 5.0  # m/s², a vehicle that needs more to stop before the line will not stop
-GAP_S = 1.0  # s between the last of one and the first of the other in a shared area
+# m/s², a driver stops for yellow where this braking is enough; Krauss's brakes as hard as it can
+COMFORT_STOP = 3.0
 STEERED_MPS = 5.0  # a steered car is taken to turn no faster than this
 LAST_CHANCE_M = 3.0  # with the front this near to the line
-ROOM_M = 3.0  # free way left behind a vehicle that clears a junction
 EXIT_LANES = 4  # looked along for room,
 EXIT_LOOK_M = 75.0  # and no further than this: ten cars stand there
-IMPATIENCE_S = 180.0  # after which a vehicle that gives way makes others brake
-FORCED_STOP = 4.5  # m/s², and how hard; less in proportion after less time
 STOP_LINE_M = 5.0  # standing with the front nearer than this counts as standing at the line
-STOP_SIGN_S = 0.5  # how long one stands at a stop sign, and before a tie is broken
-WAIT_SLACK_M = 0.5  # a front this far beyond a waiting position still waits there
-STATE_STOP = ord("s")
-STATE_ALLWAY_STOP = ord("w")
-
-
-@kernel
-def link_signal(roads: RoadArrays, link: int, phase: NDArray[np.int32]) -> int:
-    """The letter that a link's signal shows, as a SIGNAL_* code; `phase` (num_signals,)."""
-    signal = roads.links[link]["signal"]
-    if signal < 0:
-        return SIGNAL_NONE
-    first = roads.phases[phase[signal]]["first_state"]
-    return int(roads.phase_states[first + roads.links[link]["signal_index"]])
-
-
-@kernel
-def _earliest(distance: float, speed: float, limit: float, accel: float) -> float:
-    """Time in s to drive `distance` m when speeding up with `accel` m/s² to `limit` m/s."""
-    if distance <= 0.0:
-        return 0.0
-    limit = max(limit, speed, 0.1)
-    ramp = (limit * limit - speed * speed) / (2.0 * accel)
-    if distance < ramp:
-        return (math.sqrt(speed * speed + 2.0 * accel * distance) - speed) / accel
-    return (limit - speed) / accel + (distance - ramp) / limit
-
-
-@inlined_kernel
-def must_stop(roads: RoadArrays, link: int, signal: int) -> bool:
-    """Whether each vehicle has to stand once before `link`, whose signal shows `signal`."""
-    state = roads.links[link]["state"]
-    signed = signal == SIGNAL_NONE and (state == STATE_STOP or state == STATE_ALLWAY_STOP)
-    return signed or signal == SIGNAL_STOP_THEN_GO
-
-
-@inlined_kernel
-def _goes_on(row: np.void, link: int) -> bool:
-    """Whether a vehicle that has stood before `link` was let in. An agent's says so by moving."""
-    goes: bool = row["driver"] != DRIVER_AGENT or row["wait_s"] == 0.0
-    return goes and row["hold"] == HOLD_NONE and row["stopped_at"] == link
-
-
-@inlined_kernel
-def _gives_way(row: np.void, link: int) -> bool:
-    """Whether a standing vehicle waits before `link` for others: an agent's at its stop line."""
-    stands: bool = row["driver"] == DRIVER_AGENT and row["wait_s"] > 0.0
-    return row["hold"] == HOLD_YIELD or (stands and row["stopped_at"] == link)
-
-
-@kernel
-def _ignores(row: np.void, foe: np.void, link: int, foe_link: int, signal: int) -> bool:
-    """Whether a driver at `link` need not wait for a foe at `foe_link` that has the right of way.
-
-    `signal` is what the foe's own signal shows.
-    """
-    if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW:
-        return True
-    if signal == SIGNAL_YELLOW_MINOR or signal == SIGNAL_YELLOW_MAJOR:
-        return True  # a vehicle that cannot stop any more was checked before
-    if is_let_stand(foe):
-        return True
-    if foe["speed"] > STANDING_MPS or not _gives_way(foe, foe_link):
-        return False
-    # Both wait: the one that has stood longer goes first, and then goes on.
-    if _goes_on(row, link):
-        return True
-    if row["wait_s"] < STOP_SIGN_S or row["speed"] > STANDING_MPS:
-        return False
-    longer: bool = row["wait_s"] > foe["wait_s"]
-    return longer or (row["wait_s"] == foe["wait_s"] and row["id"] < foe["id"])
-
-
-@kernel
-def _is_harmless(
-    roads: RoadArrays,
-    rows: NDArray[np.void],
-    row: np.void,
-    link: int,
-    conflict: np.void,
-    foe: np.void,
-    front: float,
-    apart: float,
-    gives_way: bool,
-    phase: NDArray[np.int32],
-) -> bool:
-    """Whether an APPROACH need not be minded, whenever it comes to the shared area.
-
-    Its `front` has so many m to where it can still stop; its rear leaves the shared area `apart` m
-    before the own one.
-    """
-    if front <= 0.0:
-        # Another vehicle keeps one that stands before the shared area out of it.
-        before_area = foe["dist"] + conflict["foe_enter_m"] - foe["half"] > 0.0
-        if before_area and foe["speed"] < STANDING_MPS and rows[foe["row"]]["wait_s"] > IMPATIENT_S:
-            return True
-        # Behind one that is faster and leads into the same lane, one can follow.
-        follows: bool = conflict["merging"] and apart > ROOM_M and row["speed"] <= foe["speed"]
-        return follows
-    committed = foe["speed"] * foe["speed"] > 2.0 * HARD_STOP * max(front, 0.01)
-    if committed:
-        return False
-    if not (gives_way and conflict["must_yield"]):
-        return True
-    signal = link_signal(roads, conflict["foe"], phase)
-    if _ignores(row, rows[foe["row"]], link, conflict["foe"], signal):
-        return True
-    patience = min(row["wait_s"] / IMPATIENCE_S, 1.0)
-    if _goes_on(row, link):
-        patience = 1.0  # it has been let in and goes on
-    brakes: bool = foe["speed"] * foe["speed"] < 2.0 * FORCED_STOP * patience * front
-    return brakes
-
-
-@kernel
-def _foe_blocks(
-    roads: RoadArrays,
-    rows: NDArray[np.void],
-    row: np.void,
-    link: int,
-    distance: float,
-    limit: float,
-    conflict: np.void,
-    foe: np.void,
-    gives_way: bool,
-    phase: NDArray[np.int32],
-) -> bool:
-    """Whether one APPROACH is, or will be, in the shared area while `row` is, or goes first."""
-    to_clear = foe["dist"] + conflict["foe_leave_m"] + foe["half"]
-    if to_clear <= 0.0:
-        return False
-    foe_link = roads.links[conflict["foe"]]
-    foe_lane = roads.lanes[foe_link["from_lane"]]
-    # Its front before the line that it can still stop at: the stop line, or, where the shared
-    # area lies beyond that, its waiting position inside.
-    front = foe["dist"] - foe["half"] - foe_lane["stop_back_m"]
-    wait_m = foe_link["wait_m"]
-    if front <= 0.0 and conflict["foe_enter_m"] >= wait_m - LINE_MARGIN_M:
-        front += wait_m + WAIT_SLACK_M
-    half = 0.5 * row["length"]
-    apart = distance + conflict["leave_m"] - half - to_clear
-    if _is_harmless(roads, rows, row, link, conflict, foe, front, apart, gives_way, phase):
-        return False
-    cleared = to_clear / max(foe["speed"], 0.1)
-    time_in = _earliest(distance + conflict["enter_m"] - half, row["speed"], limit, FOE_ACCEL)
-    if front <= 0.0:
-        inside: bool = cleared + 0.5 * GAP_S > time_in
-        return inside
-    if cleared + GAP_S < time_in:
-        return False
-    time_out = _earliest(distance + conflict["leave_m"] + half, row["speed"], limit, OWN_ACCEL)
-    to_area = foe["dist"] + conflict["foe_enter_m"] - foe["half"]
-    arrives = _earliest(to_area, foe["speed"], foe_lane["speed_mps"], FOE_ACCEL)
-    return arrives < time_out + GAP_S
 
 
 @kernel
@@ -233,7 +80,7 @@ def _blocked_by_foes(
             continue
         for k in range(begin, end):
             foe = scratch.approach[k]
-            if foe["row"] != i and _foe_blocks(
+            if foe["row"] != i and foe_blocks(
                 roads, rows, row, link, distance, limit, conflict, foe, gives_way, phase
             ):
                 return True
@@ -300,7 +147,9 @@ def may_enter(
     needed = row["speed"] * row["speed"] / (2.0 * front)
     if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW:
         return HOLD_SIGNAL
-    if (signal == SIGNAL_YELLOW_MINOR or signal == SIGNAL_YELLOW_MAJOR) and needed < COMFORT_STOP:
+    kind = travel.types[row["vtype"]]
+    stops = kind["decel"] if kind["model"] == MODEL_KRAUSS else COMFORT_STOP
+    if (signal == SIGNAL_YELLOW_MINOR or signal == SIGNAL_YELLOW_MAJOR) and needed < stops:
         # A vehicle that gave way at the line all through green goes now, as the others stop.
         if row["hold"] != HOLD_YIELD or front > LAST_CHANCE_M:
             return HOLD_SIGNAL

@@ -19,7 +19,7 @@ from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import LaneGrid, RoadArrays, Travel
 from cavmarl.core.records.codes import EVENT_ARRIVED, EVENT_RED_LIGHT, SIGNAL_RED, SIGNAL_RED_YELLOW
 from cavmarl.driving.kernels.bicycle import bicycle_step
-from cavmarl.driving.kernels.junctions import link_signal
+from cavmarl.driving.kernels.gaps import link_signal
 from cavmarl.driving.kernels.lane_index import beside_s
 from cavmarl.driving.kernels.stopping import make_stop
 from cavmarl.driving.kernels.tracking import locate, side_lane
@@ -27,7 +27,7 @@ from cavmarl.driving.kernels.ways import next_step, own_step, way_left
 
 LATERAL_MPS = 1.4  # fastest sideways motion of a lane change
 LATERAL_RATIO = 0.35  # and no faster than this share of the speed,
-LATERAL_MIN_MPS = 0.2  # but never stuck between two lanes
+LATERAL_MIN_MPS = 0.5  # but never stuck between two lanes
 MAX_DRIFT_RAD = 0.12  # largest angle between a car that changes lanes and its lane
 MAX_BODY_LANES = 8  # that a body may lie on, before and behind its centre
 STANDING_MPS = 0.1

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -55,8 +55,15 @@ class SumoJob:
 
 def run_sumo(job: SumoJob) -> TrafficRun:
     """Run and measure it in a process of its own."""
+    return run_seeds(job, ())[0]
+
+
+def run_seeds(job: SumoJob, more_seeds: Sequence[int]) -> tuple[TrafficRun, list[TrafficRun]]:
+    """Run it in a process of its own, then again with more seeds; contacts of those: 0."""
     with sumo_process(job) as process:
-        return process.submit(_measure, job).result()
+        run = process.submit(_measure, job, True).result()
+        others = (replace(job, seed=seed) for seed in more_seeds)
+        return run, [process.submit(_measure, other, False).result() for other in others]
 
 
 @contextmanager
@@ -98,7 +105,7 @@ def _refusal(job: SumoJob, log: Path, error: Exception) -> ConfigError:
     )
 
 
-def _measure(job: SumoJob) -> TrafficRun:
+def _measure(job: SumoJob, contacts: bool) -> TrafficRun:
     network = load_network(job.map_file)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -114,9 +121,13 @@ def _measure(job: SumoJob) -> TrafficRun:
                 departed += _keep_shared(libsumo, job)
                 arrived += sum(map(job.is_shared, libsumo.simulation.getArrivedIDList()))
                 teleports += libsumo.simulation.getStartingTeleportNumber()
+                full_second = tick % ticks_per_s == 0
+                if not (contacts or full_second):
+                    continue
                 rows = reader.rows()
-                meter.see(rows)
-                if tick % ticks_per_s == 0:
+                if contacts:
+                    meter.see(rows)
+                if full_second:
                     reader.fill_lanes(rows)
                     meter.sample(rows, reader.signal_codes())
         except libsumo.TraCIException as error:

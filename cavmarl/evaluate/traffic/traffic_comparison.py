@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from cavmarl.core.errors import ConfigError
+from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import find_map
 from cavmarl.evaluate.traffic.native_side import make_world, run_native
-from cavmarl.evaluate.traffic.sumo_side import SumoJob, run_sumo
-from cavmarl.evaluate.traffic.traffic_metrics import EDGE_MINUTE, TrafficRun
+from cavmarl.evaluate.traffic.sumo_side import SumoJob, run_seeds
+from cavmarl.evaluate.traffic.traffic_metrics import EDGE_MINUTE, TrafficFigures, TrafficRun
 from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.sumo.sumo_input import read_input
 
@@ -32,6 +33,7 @@ class TrafficComparison:
     edge_ids: tuple[str, ...]  # of the map, by the rows that `edge_minutes` name
     # what ours left out of the demand or took for something near, with counts
     tolerated: tuple[str, ...] = ()
+    sumo_others: tuple[TrafficFigures, ...] = ()  # SUMO's with further seeds, contacts not counted
 
     def ratio(self, figure: str) -> float | None:
         """Ours over SUMO's; None where that says nothing: SUMO's is zero or one has none."""
@@ -52,7 +54,9 @@ class TrafficComparison:
         }
         run = {"map": self.map_name, "seconds": self.seconds, "dt_s": self.dt_s, "seed": self.seed}
         ratios = {name: self.ratio(name) for name in RATIOS}
-        return run | sides | {"ratios": ratios, "tolerated": list(self.tolerated)}
+        others = [asdict(figures) for figures in self.sumo_others]
+        more = {"ratios": ratios, "tolerated": list(self.tolerated), "sumo_others": others}
+        return run | sides | more
 
 
 def compare_traffic(
@@ -63,6 +67,8 @@ def compare_traffic(
     dt_s: float = 0.1,
     seed: int = 0,
     teleports: bool = True,
+    sumo_seeds: int = 1,
+    finished: Callable[[Simulation], None] = lambda world: None,
     progress: Callable[[str], None] = lambda text: None,
 ) -> TrafficComparison:
     """Run both and measure both alike: SUMO without what ours leaves out of the demand.
@@ -74,6 +80,8 @@ def compare_traffic(
         dt_s: step length; a second is a whole number of steps.
         seed: of both.
         teleports: whether SUMO may put vehicles elsewhere that stand for too long.
+        sumo_seeds: with how many seeds SUMO runs, from `seed` on.
+        finished: shown our world at its end.
         progress: told what is going on.
 
     Raises:
@@ -93,10 +101,15 @@ def compare_traffic(
     world = make_world(path, demand, seconds, seed, dt_s)
     progress("SUMO's run")
     shared = frozenset(world.demand.element_ids) if isinstance(world.demand, DemandFile) else None
-    sumo = run_sumo(SumoJob(path, given, seconds, dt_s, seed, teleports, shared))
+    job = SumoJob(path, given, seconds, dt_s, seed, teleports, shared)
+    sumo, others = run_seeds(job, range(seed + 1, seed + sumo_seeds))
     progress("our run")
     ours = run_native(world, seconds)
+    finished(world)
     name = path.name.removesuffix(".gz").removesuffix(".net.xml")
     tolerated = world.demand.report.lines() if isinstance(world.demand, DemandFile) else []
     edges = tuple(world.network.edge_ids)
-    return TrafficComparison(name, seconds, dt_s, seed, ours, sumo, edges, tuple(tolerated))
+    figures = tuple(other.figures for other in others)
+    return TrafficComparison(
+        name, seconds, dt_s, seed, ours, sumo, edges, tuple(tolerated), figures
+    )

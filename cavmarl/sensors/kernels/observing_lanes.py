@@ -18,7 +18,7 @@ from cavmarl.core.numba import kernel
 from cavmarl.core.records.arrays import RoadArrays, Sensors, Travel
 from cavmarl.core.records.codes import SIGNAL_RED, SIGNAL_RED_YELLOW
 from cavmarl.core.records.rows import is_off_lanes
-from cavmarl.driving.kernels.junctions import link_signal
+from cavmarl.driving.kernels.gaps import link_signal
 from cavmarl.driving.kernels.ways import next_step
 
 OWN = 0  # slots of two features each: a gap and a speed

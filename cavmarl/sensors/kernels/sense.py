@@ -29,7 +29,7 @@ from cavmarl.core.records.codes import (
     SIGNAL_YELLOW_MAJOR,
     SIGNAL_YELLOW_MINOR,
 )
-from cavmarl.driving.kernels.junctions import link_signal
+from cavmarl.driving.kernels.gaps import link_signal
 from cavmarl.driving.kernels.signal_timing import time_to_change
 from cavmarl.rewards.kernels.terms import write_terms
 from cavmarl.sensors.kernels.lidar_fan import lidar

@@ -31,8 +31,9 @@ from cavmarl.core.records.rows import is_lost
 from cavmarl.driving.kernels.approach import register_links
 from cavmarl.driving.kernels.contacts import find_contacts
 from cavmarl.driving.kernels.drivers import decide
+from cavmarl.driving.kernels.gaps import STOOD_S
 from cavmarl.driving.kernels.highway_control import speed_control
-from cavmarl.driving.kernels.junctions import STOP_SIGN_S, note_stop
+from cavmarl.driving.kernels.junctions import note_stop
 from cavmarl.driving.kernels.lane_choice import needed_change
 from cavmarl.driving.kernels.lane_index import index_lanes
 from cavmarl.driving.kernels.motion import move_agent, move_background
@@ -204,7 +205,7 @@ def advance(
                 row["events"] = 0
                 row["hold"] = scratch.hold[i]
                 row["blinker"] = scratch.blinker[i]
-                if scratch.link_ahead[i] >= 0 and row["wait_s"] >= STOP_SIGN_S:
+                if scratch.link_ahead[i] >= 0 and row["wait_s"] >= STOOD_S:
                     row["stopped_at"] = scratch.link_ahead[i]
                 accel, change = scratch.accel[i], scratch.lane_change[i]
                 move_background(roads, travel, row, step[i], accel, change, dt)

@@ -1,0 +1,248 @@
+"""Which gaps a driver takes at a junction: whether a foe is, or will be, where it would be.
+
+What a driver counts with is what SUMO's counts with: it gives a foe before its line, and itself,
+the whole way over the junction, and takes the foe's speed as it is. Foes on the junction are asked
+by the shared area alone.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.numba import inlined_kernel, kernel
+from cavmarl.core.records.arrays import RoadArrays
+from cavmarl.core.records.codes import (
+    DRIVER_AGENT,
+    HOLD_NONE,
+    HOLD_YIELD,
+    SIGNAL_GREEN_MINOR,
+    SIGNAL_NONE,
+    SIGNAL_RED,
+    SIGNAL_RED_YELLOW,
+    SIGNAL_STOP_THEN_GO,
+    SIGNAL_YELLOW_MAJOR,
+    SIGNAL_YELLOW_MINOR,
+)
+from cavmarl.driving.kernels.announcing import IMPATIENT_S, STANDING_MPS, is_let_stand
+from cavmarl.driving.kernels.following import LINE_MARGIN_M
+
+BRISK_ACCEL = 2.5  # m/s², with which a driver may soon be in a shared area,
+GENTLE_ACCEL = 1.8  # and, to be safe, with which it and others are out of it
+HARD_STOP = 5.0  # m/s², a vehicle that needs more to stop before the line will not stop
+AHEAD_S = (
+    2.0  # s before a foe is at its line: SUMO's drivers take 1 s, of foes that do not speed up
+)
+GAP_S = 1.0  # s between the last of one and the first of the other in a shared area
+ROOM_M = 3.0  # free way left behind a vehicle that clears a junction
+IMPATIENCE_S = 180.0  # after which a vehicle that gives way counts on others to brake,
+FORCED_STOP = 4.5  # m/s², and how hard at most
+CRAWL_MPS = 5.0  # a stream that is slower lets others in
+STUCK_S = 90.0  # after which it passes others that stand and give way, too
+STOP_SIGN_S = 0.5  # how long one stands at a stop sign, and before a tie is broken;
+STOOD_S = 0.1  # background vehicles, as SUMO's, only for a moment
+WAIT_SLACK_M = 0.5  # a front this far beyond a waiting position still waits there
+STATE_MAJOR = ord("M")
+STATE_EQUAL = ord("=")
+STATE_STOP = ord("s")
+STATE_ALLWAY_STOP = ord("w")
+
+
+@kernel
+def link_signal(roads: RoadArrays, link: int, phase: NDArray[np.int32]) -> int:
+    """The letter that a link's signal shows, as a SIGNAL_* code; `phase` (num_signals,)."""
+    signal = roads.links[link]["signal"]
+    if signal < 0:
+        return SIGNAL_NONE
+    first = roads.phases[phase[signal]]["first_state"]
+    return int(roads.phase_states[first + roads.links[link]["signal_index"]])
+
+
+@kernel
+def _earliest(distance: float, speed: float, limit: float, accel: float) -> float:
+    """Time in s to drive `distance` m when speeding up with `accel` m/s² to `limit` m/s."""
+    if distance <= 0.0:
+        return 0.0
+    limit = max(limit, speed, 0.1)
+    ramp = (limit * limit - speed * speed) / (2.0 * accel)
+    if distance < ramp:
+        return (math.sqrt(speed * speed + 2.0 * accel * distance) - speed) / accel
+    return (limit - speed) / accel + (distance - ramp) / limit
+
+
+@inlined_kernel
+def must_stop(roads: RoadArrays, link: int, signal: int) -> bool:
+    """Whether each vehicle has to stand once before `link`, whose signal shows `signal`."""
+    state = roads.links[link]["state"]
+    signed = signal == SIGNAL_NONE and (state == STATE_STOP or state == STATE_ALLWAY_STOP)
+    return signed or signal == SIGNAL_STOP_THEN_GO
+
+
+@inlined_kernel
+def is_minor(roads: RoadArrays, link: int, phase: NDArray[np.int32]) -> bool:
+    """Whether vehicles on `link` give way to others already before the junction."""
+    target = roads.links[link]
+    if target["num_conflicts"] == 0 or target["wait_m"] < math.inf:
+        return False
+    signal = link_signal(roads, link, phase)
+    gives_way: bool = signal == SIGNAL_GREEN_MINOR
+    if signal == SIGNAL_NONE:
+        gives_way = target["state"] != STATE_MAJOR
+    return gives_way
+
+
+@inlined_kernel
+def _goes_on(row: np.void, link: int) -> bool:
+    """Whether a vehicle that has stood before `link` was let in. An agent's says so by moving."""
+    goes: bool = row["driver"] != DRIVER_AGENT or row["wait_s"] == 0.0
+    return goes and row["hold"] == HOLD_NONE and row["stopped_at"] == link
+
+
+@inlined_kernel
+def _gives_way(row: np.void, link: int) -> bool:
+    """Whether a standing vehicle waits before `link` for others: an agent's at its stop line."""
+    stands: bool = row["driver"] == DRIVER_AGENT and row["wait_s"] > 0.0
+    return row["hold"] == HOLD_YIELD or (stands and row["stopped_at"] == link)
+
+
+@inlined_kernel
+def _in_turn(state: int) -> bool:
+    """Whether of two that wait at links of such a state the one goes that has stood longer."""
+    return state == STATE_EQUAL or state == STATE_ALLWAY_STOP
+
+
+@kernel
+def ignores(
+    row: np.void, foe: np.void, link: int, foe_link: int, signal: int, state: int, foe_state: int
+) -> bool:
+    """Whether a driver at `link` need not wait for a foe at `foe_link` that has the right of way.
+
+    `signal` is what the foe's own signal shows, `state` and `foe_state` are those of the links.
+    """
+    if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW:
+        return True
+    if signal == SIGNAL_YELLOW_MINOR or signal == SIGNAL_YELLOW_MAJOR:
+        return True  # a vehicle that cannot stop any more was checked before
+    if is_let_stand(foe):
+        return True
+    if signal == SIGNAL_NONE and foe_state == STATE_ALLWAY_STOP and foe["stopped_at"] != foe_link:
+        return True  # it has to stand once, too, and has not yet
+    if foe["speed"] > STANDING_MPS or not _gives_way(foe, foe_link):
+        return False
+    if not (_in_turn(state) or row["wait_s"] > STUCK_S):
+        return False  # the other road comes first even while it waits itself
+    # Among equals each may wait for the next all around: those that wait do not stop one another.
+    if (state == STATE_EQUAL and row["wait_s"] > IMPATIENT_S) or _goes_on(row, link):
+        return True
+    # Both wait: the one that has stood longer goes first, and then goes on.
+    if row["wait_s"] < STOP_SIGN_S or row["speed"] > STANDING_MPS:
+        return False
+    longer: bool = row["wait_s"] > foe["wait_s"]
+    return longer or (row["wait_s"] == foe["wait_s"] and row["id"] < foe["id"])
+
+
+@kernel
+def _is_harmless(
+    roads: RoadArrays,
+    rows: NDArray[np.void],
+    row: np.void,
+    link: int,
+    conflict: np.void,
+    foe: np.void,
+    front: float,
+    apart: float,
+    gives_way: bool,
+    phase: NDArray[np.int32],
+) -> bool:
+    """Whether an APPROACH need not be minded, whenever it comes to the shared area.
+
+    Its `front` has so many m to where it can still stop; its rear leaves the shared area `apart` m
+    before the own one.
+    """
+    if front <= 0.0:
+        # Another vehicle keeps one that stands before the shared area out of it.
+        before_area = foe["dist"] + conflict["foe_enter_m"] - foe["half"] > 0.0
+        if before_area and foe["speed"] < STANDING_MPS and rows[foe["row"]]["wait_s"] > IMPATIENT_S:
+            return True
+        # Behind one that is faster and leads into the same lane, one can follow.
+        follows: bool = conflict["merging"] and apart > ROOM_M and row["speed"] <= foe["speed"]
+        return follows
+    committed = foe["speed"] * foe["speed"] > 2.0 * HARD_STOP * max(front, 0.01)
+    if committed:
+        return False
+    if not (gives_way and conflict["must_yield"]):
+        return True
+    signal = link_signal(roads, conflict["foe"], phase)
+    state, foe_state = roads.links[link]["state"], roads.links[conflict["foe"]]["state"]
+    if ignores(row, rows[foe["row"]], link, conflict["foe"], signal, state, foe_state):
+        return True
+    # A vehicle that has been let in goes on, where others can still brake for it. A stream that
+    # crawls bumper to bumper lets one in that has waited: the longer, the harder it brakes.
+    patience = 1.0 if _goes_on(row, link) else 0.0
+    if conflict["merging"] and STANDING_MPS < foe["speed"] < CRAWL_MPS:
+        patience = max(patience, min(row["wait_s"] / IMPATIENCE_S, 1.0))
+    brakes: bool = foe["speed"] * foe["speed"] < 2.0 * FORCED_STOP * patience * front
+    return brakes
+
+
+@kernel
+def foe_blocks(
+    roads: RoadArrays,
+    rows: NDArray[np.void],
+    row: np.void,
+    link: int,
+    distance: float,
+    limit: float,
+    conflict: np.void,
+    foe: np.void,
+    gives_way: bool,
+    phase: NDArray[np.int32],
+) -> bool:
+    """Whether one APPROACH is, or will be, in the shared area while `row` is, or goes first."""
+    to_clear = foe["dist"] + conflict["foe_leave_m"] + foe["half"]
+    if to_clear <= 0.0:
+        return False
+    target = roads.links[link]
+    foe_link = roads.links[conflict["foe"]]
+    # Its front before the line that it can still stop at: the stop line, or, where the shared
+    # area lies beyond that, its waiting position inside.
+    front = foe["dist"] - foe["half"] - roads.lanes[foe_link["from_lane"]]["stop_back_m"]
+    wait_m = foe_link["wait_m"]
+    if front <= 0.0 and conflict["foe_enter_m"] >= wait_m - LINE_MARGIN_M:
+        front += wait_m + WAIT_SLACK_M
+    half = 0.5 * row["length"]
+    apart = distance + conflict["leave_m"] - half - to_clear
+    if _is_harmless(roads, rows, row, link, conflict, foe, front, apart, gives_way, phase):
+        return False
+    cleared = to_clear / max(foe["speed"], 0.1)
+    time_in = _earliest(distance + conflict["enter_m"] - half, row["speed"], limit, BRISK_ACCEL)
+    if front <= 0.0:
+        to_area = distance + conflict["enter_m"] - half
+        if _in_turn(target["state"]) and _goes_on(row, link) and to_area > ROOM_M:
+            return False  # it lost its turn if it stood once more, and can wait before the area
+        if foe["speed"] > STANDING_MPS:  # one that has just set off does not stay so slow
+            top = roads.lanes[roads.links[conflict["foe"]]["next_lane"]]["speed_mps"]
+            cleared = _earliest(to_clear, foe["speed"], top, GENTLE_ACCEL)
+        inside: bool = cleared + 0.5 * GAP_S > time_in
+        return inside
+    # A foe before its line, and the vehicle itself, are given the whole way over the junction.
+    over = target["length_m"]
+    if conflict["enter_m"] < target["wait_m"]:
+        over = min(over, target["wait_m"])
+    passed = (foe["dist"] + foe_link["length_m"] + foe["half"]) / max(foe["speed"], 0.1)
+    after_s = GAP_S if conflict["merging"] else 0.0
+    if passed + after_s < _earliest(distance - half, row["speed"], limit, BRISK_ACCEL):
+        return False
+    speed = row["speed"]
+    over += min(distance - half, 0.0)  # from a waiting position: the rest
+    reached = math.sqrt(speed * speed + 2.0 * BRISK_ACCEL * max(over, 0.0))
+    leaves_mps = min(reached, max(limit, speed))
+    time_out = _earliest(distance - half, speed, limit, GENTLE_ACCEL)
+    time_out += 2.0 * (over + row["length"]) / max(speed + leaves_mps, STANDING_MPS)
+    # With the speed that it has; it is counted on to brake by those who have waited for long.
+    arrives = (foe["dist"] - foe["half"]) / max(foe["speed"], STANDING_MPS)
+    arrives *= 1.0 + min(row["wait_s"] / IMPATIENCE_S, 1.0)
+    blocks: bool = arrives < time_out + AHEAD_S
+    return blocks

@@ -1,0 +1,185 @@
+"""The files of a drawn world: by netgenerate or netconvert, and randomTrips, of SUMO's wheel."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from xml.etree.ElementTree import Element, ElementTree, SubElement, indent
+
+import defusedxml.ElementTree
+import numpy as np
+
+from cavmarl.core.errors import ConfigError, MapError, require
+from cavmarl.core.processes import dying_with_parent
+from cavmarl.evaluate.traffic.world_draw import DemandDraw, WorldDraw
+from cavmarl.maps.netconvert import MAP_ENDINGS, build_network, map_file
+from cavmarl.roads.cache import load_network
+from cavmarl.roads.network import RoadNetwork
+
+NET_FILE, ROUTES_FILE = "world.net.xml", "world.rou.xml"
+# Maps in the wheel's `tools/game` that a cut is made of: real cities, levels told by height.
+GAME_MAPS = ("kuehne/kuehne", "bs3d/bs", "fokr_bs_demo/fokr_bs", "DRT/osm", "fkk_in/ingolstadt")
+_DRAWN_TRIPS = 1500  # from which the departures are taken
+_LEAST_EDGES = 12  # of a cut; smaller ones are drawn again
+_CUTS = 20
+_END_PER_H = 600.0  # vehicles that a road into the net brings at most, so that they find room
+_TOOL_S = 300.0
+
+
+def cut_maps(folder: Path | None) -> tuple[Path, ...]:
+    """The maps that cuts are made of: all below a folder, in the wheel if there is none.
+
+    Raises ConfigError: the folder has no map.
+    """
+    if folder is None:
+        games = Path(require("sumo", "sumo").SUMO_HOME) / "tools" / "game"
+        found = [path for name in GAME_MAPS for path in games.glob(f"{name}.net.xml*")]
+    else:
+        found = sorted(path for path in folder.rglob("*") if path.name.endswith(MAP_ENDINGS))
+    if not found:
+        raise ConfigError(f"--maps {folder}: has no map ({', '.join(MAP_ENDINGS)})")
+    return tuple(found)
+
+
+def make_files(
+    draw: WorldDraw, folder: Path, seconds: int, maps: Sequence[Path]
+) -> tuple[Path, Path]:
+    """Write net and routes of a world into a folder; the same draw gives the same traffic.
+
+    Args:
+        draw: the world.
+        folder: is made if it is not there.
+        seconds: over which vehicles depart.
+        maps: that a cut is made of.
+
+    Returns:
+        The net and the routes.
+
+    Raises:
+        ConfigError: a tool of SUMO's gives up.
+        MapError: a cut of a map cannot be driven.
+        MissingExtraError: SUMO is not installed.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    net, routes = folder / NET_FILE, folder / ROUTES_FILE
+    if draw.net.kind == "cut":
+        _cut(draw, net, maps)
+    else:
+        _run_tool(
+            "bin/netgenerate", *draw.net.options, f"--seed={draw.seed}", f"--output-file={net}"
+        )
+    _write_demand(draw, net, routes, seconds)
+    return net, routes
+
+
+def _cut(draw: WorldDraw, net: Path, maps: Sequence[Path]) -> None:
+    """Cut a square around a place on a road."""
+    random = np.random.default_rng([draw.seed, 1])
+    for _ in range(_CUTS):
+        source = map_file(maps[int(random.integers(len(maps)))])
+        points = load_network(source).points
+        point = points[int(random.integers(len(points)))]
+        x, y, half = float(point["x"]), float(point["y"]), draw.net.length_m
+        box = f"{x - half:.1f},{y - half:.1f},{x + half:.1f},{y + half:.1f}"
+        options = (*draw.net.options, f"--keep-edges.in-boundary={box}")
+        try:
+            build_network(source, net, options=options)
+        except MapError:
+            continue  # nothing can be driven there
+        if int((~load_network(net).edges["internal"]).sum()) >= _LEAST_EDGES:
+            return
+    raise MapError(f"{source}: {_CUTS} cuts of {2 * half:.0f} m have no roads; give larger maps")
+
+
+def _write_demand(draw: WorldDraw, net: Path, routes: Path, seconds: int) -> None:
+    """Routes by randomTrips, their departures by the flow that the draw asks for."""
+    drawn = routes.with_name("drawn.rou.xml")
+    network = load_network(net)
+    # Ends of roads only where there are enough of them: else all traffic is on two edges.
+    fringe = draw.demand.fringe and _num_ends(network) >= 4
+    _run_tool(
+        "tools/randomTrips.py",
+        f"--net-file={net}",
+        f"--output-trip-file={routes.with_name('trips.xml')}",
+        f"--route-file={drawn}",
+        f"--end={_DRAWN_TRIPS}",
+        f"--seed={draw.seed}",
+        "--random-depart",
+        "--lanes",
+        "--threads=1",
+        f"--fringe-factor={'max' if fringe else 1}",
+        f"--min-distance={draw.net.length_m}",
+        "--edge-permission=passenger",
+    )
+    found = list(defusedxml.ElementTree.parse(drawn).iter("vehicle"))
+    for name in ("drawn.rou.xml", "drawn.rou.alt.xml", "trips.xml"):
+        routes.with_name(name).unlink(missing_ok=True)
+    if not found:
+        raise ConfigError(f"{net}: randomTrips finds no trip; draw another seed")
+    gap_s = _gap_s(draw.demand, network, found)
+    if fringe:
+        gap_s = max(gap_s, 3600.0 / (_END_PER_H * _num_ends(network)))
+    _routes_of(draw, found, gap_s, seconds).write(routes, encoding="utf-8", xml_declaration=True)
+
+
+def _num_ends(network: RoadNetwork) -> int:
+    """Number of junctions with one road."""
+    edges = network.edges[~network.edges["internal"]]
+    junctions = np.concatenate([edges["from_junction"], edges["to_junction"]])
+    ends = np.concatenate([edges["to_junction"], edges["from_junction"]])
+    pairs = np.unique(np.stack([junctions, ends], axis=1), axis=0)
+    return int((np.bincount(pairs[:, 0]) == 1).sum())
+
+
+def _gap_s(demand: DemandDraw, network: RoadNetwork, found: Sequence[Element]) -> float:
+    """Seconds between two departures so that a usual junction gets the flow of the draw."""
+    edges = network.edges[~network.edges["internal"]]
+    num_junctions = len(np.unique(edges["to_junction"])) - _num_ends(network)
+    lanes = float(edges["num_lanes"].mean())
+    passed = [len(str(route.get("edges")).split()) - 1 for one in found for route in one]
+    # Lanes of one road share what a junction lets through.
+    flow_per_h = demand.junction_per_h * lanes**0.5 * max(num_junctions, 1)
+    gap_s: float = 3600.0 * max(float(np.mean(passed)), 1.0) / flow_per_h
+    return gap_s
+
+
+def _routes_of(
+    draw: WorldDraw, found: Sequence[Element], gap_s: float, seconds: int
+) -> ElementTree[Element]:
+    random = np.random.default_rng([draw.seed, 2])
+    root = Element("routes")
+    classes = list(draw.demand.shares)
+    for name in classes:
+        SubElement(root, "vType", id=name, vClass=name)
+    kinds = random.choice(len(classes), len(found), p=list(draw.demand.shares.values()))
+    departs = np.cumsum(random.exponential(gap_s, len(found)))
+    for number, (one, kind, depart_s) in enumerate(zip(found, kinds, departs, strict=True)):
+        if depart_s < seconds:
+            own = {"id": str(number), "type": classes[kind], "depart": f"{depart_s:.2f}"}
+            vehicle = SubElement(root, "vehicle", own | draw.demand.departure)
+            SubElement(vehicle, "route", edges=str(one[0].get("edges")))
+    indent(root)
+    return ElementTree(root)
+
+
+def _run_tool(tool: str, *options: str) -> None:
+    home = Path(require("sumo", "sumo").SUMO_HOME)
+    command = [str(home / tool), *options]
+    if tool.endswith(".py"):
+        command.insert(0, sys.executable)
+    own = {"SUMO_HOME": str(home)}
+    done = subprocess.run(
+        dying_with_parent(command),
+        capture_output=True,
+        text=True,
+        errors="replace",
+        timeout=_TOOL_S,
+        env=os.environ | own,
+        check=False,
+    )
+    if done.returncode != 0:
+        said = done.stderr.strip().splitlines()[-5:]
+        raise ConfigError(f"{tool} {' '.join(options)}: gave up: {' '.join(said)}")

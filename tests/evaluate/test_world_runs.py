@@ -1,0 +1,203 @@
+"""Many worlds: rows, what they come to, and runs that go on where they ended."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cavmarl.cli import main
+from cavmarl.core.errors import ConfigError, MissingExtraError
+from cavmarl.evaluate.traffic import world_runs
+from cavmarl.evaluate.traffic.world_rows import (
+    Row,
+    deviation,
+    has_own_lock,
+    in_spread,
+    is_delay_near,
+    is_near,
+    summary,
+    worst,
+)
+from cavmarl.evaluate.traffic.world_runs import (
+    KEPT,
+    ROWS_FILE,
+    WorldSeries,
+    read_rows,
+    run_worlds,
+    world_folder,
+)
+
+pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
+pytest.importorskip("matplotlib", reason="needs the extra 'report'")
+
+FIGURES = {
+    "departed": 100,
+    "waiting": 0,
+    "arrived": 80,
+    "mean_speed_mps": 10.0,
+    "mean_delay_s": 20.0,
+    "queue": 3.0,
+    "contacts": 0,
+    "longest_lock_s": 5.0,
+    "locked_junction": "a",
+    "teleports": 0,
+}
+SPREAD = {
+    "departed": [100, 100, 100],
+    "arrived": [78, 80, 82],
+    "mean_speed_mps": [9.0, 10.0, 11.0],
+    "mean_delay_s": [19.0, 20.0, 21.0],
+    "queue": [3.0, 3.0, 3.0],
+    "longest_lock_s": [5.0, 9.0, 7.0],
+}
+
+
+def a_row(seed: int = 0, **ours: Any) -> Row:
+    own = {"seed": seed, "features": ["grid"], "seconds": 300, "dt_s": 0.1}
+    return own | {"ours": FIGURES | ours, "sumo": FIGURES, "sumo_spread": SPREAD}
+
+
+def test_a_deviation_is_ours_over_the_mean_of_sumos_seeds() -> None:
+    assert deviation(a_row(mean_speed_mps=11.5), "mean_speed_mps") == pytest.approx(0.15)
+    assert deviation(a_row(arrived=60), "arrived") == pytest.approx(-0.25)
+    assert deviation(a_row(mean_delay_s=None), "mean_delay_s") is None
+
+
+def test_near_is_within_a_share_or_sumos_own_spread() -> None:
+    assert in_spread(a_row(mean_speed_mps=9.0), "mean_speed_mps")
+    assert not in_spread(a_row(mean_speed_mps=8.9), "mean_speed_mps")
+    assert is_near(a_row(mean_speed_mps=8.9), "mean_speed_mps", 0.15)
+    assert not is_near(a_row(mean_speed_mps=8.4), "mean_speed_mps", 0.15)
+    assert is_near(a_row(mean_speed_mps=9.0), "mean_speed_mps", 0.01)
+
+
+@pytest.mark.parametrize(
+    ("delay_s", "near"), [(23.0, True), (25.0, True), (25.1, False), (14.9, False), (None, False)]
+)
+def test_a_delay_is_near_by_share_or_by_seconds(delay_s: float | None, near: bool) -> None:
+    assert is_delay_near(a_row(mean_delay_s=delay_s)) == near
+
+
+def test_a_lock_counts_where_sumo_has_none() -> None:
+    assert has_own_lock(a_row(longest_lock_s=121.0))
+    assert not has_own_lock(a_row(longest_lock_s=120.0))
+    both = a_row(longest_lock_s=200.0) | {"sumo_spread": SPREAD | {"longest_lock_s": [9.0, 121.0]}}
+    assert not has_own_lock(both)
+
+
+def test_the_summary_of_hand_made_rows() -> None:
+    rows = [a_row(k, mean_speed_mps=10.0 + k) for k in range(5)]
+    rows.append(a_row(5, contacts=3, arrived=70, longest_lock_s=150.0))
+    failed = {"seed": 6, "features": ["cut"], "error": "MapError: no roads"}
+    found = summary([*rows, failed])
+    assert (found["worlds"], found["failed"]) == (7, 1)
+    # Deviations of 0, 10, 20, 30, 40 and 0 per cent.
+    assert found["mean_speed"]["median"] == pytest.approx(0.15)
+    assert found["mean_speed"]["size_90"] == pytest.approx(0.35)
+    assert found["mean_speed"]["share_near"] == pytest.approx(3 / 6)
+    assert found["arrived"]["share_near"] == pytest.approx(5 / 6)
+    assert found["contacts"] == {"ours": 3, "sumo": 0, "worlds": 1}
+    assert found["own_locks"] == 1
+    assert summary([failed]) == {"worlds": 1, "failed": 1}
+
+
+def test_the_worst_are_failed_ones_then_contacts_then_speeds() -> None:
+    rows = [a_row(0), a_row(1, mean_speed_mps=6.0), a_row(2, contacts=1)]
+    rows.append({"seed": 3, "features": [], "error": "x"})
+    assert [row["seed"] for row in worst(rows, 3)] == [3, 2, 1]
+
+
+@pytest.fixture
+def stubbed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Worlds are not run: a folder and a row each; the seeds that were asked for."""
+    ran: list[int] = []
+
+    def run(job: WorldSeries, seed: int) -> Row:
+        ran.append(seed)
+        world_folder(job.out, seed).mkdir()
+        return a_row(seed, mean_speed_mps=10.0 + 0.1 * seed)
+
+    monkeypatch.setattr(world_runs, "_run_world", run)
+    return ran
+
+
+def test_a_run_goes_on_where_it_ended_and_keeps_the_files_of_the_worst(
+    tmp_path: Path, stubbed: list[int]
+) -> None:
+    told: list[tuple[int, int]] = []
+    run_worlds(WorldSeries(tmp_path, 5, 0))
+    rows = run_worlds(WorldSeries(tmp_path, KEPT + 5, 0), lambda *done: told.append(done))
+    assert stubbed == list(range(KEPT + 5))
+    assert [row["seed"] for row in rows] == stubbed
+    assert told[-1] == (KEPT + 5, KEPT + 5)
+    assert len(list(read_rows(tmp_path / ROWS_FILE))) == KEPT + 5
+    kept = {path.name for path in tmp_path.iterdir() if path.is_dir()}
+    assert kept == {f"world_{seed:06d}" for seed in range(5, KEPT + 5)}
+
+
+def test_rows_of_other_settings_are_not_mixed(tmp_path: Path, stubbed: list[int]) -> None:
+    run_worlds(WorldSeries(tmp_path, 1, 0))
+    with pytest.raises(ConfigError, match="rows of other settings"):
+        run_worlds(WorldSeries(tmp_path, 1, 0, seconds=200))
+    assert stubbed == [0]
+
+
+def test_a_broken_row_is_named(tmp_path: Path) -> None:
+    (tmp_path / ROWS_FILE).write_text('{"seed": 1}\n{"seed"\n')
+    with pytest.raises(ConfigError, match="line 2: is no row"):
+        list(read_rows(tmp_path / ROWS_FILE))
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("--worlds", "0"), "worlds = 0"),
+        (("--worlds", "1", "--first-seed", "-1"), "first_seed = -1"),
+        (("--worlds", "1", "--without", "hills"), "--without hills"),
+        (("--worlds", "1", "--dt", "0.5"), "sim_dt_s = 0.5"),
+        (("--worlds", "1", "--speed"), "--worlds"),
+        (("some.net.xml", "--worlds", "1"), "--worlds"),
+        (("--worlds", "1", "--out", "/proc/nowhere"), "/proc/nowhere: cannot be written"),
+        (("some.net.xml",), "give a MAP and its --demand FILE"),
+    ],
+)
+def test_bad_input_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], says: str
+) -> None:
+    out = () if "--out" in words else ("--out", str(tmp_path))
+    with pytest.raises(SystemExit) as ended:
+        main(("bench", "traffic", *words, *out))
+    assert ended.value.code == 2
+    assert says in " ".join(capsys.readouterr().err.split())
+
+
+def test_without_sumo_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def absent(module: str) -> None:
+        raise ModuleNotFoundError(name=module)
+
+    monkeypatch.setattr("cavmarl.core.errors.importlib.import_module", absent)
+    with pytest.raises(MissingExtraError, match=r"pip install 'cavmarl\[sumo\]'"):
+        WorldSeries(tmp_path, 1, 0)
+
+
+@pytest.mark.slow
+def test_two_worlds_are_run_and_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    document = tmp_path / "all.json"
+    words = ("--worlds", "2", "--first-seed", "11", "--seconds", "30", "--dt", "0.2")
+    with pytest.raises(SystemExit) as ended:
+        main(("bench", "traffic", *words, "--out", str(tmp_path), "--json", str(document)))
+    assert not ended.value.code
+    shown = capsys.readouterr().out
+    assert "2 worlds, 0 failed" in shown
+    rows = json.loads(document.read_text())["rows"]
+    assert [row["seed"] for row in rows] == [11, 12]
+    assert all(len(row["sumo_spread"]["arrived"]) == 3 for row in rows)
+    for row in rows:
+        folder = world_folder(tmp_path, row["seed"])
+        assert {"flow.png", "end.png"} <= {path.name for path in folder.iterdir()}
+        readme = (folder / "README.txt").read_text()
+        assert f"--first-seed={row['seed']}" in readme
+        assert row["features"][0] in readme
