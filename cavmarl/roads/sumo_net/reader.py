@@ -15,7 +15,8 @@ from cavmarl.core.errors import MapError
 from cavmarl.core.math.geometry import project
 from cavmarl.core.records.rows import FORK_BEYOND_M
 from cavmarl.roads.network import EDGE, JUNCTION, LANE, LINK, GeoReference, RoadNetwork
-from cavmarl.roads.polylines import clean_shape, extend_stubs, point_rows
+from cavmarl.roads.polylines import clean_shape, extend_stubs, point_rows, refuse_points
+from cavmarl.roads.sumo_net.backward_paths import Way, mend_backward_paths
 from cavmarl.roads.sumo_net.conflicts import (
     LinkPath,
     conflict_rows,
@@ -88,7 +89,9 @@ def _assemble(net: Any, programs: list[SignalProgram], name: str, digest: str) -
     num_normal = sum(lane.getEdge().getFunction() == "" for lane in chosen.lanes)
     lane_ids = tuple(lane.getID() for lane in chosen.lanes)
     shapes = [clean_shape(lane.getShape3D()) for lane in chosen.lanes]
-    extend_stubs(shapes, before, lane_ids, num_normal)
+    refuse_points(shapes[:num_normal], lane_ids[:num_normal])
+    mend_backward_paths(shapes, [_way(move, lane_row) for move in chosen.movements])
+    extend_stubs(shapes, before)
     points, first_point = point_rows(shapes)
 
     edges = _edge_rows(chosen, net, node_row)
@@ -161,6 +164,14 @@ def _before(chosen: NetworkSelection, lane_row: dict[int, int]) -> dict[int, int
             before[lane_row[id(lane)]] = source
             source = lane_row[id(lane)]
     return before
+
+
+def _way(movement: Movement, lane_row: dict[int, int]) -> Way:
+    return Way(
+        lane_row[id(movement.connection.getFromLane())],
+        tuple(lane_row[id(lane)] for lane in movement.chain),
+        lane_row[id(movement.connection.getToLane())],
+    )
 
 
 def _edge_rows(chosen: NetworkSelection, net: Any, node_row: dict[int, int]) -> NDArray[np.void]:
