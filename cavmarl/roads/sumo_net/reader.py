@@ -6,7 +6,7 @@ import hashlib
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +25,11 @@ from cavmarl.roads.sumo_net.conflicts import (
     stop_back,
 )
 from cavmarl.roads.sumo_net.detectors import DetectorRoads, place_detectors
-from cavmarl.roads.sumo_net.programs import SignalProgram
 from cavmarl.roads.sumo_net.selection import Movement, NetworkSelection, permission_bits, select
 from cavmarl.roads.sumo_net.signal_rows import SignalRows, read_signals
+
+if TYPE_CHECKING:
+    from cavmarl.roads.sumo_net.sumo_xml import ParsedNet
 
 APPROACH_M = 12.0  # before a junction, where bodies still stand askew to vehicles that wait
 _ENDINGS = (".gz", ".xml", ".net", ".osm", ".xodr")
@@ -66,14 +68,15 @@ def read_network(path: str | Path) -> RoadNetwork:
     path = Path(path)
     digest = source_hash(path)
     try:
-        return _assemble(*parse_net(path), map_name(path), digest)
+        return _assemble(parse_net(path), map_name(path), digest)
     except MapError as error:
         if str(error).startswith(str(path)):
             raise
         raise MapError(f"{path}: {error}") from error
 
 
-def _assemble(net: Any, programs: list[SignalProgram], name: str, digest: str) -> RoadNetwork:
+def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
+    net = parsed.net
     chosen = select(net)
     if not chosen.edges:
         raise MapError(
@@ -81,7 +84,7 @@ def _assemble(net: Any, programs: list[SignalProgram], name: str, digest: str) -
             "netconvert kept (--keep-edges.by-vclass)"
         )
     lane_row = {id(lane): row for row, lane in enumerate(chosen.lanes)}
-    signal_rows = read_signals(programs)
+    signal_rows = read_signals(parsed.programs)
     nodes = net.getNodes()
     node_row = {id(node): row for row, node in enumerate(nodes)}
 
@@ -95,11 +98,11 @@ def _assemble(net: Any, programs: list[SignalProgram], name: str, digest: str) -
     points, first_point = point_rows(shapes)
 
     edges = _edge_rows(chosen, net, node_row)
-    lanes = _lane_rows(chosen, edges, points, first_point)
+    lanes = _lane_rows(chosen, edges, points, first_point, parsed.left_hand)
     links = _link_rows(chosen.movements, lane_row, lanes, node_row, signal_rows)
     into = _connect(lanes, links, chosen.movements, lane_row)
     paths = [_path(move, lane_row, lanes, points) for move in chosen.movements]
-    conflicts, first_conflict = conflict_rows(chosen.movements, paths)
+    conflicts, first_conflict = conflict_rows(chosen.movements, paths, parsed.left_hand)
     fork_m = fork_lengths(links["from_lane"].tolist(), paths)
     links["fork_m"] = np.minimum(fork_m, links["length_m"] + FORK_BEYOND_M)
     _map_neighbors(lanes, points)
@@ -136,6 +139,7 @@ def _assemble(net: Any, programs: list[SignalProgram], name: str, digest: str) -
         signal_ids=tuple(signal_rows.ids),
         junction_kinds=kinds,
         geo=_geo_reference(net),
+        left_hand=parsed.left_hand,
     )
 
 
@@ -209,6 +213,7 @@ def _lane_rows(
     edges: NDArray[np.void],
     points: NDArray[np.void],
     first_point: NDArray[np.int32],
+    left_hand: bool,
 ) -> NDArray[np.void]:
     lanes = np.zeros(len(chosen.lanes), LANE)
     lanes["edge"] = np.repeat(np.arange(len(edges)), edges["num_lanes"])
@@ -234,9 +239,10 @@ def _lane_rows(
     )
     pair = (lanes["edge"][:-1] == lanes["edge"][1:]) & (position[:-1] + 1 == position[1:])
     pair &= beside[:-1] & beside[1:]
-    right = np.flatnonzero(pair)
-    lanes["left"][right] = right + 1
-    lanes["right"][right + 1] = right
+    outer = np.flatnonzero(pair)
+    inwards, outwards = ("right", "left") if left_hand else ("left", "right")
+    lanes[inwards][outer] = outer + 1
+    lanes[outwards][outer + 1] = outer
     return lanes
 
 
@@ -261,7 +267,8 @@ def _link_rows(
         link["junction"] = node_row[id(movement.node)]
         link["index"] = movement.index
         link["signal"], link["signal_index"] = signals.find(connection, movement.node.getType())
-        link["direction"] = ord(connection.getDirection()[0])
+        # SUMO writes T for U-turns to the right, where one drives on the left.
+        link["direction"] = ord(connection.getDirection()[0].replace("T", "t"))
         link["state"] = ord(connection.getState()[0])
     return links
 
