@@ -89,28 +89,33 @@ def _slowing_to(kind: np.void, limit: float, distance: float, speed: float, dt: 
 
 
 @kernel
-def _bend_speed(roads: RoadArrays, lane: int, distance: float) -> float:
+def _bend_speed(roads: RoadArrays, before: int, lane: int, distance: float) -> float:
     """The speed in m/s, now, with which a steered car can take all bends of a lane in comfort.
 
-    `distance` is the way to the start of the lane in m, negative on it.
+    `distance` is the way to the start of the lane in m, negative on it; there it comes from the
+    lane `before`, which is the same where it is on it.
     """
     row = roads.lanes[lane]
     first = row["first_point"]
     last = first + row["num_points"] - 1
     slowest = math.inf
-    for k in range(first + 1, last):
+    for k in range(first if before != lane else first + 1, last):
         to_bend = distance + roads.points[k]["s"]
         if to_bend < -BEND_M:
             continue
-        before = roads.points[k - 1]
+        straight = roads.points[k - 1]
+        if k == first:
+            straight = roads.points[
+                roads.lanes[before]["first_point"] + roads.lanes[before]["num_points"] - 1
+            ]
         m = k
         while m < last - 1 and roads.points[m + 1]["s"] - roads.points[k]["s"] < BEND_M:
             m += 1
         after = roads.points[m]
         bend = abs(
             math.atan2(
-                before["cos"] * after["sin"] - before["sin"] * after["cos"],
-                before["cos"] * after["cos"] + before["sin"] * after["sin"],
+                straight["cos"] * after["sin"] - straight["sin"] * after["cos"],
+                straight["cos"] * after["cos"] + straight["sin"] * after["sin"],
             )
         )
         if bend > MIN_BEND_RAD:
@@ -256,7 +261,7 @@ def _road_ahead(
     limit = min(here["speed_mps"], kind["desired_max_speed"])
     allowed = min(limit * row["speed_factor"], kind["max_speed"])
     if steered:
-        allowed = min(allowed, _bend_speed(roads, lane, -row["s"]))
+        allowed = min(allowed, _bend_speed(roads, lane, lane, -row["s"]))
     press = no_press(kind)
     hold = HOLD_NONE
     link_ahead = -1
@@ -306,7 +311,7 @@ def _road_ahead(
         ahead = roads.lanes[lane]
         limit = ahead["speed_mps"] * row["speed_factor"]
         if steered:
-            allowed = min(allowed, _bend_speed(roads, lane, distance))
+            allowed = min(allowed, _bend_speed(roads, before, lane, distance))
         if limit < allowed:
             allowed = min(allowed, _slowing_to(kind, limit, distance, speed, dt))
         j = last_on(scratch, lane, row["id"], distance, travel.view_m)

@@ -16,8 +16,16 @@ from cavmarl.core.records.codes import (
     ACTION_LANE_RIGHT,
     ACTION_SLOWER,
 )
-from cavmarl.driving.kernels.highway_control import PURSUIT_S, steering_control
+from cavmarl.driving.kernels.highway_control import (
+    MAX_STEERING_RAD,
+    PURSUIT_S,
+    steering_control,
+)
 
+AIM_M = 4.0  # in a bend a driver aims at a place of the way so far ahead, or further:
+AIM_S = 0.6  # where it is after this time,
+AIM_RAD = 0.1  # if that lies so far aside of where the lane leads here
+MAX_AIM_LANES = 8  # that lie between, at most
 CHORD_M = 1.5  # real lanes have corners: their direction is that of a chord, this far to both sides
 
 
@@ -73,23 +81,54 @@ def steer_to_lane(
         ahead -= here["length_m"]
         lane = following
         here = roads.lanes[lane]
-        _, d, _, _ = project(
+        s, d, _, _ = project(
             roads.points, here["first_point"], here["num_points"], row["x"], row["y"]
         )
+    aimed = _aim(roads, plans, row, lane, s)
+    if aimed < math.inf:
+        return aimed
     direction = _direction_at(roads, plans, row["goal"], lane, ahead)
     return steering_control(row["speed"], d, wrap_angle(direction - row["heading"]), row["length"])
+
+
+@kernel
+def _aim(roads: RoadArrays, plans: NDArray[np.void], row: np.void, lane: int, s: float) -> float:
+    """The steering angle in rad that brings a vehicle round a bend; inf where there is none.
+
+    Pure pursuit: the arc through a place of the way ahead. So the car turns in before a bend that
+    is tighter than its turning circle. Coulter: "Implementation of the pure pursuit path tracking
+    algorithm", CMU-RI-TR-92-01.
+    """
+    here = roads.lanes[lane]
+    x0, y0, _, cos, sin, _ = lane_pose(roads.points, here["first_point"], here["num_points"], s)
+    x, y = _point_at(roads, plans, row["goal"], lane, s + max(AIM_M, AIM_S * row["speed"]))
+    aside = math.atan2(cos * (y - y0) - sin * (x - x0), cos * (x - x0) + sin * (y - y0))
+    if abs(aside) < AIM_RAD:
+        return math.inf
+    x -= row["x"]
+    y -= row["y"]
+    apart = math.sqrt(x * x + y * y)
+    bearing = wrap_angle(math.atan2(y, x) - row["heading"])
+    if abs(bearing) > 0.5 * math.pi:
+        return math.copysign(MAX_STEERING_RAD, bearing)
+    sin_slip = min(row["length"] * abs(math.sin(bearing)) / max(apart, AIM_M), 1.0)
+    steering = math.atan2(2.0 * sin_slip, math.sqrt(1.0 - sin_slip * sin_slip))
+    return math.copysign(min(steering, MAX_STEERING_RAD), bearing)
 
 
 @kernel
 def _point_at(
     roads: RoadArrays, plans: NDArray[np.void], goal: int, lane: int, s: float
 ) -> tuple[float, float]:
-    """The place at `s` of a lane, beyond its end on the one that the plan names."""
+    """The place at `s` of a lane, beyond its end on those that the plan names."""
     here = roads.lanes[lane]
-    following = plans[goal, lane]["next"]
-    if s > here["length_m"] and following >= 0:
+    for _ in range(MAX_AIM_LANES):
+        following = plans[goal, lane]["next"]
+        if s <= here["length_m"] or following < 0:
+            break
         s -= here["length_m"]
-        here = roads.lanes[following]
+        lane = following
+        here = roads.lanes[lane]
     x, y, _, _, _, _ = lane_pose(roads.points, here["first_point"], here["num_points"], s)
     return x, y
 
