@@ -97,6 +97,7 @@ class _Trial:
                 last_lane,
                 max(end_m, 0.0),
                 self._steering_rad,
+                -1 if self._network.left_hand else 1,
             )
         )
 

@@ -26,6 +26,15 @@ AIM_M = 4.0  # in a bend a driver aims at a place of the way so far ahead, or fu
 AIM_S = 0.6  # where it is after this time,
 AIM_RAD = 0.1  # if that lies so far aside of where the lane leads here
 MAX_AIM_LANES = 8  # that lie between, at most
+# Over junctions it aims nearer, and further again by this times the way by which an arc of the
+# turning circle begins before one of the path, but not further than this times the angle in rad.
+TURN_AIM_M = 3.0
+AIM_EARLIER = 1.5
+AIM_M_PER_RAD = 3.0
+MOST_AIM_M = 7.0
+MOST_TURN_RAD = 2.8  # a sharper turn counts as this
+NEAR_TURN_M = 10.0  # before it, a junction counts as one
+TURNING_RATIO = 1.118  # radius of the turning circle over the length, wheels turned by 45°
 CHORD_M = 1.5  # real lanes have corners: their direction is that of a chord, this far to both sides
 
 
@@ -92,6 +101,30 @@ def steer_to_lane(
 
 
 @kernel
+def _aim_m(roads: RoadArrays, plans: NDArray[np.void], row: np.void, lane: int, s: float) -> float:
+    """How far ahead a driver aims in a bend, in m: the further the tighter a turn is."""
+    here = roads.lanes[lane]
+    link = here["link"]
+    if not here["internal"]:
+        if s < here["length_m"] - NEAR_TURN_M:
+            return AIM_M
+        link = plans[row["goal"], lane]["link"]
+    if link < 0 or roads.links[link]["length_m"] == 0.0:
+        return AIM_M
+    turned = roads.links[link]
+    before = roads.lanes[turned["from_lane"]]
+    last = roads.points[before["first_point"] + before["num_points"] - 1]
+    first = roads.points[roads.lanes[turned["to_lane"]]["first_point"]]
+    turn = abs(wrap_angle(first["heading"] - last["heading"]))
+    if turn < AIM_RAD:
+        return AIM_M
+    missing_m = max(TURNING_RATIO * row["length"] - turned["length_m"] / turn, 0.0)
+    earlier_m = missing_m * math.tan(0.5 * min(turn, MOST_TURN_RAD))
+    most_m = min(AIM_M_PER_RAD * turn, MOST_AIM_M)
+    return max(min(TURN_AIM_M + AIM_EARLIER * earlier_m, most_m), TURN_AIM_M)
+
+
+@kernel
 def _aim(roads: RoadArrays, plans: NDArray[np.void], row: np.void, lane: int, s: float) -> float:
     """The steering angle in rad that brings a vehicle round a bend; inf where there is none.
 
@@ -101,7 +134,8 @@ def _aim(roads: RoadArrays, plans: NDArray[np.void], row: np.void, lane: int, s:
     """
     here = roads.lanes[lane]
     x0, y0, _, cos, sin, _ = lane_pose(roads.points, here["first_point"], here["num_points"], s)
-    x, y = _point_at(roads, plans, row["goal"], lane, s + max(AIM_M, AIM_S * row["speed"]))
+    aim_m = max(_aim_m(roads, plans, row, lane, s), AIM_S * row["speed"])
+    x, y = _point_at(roads, plans, row["goal"], lane, s + aim_m)
     aside = math.atan2(cos * (y - y0) - sin * (x - x0), cos * (x - x0) + sin * (y - y0))
     if abs(aside) < AIM_RAD:
         return math.inf
@@ -111,7 +145,7 @@ def _aim(roads: RoadArrays, plans: NDArray[np.void], row: np.void, lane: int, s:
     bearing = wrap_angle(math.atan2(y, x) - row["heading"])
     if abs(bearing) > 0.5 * math.pi:
         return math.copysign(MAX_STEERING_RAD, bearing)
-    sin_slip = min(row["length"] * abs(math.sin(bearing)) / max(apart, AIM_M), 1.0)
+    sin_slip = min(row["length"] * abs(math.sin(bearing)) / max(apart, TURN_AIM_M), 1.0)
     steering = math.atan2(2.0 * sin_slip, math.sqrt(1.0 - sin_slip * sin_slip))
     return math.copysign(min(steering, MAX_STEERING_RAD), bearing)
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.geometry import lane_pose
+from cavmarl.core.math.geometry import lane_pose, project
 from cavmarl.core.math.scalars import clamp
 from cavmarl.core.numba import kernel
 from cavmarl.core.records.arrays import LaneGrid, RoadArrays
@@ -17,8 +17,29 @@ from cavmarl.driving.kernels.tracking import locate
 
 TRIAL_MPS = 2.7  # the speed to which drivers slow down for the sharpest bends
 TRIAL_DT_S = 0.1
+SWING_M = 0.5  # of a body beyond the middle of a road: others have so much room beside them
 BEYOND_M = 12.0  # before and behind a junction: there a car swings out
 MOST_TICKS = 5000
+
+
+@kernel
+def _reaches_over(roads: RoadArrays, row: np.void, lane: int, inwards: int) -> bool:
+    """Whether a corner of a body lies far beyond the inner side of the innermost lane of a road."""
+    here = roads.lanes[lane]
+    if (here["left"] if inwards > 0 else here["right"]) >= 0:
+        return False
+    cos = math.cos(row["heading"])
+    sin = math.sin(row["heading"])
+    aside = 0.5 * inwards * row["width"]
+    most = 0.5 * here["width_m"] + SWING_M
+    for end in (-0.5, 0.5):
+        ahead = end * row["length"]
+        x = row["x"] + ahead * cos - aside * sin
+        y = row["y"] + ahead * sin + aside * cos
+        s, d, _, _ = project(roads.points, here["first_point"], here["num_points"], x, y)
+        if 0.0 < s < here["length_m"] and most < inwards * d < most + here["width_m"]:
+            return True
+    return False
 
 
 @kernel
@@ -32,8 +53,12 @@ def stays_on_road(
     last_lane: int,  # on which it ends,
     end_m: float,  # and where on it
     steering_rad: float,  # the most that its front wheels turn
+    inwards: int,  # 1: the middle of the road is to the left, -1: to the right
 ) -> bool:
-    """Whether a car that creeps along its way is never off the road or on the wrong side."""
+    """Whether a car that creeps along its way is never off the road or on the wrong side.
+
+    Nor may a corner of its body reach far beyond the middle of either road, where others come.
+    """
     here = roads.lanes[lane]
     x, y, z, cos, sin, _ = lane_pose(roads.points, here["first_point"], here["num_points"], begin_m)
     row["x"], row["y"], row["z"] = x, y, z
@@ -55,6 +80,10 @@ def stays_on_road(
             TRIAL_DT_S,
         )
         if locate(roads, plan, grid, row) != 0:
+            return False
+        if _reaches_over(roads, row, lane, inwards) or _reaches_over(
+            roads, row, last_lane, inwards
+        ):
             return False
         if row["lane"] == last_lane and row["s"] >= end_m:
             return True

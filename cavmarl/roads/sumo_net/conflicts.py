@@ -302,10 +302,15 @@ def conflict_rows(
             if _bit(a, b, a.node._foes) or _bit(b, a, a.node._foes):
                 shared = _shared(paths[one], paths[other], merging=merging)
                 yields = _bit(a, b, a.node._prohibits), _bit(b, a, a.node._prohibits)
-            elif a.connection.getFromLane() is not b.connection.getFromLane() and not merging:
-                shared = _grazing(paths[one], paths[other])
+            elif a.connection.getFromLane() is not b.connection.getFromLane():
+                if merging:
+                    shared = _shared(paths[one], paths[other], merging=True)
+                else:
+                    shared = _grazing(paths[one], paths[other])
                 crosses = _turns_across(a, left_hand), _turns_across(b, left_hand)
                 yields = crosses[0] and not crosses[1], crosses[1]
+                if merging and not any(yields):
+                    yields = not _is_straight(a) and _is_straight(b), _is_straight(a)
             else:
                 continue
             if shared is None:
@@ -331,6 +336,10 @@ def _bit(mine: Movement, foe: Movement, requests: dict[int, str]) -> bool:
             "the network again with netconvert"
         )
     return row[-1 - foe.index] == "1"
+
+
+def _is_straight(movement: Movement) -> bool:
+    return movement.connection.getDirection() == "s"
 
 
 def _turns_across(movement: Movement, left_hand: bool) -> bool:
