@@ -30,7 +30,7 @@ MAX_AIM_LANES = 8  # that lie between, at most
 # turning circle begins before one of the path, but not further than this times the angle in rad.
 TURN_AIM_M = 3.0
 AIM_EARLIER = 1.5
-AIM_M_PER_RAD = 3.0
+AIM_M_PER_RAD = 2.6
 MOST_AIM_M = 7.0
 MOST_TURN_RAD = 2.8  # a sharper turn counts as this
 NEAR_TURN_M = 10.0  # before it, a junction counts as one

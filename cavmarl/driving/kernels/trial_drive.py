@@ -15,7 +15,7 @@ from cavmarl.driving.kernels.bicycle import bicycle_step
 from cavmarl.driving.kernels.steering import steer_to_lane
 from cavmarl.driving.kernels.tracking import locate
 
-TRIAL_MPS = 2.7  # the speed to which drivers slow down for the sharpest bends
+TRIAL_MPS = 3.5  # about the speed to which drivers slow down for sharp bends
 TRIAL_DT_S = 0.1
 SWING_M = 0.5  # of a body beyond the middle of a road: others have so much room beside them
 BEYOND_M = 12.0  # before and behind a junction: there a car swings out
