@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.math.geometry import lane_pose, project, wrap_angle
+from cavmarl.core.math.scalars import clamp
 from cavmarl.core.numba import kernel
 from cavmarl.core.records.arrays import RoadArrays
 from cavmarl.core.records.codes import (
@@ -33,6 +34,8 @@ AIM_EARLIER = 1.5
 AIM_M_PER_RAD = 2.6
 MOST_AIM_M = 7.0
 MOST_TURN_RAD = 2.8  # a sharper turn counts as this
+CUT_RADIUS_M = 6.0  # a turn of this radius is cut,
+WIDE_RADIUS_M = 9.0  # one of that is followed
 NEAR_TURN_M = 10.0  # before it, a junction counts as one
 TURNING_RATIO = 1.118  # radius of the turning circle over the length, wheels turned by 45°
 CHORD_M = 1.5  # real lanes have corners: their direction is that of a chord, this far to both sides
@@ -101,27 +104,35 @@ def steer_to_lane(
 
 
 @kernel
-def _aim_m(roads: RoadArrays, plans: NDArray[np.void], row: np.void, lane: int, s: float) -> float:
-    """How far ahead a driver aims in a bend, in m: the further the tighter a turn is."""
+def _aim_m(
+    roads: RoadArrays, plans: NDArray[np.void], row: np.void, lane: int, s: float
+) -> tuple[float, float]:
+    """How far ahead a driver aims in a bend, in m, and how exactly it follows it, from 0 to 1.
+
+    The tighter a turn is, the further ahead, and the more it cuts the corner: that of the kerb, so
+    that its front does not swing over the middle of the road.
+    """
     here = roads.lanes[lane]
     link = here["link"]
     if not here["internal"]:
         if s < here["length_m"] - NEAR_TURN_M:
-            return AIM_M
+            return AIM_M, 1.0
         link = plans[row["goal"], lane]["link"]
     if link < 0 or roads.links[link]["length_m"] == 0.0:
-        return AIM_M
+        return AIM_M, 1.0
     turned = roads.links[link]
     before = roads.lanes[turned["from_lane"]]
     last = roads.points[before["first_point"] + before["num_points"] - 1]
     first = roads.points[roads.lanes[turned["to_lane"]]["first_point"]]
     turn = abs(wrap_angle(first["heading"] - last["heading"]))
     if turn < AIM_RAD:
-        return AIM_M
-    missing_m = max(TURNING_RATIO * row["length"] - turned["length_m"] / turn, 0.0)
+        return AIM_M, 1.0
+    radius_m = turned["length_m"] / turn
+    missing_m = max(TURNING_RATIO * row["length"] - radius_m, 0.0)
     earlier_m = missing_m * math.tan(0.5 * min(turn, MOST_TURN_RAD))
     most_m = min(AIM_M_PER_RAD * turn, MOST_AIM_M)
-    return max(min(TURN_AIM_M + AIM_EARLIER * earlier_m, most_m), TURN_AIM_M)
+    aim_m = max(min(TURN_AIM_M + AIM_EARLIER * earlier_m, most_m), TURN_AIM_M)
+    return aim_m, clamp((radius_m - CUT_RADIUS_M) / (WIDE_RADIUS_M - CUT_RADIUS_M), 0.0, 1.0)
 
 
 @kernel
@@ -134,7 +145,8 @@ def _aim(roads: RoadArrays, plans: NDArray[np.void], row: np.void, lane: int, s:
     """
     here = roads.lanes[lane]
     x0, y0, _, cos, sin, _ = lane_pose(roads.points, here["first_point"], here["num_points"], s)
-    aim_m = max(_aim_m(roads, plans, row, lane, s), AIM_S * row["speed"])
+    aim_m, exact = _aim_m(roads, plans, row, lane, s)
+    aim_m = max(aim_m, AIM_S * row["speed"])
     x, y = _point_at(roads, plans, row["goal"], lane, s + aim_m)
     aside = math.atan2(cos * (y - y0) - sin * (x - x0), cos * (x - x0) + sin * (y - y0))
     if abs(aside) < AIM_RAD:
@@ -145,8 +157,14 @@ def _aim(roads: RoadArrays, plans: NDArray[np.void], row: np.void, lane: int, s:
     bearing = wrap_angle(math.atan2(y, x) - row["heading"])
     if abs(bearing) > 0.5 * math.pi:
         return math.copysign(MAX_STEERING_RAD, bearing)
-    sin_slip = min(row["length"] * abs(math.sin(bearing)) / max(apart, TURN_AIM_M), 1.0)
-    steering = math.atan2(2.0 * sin_slip, math.sqrt(1.0 - sin_slip * sin_slip))
+    # The arc that the middle of the rear drives, whose heading is the car's, and that of its centre
+    # if this went where it heads.
+    apart = max(apart, TURN_AIM_M)
+    aside_m = row["length"] * math.sin(abs(bearing))
+    following = math.atan2(2.0 * aside_m, apart + row["length"] * math.cos(bearing))
+    sin_slip = min(aside_m / apart, 1.0)
+    cutting = math.atan2(2.0 * sin_slip, math.sqrt(1.0 - sin_slip * sin_slip))
+    steering = exact * following + (1.0 - exact) * cutting
     return math.copysign(min(steering, MAX_STEERING_RAD), bearing)
 
 
