@@ -339,11 +339,12 @@ def _bit(mine: Movement, foe: Movement, requests: dict[int, str]) -> bool:
 
 
 def _is_straight(movement: Movement) -> bool:
-    return movement.connection.getDirection() == "s"
+    return str(movement.connection.getDirection()) == "s"
 
 
 def _turns_across(movement: Movement, left_hand: bool) -> bool:
-    return movement.connection.getDirection() in ("rRT" if left_hand else "lLt")
+    across = "rRT" if left_hand else "lLt"
+    return str(movement.connection.getDirection()) in across
 
 
 def _grazing(path: LinkPath | None, foe: LinkPath | None) -> Overlap | None:

@@ -133,6 +133,22 @@ class Streets:
                 0.5 * float(row["foe_enter_m"] + row["foe_leave_m"]),
             )
 
+    def apart_m(self, crossing: Crossing) -> float:
+        """From the middle of the shared area on the way of the other to the way of the one."""
+        rest, lane = crossing.foe_middle_m, int(self.network.links["first_internal"][crossing.foe])
+        while rest > self.length_m(lane) and self.network.lanes["internal"][lane]:
+            rest -= self.length_m(lane)
+            lane = int(self.network.lanes["successor"][lane])
+        x, y, _ = self.point(lane, rest)
+        own = int(self.network.links["first_internal"][crossing.link])
+        nearest = math.inf
+        while own >= 0 and self.network.lanes["internal"][own]:
+            s, d, _, _ = self.network.beside(own, x, y)
+            beyond = max(-s, s - self.length_m(own), 0.0)
+            nearest = min(nearest, math.hypot(d, beyond))
+            own = int(self.network.lanes["successor"][own])
+        return nearest
+
     def movements(self, directions: str) -> list[int]:
         """LINK rows over junctions for cars, in SUMO's directions, as `s` or `lL`."""
         links, lanes = self.network.links, self.network.lanes
