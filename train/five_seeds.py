@@ -142,7 +142,7 @@ class Children:
                 dying_with_parent(command), stdout=subprocess.DEVNULL, start_new_session=True
             )
             self._running.add(child)
-        print(said, flush=True)
+        print(f"{said}\n", end="", flush=True)  # one write: others say so at the same time
         try:
             return child.wait()
         finally:

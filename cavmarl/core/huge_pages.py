@@ -7,7 +7,9 @@ tables. Linux gives pages of 2 MiB on request, where they are not switched off
 
 from __future__ import annotations
 
+import ctypes
 import mmap
+import sys
 import threading
 from math import prod
 from typing import Any
@@ -17,6 +19,7 @@ from numpy.typing import DTypeLike, NDArray
 
 PAGE = 1 << 21  # bytes
 LEAST = 1 << 16  # bytes of an array that is worth it
+_LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
 _LINE = 64  # bytes of a cache line: no two arrays share one
 
 
@@ -70,3 +73,15 @@ def _map(size: int) -> NDArray[np.uint8]:
     whole = np.frombuffer(memory, dtype=np.uint8)
     first = -whole.ctypes.data % PAGE
     return whole[first : first + size]
+
+
+def forget(array: NDArray[Any]) -> None:
+    """Give the memory of an array back, as far as it has whole pages: it reads as 0 or as it was.
+
+    Linux alone can; the array is contiguous, and nothing else lies between its first and last byte.
+    """
+    size = mmap.PAGESIZE
+    begin = array.ctypes.data
+    first, last = -(-begin // size) * size, (begin + array.nbytes) // size * size
+    if _LIBC is not None and first < last:
+        _LIBC.madvise(ctypes.c_void_p(first), ctypes.c_size_t(last - first), mmap.MADV_DONTNEED)

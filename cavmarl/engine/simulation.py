@@ -19,11 +19,13 @@ from cavmarl.core.records.codes import ACTION_IDLE
 from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.engine import world_snapshot as snapshot
 from cavmarl.engine.compilation import announce_compilation, compiling_all
+from cavmarl.engine.peers import Peers
 from cavmarl.engine.shard_clock import ShardClock
 from cavmarl.engine.shared_outputs import SharedOutputs
 from cavmarl.engine.tick_setup import cut_zones, make_frames, make_tick
 from cavmarl.engine.world_views import WorldViews
 from cavmarl.handoff.coordinator.coordinator_setup import WorldRun, make_coordinators
+from cavmarl.handoff.coordinator.coordinators import Coordination, Coordinators
 from cavmarl.handoff.coordinator.handoff_log import HandoffLog
 from cavmarl.handoff.fault_injection.committed_store import CommittedStore
 from cavmarl.handoff.fault_injection.recovery import Recovery
@@ -34,7 +36,7 @@ from cavmarl.ownership.messages import Switch
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.mounted.frames import Frames
-from cavmarl.shards.executor import SerialExecutor, Together
+from cavmarl.shards.executor import Executor, SerialExecutor, Together
 from cavmarl.shards.shard import Commands, Shard
 from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
@@ -117,12 +119,16 @@ class Simulation(WorldViews):
         watched = zones.journal or zones.check_invariants or zones.faults or zones.reproducers
         if self.partition.count > 1 or watched:
             self._let_coordinate(runs)
-        tick = self._tick
-        if zones.repartition_steps and self.partition.count > 1 and tick.coordination is not None:
+        coordination = self._tick.coordination
+        if (
+            zones.repartition_steps
+            and self.partition.count > 1
+            and isinstance(coordination, Coordinators)
+        ):
             self._recutter = Recutter(
                 self.network,
-                tick.division,
-                tick.coordination,
+                self._tick.division,
+                coordination,
                 zones.repartition_steps,
                 zones.repartition_tolerance,
             )
@@ -209,6 +215,8 @@ class Simulation(WorldViews):
         if tick.sumo is not None:
             tick.sumo.reset(chosen, worlds)
         tick.division.distribute(chosen)
+        if tick.peers is not None:
+            tick.peers.keep_own(chosen)
         if tick.coordination is not None:
             tick.coordination.reset(chosen)
         tick.switch_signals()
@@ -276,7 +284,7 @@ class Simulation(WorldViews):
         self.reset()
         self._tick.division.align()
         notes = CommittedStore(self._shards, self._shared_arrays).adopt(kept.image)
-        if self._tick.coordination is not None:
+        if isinstance(self._tick.coordination, Coordinators):
             self._tick.coordination.take_up(kept.records, notes)
             self._tick.coordination.save()
 
@@ -305,6 +313,11 @@ class Simulation(WorldViews):
         """
         self._refuse_recutting("the zones of one world over workers")
         self._tick.host(make, gathers)
+
+    def share(self, peers: Peers, coordination: Coordination, executor: Executor) -> None:
+        """From now on host the zones that `executor` runs, and leave the others to `peers`."""
+        tick = self._tick
+        tick.peers, tick.coordination, tick.executor = peers, coordination, executor
 
     def time_shards(self, every: int = 1) -> ShardClock:
         """From now on run phases zone by zone, with a clock on each."""
@@ -349,11 +362,19 @@ class Simulation(WorldViews):
         if self._tick.sumo is not None:
             self._tick.sumo.catch_up(self._shard.worlds)
 
-    def _put_back(self, saved: Sequence[NDArray[Any]]) -> None:
+    def load_own(self, saved: Sequence[NDArray[Any]], home: int) -> None:
+        """`load` where other processes hold zones: each goes on with its own, one is `home`."""
+        self._put_back(saved, home)
+        tick = self._tick
+        if tick.peers is not None:
+            tick.gate.num_passing[:] = 0
+            tick.peers.go_on(tick.gate, tick.division.side)
+
+    def _put_back(self, saved: Sequence[NDArray[Any]], home: int | None = None) -> None:
         roots, episodes, *rest = saved
         self.seed(*roots.tolist())
         self._episodes[:] = episodes
-        self._tick.gate = snapshot.load(self._parts(), rest)
+        self._tick.gate = snapshot.load(self._parts(), rest, home)
 
     def share_of(self, world: int) -> list[NDArray[Any]]:
         """What `save` would give if there were no world but one; views, to be copied."""

@@ -12,9 +12,10 @@ from cavmarl.core.math.tallies import count_tick, occasions
 from cavmarl.core.numba.specialized import specialized
 from cavmarl.core.records.arrays import Gate
 from cavmarl.engine.component import Attached
+from cavmarl.engine.peers import Peers
 from cavmarl.engine.shared_outputs import SharedOutputs
 from cavmarl.engine.step_trace import MIRROR, SUMO, Traced
-from cavmarl.handoff.coordinator.coordinators import Coordinators
+from cavmarl.handoff.coordinator.coordinators import Coordination
 from cavmarl.handoff.division import Division
 from cavmarl.shards.executor import Executor, SerialExecutor, Together
 from cavmarl.shards.shard import Commands, Shard
@@ -46,9 +47,10 @@ class Tick:
         self.gate = gate  # through which vehicles come and go; a reset may replace it
         self.attached = attached
         self.executor: Executor = SerialExecutor(shards)
-        self.coordination: Coordinators | None = None  # decides ownership; None: all is one zone
+        self.coordination: Coordination | None = None  # decides ownership; None: all is one zone
         self.sumo: SumoTraffic | None = None  # beside these worlds; None: there is none
         self.hosts_may_die = False
+        self.peers: Peers | None = None  # hold the other zones; None: all are in this process
         self._shard = shards[0]
         self._is_undivided = len(shards) == 1
         self._everywhere = np.ones(len(self._shard.worlds.ticks), dtype=np.bool_)
@@ -88,6 +90,9 @@ class Tick:
             self.division.count_rows()
         else:
             self.division.exchange()
+        if self.peers is not None:
+            self.peers.share_rows(self.gate, self.division.next_side)
+            self.traffic.settle(self.gate, self._shard.worlds)
         self.executor.each("resolve")
         if self._gathers:
             self.division.note_gathered()  # others may still be about their contacts
@@ -117,6 +122,8 @@ class Tick:
             self.sumo.show(self._shard.worlds)
             return
         self.executor.each("detect")
+        if self.peers is not None:
+            self.peers.share_detections(self._shard.worlds)
         self.commons.switch_signals(self._shard.worlds)
 
     def sense(self, chosen: NDArray[np.bool_]) -> None:
@@ -125,6 +132,8 @@ class Tick:
             return
         self.commons.clear_outputs(chosen)
         self.executor.each("sense", chosen)
+        if self.peers is not None:
+            self.peers.share_outputs(self.commons.outputs, chosen)
         self.commons.settle_outputs(chosen)
         self.executor.each("credit", chosen)
 
@@ -140,7 +149,8 @@ class Tick:
             self.executor.each("leave", gate)
             if any(gate.num_passing.tolist()):
                 self._note_left()
-                traffic.settle(gate, worlds)
+                if self.peers is None:  # else those of all zones settle together, a little later
+                    traffic.settle(gate, worlds)
         if begins_second and traffic.rerouting is not None:
             with self.division.everybody_next() as everybody:
                 traffic.rerouting.act(gate, everybody)
@@ -164,13 +174,19 @@ class Tick:
 
     def let_in(self, all_phases: bool) -> None:
         """Rank → assign → propose, and if any departure has found a gap, accept → admit."""
-        traffic, gate, worlds = self.traffic, self.gate, self._shard.worlds
+        traffic, gate, worlds, peers = self.traffic, self.gate, self._shard.worlds, self.peers
+        if peers is not None:
+            peers.clear_ranks(gate)
         self.executor.each("rank_lanes", gate)
+        if peers is not None:
+            peers.share_ranks(gate)
         traffic.assign_lanes(gate, worlds)
         self.executor.each("propose", traffic.demand, gate)
+        if peers is not None:
+            peers.share_proposals(gate)
         if not (all_phases or any(gate.num_passing.tolist())):
             return
-        traffic.accept(gate, self.division.running())
+        traffic.accept(gate, self.division.running() if peers is None else peers.running())
         self._admit()
 
     def _admit(self) -> None:
@@ -186,6 +202,9 @@ class Tick:
         self.executor.each("retire", gate)
         if any(gate.num_passing.tolist()):
             self._note_left()
+        if self.peers is not None:
+            self.peers.share_leavers(gate)
+        if any(gate.num_passing.tolist()):
             self.executor.each("forget", gate)
             self.traffic.settle(gate, self._shard.worlds)
             if self.coordination is not None:

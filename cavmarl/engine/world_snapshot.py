@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cavmarl.core.records.arrays import Common, Gate, Outputs, Worlds
 from cavmarl.driving.vehicles import STATE_FIELDS
 from cavmarl.engine.component import Attached
-from cavmarl.handoff.coordinator.coordinators import Coordinators
+from cavmarl.handoff.coordinator.coordinators import Coordination
 from cavmarl.handoff.division import Division
 from cavmarl.shards.state import Use, arrays_of
 from cavmarl.traffic.native import NativeTraffic
@@ -33,7 +33,7 @@ class Parts(NamedTuple):
     gate: Gate  # through which vehicles come and go
     traffic: NativeTraffic  # what comes
     outputs: Outputs  # what agents have got; the frames of the next observation, too
-    coordination: Coordinators | None  # decides ownership; None: all is one zone
+    coordination: Coordination | None  # decides ownership; None: all is one zone
     has_frames: bool  # an observation has frames of the ones before
     attached: tuple[Attached, ...]  # what acts in each tick beside the traffic
     sumo: SumoTraffic | None  # beside the worlds; None: there is none
@@ -56,8 +56,12 @@ def save(parts: Parts) -> list[Array]:
     ]
 
 
-def load(parts: Parts, saved: Sequence[Array]) -> Gate:  # the gate, or a larger one
-    """Put everything in its place."""
+def load(
+    parts: Parts,
+    saved: Sequence[Array],
+    home: int | None = None,  # the zone of this process, if others hold some; see `put_back`
+) -> Gate:  # the gate, or a larger one
+    """Put everything in its place: vehicles in the zones that they are in, or that owned them."""
     everywhere = np.ones(len(parts.worlds.ticks), dtype=np.bool_)
     rest = iter(saved)
     parts.division.align()
@@ -70,9 +74,11 @@ def load(parts: Parts, saved: Sequence[Array]) -> Gate:  # the gate, or a larger
     gate.num_passing[:] = 0
     for array in _of_rerouting(parts):
         _put(array, next(rest))
-    zones = range(parts.division.count)
-    vehicles = [np.concatenate([next(rest) for _ in zones]) for _ in everywhere]
-    parts.division.place(vehicles, contacts)
+    vehicles = [[next(rest) for _ in range(parts.division.count)] for _ in everywhere]
+    if home is None:
+        parts.division.place([np.concatenate(zones) for zones in vehicles], contacts)
+    else:
+        parts.division.put_back(vehicles, contacts, home)
     if parts.coordination is not None:
         parts.coordination.reset(everywhere)
     return gate

@@ -16,7 +16,7 @@ from cavmarl.engine.tick import Tick
 from cavmarl.engine.traffic_stats import TrafficStats, count_traffic
 from cavmarl.engine.v2x_component import Messaging
 from cavmarl.handoff.coordinator.coordinator import Coordinator
-from cavmarl.handoff.division import ZoneLoads
+from cavmarl.handoff.division import Division, ZoneLoads
 from cavmarl.handoff.fault_injection.recovery import Recovery, Revival
 from cavmarl.handoff.repartitioning import Recut, Recutter
 from cavmarl.handoff.zone_view import ZoneView, view_zones
@@ -102,6 +102,11 @@ class WorldViews:
     def plans(self) -> NDArray[np.void]:
         """PLAN (G, L): the ways of agents, by `VEHICLE["goal"]`."""
         return self._tick.traffic.plans
+
+    @property
+    def division(self) -> Division:
+        """The shards together, and the rows that go between them."""
+        return self._tick.division
 
     def vehicles(self, world: int = 0) -> NDArray[np.void]:
         """The live vehicles of one world, VEHICLE records in no order.

@@ -30,7 +30,7 @@ from cavmarl.env.actions import LENIENT, ActionDecoder
 from cavmarl.env.declared_events import DeclaredEvents
 from cavmarl.env.drawn_worlds import RENDER_MODES, DrawnWorlds, check_rendering
 from cavmarl.env.world_copies import CopiedWithWorlds
-from cavmarl.parallel.backends import check_hosts, make_worlds
+from cavmarl.parallel.backends import check_hosts, make_worlds, places_of
 from cavmarl.parallel.step_arrays import SteppedWorlds
 from cavmarl.sensors.mounted.frames import SensorFrames
 
@@ -46,6 +46,7 @@ def parallel_env(
     zones: int | None = None,
     workers: int | str | None = None,
     hosts: str | None = None,
+    nodes: int | None = None,
     sensor_workers: int | None = None,
     agents: int | None = None,
     background: int | None = None,
@@ -64,6 +65,8 @@ def parallel_env(
             Results do not depend on it. "ray": as with hosts="ray", as many as are of use.
         hosts: "ray" runs the workers on the machines of a Ray cluster (docs/cluster.md). None: on
             this one.
+        nodes: in place of workers: processes that share nothing, each with some zones of each
+            world (docs/nodes.md). Results do not depend on it.
         sensor_workers: shadows workers.sensors, how many processes the sensors of `rig` are shared
             out over (docs/sensor_workers.md). Results do not depend on it.
         agents: shadows population.agents.
@@ -82,6 +85,7 @@ def parallel_env(
         WorkerError: worker processes cannot be started, or have no memory.
         MissingExtraError: hosts on Ray without Ray.
     """
+    workers, hosts = places_of(workers, hosts, nodes)
     check_hosts(workers, hosts)
     first_seed = None if seed is None else check_seed(seed)
     check_rendering(render_mode, 1, workers, hosts)

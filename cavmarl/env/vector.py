@@ -31,7 +31,7 @@ from cavmarl.env.declared_events import DeclaredEvents
 from cavmarl.env.drawn_worlds import DrawnWorlds, check_rendering
 from cavmarl.env.saved_state import SavedState
 from cavmarl.env.world_copies import CopiedWithWorlds
-from cavmarl.parallel.backends import check_hosts, make_worlds
+from cavmarl.parallel.backends import check_hosts, make_worlds, places_of
 from cavmarl.parallel.step_arrays import SteppedWorlds
 from cavmarl.sensors.mounted.frames import SensorFrames
 from cavmarl.shards.shard import Commands
@@ -53,6 +53,7 @@ def make_vec(
     zones: int | None = None,
     workers: int | str | None = None,
     hosts: str | None = None,
+    nodes: int | None = None,
     sensor_workers: int | None = None,
     agents: int | None = None,
     background: int | None = None,
@@ -71,11 +72,10 @@ def make_vec(
         zones: shadows zones.count, how many shards run the world; results do not depend on it.
         workers: processes that the worlds are shared out over, whole worlds each; where there are
             more of them than worlds, the zones of each world. 0: all run in the caller's process.
-            Results do not depend on it. "ray": as with hosts="ray", as many as CPUs and worlds.
-        hosts: "ray" runs the workers on the machines of a Ray cluster (docs/cluster.md). None: on
-            this one.
-        sensor_workers: shadows workers.sensors, how many processes the sensors of `rig` are shared
-            out over (docs/sensor_workers.md). Results do not depend on it.
+            "ray": as with hosts="ray", as many as CPUs and worlds. No result depends on it.
+        hosts: "ray" runs the workers on a Ray cluster (docs/cluster.md). None: on this machine.
+        nodes: in place of workers: processes with zones that share nothing (docs/nodes.md).
+        sensor_workers: shadows workers.sensors: processes for `rig` (docs/sensor_workers.md).
         agents: shadows population.agents.
         background: shadows population.background.
         seed: of the first reset, if that is given none.
@@ -93,6 +93,7 @@ def make_vec(
         MissingExtraError: hosts on Ray without Ray.
     """
     num_envs = _checked(num_envs)
+    workers, hosts = places_of(workers, hosts, nodes)
     check_hosts(workers, hosts)
     mode = known_mode(autoreset_mode)
     check_rendering(render_mode, num_envs, workers, hosts, ("rgb_array",))
@@ -140,8 +141,7 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
     - `DISABLED`: by `reset(options={"reset_mask": infos["episode_over"]})` before the next step,
       and never by itself. What a step returns is that of `NEXT_STEP`.
 
-    The worlds run in this process, or shared out over worker processes (docs/workers.md): what
-    comes out is the same bit for bit.
+    Worlds run here, or over processes (docs/workers.md), which changes no bit of what comes out.
 
     Args:
         worlds: that are stepped.

@@ -24,7 +24,7 @@ from cavmarl.ownership.messages import Birth, Switch
 from cavmarl.shards.executor import Executor
 from cavmarl.shards.shard import Shard
 from cavmarl.shards.vehicle_codec import TransferCodec
-from cavmarl.zones.kernels.borders import Borders, pass_on
+from cavmarl.zones.kernels.borders import Borders, give_up, pass_on, take_over
 from cavmarl.zones.kernels.ghost_exchange import exchange, note_gathered, take_own
 from cavmarl.zones.kernels.handoff import BorderRecords, hand_over, look, make_book, release
 from cavmarl.zones.kernels.zone_lookup import Halo, ZoneArrays, zone_of
@@ -83,6 +83,8 @@ class Division:
         self._note_gathered = specialized(note_gathered)
         self._look = specialized(look)
         self._pass_on = specialized(pass_on)
+        self._give_up = specialized(give_up)
+        self._take_over = specialized(take_over)
         self._totals = specialized(totals)
         self.call_hand_over = specialized(hand_over)
         self.call_release = specialized(release)
@@ -217,6 +219,26 @@ class Division:
         self.distribute(np.ones(len(vehicles), dtype=np.bool_))
         first.num_contacts[:] = contacts
 
+    def put_back(
+        self,
+        vehicles: Sequence[Sequence[NDArray[np.void]]],  # VEHICLE (n,) of each world and zone
+        contacts: NDArray[np.int64],  # (W,) as `contacts` counts them
+        home: int,  # the zone whose contacts these are from now on
+    ) -> None:
+        """Give every zone the vehicles that it owned; ghosts are to be renewed."""
+        self._zoned.step_at[...] = 0
+        self._zoned.num_outer[...] = -1
+        self._zoned.num_contacts[...] = 0
+        self._zoned.num_contacts[home] = contacts
+        for w, zones in enumerate(vehicles):
+            self._forget_offers(w)
+            for shard, rows in zip(self._shards, zones, strict=True):
+                worlds = shard.worlds
+                worlds.rows[w, : len(rows)] = rows
+                worlds.rows["epoch"][w, : len(rows)] = 0
+                worlds.num_owned[w] = worlds.num_rows[w] = len(rows)
+        self._exchange(self._first_side, 0, self.num_worlds)
+
     def contacts(self) -> NDArray[np.int64]:
         """(W,) vehicles that began to touch another, since each world's reset."""
         return _total([shard.worlds.num_contacts for shard in self._shards])
@@ -272,6 +294,21 @@ class Division:
             row = target.rows[w, place]
             row["owner"], row["epoch"] = switch.target, switch.epoch
         return place
+
+    def give_up(self, w: int, zone: int, vehicle: int) -> None:
+        """Let another process's zone have a vehicle of a zone of this one; it stays as a ghost."""
+        if not self._give_up(vehicle, zone, 0, self._zoned, self.side, w):
+            raise ConfigError(f"zone {zone} does not own vehicle {vehicle}")
+
+    def take_over(self, w: int, zone: int, vehicle: int, epoch: int, state: bytes) -> None:
+        """Go on with a vehicle of another zone, of which a zone of this process has a ghost."""
+        place = self._take_over(vehicle, zone, epoch, self._zoned, self.side, w)
+        if place < 0:
+            raise self.unseen(vehicle, zone)
+        worlds = self._shards[zone].worlds
+        self.codec.unpack(state, vehicle, int(worlds.ticks[w]), worlds.rows, w, place)
+        row = worlds.rows[w, place]
+        row["owner"], row["epoch"] = zone, epoch
 
     @staticmethod
     def unseen(vehicle: int, zone: int) -> ConfigError:

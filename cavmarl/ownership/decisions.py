@@ -6,7 +6,6 @@ from collections.abc import Iterable
 from typing import Protocol
 
 from cavmarl.core.errors import ProtocolError
-from cavmarl.ownership.ledger import state_digest
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import Birth, Deferral, Switch
 from cavmarl.ownership.readiness import Readiness
@@ -20,6 +19,9 @@ class CommittedStates(Protocol):
 
     def state(self, vehicle: int) -> bytes:
         """The vehicle's whole state as of the committed tick."""
+
+    def digest_of(self, vehicle: int) -> bytes:
+        """`ledger.state_digest` of it."""
 
 
 class Decisions:
@@ -81,5 +83,5 @@ class Decisions:
             tick=table.tick,
             epoch=epoch,
             incarnation=table.hosts[zone][1],
-            digest=state_digest(self._store.state(vehicle)),
+            digest=self._store.digest_of(vehicle),
         )

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from cavmarl.core.errors import JournalError, LostTickError, ProtocolError
 from cavmarl.ownership.decisions import CommittedStates, Decisions
-from cavmarl.ownership.ledger import state_digest, world_digest
+from cavmarl.ownership.ledger import world_digest
 from cavmarl.ownership.limits import DeadlinePolicy, Limits
 from cavmarl.ownership.messages import (
     Ack,
@@ -325,8 +325,7 @@ def make_step(table: Table, zone: int, store: CommittedStates, payload: bytes) -
     """
     plan = table.planned
     enter = tuple(
-        _entry(switch, store.state(switch.vehicle), switch.vehicle in plan.attach)
-        for switch in plan.enter.get(zone, ())
+        _entry(switch, store, switch.vehicle in plan.attach) for switch in plan.enter.get(zone, ())
     )
     return Step(
         table.run, table.episode, plan.record.tick, zone, table.hosts[zone][1], table.tick,
@@ -335,6 +334,6 @@ def make_step(table: Table, zone: int, store: CommittedStates, payload: bytes) -
     )  # fmt: skip
 
 
-def _entry(switch: Switch, state: bytes, attached: bool) -> In:
-    carried = state if attached else b""
-    return In(switch.vehicle, switch.epoch, attached, state_digest(state), carried)
+def _entry(switch: Switch, store: CommittedStates, attached: bool) -> In:
+    carried = store.state(switch.vehicle) if attached else b""
+    return In(switch.vehicle, switch.epoch, attached, store.digest_of(switch.vehicle), carried)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from cavmarl.ownership.ledger import row_hash, world_digest
+from cavmarl.ownership.ledger import row_hash, state_digest, world_digest
 from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 
 
@@ -28,6 +28,9 @@ class MemoryStore:
 
     def state(self, vehicle: int) -> bytes:
         return self.committed[vehicle]
+
+    def digest_of(self, vehicle: int) -> bytes:
+        return state_digest(self.committed[vehicle])
 
     def write(self, zone: int, incarnation: int, vehicle: int, state: bytes) -> None:
         """One row of the next tick, from the process of that incarnation."""

@@ -10,12 +10,13 @@ from typing import Protocol
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import World, check_workers
 from cavmarl.parallel.hosts.remote_worlds import RemoteWorlds
+from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.parallel.pooled_worlds import PooledWorlds
 from cavmarl.parallel.sensor_workers.sensor_worker_setup import local_worlds
 from cavmarl.parallel.split_hosts.divided_worlds import DividedWorlds
 from cavmarl.parallel.step_arrays import SteppedWorlds
 
-LOCAL, PROCESSES, RAY = "local", "processes", "ray"
+LOCAL, PROCESSES, RAY, NODES = "local", "processes", "ray", "nodes"
 
 
 class MakeWorlds(Protocol):
@@ -66,10 +67,17 @@ def _ray(
     return RemoteWorlds(world, base_dir, num_worlds, workers, in_next_step)
 
 
+def _nodes(
+    world: World, base_dir: Path, num_worlds: int, workers: int | None, in_next_step: bool
+) -> SteppedWorlds:
+    return NodeWorlds(world, base_dir, num_worlds, int(workers or 1), in_next_step)
+
+
 _BACKENDS = {
     LOCAL: Backend(_local, keeps_state=lambda num_worlds, workers: True),
     PROCESSES: Backend(_processes, needs_workers=True),
     RAY: Backend(_ray, needs_workers=True, keeps_state=_is_split),
+    NODES: Backend(_nodes, needs_workers=True),
 }
 _OWN = frozenset(_BACKENDS)
 
@@ -89,6 +97,22 @@ def register_backend(name: str, make: MakeWorlds) -> None:
     if name in _OWN:
         raise ConfigError(f"backend '{name}': one of cavmarl's own; take another name")
     _BACKENDS[name] = Backend(make)
+
+
+def places_of(
+    workers: int | str | None, hosts: str | None, nodes: int | None
+) -> tuple[int | str | None, str | None]:
+    """`workers` and `hosts` where worlds may be over nodes instead."""
+    if nodes is None:
+        return workers, hosts
+    if workers or hosts is not None:
+        raise ConfigError(
+            f"nodes = {nodes!r} with workers = {workers!r} and hosts = {hosts!r}: nodes are "
+            "processes of their own; leave the others out"
+        )
+    if not check_workers(nodes):
+        raise ConfigError(f"nodes = {nodes!r}: must be 1 or more; leave it out for this process")
+    return nodes, NODES
 
 
 def check_hosts(workers: int | str | None, hosts: str | None) -> tuple[str, int | None]:

@@ -215,6 +215,11 @@ class LocalWorlds:
         self._steps[:], self._waiting[:] = saved[:2]
         self.simulation.load(saved[2:])
 
+    def load_own(self, saved: Sequence[NDArray[Any]], home: int) -> None:
+        """The same where other processes hold zones; see `Simulation.load_own`."""
+        self._steps[:], self._waiting[:] = saved[:2]
+        self.simulation.load_own(saved[2:], home)
+
     def __reduce__(self) -> tuple[Any, ...]:
         """What a copy is made of: the worlds' parts, their state, and what is to be read of it.
 

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 
 from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.endpoint import Endpoint
-from cavmarl.ownership.ledger import row_hash, world_digest
+from cavmarl.ownership.ledger import row_hash, state_digest, world_digest
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import (
     COORDINATOR,
@@ -46,6 +46,9 @@ class Bench:
 
     def state(self, vehicle: int) -> bytes:
         return version(vehicle, self.directory.table.tick)
+
+    def digest_of(self, vehicle: int) -> bytes:
+        return state_digest(self.state(vehicle))
 
     def note(self, output: Output) -> Output:
         """Log what is to be logged."""

@@ -22,7 +22,7 @@ from cavmarl.core.errors import ProtocolError
 from cavmarl.ownership.decisions import Decisions
 from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.endpoint import Endpoint
-from cavmarl.ownership.ledger import SeenIds, row_hash, tally, world_digest
+from cavmarl.ownership.ledger import SeenIds, row_hash, state_digest, tally, world_digest
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import (
     COORDINATOR,
@@ -94,6 +94,9 @@ class Versions:
 
     def state(self, vehicle: int) -> bytes:
         return version(vehicle, self._directory.table.tick)
+
+    def digest_of(self, vehicle: int) -> bytes:
+        return state_digest(self.state(vehicle))
 
 
 class Explorer:

@@ -25,7 +25,7 @@ _OF_PROCESSES = re.compile(
     r"^import (subprocess|multiprocessing|libsumo)\b"
     r"|^from tests\.support\.(sumo_worlds|netgenerate|toy_hosts|toy_job|world_hosts) import"
     r"|importorskip\(\"(libsumo|ray)\""
-    r"|\bworkers=(?!0\b)|\bhosts=",
+    r"|\bworkers=(?!0\b)|\bhosts=|\bnodes=",
     re.MULTILINE,
 )
 _STARTS = {"subprocess.Popen", "os.fork", "os.posix_spawn", "os.system"}

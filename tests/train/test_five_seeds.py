@@ -27,6 +27,8 @@ def test_trainings_end_with_the_program(tmp_path: Path, ended_by: signal.Signals
     config.write_text("env: ring\nnum_envs: 2\ntotal_agent_steps: 1000000000\n")
     words = ["--config", "long.yaml", "--seeds", "0", "1", "--jobs", "2"]
     errors = tmp_path / "errors"
+    # In the background of a shell, SIGINT is ignored, here and in children.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     with errors.open("w") as file:  # a pipe would be open as long as they train
         program = subprocess.Popen(
             [sys.executable, str(TRAIN / "five_seeds.py"), *words],
@@ -35,15 +37,22 @@ def test_trainings_end_with_the_program(tmp_path: Path, ended_by: signal.Signals
             stderr=file,
             text=True,
         )
+    signal.signal(signal.SIGINT, before)
     with program:
-        assert program.stdout
-        said = {program.stdout.readline() for _ in range(2)}
-        assert said == {"training seed 0\n", "training seed 1\n"}
-        trainings = [os.pidfd_open(child.pid) for child in psutil.Process(program.pid).children()]
-        assert len(trainings) == 2
-        program.send_signal(ended_by)
-        ended = [has_ended(training) for training in trainings]
-        assert ended == [True, True], "they train on"
+        try:
+            assert program.stdout
+            said = {program.stdout.readline() for _ in range(2)}
+            assert said == {"training seed 0\n", "training seed 1\n"}
+            trainings = [
+                os.pidfd_open(child.pid) for child in psutil.Process(program.pid).children()
+            ]
+            assert len(trainings) == 2
+            program.send_signal(ended_by)
+            ended = [has_ended(training) for training in trainings]
+            assert ended == [True, True], "they train on"
+            program.wait(WAIT_MS / 1000)
+        finally:
+            program.kill()  # a fault here must not wait for it
     assert "Traceback" not in errors.read_text()
     if ended_by is signal.SIGINT:
         assert program.returncode == 130

@@ -24,6 +24,7 @@ from cavmarl.cli.output import (
 )
 from cavmarl.cli.verify.faults import check_campaign, print_figures, verify_campaign
 from cavmarl.cli.verify.kills import verify_with_kills
+from cavmarl.cli.verify.nodes import verify_over_nodes
 from cavmarl.config.env import ZONE_LAYOUTS
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError, LostTickError
@@ -77,6 +78,13 @@ def verify(
             metavar="N",
         ),
     ] = None,
+    nodes: Annotated[
+        str | None,
+        about(
+            "Numbers of nodes, processes that share nothing; with --kill N of them are killed.",
+            metavar="N,N,…",
+        ),
+    ] = None,
     workers: Annotated[int, about("With --kill: workers that run the worlds.")] = 2,
     hosts: Annotated[
         str | None,
@@ -115,10 +123,23 @@ def verify(
     console = Console()
     checked = {"zones.check_invariants": True} if check else {}
     strict = replace(world, overrides={**world.overrides, **checked})
-    if kill is not None:
-        _refuse_with_kill(
-            env, counts, {"--faults": faults, "--layout": layout, "--journal": journal}
+    if kill is not None or nodes is not None:
+        others = {"--faults": faults, "--layout": layout, "--journal": journal}
+        _refuse_with_kill("--kill" if nodes is None else "--nodes", env, counts, others)
+    if nodes is not None:
+        verify_over_nodes(
+            console,
+            strict,
+            _counts(nodes),
+            json_path,
+            kills=kill or 0,
+            zones=None if counts is None else counts[0],
+            worlds=1 if worlds is None else worlds,
+            steps=200 if steps is None else steps,
+            policy=policy,
         )
+        return
+    if kill is not None:
         verify_with_kills(
             console,
             strict,
@@ -204,15 +225,15 @@ def _run_again(path: Path, env: str | None, json_path: Path | None) -> None:
 
 
 def _refuse_with_kill(
-    env: str | None, counts: list[int] | None, others: dict[str, str | Path | None]
+    what: str, env: str | None, counts: list[int] | None, others: dict[str, str | Path | None]
 ) -> None:
     if env is None:
-        raise ConfigError("--kill: name an environment")
+        raise ConfigError(f"{what}: name an environment")
     if counts is not None and len(counts) > 1:
-        raise ConfigError(f"--zones {','.join(map(str, counts))}: --kill takes one number of zones")
+        raise ConfigError(f"--zones {','.join(map(str, counts))}: {what} takes one number of zones")
     for option, value in others.items():
         if value is not None:
-            raise ConfigError(f"{option} does not go with --kill: zones.layout is for --set")
+            raise ConfigError(f"{option} does not go with {what}: zones.layout is for --set")
 
 
 def _counts(text: str) -> list[int]:

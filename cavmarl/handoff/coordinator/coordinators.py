@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from hashlib import blake2b
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from cavmarl.handoff.division import Division
 from cavmarl.handoff.fault_injection.committed_store import CommittedStore, Notes
 from cavmarl.handoff.fault_injection.message_coordinator import MessageCoordinator
 from cavmarl.handoff.zone_view import TransferInFlight
+from cavmarl.ownership.ledger import state_digest
 from cavmarl.ownership.messages import Record
 from cavmarl.shards.shard import Commands
 from cavmarl.zones.kernels.zone_lookup import zones_of
@@ -100,8 +102,43 @@ class RowStates:
             self._known[vehicle] = found
         return found
 
+    def digest_of(self, vehicle: int) -> bytes:
+        return state_digest(self.state(vehicle))
+
+
+class Coordination(Protocol):
+    """What decides ownership in W worlds, as a tick calls it."""
+
+    coordinators: tuple[Coordinator, ...]  # one a world, if they are in this process
+
+    def reset(self, chosen: NDArray[np.bool_]) -> None: ...
+
+    def begin(self, commands: Commands) -> None:
+        """The rows are those of a committed tick; vehicles change their owner now."""
+        ...
+
+    def left(self, gate: Gate) -> None:
+        """Vehicles in `gate.passing` have left the world."""
+        ...
+
+    def entered(self, gate: Gate) -> None:
+        """Vehicles in `gate.passing` are new."""
+        ...
+
+    def end(self) -> None:
+        """All zones of this process are through with the tick."""
+        ...
+
+    def save(self) -> None:
+        """What has changed between two ticks is committed."""
+        ...
+
+    def in_flight(self, w: int) -> list[TransferInFlight]: ...
+
 
 class Coordinators:
+    """The coordinators of W worlds in this process; a `Coordination`."""
+
     def __init__(
         self,
         division: Division,  # whose rows change hands

@@ -89,8 +89,9 @@ class PendingConnection:
 class Listener:
     """Listens."""
 
-    def __init__(self, address: str) -> None:
-        self.secret = secrets.token_bytes(SECRET)  # that hosts have to know
+    def __init__(self, address: str, secret: bytes | None = None) -> None:
+        # that hosts have to know; None: one is drawn
+        self.secret = secrets.token_bytes(SECRET) if secret is None else secret
         try:
             self._listener = socket.create_server((address, 0), backlog=BACKLOG)
         except OSError as error:
@@ -119,6 +120,16 @@ def knock(place: tuple[str, int], secret: bytes, number: int) -> FramedSocket:
     Raises:
         OSError: nobody listens there.
     """
+    return FramedSocket(call(place, secret, number))
+
+
+def call(place: tuple[str, int], secret: bytes, number: int) -> socket.socket:
+    """A connection to a `Listener` on which both ends have proved that they know the secret.
+
+    Raises:
+        OSError: nothing listens there.
+        MessageError: what listens there does not know the secret.
+    """
     connection = socket.create_connection(place, CALL_S)
     try:
         connection.settimeout(None)
@@ -137,7 +148,7 @@ def knock(place: tuple[str, int], secret: bytes, number: int) -> FramedSocket:
     except BaseException:
         connection.close()
         raise
-    return FramedSocket(connection)
+    return connection
 
 
 def _proof(secret: bytes, who: bytes, said: bytes) -> bytes:

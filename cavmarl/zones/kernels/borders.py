@@ -136,29 +136,62 @@ def pass_on(
     Returns:
         its row at the target; -1: the source does not own it; -2: the target has no ghost of it.
     """
-    old = zoned.rows[side, source, w]
-    new = zoned.rows[side, target, w]
-    owned = zoned.num_owned[source, w]
-    if row >= owned or old[row]["id"] != vehicle:
-        row = 0
-        while row < owned and old[row]["id"] != vehicle:
-            row += 1
-        if row == owned:
-            return -1
-    place = zoned.num_owned[target, w]
-    ghost = place
-    while ghost < zoned.num_rows[target, w] and new[ghost]["id"] != vehicle:
-        ghost += 1
-    if ghost == zoned.num_rows[target, w]:
+    row = _owned_row(vehicle, source, row, zoned, side, w)
+    if row < 0:
+        return -1
+    place = take_over(vehicle, target, epoch, zoned, side, w)
+    if place < 0:
         return -2
-    _swap(new, ghost, place, zoned.spare)
-    new[place] = old[row]
+    new = zoned.rows[side, target, w]
+    new[place] = zoned.rows[side, source, w, row]
     new[place]["owner"] = target
     new[place]["epoch"] = epoch
+    give_up(vehicle, source, row, zoned, side, w)
+    return place
+
+
+@kernel
+def give_up(vehicle: int, source: int, row: int, zoned: Zoned, side: int, w: int) -> bool:
+    """Make a vehicle that a zone owns one of its ghosts; whether it did own it."""
+    row = _owned_row(vehicle, source, row, zoned, side, w)
+    if row < 0:
+        return False
+    last = zoned.num_owned[source, w] - 1
+    _swap(zoned.rows[side, source, w], row, last, zoned.spare)
+    zoned.num_owned[source, w] = last
+    return True
+
+
+@kernel
+def take_over(vehicle: int, target: int, epoch: int, zoned: Zoned, side: int, w: int) -> int:
+    """Make a ghost of a zone a row that it owns, at an epoch: where it is; -1: it has none."""
+    rows = zoned.rows[side, target, w]
+    place = zoned.num_owned[target, w]
+    ghost = place
+    while ghost < zoned.num_rows[target, w] and rows[ghost]["id"] != vehicle:
+        ghost += 1
+    if ghost == zoned.num_rows[target, w]:
+        return -1
+    _swap(rows, ghost, place, zoned.spare)
+    rows[place]["owner"] = target
+    rows[place]["epoch"] = epoch
     zoned.num_owned[target, w] = place + 1
-    _swap(old, row, owned - 1, zoned.spare)
-    zoned.num_owned[source, w] = owned - 1
     return int(place)
+
+
+@inlined_kernel
+def _owned_row(vehicle: int, zone: int, hint: int, zoned: Zoned, side: int, w: int) -> int:
+    """Where a zone keeps a vehicle that it owns, probably at `hint`; -1: it does not own it."""
+    rows = zoned.rows[side, zone, w]
+    owned = zoned.num_owned[zone, w]
+    found = hint
+    if hint >= owned or rows[hint]["id"] != vehicle:
+        found = 0
+        while found < owned and rows[found]["id"] != vehicle:
+            found += 1
+        if found == owned:
+            found = -1
+    return found
 
 
 @inlined_kernel

@@ -1,0 +1,41 @@
+"""What `cavmarl verify --nodes` does and prints: worlds over nodes beside the undivided ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from cavmarl.cli.evaluate import counting
+from cavmarl.cli.output import grid, write_json
+from cavmarl.config.world_spec import WorldSpec
+
+
+def verify_over_nodes(
+    console: Console, world: WorldSpec, nodes: list[int], json_path: Path | None, **arguments: Any
+) -> None:
+    """Compare worlds over nodes with undivided ones; exit code 1 if anything differs."""
+    from cavmarl.verify.node_losses import verify_nodes
+
+    with counting(console, f"{world.env} over {', '.join(map(str, nodes))} nodes") as progress:
+        found = verify_nodes(world, nodes, progress=progress, **arguments)
+    write_json(json_path, found.to_dict())
+    rows = [
+        (
+            str(run.nodes),
+            str(run.killed),
+            f"{run.migrations:,}",
+            f"{run.step_ms:.3g}",
+            " ".join(f"{ms:.0f}" for ms in run.recovery_ms) or "-",
+            "equal" if run.different is None else f"different after step {run.different}",
+        )
+        for run in found.runs
+    ]
+    heads = ("nodes", "killed", "changes of owner", "step, ms", "recovery, ms", "")
+    title = f"{escape(Path(found.env).name)}: {found.zones} zones, {found.steps} steps"
+    console.print(grid(heads, rows, title))
+    if not found.holds:
+        raise typer.Exit(1)

@@ -1,0 +1,63 @@
+"""`Peers`: the other processes that hold zones of the same worlds.
+
+Where zones live in several processes, each runs the same ticks on its own zones. What all of them
+have to know goes between them at fixed points of a tick, so that departures, signals and outputs
+are worked out everywhere alike.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.records.arrays import Gate, Outputs, Worlds
+
+
+class Peers(Protocol):
+    """Each method returns when all processes have called it in the same place of the tick."""
+
+    def keep_own(self, chosen: NDArray[np.bool_]) -> None:
+        """After a reset of the chosen worlds (W,), of which all have made all vehicles."""
+        ...
+
+    def go_on(self, gate: Gate, side: int) -> None:
+        """Zones have their vehicles of an earlier tick again, on `side`; ghosts follow."""
+        ...
+
+    def share_rows(self, gate: Gate, side: int) -> None:
+        """Ghosts of the next rows, which are on `side`, and vehicles that leave.
+
+        Those of all zones stand in `gate.passing` then, and how often vehicles took another way
+        in `gate.counts`.
+        """
+        ...
+
+    def running(self) -> NDArray[np.int64]:
+        """(W,) vehicles of each world, in all zones, after `share_rows`."""
+        ...
+
+    def clear_ranks(self, gate: Gate) -> None:
+        """Before zones rank the lanes where departures may enter."""
+        ...
+
+    def share_ranks(self, gate: Gate) -> None:
+        """`gate.ranks` and `gate.last_s`, as the zones wrote them."""
+        ...
+
+    def share_proposals(self, gate: Gate) -> None:
+        """Departures that found a gap: `gate.passing` and `gate.places`."""
+        ...
+
+    def share_leavers(self, gate: Gate) -> None:
+        """Agents' vehicles whose trip has ended, in `gate.passing`."""
+        ...
+
+    def share_detections(self, worlds: Worlds) -> None:
+        """`worlds.detected_s`: when detectors have seen a vehicle last."""
+        ...
+
+    def share_outputs(self, outputs: Outputs, chosen: NDArray[np.bool_]) -> None:
+        """What the agents of the chosen worlds (W,) have got, but for their observations."""
+        ...

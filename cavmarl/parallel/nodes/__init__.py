@@ -1,0 +1,1 @@
+"""Zone nodes: processes that share nothing, each with some zones of the same worlds."""

@@ -1,0 +1,265 @@
+"""`Links`: the connections of a process to others, over which whole frames go.
+
+A frame is a head of fixed size and bytes. Frames of a connection arrive in their order, or the
+connection has ended. Nothing in a frame is ever run.
+
+    head    magic, version, kind, number, checksum of what follows, bytes of what follows
+"""
+
+from __future__ import annotations
+
+import select
+import socket
+import struct
+import time
+import zlib
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from enum import IntEnum
+from typing import NamedTuple, TypeAlias
+
+from cavmarl.core.errors import MessageError
+
+MAGIC = b"cavN"
+VERSION = 1
+MAX_FRAME = 1 << 32
+_HEAD = struct.Struct("<4sHHQIQ")
+
+Bytes: TypeAlias = bytes | bytearray | memoryview
+
+
+class FrameKind(IntEnum):
+    """What a frame carries."""
+
+    JOB = 0  # C → N: what to be
+    READY = 1  # N → C: where other nodes can call
+    PEERS = 2  # C → N: where the others are
+    COMMAND = 3  # C → N: a task, and what it needs
+    LEASE = 4  # C → N: STEP messages
+    REPORT = 5  # N → C: DONE messages, and what the next decision needs
+    MESSAGES = 6  # N → N, N → C: the protocol's other messages
+    RESULT = 7  # N → C: what a task gave
+    FAILED = 8  # N → C: an error
+    SHARE = 9  # N → N: a part of a tick
+    KEEP = 10  # N → N: the state of a node's zones, for when it is lost
+    RECOVER = 11  # C → N: nodes are lost; go back to a state that was kept
+    SYNC = 12  # N → N: all before this is of no use any more
+    PING = 13  # C → N: answer at once
+    PONG = 14  # N → C: the answer
+
+
+class NodeFrame(NamedTuple):
+    """A frame that has come."""
+
+    kind: FrameKind
+    number: int  # which of its kind, as both ends count
+    data: memoryview
+
+
+URGENT = frozenset({FrameKind.MESSAGES, FrameKind.KEEP, FrameKind.PING, FrameKind.PONG})
+Urgent: TypeAlias = Callable[[int, NodeFrame], None]
+"""What is called with an urgent frame as soon as it has come, and the number of its sender."""
+
+
+class SilenceError(Exception):
+    """Nothing has come for long."""
+
+
+class LinkLostError(Exception):
+    """A connection has ended."""
+
+    def __init__(self, peer: int) -> None:
+        super().__init__(f"the connection to node {peer} has ended")
+        self.peer = peer
+
+
+class _Link:
+    """One connection: what is to be sent, and what has come of the next frame."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        if connection.family != socket.AF_UNIX:
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connection.setblocking(False)
+        self.socket = connection
+        self.waiting: deque[memoryview] = deque()
+        self.frames: deque[NodeFrame] = deque()
+        self._head = bytearray(_HEAD.size)
+        self._into = memoryview(self._head)
+        self._opened: tuple[FrameKind, int, int, bytearray] | None = None
+
+    def send(self, kind: FrameKind, number: int, pieces: Sequence[Bytes]) -> None:
+        """Send what the system takes at once; the rest is kept, as a copy."""
+        views = [memoryview(piece).cast("B") for piece in pieces if len(piece)]
+        checksum = 0
+        for view in views:
+            checksum = zlib.crc32(view, checksum)
+        size = sum(map(len, views))
+        head = _HEAD.pack(MAGIC, VERSION, kind, number, checksum, size)
+        rest = [memoryview(head), *views]
+        if not self.waiting:
+            rest = self._sent(rest)
+        self.waiting.extend(memoryview(bytes(view)) for view in rest)
+
+    def go_on_sending(self) -> None:
+        self.waiting = deque(self._sent(list(self.waiting)))
+
+    def _sent(self, pieces: list[memoryview]) -> list[memoryview]:
+        """What is left after the system has taken all it can."""
+        while pieces:
+            try:
+                sent = self.socket.sendmsg(pieces[:512])
+            except BlockingIOError:
+                break
+            while pieces and sent >= len(pieces[0]):
+                sent -= len(pieces.pop(0))
+            if sent:
+                pieces[0] = pieces[0][sent:]
+        return pieces
+
+    def receive(self, urgent: Urgent, number: int) -> None:
+        """Take what has come. Raises EOFError, OSError: the other end has gone."""
+        while True:
+            if len(self._into):
+                try:
+                    got = self.socket.recv_into(self._into)
+                except BlockingIOError:
+                    return
+                if not got:
+                    raise EOFError
+                self._into = self._into[got:]
+                if len(self._into):
+                    continue
+            if self._opened is None:
+                self._open()
+            else:
+                frame = self._close()
+                if frame.kind in URGENT:
+                    urgent(number, frame)
+                else:
+                    self.frames.append(frame)
+
+    def _open(self) -> None:
+        magic, version, kind, number, checksum, size = _HEAD.unpack(self._head)
+        if magic != MAGIC:
+            raise MessageError(f"{bytes(magic)!r} begins no frame of a node")
+        if version != VERSION:
+            raise MessageError(
+                f"a frame of version {version}, this is {VERSION}: install the same cavmarl "
+                "everywhere"
+            )
+        if size > MAX_FRAME or kind not in FrameKind.__members__.values():
+            raise MessageError(f"a frame of kind {kind} with {size} bytes is none")
+        room = bytearray(size)
+        self._opened = (FrameKind(kind), number, checksum, room)
+        self._into = memoryview(room)
+
+    def _close(self) -> NodeFrame:
+        assert self._opened is not None
+        kind, number, checksum, room = self._opened
+        if zlib.crc32(room) != checksum:
+            raise MessageError("a frame is not what was sent")
+        self._opened, self._into = None, memoryview(self._head)
+        return NodeFrame(kind, number, memoryview(room))
+
+
+class Links:
+    """Connections by the number of the process at the other end."""
+
+    def __init__(self, urgent: Urgent) -> None:
+        self.urgent = urgent
+        self._links: dict[int, _Link] = {}
+        self._poll = select.poll()
+        self._by_socket: dict[int, int] = {}
+        self.sent_bytes = 0
+        self.sent_frames = 0
+
+    def add(self, number: int, connection: socket.socket) -> None:
+        self._links[number] = _Link(connection)
+        self._by_socket[connection.fileno()] = number
+        self._poll.register(connection, select.POLLIN)
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        return tuple(self._links)
+
+    def send(self, to: int, kind: FrameKind, number: int, pieces: Sequence[Bytes] = ()) -> None:
+        """Send a frame.
+
+        Raises:
+            LinkLostError: the other end has gone.
+        """
+        link = self._links.get(to)
+        if link is None:
+            raise LinkLostError(to)
+        self.sent_frames += 1
+        self.sent_bytes += _HEAD.size + sum(memoryview(piece).nbytes for piece in pieces)
+        try:
+            link.send(kind, number, pieces)
+        except OSError as error:
+            self.drop(to)
+            raise LinkLostError(to) from error
+        if link.waiting:
+            self._poll.modify(link.socket, select.POLLIN | select.POLLOUT)
+
+    def take(
+        self,
+        wanted: Iterable[int],  # of whom a frame is awaited
+        timeout_s: float | None = None,  # None: as long as it takes
+    ) -> dict[int, NodeFrame]:
+        """The next frame of each.
+
+        Raises:
+            LinkLostError: one of them has gone.
+            MessageError: what came is no frame.
+            SilenceError: nothing has come in time.
+        """
+        missing = set(wanted)
+        found: dict[int, NodeFrame] = {}
+        until_s = None if timeout_s is None else time.monotonic() + timeout_s
+        while True:
+            for number in tuple(missing):
+                link = self._links.get(number)
+                if link is None:
+                    raise LinkLostError(number)
+                if link.frames:
+                    found[number] = link.frames.popleft()
+                    missing.remove(number)
+            if not missing:
+                return found
+            left_ms = None if until_s is None else 1e3 * max(until_s - time.monotonic(), 0.0)
+            if left_ms == 0.0:
+                raise SilenceError(f"nodes {sorted(missing)} do not answer within {timeout_s:g} s")
+            self.pump(left_ms)
+
+    def pump(self, timeout_ms: float | None) -> None:
+        """Send and receive what can be; wait so long for the first that can."""
+        for socket_number, _ in self._poll.poll(timeout_ms):
+            number = self._by_socket[socket_number]
+            link = self._links[number]
+            try:
+                if link.waiting:
+                    link.go_on_sending()
+                    if not link.waiting:
+                        self._poll.modify(link.socket, select.POLLIN)
+                link.receive(self.urgent, number)
+            except (EOFError, OSError) as error:
+                self.drop(number)
+                raise LinkLostError(number) from error
+
+    def flush(self) -> None:
+        """Wait until all that is to be sent is sent."""
+        while any(link.waiting for link in self._links.values()):
+            self.pump(None)
+
+    def drop(self, number: int) -> None:
+        """End a connection, if there is one."""
+        link = self._links.pop(number, None)
+        if link is None:
+            return
+        self._poll.unregister(link.socket)
+        del self._by_socket[link.socket.fileno()]
+        link.socket.close()
+
+    def close(self) -> None:
+        for number in self.numbers:
+            self.drop(number)

@@ -1,0 +1,170 @@
+"""`NodeCoordinator`: decides which zone owns which vehicle, and knows no row of any."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+
+from cavmarl.core.errors import ProtocolError
+from cavmarl.handoff.coordinator.journal import AnyJournal
+from cavmarl.ownership.directory import Directory
+from cavmarl.ownership.limits import Limits
+from cavmarl.ownership.messages import Ack, Begin, Birth, Message, Nack, Output
+from cavmarl.ownership.reactions import Hosting
+from cavmarl.parallel.nodes.links import FrameKind, Links, NodeFrame, SilenceError
+from cavmarl.parallel.nodes.zone_hosts import Report, packed, unpacked
+
+
+class CrossingDigests:
+    """Digests of the states of vehicles that have crossed a border, as their owners said."""
+
+    def __init__(self) -> None:
+        self.digests: dict[int, bytes] = {}
+
+    def digest_of(self, vehicle: int) -> bytes:
+        return self.digests[vehicle]
+
+    def state(self, vehicle: int) -> bytes:
+        """No state is known here: a node that needs one has lost what it was sent."""
+        raise ProtocolError(
+            f"vehicle {vehicle}: its new zone does not have the state that it has acknowledged"
+        )
+
+
+class _World:
+    """The decisions of one world."""
+
+    def __init__(self, run: bytes, zones: int, limits: Limits, journal: AnyJournal | None) -> None:
+        self.states = CrossingDigests()
+        self.directory = Directory(run, range(zones), self.states, limits)
+        self.journal = journal
+        self.movers: list[tuple[int, int]] = []
+        self.births: list[Birth] = []
+        self.answered: set[tuple[int, int]] = set()
+
+    def write(self, output: Output) -> int:
+        """Write records down; how many vehicles change their owner by them."""
+        if self.journal is not None and output.records:
+            self.journal.append(output.records)
+        return sum(len(r.switches) for r in output.records if isinstance(r, Begin))
+
+
+class NodeCoordinator:
+    """Those of W worlds.
+
+    Attributes:
+        switched: vehicles that have changed their owner.
+    """
+
+    def __init__(
+        self,
+        runs: Sequence[bytes],  # of each world
+        node_of: Sequence[int],  # zone → the node that hosts it
+        limits: Limits,
+        links: Links,  # to all nodes
+        journals: Sequence[AnyJournal | None],  # of each world
+    ) -> None:
+        self._worlds = [
+            _World(run, len(node_of), limits, journal)
+            for run, journal in zip(runs, journals, strict=True)
+        ]
+        self._node_of = node_of
+        self._links = links
+        self.switched = 0
+
+    def host(self) -> list[list[Hosting]]:
+        """Begin; what the hosts of all zones have to know, by worlds."""
+        for world in self._worlds:
+            world.write(world.directory.reset())
+            for zone, node in enumerate(self._node_of):
+                world.write(world.directory.host(zone, worker=node))
+        return self._hostings()
+
+    def recover(self, node_of: Sequence[int], switched: int) -> list[list[Hosting]]:
+        """Nodes are lost, and others host their zones; what is under way is void.
+
+        Args:
+            node_of: zone → the node that hosts it from now on.
+            switched: vehicles that had changed their owner when what is gone back to was kept.
+        """
+        for world in self._worlds:
+            moved = [z for z, node in enumerate(node_of) if node != self._node_of[z]]
+            for zone in moved:
+                world.write(world.directory.fence(zone))
+            world.write(world.directory.reset())
+            for zone in moved:
+                world.write(world.directory.host(zone, worker=node_of[zone]))
+            world.births, world.movers = [], []
+            world.answered.clear()
+        self._node_of, self.switched = node_of, switched
+        return self._hostings()
+
+    def _hostings(self) -> list[list[Hosting]]:
+        zones = range(len(self._node_of))
+        return [[world.directory.hosting(zone) for zone in zones] for world in self._worlds]
+
+    def hear(self, number: int, frame: NodeFrame) -> None:
+        """Acknowledgements, as soon as they come."""
+        for w, message in unpacked(frame.data):
+            self._take(w, message)
+
+    def _take(self, w: int, message: Message) -> None:
+        world = self._worlds[w]
+        table = world.directory.table
+        is_present = message.episode == table.episode and message.tick >= table.tick
+        if isinstance(message, Ack | Nack) and is_present:
+            world.answered.update((entry.vehicle, message.zone) for entry in message.entries)
+        output = world.directory.on_message(message)
+        world.write(output)
+        self._send([(w, answer) for answer in output.messages])
+
+    def commit(self, reports: Mapping[int, tuple[list[tuple[int, Message]], list[Report]]]) -> None:
+        """All nodes are through with the tick, as they report."""
+        for messages, _ in reports.values():
+            for w, message in messages:
+                self._take(w, message)
+        for w, world in enumerate(self._worlds):
+            said = [report[w] for _, report in reports.values()]
+            if world.directory.table.plan is not None:
+                world.write(world.directory.commit(dict.fromkeys(range(len(self._node_of)), 0)))
+            if any(report.began for report in said):
+                world.write(world.directory.reset())
+                world.births = []
+            movers = [mover for report in said for mover in report.movers]
+            world.movers = [(vehicle, target) for vehicle, target, _ in movers]
+            world.states.digests = {v: bytes.fromhex(digest) for v, _, digest in movers}
+            world.births += [Birth(v, zone, b"") for report in said for v, zone in report.births]
+
+    def begin(self, timeout_s: float) -> None:
+        """Decide the way to the next tick, once all offers are answered, and lease it.
+
+        Raises:
+            SilenceError: an offer is not answered in time.
+        """
+        until_s = time.monotonic() + timeout_s
+        while any(not set(world.movers) <= world.answered for world in self._worlds):
+            if time.monotonic() > until_s:
+                raise SilenceError(f"offers are not answered within {timeout_s:g} s")
+            self._links.pump(1e3 * timeout_s)
+        messages = []
+        for w, world in enumerate(self._worlds):
+            births, world.births = world.births, []
+            output = world.directory.begin(world.movers, births)
+            world.answered.clear()
+            self.switched += world.write(output)
+            messages += [(w, message) for message in output.messages]
+        self._send(messages)
+
+    def _send(self, messages: Sequence[tuple[int, Message]]) -> None:
+        by_node: defaultdict[int, list[tuple[int, Message]]] = defaultdict(list)
+        for w, message in messages:
+            for zone in message.destinations():
+                by_node[self._node_of[zone]].append((w, message))
+        for node, some in by_node.items():
+            self._links.send(node, FrameKind.LEASE, 0, [packed(some)])
+
+    def close(self) -> None:
+        for world in self._worlds:
+            if world.journal is not None:
+                world.journal.close()

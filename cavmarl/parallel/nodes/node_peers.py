@@ -1,0 +1,283 @@
+"""`NodePeers`: the other nodes of the same worlds; see `engine.peers.Peers`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from cavmarl.core.huge_pages import forget
+from cavmarl.core.numba.specialized import specialized
+from cavmarl.core.records.arrays import Gate, Outputs, Worlds
+from cavmarl.core.records.codes import (
+    COUNT_REROUTED,
+    LANE_FIRST,
+    LANE_GIVEN,
+    LANE_RANDOM,
+    POS_LAST,
+)
+from cavmarl.engine.simulation import Simulation
+from cavmarl.parallel.nodes.links import Bytes, FrameKind, Links
+from cavmarl.zones.kernels.ghost_frames import count_ghosts, pack_ghosts, take_ghosts
+
+Array = NDArray[Any]
+PIECES = ("terms", "terminated", "present", "acted", "events", "vehicle_ids")
+
+
+class NodePeers:
+    """Each share is one frame to every other node, and one from it.
+
+    Attributes:
+        own: (W, A) agents that this node has sensed for last.
+        stepped: the same at the end of the last step, before worlds began anew.
+    """
+
+    def __init__(
+        self,
+        simulation: Simulation,
+        links: Links,  # to all other nodes
+        zones: Sequence[Sequence[int]],  # of each node
+        number: int,  # of this one
+        first_share: int = 0,  # what shares are counted from, the same at all nodes
+    ) -> None:
+        shard = simulation.shards[0]
+        self._zoned = shard.zoned
+        self._of_rows = (self._zoned.step, self._zoned.step_at, self._zoned.outer)
+        self._mine = np.array(zones[number], dtype=np.int64)
+        self._foreign = np.array(
+            [zone for n, some in enumerate(zones) if n != number for zone in some], dtype=np.int64
+        )
+        self._links = links
+        self._number = number
+        self._others = [n for n, some in enumerate(zones) if some and n != number]
+        self._zones = [np.array(some, dtype=np.int64) for some in zones]
+        self._num_worlds = simulation.num_worlds
+        self._has_controllers = bool(shard.worlds.controllers.shape[1])
+        self._detected_s = shard.worlds.detected_s
+        self._seen_s = self._detected_s.copy()
+        self._running = np.zeros(self._num_worlds, dtype=np.int64)
+        self._rerouted = np.zeros(self._num_worlds, dtype=np.int64)
+        self._count = specialized(count_ghosts)
+        self._pack = specialized(pack_ghosts)
+        self._take = specialized(take_ghosts)
+        self._sent = first_share
+        self._is_stepping = False
+        self.own = np.zeros(simulation.outputs.present.shape, dtype=np.bool_)
+        self.stepped = self.own.copy()
+
+    def begin_step(self) -> None:
+        """What is sensed next is what a step gave."""
+        self._is_stepping = True
+
+    def keep_own(self, chosen: NDArray[np.bool_]) -> None:
+        zoned = self._zoned
+        for zone in self._foreign.tolist():
+            for numbers in (zoned.num_owned, zoned.num_rows, zoned.num_near, zoned.num_through):
+                numbers[zone, chosen] = 0
+            zoned.num_contacts[zone, chosen] = 0
+            zoned.num_outer[zone, chosen] = -1
+            for w in np.flatnonzero(chosen).tolist():
+                for array in (*zoned.rows[:, zone, w], *(each[zone, w] for each in self._of_rows)):
+                    forget(array)
+        self._rerouted[chosen] = 0
+
+    def go_on(self, gate: Gate, side: int) -> None:
+        self._rerouted[:] = gate.counts[:, COUNT_REROUTED]
+        self._seen_s[...] = self._detected_s
+        self.own[...] = False
+        for zone in self._mine.tolist():
+            for w, num in enumerate(self._zoned.num_owned[zone].tolist()):
+                agents = self._zoned.rows["agent"][side, zone, w, :num]
+                self.own[w, agents[agents >= 0]] = True
+        self.share_rows(gate, side)
+
+    def share_rows(self, gate: Gate, side: int) -> None:
+        zoned = self._zoned
+        mine = zoned.num_owned[self._mine].sum(axis=0)
+        rerouted = gate.counts[:, COUNT_REROUTED] - self._rerouted
+        common = [mine, rerouted, *self._passing(gate)]
+        found = self._swap([*self._ghosts(to, side), *common] for to in self._others)
+        self._running[:] = mine
+        for _, data in found:
+            at = self._take_ghosts(data, side)
+            theirs, at = _read(data, at, np.int64, self._num_worlds)
+            more, at = _read(data, at, np.int64, self._num_worlds)
+            self._running += theirs
+            gate.counts[:, COUNT_REROUTED] += more
+            self._add_passing(gate, data, at)
+        self._rerouted[:] = gate.counts[:, COUNT_REROUTED]
+
+    def _ghosts(self, to: int, side: int) -> list[Bytes]:
+        zoned, zones = self._zoned, self._zones[to]
+        counts = np.empty((len(zones), self._num_worlds, 2), dtype=np.int64)
+        total = self._count(zoned, zones, counts)
+        rows = np.empty(total, dtype=zoned.rows.dtype)
+        step = np.empty(total, dtype=zoned.step.dtype)
+        step_at = np.empty(total, dtype=np.int64)
+        self._pack(zoned, side, zones, counts, rows, step, step_at)
+        return [counts.data, *map(_bytes, (rows, step, step_at))]
+
+    def _take_ghosts(self, data: memoryview, side: int) -> int:
+        """Take those of a frame; where in it they end."""
+        zoned, zones = self._zoned, self._mine
+        flat, at = _read(data, 0, np.int64, len(zones) * self._num_worlds * 2)
+        counts = flat.reshape(len(zones), self._num_worlds, 2)
+        total = int(counts[:, :, 0].sum())
+        rows, at = _read(data, at, zoned.rows.dtype, total)
+        step, at = _read(data, at, zoned.step.dtype, total)
+        step_at, at = _read(data, at, np.int64, total)
+        self._take(zoned, side, zones, counts, rows, step, step_at)
+        return at
+
+    def running(self) -> NDArray[np.int64]:
+        return self._running
+
+    def clear_ranks(self, gate: Gate) -> None:
+        longest = int(gate.num_queue.max(initial=0))
+        gate.ranks[:, :longest] = -1
+        gate.last_s[:, :longest] = -np.inf
+
+    def share_ranks(self, gate: Gate) -> None:
+        longest = int(gate.num_queue.max(initial=0))
+        queue = gate.queue[:, :longest]
+        asks = ~np.isin(queue["lane_code"], (LANE_GIVEN, LANE_FIRST, LANE_RANDOM))
+        asks |= queue["pos_code"] == POS_LAST
+        asks &= np.arange(longest) < gate.num_queue[:, None]
+        if not asks.any():
+            return
+        ranks, last_s = gate.ranks[:, :longest][asks], gate.last_s[:, :longest][asks]
+        for _, data in self._swap([ranks.data, last_s.data] for _ in self._others):
+            theirs, at = _read(data, 0, ranks.dtype, ranks.size)
+            theirs_s, _ = _read(data, at, last_s.dtype, last_s.size)
+            np.maximum(ranks, theirs.reshape(ranks.shape), out=ranks)
+            np.maximum(last_s, theirs_s.reshape(last_s.shape), out=last_s)
+        gate.ranks[:, :longest][asks] = ranks
+        gate.last_s[:, :longest][asks] = last_s
+
+    def share_proposals(self, gate: Gate) -> None:
+        places = [gate.places[w, :num] for w, num in enumerate(gate.num_passing.tolist())]
+        pieces = [*self._passing(gate), np.concatenate(places).data]
+        for _, data in self._swap(pieces for _ in self._others):
+            before = gate.num_passing.copy()
+            at = self._add_passing(gate, data, 0)
+            for w in range(self._num_worlds):
+                first, last = int(before[w]), int(gate.num_passing[w])
+                gate.places[w, first:last], at = _read(data, at, np.int64, last - first)
+
+    def share_leavers(self, gate: Gate) -> None:
+        for _, data in self._swap(self._passing(gate) for _ in self._others):
+            self._add_passing(gate, data, 0)
+
+    def _passing(self, gate: Gate) -> list[Bytes]:
+        """How many vehicles pass the gate of each world, and their rows."""
+        counts = gate.num_passing.copy()
+        rows = [gate.passing[w, :num] for w, num in enumerate(counts.tolist()) if num]
+        return [counts.data, *map(_bytes, rows)]
+
+    def _add_passing(self, gate: Gate, data: memoryview, at: int) -> int:
+        counts, at = _read(data, at, np.int64, self._num_worlds)
+        for w, num in enumerate(counts.tolist()):
+            if num:
+                first = gate.num_passing.item(w)
+                rows, at = _read(data, at, gate.passing.dtype, num)
+                gate.passing[w, first : first + num] = rows
+                gate.num_passing[w] = first + num
+        return at
+
+    def share_detections(self, worlds: Worlds) -> None:
+        if not self._has_controllers:
+            return
+        seen = worlds.detected_s
+        changed = np.flatnonzero(seen.reshape(-1) != self._seen_s.reshape(-1))
+        times = seen.reshape(-1)[changed]
+        for _, data in self._swap(
+            [np.int64(changed.size).tobytes(), changed.data, times.data] for _ in self._others
+        ):
+            (num,), at = _read(data, 0, np.int64, 1)
+            where, at = _read(data, at, np.int64, int(num))
+            seen.reshape(-1)[where], _ = _read(data, at, np.float64, int(num))
+        self._seen_s[...] = seen
+
+    def share_outputs(self, outputs: Outputs, chosen: NDArray[np.bool_]) -> None:
+        self.own[chosen] = outputs.present[chosen]
+        if self._is_stepping:
+            self._is_stepping = False
+            self.stepped[...] = self.own
+        mine = self.own & chosen[:, None]
+        where = np.flatnonzero(mine.reshape(-1))
+        arrays = [_by_agent(getattr(outputs, name)) for name in PIECES]
+        pieces = [np.int64(where.size).tobytes(), where.data]
+        pieces += [_bytes(array[where]) for array in arrays]
+        for _, data in self._swap(pieces for _ in self._others):
+            (num,), at = _read(data, 0, np.int64, 1)
+            agents, at = _read(data, at, np.int64, int(num))
+            for array in arrays:
+                found, at = _read(data, at, array.dtype, int(num) * array[0].size)
+                array[agents] = found.reshape(int(num), *array.shape[1:])
+
+    @contextmanager
+    def whole(self, simulation: Simulation, world: int) -> Iterator[None]:
+        """The time in which the first node that lives has a whole world; all have to call it.
+
+        Vehicles of another node are those of the first of its zones meanwhile.
+        """
+        zoned, side = self._zoned, simulation.division.side
+        pending = simulation.shards[0].worlds.pending
+        owned = zoned.num_owned[:, world].tolist()
+        mine = np.concatenate(
+            [zoned.rows[side, zone, world, : owned[zone]] for zone in self._mine.tolist()]
+        )
+        agents = mine["agent"][mine["agent"] >= 0].astype(np.int64)
+        contacts = zoned.num_contacts[self._mine, world].sum()
+        head = np.array([len(mine), len(agents), contacts], dtype=np.int64)
+        self._sent += 1
+        first = min(self._number, *self._others, self._number)
+        if self._number != first:
+            pieces = [head.data, _bytes(mine), agents.data, _bytes(pending[world, agents])]
+            self._links.send(first, FrameKind.SHARE, self._sent, pieces)
+            yield
+            return
+        for number, frame in self._links.take(self._others).items():
+            zone = self._zones[number][0]
+            (num, num_agents, found), at = _read(frame.data, 0, np.int64, 3)
+            zoned.rows[side, zone, world, :num], at = _read(frame.data, at, mine.dtype, int(num))
+            theirs, at = _read(frame.data, at, np.int64, int(num_agents))
+            kept, _ = _read(frame.data, at, np.float64, int(num_agents) * pending[0, :1].size)
+            pending[world, theirs] = kept.reshape(-1, *pending.shape[2:])
+            zoned.num_owned[zone, world], zoned.num_contacts[zone, world] = num, found
+        yield
+        for number in self._others:
+            zone = self._zones[number][0]
+            zoned.num_owned[zone, world] = zoned.num_contacts[zone, world] = 0
+
+    def _swap(self, pieces: Any) -> list[tuple[int, memoryview]]:
+        """Send pieces to each of the others, and take theirs, by rising numbers."""
+        self._sent += 1
+        for to, some in zip(self._others, pieces, strict=True):
+            self._links.send(to, FrameKind.SHARE, self._sent, some)
+        found = self._links.take(self._others)
+        for number, frame in found.items():
+            if frame.kind is not FrameKind.SHARE or frame.number != self._sent:
+                raise AssertionError(f"node {number} is at {frame[:2]}, not at share {self._sent}")
+        return [(number, found[number].data) for number in self._others]
+
+
+def _by_agent(array: Array) -> Array:
+    """(W, A, …) as (W · A, …), a view."""
+    return array.reshape(-1, *array.shape[2:])
+
+
+def _bytes(array: Array) -> Bytes:
+    flat: NDArray[np.uint8] = array.reshape(-1).view(np.uint8)
+    return flat.data
+
+
+def _read(data: memoryview, at: int, kind: DTypeLike, num: int) -> tuple[Array, int]:
+    """An array (num,) of a frame, as a view, and where it ends."""
+    dtype = np.dtype(kind)
+    return np.frombuffer(data, dtype, num, at) if num else np.zeros(0, dtype), at + (
+        num * dtype.itemsize
+    )

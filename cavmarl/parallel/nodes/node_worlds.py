@@ -1,0 +1,163 @@
+"""`NodeWorlds`: worlds whose zones are hosted by nodes, processes that share nothing."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.balance.balance_plan import Plan
+from cavmarl.core.errors import ConfigError
+from cavmarl.engine.simulation import Simulation
+from cavmarl.engine.world_setup import World
+from cavmarl.parallel.commanded_worlds import uncopied, unsaved
+from cavmarl.parallel.nodes.node_frames import pieces_of, take_results
+from cavmarl.parallel.nodes.node_pool import NodeCommand, NodePool
+from cavmarl.parallel.step_arrays import Driven
+from cavmarl.parallel.worlds_job import Task
+from cavmarl.shards.shard import Commands
+from cavmarl.traffic.demand import DemandFile
+
+
+class NodeWorlds(NodePool):
+    """W worlds over n nodes; a `SteppedWorlds`.
+
+    Raises:
+        ConfigError: a setting that such worlds cannot have, or more nodes than zones.
+        WorkerError: a node cannot be started.
+    """
+
+    def __init__(
+        self,
+        world: World,  # what each is made of
+        base_dir: Path,  # the folder that its relative files start from
+        num_worlds: int,  # W
+        nodes: int,  # n, from 1 to the zones of a world
+        in_next_step: bool = False,  # when worlds begin anew; see `SteppedWorlds`
+    ) -> None:
+        check_nodes(world, nodes)
+        super().__init__(world, base_dir, num_worlds, nodes, in_next_step)
+
+    def reset(self, seed: int | None, first_world: int) -> None:
+        arrays = self.arrays
+        results = self.run(self._command(Task.RESET, {"seed": seed, "first_world": first_world}))
+        arrays.observations[arrays.chosen] = 0.0
+        self._write(results, of_step=False)
+        if not arrays.chosen.all():
+            arrays.observations[~arrays.mask] = 0.0
+
+    def step(self, commands: Commands) -> None:
+        """Let the agents act, and reset the worlds whose episode is over, now or a step later."""
+        arrays = self.arrays
+        if commands.controls is not arrays.controls:
+            arrays.controls[:] = commands.controls
+            arrays.meta_actions[:] = commands.meta_actions
+        arrays.declared[:] = commands.declared if commands.declared.size else 0
+        results = self.run(self._command(Task.STEP))
+        arrays.observations[...] = 0.0
+        self._write(results, of_step=True)
+
+    def _command(self, task: Task, letter: Any = None) -> NodeCommand:
+        changes = task in (Task.STEP, Task.RESET)
+        pieces = [bytes(piece) for piece in pieces_of(task, letter, self.arrays)]
+        return NodeCommand(pieces, changes, self._ticks_per_step if task == Task.STEP else 0)
+
+    def _write(self, results: Sequence[memoryview], of_step: bool) -> None:
+        for number, data in enumerate(results):
+            take_results(data, self.arrays, with_common=number == 0, of_step=of_step)
+
+    def suggest(self) -> None:
+        """Write what the built-in driver would do in the agents' place."""
+        suggested = self.arrays.suggested
+        suggested[...] = 0.0
+        for data in self.run(self._command(Task.SUGGEST)):
+            num = len(data) // (8 + suggested.itemsize * 2)
+            where = np.frombuffer(data, np.int64, num)
+            found = np.frombuffer(data, suggested.dtype, 2 * num, 8 * num)
+            suggested.reshape(-1, 2)[where] = found.reshape(-1, 2)
+
+    def _asked(self, task: Task, letter: Any) -> Any:
+        return json.loads(bytes(self.run(self._command(task, letter))[0]))
+
+    def write_states(self) -> None:
+        data = self.run(self._command(Task.WRITE_STATES))[0]
+        found = np.frombuffer(data, self.arrays.states.dtype)
+        self.arrays.states[...] = found.reshape(self.arrays.states.shape)
+
+    def ticks(self) -> NDArray[np.int64]:
+        return self.arrays.ticks.copy()
+
+    def state_hash(self, world: int) -> str:
+        return str(self._asked(Task.STATE_HASH, self._number(world)))
+
+    def traffic_stats(self, world: int) -> dict[str, float]:
+        found: dict[str, float] = self._asked(Task.TRAFFIC_STATS, self._number(world))
+        return found
+
+    def driven(self, world: int, agents: Sequence[int]) -> list[Driven]:
+        found = self._asked(Task.DRIVEN, [self._number(world), list(map(int, agents))])
+        return [Driven(*row) for row in found]
+
+    def signal_phases(self, world: int) -> NDArray[np.int32]:
+        return np.array(self._asked(Task.SIGNAL_PHASES, self._number(world)), dtype=np.int32)
+
+    def _number(self, world: int) -> int:
+        return range(len(self.arrays.mask))[world]
+
+    def save_worlds(self) -> list[bytes]:
+        raise unsaved()
+
+    def load_worlds(self, cases: Sequence[bytes]) -> None:
+        raise unsaved()
+
+    @property
+    def simulation(self) -> Simulation:
+        """Refused: the worlds live elsewhere."""
+        raise ConfigError("the worlds live in nodes: use workers=0 to look into them")
+
+    @property
+    def plans(self) -> tuple[Plan, ...]:
+        return self._placement.plans
+
+    @property
+    def migrations(self) -> int:
+        """How many vehicles have changed their owner since the worlds were made."""
+        return self._coordinator.switched
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        raise uncopied()
+
+
+def check_nodes(world: World, nodes: int) -> None:
+    """Refuse what worlds over nodes cannot have."""
+    config, count, demand = world.config, world.partition.count, world.demand
+    if not 1 <= nodes <= count:
+        raise ConfigError(
+            f"nodes = {nodes}: a world of {count} zone(s) is hosted by 1 to {count} nodes; use "
+            "more zones or fewer nodes"
+        )
+    looks = isinstance(demand, DemandFile) and (demand.may_look or len(demand.rerouters.rules))
+    refused = {
+        "traffic.source": config.traffic.source != "native" and config.traffic.source,
+        "rig": bool(config.rig) and "…",
+        "v2x.enabled": config.v2x.enabled,
+        "scenario.name": config.scenario.name,
+        "a demand with rerouting devices or rerouters": bool(looks),
+        "zones.faults": config.zones.faults,
+        "zones.reproducers": config.zones.reproducers,
+        "zones.check_invariants": config.zones.check_invariants,
+        "zones.repartition_steps": config.zones.repartition_steps,
+        "workers.sensors": config.workers.sensors,
+        "workers.balance_steps": config.workers.balance_steps,
+        "workers.monitor_cpu": config.workers.monitor_cpu,
+    }
+    for key, value in refused.items():
+        if value:
+            raise ConfigError(
+                f"{key} = {value!r}: worlds over nodes do not have it yet; leave it out, or use "
+                "workers in place of nodes"
+            )

@@ -1,0 +1,263 @@
+"""`ZoneHosts`: the zones of a node as hosts of the ownership protocol.
+
+A vehicle that has crossed a border is offered to the node of the zone that it is in, by PREPARE;
+that node acknowledges it to the coordinator and to the source; the coordinator decides, and the
+next STEP of both zones says so. Until then the source goes on with it.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import MessageError, ProtocolError
+from cavmarl.core.records.arrays import Gate
+from cavmarl.handoff.coordinator.coordinator import Coordinator
+from cavmarl.handoff.division import Division
+from cavmarl.handoff.zone_view import TransferInFlight
+from cavmarl.ownership.codec import decode, encode
+from cavmarl.ownership.endpoint import Endpoint
+from cavmarl.ownership.ledger import state_digest
+from cavmarl.ownership.limits import Limits
+from cavmarl.ownership.messages import COORDINATOR, Message, Removed
+from cavmarl.ownership.offers import Approach
+from cavmarl.ownership.reactions import Advance, Hosting
+from cavmarl.parallel.nodes.links import Bytes, FrameKind, Links, NodeFrame
+from cavmarl.shards.shard import Commands
+from cavmarl.zones.kernels.zone_lookup import zones_of
+
+_LENGTH = struct.Struct("<II")
+
+
+class RecoveryOrderedError(Exception):
+    """The coordinator wants this node to go back to a state that was kept."""
+
+    def __init__(self, frame: NodeFrame) -> None:
+        super().__init__("other nodes are lost")
+        self.frame = frame
+
+
+class Report(NamedTuple):
+    """What the coordinator has to know of a world's tick beside DONE."""
+
+    movers: list[tuple[int, int, str]]  # vehicle, zone that it is in, digest of its state as hex
+    births: list[tuple[int, int]]  # vehicle, zone that owns it first
+    began: bool  # the world has begun anew after the tick
+
+
+class ZoneHosts:
+    """Those of one node, of W worlds."""
+
+    coordinators: tuple[Coordinator, ...] = ()  # they are in another process
+
+    def __init__(
+        self,
+        division: Division,
+        zones: Sequence[int],  # of this node
+        node_of: Sequence[int],  # zone → the node that hosts it
+        hostings: Sequence[Sequence[Hosting]],  # of each world, of these zones
+        limits: Limits,
+        links: Links,  # to the coordinator and to all other nodes
+        generation: int = 0,  # how often nodes have been lost
+    ) -> None:
+        self._generation = generation
+        self._division = division
+        self._zones = frozenset(zones)
+        self._node_of = node_of
+        self._links = links
+        self._endpoints = [
+            {hosting.zone: Endpoint(hosting, limits) for hosting in some} for some in hostings
+        ]
+        num_worlds = len(hostings)
+        self._leases: list[dict[int, Advance]] = [{} for _ in range(num_worlds)]
+        self._births: list[list[tuple[int, int]]] = [[] for _ in range(num_worlds)]
+        self._gone: list[dict[int, int]] = [{} for _ in range(num_worlds)]
+        self._began = [False] * num_worlds
+        self._stirred = [True] * num_worlds
+        self._is_open = False
+
+    # Called by a tick
+
+    def begin(self, commands: Commands) -> None:
+        """Wait for the lease of the next tick, and let vehicles change hands as it says."""
+        if self._is_open:
+            self.report()
+        while any(len(leases) < len(self._zones) for leases in self._leases):
+            frame = self._links.take([COORDINATOR])[COORDINATOR]
+            if frame.kind is FrameKind.RECOVER:
+                raise RecoveryOrderedError(frame)
+            if frame.kind is not FrameKind.LEASE:
+                raise ProtocolError(f"a frame of kind {frame.kind.name}, where a lease was due")
+            for w, message in unpacked(frame.data):
+                self._take(w, message)
+        for w, leases in enumerate(self._leases):
+            self._change_hands(w, leases)
+            self._leases[w] = {}
+        self._is_open = True
+
+    def end(self) -> None:
+        """The tick is over here; `report` tells the coordinator."""
+
+    def entered(self, gate: Gate) -> None:
+        division = self._division
+        for w, births in enumerate(self._births):
+            new = gate.passing[w, : gate.num_passing[w]]
+            if len(new):
+                zones = np.empty(len(new), dtype=np.int32)
+                zones_of(division.zones, new, len(new), zones)
+                pairs = zip(new["id"].tolist(), zones.tolist(), strict=True)
+                births += [(vehicle, zone) for vehicle, zone in pairs if zone in self._zones]
+
+    def left(self, gate: Gate) -> None:
+        for w, gone in enumerate(self._gone):
+            rows = gate.passing[w, : gate.num_passing[w]]
+            if len(rows):
+                gone.update(zip(rows["id"].tolist(), rows["events"].tolist(), strict=True))
+                self._stirred[w] = True
+
+    def reset(self, chosen: NDArray[np.bool_]) -> None:
+        for w in np.flatnonzero(chosen).tolist():
+            self._began[w] = True
+            owned = self._division.owners(w)
+            self._births[w] = [(vehicle, zone) for vehicle, zone in owned if zone in self._zones]
+            self._gone[w] = {}
+            self._stirred[w] = True
+
+    def save(self) -> None:
+        """Nothing is kept apart of what is in the rows."""
+
+    def in_flight(self, w: int) -> list[TransferInFlight]:
+        return [
+            TransferInFlight(vehicle, zone, target, "offered")
+            for zone, endpoint in self._endpoints[w].items()
+            for vehicle, target in endpoint.offers.open
+        ]
+
+    # Messages
+
+    def report(self, more: Sequence[Bytes] = ()) -> None:
+        """End the leases: DONE of all zones, and offers of vehicles that have crossed a border."""
+        messages: list[tuple[int, Message]] = []
+        reports = []
+        for w in range(len(self._endpoints)):
+            began, self._began[w] = self._began[w], False
+            messages += [(w, done) for done in self._complete(w)]
+            movers = [] if began else self._offer(w)
+            reports.append(Report(movers, self._births[w], began))
+            self._births[w] = []
+        said = json.dumps(reports).encode()
+        packed_messages = packed(messages)
+        head = _LENGTH.pack(len(packed_messages), len(said))
+        self._links.send(
+            COORDINATOR, FrameKind.REPORT, self._generation, [head, packed_messages, said, *more]
+        )
+        self._is_open = False
+
+    def _complete(self, w: int) -> Iterable[Message]:
+        gone, self._gone[w] = self._gone[w], {}
+        left: dict[int, list[Removed]] = {}
+        kept: dict[int, int] = {}
+        for vehicle, reason in gone.items():
+            zone = next((z for z, e in self._endpoints[w].items() if vehicle in e.owned), None)
+            if zone is None:  # it has been born since the lease was given
+                kept[vehicle] = reason
+            else:
+                left.setdefault(zone, []).append(Removed(vehicle, reason))
+        self._gone[w] = kept
+        for zone, endpoint in self._endpoints[w].items():
+            if endpoint.lease is not None:
+                yield endpoint.complete(0, left.get(zone, ()))
+
+    def _offer(self, w: int) -> list[tuple[int, int, str]]:
+        """Offer the vehicles that have crossed to the zones that they are in."""
+        division, endpoints = self._division, self._endpoints[w]
+        everybody, self._stirred[w] = self._stirred[w], False
+        approaches: dict[int, list[Approach]] = {zone: [] for zone in endpoints}
+        movers = []
+        for entry in division.near(w, everybody):
+            endpoint = endpoints.get(entry.source)
+            if entry.crossed and endpoint is not None and entry.vehicle in endpoint.owned:
+                state = division.state(w, entry.source, entry.row)
+                approaches[entry.source].append(Approach(entry.vehicle, entry.target, state))
+                movers.append((entry.vehicle, entry.target, state_digest(state).hex()))
+        for zone, endpoint in endpoints.items():
+            if approaches[zone] or endpoint.offers.open:
+                for message in endpoint.offer(approaches[zone]):
+                    self._send(w, message)
+        return movers
+
+    def hear(self, number: int, frame: NodeFrame) -> None:
+        """Take messages of other nodes as soon as they come."""
+        for w, message in unpacked(frame.data):
+            self._take(w, message)
+
+    def _take(self, w: int, message: Message) -> None:
+        for zone in message.destinations():
+            endpoint = self._endpoints[w].get(zone)
+            if endpoint is None:
+                continue
+            reaction = endpoint.on_message(message)
+            if reaction.advance is not None:
+                self._leases[w][zone] = reaction.advance
+            for answer in reaction.messages:
+                self._send(w, answer)
+
+    def _send(self, w: int, message: Message) -> None:
+        """To the nodes of its zones, which may be this one, and to the coordinator."""
+        for destination in message.destinations():
+            if destination in self._zones:
+                self._take_own(w, destination, message)
+            else:
+                to = COORDINATOR if destination == COORDINATOR else self._node_of[destination]
+                self._links.send(to, FrameKind.MESSAGES, 0, [packed([(w, message)])])
+
+    def _take_own(self, w: int, zone: int, message: Message) -> None:
+        reaction = self._endpoints[w][zone].on_message(message)
+        for answer in reaction.messages:
+            self._send(w, answer)
+
+    def _change_hands(self, w: int, leases: dict[int, Advance]) -> None:
+        division = self._division
+        for zone, advance in leases.items():
+            for vehicle in advance.leave:
+                division.give_up(w, zone, vehicle)
+        for zone, advance in leases.items():
+            owned = self._endpoints[w][zone].owned
+            for vehicle, state in advance.enter:
+                division.take_over(w, zone, vehicle, owned[vehicle], state)
+
+
+def packed(messages: Sequence[tuple[int, Message]]) -> bytes:
+    """Messages with the world of each, one after the other."""
+    parts: list[bytes] = []
+    for w, message in messages:
+        data = encode(message)
+        parts += (_LENGTH.pack(w, len(data)), data)
+    return b"".join(parts)
+
+
+def unpacked(data: memoryview) -> list[tuple[int, Message]]:
+    """The same, read. Raises MessageError: it is none."""
+    found, at = [], 0
+    while at < len(data):
+        if at + _LENGTH.size > len(data):
+            raise MessageError("messages end inside a length")
+        w, size = _LENGTH.unpack_from(data, at)
+        at += _LENGTH.size
+        found.append((w, decode(bytes(data[at : at + size]))))
+        at += size
+    return found
+
+
+def read_report(data: memoryview) -> tuple[list[tuple[int, Message]], list[Report], memoryview]:
+    """Messages, what is said of each world, and what follows."""
+    size, said = _LENGTH.unpack_from(data)
+    at = _LENGTH.size
+    messages = unpacked(data[at : at + size])
+    reports: Any = json.loads(bytes(data[at + size : at + size + said]))
+    return messages, [Report(*report) for report in reports], data[at + size + said :]

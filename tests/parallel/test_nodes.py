@@ -1,0 +1,205 @@
+"""Worlds over nodes that share nothing are the undivided ones, whichever node is lost."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from threading import Timer
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+
+from cavmarl import ConfigError, make_vec, parallel_env
+from cavmarl.core.errors import WorkerDeathError, WorkerError
+from cavmarl.env.vector import CavVectorEnv
+from cavmarl.handoff.coordinator.journal import JournalReader
+from cavmarl.parallel.nodes.node_worlds import NodeWorlds
+from tests.support.actuated import actuated_grid
+from tests.support.vec_runs import Make, drive, same
+
+WANTED: dict[str, Any] = {"agents": 8, "background": 30, "max_cycles": 8}
+SEATS = {"population.mode": "respawn", "action.kind": "discrete"}
+
+
+def over_nodes(vec: CavVectorEnv) -> NodeWorlds:
+    assert isinstance(vec.worlds, NodeWorlds)
+    return vec.worlds
+
+
+@pytest.mark.parametrize(
+    ("arguments", "nodes"),
+    [
+        ({"env": "grid4x4"}, 2),
+        ({"env": "grid4x4", "num_envs": 2}, 3),
+        ({"env": "merge", "autoreset_mode": "NextStep"}, 4),
+        ({"env": "rush"}, 2),
+        ({"env": "town", "overrides": {**SEATS, "sensors.stack": 3}}, 4),
+        ({"env": "town", "overrides": {"clock.control_latency_ticks": 2}}, 1),
+    ],
+)
+def test_nobody_can_tell(make: Make, arguments: dict[str, Any], nodes: int) -> None:
+    wanted = WANTED | arguments
+    whole = drive(make(**wanted))
+    vec = make(zones=4, nodes=nodes, **wanted)
+    assert same(drive(vec), whole)
+    assert same(drive(vec), whole)
+    assert len(over_nodes(vec).processes) == nodes
+    assert over_nodes(vec).recoveries == 0
+
+
+def test_actuated_signals_and_a_demand(make: Make, tmp_path: Path) -> None:
+    wanted = {"env": str(actuated_grid(tmp_path)), "agents": 4, "background": 40}
+    whole = drive(make(**wanted), steps=60)
+    vec = make(zones=4, nodes=2, **wanted)
+    assert same(drive(vec, steps=60), whole)
+    assert over_nodes(vec).migrations > 0
+
+
+def test_no_memory_is_shared(make: Make) -> None:
+    """No node has a mapping in common with another process that both can write."""
+    vec = make("grid4x4", zones=4, nodes=2, **WANTED)
+    drive(vec, steps=3)
+    for process in over_nodes(vec).processes:
+        shared = [
+            region.path
+            for region in psutil.Process(process.pid).memory_maps(grouped=False)
+            if "s" in region.perms and "w" in region.perms
+        ]
+        assert shared == []
+
+
+class Killer:
+    """Kills a node at a random time of some steps."""
+
+    def __init__(self, vec: CavVectorEnv, seed: int, *steps: int) -> None:
+        self._worlds, self._steps = over_nodes(vec), steps
+        self._random = random.Random(seed)
+
+    def __call__(self, step: int) -> None:
+        if step in self._steps:
+            living = [n for n, zones in enumerate(self._worlds.zones) if zones]
+            pid = self._worlds.processes[self._random.choice(living)].pid
+            Timer(self._random.uniform(0.0, 0.01), os.kill, (pid, signal.SIGKILL)).start()
+
+
+@pytest.mark.parametrize(("env", "seed"), [("grid4x4", 1), ("town", 2)])
+def test_nodes_that_are_lost_at_any_time(make: Make, env: str, seed: int) -> None:
+    wanted = {"agents": 6, "background": 60, "max_cycles": 20}
+    whole = drive(make(env, **wanted), steps=40)
+    vec = make(env, zones=4, nodes=4, **wanted)
+    assert same(drive(vec, steps=40, before=Killer(vec, seed, 4, 17, 30)), whole)
+    assert over_nodes(vec).recoveries == 3
+    assert sum(map(bool, over_nodes(vec).zones)) == 1
+
+
+def test_a_node_that_stops_is_taken_for_lost(make: Make) -> None:
+    wanted = {**WANTED, "overrides": {"workers.timeout_s": 1.0}}
+    whole = drive(make("grid4x4", **wanted))
+    vec = make("grid4x4", zones=4, nodes=3, **wanted)
+
+    def strike(step: int) -> None:
+        if step == 5:
+            os.kill(over_nodes(vec).processes[1].pid, signal.SIGSTOP)
+
+    assert same(drive(vec, before=strike), whole)
+    assert over_nodes(vec).zones[1] == []
+
+
+def test_two_nodes_apart_are_lost_at_once(make: Make) -> None:
+    whole = drive(make("grid4x4", **WANTED))
+    vec = make("grid4x4", zones=4, nodes=4, **WANTED)
+    worlds = over_nodes(vec)
+
+    def strike(step: int) -> None:
+        if step == 5:
+            for number in (0, 2):
+                os.kill(worlds.processes[number].pid, signal.SIGKILL)
+
+    assert same(drive(vec, before=strike), whole)
+    assert worlds.zones[0] == worlds.zones[2] == []
+
+
+def test_a_node_and_the_one_that_keeps_its_state_are_lost(make: Make) -> None:
+    vec = make("grid4x4", zones=4, nodes=4, **WANTED)
+    vec.reset(seed=1)
+    for number in (1, 2):
+        os.kill(over_nodes(vec).processes[number].pid, signal.SIGKILL)
+    with pytest.raises(WorkerDeathError, match="node 1 was lost"):
+        vec.step(vec.suggest_actions())
+
+
+def test_the_only_node_is_lost(make: Make) -> None:
+    vec = make("grid4x4", zones=2, nodes=1, **WANTED)
+    vec.reset(seed=1)
+    os.kill(over_nodes(vec).processes[0].pid, signal.SIGKILL)
+    with pytest.raises(WorkerDeathError, match="node 0 was lost"):
+        vec.step(vec.suggest_actions())
+
+
+def test_nothing_stays_behind(make: Make) -> None:
+    vec = make("grid4x4", zones=2, nodes=2, **WANTED)
+    vec.reset(seed=1)
+    pids = [process.pid for process in over_nodes(vec).processes]
+    vec.close()
+    assert not any(map(psutil.pid_exists, pids))
+
+
+def test_a_journal_tells_of_changes_of_owner(make: Make, tmp_path: Path) -> None:
+    path = tmp_path / "run.jsonl"
+    vec = make("grid4x4", zones=4, nodes=2, overrides={"zones.journal": str(path)}, **WANTED)
+    drive(vec, steps=20)
+    switched = over_nodes(vec).migrations
+    vec.close()
+    records = JournalReader(path)
+    assert sum(len(getattr(record, "switches", ())) for record in records) == switched > 0
+
+
+def test_one_environment_of_pettingzoo() -> None:
+    env = parallel_env("grid4x4", zones=4, nodes=2, agents=3, background=10)
+    one = parallel_env("grid4x4", agents=3, background=10)
+    for made in (env, one):
+        made.reset(seed=4)
+    for _ in range(5):
+        actions = {agent: np.array([0.2, 0.0], np.float32) for agent in one.agents}
+        (seen, *_), (other, *_) = env.step(actions), one.step(actions)
+        assert seen.keys() == other.keys()
+        assert all(np.array_equal(seen[agent], other[agent]) for agent in seen)
+    env.close()
+    one.close()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"nodes": 5, "zones": 4}, "hosted by 1 to 4 nodes"),
+        ({"nodes": 0}, "nodes = 0"),
+        ({"nodes": 2, "workers": 2}, "leave the others out"),
+        ({"nodes": 2, "zones": 2, "overrides": {"v2x.enabled": True}}, "v2x.enabled = True"),
+        ({"nodes": 2, "zones": 2, "overrides": {"rig": "ten_sensors"}}, "rig = "),
+        ({"nodes": 2, "zones": 2, "overrides": {"zones.faults": "x.json"}}, "zones.faults"),
+    ],
+)
+def test_bad_input(arguments: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        make_vec("grid4x4", **arguments)
+
+
+def test_what_needs_the_worlds_here_is_refused(make: Make) -> None:
+    vec = make("grid4x4", zones=2, nodes=2, **WANTED)
+    with pytest.raises(ConfigError, match="use workers=0"):
+        _ = vec.simulation
+    refused: list[Callable[[], Any]] = [vec.worlds.save_worlds, vec.worlds.__reduce__]
+    for call in refused:
+        with pytest.raises(ConfigError):
+            call()
+
+
+def test_a_node_that_cannot_begin_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cavmarl.parallel.nodes.node_pool.NODE", "cavmarl.nothing")
+    with pytest.raises(WorkerError, match="before it had begun"):
+        make_vec("grid4x4", zones=2, nodes=2)

@@ -1,0 +1,56 @@
+"""`cavmarl verify --nodes`: nodes beside the undivided worlds."""
+
+from __future__ import annotations
+
+import pytest
+
+from cavmarl import ConfigError
+from cavmarl.env.vector import CavVectorEnv
+from cavmarl.verify.node_losses import verify_nodes
+from tests.cli.test_main import refusal, run
+
+
+def test_nodes_change_nothing_while_some_are_killed() -> None:
+    found = verify_nodes("grid4x4", nodes=(1, 3), kills=2, steps=30, agents=4, background=30)
+    assert found.holds
+    assert [run.nodes for run in found.runs] == [1, 3]
+    assert [run.killed for run in found.runs] == [0, 2]
+    assert found.zones == 6
+    assert found.to_dict()["holds"] is True
+
+
+def test_a_difference_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    hashed = CavVectorEnv.state_hash
+
+    def wrong(vec: CavVectorEnv, world: int = 0) -> str:
+        found = hashed(vec, world)
+        return found if type(vec.worlds).__name__ == "LocalWorlds" else found[::-1]
+
+    monkeypatch.setattr(CavVectorEnv, "state_hash", wrong)
+    (run,) = verify_nodes("grid4x4", nodes=(2,), steps=8, agents=1, background=0).runs
+    assert run.different == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"nodes": ()}, "name at least one"),
+        ({"nodes": (0,)}, "from 1 on"),
+        ({"nodes": (2,), "kills": 30, "steps": 20}, "can have up to 15"),
+        ({"nodes": (3,), "zones": 2}, "hosted by 1 to 2 nodes"),
+    ],
+)
+def test_bad_input(arguments: dict[str, object], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        verify_nodes("grid4x4", **arguments)  # type: ignore[arg-type]
+
+
+def test_the_command(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ("--nodes", "2", "--steps", "10", "--zones", "2")
+    assert run("verify", "grid4x4", *words) == 0
+    assert "equal" in capsys.readouterr().out
+
+
+def test_the_command_refuses_layouts(capsys: pytest.CaptureFixture[str]) -> None:
+    said = refusal(capsys, "verify", "grid4x4", "--nodes", "2", "--layout", "strips")
+    assert "--layout does not go with --nodes" in said
