@@ -55,4 +55,3 @@ def test_a_blockage_stands_on_the_way_that_it_blocks(tmp_path: Path) -> None:
             assert streets.apart_m(place) < 1.0
         found += len(places)
     assert found > 10
-
