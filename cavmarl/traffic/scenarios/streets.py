@@ -16,6 +16,7 @@ CAR = 1 << VEHICLE_CLASSES.index("passenger")
 STRAIGHT_RAD = 0.05  # the most that the direction of a straight lane changes
 BESIDE_M = 8.0  # the farthest between the middles of lanes of one road
 LOOK_MARGIN_M = 0.3
+ACROSS_M = 1.0  # from the middle of an area that two ways share to either, at most
 
 
 class Crossing(NamedTuple):
@@ -110,7 +111,7 @@ class Streets:
         return Opposite(other, place, abs(d))
 
     def crossings(self, directions: str, *, yields: bool, merges: bool) -> Iterator[Crossing]:
-        """Pairs of movements of cars that share an area.
+        """Pairs of movements of cars that share an area, whose middle lies on both, or its end.
 
         `directions`: SUMO's letters of the one, as `s` or `lL`. `yields`: whether it has to give
         way to the other. `merges`: whether both lead into one lane.
@@ -126,12 +127,14 @@ class Streets:
         good &= (conflicts["merging"] == merges) & (conflicts["must_yield"] == yields)
         for c in np.flatnonzero(good):
             row = conflicts[c]
-            yield Crossing(
+            crossing = Crossing(
                 int(own[c]),
                 int(foe[c]),
                 0.5 * float(row["enter_m"] + row["leave_m"]),
                 0.5 * float(row["foe_enter_m"] + row["foe_leave_m"]),
             )
+            if merges or self.apart_m(crossing) < ACROSS_M:
+                yield crossing
 
     def apart_m(self, crossing: Crossing) -> float:
         """From the middle of the shared area on the way of the other to the way of the one."""

@@ -13,7 +13,6 @@ NEEDS = "a junction where a way straight on crosses another one, with 65 m of ro
 
 FAR_M = 60.0  # from the agent to the junction in the beginning
 ROLL_M = 12.0  # from the other car to its stop line
-ACROSS_M = 1.0  # from the middle of the car that stands to the agent's way, at most
 NEAR_M = 30.0  # from the agent to the junction, when the time of the blockage begins
 
 
@@ -37,7 +36,7 @@ def places(streets: Streets, parameters: Parameters) -> dict[str, Crossing]:
             path = path_of(streets.network, crossing.foe)
             ends = (streets.length_m(path[0]), streets.length_m(path[-1]))
             room = ends[0] > ROLL_M + 5.0 and ends[1] > FREE_M + 5.0
-            if seat is not None and room and streets.apart_m(crossing) < ACROSS_M:
+            if seat is not None and room:
                 found.setdefault(streets.name(lane), crossing)
     return found
 
