@@ -100,12 +100,14 @@ def covered(row: np.void, at: tuple[float, float]) -> dict[int, tuple[float, flo
     """The twin of `Shadows`: by lane, from where to where a fine grid over a body is on it."""
     found: dict[int, list[float]] = {}
     cos, sin = math.cos(row["heading"]), math.sin(row["heading"])
+    lanes, room_m = ROADS.lanes, 3.0 + row["length"]
+    near = (lanes["min_x"] - room_m < at[0]) & (at[0] < lanes["max_x"] + room_m)
+    near &= (lanes["min_y"] - room_m < at[1]) & (at[1] < lanes["max_y"] + room_m)
     for u in np.linspace(-0.5, 0.5, 41) * row["length"]:
         for v in np.linspace(-0.5, 0.5, 21) * row["width"]:
             x, y = at[0] + u * cos - v * sin, at[1] + u * sin + v * cos
-            for number, lane in enumerate(ROADS.lanes):
-                if not (lane["min_x"] - 3.0 < x < lane["max_x"] + 3.0):
-                    continue
+            for number in np.flatnonzero(near).tolist():
+                lane = lanes[number]
                 s, d, _, _ = project(ROADS.points, lane["first_point"], lane["num_points"], x, y)
                 if abs(d) < 0.5 * lane["width_m"] and 0.0 <= s <= lane["length_m"]:
                     found.setdefault(number, []).append(s)

@@ -124,6 +124,47 @@ def test_two_nodes_apart_are_lost_at_once(make: Make) -> None:
     assert worlds.zones[0] == worlds.zones[2] == []
 
 
+def test_commands_that_are_alike_are_done_as_often_as_they_were_given(make: Make) -> None:
+    wanted = {**WANTED, "max_cycles": 100}
+    vecs = [make("grid4x4", **wanted), make("grid4x4", zones=4, nodes=3, **wanted)]
+    for vec in vecs:
+        vec.reset(seed=2)
+    still = np.zeros_like(vecs[0].suggest_actions())
+    for step in range(60):
+        if step == 50:  # by then states were kept several times
+            os.kill(over_nodes(vecs[1]).processes[0].pid, signal.SIGKILL)
+        for vec in vecs:
+            vec.step(still)
+        assert vecs[0].state_hash() == vecs[1].state_hash(), step
+
+
+def test_an_interrupted_step_can_be_taken_again(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vecs = [make("grid4x4", **WANTED), make("grid4x4", zones=4, nodes=2, **WANTED)]
+    for vec in vecs:
+        vec.reset(seed=2)
+    coordinator = over_nodes(vecs[1])._coordinator
+    begin = coordinator.begin
+    for step in range(6):
+        actions = vecs[0].suggest_actions()
+        if step in (2, 3):
+
+            def interrupted(timeout_s: float, after: bool = step == 3) -> None:
+                if after:
+                    begin(timeout_s)
+                raise KeyboardInterrupt
+
+            monkeypatch.setattr(coordinator, "begin", interrupted)
+            with pytest.raises(KeyboardInterrupt):
+                vecs[1].step(actions)
+            monkeypatch.setattr(coordinator, "begin", begin)
+        for vec in vecs:
+            vec.step(actions)
+        assert vecs[0].state_hash() == vecs[1].state_hash(), step
+    assert over_nodes(vecs[1]).recoveries == 0
+
+
 def test_a_node_and_the_one_that_keeps_its_state_are_lost(make: Make) -> None:
     vec = make("grid4x4", zones=4, nodes=4, **WANTED)
     vec.reset(seed=1)

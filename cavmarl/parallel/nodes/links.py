@@ -73,6 +73,14 @@ class LinkLostError(Exception):
         self.peer = peer
 
 
+class RecoveryOrderedError(Exception):
+    """A node is to go back to a state that was kept; the order itself, if it has come."""
+
+    def __init__(self, frame: NodeFrame | None) -> None:
+        super().__init__("other nodes are lost")
+        self.frame = frame
+
+
 class _Link:
     """One connection: what is to be sent, and what has come of the next frame."""
 
@@ -230,6 +238,10 @@ class Links:
             if left_ms == 0.0:
                 raise SilenceError(f"nodes {sorted(missing)} do not answer within {timeout_s:g} s")
             self.pump(left_ms)
+
+    def put_back(self, number: int, frame: NodeFrame) -> None:
+        """Let a frame be the next one of its sender once more."""
+        self._links[number].frames.appendleft(frame)
 
     def pump(self, timeout_ms: float | None) -> None:
         """Send and receive what can be; wait so long for the first that can."""

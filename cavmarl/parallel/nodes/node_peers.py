@@ -20,7 +20,13 @@ from cavmarl.core.records.codes import (
     POS_LAST,
 )
 from cavmarl.engine.simulation import Simulation
-from cavmarl.parallel.nodes.links import Bytes, FrameKind, Links
+from cavmarl.parallel.nodes.links import (
+    Bytes,
+    FrameKind,
+    Links,
+    NodeFrame,
+    RecoveryOrderedError,
+)
 from cavmarl.zones.kernels.ghost_frames import count_ghosts, pack_ghosts, take_ghosts
 
 Array = NDArray[Any]
@@ -240,7 +246,7 @@ class NodePeers:
             self._links.send(first, FrameKind.SHARE, self._sent, pieces)
             yield
             return
-        for number, frame in self._links.take(self._others).items():
+        for number, frame in self._take_all().items():
             zone = self._zones[number][0]
             (num, num_agents, found), at = _read(frame.data, 0, np.int64, 3)
             zoned.rows[side, zone, world, :num], at = _read(frame.data, at, mine.dtype, int(num))
@@ -253,12 +259,26 @@ class NodePeers:
             zone = self._zones[number][0]
             zoned.num_owned[zone, world] = zoned.num_contacts[zone, world] = 0
 
+    def _take_all(self) -> dict[int, NodeFrame]:
+        """The next frame of each of the others.
+
+        Raises:
+            RecoveryOrderedError: one of them has been told to go back already.
+        """
+        found = self._links.take(self._others)
+        ahead = {n: frame for n, frame in found.items() if frame.kind is FrameKind.SYNC}
+        for number, frame in ahead.items():
+            self._links.put_back(number, frame)
+        if ahead:
+            raise RecoveryOrderedError(None)
+        return found
+
     def _swap(self, pieces: Any) -> list[tuple[int, memoryview]]:
         """Send pieces to each of the others, and take theirs, by rising numbers."""
         self._sent += 1
         for to, some in zip(self._others, pieces, strict=True):
             self._links.send(to, FrameKind.SHARE, self._sent, some)
-        found = self._links.take(self._others)
+        found = self._take_all()
         for number, frame in found.items():
             if frame.kind is not FrameKind.SHARE or frame.number != self._sent:
                 raise AssertionError(f"node {number} is at {frame[:2]}, not at share {self._sent}")

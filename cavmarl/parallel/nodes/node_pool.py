@@ -73,7 +73,7 @@ class NodePool:
     Attributes:
         zones: that each node hosts.
         processes: of the nodes.
-        recoveries: how often the worlds have gone on after nodes were lost.
+        recoveries: how often the worlds have gone back because nodes were lost.
 
     Raises:
         ConfigError: a setting that such worlds cannot have, or more nodes than zones.
@@ -213,23 +213,32 @@ class NodePool:
             self._begin_state()
         if command.changes:
             self._log.append(command)
+        try:
+            results = self._insist(command)
+        except BaseException:  # it is as if the command had never been given
+            self._is_torn, self._opened = True, None
+            if command.changes:
+                self._log.pop()
+            raise
+        if command.changes and self._opened is not None:
+            self._state, self._opened = self._opened, None
+            self._log = self._log[-1:]
+            self._keep_again_s = time.monotonic() + KEEP_S
+        return results
+
+    def _insist(self, command: NodeCommand) -> list[memoryview]:
+        """Do a command again and again, until no node is lost meanwhile."""
         while True:
             try:
                 if self._is_torn:
                     self._recover()
                     for one in self._log[: -1 if command.changes else None]:
                         self._perform(one)
-                results = self._perform(command)
-                break
+                return self._perform(command)
             except LinkLostError as lost:
                 self._lose(lost.peer)
             except SilenceError as silence:
                 self._lose(self._silent(silence))
-        if command.changes and self._opened is not None:
-            self._state, self._opened = self._opened, None
-            self._log = self._log[self._log.index(command) :]
-            self._keep_again_s = time.monotonic() + KEEP_S
-        return results
 
     def _begin_state(self) -> None:
         """Let all nodes keep what they have before the next command."""
@@ -324,7 +333,7 @@ class NodePool:
         self._commit()
         self._is_torn = False
         self._keep_again_s = 0.0
-        self.recoveries += 1
+        self.recoveries += bool(heirs)
 
     def _commit(self) -> list[memoryview]:
         """Wait for the nodes to be through with a tick; what else they have sent with it."""

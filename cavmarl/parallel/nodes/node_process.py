@@ -22,11 +22,18 @@ from cavmarl.parallel.hosts.listener import Listener, call
 from cavmarl.parallel.journaled_worlds import unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.nodes.kept_states import KeptStates
-from cavmarl.parallel.nodes.links import Bytes, FrameKind, LinkLostError, Links, NodeFrame
+from cavmarl.parallel.nodes.links import (
+    Bytes,
+    FrameKind,
+    LinkLostError,
+    Links,
+    NodeFrame,
+    RecoveryOrderedError,
+)
 from cavmarl.parallel.nodes.meeting import calls_of
 from cavmarl.parallel.nodes.node_frames import command_of, results_of
 from cavmarl.parallel.nodes.node_peers import NodePeers
-from cavmarl.parallel.nodes.zone_hosts import RecoveryOrderedError, ZoneHosts
+from cavmarl.parallel.nodes.zone_hosts import ZoneHosts
 from cavmarl.parallel.recipe import CHANGED, world_of
 from cavmarl.parallel.worlds_job import Task, commands_of
 from cavmarl.shards.executor import SerialExecutor

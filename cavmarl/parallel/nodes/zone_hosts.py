@@ -27,19 +27,11 @@ from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import COORDINATOR, Message, Removed
 from cavmarl.ownership.offers import Approach
 from cavmarl.ownership.reactions import Advance, Hosting
-from cavmarl.parallel.nodes.links import Bytes, FrameKind, Links, NodeFrame
+from cavmarl.parallel.nodes.links import Bytes, FrameKind, Links, NodeFrame, RecoveryOrderedError
 from cavmarl.shards.shard import Commands
 from cavmarl.zones.kernels.zone_lookup import zones_of
 
 _LENGTH = struct.Struct("<II")
-
-
-class RecoveryOrderedError(Exception):
-    """The coordinator wants this node to go back to a state that was kept."""
-
-    def __init__(self, frame: NodeFrame) -> None:
-        super().__init__("other nodes are lost")
-        self.frame = frame
 
 
 class Report(NamedTuple):
