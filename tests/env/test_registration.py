@@ -13,8 +13,7 @@ import pettingzoo
 import pytest
 
 import cavmarl
-from cavmarl.config.io import load_config
-from cavmarl.config.registry import entries
+from cavmarl.config.registry import entries, load_config
 from cavmarl.core.seeds import check_seed, first_seed
 
 ALL = sorted(entries())
