@@ -17,7 +17,7 @@ from cavmarl.config.registry import find_settings
 if TYPE_CHECKING:
     from cavmarl.evaluate import EvaluationReport
 
-SHOWN = ("success", "collision", "delay_s")  # as many as eighty columns hold
+SHOWN = ("success", "collision", "off_road", "delay_s")  # as many as eighty columns hold
 
 
 def suite(

@@ -271,16 +271,17 @@ def _dashes(network: RoadNetwork) -> Points:
 
 
 def _centre_lines(network: RoadNetwork) -> Points:
-    """Along the left side of each road that has an opposite direction, once for both."""
+    """Along the inner side of each road that has an opposite direction, once for both."""
     edges, lanes = network.edges, network.lanes
     roads = edges[~edges["internal"]]
     ways = set(zip(roads["from_junction"].tolist(), roads["to_junction"].tolist(), strict=True))
     pieces = [np.zeros((0, 2, 3))]
     for edge in roads:
-        leftmost = edge["first_lane"] + edge["num_lanes"] - 1
+        inner = edge["first_lane"] + edge["num_lanes"] - 1
         way = int(edge["from_junction"]), int(edge["to_junction"])
-        if way < way[::-1] and way[::-1] in ways and lanes[leftmost]["permissions"] & CAR_BIT:
-            line = _side(network, leftmost, lanes[leftmost]["width_m"] / 2.0)
+        if way < way[::-1] and way[::-1] in ways and lanes[inner]["permissions"] & CAR_BIT:
+            half = lanes[inner]["width_m"] / 2.0
+            line = _side(network, inner, -half if network.left_hand else half)
             pieces.append(np.stack([line[:-1], line[1:]], axis=1))
     return np.concatenate(pieces)
 

@@ -33,7 +33,7 @@ from cavmarl.roads.network import (
 from cavmarl.roads.sumo_net.reader import map_name, read_network, source_hash
 
 # Raise this when the reader gives other rows for the same file; record types count by themselves.
-FORMAT = 16
+FORMAT = 20
 
 _DIGEST_BYTES = 32  # SHA-256 of the rest begins an entry: NumPy would stumble over a broken one
 
@@ -92,6 +92,7 @@ def _restore(entry: Path, name: str, digest: str) -> RoadNetwork | None:
         values |= {key: tuple(json.loads(stored[key].tobytes())) for key in _IDS}
         geo = json.loads(stored["geo"].tobytes())
         values["geo"] = None if geo is None else GeoReference(**geo)
+        values["left_hand"] = bool(json.loads(stored["left_hand"].tobytes()))
     return RoadNetwork(name=name, source_hash=digest, **values)
 
 
@@ -104,6 +105,7 @@ def _store(entry: Path, network: RoadNetwork) -> None:
             stored[field.name] = np.frombuffer(value.tobytes(), dtype=np.uint8)
         elif field.name in _IDS:
             stored[field.name] = _text(value)
+    stored["left_hand"] = _text(network.left_hand)
     stored["geo"] = _text(None if network.geo is None else asdict(network.geo))
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **stored)

@@ -84,7 +84,7 @@ LANE = record(
     ("first_into", np.int32),
     ("num_into", np.int32),
     ("permissions", np.uint32),  # bit k set: VEHICLE_CLASSES[k] may drive here
-    ("index", np.int32),  # position on its edge, 0 = rightmost
+    ("index", np.int32),  # position on its edge, 0 = at the kerb
     ("min_x", np.float64),  # bounding box of the polyline, m
     ("min_y", np.float64),
     ("max_x", np.float64),
@@ -92,7 +92,7 @@ LANE = record(
 )
 
 EDGE = record(
-    # LANE rows [first_lane, first_lane + num_lanes), from right to left
+    # LANE rows [first_lane, first_lane + num_lanes), from the kerb to the middle of the road
     ("first_lane", np.int32),
     ("num_lanes", np.int32),
     ("internal", np.bool_),
@@ -226,6 +226,7 @@ class RoadNetwork:
     program_ids: tuple[str, ...]
     junction_kinds: tuple[str, ...]  # SUMO's types that occur, by `JUNCTION["kind"]`
     geo: GeoReference | None = None  # where it lies on the earth; None: the map does not say
+    left_hand: bool = False  # whether one drives on the left
     # WALL (num_walls,) of the buildings, if they were asked for; see `maps.buildings`
     walls: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, WALL))
     # (num_roofs, 4, 2) corners in m of the convex parts of their footprints
@@ -337,6 +338,8 @@ class RoadNetwork:
                 digest.update("\0".join(value).encode())
             elif isinstance(value, GeoReference):
                 digest.update(repr(value).encode())
+            elif value is True:
+                digest.update(item.name.encode())
         return digest.hexdigest()
 
 

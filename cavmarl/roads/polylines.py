@@ -31,26 +31,26 @@ def clean_shape(points: Sequence[tuple[float, float, float]]) -> Shape:
     return np.ascontiguousarray(shape[fresh])
 
 
-def extend_stubs(
-    shapes: list[Shape], before: Mapping[int, int], names: Sequence[str], num_normal: int
-) -> None:
+def refuse_points(shapes: Sequence[Shape], names: Sequence[str]) -> None:
+    """Check that normal lanes, with their ids for the message, have a length.
+
+    Raises MapError: one has none.
+    """
+    for shape, name in zip(shapes, names, strict=True):
+        if len(shape) < 2:
+            raise MapError(
+                f"lane '{name}' has no length: remove its edge or join its junctions "
+                "(netconvert --junctions.join)"
+            )
+
+
+def extend_stubs(shapes: list[Shape], before: Mapping[int, int]) -> None:
     """Stretch internal lanes of one point to `STUB_M`, in the direction they are entered.
 
     Args:
         shapes: one (n, 3) array a lane row; changed in place.
         before: the row that leads into an internal row; rows of a chain in driving order.
-        names: lane ids, for the message.
-        num_normal: rows below this are normal lanes.
-
-    Raises:
-        MapError: a normal lane has no length.
     """
-    for row in range(num_normal):
-        if len(shapes[row]) < 2:
-            raise MapError(
-                f"lane '{names[row]}' has no length: remove its edge or join its junctions "
-                "(netconvert --junctions.join)"
-            )
     for row, source in before.items():
         if len(shapes[row]) < 2:
             step = shapes[source][-1] - shapes[source][-2]

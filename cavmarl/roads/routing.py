@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import RouteError
 from cavmarl.core.records import record
-from cavmarl.core.records.arrays import LaneGrid
+from cavmarl.core.records.arrays import LaneGrid, RoadArrays
 from cavmarl.roads.kernels.plans import plan_goal
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 
@@ -33,19 +33,24 @@ PLAN = record(
 
 
 def make_plans(
-    network: RoadNetwork, goal_edges: Sequence[int], vehicle_class: str = "passenger"
+    network: RoadNetwork,
+    goal_edges: Sequence[int],
+    vehicle_class: str = "passenger",
+    roads: RoadArrays | None = None,
 ) -> NDArray[np.void]:
     """The plans of several goals.
 
     `goal_edges`: EDGE rows to plan for. `vehicle_class`: one of `VEHICLE_CLASSES`; lanes that
-    forbid it are not used.
+    forbid it are not used. `roads`: in the place of the network's.
 
     Returns PLAN (len(goal_edges), num_lanes), read-only.
     """
     plans = np.zeros((len(goal_edges), len(network.lanes)), dtype=PLAN)
     permission = 1 << VEHICLE_CLASSES.index(vehicle_class)
     for goal, edge in enumerate(goal_edges):
-        plan_goal(network.arrays, int(edge), permission, 1.0, plans[goal])
+        plan_goal(
+            network.arrays if roads is None else roads, int(edge), permission, 1.0, plans[goal]
+        )
     plans.setflags(write=False)
     return plans
 

@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config.env import PopulationConfig, TrafficConfig
+from cavmarl.config.env import ActionConfig, PopulationConfig, TrafficConfig
 from cavmarl.core.errors import CapacityError, ConfigError, RouteError
 from cavmarl.core.memory import Zeros
 from cavmarl.core.numba.specialized import specialized
@@ -34,6 +34,7 @@ from cavmarl.traffic.scenarios.scene import Scene
 from cavmarl.traffic.schedule import Schedule
 from cavmarl.traffic.sumo.route_book import RouteBook, StopBook
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
+from cavmarl.traffic.turning_circle import with_tight_turns
 from cavmarl.traffic.way_search import WaySlots, way_slots
 
 PASSENGER = 1 << VEHICLE_CLASSES.index("passenger")
@@ -107,7 +108,8 @@ class NativeTraffic:
     @cached_property
     def plans(self) -> NDArray[np.void]:
         """PLAN (G, L) of the goal edges."""
-        return make_plans(self.network, [int(edge) for edge in self.goal_edges])
+        roads = with_tight_turns(self.network, ActionConfig().steering_rad)
+        return make_plans(self.network, self.goal_edges.tolist(), roads=roads)
 
     @cached_property
     def schedule(self) -> Schedule | None:
@@ -368,7 +370,7 @@ class NativeTraffic:
         """(P, 2) pairs of origin lane and goal whose way has a length from `least_m` to `most_m`.
 
         Vehicles start on a lane that their way can follow: no trip begins with a lane change. And
-        no trip has a U-turn, for which a car's turning circle is too wide on most roads.
+        no trip has a turn for which a car's turning circle is too wide.
         """
         pairs = np.ix_(goals, origins)
         to_go = self.plans["to_go"][pairs]

@@ -13,7 +13,7 @@ import pettingzoo
 import pytest
 
 import cavmarl
-from cavmarl.config.registry import entries
+from cavmarl.config.registry import entries, load_config
 from cavmarl.core.seeds import check_seed, first_seed
 
 ALL = sorted(entries())
@@ -21,14 +21,15 @@ ALL = sorted(entries())
 
 @pytest.mark.parametrize("name", ALL)
 def test_every_entry_has_its_ids(name: str) -> None:
-    assert f"cavmarl/{name}-v1" in gymnasium.registry
-    assert f"cavmarl/{name}Agents-v1" in gymnasium.registry
-    assert f"cavmarl/{name}Discrete-v1" in gymnasium.registry
-    assert f"cavmarl/{name}DiscreteAgents-v1" in gymnasium.registry
+    version = load_config(name)[0].version
+    assert f"cavmarl/{name}-v{version}" in gymnasium.registry
+    assert f"cavmarl/{name}Agents-v{version}" in gymnasium.registry
+    assert f"cavmarl/{name}Discrete-v{version}" in gymnasium.registry
+    assert f"cavmarl/{name}DiscreteAgents-v{version}" in gymnasium.registry
     if not hasattr(pettingzoo, "make"):
         pytest.skip("this PettingZoo has no registry")
     for kind in ("parallel", "aec"):
-        world = pettingzoo.make(kind, f"cavmarl/{name}-v1", max_cycles=3)
+        world = pettingzoo.make(kind, f"cavmarl/{name}-v{version}", max_cycles=3)
         world.reset(seed=0)
         assert world.agents
 

@@ -39,12 +39,12 @@ ROOMY = {"failed_u_turn": "A1B1_1", "pedestrian_crossing": "A1B1_0"}
 # The reference driver on grid4x4, seed 0, nobody else on the road.
 GOLDEN = {
     ("failed_u_turn", False): "d328218ab78180a26e908b8588cbff9e",
-    ("intersection_blockage", False): "49c788c26bcf617b432dbb6a3e8d5a99",
-    ("merge_conflict", False): "d00fa41820b353bf730aaa6c574a7b10",
+    ("intersection_blockage", False): "d05a0f96382e3b2e9fb20bb638085bc8",
+    ("merge_conflict", False): "f231e9b48c351919c77298a9bf9a7207",
     ("pedestrian_crossing", False): "1ecd190d1f275fa51cb0fc8c4db01b5a",
     ("pedestrian_crossing", True): "17751e9da0f775beba34f709cf661460",
-    ("road_closure", False): "ad1cd41f91dba04a10e71c89efa38671",
-    ("signal_outage", False): "0c4af1b6f8eb914752d74c5041e87ef0",
+    ("road_closure", False): "4c0d6855a8ae2af9dddd74a9eddd257e",
+    ("signal_outage", False): "5962afa02a50f8dfb0bf3460943e9d36",
     ("unprotected_left_turn", False): "c61fa293d08fb4492f54009630ed42ba",
 }
 

@@ -18,7 +18,7 @@ MODEL_ACC = 2
 
 # DEPARTURE["lane_code"]: on which lane of its edge a vehicle enters
 LANE_GIVEN = 0
-LANE_FIRST = -1  # the rightmost one of those that it may use
+LANE_FIRST = -1  # the one nearest to the kerb of those that it may use
 LANE_RANDOM = -2
 LANE_FREE = -3  # the least occupied one
 LANE_ALLOWED = -4

@@ -20,6 +20,7 @@ from cavmarl.core.numba.prefetch import SOON, prefetch
 from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
 from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_BACKGROUND, HOLD_NONE, MODEL_KRAUSS
 from cavmarl.core.records.rows import is_lost
+from cavmarl.driving.kernels.bends import LIMIT_DECEL, bend_speed
 from cavmarl.driving.kernels.courtesy import COURTESY_DECEL, let_merge
 from cavmarl.driving.kernels.following import (
     LINE_MARGIN_M,
@@ -31,7 +32,12 @@ from cavmarl.driving.kernels.following import (
 )
 from cavmarl.driving.kernels.gaps import is_minor
 from cavmarl.driving.kernels.junctions import STOP_LINE_M, may_enter, press_inside, waits_inside
-from cavmarl.driving.kernels.lane_choice import choose_lane, needed_change, thinks_of_lanes
+from cavmarl.driving.kernels.lane_choice import (
+    choose_lane,
+    needed_change,
+    thinks_of_lanes,
+    wish_on_lane,
+)
 from cavmarl.driving.kernels.lane_index import VIEW_M, ahead_on, beside_s, last_on
 from cavmarl.driving.kernels.stopping import way_to_stop
 from cavmarl.driving.kernels.ways import leave, next_step
@@ -42,7 +48,6 @@ NEAR_M = 8.0  # to a leader so near the corner between matters,
 ASKEW_RAD = 0.7  # if it turns by so much,
 ASKEW_M = 2.5  # which takes this off the gap
 NEXT_LINE_M = 5.0  # and braking way: so near a line is minded by a vehicle with a leader
-LIMIT_DECEL = 2.0  # m/s², how a driver slows for a lower limit ahead,
 LIMIT_LEAD_S = 1.0  # to be down this time before it, as the model lags behind what is allowed
 FALL_IN_M = 100.0  # before the place where a lane change must be made
 # A driver that has to leave a lane waits this far before its end to change right, and a vehicle's
@@ -50,9 +55,6 @@ FALL_IN_M = 100.0  # before the place where a lane change must be made
 MERGE_ROOM_M = 2.0
 SWAP_ROOM_M = 3.0
 MERGE_ROOM_SHARE = 0.25  # to the right at most this share of the lane's length
-LATERAL_ACCEL = 2.5  # m/s², with which a steered car takes a bend: where a lane turns
-MIN_BEND_RAD = 0.2  # by more than this
-BEND_M = 6.0  # within this length
 ROW_LINES = 3  # of a VEHICLE row that drivers ask for
 RETURN_MPS = 5.0  # at which a lost vehicle looks for its lane
 
@@ -88,37 +90,6 @@ def _slowing_to(kind: np.void, limit: float, distance: float, speed: float, dt: 
         decel = kind["decel"]
         lead_s = dt
     return math.sqrt(limit * limit + 2.0 * decel * max(distance - lead_s * speed, 0.0))
-
-
-@kernel
-def _bend_speed(roads: RoadArrays, lane: int, distance: float) -> float:
-    """The speed in m/s, now, with which a steered car can take all bends of a lane in comfort.
-
-    `distance` is the way to the start of the lane in m, negative on it.
-    """
-    row = roads.lanes[lane]
-    first = row["first_point"]
-    last = first + row["num_points"] - 1
-    slowest = math.inf
-    for k in range(first + 1, last):
-        to_bend = distance + roads.points[k]["s"]
-        if to_bend < -BEND_M:
-            continue
-        before = roads.points[k - 1]
-        m = k
-        while m < last - 1 and roads.points[m + 1]["s"] - roads.points[k]["s"] < BEND_M:
-            m += 1
-        after = roads.points[m]
-        bend = abs(
-            math.atan2(
-                before["cos"] * after["sin"] - before["sin"] * after["cos"],
-                before["cos"] * after["cos"] + before["sin"] * after["sin"],
-            )
-        )
-        if bend > MIN_BEND_RAD:
-            squared = LATERAL_ACCEL * BEND_M / bend + 2.0 * LIMIT_DECEL * max(to_bend, 0.0)
-            slowest = min(slowest, math.sqrt(squared))
-    return slowest
 
 
 @kernel
@@ -260,7 +231,7 @@ def _road_ahead(
     limit = min(here["speed_mps"], kind["desired_max_speed"])
     allowed = min(limit * row["speed_factor"], kind["max_speed"])
     if steered:
-        allowed = min(allowed, _bend_speed(roads, lane, -row["s"]))
+        allowed = min(allowed, bend_speed(roads, lane, lane, -row["s"]))
     press = no_press(kind)
     hold = HOLD_NONE
     link_ahead = -1
@@ -310,7 +281,7 @@ def _road_ahead(
         ahead = roads.lanes[lane]
         limit = ahead["speed_mps"] * row["speed_factor"]
         if steered:
-            allowed = min(allowed, _bend_speed(roads, lane, distance))
+            allowed = min(allowed, bend_speed(roads, before, lane, distance))
         if limit < allowed:
             allowed = min(allowed, _slowing_to(kind, limit, distance, speed, dt))
         j = last_on(scratch, lane, row["id"], distance, travel.view_m)
@@ -426,6 +397,8 @@ def decide(
         change = 0
         if thinks_of_lanes(row, needed, tick, dt):
             own_wish = wish(kind, speed, allowed, press)
+            if driver == DRIVER_AGENT:
+                own_wish = wish_on_lane(roads, travel, row, k, scratch)
             change = choose_lane(roads, travel, rows, i, tick, needed, own_wish, scratch)
         if change != 0 and driver == DRIVER_AGENT:
             # A steered vehicle on its way into a neighbour lane still minds its own lane, to the

@@ -62,6 +62,28 @@ def _desired(roads: RoadArrays, kind: np.void, row: np.void, lane: int) -> float
 
 
 @kernel
+def wish_on_lane(
+    roads: RoadArrays,
+    travel: Travel,
+    row: np.void,
+    k: int,  # its entry
+    scratch: Scratch,
+) -> float:
+    """The acceleration in m/s² that a steered vehicle would like of its lane and its leader there.
+
+    What it slows down for on either lane, bends, lines and limits ahead, is no reason to change.
+    """
+    lane = row["lane"]
+    kind = travel.types[row["vtype"]]
+    desired = _desired(roads, kind, row, lane)
+    if k + 1 == scratch.lane_end[lane]:
+        return wish(kind, row["speed"], desired, no_press(kind))
+    leader = scratch.entries[k + 1]
+    gap = leader["s"] - row["s"] - 0.5 * row["length"] - leader["half"]
+    return accel_behind(kind, row["speed"], desired, gap, leader["speed"], leader["decel"])
+
+
+@kernel
 def _change_is_safe(
     roads: RoadArrays,
     travel: Travel,

@@ -23,6 +23,7 @@ JUNCTION_MARGIN_M = (
 END_MARGIN_M = 1.0  # lanes may leave gaps up to this between end and start,
 SEAM_M = 1.0  # and side by side, where they bend: what lies between is road
 WINDOW_M = 40.0
+TURNING_M = 6.0  # the radius of a car's turning circle, a little more
 SIDE_MARGIN_M = 0.1  # a body this near to a neighbour lane counts as in it: it may stand askew
 LEVEL_M = 4.0  # lanes further above or below are another road
 
@@ -196,10 +197,26 @@ def locate(
 
 @kernel
 def _drives_along(roads: RoadArrays, row: np.void) -> bool:
-    """Whether the vehicle heads within 90° of its lane's direction."""
+    """Whether the vehicle heads within 90° of its lane's direction there, or a little away.
+
+    Lanes may turn more sharply than a car can, which then turns before them or after them. Inside a
+    junction the directions of the roads that it comes from, and goes to, are as good.
+    """
     lane = roads.lanes[row["lane"]]
-    _, _, _, cos, sin, _ = lane_pose(
-        roads.points, lane["first_point"], lane["num_points"], row["s"]
-    )
+    if _heads_along(roads, row, lane, row["s"]):
+        return True
+    if not lane["internal"]:
+        behind = _heads_along(roads, row, lane, max(row["s"] - TURNING_M, 0.0))
+        return behind or _heads_along(roads, row, lane, row["s"] + TURNING_M)
+    link = roads.links[lane["link"]]
+    before = roads.lanes[link["from_lane"]]
+    along: bool = _heads_along(roads, row, before, before["length_m"])
+    return along or _heads_along(roads, row, roads.lanes[link["to_lane"]], 0.0)
+
+
+@kernel
+def _heads_along(roads: RoadArrays, row: np.void, lane: np.void, s: float) -> bool:
+    """Whether the vehicle heads within 90° of the direction of a lane at `s`."""
+    _, _, _, cos, sin, _ = lane_pose(roads.points, lane["first_point"], lane["num_points"], s)
     along: bool = math.cos(row["heading"]) * cos + math.sin(row["heading"]) * sin >= 0.0
     return along

@@ -274,18 +274,19 @@ Row = tuple[int, bool, bool, float, float, float, float]
 
 
 def conflict_rows(
-    movements: Sequence[Movement], paths: Sequence[LinkPath | None]
+    movements: Sequence[Movement], paths: Sequence[LinkPath | None], left_hand: bool
 ) -> tuple[NDArray[np.void], NDArray[np.int32]]:
     """All conflicts of all links, and each link's first row with the end as last entry.
 
     Two links are foes if either names the other: some maps set the bit on one side only, but a
     shared area is shared. Links over a bridge and below it are none, whatever the map says. Links
     from different lanes that the map calls free of each other, but that pass so narrowly that cars
-    would touch, are foes too; of these a left turn gives way.
+    would touch, are foes too; of these the turn across the road gives way.
 
     Args:
         movements: one a LINK row.
         paths: the path of each link; None where the map has no internal lanes.
+        left_hand: whether one drives on the left, where turns to the right lead across the road.
 
     Raises:
         MapError: a junction's request has fewer bits than the junction has links.
@@ -301,9 +302,15 @@ def conflict_rows(
             if _bit(a, b, a.node._foes) or _bit(b, a, a.node._foes):
                 shared = _shared(paths[one], paths[other], merging=merging)
                 yields = _bit(a, b, a.node._prohibits), _bit(b, a, a.node._prohibits)
-            elif a.connection.getFromLane() is not b.connection.getFromLane() and not merging:
-                shared = _grazing(paths[one], paths[other])
-                yields = _turns_left(a) and not _turns_left(b), _turns_left(b)
+            elif a.connection.getFromLane() is not b.connection.getFromLane():
+                if merging:
+                    shared = _shared(paths[one], paths[other], merging=True)
+                else:
+                    shared = _grazing(paths[one], paths[other])
+                crosses = _turns_across(a, left_hand), _turns_across(b, left_hand)
+                yields = crosses[0] and not crosses[1], crosses[1]
+                if merging and not any(yields):
+                    yields = not _is_straight(a) and _is_straight(b), _is_straight(a)
             else:
                 continue
             if shared is None:
@@ -331,8 +338,13 @@ def _bit(mine: Movement, foe: Movement, requests: dict[int, str]) -> bool:
     return row[-1 - foe.index] == "1"
 
 
-def _turns_left(movement: Movement) -> bool:
-    return movement.connection.getDirection() in "lLt"
+def _is_straight(movement: Movement) -> bool:
+    return str(movement.connection.getDirection()) == "s"
+
+
+def _turns_across(movement: Movement, left_hand: bool) -> bool:
+    across = "rRT" if left_hand else "lLt"
+    return str(movement.connection.getDirection()) in across
 
 
 def _grazing(path: LinkPath | None, foe: LinkPath | None) -> Overlap | None:

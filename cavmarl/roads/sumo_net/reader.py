@@ -6,7 +6,7 @@ import hashlib
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,8 @@ from cavmarl.core.errors import MapError
 from cavmarl.core.math.geometry import project
 from cavmarl.core.records.rows import FORK_BEYOND_M
 from cavmarl.roads.network import EDGE, JUNCTION, LANE, LINK, GeoReference, RoadNetwork
-from cavmarl.roads.polylines import clean_shape, extend_stubs, point_rows
+from cavmarl.roads.polylines import clean_shape, extend_stubs, point_rows, refuse_points
+from cavmarl.roads.sumo_net.backward_paths import Way, mend_backward_paths
 from cavmarl.roads.sumo_net.conflicts import (
     LinkPath,
     conflict_rows,
@@ -24,9 +25,11 @@ from cavmarl.roads.sumo_net.conflicts import (
     stop_back,
 )
 from cavmarl.roads.sumo_net.detectors import DetectorRoads, place_detectors
-from cavmarl.roads.sumo_net.programs import SignalProgram
 from cavmarl.roads.sumo_net.selection import Movement, NetworkSelection, permission_bits, select
 from cavmarl.roads.sumo_net.signal_rows import SignalRows, read_signals
+
+if TYPE_CHECKING:
+    from cavmarl.roads.sumo_net.sumo_xml import ParsedNet
 
 APPROACH_M = 12.0  # before a junction, where bodies still stand askew to vehicles that wait
 _ENDINGS = (".gz", ".xml", ".net", ".osm", ".xodr")
@@ -65,14 +68,15 @@ def read_network(path: str | Path) -> RoadNetwork:
     path = Path(path)
     digest = source_hash(path)
     try:
-        return _assemble(*parse_net(path), map_name(path), digest)
+        return _assemble(parse_net(path), map_name(path), digest)
     except MapError as error:
         if str(error).startswith(str(path)):
             raise
         raise MapError(f"{path}: {error}") from error
 
 
-def _assemble(net: Any, programs: list[SignalProgram], name: str, digest: str) -> RoadNetwork:
+def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
+    net = parsed.net
     chosen = select(net)
     if not chosen.edges:
         raise MapError(
@@ -80,7 +84,7 @@ def _assemble(net: Any, programs: list[SignalProgram], name: str, digest: str) -
             "netconvert kept (--keep-edges.by-vclass)"
         )
     lane_row = {id(lane): row for row, lane in enumerate(chosen.lanes)}
-    signal_rows = read_signals(programs)
+    signal_rows = read_signals(parsed.programs)
     nodes = net.getNodes()
     node_row = {id(node): row for row, node in enumerate(nodes)}
 
@@ -88,15 +92,17 @@ def _assemble(net: Any, programs: list[SignalProgram], name: str, digest: str) -
     num_normal = sum(lane.getEdge().getFunction() == "" for lane in chosen.lanes)
     lane_ids = tuple(lane.getID() for lane in chosen.lanes)
     shapes = [clean_shape(lane.getShape3D()) for lane in chosen.lanes]
-    extend_stubs(shapes, before, lane_ids, num_normal)
+    refuse_points(shapes[:num_normal], lane_ids[:num_normal])
+    mend_backward_paths(shapes, [_way(move, lane_row) for move in chosen.movements])
+    extend_stubs(shapes, before)
     points, first_point = point_rows(shapes)
 
     edges = _edge_rows(chosen, net, node_row)
-    lanes = _lane_rows(chosen, edges, points, first_point)
+    lanes = _lane_rows(chosen, edges, points, first_point, parsed.left_hand)
     links = _link_rows(chosen.movements, lane_row, lanes, node_row, signal_rows)
     into = _connect(lanes, links, chosen.movements, lane_row)
     paths = [_path(move, lane_row, lanes, points) for move in chosen.movements]
-    conflicts, first_conflict = conflict_rows(chosen.movements, paths)
+    conflicts, first_conflict = conflict_rows(chosen.movements, paths, parsed.left_hand)
     fork_m = fork_lengths(links["from_lane"].tolist(), paths)
     links["fork_m"] = np.minimum(fork_m, links["length_m"] + FORK_BEYOND_M)
     _map_neighbors(lanes, points)
@@ -133,6 +139,7 @@ def _assemble(net: Any, programs: list[SignalProgram], name: str, digest: str) -
         signal_ids=tuple(signal_rows.ids),
         junction_kinds=kinds,
         geo=_geo_reference(net),
+        left_hand=parsed.left_hand,
     )
 
 
@@ -161,6 +168,14 @@ def _before(chosen: NetworkSelection, lane_row: dict[int, int]) -> dict[int, int
             before[lane_row[id(lane)]] = source
             source = lane_row[id(lane)]
     return before
+
+
+def _way(movement: Movement, lane_row: dict[int, int]) -> Way:
+    return Way(
+        lane_row[id(movement.connection.getFromLane())],
+        tuple(lane_row[id(lane)] for lane in movement.chain),
+        lane_row[id(movement.connection.getToLane())],
+    )
 
 
 def _edge_rows(chosen: NetworkSelection, net: Any, node_row: dict[int, int]) -> NDArray[np.void]:
@@ -198,6 +213,7 @@ def _lane_rows(
     edges: NDArray[np.void],
     points: NDArray[np.void],
     first_point: NDArray[np.int32],
+    left_hand: bool,
 ) -> NDArray[np.void]:
     lanes = np.zeros(len(chosen.lanes), LANE)
     lanes["edge"] = np.repeat(np.arange(len(edges)), edges["num_lanes"])
@@ -223,9 +239,10 @@ def _lane_rows(
     )
     pair = (lanes["edge"][:-1] == lanes["edge"][1:]) & (position[:-1] + 1 == position[1:])
     pair &= beside[:-1] & beside[1:]
-    right = np.flatnonzero(pair)
-    lanes["left"][right] = right + 1
-    lanes["right"][right + 1] = right
+    outer = np.flatnonzero(pair)
+    inwards, outwards = ("right", "left") if left_hand else ("left", "right")
+    lanes[inwards][outer] = outer + 1
+    lanes[outwards][outer + 1] = outer
     return lanes
 
 
@@ -250,7 +267,8 @@ def _link_rows(
         link["junction"] = node_row[id(movement.node)]
         link["index"] = movement.index
         link["signal"], link["signal_index"] = signals.find(connection, movement.node.getType())
-        link["direction"] = ord(connection.getDirection()[0])
+        # SUMO writes T for U-turns to the right, where one drives on the left.
+        link["direction"] = ord(connection.getDirection()[0].replace("T", "t"))
         link["state"] = ord(connection.getState()[0])
     return links
 

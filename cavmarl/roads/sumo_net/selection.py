@@ -29,7 +29,7 @@ class NetworkSelection:
     """The parts of a network that become rows, in row order."""
 
     edges: list[Any] = field(default_factory=list)  # normal edges first, then internal ones
-    lanes: list[Any] = field(default_factory=list)  # grouped by edge, from right to left
+    lanes: list[Any] = field(default_factory=list)  # grouped by edge, from the kerb to the middle
     movements: list[Movement] = field(default_factory=list)  # sorted by from-lane, then index
 
 

@@ -10,7 +10,7 @@ import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from xml.sax.handler import ContentHandler
 
 from sumolib.net import NetReader
@@ -32,6 +32,7 @@ _REQUIRED = {
 _FINITE = {"lane": ("speed", "length", "width"), "junction": ("x", "y", "z")}
 _POSITIVE = {("lane", "speed"), ("lane", "length"), ("lane", "width")}
 _VERSION = re.compile(r"[0-9]+\.[0-9]+(\.[0-9]+)?")
+_TRUTH = {"true": True, "1": True, "false": False, "0": False}
 _BITS = re.compile(r"[01]+")
 
 
@@ -42,6 +43,7 @@ class _CheckedReader(ContentHandler):
         super().__init__()
         self.reader = NetReader(withInternal=True, withFoes=True)
         self.programs = ProgramReader(path)
+        self.left_hand = False
         self._path = path
         self._seen: set[tuple[str, str]] = set()
         self._edge = ""
@@ -56,6 +58,7 @@ class _CheckedReader(ContentHandler):
             if name != "net":
                 raise self._error(name, attrs, "is not the root of a SUMO network, which is <net>")
             self._check_version(attrs)
+            self.left_hand = self._is_left_hand(attrs)
         self._check(name, attrs)
         self.programs.start(name, attrs, self._locator.getLineNumber())
         try:
@@ -102,6 +105,12 @@ class _CheckedReader(ContentHandler):
         if not _VERSION.fullmatch(attrs["version"]):
             raise self._error("net", attrs, f"has version='{attrs['version']}', none of SUMO's")
 
+    def _is_left_hand(self, attrs: Mapping[str, str]) -> bool:
+        said = attrs.get("lefthand", "false")
+        if said not in _TRUTH:
+            raise self._error("net", attrs, f"has lefthand='{said}', neither true nor false")
+        return _TRUTH[said]
+
     def _check_number(self, name: str, key: str, attrs: Mapping[str, str]) -> None:
         try:
             value = float(attrs[key])
@@ -138,8 +147,16 @@ class _CheckedReader(ContentHandler):
                 raise self._error("lane", attrs, f"has the point '{point}', not finite x,y[,z]")
 
 
-def parse_net(path: Path) -> tuple[Any, list[SignalProgram]]:
-    """Read a SUMO network (`.net.xml`, `.net.xml.gz`): a `sumolib.net.Net` and signal programs.
+class ParsedNet(NamedTuple):
+    """A SUMO network file."""
+
+    net: Any  # a `sumolib.net.Net`
+    programs: list[SignalProgram]
+    left_hand: bool  # whether one drives on the left
+
+
+def parse_net(path: Path) -> ParsedNet:
+    """Read a SUMO network (`.net.xml`, `.net.xml.gz`).
 
     Raises:
         MapError: hostile or broken XML, a root other than <net>, missing attributes, numbers that
@@ -148,4 +165,4 @@ def parse_net(path: Path) -> tuple[Any, list[SignalProgram]]:
     """
     handler = _CheckedReader(path)
     read_xml(path, handler)
-    return handler.reader.getNet(), handler.programs.programs
+    return ParsedNet(handler.reader.getNet(), handler.programs.programs, handler.left_hand)

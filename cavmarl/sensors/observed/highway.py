@@ -76,7 +76,7 @@ def codes(features: tuple[str, ...]) -> NDArray[np.int64]:
 
 
 def goal_places(network: RoadNetwork, plans: NDArray[np.void]) -> NDArray[np.float64]:
-    """(G, 2) x and y of each goal in m: the end of the rightmost lane of its edge."""
+    """(G, 2) x and y of each goal in m: the end of the lane at the kerb of its edge."""
     places = np.zeros((len(plans), 2))
     for place, plan in zip(places, plans, strict=True):
         reached = np.isfinite(plan["to_go"]) & (plan["next"] < 0) & (plan["change"] == 0)

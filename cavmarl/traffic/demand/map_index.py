@@ -101,7 +101,7 @@ class MapIndex:
         return row
 
     def open_lane(self, edge: int, permissions: int) -> int:
-        """The rightmost lane of an edge that a class may use; its first lane if there is none."""
+        """The lane nearest to the kerb that a class may use; the first one if there is none."""
         row = self.network.edges[edge]
         lanes = self.network.lanes[row["first_lane"] : row["first_lane"] + row["num_lanes"]]
         return int(row["first_lane"]) + int(np.argmax(lanes["permissions"] & permissions != 0))

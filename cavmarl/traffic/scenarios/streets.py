@@ -16,6 +16,7 @@ CAR = 1 << VEHICLE_CLASSES.index("passenger")
 STRAIGHT_RAD = 0.05  # the most that the direction of a straight lane changes
 BESIDE_M = 8.0  # the farthest between the middles of lanes of one road
 LOOK_MARGIN_M = 0.3
+ACROSS_M = 1.0  # from the middle of an area that two ways share to either, at most
 
 
 class Crossing(NamedTuple):
@@ -41,11 +42,29 @@ class Streets:
     def __init__(self, network: RoadNetwork) -> None:
         self.network = network
         self._grid = lane_grid(network)
+        self.inwards = -1 if network.left_hand else 1  # sign of the way to the middle of a road
 
     def point(self, lane: int, s: float, d: float = 0.0) -> NDArray[np.float64]:
         """(3,) x, y and heading of a place on a lane, `d` m to the left of its middle."""
         x, y, _, cos, sin, _ = self.network.pose_on(lane, s)
         return np.array([x - d * sin, y + d * cos, math.atan2(sin, cos)])
+
+    @property
+    def _sides(self) -> tuple[str, str]:
+        """The neighbour of a lane towards the kerb, and that towards the middle of the road."""
+        return ("left", "right") if self.network.left_hand else ("right", "left")
+
+    @property
+    def across(self) -> str:
+        """SUMO's letters of turns across the road."""
+        return "rR" if self.network.left_hand else "lL"
+
+    def is_at_kerb(self, lane: int) -> bool:
+        return int(self.network.lanes[self._sides[0]][lane]) < 0
+
+    def inside(self, lane: int, s: float, aside_m: float) -> NDArray[np.float64]:
+        """`point` so far to the middle of the road."""
+        return self.point(lane, s, self.inwards * aside_m)
 
     def edge(self, lane: int) -> int:
         return int(self.network.lanes["edge"][lane])
@@ -61,26 +80,26 @@ class Streets:
         return [lane for lane in np.flatnonzero(good).tolist() if self._bend(lane) < STRAIGHT_RAD]
 
     def kerbs_m(self, lane: int, s: float) -> tuple[float, float]:
-        """How far right of the middle of a lane the whole road reaches, and how far left."""
+        """How far from the middle of a lane the whole road reaches to the kerb, and beyond."""
         lanes = self.network.lanes
         sides = []
-        for side in ("right", "left"):
+        for side in self._sides:
             at, reach = lane, 0.5 * float(lanes["width_m"][lane])
             while lanes[side][at] >= 0:
                 at = int(lanes[side][at])
                 reach += float(lanes["width_m"][at])
             sides.append(reach)
-        right, left = sides
-        while (beyond := self._lane_at(self.point(lane, s, left + LOOK_MARGIN_M))) >= 0:
-            left += float(lanes["width_m"][beyond])
-        return right, left
+        near, far = sides
+        while (beyond := self._lane_at(self.inside(lane, s, far + LOOK_MARGIN_M))) >= 0:
+            far += float(lanes["width_m"][beyond])
+        return near, far
 
     def opposite(self, lane: int, s: float) -> Opposite | None:
-        """The lane to the left, beyond the middle of the road, that leads back."""
+        """The lane beyond the middle of the road, right beside another one, that leads back."""
         here = self.network.lanes[lane]
-        if here["left"] >= 0:
+        if here[self._sides[1]] >= 0:
             return None
-        x, y, heading = self.point(lane, s, 0.5 * float(here["width_m"]) + LOOK_MARGIN_M)
+        x, y, heading = self.inside(lane, s, 0.5 * float(here["width_m"]) + LOOK_MARGIN_M)
         other = self._lane_at(np.array([x, y, heading]))
         if other < 0:
             return None
@@ -92,7 +111,7 @@ class Streets:
         return Opposite(other, place, abs(d))
 
     def crossings(self, directions: str, *, yields: bool, merges: bool) -> Iterator[Crossing]:
-        """Pairs of movements of cars that share an area.
+        """Pairs of movements of cars that share an area, whose middle lies on both, or its end.
 
         `directions`: SUMO's letters of the one, as `s` or `lL`. `yields`: whether it has to give
         way to the other. `merges`: whether both lead into one lane.
@@ -108,12 +127,30 @@ class Streets:
         good &= (conflicts["merging"] == merges) & (conflicts["must_yield"] == yields)
         for c in np.flatnonzero(good):
             row = conflicts[c]
-            yield Crossing(
+            crossing = Crossing(
                 int(own[c]),
                 int(foe[c]),
                 0.5 * float(row["enter_m"] + row["leave_m"]),
                 0.5 * float(row["foe_enter_m"] + row["foe_leave_m"]),
             )
+            if merges or self.apart_m(crossing) < ACROSS_M:
+                yield crossing
+
+    def apart_m(self, crossing: Crossing) -> float:
+        """From the middle of the shared area on the way of the other to the way of the one."""
+        rest, lane = crossing.foe_middle_m, int(self.network.links["first_internal"][crossing.foe])
+        while rest > self.length_m(lane) and self.network.lanes["internal"][lane]:
+            rest -= self.length_m(lane)
+            lane = int(self.network.lanes["successor"][lane])
+        x, y, _ = self.point(lane, rest)
+        own = int(self.network.links["first_internal"][crossing.link])
+        nearest = math.inf
+        while own >= 0 and self.network.lanes["internal"][own]:
+            s, d, _, _ = self.network.beside(own, x, y)
+            beyond = max(-s, s - self.length_m(own), 0.0)
+            nearest = min(nearest, math.hypot(d, beyond))
+            own = int(self.network.lanes["successor"][own])
+        return nearest
 
     def movements(self, directions: str) -> list[int]:
         """LINK rows over junctions for cars, in SUMO's directions, as `s` or `lL`."""
@@ -139,13 +176,13 @@ class Streets:
         return int(links["to_lane"][ways[0]]) if ways else None
 
     def lanes_beside(self, lane: int) -> list[int]:
-        """A lane and all others of its road that lead the same way, from the right to the left."""
-        lanes = self.network.lanes
-        while lanes["right"][lane] >= 0:
-            lane = int(lanes["right"][lane])
+        """A lane and all others of its road that lead the same way, from the kerb to the middle."""
+        outer, inner = (self.network.lanes[side] for side in self._sides)
+        while outer[lane] >= 0:
+            lane = int(outer[lane])
         found = [lane]
-        while lanes["left"][found[-1]] >= 0:
-            found.append(int(lanes["left"][found[-1]]))
+        while inner[found[-1]] >= 0:
+            found.append(int(inner[found[-1]]))
         return found
 
     def turn_rad(self, one: int, other: int) -> float:

@@ -82,7 +82,7 @@ def _first_turn(other: Opposite) -> float:
 
 
 def _parts(streets: Streets, other: Opposite) -> list[NDArray[np.float64]]:
-    first = _first_turn(other)
-    forward = arc(streets.point(other.lane, other.s), RADIUS_M, first)
-    back = arc(forward[-1], RADIUS_M, math.pi - 2.0 * first, backwards=True)
-    return [forward, back, arc(back[-1], RADIUS_M, first)]
+    first, side = _first_turn(other), streets.inwards
+    forward = arc(streets.point(other.lane, other.s), RADIUS_M, side * first)
+    back = arc(forward[-1], RADIUS_M, side * (math.pi - 2.0 * first), backwards=True)
+    return [forward, back, arc(back[-1], RADIUS_M, side * first)]

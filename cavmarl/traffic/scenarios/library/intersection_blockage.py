@@ -35,7 +35,8 @@ def places(streets: Streets, parameters: Parameters) -> dict[str, Crossing]:
             seat = approach(streets, crossing.link, FAR_M, parameters.speed_mps)
             path = path_of(streets.network, crossing.foe)
             ends = (streets.length_m(path[0]), streets.length_m(path[-1]))
-            if seat is not None and ends[0] > ROLL_M + 5.0 and ends[1] > FREE_M + 5.0:
+            room = ends[0] > ROLL_M + 5.0 and ends[1] > FREE_M + 5.0
+            if seat is not None and room:
                 found.setdefault(streets.name(lane), crossing)
     return found
 

@@ -38,28 +38,27 @@ class Parameters:
 
 
 def places(streets: Streets, parameters: Parameters) -> dict[str, int]:
-    """The rightmost lanes of straight roads."""
-    lanes = streets.network.lanes
+    """The lanes at the kerb of straight roads."""
     return {
-        streets.name(lane): lane for lane in streets.straights(ROAD_M) if lanes["right"][lane] < 0
+        streets.name(lane): lane for lane in streets.straights(ROAD_M) if streets.is_at_kerb(lane)
     }
 
 
 def stage(streets: Streets, place: int, parameters: Parameters) -> Scene:
     """The pedestrian sets off so that a vehicle that keeps its speed runs into it."""
     lane, s = place, streets.length_m(place) - BEHIND_M
-    right, left = streets.kerbs_m(lane, s)
-    side = right + KERB_M
+    near, far = streets.kerbs_m(lane, s)
+    side = near + KERB_M
     walk = parameters.walk_mps
     to_lane_s = side / walk + 0.5 * walk / ACCEL_MPS2
     radius_m = parameters.speed_mps * (to_lane_s + parameters.lead_s)
-    start, end = streets.point(lane, s, -side), streets.point(lane, s, left + KERB_M)
-    heading = start[2] + 0.5 * np.pi
+    start, end = streets.inside(lane, s, -side), streets.inside(lane, s, far + KERB_M)
+    heading = start[2] + 0.5 * np.pi * streets.inwards
     line = np.array([[*start[:2], heading], [*end[:2], heading]])
     actors = [Actor("pedestrian", [Move(line[:1], lane), Await(0), Move(line, lane, walk)])]
     if parameters.occluded:
-        d = right + VAN_GAP_M + 0.5 * VAN_M[1]
-        van = streets.point(lane, s - STEP_M - 0.5 * VAN_M[0], -d)
+        aside_m = near + VAN_GAP_M + 0.5 * VAN_M[1]
+        van = streets.inside(lane, s - STEP_M - 0.5 * VAN_M[0], -aside_m)
         actors.append(Actor("van", [Move(van[None, :], lane)]))
     x, y, _ = streets.point(lane, s).tolist()
     seat = Seat(lane, max(s - radius_m - 20.0, 5.0), parameters.speed_mps, streets.edge(lane))

@@ -1,5 +1,7 @@
 """The agent turns left across oncoming cars that do not slow down for it.
 
+Where one drives on the left it turns right.
+
 No signal phase of its own protects it: it has to find a gap, or to wait until all have passed.
 """
 
@@ -30,10 +32,10 @@ class Parameters:
 
 
 def places(streets: Streets, parameters: Parameters) -> dict[str, Meeting]:
-    """Left turns that have to give way to a lane that comes from the opposite side."""
+    """Turns across the road that have to give way to a lane that comes from the opposite side."""
     crossings = (
         crossing
-        for crossing in streets.crossings("lL", yields=True, merges=False)
+        for crossing in streets.crossings(streets.across, yields=True, merges=False)
         if streets.turn_rad(crossing.link, crossing.foe) > OPPOSITE_RAD
     )
     return meetings(streets, crossings, FAR_M, parameters.oncoming_mps, parameters)

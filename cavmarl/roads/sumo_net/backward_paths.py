@@ -1,0 +1,174 @@
+"""Paths over junctions that run backwards, drawn anew so that a car can follow them.
+
+netconvert joins the end of one lane to the start of another with a line, also where roads overlap
+and the start lies behind the end, or beside it: that line then runs against both roads, or folds
+back. Here the two lanes are cut back until a curve without such turns joins them. What is cut off
+a lane becomes part of the other paths that begin or end there, so no way changes but the mended.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.roads.polylines import SAME_POINT_M, Shape
+
+KINK_RAD = np.radians(60.0)  # a path with a corner sharper than this,
+ASTRAY_RAD = np.radians(90.0)  # that turns so much more than its roads do, cannot be driven;
+BACK_RAD = np.radians(100.0)  # nor can one with such a corner, if its roads
+U_TURN_RAD = np.radians(150.0)  # do not themselves turn round
+SMOOTH_RAD = np.radians(60.0)  # a new path turns this much to and fro at most; if none does,
+WORTH_RAD = np.radians(3.0)  # a longer cut has to save this much
+STEP_M = 0.5  # by which lanes are cut back at least, and in steps of it,
+MOST_M = 12.0  # and how far at most,
+MOST_SHARE = 0.4  # or this share of the lane: its other end may be cut, too
+CURVE_M = 1.0  # between the points of a new path
+MOST_POINTS = 24
+
+
+class Way(NamedTuple):
+    """The LANE rows of a movement over a junction."""
+
+    before: int
+    inside: tuple[int, ...]
+    after: int
+
+
+def mend_backward_paths(shapes: list[Shape], ways: Sequence[Way]) -> None:
+    """Draw paths that no car can follow anew; shapes (n, 3) in m of all lanes, changed in place.
+
+    A lane keeps its shape where a movement without internal lanes begins or ends there.
+    """
+    fixed_ends = {way.before for way in ways if not way.inside}
+    fixed_starts = {way.after for way in ways if not way.inside}
+    broken = [way for way in ways if way.inside and _is_broken(shapes, way)]
+    back: dict[int, float] = defaultdict(float)
+    front: dict[int, float] = defaultdict(float)
+    for way in broken:
+        cut = _needed_cut(shapes, way, way.before in fixed_ends, way.after in fixed_starts)
+        back[way.before] = max(back[way.before], cut[0])
+        front[way.after] = max(front[way.after], cut[1])
+    tails = {lane: _cut(shapes[lane], _length(shapes[lane]) - m) for lane, m in back.items() if m}
+    for lane, (kept, _) in tails.items():
+        shapes[lane] = kept
+    heads = {lane: _cut(shapes[lane], m) for lane, m in front.items() if m}
+    for lane, (_, kept) in heads.items():
+        shapes[lane] = kept
+    mended = set(broken)
+    for way in ways:
+        if not way.inside or way in mended:
+            continue
+        if way.before in tails:
+            first = way.inside[0]
+            shapes[first] = _join(tails[way.before][1], shapes[first])
+        if way.after in heads:
+            last = way.inside[-1]
+            shapes[last] = _join(shapes[last], heads[way.after][0])
+        if (way.before in tails or way.after in heads) and _is_broken(shapes, way):
+            mended.add(way)  # what was cut off its lanes runs backwards
+    for way in ways:
+        if way in mended:
+            _redraw(shapes, way)
+
+
+def _is_broken(shapes: Sequence[Shape], way: Way) -> bool:
+    path = _join(*(shapes[lane] for lane in way.inside))
+    corners = _corners(shapes[way.before], path, shapes[way.after])
+    sharpest, astray = np.abs(corners).max(), _astray(corners)
+    turns_round = np.abs(corners).sum() - astray > U_TURN_RAD
+    goes_back = sharpest > BACK_RAD and not turns_round
+    return bool(goes_back or (sharpest > KINK_RAD and astray > ASTRAY_RAD))
+
+
+def _corners(before: Shape, path: Shape, after: Shape) -> NDArray[np.float64]:
+    """Changes of direction in rad along a path, from that of the lane before to that after."""
+    steps = np.concatenate([before[-2:], path[1:], after[1:2] - after[0] + path[-1]])
+    heading = np.arctan2(*np.diff(steps[:, 1::-1], axis=0).T)
+    corners: NDArray[np.float64] = (np.diff(heading) + np.pi) % (2.0 * np.pi) - np.pi
+    return corners
+
+
+def _astray(corners: NDArray[np.float64]) -> float:
+    """How much more is turned, to and fro, than the roads differ, in rad."""
+    net = (corners.sum() + np.pi) % (2.0 * np.pi) - np.pi
+    return float(np.abs(corners).sum() - abs(net))
+
+
+def _needed_cut(
+    shapes: Sequence[Shape], way: Way, fixed_end: bool, fixed_start: bool
+) -> tuple[float, float]:
+    """The least cut in m of both lanes with which a smooth curve joins them, or the best one."""
+    rooms = [
+        0.0 if fixed else min(MOST_SHARE * _length(shapes[lane]), MOST_M)
+        for lane, fixed in ((way.before, fixed_end), (way.after, fixed_start))
+    ]
+    steps = [np.append(np.arange(STEP_M, room, STEP_M), room).tolist() for room in rooms]
+    best = (np.inf, 0.0, 0.0)
+    for cuts in sorted(product(*steps), key=lambda pair: (sum(pair), max(pair))):
+        before = _cut(shapes[way.before], _length(shapes[way.before]) - cuts[0])[0]
+        after = _cut(shapes[way.after], cuts[1])[1]
+        astray = _astray(_corners(before, _curve(before, after), after))
+        if astray < best[0] - WORTH_RAD:
+            best = (astray, *cuts)
+        if astray <= SMOOTH_RAD:
+            break
+    return best[1:]
+
+
+def _redraw(shapes: list[Shape], way: Way) -> None:
+    """Give the internal lanes of a way a curve, each its share of the length."""
+    curve = _curve(shapes[way.before], shapes[way.after])
+    lengths = [max(_length(shapes[lane]), SAME_POINT_M) for lane in way.inside]
+    whole = _length(curve)
+    for lane, length in zip(way.inside[:-1], lengths, strict=False):
+        shapes[lane], curve = _cut(curve, whole * length / sum(lengths))
+    shapes[way.inside[-1]] = curve
+
+
+def _curve(before: Shape, after: Shape) -> Shape:
+    """A cubic curve from the end of one lane to the start of another, in their directions."""
+    start, end = before[-1], after[0]
+    leaves, arrives = _direction(before[-2:]), _direction(after[:2])
+    chord = float(np.hypot(*(end - start)[:2]))
+    cos_turn = float(leaves[:2] @ arrives[:2])
+    # The handles that make the curve an arc of a circle where both ends lie on one.
+    handle = chord * 2.0 / (3.0 * (1.0 + np.sqrt(max(0.5 * (1.0 + cos_turn), 0.0))))
+    nodes = np.stack([start, start + handle * leaves, end - handle * arrives, end])
+    nodes[1:3, 2] = start[2] + (end[2] - start[2]) * np.array([1.0, 2.0]) / 3.0
+    number = int(np.clip(np.ceil(chord / CURVE_M), 8, MOST_POINTS))
+    t = np.linspace(0.0, 1.0, number + 1)[:, None]
+    basis = np.hstack([(1 - t) ** 3, 3 * t * (1 - t) ** 2, 3 * t * t * (1 - t), t**3])
+    return _clean(basis @ nodes)
+
+
+def _direction(pair: Shape) -> NDArray[np.float64]:
+    step = pair[1] - pair[0]
+    step[2] = 0.0
+    direction: NDArray[np.float64] = step / np.hypot(step[0], step[1])
+    return direction
+
+
+def _length(shape: Shape) -> float:
+    return float(np.hypot(*np.diff(shape[:, :2], axis=0).T).sum())
+
+
+def _cut(shape: Shape, at_m: float) -> tuple[Shape, Shape]:
+    """The parts of a polyline before and behind a place in m along it."""
+    s = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(shape[:, :2], axis=0).T))])
+    point = np.array([[np.interp(at_m, s, shape[:, axis]) for axis in range(3)]])
+    near, far = s < at_m - SAME_POINT_M, s > at_m + SAME_POINT_M
+    return np.concatenate([shape[near], point]), np.concatenate([point, shape[far]])
+
+
+def _join(*parts: Shape) -> Shape:
+    return _clean(np.concatenate(parts))
+
+
+def _clean(shape: Shape) -> Shape:
+    step = np.hypot(*np.diff(shape[:, :2], axis=0).T)
+    return np.ascontiguousarray(shape[np.concatenate([[True], step > SAME_POINT_M])])

@@ -1,0 +1,110 @@
+"""Which turns of a map are too tight for a car's turning circle: trips keep away from these.
+
+A car has no reverse gear here. Where a path turns back on itself within a few metres, as at dead
+ends and hairpins, it can only leave its road.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.records.arrays import RoadArrays
+from cavmarl.driving.kernels.trial_drive import BEYOND_M, stays_on_road
+from cavmarl.driving.vehicles import blank_vehicle
+from cavmarl.roads.kernels.plans import TURNAROUND
+from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.roads.routing import PLAN, lane_grid
+
+CAR = 1 << VEHICLE_CLASSES.index("passenger")
+TURN_RAD = 0.9  # ways that turn less within `NEAR_M` are tight for no car
+NEAR_M = 12.0
+
+
+@lru_cache(maxsize=1)
+def with_tight_turns(network: RoadNetwork, steering_rad: float) -> RoadArrays:
+    """The map with turns that no car can take marked as U-turns, which plans avoid.
+
+    `steering_rad`: the most that front wheels turn. A lane that turns too tightly itself makes all
+    links that lead there, and from there, such turns.
+    """
+    trial = _Trial(network, steering_rad)
+    for_cars = network.lanes["permissions"] & CAR != 0
+    links = network.arrays.links.copy()
+    normal = np.flatnonzero(for_cars & ~network.lanes["internal"])
+    tight = [lane for lane in normal.tolist() if trial.is_tight_lane(lane)]
+    at_tight = np.isin(links["to_lane"], tight) | np.isin(links["from_lane"], tight)
+    usable = for_cars[links["from_lane"]] & for_cars[links["to_lane"]]
+    for link in np.flatnonzero(usable & (links["first_internal"] >= 0)).tolist():
+        if at_tight[link] or trial.is_tight_link(link):
+            links["direction"][link] = TURNAROUND
+    return network.arrays._replace(links=links)
+
+
+class _Trial:
+    """A car that is driven over single turns."""
+
+    def __init__(self, network: RoadNetwork, steering_rad: float) -> None:
+        self._network = network
+        self._steering_rad = steering_rad
+        self._grid = lane_grid(network)
+        self._plan = np.zeros((1, len(network.lanes)), dtype=PLAN)
+        self._plan["next"] = network.lanes["successor"]
+
+    def is_tight_lane(self, lane: int) -> bool:
+        row = self._network.lanes[lane]
+        points = self._network.lane_points(lane)
+        length_m = float(row["length_m"])
+        if _most_turn(points["s"], points["heading"]) < TURN_RAD:
+            return False
+        return not self._drives(lane, 0.0, lane, length_m - 1.0)
+
+    def is_tight_link(self, link: int) -> bool:
+        network = self._network
+        row = network.links[link]
+        lanes = [int(row["from_lane"]), int(row["first_internal"])]
+        while network.lanes["internal"][lanes[-1]]:
+            lanes.append(int(network.lanes["successor"][lanes[-1]]))
+        before_m, after_m = (float(network.lanes["length_m"][k]) for k in (lanes[0], lanes[-1]))
+        begin_m, end_m = max(before_m - BEYOND_M, 0.0), min(BEYOND_M, after_m - 1.0)
+        parts = [network.lane_points(lane) for lane in lanes]
+        starts = np.cumsum([0.0, *(float(part["s"][-1]) for part in parts[:-1])])
+        s = np.concatenate([part["s"] + at for part, at in zip(parts, starts, strict=True)])
+        heading = np.concatenate([part["heading"] for part in parts])
+        near = (s >= before_m - BEYOND_M) & (s <= starts[-1] + BEYOND_M)
+        near[len(parts[0]) - 1] = True
+        if _most_turn(s[near], heading[near]) < TURN_RAD:
+            return False
+        for lane, following in pairwise(lanes):
+            self._plan["next"][0, lane] = following
+        stays = self._drives(lanes[0], begin_m, lanes[-1], end_m)
+        self._plan["next"][0, lanes[0]] = -1
+        return not stays
+
+    def _drives(self, lane: int, begin_m: float, last_lane: int, end_m: float) -> bool:
+        row = blank_vehicle()[0]
+        return bool(
+            stays_on_road(
+                self._network.arrays,
+                self._plan,
+                self._grid,
+                row,
+                lane,
+                begin_m,
+                last_lane,
+                max(end_m, 0.0),
+                self._steering_rad,
+                -1 if self._network.left_hand else 1,
+            )
+        )
+
+
+def _most_turn(s: NDArray[np.float64], heading: NDArray[np.float64]) -> float:
+    """The most that a polyline turns within `NEAR_M`, in rad, to one side or to and fro."""
+    turned = np.concatenate(
+        [[0.0], np.cumsum(np.abs(np.remainder(np.diff(heading) + np.pi, 2.0 * np.pi) - np.pi))]
+    )
+    return float((turned[np.searchsorted(s, s + NEAR_M, side="right") - 1] - turned).max())

@@ -1,0 +1,121 @@
+"""Where one drives on the left: read as it is, driven as in a mirror, staged on the other side."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cavmarl.core.errors import MapError
+from cavmarl.roads.cache import load_network
+from cavmarl.roads.sumo_net.reader import read_network
+from cavmarl.traffic.scenarios.library import scenario_names
+from tests.support.driving import drive, make_simulation, make_traffic, start, suggested
+from tests.support.mirrored import mirror_net
+from tests.support.netgenerate import netgenerate
+
+GRID = ["--grid", "--grid.number", "3", "--grid.length", "120", "--no-turnarounds.except-deadend"]
+TWO_LANES = ["-L", "2", "--lefthand"]
+NETS = {
+    "grid": ["--grid", "--grid.number", "3", "--grid.length", "150", *TWO_LANES],
+    "spider": ["--spider", "--spider.arm-number", "5", "--spider.circle-number", "2", *TWO_LANES],
+    "random": ["--rand", "--rand.iterations", "40", "--seed", "4", *TWO_LANES],
+}
+MIRRORED = {"x": 1.0, "y": -1.0, "s": 1.0, "d": -1.0, "speed": 1.0, "to_go": 1.0}
+
+
+def test_neighbours_lie_on_the_side_that_the_map_says(tmp_path: Path) -> None:
+    network = read_network(netgenerate(tmp_path / "left.net.xml", *NETS["random"]))
+    assert network.left_hand
+    beside = np.flatnonzero(network.lanes["right"] >= 0)
+    assert beside.size > 100
+    for lane in beside:
+        row = network.lanes[lane]
+        assert network.lanes["left"][row["right"]] == lane
+        assert network.lanes["index"][row["right"]] == row["index"] + 1
+        x, y, *_ = network.pose_on(lane, 0.5 * row["length_m"])
+        assert network.beside(row["right"], x, y)[1] > 1.0  # so far to the left of it
+
+
+def test_u_turns_are_known_as_such_on_either_side(tmp_path: Path) -> None:
+    directions = [
+        np.sort(read_network(netgenerate(tmp_path / f"{n}.net.xml", *options)).links["direction"])
+        for n, options in enumerate((["--grid", "-L", "2"], ["--grid", *TWO_LANES]))
+    ]
+    assert directions[0].tolist() == directions[1].tolist()
+    assert ord("t") in directions[0]
+
+
+def test_the_cache_keeps_the_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CAVMARL_CACHE_DIR", str(tmp_path))
+    path = netgenerate(tmp_path / "left.net.xml", *NETS["grid"])
+    made, restored = load_network(path), load_network(path)
+    assert made.left_hand
+    assert restored.left_hand
+    assert made.content_hash == restored.content_hash
+
+
+def test_a_side_that_is_none_is_refused(tmp_path: Path) -> None:
+    path = netgenerate(tmp_path / "left.net.xml", *NETS["grid"])
+    path.write_text(path.read_text().replace('lefthand="true"', 'lefthand="both"'))
+    with pytest.raises(MapError, match="lefthand='both'"):
+        read_network(path)
+
+
+@pytest.mark.parametrize("junctions", ["priority", "traffic_light", "right_before_left"])
+def test_a_mirrored_world_is_driven_as_in_a_mirror(tmp_path: Path, junctions: str) -> None:
+    plain = netgenerate(tmp_path / "right.net.xml", *GRID, "-j", junctions)
+    mirror = mirror_net(plain, tmp_path / "left.net.xml")
+    worlds = [make_traffic(path, background=25) for path in (plain, mirror)]
+    for world in worlds:
+        start(world, 3)
+    for _ in range(600):
+        right, left = (np.sort(world.vehicles(0), order="id") for world in worlds)
+        for field, sign in MIRRORED.items():
+            np.testing.assert_array_equal(right[field], sign * left[field], err_msg=field)
+        for world in worlds:
+            drive(world)
+
+
+def test_agents_in_a_mirrored_world_steer_to_the_other_side(tmp_path: Path) -> None:
+    plain = netgenerate(tmp_path / "right.net.xml", *GRID)
+    mirror = mirror_net(plain, tmp_path / "left.net.xml")
+    worlds = [make_simulation(path, mode="respawn", agents=9) for path in (plain, mirror)]
+    for world in worlds:
+        start(world, 3)
+    most_rad = 0.0
+    for _ in range(300):
+        right, left = (suggested(world) for world in worlds)
+        # Angles are wrapped upwards, so a mirrored one is the same to the last digits only.
+        np.testing.assert_allclose(right, left * [1.0, -1.0], atol=1e-6)
+        most_rad = max(most_rad, float(np.abs(right[..., 1]).max()))
+        for world in worlds:
+            drive(world)
+    assert most_rad > 0.3
+
+
+@pytest.mark.parametrize("net", NETS)
+def test_drivers_on_the_left_touch_nothing(tmp_path: Path, net: str) -> None:
+    world = make_traffic(netgenerate(tmp_path / "left.net.xml", *NETS[net]), background=60)
+    start(world, 1)
+    for _ in range(1200):
+        drive(world)
+        assert (world.vehicles(0)["hit"] < 0).all()
+    assert (world.vehicles(0)["distance_m"] > 100.0).mean() > 0.5
+
+
+@pytest.mark.parametrize("name", scenario_names())
+def test_scenarios_are_staged_as_in_a_mirror(tmp_path: Path, name: str) -> None:
+    plain = netgenerate(tmp_path / "right.net.xml", *GRID, "-j", "traffic_light", "-L", "1")
+    mirror = mirror_net(plain, tmp_path / "left.net.xml")
+    worlds = [
+        make_simulation(
+            path, mode="respawn", agents=1, background=0, overrides={"scenario.name": name}
+        )
+        for path in (plain, mirror)
+    ]
+    for world in worlds:
+        start(world, 0)
+    right, left = (np.sort(world.vehicles(0), order="id") for world in worlds)
+    assert right.size > 1
+    for field in ("x", "y", "s"):
+        np.testing.assert_allclose(right[field], MIRRORED[field] * left[field], atol=1e-9)
