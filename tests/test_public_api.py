@@ -109,8 +109,9 @@ def test_every_public_error_is_one_of_ours() -> None:
 def test_every_entry_has_its_ids() -> None:
     names = list(registry.entries())
     for name in names:
-        assert f"cavmarl/{name}-v1" in gymnasium.registry
-        assert f"cavmarl/{name}Agents-v1" in gymnasium.registry
+        version = registry.load_config(name)[0].version
+        assert f"cavmarl/{name}-v{version}" in gymnasium.registry
+        assert f"cavmarl/{name}Agents-v{version}" in gymnasium.registry
     ours = {spec for spec in gymnasium.registry if spec.startswith("cavmarl/")}
     assert len(ours) == 4 * len(names), "and each with meta-actions"
 

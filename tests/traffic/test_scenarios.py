@@ -44,7 +44,7 @@ GOLDEN = {
     ("pedestrian_crossing", False): "1ecd190d1f275fa51cb0fc8c4db01b5a",
     ("pedestrian_crossing", True): "17751e9da0f775beba34f709cf661460",
     ("road_closure", False): "4c0d6855a8ae2af9dddd74a9eddd257e",
-    ("signal_outage", False): "5962afa02a50f8dfb0bf3460943e9d36",
+    ("signal_outage", False): "e6dd0ced6cdf7682f6a0cdc530f0cb84",
     ("unprotected_left_turn", False): "c61fa293d08fb4492f54009630ed42ba",
 }
 
