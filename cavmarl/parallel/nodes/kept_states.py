@@ -63,12 +63,8 @@ class KeptStates:
         """Add the vehicles of a lost node to the saved ones, and what is kept of its agents."""
         simulation, zones = self._worlds.simulation, self._worlds.world.partition.count
         first = len(saved) - simulation.num_worlds * zones
-        of_agents = [
-            n
-            for n, array in enumerate(like)
-            if array is simulation.shards[0].worlds.pending
-            or array is simulation.outputs.observations
-        ]
+        kept = {id(array) for array in simulation.of_agents()}
+        of_agents = [n for n, array in enumerate(like) if id(array) in kept]
         saved[first - 1] += lost[first - 1]  # contacts
         for n in range(first, len(saved)):
             if not len(lost[n]):

@@ -46,6 +46,7 @@ class FrameKind(IntEnum):
     SYNC = 12  # N → N: all before this is of no use any more
     PING = 13  # C → N: answer at once
     PONG = 14  # N → C: the answer
+    AGENT = 15  # N → N: what is kept of an agent whose vehicle changes its node
 
 
 class NodeFrame(NamedTuple):
@@ -56,7 +57,9 @@ class NodeFrame(NamedTuple):
     data: memoryview
 
 
-URGENT = frozenset({FrameKind.MESSAGES, FrameKind.KEEP, FrameKind.PING, FrameKind.PONG})
+URGENT = frozenset(
+    {FrameKind.MESSAGES, FrameKind.KEEP, FrameKind.PING, FrameKind.PONG, FrameKind.AGENT}
+)
 Urgent: TypeAlias = Callable[[int, NodeFrame], None]
 """What is called with an urgent frame as soon as it has come, and the number of its sender."""
 

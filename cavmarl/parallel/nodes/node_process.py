@@ -9,7 +9,6 @@ import json
 import sys
 import traceback
 from collections.abc import Sequence
-from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
@@ -74,6 +73,7 @@ class NodeProgram:
             world, num_worlds, warm=True, in_next_step=job["in_next_step"]
         )
         self._commands = commands_of(worlds.arrays)
+        worlds.keep_logs()
         listener = Listener(job["address"], self._secret)
         links.send(COORDINATOR, FrameKind.READY, 0, [json.dumps(listener.place).encode()])
         places = json.loads(bytes(links.take([COORDINATOR])[COORDINATOR].data))
@@ -104,8 +104,10 @@ class NodeProgram:
         ]
         self._peers = NodePeers(simulation, self._links, zones, self._number, generation << 32)
         limits = limits_of(simulation.config.zones, simulation.division.codec.schema)
+        mounted = simulation.mounted
+        carried = [] if mounted is None else [*mounted.arrays()]
         self._hosts = ZoneHosts(
-            simulation.division, mine, node_of, told, limits, self._links, generation
+            simulation.division, mine, node_of, told, limits, self._links, carried, generation
         )
         shards = simulation.shards
         own = [shards[zone] for zone in mine]
@@ -116,6 +118,8 @@ class NodeProgram:
         """Take an urgent frame."""
         if frame.kind is FrameKind.KEEP:
             self._kept.take(number, frame)
+        elif frame.kind is FrameKind.AGENT:
+            self._hosts.keep_agent(frame)
         elif frame.kind is FrameKind.PING:
             self._links.send(COORDINATOR, FrameKind.PONG, frame.number)
         else:
@@ -201,11 +205,7 @@ class NodeProgram:
     def _look(self, task: Task, letter: Any) -> None:
         """Answer what only the first node can, which has the whole world meanwhile."""
         worlds, answer = self._worlds, None
-        every = task == Task.WRITE_STATES
-        world = None if every else int(letter[0] if isinstance(letter, list) else letter)
-        with ExitStack() as stack:
-            for w in range(worlds.simulation.num_worlds) if every else [world or 0]:
-                stack.enter_context(self._peers.whole(worlds.simulation, w))
+        with self._peers.whole(worlds.simulation):
             if self._is_first:
                 answer = self._found(task, letter)
         self._answer([] if answer is None else answer)
