@@ -23,8 +23,8 @@ class Peers(Protocol):
         """After a reset of the chosen worlds (W,), of which all have made all vehicles."""
         ...
 
-    def go_on(self, gate: Gate, side: int) -> None:
-        """Zones have their vehicles of an earlier tick again, on `side`; ghosts follow."""
+    def take_up(self, gate: Gate, side: int) -> None:
+        """Zones have their vehicles of another tick, on `side`."""
         ...
 
     def everybody(self, gate: Gate, side: int) -> AbstractContextManager[None]:

@@ -360,8 +360,12 @@ class Simulation(WorldViews):
                 `SumoTraffic.keep_logs`.
         """
         self._put_back(saved)
-        if self._tick.sumo is not None:
-            self._tick.sumo.catch_up(self._shard.worlds)
+        tick = self._tick
+        if tick.sumo is not None:
+            tick.sumo.catch_up(self._shard.worlds)
+        if tick.peers is not None:
+            tick.peers.keep_own(self.everywhere)
+            tick.peers.take_up(tick.gate, tick.division.side)
 
     def load_own(self, saved: Sequence[NDArray[Any]], home: int) -> None:
         """`load` where other processes hold zones: each goes on with its own, one is `home`."""
@@ -371,7 +375,8 @@ class Simulation(WorldViews):
             tick.sumo.catch_up(self._shard.worlds)
         if tick.peers is not None:
             tick.gate.num_passing[:] = 0
-            tick.peers.go_on(tick.gate, tick.division.side)
+            tick.peers.take_up(tick.gate, tick.division.side)
+            tick.peers.share_rows(tick.gate, tick.division.side)
 
     def _put_back(self, saved: Sequence[NDArray[Any]], home: int | None = None) -> None:
         roots, episodes, *rest = saved

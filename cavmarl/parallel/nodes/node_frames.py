@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Mapping
+from base64 import b64decode, b64encode
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -106,6 +107,15 @@ def take_results(
                 rows = np.frombuffer(data, target.dtype, num * target[0].size, at)
                 target[where] = rows.reshape(num, *target.shape[1:])
                 at += rows.nbytes
+
+
+def told_cases(cases: Sequence[bytes], only_reads: bool = False) -> dict[str, Any]:
+    """Worlds as bytes, as a letter; see `LocalWorlds.save_worlds`."""
+    return {"cases": [b64encode(case).decode() for case in cases], "only_reads": only_reads}
+
+
+def cases_of(letter: Mapping[str, Any]) -> list[bytes]:
+    return [b64decode(case) for case in letter["cases"]]
 
 
 def _flat(array: NDArray[Any]) -> NDArray[np.uint8]:

@@ -90,7 +90,7 @@ class NodePeers:
                     forget(array)
         self._rerouted[chosen] = 0
 
-    def go_on(self, gate: Gate, side: int) -> None:
+    def take_up(self, gate: Gate, side: int) -> None:
         self._rerouted[:] = gate.counts[:, COUNT_REROUTED]
         self._seen_s[...] = self._detected_s
         self.own[...] = False
@@ -98,7 +98,6 @@ class NodePeers:
             for w, num in enumerate(self._zoned.num_owned[zone].tolist()):
                 agents = self._zoned.rows["agent"][side, zone, w, :num]
                 self.own[w, agents[agents >= 0]] = True
-        self.share_rows(gate, side)
 
     def share_rows(self, gate: Gate, side: int) -> None:
         zoned = self._zoned

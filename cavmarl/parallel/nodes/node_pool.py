@@ -247,7 +247,7 @@ class NodePool:
 
     def _perform(self, command: NodeCommand) -> list[memoryview]:
         """Do a command once. Raises LinkLostError: a node is lost."""
-        kept = self._opened.number if self._opened and command is self._log[-1] else 0
+        kept = self._opened.number if self._opened and self._log and command is self._log[-1] else 0
         for number in self._living:
             self._links.send(number, FrameKind.COMMAND, kept, command.pieces)
         if not command.changes:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from cavmarl.core.errors import CavmarlError
+from cavmarl.core.errors import CavmarlError, ConfigError
 from cavmarl.handoff.shard_setup import limits_of
 from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.ownership.reactions import Hosting
@@ -30,7 +30,7 @@ from cavmarl.parallel.nodes.links import (
     RecoveryOrderedError,
 )
 from cavmarl.parallel.nodes.meeting import calls_of
-from cavmarl.parallel.nodes.node_frames import command_of, results_of
+from cavmarl.parallel.nodes.node_frames import cases_of, command_of, results_of, told_cases
 from cavmarl.parallel.nodes.node_peers import NodePeers
 from cavmarl.parallel.nodes.zone_hosts import ZoneHosts
 from cavmarl.parallel.recipe import CHANGED, world_of
@@ -188,6 +188,9 @@ class NodeProgram:
                 chosen = worlds.arrays.chosen.copy()
                 worlds.reset(letter["seed"], letter["first_world"])
                 self._hosts.report(self._results(chosen, stepped=False))
+            case Task.LOAD if not letter["only_reads"]:
+                worlds.load_worlds(cases_of(letter))
+                self._hosts.report()
             case Task.SUGGEST:
                 worlds.suggest()
                 where = np.flatnonzero(peers.own.reshape(-1))
@@ -218,6 +221,10 @@ class NodeProgram:
             return [worlds.arrays.states.reshape(-1).data]
         if task == Task.STATE_HASH:
             found = worlds.state_hash(letter)
+        elif task == Task.SAVE:
+            found = told_cases(worlds.save_worlds())
+        elif task == Task.LOAD:
+            found = _refusal(worlds, cases_of(letter))
         elif task == Task.TRAFFIC_STATS:
             found = worlds.traffic_stats(letter)
         elif task == Task.DRIVEN:
@@ -263,6 +270,15 @@ def main() -> int:
         links.flush()
         return _wait_for_the_end(links)
     return 0
+
+
+def _refusal(worlds: LocalWorlds, cases: Sequence[bytes]) -> str:
+    """Why worlds cannot go on from these; empty: they can."""
+    try:
+        worlds.read_worlds(cases)
+    except ConfigError as error:
+        return str(error)
+    return ""
 
 
 def _hosting(run: bytes, numbers: Sequence[int]) -> Hosting:

@@ -14,8 +14,14 @@ from cavmarl.balance.balance_plan import Plan
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
-from cavmarl.parallel.commanded_worlds import uncopied, unsaved
-from cavmarl.parallel.nodes.node_frames import clear_sensed, pieces_of, take_results
+from cavmarl.parallel.commanded_worlds import uncopied
+from cavmarl.parallel.nodes.node_frames import (
+    cases_of,
+    clear_sensed,
+    pieces_of,
+    take_results,
+    told_cases,
+)
 from cavmarl.parallel.nodes.node_pool import NodeCommand, NodePool
 from cavmarl.parallel.step_arrays import Driven
 from cavmarl.parallel.worlds_job import Task
@@ -61,7 +67,8 @@ class NodeWorlds(NodePool):
         self._write(results, of_step=True)
 
     def _command(self, task: Task, letter: Any = None) -> NodeCommand:
-        changes = task in (Task.STEP, Task.RESET)
+        loads = task == Task.LOAD and not letter["only_reads"]
+        changes = loads or task in (Task.STEP, Task.RESET)
         pieces = [bytes(piece) for piece in pieces_of(task, letter, self.arrays)]
         return NodeCommand(pieces, changes, self._ticks_per_step if task == Task.STEP else 0)
 
@@ -108,10 +115,17 @@ class NodeWorlds(NodePool):
         return range(len(self.arrays.mask))[world]
 
     def save_worlds(self) -> list[bytes]:
-        raise unsaved()
+        return cases_of(self._asked(Task.SAVE, None))
 
     def load_worlds(self, cases: Sequence[bytes]) -> None:
-        raise unsaved()
+        """Go on from what `save_worlds` gave; `arrays` stay as they are.
+
+        Raises:
+            ConfigError: it is of other worlds.
+        """
+        if refusal := self._asked(Task.LOAD, told_cases(cases, only_reads=True)):
+            raise ConfigError(refusal)
+        self.run(self._command(Task.LOAD, told_cases(cases)))
 
     @property
     def simulation(self) -> Simulation:
