@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -30,6 +30,31 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         mark(item)
         if item.nodeid in rare:
             item.add_marker(pytest.mark.slow)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def forked_processes() -> Iterator[None]:
+    """Pools get their processes as forks of one that has loaded the kernels."""
+    from cavmarl.core import processes
+    from cavmarl.parallel.nodes import node_pool
+    from cavmarl.parallel.processes import fork_server
+    from tests.support.forked_processes import start_forked
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (fork_server, node_pool):
+            patch.setattr(module, processes.start_dying_with_process.__name__, start_forked)
+        yield
+
+
+@pytest.fixture
+def fresh_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let pools start Pythons of their own, as they do outside of the tests."""
+    from cavmarl.core import processes
+    from cavmarl.parallel.nodes import node_pool
+    from cavmarl.parallel.processes import fork_server
+
+    for module in (fork_server, node_pool):
+        monkeypatch.setattr(module, "start_dying_with_process", processes.start_dying_with_process)
 
 
 def pytest_runtest_setup() -> None:
