@@ -68,7 +68,11 @@ def test_messages_between_vehicles(make: Make) -> None:
 
 
 def test_scripted_scenes(make: Make) -> None:
-    wanted = {"agents": 1, "background": 10, "overrides": {"scenario.name": "unprotected_left_turn"}}
+    wanted = {
+        "agents": 1,
+        "background": 10,
+        "overrides": {"scenario.name": "unprotected_left_turn"},
+    }
     whole = drive(make("grid4x4", **wanted), steps=40)
     vec = make("grid4x4", zones=4, nodes=3, **wanted)
     assert same(drive(vec, steps=40, before=lose_one(vec, 20)), whole)

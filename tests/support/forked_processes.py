@@ -42,7 +42,9 @@ class ForkedProcess:
         given = {0: stdin, 1: 1, 2: 2} | {number: number for number in descriptors}
         passed = {number: DupFd(there) for number, there in given.items()}
         self._process = FORKS.Process(
-            target=_run, args=(module, list(arguments), passed, dict(variables)), daemon=True
+            target=_run,
+            args=(module, list(arguments), passed, dict(variables), os.getpid()),
+            daemon=True,
         )
         self._process.start()
         os.close(stdin)
@@ -84,7 +86,11 @@ def start_forked(command: Sequence[str], **options: Any) -> Any:
 
 
 def _run(
-    module: str, arguments: list[str], passed: dict[int, Any], variables: dict[str, str]
+    module: str,
+    arguments: list[str],
+    passed: dict[int, Any],
+    variables: dict[str, str],
+    caller: int,
 ) -> None:
     free = max(passed) + 1
     moved = {}
@@ -97,6 +103,9 @@ def _run(
         os.close(there)
     os.environ.clear()
     os.environ.update(variables)
+    own, asked = os.getpid(), os.getppid
+    # Between the two is the process that has forked this one.
+    os.getppid = lambda: caller if os.getpid() == own else asked()
     sys.argv = [module, *arguments]
     sys.stdin = open(0, closefd=False)  # noqa: SIM115
     with warnings.catch_warnings():
