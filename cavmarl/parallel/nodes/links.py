@@ -21,9 +21,16 @@ from typing import NamedTuple, TypeAlias
 from cavmarl.core.errors import MessageError
 
 MAGIC = b"cavN"
-VERSION = 1
+VERSION = 2
 MAX_FRAME = 1 << 32
 _HEAD = struct.Struct("<4sHHQIQ")
+
+# A machine that vanishes says nothing: after so many seconds it is asked, and again, so often.
+_ALIVE = [(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)] + [
+    (socket.IPPROTO_TCP, getattr(socket, name), value)
+    for name, value in (("TCP_KEEPIDLE", 10), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3))
+    if hasattr(socket, name)
+]
 
 Bytes: TypeAlias = bytes | bytearray | memoryview
 
@@ -33,7 +40,7 @@ class FrameKind(IntEnum):
 
     JOB = 0  # C → N: what to be
     READY = 1  # N → C: where other nodes can call
-    PEERS = 2  # C → N: where the others are
+    JOIN = 2  # N → C: what it runs
     COMMAND = 3  # C → N: a task, and what it needs
     LEASE = 4  # C → N: STEP messages
     REPORT = 5  # N → C: DONE messages, and what the next decision needs
@@ -42,10 +49,15 @@ class FrameKind(IntEnum):
     FAILED = 8  # N → C: an error
     SHARE = 9  # N → N: a part of a tick
     KEEP = 10  # N → N: the state of a node's zones, for when it is lost
-    RECOVER = 11  # C → N: nodes are lost; go back to a state that was kept
+    RECOVER = 11  # C → N: nodes are lost or new; begin, or go back to a state that was kept
     SYNC = 12  # N → N: all before this is of no use any more
     PING = 13  # C → N: answer at once
     PONG = 14  # N → C: the answer
+    WANTED = 15  # N → C: files that it does not have
+    FILES = 16  # C → N: those
+    MISSED = 17  # N → C: the connection to another node has ended
+    REFUSED = 18  # C → N: why it is of no use
+    END = 19  # C → N: it is needed no more
 
 
 class NodeFrame(NamedTuple):
@@ -56,7 +68,9 @@ class NodeFrame(NamedTuple):
     data: memoryview
 
 
-URGENT = frozenset({FrameKind.MESSAGES, FrameKind.KEEP, FrameKind.PING, FrameKind.PONG})
+URGENT = frozenset(
+    {FrameKind.MESSAGES, FrameKind.KEEP, FrameKind.PING, FrameKind.PONG, FrameKind.MISSED}
+)
 Urgent: TypeAlias = Callable[[int, NodeFrame], None]
 """What is called with an urgent frame as soon as it has come, and the number of its sender."""
 
@@ -66,10 +80,11 @@ class SilenceError(Exception):
 
 
 class LinkLostError(Exception):
-    """A connection has ended."""
+    """A connection has ended, or what came over it was no frame."""
 
-    def __init__(self, peer: int) -> None:
-        super().__init__(f"the connection to node {peer} has ended")
+    def __init__(self, peer: int, cause: Exception | None = None) -> None:
+        why = f": {cause}" if isinstance(cause, MessageError) else ""
+        super().__init__(f"the connection to node {peer} has ended{why}")
         self.peer = peer
 
 
@@ -87,6 +102,8 @@ class _Link:
     def __init__(self, connection: socket.socket) -> None:
         if connection.family != socket.AF_UNIX:
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            for level, option, value in _ALIVE:
+                connection.setsockopt(level, option, value)
         connection.setblocking(False)
         self.socket = connection
         self.waiting: deque[memoryview] = deque()
@@ -239,6 +256,16 @@ class Links:
                 raise SilenceError(f"nodes {sorted(missing)} do not answer within {timeout_s:g} s")
             self.pump(left_ms)
 
+    def arrived(self, number: int) -> NodeFrame | None:
+        """The next frame of one, if it has come."""
+        frames = self._links[number].frames
+        return frames.popleft() if frames else None
+
+    def release(self, number: int) -> socket.socket:
+        """Leave a connection to somebody else, between two frames."""
+        link = self._forget(number)
+        return link.socket
+
     def put_back(self, number: int, frame: NodeFrame) -> None:
         """Let a frame be the next one of its sender once more."""
         self._links[number].frames.appendleft(frame)
@@ -254,9 +281,9 @@ class Links:
                     if not link.waiting:
                         self._poll.modify(link.socket, select.POLLIN)
                 link.receive(self.urgent, number)
-            except (EOFError, OSError) as error:
+            except (EOFError, OSError, MessageError) as error:
                 self.drop(number)
-                raise LinkLostError(number) from error
+                raise LinkLostError(number, error) from error
 
     def flush(self) -> None:
         """Wait until all that is to be sent is sent."""
@@ -265,12 +292,14 @@ class Links:
 
     def drop(self, number: int) -> None:
         """End a connection, if there is one."""
-        link = self._links.pop(number, None)
-        if link is None:
-            return
+        if number in self._links:
+            self._forget(number).socket.close()
+
+    def _forget(self, number: int) -> _Link:
+        link = self._links.pop(number)
         self._poll.unregister(link.socket)
         del self._by_socket[link.socket.fileno()]
-        link.socket.close()
+        return link
 
     def close(self) -> None:
         for number in self.numbers:
