@@ -261,6 +261,10 @@ class Links:
         frames = self._links[number].frames
         return frames.popleft() if frames else None
 
+    def has(self, number: int) -> bool:
+        """Whether a frame of one has come, and nobody has taken it."""
+        return number in self._links and bool(self._links[number].frames)
+
     def release(self, number: int) -> socket.socket:
         """Leave a connection to somebody else, between two frames."""
         link = self._forget(number)
