@@ -15,6 +15,7 @@ import time
 import zlib
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from enum import IntEnum
 from typing import NamedTuple, TypeAlias
 
@@ -86,6 +87,10 @@ class LinkLostError(Exception):
         why = f": {cause}" if isinstance(cause, MessageError) else ""
         super().__init__(f"the connection to node {peer} has ended{why}")
         self.peer = peer
+
+
+class NeededNoMoreError(Exception):
+    """The coordinator says that this node may end."""
 
 
 class RecoveryOrderedError(Exception):
@@ -305,6 +310,22 @@ class Links:
         del self._by_socket[link.socket.fileno()]
         return link
 
+    def end(self, timeout_s: float) -> None:
+        """Tell all that they are needed no more, and wait a while for them to end."""
+        for number in self.numbers:
+            with suppress(LinkLostError):
+                self.send(number, FrameKind.END, 0)
+        self.urgent = _unheard
+        until_s = time.monotonic() + timeout_s
+        while self._links and time.monotonic() < until_s:
+            with suppress(LinkLostError):
+                self.pump(1e3 * max(until_s - time.monotonic(), 0.0))
+        self.close()
+
     def close(self) -> None:
         for number in self.numbers:
             self.drop(number)
+
+
+def _unheard(number: int, frame: NodeFrame) -> None:
+    """What is of no use any more."""

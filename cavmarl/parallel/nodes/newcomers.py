@@ -136,12 +136,7 @@ class Newcomers:
 
     def close(self) -> None:
         """Send all away, and hear no more."""
-        for number in self._links.numbers:
-            try:
-                self._links.send(number, FrameKind.END, 0)
-            except LinkLostError:
-                continue
-        self._links.close()
+        self._links.end(0.0)
         self._listener.close()
 
 

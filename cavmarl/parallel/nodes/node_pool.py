@@ -7,7 +7,6 @@ import logging
 import struct
 import time
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -51,6 +50,7 @@ log = logging.getLogger("cavmarl.nodes")
 PONG_S = 1.0  # for a living node to answer
 KEEP_S = 0.2  # so much of work may have to be done again
 LOOK_MS = 20.0  # so often it is looked who has called, before the worlds begin
+END_S = 1.0  # for nodes to hear that they are needed no more
 SPARES = 1  # nodes more than are wanted that may wait for another one's end
 
 
@@ -425,10 +425,7 @@ class NodePool:
 
     def close(self) -> None:
         """End the nodes."""
-        for number in self._links.numbers:
-            with suppress(LinkLostError):
-                self._links.send(number, FrameKind.END, 0)
-        self._links.close()
+        self._links.end(END_S)
         self._newcomers.close()
         self._coordinator.close()
         self._starter.close()

@@ -1,18 +1,14 @@
-"""The process of a node: it hosts some zones of W worlds, and runs the ticks beside the others.
-
-python -m cavmarl.parallel.nodes.node_process HOST PORT NUMBER    # the secret on standard input
-"""
+"""The process of a node: it hosts some zones of W worlds, and runs the ticks beside the others."""
 
 from __future__ import annotations
 
 import json
 import os
 import socket
-import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -30,6 +26,7 @@ from cavmarl.parallel.nodes.links import (
     FrameKind,
     LinkLostError,
     Links,
+    NeededNoMoreError,
     NodeFrame,
     RecoveryOrderedError,
 )
@@ -115,7 +112,7 @@ class NodeProgram:
         if frame.kind is FrameKind.REFUSED:
             raise NodeRefusedError(f"the caller refuses this node: {bytes(frame.data).decode()}")
         if frame.kind is FrameKind.END:
-            raise LinkLostError(COORDINATOR)
+            raise NeededNoMoreError
         if frame.kind is not kind:
             raise MessageError(f"the caller sent {frame.kind.name}, not {kind.name}")
         return frame.data
@@ -152,13 +149,18 @@ class NodeProgram:
         else:
             self._hosts.hear(number, frame)
 
-    def serve(self) -> None:
-        """Do what the coordinator asks for, until it asks for no more."""
+    def serve(self) -> NoReturn:
+        """Do what the coordinator asks for.
+
+        Raises:
+            NeededNoMoreError: it asks for no more.
+            LinkLostError: it is gone.
+        """
         while True:
             try:
                 frame = self._links.take([COORDINATOR])[COORDINATOR]
                 if frame.kind is FrameKind.END:
-                    return
+                    raise NeededNoMoreError
                 if frame.kind is FrameKind.RECOVER:
                     self._recover(frame)
                 else:
@@ -176,7 +178,7 @@ class NodeProgram:
                 while frame is None or frame.kind is not FrameKind.RECOVER:
                     frame = self._links.take([COORDINATOR])[COORDINATOR]
                     if frame.kind is FrameKind.END:
-                        raise LinkLostError(COORDINATOR)
+                        raise NeededNoMoreError
                 self._recover(frame)
                 return
             except RecoveryOrderedError as ordered:
@@ -358,6 +360,8 @@ def run_node(
         node.serve()
     except NodeRefusedError:
         raise
+    except NeededNoMoreError:
+        return True
     except LinkLostError:
         return False
     except Exception as error:
@@ -374,7 +378,6 @@ def run_node(
         return False
     finally:
         links.close()
-    return True
 
 
 def run_on_ray(recipe: str, place: tuple[str, int], secret: bytes, number: int) -> None:
@@ -383,17 +386,6 @@ def run_on_ray(recipe: str, place: tuple[str, int], secret: bytes, number: int) 
         os._exit(1)
 
 
-def main() -> int:
-    host, port, number = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
-    secret = bytes.fromhex(sys.stdin.readline().strip())
-    run_node((host, port), secret, number)
-    return 0
-
-
 def _hosting(run: bytes, numbers: Sequence[int]) -> Hosting:
     episode, tick, zone, incarnation = numbers
     return Hosting(run, episode, tick, zone, incarnation, {})
-
-
-if __name__ == "__main__":
-    sys.exit(main())

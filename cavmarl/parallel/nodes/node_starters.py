@@ -16,7 +16,7 @@ from cavmarl.parallel.hosts.listener import Listener
 from cavmarl.parallel.hosts.ray_actors import RayActors
 from cavmarl.parallel.nodes.node_process import run_on_ray
 
-NODE = "cavmarl.parallel.nodes.node_process"  # the program of a node
+NODE = "cavmarl.parallel.nodes.local_node"  # the program of a node
 LOCAL = "127.0.0.1"  # where nodes of this machine meet
 RAY = "ray"
 MIN_KEY = 32  # characters of a key file
