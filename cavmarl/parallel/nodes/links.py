@@ -116,6 +116,7 @@ class _Link:
         self._head = bytearray(_HEAD.size)
         self._into = memoryview(self._head)
         self._opened: tuple[FrameKind, int, int, bytearray] | None = None
+        self.ended: Exception | None = None  # why nothing comes any more but what has come
 
     def send(self, kind: FrameKind, number: int, pieces: Sequence[Bytes]) -> None:
         """Send what the system takes at once; the rest is kept, as a copy."""
@@ -219,7 +220,8 @@ class Links:
             LinkLostError: the other end has gone.
         """
         link = self._links.get(to)
-        if link is None:
+        if link is None or link.ended is not None:
+            self.drop(to)
             raise LinkLostError(to)
         self.sent_frames += 1
         self.sent_bytes += _HEAD.size + sum(memoryview(piece).nbytes for piece in pieces)
@@ -254,6 +256,9 @@ class Links:
                 if link.frames:
                     found[number] = link.frames.popleft()
                     missing.remove(number)
+                elif link.ended is not None:
+                    self.drop(number)
+                    raise LinkLostError(number, link.ended)
             if not missing:
                 return found
             left_ms = None if until_s is None else 1e3 * max(until_s - time.monotonic(), 0.0)
@@ -262,9 +267,14 @@ class Links:
             self.pump(left_ms)
 
     def arrived(self, number: int) -> NodeFrame | None:
-        """The next frame of one, if it has come."""
-        frames = self._links[number].frames
-        return frames.popleft() if frames else None
+        """The next frame of one, if it has come. Raises LinkLostError: none will come."""
+        link = self._links[number]
+        if link.frames:
+            return link.frames.popleft()
+        if link.ended is not None:
+            self.drop(number)
+            raise LinkLostError(number, link.ended)
+        return None
 
     def has(self, number: int) -> bool:
         """Whether a frame of one has come, and nobody has taken it."""
@@ -291,6 +301,10 @@ class Links:
                         self._poll.modify(link.socket, select.POLLIN)
                 link.receive(self.urgent, number)
             except (EOFError, OSError, MessageError) as error:
+                if link.frames:  # its last words are heard first
+                    link.ended = error
+                    self._poll.unregister(link.socket)
+                    continue
                 self.drop(number)
                 raise LinkLostError(number, error) from error
 
@@ -306,7 +320,8 @@ class Links:
 
     def _forget(self, number: int) -> _Link:
         link = self._links.pop(number)
-        self._poll.unregister(link.socket)
+        if link.ended is None:
+            self._poll.unregister(link.socket)
         del self._by_socket[link.socket.fileno()]
         return link
 
@@ -318,6 +333,10 @@ class Links:
         self.urgent = _unheard
         until_s = time.monotonic() + timeout_s
         while self._links and time.monotonic() < until_s:
+            for number, link in list(self._links.items()):
+                link.frames.clear()
+                if link.ended is not None:
+                    self.drop(number)
             with suppress(LinkLostError):
                 self.pump(1e3 * max(until_s - time.monotonic(), 0.0))
         self.close()

@@ -69,12 +69,12 @@ class Newcomers:
             self._next += 1
         try:
             self._links.pump(wait_ms)
+            for number in list(self._all):
+                frame = self._links.arrived(number)
+                if frame is not None:
+                    self._hear(number, self._all[number], frame)
         except LinkLostError as lost:
             self._forget(lost.peer)
-        for number in list(self._all):
-            frame = self._links.arrived(number)
-            if frame is not None:
-                self._hear(number, self._all[number], frame)
 
     def take(self, number: int) -> tuple[Newcomer, socket.socket]:
         """One that is ready, and its connection."""
