@@ -110,12 +110,8 @@ class KeptStates:
         """
         simulation, zones = self._worlds.simulation, self._worlds.world.partition.count
         first = self._first
-        of_agents = [
-            n
-            for n, array in enumerate(like)
-            if array is simulation.shards[0].worlds.pending
-            or array is simulation.outputs.observations
-        ]
+        kept = {id(array) for array in simulation.of_agents()}
+        of_agents = [n for n, array in enumerate(like) if id(array) in kept]
         for n in range(first, len(saved)):
             if not len(other[n]):
                 continue

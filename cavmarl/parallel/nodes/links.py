@@ -54,11 +54,12 @@ class FrameKind(IntEnum):
     SYNC = 12  # N → N: all before this is of no use any more
     PING = 13  # C → N: answer at once
     PONG = 14  # N → C: the answer
-    WANTED = 15  # N → C: files that it does not have
-    FILES = 16  # C → N: those
-    MISSED = 17  # N → C: the connection to another node has ended
-    REFUSED = 18  # C → N: why it is of no use
-    END = 19  # C → N: it is needed no more
+    AGENT = 15  # N → N: what is kept of an agent whose vehicle changes its node
+    WANTED = 16  # N → C: files that it does not have
+    FILES = 17  # C → N: those
+    MISSED = 18  # N → C: the connection to another node has ended
+    REFUSED = 19  # C → N: why it is of no use
+    END = 20  # C → N: it is needed no more
 
 
 class NodeFrame(NamedTuple):
@@ -70,7 +71,14 @@ class NodeFrame(NamedTuple):
 
 
 URGENT = frozenset(
-    {FrameKind.MESSAGES, FrameKind.KEEP, FrameKind.PING, FrameKind.PONG, FrameKind.MISSED}
+    {
+        FrameKind.MESSAGES,
+        FrameKind.KEEP,
+        FrameKind.PING,
+        FrameKind.PONG,
+        FrameKind.MISSED,
+        FrameKind.AGENT,
+    }
 )
 Urgent: TypeAlias = Callable[[int, NodeFrame], None]
 """What is called with an urgent frame as soon as it has come, and the number of its sender."""

@@ -264,8 +264,11 @@ class NodePool:
     def _replace_lost(self) -> bool:  # whether the worlds go back for that
         """Let nodes that have joined meanwhile host what lost ones had.
 
-        They get it from those that have it now, out of the newest state.
+        They get it from those that have it now, out of the newest state. With SUMO none can: what
+        SUMO was told up to now is in no state.
         """
+        if self.world.config.traffic.source != "native":
+            return False
         self._newcomers.look(0.0)
         is_fresh = self._state.zones == self.zones and not self._is_torn
         if not (self._newcomers.ready and is_fresh and len(self._nodes) < len(self._first_zones)):
@@ -283,7 +286,7 @@ class NodePool:
 
     def _perform(self, command: NodeCommand) -> list[memoryview]:
         """Do a command once. Raises LinkLostError: a node is lost."""
-        kept = self._opened.number if self._opened and command is self._log[-1] else 0
+        kept = self._opened.number if self._opened and self._log and command is self._log[-1] else 0
         for number in self._living:
             self._links.send(number, FrameKind.COMMAND, kept, command.pieces)
         if not command.changes:

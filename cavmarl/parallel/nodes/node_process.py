@@ -7,12 +7,12 @@ import os
 import socket
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from typing import Any, NoReturn
 
 import numpy as np
 
-from cavmarl.core.errors import CavmarlError, MessageError, NodeRefusedError
+from cavmarl.core.errors import CavmarlError, ConfigError, MessageError, NodeRefusedError
 from cavmarl.handoff.shard_setup import limits_of
 from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.ownership.reactions import Hosting
@@ -31,7 +31,7 @@ from cavmarl.parallel.nodes.links import (
     RecoveryOrderedError,
 )
 from cavmarl.parallel.nodes.meeting import call_node, calls_of
-from cavmarl.parallel.nodes.node_frames import command_of, results_of
+from cavmarl.parallel.nodes.node_frames import cases_of, command_of, results_of, told_cases
 from cavmarl.parallel.nodes.node_peers import NodePeers
 from cavmarl.parallel.nodes.world_files import WorldFile, recipe_with
 from cavmarl.parallel.nodes.zone_hosts import ZoneHosts
@@ -90,6 +90,7 @@ class NodeProgram:
             world, job["num_worlds"], warm=True, in_next_step=job["in_next_step"]
         )
         self._commands = commands_of(worlds.arrays)
+        worlds.keep_logs()
         self._listener = Listener(self._address, self._secret)
         said = json.dumps(self._listener.place).encode()
         links.send(COORDINATOR, FrameKind.READY, 0, [said])
@@ -132,8 +133,10 @@ class NodeProgram:
         ]
         self._peers = NodePeers(simulation, self._links, zones, self._number, generation << 32)
         limits = limits_of(simulation.config.zones, simulation.division.codec.schema)
+        mounted = simulation.mounted
+        carried = [] if mounted is None else [*mounted.arrays()]
         self._hosts = ZoneHosts(
-            simulation.division, mine, node_of, told, limits, self._links, generation
+            simulation.division, mine, node_of, told, limits, self._links, carried, generation
         )
         shards = simulation.shards
         own = [shards[zone] for zone in mine]
@@ -144,6 +147,8 @@ class NodeProgram:
         """Take an urgent frame."""
         if frame.kind is FrameKind.KEEP:
             self._kept.take(number, frame)
+        elif frame.kind is FrameKind.AGENT:
+            self._hosts.keep_agent(frame)
         elif frame.kind is FrameKind.PING:
             self._links.send(COORDINATOR, FrameKind.PONG, frame.number)
         else:
@@ -271,6 +276,9 @@ class NodeProgram:
                 chosen = worlds.arrays.chosen.copy()
                 worlds.reset(letter["seed"], letter["first_world"])
                 self._hosts.report(self._results(chosen, stepped=False))
+            case Task.LOAD if not letter["only_reads"]:
+                worlds.load_worlds(cases_of(letter))
+                self._hosts.report()
             case Task.SUGGEST:
                 worlds.suggest()
                 where = np.flatnonzero(peers.own.reshape(-1))
@@ -288,11 +296,7 @@ class NodeProgram:
     def _look(self, task: Task, letter: Any) -> None:
         """Answer what only the first node can, which has the whole world meanwhile."""
         worlds, answer = self._worlds, None
-        every = task == Task.WRITE_STATES
-        world = None if every else int(letter[0] if isinstance(letter, list) else letter)
-        with ExitStack() as stack:
-            for w in range(worlds.simulation.num_worlds) if every else [world or 0]:
-                stack.enter_context(self._peers.whole(worlds.simulation, w))
+        with self._peers.whole(worlds.simulation):
             if self._is_first:
                 answer = self._found(task, letter)
         self._answer([] if answer is None else answer)
@@ -305,6 +309,10 @@ class NodeProgram:
             return [worlds.arrays.states.reshape(-1).data]
         if task == Task.STATE_HASH:
             found = worlds.state_hash(letter)
+        elif task == Task.SAVE:
+            found = told_cases(worlds.save_worlds())
+        elif task == Task.LOAD:
+            found = _refusal(worlds, cases_of(letter))
         elif task == Task.TRAFFIC_STATS:
             found = worlds.traffic_stats(letter)
         elif task == Task.DRIVEN:
@@ -384,6 +392,15 @@ def run_on_ray(recipe: str, place: tuple[str, int], secret: bytes, number: int) 
     """The same as an actor, which Ray starts again if it ends before it is needed no more."""
     if not run_node(place, secret, number):
         os._exit(1)
+
+
+def _refusal(worlds: LocalWorlds, cases: Sequence[bytes]) -> str:
+    """Why worlds cannot go on from these; empty: they can."""
+    try:
+        worlds.read_worlds(cases)
+    except ConfigError as error:
+        return str(error)
+    return ""
 
 
 def _hosting(run: bytes, numbers: Sequence[int]) -> Hosting:
