@@ -28,8 +28,8 @@ def lose_one(vec: CavVectorEnv, at: int) -> Callable[[int], None]:
 
     def strike(step: int) -> None:
         if step == at:
-            process = drawn.choice(worlds.processes)
-            Timer(drawn.uniform(0.0, 0.01), os.kill, (process.pid, signal.SIGKILL)).start()
+            pid = drawn.choice(worlds.pids)
+            Timer(drawn.uniform(0.0, 0.01), os.kill, (pid, signal.SIGKILL)).start()
 
     return strike
 

@@ -43,9 +43,10 @@ class NodeWorlds(NodePool):
         num_worlds: int,  # W
         nodes: int,  # n, from 1 to the zones of a world
         in_next_step: bool = False,  # when worlds begin anew; see `SteppedWorlds`
+        hosts: str = "",  # what starts the nodes; see `start_nodes`
     ) -> None:
         check_nodes(world, nodes)
-        super().__init__(world, base_dir, num_worlds, nodes, in_next_step)
+        super().__init__(world, base_dir, num_worlds, nodes, in_next_step, hosts)
 
     def reset(self, seed: int | None, first_world: int) -> None:
         arrays = self.arrays
