@@ -1,4 +1,4 @@
-"""`FaultyNetwork`: connections that go through this process, which does to them what networks do."""
+"""`FaultyNetwork`: carries connections, and does to them what bad networks do."""
 
 from __future__ import annotations
 

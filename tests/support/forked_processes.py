@@ -107,7 +107,7 @@ def _run(
     # Between the two is the process that has forked this one.
     os.getppid = lambda: caller if os.getpid() == own else asked()
     sys.argv = [module, *arguments]
-    sys.stdin = open(0, closefd=False)  # noqa: SIM115
+    sys.stdin = open(0, closefd=False)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # it has been imported before
         runpy.run_module(module, run_name="__main__")
