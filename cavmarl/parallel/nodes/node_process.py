@@ -150,7 +150,8 @@ class NodeProgram:
         elif frame.kind is FrameKind.AGENT:
             self._hosts.keep_agent(frame)
         elif frame.kind is FrameKind.PING:
-            self._links.send(COORDINATOR, FrameKind.PONG, frame.number)
+            said = json.dumps(sorted(self._links.awaited)).encode()
+            self._links.send(COORDINATOR, FrameKind.PONG, frame.number, [said])
         else:
             self._hosts.hear(number, frame)
 
