@@ -32,9 +32,9 @@ from cavmarl.parallel.nodes import newcomers as newcomers_module
 from cavmarl.parallel.nodes import node_starters
 from cavmarl.parallel.nodes.links import FrameKind, Link, LinkLostError, Links
 from cavmarl.parallel.nodes.newcomers import ANYONE, Newcomer, Newcomers
+from cavmarl.parallel.nodes.node_files import WorldFile
 from cavmarl.parallel.nodes.node_process import run_node
 from cavmarl.parallel.nodes.node_starters import read_key
-from cavmarl.parallel.nodes.world_files import WorldFile
 from cavmarl.parallel.nodes.zone_moves import moves_of
 from tests.parallel.test_nodes import over_nodes
 from tests.support.actuated import actuated_grid

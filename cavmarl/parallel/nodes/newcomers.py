@@ -15,7 +15,7 @@ from cavmarl.parallel.commanded_worlds import own_error
 from cavmarl.parallel.hosts.host_process import code_stamp
 from cavmarl.parallel.hosts.listener import Listener
 from cavmarl.parallel.nodes.links import FrameKind, Link, LinkLostError, Links, NodeFrame
-from cavmarl.parallel.nodes.world_files import WorldFile
+from cavmarl.parallel.nodes.node_files import WorldFile
 
 log = logging.getLogger("cavmarl.nodes")
 

@@ -36,8 +36,8 @@ from cavmarl.parallel.nodes.links import (
 )
 from cavmarl.parallel.nodes.newcomers import Newcomer, Newcomers
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
+from cavmarl.parallel.nodes.node_files import files_of
 from cavmarl.parallel.nodes.node_starters import start_nodes
-from cavmarl.parallel.nodes.world_files import files_of
 from cavmarl.parallel.nodes.zone_hosts import read_report
 from cavmarl.parallel.nodes.zone_moves import ZoneMoves, moves_of, name_of
 from cavmarl.parallel.recipe import recipe_of
