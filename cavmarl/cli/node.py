@@ -34,7 +34,7 @@ def node(
         except (OSError, EOFError) as error:
             if time.monotonic() > until_s:
                 raise WorkerError(
-                    f"nobody lets this node in at {join} within {wait_s:g} s ({error}): start the "
+                    f"no caller lets this node in at {join} within {wait_s:g} s ({error}): start the "
                     "caller, and look whether the two can reach each other"
                 ) from error
             time.sleep(AGAIN_S)
