@@ -4,6 +4,9 @@ A frame is a head of fixed size and bytes. Frames of a connection arrive in thei
 connection has ended. Nothing in a frame is ever run.
 
     head    magic, version, kind, number, checksum of what follows, bytes of what follows
+
+A checksum begins with how many frames went before on that connection, so that one that comes twice
+or out of turn is no frame.
 """
 
 from __future__ import annotations
@@ -24,6 +27,7 @@ from cavmarl.core.errors import MessageError
 MAGIC = b"cavN"
 VERSION = 2
 MAX_FRAME = 1 << 32
+_ALL = (1 << 32) - 1
 _HEAD = struct.Struct("<4sHHQIQ")
 
 # A machine that vanishes says nothing: after so many seconds it is asked, and again, so often.
@@ -109,7 +113,7 @@ class RecoveryOrderedError(Exception):
         self.frame = frame
 
 
-class _Link:
+class Link:
     """One connection: what is to be sent, and what has come of the next frame."""
 
     def __init__(self, connection: socket.socket) -> None:
@@ -124,12 +128,13 @@ class _Link:
         self._head = bytearray(_HEAD.size)
         self._into = memoryview(self._head)
         self._opened: tuple[FrameKind, int, int, bytearray] | None = None
+        self._num_sent = self._num_heard = 0  # frames
         self.ended: Exception | None = None  # why nothing comes any more but what has come
 
     def send(self, kind: FrameKind, number: int, pieces: Sequence[Bytes]) -> None:
         """Send what the system takes at once; the rest is kept, as a copy."""
         views = [memoryview(piece).cast("B") for piece in pieces if len(piece)]
-        checksum = 0
+        checksum = self._num_sent = self._num_sent + 1 & _ALL
         for view in views:
             checksum = zlib.crc32(view, checksum)
         size = sum(map(len, views))
@@ -195,8 +200,9 @@ class _Link:
     def _close(self) -> NodeFrame:
         assert self._opened is not None
         kind, number, checksum, room = self._opened
-        if zlib.crc32(room) != checksum:
-            raise MessageError("a frame is not what was sent")
+        self._num_heard = self._num_heard + 1 & _ALL
+        if zlib.crc32(room, self._num_heard) != checksum:
+            raise MessageError("a frame is not what was sent, or not the next one")
         self._opened, self._into = None, memoryview(self._head)
         return NodeFrame(kind, number, memoryview(room))
 
@@ -206,17 +212,18 @@ class Links:
 
     def __init__(self, urgent: Urgent) -> None:
         self.urgent = urgent
-        self._links: dict[int, _Link] = {}
+        self._links: dict[int, Link] = {}
         self._poll = select.poll()
         self._by_socket: dict[int, int] = {}
         self.awaited: set[int] = set()  # whose frames `take` waits for
         self.sent_bytes = 0
         self.sent_frames = 0
 
-    def add(self, number: int, connection: socket.socket) -> None:
-        self._links[number] = _Link(connection)
-        self._by_socket[connection.fileno()] = number
-        self._poll.register(connection, select.POLLIN)
+    def add(self, number: int, connection: socket.socket | Link) -> None:
+        link = connection if isinstance(connection, Link) else Link(connection)
+        self._links[number] = link
+        self._by_socket[link.socket.fileno()] = number
+        self._poll.register(link.socket, select.POLLIN)
 
     @property
     def numbers(self) -> tuple[int, ...]:
@@ -289,10 +296,9 @@ class Links:
         """Whether a frame of one has come, and nobody has taken it."""
         return number in self._links and bool(self._links[number].frames)
 
-    def release(self, number: int) -> socket.socket:
-        """Leave a connection to somebody else, between two frames."""
-        link = self._forget(number)
-        return link.socket
+    def release(self, number: int) -> Link:
+        """Leave a connection to somebody else."""
+        return self._forget(number)
 
     def put_back(self, number: int, frame: NodeFrame) -> None:
         """Let a frame be the next one of its sender once more."""
@@ -327,7 +333,7 @@ class Links:
         if number in self._links:
             self._forget(number).socket.close()
 
-    def _forget(self, number: int) -> _Link:
+    def _forget(self, number: int) -> Link:
         link = self._links.pop(number)
         if link.ended is None:
             self._poll.unregister(link.socket)

@@ -37,8 +37,8 @@ from cavmarl.parallel.nodes.links import (
 )
 from cavmarl.parallel.nodes.newcomers import Newcomer, Newcomers
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
+from cavmarl.parallel.nodes.node_files import files_of
 from cavmarl.parallel.nodes.node_starters import Route, start_nodes, straight
-from cavmarl.parallel.nodes.world_files import files_of
 from cavmarl.parallel.nodes.zone_hosts import read_report
 from cavmarl.parallel.nodes.zone_moves import ZoneMoves, moves_of, name_of
 from cavmarl.parallel.recipe import recipe_of
@@ -50,7 +50,7 @@ log = logging.getLogger("cavmarl.nodes")
 
 PONG_S = 1.0  # for a living node to answer
 KEEP_S = 0.2  # so much of work may have to be done again
-LOOK_MS = 20.0  # so often it is looked who has called, before the worlds begin
+MISSED_S = 0.1  # to hear who else misses a node
 END_S = 1.0  # for nodes to hear that they are needed no more
 SPARES = 1  # nodes more than are wanted that may wait for another one's end
 
@@ -112,6 +112,7 @@ class NodePool:
         self._keep_again_s = 0.0  # by `time.monotonic`
         self._log: list[NodeCommand] = []  # since that state
         self._lost: list[int] = []
+        self._missed: list[int] = []  # the two ends of connections that nodes have lost
         self._is_torn = False
         self.losses = self.recoveries = self.replacements = 0
         self._timeout_s = config.workers.timeout_s
@@ -144,7 +145,7 @@ class NodePool:
         self._starter, listener = start_nodes(hosts, nodes, config.workers, base_dir, route)
         self._newcomers = Newcomers(listener, job, files, self._room)
         try:
-            self._await_first(nodes, hosts or "this machine", config.workers.join_timeout_s)
+            self._newcomers.await_ready(nodes, config.workers.join_timeout_s, self._starter.trouble)
             self._seat()
             self._tell_zones(self._coordinator.host(), ZoneMoves(self.zones, {}, []), begins=True)
             self._commit()
@@ -162,28 +163,6 @@ class NodePool:
 
     def _room(self) -> int:
         return len(self._first_zones) - len(self._nodes) + SPARES
-
-    def _await_first(self, nodes: int, hosts: str, timeout_s: float) -> None:
-        """Return when as many nodes are ready as are wanted.
-
-        Raises:
-            WorkerError: they have not come in time.
-        """
-        newcomers, until_s = self._newcomers, time.monotonic() + timeout_s
-        log.info("waiting for %d nodes at %s", nodes, newcomers.place)
-        while len(newcomers.ready) < nodes:
-            newcomers.look(LOOK_MS)
-            for failure in newcomers.failures:
-                raise own_error(failure) from failure
-            trouble = self._starter.trouble()
-            if trouble is None and time.monotonic() > until_s:
-                refused = "; refused ".join(("", *newcomers.refused))
-                trouble = (
-                    f"{len(newcomers.ready)} of {nodes} nodes have joined within "
-                    f"workers.join_timeout_s = {timeout_s:g} ({hosts}){refused}"
-                )
-            if trouble is not None:
-                raise WorkerError(trouble)
 
     def _seat(self) -> None:
         """Let those that are ready host the zones that a lost node had at the beginning."""
@@ -260,7 +239,7 @@ class NodePool:
                         self._perform(one)
                 return self._perform(command)
             except LinkLostError as lost:
-                self._lose(lost)
+                self._lose(self._most_missed(lost))
             except SilenceError as silence:
                 self._lose(LinkLostError(self._silent(silence)), is_silent=True)
 
@@ -305,6 +284,7 @@ class NodePool:
         if frame.kind is FrameKind.MISSED:
             peer = int.from_bytes(frame.data, "little")
             if frame.number == self._generation and peer in self._nodes:
+                self._missed += (number, peer)
                 raise LinkLostError(peer)
         elif frame.kind is not FrameKind.PONG:
             self._coordinator.hear(number, frame)
@@ -334,10 +314,24 @@ class NodePool:
             raise WorkerError(f"{silence}, though they live") from silence
         return mute[0]
 
+    def _most_missed(self, lost: LinkLostError) -> LinkLostError:
+        """The node that has ended, or else the one that cannot be reached by most others."""
+        until_s = time.monotonic() + MISSED_S
+        while lost.peer in self._links.numbers and time.monotonic() < until_s:
+            try:
+                self._links.pump(1e3 * (until_s - time.monotonic()))
+            except LinkLostError as more:
+                lost = more
+        if lost.peer not in self._links.numbers:
+            return lost
+        worst = max(self._missed, key=lambda number: (self._missed.count(number), number))
+        return LinkLostError(worst, MessageError("other nodes do not reach it"))
+
     def _lose(self, lost: LinkLostError, is_silent: bool = False) -> None:
         """A node is gone: nothing of it counts any more."""
         number = lost.peer
         self._is_torn = True
+        self._missed.clear()
         self._links.drop(number)
         node = self._nodes.pop(number, None)
         self._new.pop(number, None)

@@ -31,9 +31,9 @@ from cavmarl.parallel.nodes.links import (
     RecoveryOrderedError,
 )
 from cavmarl.parallel.nodes.meeting import call_node, calls_of
+from cavmarl.parallel.nodes.node_files import WorldFile, recipe_with
 from cavmarl.parallel.nodes.node_frames import cases_of, command_of, results_of, told_cases
 from cavmarl.parallel.nodes.node_peers import NodePeers
-from cavmarl.parallel.nodes.world_files import WorldFile, recipe_with
 from cavmarl.parallel.nodes.zone_hosts import ZoneHosts
 from cavmarl.parallel.recipe import world_of
 from cavmarl.parallel.worlds_job import Task, commands_of
