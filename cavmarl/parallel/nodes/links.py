@@ -226,6 +226,7 @@ class Links:
         self._links: dict[int, Link] = {}
         self._poll = select.poll()
         self._by_socket: dict[int, int] = {}
+        self.awaited: set[int] = set()  # whose frames `take` waits for
         self.sent_bytes = 0
         self.sent_frames = 0
 
@@ -270,7 +271,7 @@ class Links:
             MessageError: what came is no frame.
             SilenceError: nothing has come in time.
         """
-        missing = set(wanted)
+        self.awaited = missing = set(wanted)
         found: dict[int, NodeFrame] = {}
         until_s = None if timeout_s is None else time.monotonic() + timeout_s
         while True:

@@ -6,6 +6,7 @@ import json
 import logging
 import struct
 import time
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -37,7 +38,7 @@ from cavmarl.parallel.nodes.links import (
 from cavmarl.parallel.nodes.newcomers import Newcomer, Newcomers
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
 from cavmarl.parallel.nodes.node_files import files_of
-from cavmarl.parallel.nodes.node_starters import start_nodes
+from cavmarl.parallel.nodes.node_starters import Route, start_nodes, straight
 from cavmarl.parallel.nodes.zone_hosts import read_report
 from cavmarl.parallel.nodes.zone_moves import ZoneMoves, moves_of, name_of
 from cavmarl.parallel.recipe import recipe_of
@@ -93,8 +94,9 @@ class NodePool:
         nodes: int,  # n, from 1 to the zones of a world
         in_next_step: bool = False,  # when worlds begin anew; see `SteppedWorlds`
         hosts: str = "",  # what starts the nodes; see `start_nodes`
+        route: Route = straight,  # where to call in order to reach a place
     ) -> None:
-        self.world = world
+        self.world, self._route = world, route
         self.in_next_step = in_next_step
         config, count = world.config, world.partition.count
         layout = layout_of(config, world.capacity, num_worlds).items()
@@ -114,7 +116,8 @@ class NodePool:
         self._is_torn = False
         self.losses = self.recoveries = self.replacements = 0
         self._timeout_s = config.workers.timeout_s
-        self._answered: set[int] = set()  # nodes that answered the last PING
+        # nodes that answered the last PING, and whose frames each waits for
+        self._answered: dict[int, list[int]] = {}
         self._pings = 0
         self._ticks_per_step = config.clock.ticks_per_step
         self._links = Links(_nothing)
@@ -139,7 +142,7 @@ class NodePool:
             "in_next_step": in_next_step,
         }
         files = files_of(config, base_dir)
-        self._starter, listener = start_nodes(hosts, nodes, config.workers, base_dir)
+        self._starter, listener = start_nodes(hosts, nodes, config.workers, base_dir, route)
         self._newcomers = Newcomers(listener, job, files, self._room)
         try:
             self._newcomers.await_ready(nodes, config.workers.join_timeout_s, self._starter.trouble)
@@ -170,7 +173,7 @@ class NodePool:
             empty.remove(number)
             assert newcomer.place is not None
             self._links.add(number, connection)
-            self._nodes[number], self._new[number] = newcomer, newcomer.place
+            self._nodes[number], self._new[number] = newcomer, self._route(newcomer.place)
             if number in self._lost:
                 self._lost.remove(number)
 
@@ -287,10 +290,10 @@ class NodePool:
         elif frame.kind is not FrameKind.PONG:
             self._coordinator.hear(number, frame)
         elif frame.number == self._pings:
-            self._answered.add(number)
+            self._answered[number] = json.loads(bytes(frame.data))
 
     def _silent(self, silence: SilenceError) -> int:
-        """A node that answers nothing: it has stopped.
+        """A node that answers nothing, for it has stopped; or that another one waits for in vain.
 
         Raises:
             WorkerError: all answer, and yet nothing comes of the command.
@@ -306,6 +309,8 @@ class NodePool:
         except LinkLostError as lost:
             return lost.peer
         mute = [number for number in self._living if number not in self._answered]
+        missed = Counter(peer for peers in self._answered.values() for peer in peers)
+        mute += [number for number, _ in missed.most_common() if number in self._nodes]
         if not mute:
             raise WorkerError(f"{silence}, though they live") from silence
         return mute[0]

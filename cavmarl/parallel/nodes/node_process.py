@@ -154,7 +154,8 @@ class NodeProgram:
         elif frame.kind is FrameKind.GIVE:
             self._kept.take_given(number, frame)
         elif frame.kind is FrameKind.PING:
-            self._links.send(COORDINATOR, FrameKind.PONG, frame.number)
+            said = json.dumps(sorted(self._links.awaited)).encode()
+            self._links.send(COORDINATOR, FrameKind.PONG, frame.number, [said])
         else:
             self._hosts.hear(number, frame)
 

@@ -24,6 +24,7 @@ from cavmarl.parallel.nodes.node_frames import (
     told_cases,
 )
 from cavmarl.parallel.nodes.node_pool import NodeCommand, NodePool
+from cavmarl.parallel.nodes.node_starters import Route, straight
 from cavmarl.parallel.step_arrays import Driven
 from cavmarl.parallel.worlds_job import Task
 from cavmarl.shards.shard import Commands
@@ -48,9 +49,10 @@ class NodeWorlds(NodePool):
         nodes: int,  # n, from 1 to the zones of a world
         in_next_step: bool = False,  # when worlds begin anew; see `SteppedWorlds`
         hosts: str = "",  # what starts the nodes; see `start_nodes`
+        route: Route = straight,  # where nodes of this machine call in order to reach a place
     ) -> None:
         check_nodes(world, nodes)
-        super().__init__(world, base_dir, num_worlds, nodes, in_next_step, hosts)
+        super().__init__(world, base_dir, num_worlds, nodes, in_next_step, hosts, route)
         count, every = world.partition.count, world.config.workers.balance_steps
         self._spent_s = np.zeros((1, count))
         self.mover = Mover(self._placement, count, every, self._spent_s) if every else None
