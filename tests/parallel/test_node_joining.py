@@ -36,11 +36,14 @@ from cavmarl.parallel.nodes.node_files import WorldFile
 from cavmarl.parallel.nodes.node_process import run_node
 from cavmarl.parallel.nodes.node_starters import read_key
 from cavmarl.parallel.nodes.zone_moves import moves_of
+from tests.parallel.test_moving import RESTLESS, uneven
 from tests.parallel.test_nodes import over_nodes
 from tests.support.actuated import actuated_grid
 from tests.support.vec_runs import Make, drive, same
 from tests.support.wires import Proxy, free_port, own_address
 from tests.support.world_hosts import FORKS, WorldHosts
+
+__all__ = ["uneven"]
 
 WANTED: dict[str, Any] = {"agents": 6, "background": 40, "max_cycles": 20}
 KEY = secrets.token_hex(32)
@@ -198,6 +201,23 @@ def test_a_node_of_this_machine_is_started_again(make: Make) -> None:
     os.kill(worlds.pids[1], signal.SIGKILL)
     step_alike(one, vec, lambda: bool(worlds.replacements))
     assert worlds.zones == [[0, 1], [2, 3]]
+
+
+@pytest.mark.parametrize("is_lost", [False, True])
+def test_zones_that_change_their_node(make: Make, uneven: list[int], is_lost: bool) -> None:
+    wanted = {"agents": 8, "background": 30, "max_cycles": 8}
+    whole = drive(make("town", **wanted), steps=20)
+    vec = make("town", zones=4, nodes=3, overrides=RESTLESS, **wanted)
+
+    def strike(step: int) -> None:
+        if is_lost and step == 9:
+            os.kill(over_nodes(vec).pids[1], signal.SIGKILL)
+
+    assert same(drive(vec, steps=20, before=strike), whole)
+    mover = over_nodes(vec).mover
+    assert mover is not None
+    assert mover.moves == sum(uneven) > 0
+    assert over_nodes(vec)._generation > 1 + is_lost
 
 
 def test_hosts_of_ray_are_nodes(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:

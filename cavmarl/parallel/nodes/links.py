@@ -22,7 +22,7 @@ from contextlib import suppress
 from enum import IntEnum
 from typing import NamedTuple, TypeAlias
 
-from cavmarl.core.errors import MessageError
+from cavmarl.core.errors import MessageError, NodeRefusedError
 
 MAGIC = b"cavN"
 VERSION = 2
@@ -64,6 +64,7 @@ class FrameKind(IntEnum):
     MISSED = 18  # N → C: the connection to another node has ended
     REFUSED = 19  # C → N: why it is of no use
     END = 20  # C → N: it is needed no more
+    GIVE = 21  # N → N: the state of zones that another node hosts from now on
 
 
 class NodeFrame(NamedTuple):
@@ -82,6 +83,7 @@ URGENT = frozenset(
         FrameKind.PONG,
         FrameKind.MISSED,
         FrameKind.AGENT,
+        FrameKind.GIVE,
     }
 )
 Urgent: TypeAlias = Callable[[int, NodeFrame], None]
@@ -129,7 +131,6 @@ class Link:
         self._into = memoryview(self._head)
         self._opened: tuple[FrameKind, int, int, bytearray] | None = None
         self._num_sent = self._num_heard = 0  # frames
-        self.ended: Exception | None = None  # why nothing comes any more but what has come
 
     def send(self, kind: FrameKind, number: int, pieces: Sequence[Bytes]) -> None:
         """Send what the system takes at once; the rest is kept, as a copy."""
@@ -161,7 +162,13 @@ class Link:
         return pieces
 
     def receive(self, urgent: Urgent, number: int) -> None:
-        """Take what has come. Raises EOFError, OSError: the other end has gone."""
+        """Take what has come.
+
+        Raises:
+            EOFError, OSError: the other end has gone.
+            MessageError: what came is no frame.
+            NeededNoMoreError, NodeRefusedError: the coordinator has said its last word.
+        """
         while True:
             if len(self._into):
                 try:
@@ -177,6 +184,10 @@ class Link:
                 self._open()
             else:
                 frame = self._close()
+                if frame.kind is FrameKind.END:
+                    raise NeededNoMoreError
+                if frame.kind is FrameKind.REFUSED:
+                    raise NodeRefusedError(f"the caller refuses this node: {_text(frame)}")
                 if frame.kind in URGENT:
                     urgent(number, frame)
                 else:
@@ -236,8 +247,7 @@ class Links:
             LinkLostError: the other end has gone.
         """
         link = self._links.get(to)
-        if link is None or link.ended is not None:
-            self.drop(to)
+        if link is None:
             raise LinkLostError(to)
         self.sent_frames += 1
         self.sent_bytes += _HEAD.size + sum(memoryview(piece).nbytes for piece in pieces)
@@ -272,9 +282,6 @@ class Links:
                 if link.frames:
                     found[number] = link.frames.popleft()
                     missing.remove(number)
-                elif link.ended is not None:
-                    self.drop(number)
-                    raise LinkLostError(number, link.ended)
             if not missing:
                 return found
             left_ms = None if until_s is None else 1e3 * max(until_s - time.monotonic(), 0.0)
@@ -283,14 +290,9 @@ class Links:
             self.pump(left_ms)
 
     def arrived(self, number: int) -> NodeFrame | None:
-        """The next frame of one, if it has come. Raises LinkLostError: none will come."""
-        link = self._links[number]
-        if link.frames:
-            return link.frames.popleft()
-        if link.ended is not None:
-            self.drop(number)
-            raise LinkLostError(number, link.ended)
-        return None
+        """The next frame of one, if it has come."""
+        frames = self._links[number].frames
+        return frames.popleft() if frames else None
 
     def has(self, number: int) -> bool:
         """Whether a frame of one has come, and nobody has taken it."""
@@ -316,10 +318,6 @@ class Links:
                         self._poll.modify(link.socket, select.POLLIN)
                 link.receive(self.urgent, number)
             except (EOFError, OSError, MessageError) as error:
-                if link.frames:  # its last words are heard first
-                    link.ended = error
-                    self._poll.unregister(link.socket)
-                    continue
                 self.drop(number)
                 raise LinkLostError(number, error) from error
 
@@ -335,8 +333,7 @@ class Links:
 
     def _forget(self, number: int) -> Link:
         link = self._links.pop(number)
-        if link.ended is None:
-            self._poll.unregister(link.socket)
+        self._poll.unregister(link.socket)
         del self._by_socket[link.socket.fileno()]
         return link
 
@@ -348,10 +345,6 @@ class Links:
         self.urgent = _unheard
         until_s = time.monotonic() + timeout_s
         while self._links and time.monotonic() < until_s:
-            for number, link in list(self._links.items()):
-                link.frames.clear()
-                if link.ended is not None:
-                    self.drop(number)
             with suppress(LinkLostError):
                 self.pump(1e3 * max(until_s - time.monotonic(), 0.0))
         self.close()
@@ -359,6 +352,10 @@ class Links:
     def close(self) -> None:
         for number in self.numbers:
             self.drop(number)
+
+
+def _text(frame: NodeFrame) -> str:
+    return bytes(frame.data).decode(errors="replace")
 
 
 def _unheard(number: int, frame: NodeFrame) -> None:

@@ -103,7 +103,7 @@ class NodePool:
         self.arrays = StepArrays.of({name: np.zeros(shape, kind) for name, (kind, shape) in layout})
         self._placement = StepPlacement(world, 1, nodes)
         self.zones = parts_of(self._placement.plans, count)[0].zones
-        self._first_zones = self.zones
+        self._homes = self.zones
         self._generation = 0
         self._teller = 0
         self._state = _State(1, self.zones, 0)  # that all nodes can go back to
@@ -162,11 +162,11 @@ class NodePool:
         return [self._nodes[number].pid for number in sorted(self._nodes)]
 
     def _room(self) -> int:
-        return len(self._first_zones) - len(self._nodes) + SPARES
+        return len(self._homes) - len(self._nodes) + SPARES
 
     def _seat(self) -> None:
         """Let those that are ready host the zones that a lost node had at the beginning."""
-        empty = [n for n in range(len(self._first_zones)) if n not in self._nodes]
+        empty = [n for n in range(len(self._homes)) if n not in self._nodes]
         for ready in list(self._newcomers.ready)[: len(empty)]:
             newcomer, connection = self._newcomers.take(ready)
             number = newcomer.asked if newcomer.asked in empty else empty[0]
@@ -189,7 +189,7 @@ class NodePool:
                 if frame.kind is FrameKind.FAILED:
                     name, text, trace = json.loads(bytes(frame.data))
                     failure = WorkerFailureError(
-                        number, name_of(self._first_zones[number]), name, text, trace
+                        number, name_of(self._homes[number]), name, text, trace
                     )
                     raise own_error(failure) from failure
                 if frame.number == self._generation:
@@ -229,15 +229,16 @@ class NodePool:
             self._keep_again_s = time.monotonic() + KEEP_S
         return results
 
-    def _insist(self, command: NodeCommand) -> list[memoryview]:
-        """Do a command again and again, until no node is lost meanwhile."""
+    def _insist(self, command: NodeCommand | None) -> list[memoryview]:
+        """Do a command, or none, again and again, until no node is lost meanwhile."""
         while True:
             try:
                 if self._is_torn:
                     self._recover()
-                    for one in self._log[: -1 if command.changes else None]:
+                    changes = command is not None and command.changes
+                    for one in self._log[: -1 if changes else None]:
                         self._perform(one)
-                return self._perform(command)
+                return [] if command is None else self._perform(command)
             except LinkLostError as lost:
                 self._lose(self._most_missed(lost))
             except SilenceError as silence:
@@ -253,7 +254,7 @@ class NodePool:
             return False
         self._newcomers.look(0.0)
         is_fresh = self._state.zones == self.zones and not self._is_torn
-        if not (self._newcomers.ready and is_fresh and len(self._nodes) < len(self._first_zones)):
+        if not (self._newcomers.ready and is_fresh and len(self._nodes) < len(self._homes)):
             return False
         before = len(self._nodes)
         self._seat()
@@ -343,7 +344,7 @@ class NodePool:
             "node %d on %s (%s) is lost: %s",
             number,
             node.machine,
-            name_of(self._first_zones[number]),
+            name_of(self._homes[number]),
             lost,
         )
         self._starter.replace(node.asked, is_silent)
@@ -351,7 +352,7 @@ class NodePool:
     def _recover(self) -> None:
         """Let the living nodes host the zones of the lost ones, as of the newest state they have.
 
-        Nodes that are new get the zones that those had whom they replace.
+        Zones whose home is another node that lives go there.
 
         Raises:
             LinkLostError: another one is lost.
@@ -359,7 +360,7 @@ class NodePool:
         """
         state = self._state
         self._opened = None
-        moves = moves_of(state.zones, self._first_zones, self._lost, self._nodes, state.number)
+        moves = moves_of(state.zones, self._homes, self._lost, self._nodes, state.number)
         self.zones = moves.zones
         self._generation += 1
         hostings = self._coordinator.recover(self._node_of(), state.switched)
