@@ -83,6 +83,7 @@ URGENT = frozenset(
         FrameKind.PONG,
         FrameKind.MISSED,
         FrameKind.AGENT,
+        FrameKind.FAILED,
         FrameKind.GIVE,
     }
 )
