@@ -228,6 +228,7 @@ class Links:
         self._poll = select.poll()
         self._by_socket: dict[int, int] = {}
         self.awaited: set[int] = set()  # whose frames `take` waits for
+        self.waited_s = 0.0
         self.sent_bytes = 0
         self.sent_frames = 0
 
@@ -309,7 +310,10 @@ class Links:
 
     def pump(self, timeout_ms: float | None) -> None:
         """Send and receive what can be; wait so long for the first that can."""
-        for socket_number, _ in self._poll.poll(timeout_ms):
+        began_s = time.perf_counter()
+        ready = self._poll.poll(timeout_ms)
+        self.waited_s += time.perf_counter() - began_s
+        for socket_number, _ in ready:
             number = self._by_socket[socket_number]
             link = self._links[number]
             try:

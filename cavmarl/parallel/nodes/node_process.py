@@ -34,6 +34,7 @@ from cavmarl.parallel.nodes.links import (
 from cavmarl.parallel.nodes.meeting import call_node, calls_of
 from cavmarl.parallel.nodes.node_files import WorldFile, recipe_with
 from cavmarl.parallel.nodes.node_frames import cases_of, command_of, results_of, told_cases
+from cavmarl.parallel.nodes.node_loads import totals
 from cavmarl.parallel.nodes.node_peers import NodePeers
 from cavmarl.parallel.nodes.zone_hosts import ZoneHosts
 from cavmarl.parallel.recipe import world_of
@@ -281,6 +282,9 @@ class NodeProgram:
             case Task.HOST:
                 spent_s = [] if self._clock is None else self._clock.take_s().tolist()
                 self._answer([json.dumps(list(zip(self.zones, spent_s, strict=False))).encode()])
+            case Task.LOADS:
+                said = [self._number, *totals(self._links, worlds.simulation, self.zones)]
+                self._answer([json.dumps(said).encode()])
             case Task.SUGGEST:
                 worlds.suggest()
                 where = np.flatnonzero(peers.own.reshape(-1))

@@ -23,6 +23,7 @@ from cavmarl.parallel.nodes.node_frames import (
     take_results,
     told_cases,
 )
+from cavmarl.parallel.nodes.node_loads import NodeLoad, since
 from cavmarl.parallel.nodes.node_pool import NodeCommand, NodePool
 from cavmarl.parallel.nodes.node_starters import Route, straight
 from cavmarl.parallel.step_arrays import Driven
@@ -55,6 +56,8 @@ class NodeWorlds(NodePool):
         super().__init__(world, base_dir, num_worlds, nodes, in_next_step, hosts, route)
         count, every = world.partition.count, world.config.workers.balance_steps
         self._spent_s = np.zeros((1, count))
+        self._ticks_done = self._ticks_told = 0
+        self._told: dict[int, list[Any]] = {}  # what nodes have said of themselves last
         self.mover = Mover(self._placement, count, every, self._spent_s) if every else None
 
     def reset(self, seed: int | None, first_world: int) -> None:
@@ -75,6 +78,7 @@ class NodeWorlds(NodePool):
             self.mover.before_step(self._move, self._measured)
         arrays.declared[:] = commands.declared if commands.declared.size else 0
         results = self.run(self._command(Task.STEP))
+        self._ticks_done += self._ticks_per_step
         clear_sensed(arrays, np.ones(len(arrays.chosen), dtype=np.bool_))
         self._write(results, of_step=True)
 
@@ -116,6 +120,21 @@ class NodeWorlds(NodePool):
             where = np.frombuffer(data, np.int64, num)
             found = np.frombuffer(data, suggested.dtype, 2 * num, 8 * num)
             suggested.reshape(-1, 2)[where] = found.reshape(-1, 2)
+
+    def node_loads(self) -> list[NodeLoad]:
+        """What each node has done since this was asked last, by rising numbers.
+
+        After a node was lost its successor's time is that since it began.
+        """
+        found = []
+        ticks, self._ticks_told = self._ticks_done - self._ticks_told, self._ticks_done
+        for data in self.run(self._command(Task.LOADS)):
+            node, *now = json.loads(bytes(data))
+            before = self._told.get(node)
+            is_same = before is not None and before[0] <= now[0]
+            found.append(since(node, ticks, now, before if is_same else None))
+            self._told[node] = now
+        return sorted(found)
 
     def _asked(self, task: Task, letter: Any) -> Any:
         return json.loads(bytes(self.run(self._command(task, letter))[0]))
