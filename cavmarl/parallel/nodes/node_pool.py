@@ -34,6 +34,7 @@ from cavmarl.parallel.nodes.links import (
     Links,
     NodeFrame,
     SilenceError,
+    said_by,
 )
 from cavmarl.parallel.nodes.newcomers import Newcomer, Newcomers
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
@@ -282,13 +283,13 @@ class NodePool:
                 self._missed += (number, peer)
                 raise LinkLostError(peer)
         elif frame.kind is FrameKind.FAILED:
-            name, text, trace = json.loads(bytes(frame.data))
+            name, text, trace = said_by(frame)
             failure = WorkerFailureError(number, name_of(self._homes[number]), name, text, trace)
             raise own_error(failure) from failure
         elif frame.kind is not FrameKind.PONG:
             self._coordinator.hear(number, frame)
         elif frame.number == self._pings:
-            self._answered[number] = json.loads(bytes(frame.data))
+            self._answered[number] = list(said_by(frame))
 
     def _silent(self, silence: SilenceError) -> int:
         """A node that answers nothing, for it has stopped; or that another one waits for in vain.
