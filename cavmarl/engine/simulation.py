@@ -305,7 +305,6 @@ class Simulation(WorldViews):
         self,
         # called with the shards, and with what the phase `gather` is called with
         make: Callable[[Sequence[Shard], tuple[float, float]], Together],
-        gathers: bool = True,  # whether that phase is his, too
     ) -> None:
         """From now on let others run the phases of the shards, as `make` returns them.
 
@@ -313,7 +312,7 @@ class Simulation(WorldViews):
             ConfigError: zones become others, and the caller would not be told.
         """
         self._refuse_recutting("the zones of one world over workers")
-        self._tick.host(make, gathers)
+        self._tick.host(make)
 
     def share(self, peers: Peers, coordination: Coordination, executor: Executor) -> None:
         """From now on host the zones that `executor` runs, and leave the others to `peers`."""

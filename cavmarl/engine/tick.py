@@ -256,12 +256,11 @@ class Tick:
         self,
         # called with the shards, and with what the phase `gather` is called with
         make: Callable[[Sequence[Shard], tuple[float, float]], Together],
-        gathers: bool,  # whether that phase is his, too
     ) -> None:
         """From now on let others run the phases of the shards, as `make` returns them."""
         team = make(self.shards, self.division.gathering)
         self.executor, self._meet = team, team.meet
-        self._gathers = gathers and self.division.let_gather(team)
+        self._gathers = self.division.let_gather(team)
 
 
 def _there() -> None:

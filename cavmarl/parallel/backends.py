@@ -15,7 +15,6 @@ from cavmarl.parallel.nodes.node_starters import place_of
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.parallel.pooled_worlds import PooledWorlds
 from cavmarl.parallel.sensor_workers.sensor_worker_setup import local_worlds
-from cavmarl.parallel.split_hosts.divided_worlds import DividedWorlds
 from cavmarl.parallel.step_arrays import SteppedWorlds
 
 LOCAL, PROCESSES, RAY, NODES = "local", "processes", "ray", "nodes"
@@ -45,7 +44,7 @@ class Backend:
 
 
 def _is_split(num_worlds: int, workers: int | None) -> bool:
-    """Whether there are more workers than worlds: this process leads, workers run zones."""
+    """Whether there are more workers than worlds: each hosts some zones of all of them."""
     return workers is not None and workers > num_worlds
 
 
@@ -69,7 +68,7 @@ def _ray(
     world: World, base_dir: Path, num_worlds: int, workers: int | None, in_next_step: bool
 ) -> SteppedWorlds:
     if workers is not None and _is_split(num_worlds, workers):
-        return DividedWorlds(world, base_dir, num_worlds, workers, in_next_step)
+        return NodeWorlds(world, base_dir, num_worlds, workers, in_next_step, RAY)
     return RemoteWorlds(world, base_dir, num_worlds, workers, in_next_step)
 
 

@@ -1,6 +1,6 @@
 """The state of worlds: which arrays outlive a tick, and which part keeps which, in one table.
 
-What saves, moves, commits, sends or digests worlds takes its arrays from here. Beside these there
+What saves, moves, commits or digests worlds takes its arrays from here. Beside these there
 are the owned rows, the arrays of rerouting, and those of attached parts (`Attached.arrays`).
 """
 
@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 from numpy.typing import NDArray
 
 from cavmarl.core.records.arrays import Common, Gate, Outputs, Zoned
-from cavmarl.v2x.kernels.v2x_records import Mail
 
 
 class Use(Enum):
@@ -22,11 +21,10 @@ class Use(Enum):
 
     SAVED = auto()  # in checkpoints, and with a world that changes its worker
     COMMITTED = auto()  # in the store from which a tick is begun again
-    SENT = auto()  # to machines that run phases, and back
     DIGESTED = auto()  # in the hash of a world's state
 
 
-S, C, T, D = Use.SAVED, Use.COMMITTED, Use.SENT, Use.DIGESTED
+S, C, D = Use.SAVED, Use.COMMITTED, Use.DIGESTED
 
 
 class StateArray(NamedTuple):
@@ -39,20 +37,18 @@ class StateArray(NamedTuple):
 
 
 STATE = (
-    StateArray(Common, "ticks", (S, C, T, D), 4),
-    StateArray(Common, "keys", (S, C, T, D), 5),
-    StateArray(Common, "signal_phase", (S, C, T, D), 1),
-    StateArray(Common, "controllers", (S, C, T, D), 2),
-    StateArray(Common, "detected_s", (S, C, T, D), 3),
-    StateArray(Common, "pending", (S, C)),  # sent and digested agent by agent
-    StateArray(Common, "cues", (S, C, T, D), 6),
-    StateArray(Zoned, "num_owned", (C, T)),
-    StateArray(Zoned, "num_rows", (C, T)),
-    StateArray(Zoned, "num_near", (T,)),
-    StateArray(Zoned, "num_through", (C, T)),
-    StateArray(Zoned, "num_touching", (C, T)),
-    StateArray(Zoned, "num_contacts", (C, T)),  # saved as the sum of all zones
-    StateArray(Zoned, "num_outer", (T,)),
+    StateArray(Common, "ticks", (S, C, D), 4),
+    StateArray(Common, "keys", (S, C, D), 5),
+    StateArray(Common, "signal_phase", (S, C, D), 1),
+    StateArray(Common, "controllers", (S, C, D), 2),
+    StateArray(Common, "detected_s", (S, C, D), 3),
+    StateArray(Common, "pending", (S, C)),  # digested agent by agent
+    StateArray(Common, "cues", (S, C, D), 6),
+    StateArray(Zoned, "num_owned", (C,)),
+    StateArray(Zoned, "num_rows", (C,)),
+    StateArray(Zoned, "num_through", (C,)),
+    StateArray(Zoned, "num_touching", (C,)),
+    StateArray(Zoned, "num_contacts", (C,)),  # saved as the sum of all zones
     StateArray(Gate, "next_order", (S, C, D), 8),
     StateArray(Gate, "queue", (C,)),  # saved and digested as far as vehicles wait
     StateArray(Gate, "num_queue", (S, C)),
@@ -62,17 +58,14 @@ STATE = (
     StateArray(Gate, "sums", (S, C)),
     StateArray(Gate, "num_passing", (C,)),  # between two steps no vehicle is passing the gate
     StateArray(Gate, "lane_taken", (C,)),
-    StateArray(Outputs, "observations", (S, C, T)),  # saved where an observation has earlier frames
-    StateArray(Outputs, "terms", (S, C, T)),
+    StateArray(Outputs, "observations", (S, C)),  # saved where an observation has earlier frames
+    StateArray(Outputs, "terms", (S, C)),
     StateArray(Outputs, "rewards", (S, C)),
-    StateArray(Outputs, "terminated", (S, C, T)),
-    StateArray(Outputs, "present", (S, C, T)),
-    StateArray(Outputs, "acted", (S, C, T)),
-    StateArray(Outputs, "events", (S, C, T)),
-    StateArray(Outputs, "vehicle_ids", (S, C, T)),
-    StateArray(Mail, "objects", (T,)),
-    StateArray(Mail, "events", (T,)),
-    StateArray(Mail, "signals", (T,)),
+    StateArray(Outputs, "terminated", (S, C)),
+    StateArray(Outputs, "present", (S, C)),
+    StateArray(Outputs, "acted", (S, C)),
+    StateArray(Outputs, "events", (S, C)),
+    StateArray(Outputs, "vehicle_ids", (S, C)),
 )
 
 

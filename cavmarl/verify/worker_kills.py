@@ -22,7 +22,6 @@ from cavmarl.parallel.hosts.host_pool import HostPool
 from cavmarl.parallel.hosts.remote_worlds import RemoteWorlds
 from cavmarl.parallel.pooled_worlds import PooledWorlds
 from cavmarl.parallel.processes.worker_pool import Death, Pool
-from cavmarl.parallel.split_hosts.divided_worlds import DividedWorlds
 from cavmarl.verify.differences import Arrays, DrivenRun, same_bytes
 
 FIRST_STEPS = 10  # before any is killed, to know how long a step takes
@@ -108,6 +107,11 @@ def verify_kills(
     if steps < kills + FIRST_STEPS:
         raise ConfigError(f"{steps} steps: {kills} kills need at least {kills + FIRST_STEPS}")
     worlds = 2 * workers if worlds is None else worlds
+    if hosts is not None and workers > worlds:
+        raise ConfigError(
+            f"{workers} workers on hosts = {hosts!r}, {worlds} world(s): they would be nodes; use "
+            "verify --nodes, or more worlds"
+        )
     wanted = {"num_envs": worlds, "zones": zones, **spec.keywords}
     whole = make_vec(spec.env, **wanted)
     parted = make_vec(spec.env, workers=workers, hosts=hosts, **wanted)
@@ -141,7 +145,7 @@ def verify_kills(
 
 
 def _pool(vec: CavVectorEnv) -> Pool | HostPool:
-    assert isinstance(vec.worlds, PooledWorlds | RemoteWorlds | DividedWorlds)
+    assert isinstance(vec.worlds, PooledWorlds | RemoteWorlds)
     return vec.worlds.pool
 
 

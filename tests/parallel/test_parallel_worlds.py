@@ -92,7 +92,10 @@ def test_the_processes_end_with_the_environment() -> None:
         ({"hosts": "ray"}, r"hosts = 'ray' without workers"),
         ({"workers": "two"}, r"workers = 'two': must be a whole number, or 'ray'"),
         ({"workers": -1, "hosts": "ray"}, r"workers = -1: must be a number from 0"),
-        ({"workers": 5, "hosts": "ray", "zones": 4}, r"workers = 5, .* at most as many as zones"),
+        (
+            {"workers": 5, "hosts": "ray", "zones": 4},
+            r"nodes = 5: a world of 4 zone",
+        ),
         ({"workers": "ray", "render_mode": "rgb_array"}, r"workers = 'ray': such worlds are only"),
     ],
 )

@@ -20,7 +20,7 @@ from cavmarl import CapacityError, ConfigError, parallel_env
 from cavmarl.core.errors import WorkerError
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.parallel.hosts.remote_worlds import RemoteWorlds
-from cavmarl.parallel.split_hosts.divided_worlds import DividedWorlds
+from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from tests.parallel.test_moving import RESTLESS, uneven
 from tests.parallel.test_parallel_worlds import drive as drive_view
 from tests.parallel.test_parallel_worlds import settings
@@ -183,37 +183,10 @@ def test_worlds_that_move_between_nodes_are_the_same(
     assert sum(uneven) > 0
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
-def test_one_world_over_two_nodes(make: Make, cluster: Any, how: signal.Signals) -> None:
-    wanted = WANTED | {"num_envs": 1, "background": 40}
-    whole = drive(make("town", **wanted))
-    vec = make("town", zones=4, workers=2, hosts="ray", **wanted)
-    assert isinstance(vec.worlds, DividedWorlds)
-    pool = vec.worlds.pool
-    vec.reset(seed=0)
-    assert len(set(nodes_of(pool.pids))) == 2
-    timers: list[Timer] = []
-
-    def strike(step: int) -> None:
-        if step in (3, 8):
-            pool.await_spare()
-            timers.append(Timer(0.001 * step, os.kill, (pool.pids[step % 2], how)))
-            timers[-1].start()
-
-    assert same(drive(vec, before=strike), whole)
-    for timer in timers:
-        timer.join()
-    pool.ping()
-    assert [death.worker for death in pool.deaths] == [1, 0]
-    pids = pool.pids
-    vec.close()
-    await_true(lambda: not any(psutil.pid_exists(pid) for pid in pids))
-
-
-def test_the_divided_world_as_pettingzoo_sees_it(cluster: Any) -> None:
+def test_zones_of_one_world_are_hosted_by_nodes(cluster: Any) -> None:
     whole = drive_view(parallel_env("grid4x4", **settings("open", "dict")))
     env = parallel_env("grid4x4", workers=2, hosts="ray", **settings("open", "dict"))
-    assert isinstance(env.worlds, DividedWorlds)
+    assert isinstance(env.worlds, NodeWorlds)
     assert drive_view(env) == whole
     env.close()
 

@@ -115,22 +115,6 @@ class HostPool:
         """
         return self._command(self._all, task, _said(letters, inputs), outputs, commits, sizes)
 
-    def tell(
-        self,
-        task: int,
-        # called for each host that is given the order, and told whether it has carried out the last
-        # one; what it returns is sent at once
-        say: Say,
-        # part, answer → arrays that what comes out is written to
-        outputs: Callable[[int, Any], Arrays],
-    ) -> list[Any]:  # what each part has answered; errors as of `run`
-        """Let all hosts do a task for a caller that keeps the state of all parts itself.
-
-        Nothing is committed: the successor of a dead host is told all that it
-        needs.
-        """
-        return self._command(self._all, task, say, outputs, False)
-
     def ask(self, part: int, task: int, letter: Any = None) -> Any:
         """Let the host of one part do a task that changes nothing; raises as `run`."""
         letters = [letter] * len(self._all)

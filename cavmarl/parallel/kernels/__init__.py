@@ -1,1 +1,0 @@
-"""Compiled copies between replicas of shared arrays."""

@@ -1,1 +1,0 @@
-"""The zones of one world on several machines."""
