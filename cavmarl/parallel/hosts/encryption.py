@@ -56,7 +56,21 @@ def leaves_this_machine(connection: socket.socket) -> bool:
     """Whether the other end is elsewhere, as its address says."""
     if connection.family not in (socket.AF_INET, socket.AF_INET6):
         return False
-    return not ipaddress.ip_address(connection.getpeername()[0].partition("%")[0]).is_loopback
+    return not _is_loopback(connection.getpeername()[0])
+
+
+def prepare(address: str, secret: bytes) -> None:
+    """Make ready to encrypt what comes to an address, if others than this machine can call there.
+
+    Raises:
+        MissingExtraError: cryptography is not installed.
+    """
+    if not _is_loopback(address):
+        _context(secret, calls=False)
+
+
+def _is_loopback(address: str) -> bool:
+    return ipaddress.ip_address(address.partition("%")[0]).is_loopback
 
 
 def encrypted(connection: socket.socket, secret: bytes, calls: bool) -> EncryptedSocket:

@@ -24,7 +24,12 @@ from collections.abc import Iterator
 from contextlib import suppress
 
 from cavmarl.core.errors import MessageError, WorkerError
-from cavmarl.parallel.hosts.encryption import EncryptedSocket, encrypted, leaves_this_machine
+from cavmarl.parallel.hosts.encryption import (
+    EncryptedSocket,
+    encrypted,
+    leaves_this_machine,
+    prepare,
+)
 from cavmarl.parallel.hosts.framed_socket import MAGIC, VERSION, FramedSocket
 
 NONCE = 16  # bytes of a random number
@@ -113,6 +118,7 @@ class Listener:
 
     Raises:
         WorkerError: nobody can listen there.
+        MissingExtraError: others than this machine can call there, and cryptography is missing.
     """
 
     def __init__(
@@ -132,6 +138,11 @@ class Listener:
             ) from error
         self._listener.setblocking(False)
         self.place: tuple[str, int] = self._listener.getsockname()[:2]  # address and port
+        try:
+            prepare(self.place[0], self.secret)
+        except BaseException:
+            self._listener.close()
+            raise
         self._guests: list[PendingConnection] = []
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listener, selectors.EVENT_READ)

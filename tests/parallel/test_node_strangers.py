@@ -1,0 +1,126 @@
+"""Callers that are no nodes of the run, or none that are wanted, at real sockets."""
+
+from __future__ import annotations
+
+import secrets
+import socket
+import sys
+import threading
+from contextlib import closing, suppress
+
+import pytest
+
+from cavmarl.core.errors import MessageError, MissingExtraError, NodeRefusedError
+from cavmarl.ownership.messages import COORDINATOR
+from cavmarl.parallel.hosts.framed_socket import VERSION
+from cavmarl.parallel.hosts.host_process import code_stamp
+from cavmarl.parallel.hosts.listener import Listener, call
+from cavmarl.parallel.nodes import newcomers as newcomers_module
+from cavmarl.parallel.nodes.links import FrameKind, LinkLostError, Links
+from cavmarl.parallel.nodes.newcomers import ANYONE, Newcomers
+from cavmarl.parallel.nodes.node_process import run_node
+from tests.parallel.test_node_joining import WAIT_S, elsewhere
+
+
+class Door:
+    """A caller's end, in a thread."""
+
+    def __init__(self, key: bytes, address: str = "127.0.0.1", room: int = 1) -> None:
+        self.listener = Listener(address, key)
+        self.newcomers = Newcomers(self.listener, {}, [], lambda: room)
+        self._is_open = True
+        self._thread = threading.Thread(target=self._look)
+        self._thread.start()
+
+    def _look(self) -> None:
+        while self._is_open:
+            self.newcomers.look(5.0)
+
+    def close(self) -> None:
+        self._is_open = False
+        self._thread.join()
+        self.newcomers.close()
+
+
+def test_who_has_another_key_stays_outside() -> None:
+    for address in ("127.0.0.1", elsewhere()):
+        with closing(Door(b"a" * 32, address)) as door:
+            with pytest.raises(MessageError, match="give both the same key"):
+                run_node(door.listener.place, b"b" * 32, ANYONE)
+
+
+def answer(server: socket.socket, said: bytes) -> threading.Thread:
+    """Somebody who answers the first caller, and ends."""
+
+    def run() -> None:
+        connection, _ = server.accept()
+        with connection:
+            connection.recv(1 << 16)
+            connection.sendall(said)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    return thread
+
+
+def test_who_does_not_encrypt_stays_outside() -> None:
+    with closing(Door(b"a" * 32, elsewhere())) as door:
+        with socket.create_connection(door.listener.place) as stranger:
+            stranger.settimeout(5.0)
+            stranger.sendall(secrets.token_bytes(100))
+            with suppress(ConnectionResetError):
+                assert b"cav" not in stranger.recv(100)
+    with socket.create_server((elsewhere(), 0)) as server:
+        answering = answer(server, bytes(100))
+        with pytest.raises(MessageError, match="does not encrypt as cavmarl does"):
+            call(server.getsockname()[:2], b"a" * 32, ANYONE)
+        answering.join()
+
+
+def test_encryption_needs_its_library_from_the_beginning(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cryptography", None)
+    with pytest.raises(MissingExtraError, match="nodes"):
+        Listener(elsewhere(), secrets.token_bytes(32))
+    Listener("127.0.0.1").close()
+
+
+def test_another_version_is_told_which_one_is_spoken() -> None:
+    with closing(Door(b"a" * 32)) as door:
+        with socket.create_connection(door.listener.place) as stranger:
+            stranger.settimeout(5.0)
+            stranger.sendall(b"cavW" + (VERSION + 1).to_bytes(2, "little") + bytes(20))
+            assert stranger.recv(100) == b"cavW" + VERSION.to_bytes(2, "little")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        answering = answer(server, b"cavW\x63\x00")
+        with pytest.raises(MessageError, match=f"speaks version 99, this is {VERSION}"):
+            call(server.getsockname()[:2], b"a" * 32, ANYONE)
+        answering.join()
+
+
+@pytest.mark.parametrize(
+    ("code", "room", "words"),
+    [
+        ("cavmarl of another day", 1, "runs cavmarl of another day.*install the same versions"),
+        ("", 0, "no more nodes are wanted"),
+    ],
+)
+def test_nodes_that_are_not_wanted(
+    monkeypatch: pytest.MonkeyPatch, code: str, room: int, words: str
+) -> None:
+    if code:
+        monkeypatch.setattr(newcomers_module, "code_stamp", code_stamp)
+        monkeypatch.setattr("cavmarl.parallel.nodes.node_process.code_stamp", lambda: code)
+    with closing(Door(b"a" * 32, room=room)) as door:
+        with pytest.raises(NodeRefusedError, match=words):
+            run_node(door.listener.place, b"a" * 32, ANYONE)
+
+
+def test_who_has_come_in_and_talks_nonsense_is_sent_away() -> None:
+    with closing(Door(b"a" * 32)) as door:
+        for said in (b"no JSON", b"[]", b"{}"):
+            links = Links(lambda number, frame: None)
+            links.add(COORDINATOR, call(door.listener.place, b"a" * 32, ANYONE))
+            links.send(COORDINATOR, FrameKind.JOIN, 0, [said])
+            with pytest.raises(LinkLostError):
+                links.take([COORDINATOR], WAIT_S)
+            links.close()
