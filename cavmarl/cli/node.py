@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import socket
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -25,6 +25,9 @@ def node(
     allow: Annotated[
         list[str] | None, about("Names of identities that it serves; default: all.")
     ] = None,
+    snapshot: Annotated[
+        Literal["measured", "idle"], about("Load that it tells: this machine's, or none.")
+    ] = "measured",
     secret_file: SecretFile = None,
     certificate: Certificate = None,
     key: Key = None,
@@ -43,6 +46,7 @@ def node(
         slots=slots,
         capabilities=tuple(capability or ()),
         allowed=tuple(allow or ()),
+        is_supposed_idle=snapshot == "idle",
         certificate=certificate,
         key=key,
         authority=None if authority is None else str(Path(authority)),

@@ -18,13 +18,14 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from cavmarl.core.errors import ServiceError
 from cavmarl.service.guards import Service, rule_of
-from cavmarl.service.metrics import ServiceMetrics
 from cavmarl.service.problems import add_handlers, answer
 from cavmarl.service.routes import ROUTERS
+from cavmarl.service.service_metrics import ServiceMetrics
 
 MAX_BODY_BYTES = 256 * 1024
 MAX_PATH_BYTES = 1024
 BODY_S = 10.0  # in which a body has to come
+PROBLEM_TYPE = b"application/problem+json"
 HEADERS = {
     b"x-content-type-options": b"nosniff",
     b"cache-control": b"no-store",
@@ -33,7 +34,7 @@ HEADERS = {
 }
 
 
-def make_app(service: Service, sweep_s: float = 0.5) -> FastAPI:
+def make_app(service: Service, sweep_s: float = 0.5) -> ASGIApp:
     """The application; it sweeps the broker so often."""
 
     @asynccontextmanager
@@ -60,8 +61,7 @@ def make_app(service: Service, sweep_s: float = 0.5) -> FastAPI:
         _check_rules(router)
         app.include_router(router)
     add_handlers(app)
-    app.add_middleware(GuardedRequests)
-    return app
+    return GuardedRequests(app)
 
 
 def _check_rules(router: APIRouter) -> None:
@@ -109,8 +109,22 @@ class GuardedRequests:
             is_read = not message.get("more_body", False)
             return message
 
+        is_replaced = False
+
         async def send_with_headers(message: Message) -> None:
+            nonlocal is_replaced
+            if is_replaced and message["type"] == "http.response.body":
+                return
             if message["type"] == "http.response.start":
+                if (
+                    message["status"] == 413
+                    and PROBLEM_TYPE not in dict(message["headers"]).values()
+                ):
+                    await answer("too-large", "the body is too large for this route")(
+                        scope, receive, send_with_headers
+                    )
+                    is_replaced = True  # it was the framework's own, in plain text
+                    return
                 message = {**message, "headers": [*message["headers"], *HEADERS.items()]}
             await send(message)
 

@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from cavmarl.balance.load_score import Utilisation
+from cavmarl.service.bodies import BeatBody, NodeBody
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.infrastructure import (
     SESSION_OVER,
@@ -20,9 +21,8 @@ from cavmarl.service.infrastructure import (
     NodeRecord,
     SessionRecord,
 )
-from cavmarl.service.messages import BeatBody, NodeBody
+from cavmarl.service.node_selection import Chosen, LiveNode, NoNodeError, choose, overloads
 from cavmarl.service.refusals import problem
-from cavmarl.service.selection import Chosen, LiveNode, NoNodeError, choose, overloads
 
 SHOWN_EXCLUSIONS = 10  # in an event
 

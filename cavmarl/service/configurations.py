@@ -14,9 +14,9 @@ from typing import Any
 
 from cavmarl.config.registry import agent_entries, entries, load_config
 from cavmarl.core.errors import CavmarlError
+from cavmarl.service.bodies import ConfigurationBody
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.infrastructure import IdentityRecord
-from cavmarl.service.messages import ConfigurationBody
 from cavmarl.service.refusals import problem
 
 _PLAIN = re.compile(r"[A-Za-z0-9_+:#,() -]{0,64}")

@@ -11,6 +11,7 @@ import json
 import os
 import threading
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import IO, Any
 
@@ -83,6 +84,7 @@ class EventStore:
     def __init__(self, where: str | Path) -> None:
         self.where = str(where)
         self._lock: IO[bytes] | None = None
+        self._open = ExitStack()
         self._guard = threading.Lock()  # of the one connection
         self.url = url = _url_of(self.where)
         self.is_embedded = url.get_backend_name() == "sqlite"
@@ -90,21 +92,22 @@ class EventStore:
             self._lock = _lock_file(Path(str(url.database)))
         try:
             engine = create_engine(url, pool_size=1, max_overflow=0)
+            self._open.callback(engine.dispose)
             if self.is_embedded:
                 event.listen(engine, "connect", _make_durable)
-            self._connection = engine.connect()
+            self._connection = self._open.enter_context(engine.connect())
             if not self.is_embedded:
                 self._hold_advisory_lock()
             self._check_schema()
         except SQLAlchemyError as error:
-            self._unlock()
+            self.close()
             cause = str(getattr(error, "orig", error)).strip().splitlines()[0]
             raise ServiceError(
                 f"store {url.render_as_string()}: cannot be opened ({cause}); see that its folder "
                 "or server is there and may be written"
             ) from error
         except ServiceError:
-            self._unlock()
+            self.close()
             raise
 
     def append(
@@ -174,9 +177,10 @@ class EventStore:
 
     def close(self) -> None:
         """Let another service have it."""
-        self._connection.close()
-        self._connection.engine.dispose()
-        self._unlock()
+        self._open.close()
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
 
     def _check_schema(self) -> None:
         connection = self._connection
@@ -196,11 +200,6 @@ class EventStore:
             query = text("SELECT pg_try_advisory_lock(:key)")
             if not self._connection.execute(query, {"key": _LOCK_KEY}).scalar():
                 raise _taken(self.url.render_as_string())
-
-    def _unlock(self) -> None:
-        if self._lock is not None:
-            self._lock.close()
-            self._lock = None
 
 
 def _url_of(where: str) -> URL:

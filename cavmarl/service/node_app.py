@@ -15,15 +15,16 @@ from typing import Annotated, Any
 import jwt
 from fastapi import APIRouter, Depends, FastAPI, Query, Request, Response
 from fastapi.responses import JSONResponse
+from starlette.types import ASGIApp
 
 from cavmarl.client.world_flows import SAVED_HEADER
 from cavmarl.core.errors import ServiceError
 from cavmarl.service.access import ALGORITHM, ISSUER
 from cavmarl.service.app import GuardedRequests
-from cavmarl.service.hosted_worlds import SAVED_EVERY, HostedWorlds
 from cavmarl.service.node_link import NodeLink
 from cavmarl.service.problems import add_handlers
 from cavmarl.service.refusals import problem
+from cavmarl.service.session_worlds import SAVED_EVERY, SessionWorlds
 
 MAX_ACTIONS_BYTES = 16 * 1024 * 1024
 
@@ -60,7 +61,7 @@ async def _opened(request: Request, session: str) -> str:
 Opened = Annotated[str, Depends(_opened)]
 
 
-def make_node_app(link: NodeLink, worlds: HostedWorlds) -> FastAPI:
+def make_node_app(link: NodeLink, worlds: SessionWorlds) -> ASGIApp:
     """The application of a node."""
     app = FastAPI(
         title="cavmarl node",
@@ -74,12 +75,11 @@ def make_node_app(link: NodeLink, worlds: HostedWorlds) -> FastAPI:
     app.state.link, app.state.worlds = link, worlds
     app.include_router(router)
     add_handlers(app)
-    app.add_middleware(GuardedRequests)
-    return app
+    return GuardedRequests(app)
 
 
-def _worlds(request: Request) -> HostedWorlds:
-    found: HostedWorlds = request.app.state.worlds
+def _worlds(request: Request) -> SessionWorlds:
+    found: SessionWorlds = request.app.state.worlds
     return found
 
 
@@ -153,7 +153,7 @@ async def close_worlds(request: Request, session: str, _: Opened) -> None:
     await asyncio.to_thread(_worlds(request).close, session)
 
 
-async def _save(link: NodeLink, worlds: HostedWorlds, session: str) -> None:
+async def _save(link: NodeLink, worlds: SessionWorlds, session: str) -> None:
     world = worlds[session]
     number = world.number
     if number == world.saved:
@@ -170,7 +170,7 @@ async def _save(link: NodeLink, worlds: HostedWorlds, session: str) -> None:
     world.saved = number
 
 
-async def _in_turn(worlds: HostedWorlds, act: Callable[[], Any]) -> Any:
+async def _in_turn(worlds: SessionWorlds, act: Callable[[], Any]) -> Any:
     """Do something with worlds, in a thread, when no other does."""
 
     def wait_and_act() -> Any:

@@ -17,10 +17,10 @@ from cavmarl.core.errors import CavmarlError, ServiceError
 from cavmarl.evaluate.evaluation import evaluate
 from cavmarl.evaluate.fresh import call_in_fresh_process
 from cavmarl.service.configurations import world_keywords
-from cavmarl.service.hosted_worlds import HostedWorlds
 from cavmarl.service.node_app import make_node_app
 from cavmarl.service.node_link import NodeLink, is_final
 from cavmarl.service.server import ServerOptions, check_transport, listen, uvicorn_config
+from cavmarl.service.session_worlds import SessionWorlds
 
 MOST_MESSAGE = 2000
 DRAIN_S = 60.0  # after which a node that is drained ends, whatever it has
@@ -39,6 +39,7 @@ class NodeOptions:
     slots: int = 4
     capabilities: tuple[str, ...] = ()
     allowed: tuple[str, ...] = ()
+    is_supposed_idle: bool = False  # tell no load
     certificate: Path | None = None
     key: Path | None = None
     authority: str | None = None  # file of the authority that has signed the service's certificate
@@ -47,7 +48,7 @@ class NodeOptions:
 @dataclass
 class _Host:
     link: NodeLink
-    worlds: HostedWorlds
+    worlds: SessionWorlds
     tell: Callable[[str], None]
     jobs: dict[str, asyncio.Task[None]] = field(default_factory=dict)
     failure: ServiceError | None = None
@@ -77,8 +78,9 @@ async def _run(options: NodeOptions, tell: Callable[[str], None]) -> None:
         "capabilities": [*tls, *options.capabilities],
         "allowed": list(options.allowed),
     }
-    link = NodeLink(options.service, options.secret, body, verify=options.authority or True)
-    host = _Host(link, HostedWorlds(options.slots), tell)
+    trust = {"verify": options.authority or True}
+    link = NodeLink(options.service, options.secret, body, options.is_supposed_idle, **trust)
+    host = _Host(link, SessionWorlds(options.slots), tell)
     server = uvicorn.Server(
         uvicorn_config(
             make_node_app(link, host.worlds),

@@ -26,9 +26,17 @@ class NodeLink:
         url: of the service.
         secret: of an identity with the role `node`.
         body: with which it registers; docs/service.md has its fields.
+        is_supposed_idle: tell no load, so that selection goes by sessions alone.
     """
 
-    def __init__(self, url: str, secret: str, body: dict[str, Any], **options: Any) -> None:
+    def __init__(
+        self,
+        url: str,
+        secret: str,
+        body: dict[str, Any],
+        is_supposed_idle: bool = False,
+        **options: Any,
+    ) -> None:
         self._client = AsyncClient(url, secret, **options)
         self._body = {**body, "versions": {"cavmarl": version("cavmarl")}}
         self.name: str = body["name"]
@@ -38,6 +46,7 @@ class NodeLink:
         self._keys: dict[str, Any] = {}
         self._expected: dict[str, float] = {}
         self._gpu = 0.0
+        self._is_supposed_idle = is_supposed_idle
 
     async def register(self) -> None:
         """Say that this process is the node."""
@@ -49,14 +58,17 @@ class NodeLink:
     async def beat(self, counters: dict[str, float]) -> dict[str, Any]:
         """Say how busy this machine is; what the node has to do."""
         number = next(self._beats)
-        if number % GPU_EVERY == 0:
-            self._gpu = (await asyncio.to_thread(busiest_gpu))[0]
+        load = {"cpu": 0.0, "ram": 0.0, "gpu": 0.0}
+        if not self._is_supposed_idle:
+            if number % GPU_EVERY == 0:
+                self._gpu = (await asyncio.to_thread(busiest_gpu))[0]
+            load["cpu"] = min(psutil.cpu_percent(None) / 100.0, 1.0)
+            load["ram"] = psutil.virtual_memory().percent / 100.0
+            load["gpu"] = self._gpu
         body = {
+            **load,
             "incarnation": self.incarnation,
             "sequence": number,
-            "cpu": min(psutil.cpu_percent(None) / 100.0, 1.0),
-            "ram": psutil.virtual_memory().percent / 100.0,
-            "gpu": self._gpu,
             "sent_s": time.time(),
             "counters": counters,
         }

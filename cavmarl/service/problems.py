@@ -11,8 +11,8 @@ from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
 from cavmarl.core.errors import CavmarlError, ServiceError
+from cavmarl.service.node_selection import NoNodeError
 from cavmarl.service.refusals import PROBLEMS
-from cavmarl.service.selection import NoNodeError
 
 MOST_EXCLUSIONS = 100  # that an answer names
 

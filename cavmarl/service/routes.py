@@ -12,7 +12,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from fastapi.responses import PlainTextResponse, StreamingResponse
 
-from cavmarl.service import configurations, messages
+from cavmarl.service import bodies, configurations
 from cavmarl.service.guards import (
     DurableRoute,
     Service,
@@ -26,8 +26,8 @@ from cavmarl.service.infrastructure import (
     NodeRecord,
     SessionRecord,
 )
+from cavmarl.service.node_selection import NoNodeError, score_of
 from cavmarl.service.refusals import problem
-from cavmarl.service.selection import NoNodeError, score_of
 
 open_routes = APIRouter(prefix="/v1", route_class=DurableRoute, tags=["open"])
 nodes = APIRouter(prefix="/v1/nodes", route_class=DurableRoute, tags=["nodes"])
@@ -50,9 +50,9 @@ Admins = Annotated[IdentityRecord, Depends(may("admin"))]
 Nodes = Annotated[IdentityRecord, Depends(may("node"))]
 Anybody = Annotated[IdentityRecord, Depends(open_to_all())]
 
-NodeName = Annotated[messages.Name, Path()]
+NodeName = Annotated[bodies.Name, Path()]
 SessionId = Annotated[str, Path(pattern=r"^s-[0-9a-f]{24}$")]
-FileName = Annotated[messages.Name, Path()]
+FileName = Annotated[bodies.Name, Path()]
 
 
 @open_routes.get("/health")
@@ -68,7 +68,7 @@ async def keys(_: Anybody, service: TheService) -> dict[str, Any]:
 
 
 @open_routes.post("/token")
-async def token(_: Anybody, service: TheService, body: messages.TokenBody) -> dict[str, Any]:
+async def token(_: Anybody, service: TheService, body: bodies.TokenBody) -> dict[str, Any]:
     """An access token and a refresh token for a secret, or for a refresh token."""
     return service.access.exchange(body.secret, body.refresh_token)
 
@@ -86,14 +86,14 @@ async def list_nodes(_: Readers, service: TheService) -> dict[str, Any]:
 
 
 @nodes.post("", status_code=201)
-async def register(identity: Nodes, service: TheService, body: messages.NodeBody) -> dict[str, Any]:
+async def register(identity: Nodes, service: TheService, body: bodies.NodeBody) -> dict[str, Any]:
     """Register a node, or register it anew after it has left, died or begun again."""
     return _node(service, service.broker.register(identity, body))
 
 
 @nodes.post("/{name}/beat")
 async def beat(
-    identity: Nodes, service: TheService, name: NodeName, body: messages.BeatBody
+    identity: Nodes, service: TheService, name: NodeName, body: bodies.BeatBody
 ) -> dict[str, Any]:
     """Say that a node is alive; the answer says what it has to do."""
     found = service.broker.beat(identity, name, body)
@@ -122,7 +122,7 @@ async def leave(identity: Drainers, service: TheService, name: NodeName) -> dict
 
 @worlds.post("/configurations", status_code=201)
 async def add_configuration(
-    identity: Clients, service: TheService, body: messages.ConfigurationBody
+    identity: Clients, service: TheService, body: bodies.ConfigurationBody
 ) -> dict[str, Any]:
     """Check and keep a configuration; another content is another version."""
     return configurations.add_configuration(service.broker.log, identity, body)
@@ -130,7 +130,7 @@ async def add_configuration(
 
 @worlds.get("/configurations/{sha256}")
 async def get_configuration(
-    _: Everyone, service: TheService, sha256: Annotated[messages.Sha256, Path()]
+    _: Everyone, service: TheService, sha256: Annotated[bodies.Sha256, Path()]
 ) -> dict[str, Any]:
     """A configuration by its hash."""
     return configurations.read_configuration(service.broker.log, sha256)
@@ -138,7 +138,7 @@ async def get_configuration(
 
 @worlds.post("/sessions", status_code=201)
 async def open_session(
-    identity: Clients, service: TheService, body: messages.SessionBody
+    identity: Clients, service: TheService, body: bodies.SessionBody
 ) -> dict[str, Any]:
     """Open a session on the node that eq. (1) and (2) choose, or on a preferred one."""
     configurations.read_configuration(service.broker.log, body.configuration)
@@ -153,7 +153,7 @@ async def open_session(
 
 @worlds.post("/sessions/{number}/resolve")
 async def resolve(
-    identity: Clients, service: TheService, number: SessionId, body: messages.ResolveBody
+    identity: Clients, service: TheService, number: SessionId, body: bodies.ResolveBody
 ) -> dict[str, Any]:
     """Where a session is now, and a new lease of it."""
 
@@ -210,7 +210,7 @@ async def put_state(
 
 
 @worlds.post("/jobs", status_code=201)
-async def submit(identity: Clients, service: TheService, body: messages.JobBody) -> dict[str, Any]:
+async def submit(identity: Clients, service: TheService, body: bodies.JobBody) -> dict[str, Any]:
     """Have a node evaluate drivers; where none can, the job waits for one."""
     configurations.read_configuration(service.broker.log, body.configuration)
     configurations.check_policies(body.policies)
@@ -224,7 +224,7 @@ async def submit(identity: Clients, service: TheService, body: messages.JobBody)
 
 @worlds.post("/jobs/{number}/outcome")
 async def finish(
-    identity: Nodes, service: TheService, number: SessionId, body: messages.OutcomeBody
+    identity: Nodes, service: TheService, number: SessionId, body: bodies.OutcomeBody
 ) -> dict[str, Any]:
     """A node has ended a job."""
     session = service.broker.hosted(identity, number)
@@ -288,7 +288,7 @@ async def metrics(_: Viewers, request: Request) -> PlainTextResponse:
 
 @records.post("/identities", status_code=201)
 async def add_identity(
-    identity: Admins, service: TheService, body: messages.IdentityBody
+    identity: Admins, service: TheService, body: bodies.IdentityBody
 ) -> dict[str, Any]:
     """A new identity, and its secret, which is shown this once."""
     found, secret = service.access.add_identity(body.name, body.role, identity.id)

@@ -16,7 +16,7 @@ from cavmarl.service.refusals import problem
 SAVED_EVERY = 50  # commands
 
 
-class HostedWorld:
+class SessionWorld:
     """The worlds of one session.
 
     Args:
@@ -115,7 +115,7 @@ class HostedWorld:
         self._vec.close()
 
 
-class HostedWorlds:
+class SessionWorlds:
     """The sessions of a node; one command at a time, as kernels use all of a core anyway.
 
     Args:
@@ -127,12 +127,12 @@ class HostedWorlds:
         self.ticks = self.steps = 0
         self.wait_s = 0.0
         self._slots = slots
-        self._worlds: dict[str, HostedWorld] = {}
+        self._worlds: dict[str, SessionWorld] = {}
 
     def __contains__(self, session: str) -> bool:
         return session in self._worlds
 
-    def __getitem__(self, session: str) -> HostedWorld:
+    def __getitem__(self, session: str) -> SessionWorld:
         if session not in self._worlds:
             raise problem("lost", f"session '{session}' is not on this node: resolve it again")
         return self._worlds[session]
@@ -143,7 +143,7 @@ class HostedWorlds:
             raise CapacityError(f"{self._slots} sessions are on this node: resolve it again later")
         with self.lock:
             if session not in self._worlds:
-                self._worlds[session] = HostedWorld(document, state, number)
+                self._worlds[session] = SessionWorld(document, state, number)
 
     def keep_only(self, sessions: set[str]) -> None:
         """Close those that are another node's now."""

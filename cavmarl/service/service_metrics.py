@@ -10,7 +10,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector as PrometheusCollector
 
 from cavmarl.service.broker import Broker
-from cavmarl.service.selection import score_of
+from cavmarl.service.node_selection import score_of
 
 BUCKETS_S = (0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.5)
 _TOLD = {  # by nodes, with their beats

@@ -1,0 +1,76 @@
+"""A service and its nodes in processes of their own."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from cavmarl.client import Client
+
+__all__ = ["Cluster", "RunningService", "running_service"]
+
+
+@dataclass
+class RunningService:
+    """`cavmarl serve` in a process of its own."""
+
+    process: subprocess.Popen[str]
+    url: str
+    secret: str  # of the admin; nothing, if there was one before
+    store: Path
+
+    def client(self, secret: str = "", **options: Any) -> Client:
+        return Client(self.url, secret or self.secret, **options)
+
+    def grant(self, name: str, role: str) -> str:
+        with self.client() as admin:
+            return str(admin.post("/identities", {"name": name, "role": role})["secret"])
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+
+@contextmanager
+def running_service(store: Path, *options: str) -> Iterator[RunningService]:
+    """A service on a socket; it ends with the block."""
+    has_admin = store.exists()
+    words = [sys.executable, "-m", "cavmarl", "serve", "--port", "0", "--store", str(store)]
+    with subprocess.Popen([*words, *options], stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            url = process.stdout.readline().split()[1].rstrip(",")
+            secret = "" if has_admin else process.stdout.readline().split()[-1]
+            yield RunningService(process, url, secret, store)
+        finally:
+            process.terminate()
+
+
+@dataclass
+class Cluster:
+    """Node processes of a running service, by name."""
+
+    service: RunningService
+    processes: dict[str, subprocess.Popen[str]] = field(default_factory=dict)
+
+    def start(self, name: str, *options: str) -> None:
+        secret = self.service.grant(f"{name}-{len(self.processes)}", "node")
+        words = [sys.executable, "-m", "cavmarl", "node", "--service", self.service.url]
+        words += ["--name", name, "--snapshot", "idle", *options]
+        environment = {**os.environ, "CAVMARL_SECRET": secret}
+        process = subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, text=True)
+        self.processes[name] = process
+        assert process.stdout is not None
+        assert name in process.stdout.readline()
+
+    def stop(self) -> None:
+        for process in self.processes.values():
+            process.send_signal(signal.SIGKILL)
+            process.communicate()
