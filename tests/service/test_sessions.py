@@ -27,8 +27,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
     store = tmp_path_factory.mktemp("service") / "store.sqlite"
     with running_service(store, "--lease-s", "3", "--beat-s", "0.3") as service:
         started = Cluster(service)
-        started.start("a")
-        started.start("b")
+        started.start("a", "b", "victim")
         yield started
         started.stop()
 
@@ -64,7 +63,6 @@ def make_local() -> cavmarl.CavVectorEnv:
 def test_a_session_goes_on_bit_for_bit_when_its_node_is_killed(
     cluster: Cluster, client: Client
 ) -> None:
-    cluster.start("victim")
     remote, local = open_world(client, node="victim"), make_local()
     assert remote.flows.assignment["assigned"] == "victim"
     np.testing.assert_array_equal(remote.reset(seed=5)[0], local.reset(seed=5)[0])
@@ -80,7 +78,7 @@ def test_a_session_goes_on_bit_for_bit_when_its_node_is_killed(
         "session.opened",
         "session.assigned",
         "session.saved",
-        "session.assigned",
+        "session.redirected",
     ]
     remote.close()
     assert client.get(f"/sessions/{remote.flows.session}")["state"] == "closed"
@@ -101,7 +99,6 @@ def test_a_session_moves_from_a_drained_node(cluster: Cluster, client: Client) -
 
 
 def test_another_client_takes_a_session_up(cluster: Cluster, client: Client) -> None:
-    cluster.start("c")
     remote, local = open_world(client), make_local()
     remote.reset(seed=2)
     local.reset(seed=2)

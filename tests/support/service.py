@@ -60,15 +60,22 @@ class Cluster:
     service: RunningService
     processes: dict[str, subprocess.Popen[str]] = field(default_factory=dict)
 
-    def start(self, name: str, *options: str) -> None:
-        secret = self.service.grant(f"{name}-{len(self.processes)}", "node")
+    def start(self, *names: str) -> None:
+        for name in names:
+            self._begin(name)
+        for name in names:
+            stdout = self.processes[name].stdout
+            assert stdout is not None
+            assert name in stdout.readline()
+
+    def _begin(self, name: str) -> None:
+        secret = self.service.grant(name, "node")
         words = [sys.executable, "-m", "cavmarl", "node", "--service", self.service.url]
-        words += ["--name", name, "--snapshot", "idle", *options]
+        words += ["--name", name, "--snapshot", "idle"]
         environment = {**os.environ, "CAVMARL_SECRET": secret}
-        process = subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, text=True)
-        self.processes[name] = process
-        assert process.stdout is not None
-        assert name in process.stdout.readline()
+        self.processes[name] = subprocess.Popen(
+            words, env=environment, stdout=subprocess.PIPE, text=True
+        )
 
     def stop(self) -> None:
         for process in self.processes.values():
