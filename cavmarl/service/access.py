@@ -31,7 +31,7 @@ ALGORITHM = "EdDSA"
 ACCESS_S = 900.0
 REFRESH_S = 8 * 3600.0
 KEYS_KEPT = 2  # whose tokens are taken: the present one and the one before
-MOST_BUCKETS = 10_000
+MOST_BUCKETS = MOST_VERIFIED = 10_000
 
 
 class RateLimit:
@@ -63,6 +63,7 @@ class Access:
     def __init__(self, log: EventLog, wall_s: Callable[[], float] = time.time) -> None:
         self._log = log
         self._wall_s = wall_s
+        self._verified: dict[str, tuple[str, int, float]] = {}  # signatures that were checked
         if not log.state.keys:
             self.rotate_key()
         self._load_keys()
@@ -134,7 +135,18 @@ class Access:
 
     def authenticate(self, token: str) -> IdentityRecord:
         """The identity that an access token is of; raises the problem `bad-token`."""
-        return self._identity(self._verify(token, "access")["sub"])
+        known = self._verified.get(token)
+        if known is None:
+            claims = self._verify(token, "access")
+            known = self._verified[token] = claims["sub"], claims["gen"], claims["exp"]
+            while len(self._verified) > MOST_VERIFIED:
+                del self._verified[next(iter(self._verified))]
+        number, generation, until_s = known
+        identity = self._identity(number)
+        if generation != identity.generation or until_s <= self._wall_s():
+            del self._verified[token]
+            raise problem("bad-token", "the token has expired or was revoked: get another")
+        return identity
 
     def session_token(self, session: SessionRecord, lease_s: float) -> str:
         """What opens a session on its node, until the lease ends."""
@@ -196,6 +208,7 @@ class Access:
         return identity
 
     def _load_keys(self) -> None:
+        self._verified.clear()
         newest = list(self._log.state.keys.items())[-KEYS_KEPT:]
         self._keys: dict[str, Ed25519PrivateKey] = {}
         for number, pem in newest:

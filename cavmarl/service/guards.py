@@ -36,7 +36,11 @@ def service_of(request: Request) -> Service:
     return found
 
 
-TheService = Annotated[Service, Depends(service_of)]
+async def _given(request: Request) -> Service:
+    return service_of(request)
+
+
+TheService = Annotated[Service, Depends(_given)]  # what is not async would go through a thread
 
 
 class may:
@@ -46,7 +50,8 @@ class may:
         assert set(roles) <= set(ROLES)
         self.roles = frozenset(roles)
 
-    def __call__(self, request: Request, service: TheService) -> IdentityRecord:
+    async def __call__(self, request: Request) -> IdentityRecord:
+        service = service_of(request)
         kind, _, token = request.headers.get("authorization", "").partition(" ")
         if kind.lower() != "bearer" or not token:
             service.by_address.take(_address(request))
@@ -71,8 +76,8 @@ class open_to_all(may):
     def __init__(self) -> None:
         super().__init__(*ROLES)
 
-    def __call__(self, request: Request, service: TheService) -> IdentityRecord:
-        service.by_address.take(_address(request))
+    async def __call__(self, request: Request) -> IdentityRecord:
+        service_of(request).by_address.take(_address(request))
         return IdentityRecord("nobody", "nobody", "viewer", "")
 
 

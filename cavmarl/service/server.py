@@ -130,8 +130,6 @@ def uvicorn_config(app: object, options: ServerOptions) -> uvicorn.Config:
         timeout_keep_alive=30,
         timeout_graceful_shutdown=2,
         limit_concurrency=2048,
-        h11_max_incomplete_event_size=16 * 1024,
-        http="h11",
         loop="asyncio",
         ws="none",
         proxy_headers=False,
