@@ -1,8 +1,9 @@
-"""What coordination costs: choosing among many nodes, their beats, and a day of coming and going."""
+"""What coordination costs: choosing among many nodes, their beats, a day of coming and going."""
 
 from __future__ import annotations
 
 import asyncio
+import json
 import secrets
 import subprocess
 import sys
@@ -11,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
+from urllib.parse import urlsplit
 
 import httpx
 import numpy as np
@@ -40,7 +42,7 @@ def measure(
     seed: Seed = 0,
     say: Say = silent,
 ) -> Report:
-    """Time selections, beats over HTTP, and replay a day in which nodes and sessions come and go."""
+    """Time selections and beats, and replay a day in which nodes and sessions come and go."""
     check_range(
         nodes=(nodes, 1, 10_000), requests=(requests, 1, 1_000_000),
         seconds=(seconds, 1, 3600), hours=(hours, 0.01, 1000.0),
@@ -102,7 +104,8 @@ def _selections(
     fleet = _Fleet(store, rng)
     for k in range(nodes):
         fleet.register(f"node-{k}")
-    spent, opened = [], []
+    spent: list[float] = []
+    opened: list[str] = []
     for k in range(requests):
         if k % 100 == 0:
             for name in fleet.log.state.nodes:
@@ -142,34 +145,49 @@ def _beats(store: Path, nodes: int, seconds: int) -> tuple[float, float]:
 async def _beat(
     url: str, granted: list[str], nodes: int, seconds: int, process: psutil.Process
 ) -> tuple[float, float]:
-    limits = httpx.Limits(max_connections=64, max_keepalive_connections=64)
-    async with httpx.AsyncClient(base_url=f"{url}/v1", limits=limits, timeout=60.0) as http:
-        heads = []
+    """Each connection speaks for the nodes of one identity, one after the other."""
+    tokens = []
+    async with httpx.AsyncClient(base_url=f"{url}/v1") as http:
         for secret in granted:
-            token = (await http.post("/token", json={"secret": secret})).json()["access_token"]
-            heads.append({"Authorization": f"Bearer {token}"})
-        done = 0
+            told = (await http.post("/token", json={"secret": secret})).json()
+            tokens.append(told["access_token"])
+    place = urlsplit(url)
+    lines = [await asyncio.open_connection(place.hostname, place.port) for _ in granted]
+    owned = [range(k, nodes, len(granted)) for k in range(len(granted))]
 
-        async def say(k: int, path: str, body: dict[str, Any]) -> None:
-            nonlocal done
-            answer = await http.post(path, json=body, headers=heads[k // NODES_AN_IDENTITY])
-            answer.raise_for_status()
-            done += 1
+    async def tell(k: int, path: str, body: dict[str, Any]) -> None:
+        reader, writer = lines[k]
+        content = json.dumps(body).encode()
+        head = (
+            f"POST /v1{path} HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {tokens[k]}\r\n"
+            f"Content-Type: application/json\r\nContent-Length: {len(content)}\r\n\r\n"
+        )
+        writer.write(head.encode() + content)
+        answer = (await reader.readuntil(b"\r\n\r\n")).lower()
+        assert answer.startswith(b"http/1.1 20"), answer
+        await reader.readexactly(int(answer.split(b"content-length:")[1].split(b"\r\n")[0]))
 
-        port = {"address": "127.0.0.1", "client_port": 1, "simulator_port": 1}
-        for k in range(nodes):
-            await say(k, "/nodes", {"name": f"node-{k}", **port})
+    async def register(k: int) -> None:
+        for node in owned[k]:
+            port = {"address": "127.0.0.1", "client_port": 1, "simulator_port": 1}
+            await tell(k, "/nodes", {"name": f"node-{node}", **port})
+
+    async def beat(k: int, second: int) -> None:
         load = {"cpu": 0.2, "ram": 0.3, "gpu": 0.0}
-        began_s, before_s, done = time.monotonic(), sum(process.cpu_times()[:2]), 0
-        for second in range(seconds):
+        for node in owned[k]:
             told = {"incarnation": 1, "sequence": second, "sent_s": time.time(), **load}
-            group = [say(k, f"/nodes/node-{k}/beat", told) for k in range(nodes)]
-            await asyncio.gather(*group)
-            await asyncio.sleep(max(0.0, began_s + second + 1 - time.monotonic()))
-        took_s = time.monotonic() - began_s
-        used_s = sum(process.cpu_times()[:2]) - before_s
-    beats_hz = done / took_s
-    return used_s / done * nodes, beats_hz  # of a second in which each node beats once
+            await tell(k, f"/nodes/node-{node}/beat", told)
+
+    await asyncio.gather(*map(register, range(len(granted))))
+    began_s, before_s = time.monotonic(), sum(process.cpu_times()[:2])
+    for second in range(seconds):
+        await asyncio.gather(*(beat(k, second) for k in range(len(granted))))
+        await asyncio.sleep(max(0.0, began_s + second + 1 - time.monotonic()))
+    took_s = time.monotonic() - began_s
+    used_s = sum(process.cpu_times()[:2]) - before_s
+    for _, writer in lines:
+        writer.close()
+    return used_s / seconds, nodes * seconds / took_s  # of a second in which each beats once
 
 
 def _churn(store: Path, nodes: int, hours: float, rng: np.random.Generator) -> dict[str, float]:

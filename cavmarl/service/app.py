@@ -13,6 +13,7 @@ from contextlib import asynccontextmanager, suppress
 
 from fastapi import APIRouter, FastAPI
 from fastapi.routing import APIRoute
+from fastapi.telemetry import TelemetryConfig
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -24,6 +25,12 @@ from cavmarl.service.service_metrics import ServiceMetrics
 
 MAX_BODY_BYTES = 256 * 1024
 MAX_PATH_BYTES = 1024
+NO_TELEMETRY: TelemetryConfig = {  # whatever the surroundings have set up: nothing is exported
+    "tracing": False,
+    "metrics": False,
+    "logs": False,
+    "auto_configure": False,
+}
 BODY_S = 10.0  # in which a body has to come
 PROBLEM_TYPE = b"application/problem+json"
 HEADERS = {
@@ -52,6 +59,7 @@ def make_app(service: Service, sweep_s: float = 0.5) -> ASGIApp:
         docs_url=None,
         redoc_url=None,
         redirect_slashes=False,
+        telemetry=NO_TELEMETRY,
         lifespan=lifespan,
         max_body_size=MAX_BODY_BYTES,
     )

@@ -20,7 +20,7 @@ from starlette.types import ASGIApp
 from cavmarl.client.world_flows import SAVED_HEADER
 from cavmarl.core.errors import ServiceError
 from cavmarl.service.access import ALGORITHM, ISSUER
-from cavmarl.service.app import GuardedRequests
+from cavmarl.service.app import NO_TELEMETRY, GuardedRequests
 from cavmarl.service.node_link import NodeLink
 from cavmarl.service.problems import add_handlers
 from cavmarl.service.refusals import problem
@@ -70,6 +70,7 @@ def make_node_app(link: NodeLink, worlds: SessionWorlds) -> ASGIApp:
         docs_url=None,
         redoc_url=None,
         redirect_slashes=False,
+        telemetry=NO_TELEMETRY,
         max_body_size=MAX_ACTIONS_BYTES,
     )
     app.state.link, app.state.worlds = link, worlds

@@ -10,7 +10,7 @@ from dataclasses import asdict
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
-from fastapi.responses import PlainTextResponse, StreamingResponse
+from fastapi.responses import JSONResponse, PlainTextResponse, StreamingResponse
 
 from cavmarl.service import bodies, configurations
 from cavmarl.service.guards import (
@@ -33,7 +33,7 @@ open_routes = APIRouter(prefix="/v1", route_class=DurableRoute, tags=["open"])
 nodes = APIRouter(prefix="/v1/nodes", route_class=DurableRoute, tags=["nodes"])
 worlds = APIRouter(prefix="/v1", route_class=DurableRoute, tags=["sessions"])
 records = APIRouter(prefix="/v1", route_class=DurableRoute, tags=["records"])
-ROUTERS = (open_routes, nodes, worlds, records)
+ROUTERS = (nodes, worlds, records, open_routes)  # beats are most of what comes
 
 PAGE = 1000
 TLS = "tls"  # the capability of nodes whose clients' port has it
@@ -79,6 +79,17 @@ async def withdraw(identity: Everyone, service: TheService) -> None:
     service.access.withdraw(identity)
 
 
+@nodes.post("/{name}/beat")
+async def beat(
+    identity: Nodes, service: TheService, name: NodeName, body: bodies.BeatBody
+) -> JSONResponse:
+    """Say that a node is alive; the answer says what it has to do."""
+    found = service.broker.beat(identity, name, body)
+    if service.broker.waiting:
+        await service.broker.log.stir()
+    return JSONResponse(found)
+
+
 @nodes.get("")
 async def list_nodes(_: Readers, service: TheService) -> dict[str, Any]:
     """All nodes, with what their last beats said."""
@@ -89,17 +100,6 @@ async def list_nodes(_: Readers, service: TheService) -> dict[str, Any]:
 async def register(identity: Nodes, service: TheService, body: bodies.NodeBody) -> dict[str, Any]:
     """Register a node, or register it anew after it has left, died or begun again."""
     return _node(service, service.broker.register(identity, body))
-
-
-@nodes.post("/{name}/beat")
-async def beat(
-    identity: Nodes, service: TheService, name: NodeName, body: bodies.BeatBody
-) -> dict[str, Any]:
-    """Say that a node is alive; the answer says what it has to do."""
-    found = service.broker.beat(identity, name, body)
-    if service.broker.waiting:
-        await service.broker.log.stir()
-    return found
 
 
 @nodes.post("/{name}/drain")
