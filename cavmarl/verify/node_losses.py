@@ -147,7 +147,7 @@ class _Run:
             one, other = self._hashes()  # a node that was killed last is missed now
             different = steps if different is None and one != other else different
             migrations = self._worlds.migrations
-            killed = sum(not zones for zones in self._worlds.zones)
+            killed = self._worlds.losses
         finally:
             over.close()
         median_ms = statistics.median(calm_ms) if calm_ms else 0.0
@@ -156,8 +156,7 @@ class _Run:
 
     def _strike(self, step_ms: float) -> None:
         """Kill a living node some time in the next step."""
-        pids = [process.pid for process in self._worlds.processes]
-        pid = self._random.choice([pid for pid in pids if pid not in self._struck])
+        pid = self._random.choice([pid for pid in self._worlds.pids if pid not in self._struck])
         self._struck.add(pid)
         delay_s = 1e-3 * self._random.uniform(0.0, LATEST * step_ms)
         self._timers.append(Timer(delay_s, os.kill, (pid, signal.SIGKILL)))

@@ -2,12 +2,13 @@
 
 Now and then, between two steps, each node keeps what it needs to go on from there, and sends it to
 the next node that lives. When a node is lost, the next one hosts its zones, and all go back to the
-newest state that everyone has. What was done since is done again, which gives the same bytes.
+newest state that everyone has. What was done since is done again, which gives the same bytes. A
+new node gets its zones in the same way, from those that have had them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from numpy.typing import NDArray
@@ -43,11 +44,17 @@ class KeptStates:
         """What another node wants to have kept here."""
         _add(self._others.setdefault(number, {}), frame.number, bytes(frame.data))
 
-    def load(self, state: int, lost: Sequence[int], home: int) -> None:
-        """Go back to a state, with the zones of lost nodes.
+    def load(
+        self,
+        state: int,
+        lost: Sequence[int],  # nodes whose zones are hosted here from now on
+        zones: Sequence[int],  # all that are
+        takers: Sequence[int],  # nodes that are given some of those that were
+    ) -> None:
+        """Go back to a state.
 
         Raises:
-            WorkerError: what one of them had is not here.
+            WorkerError: what a lost node had is not here.
         """
         worlds = self._worlds
         like = worlds.save()
@@ -56,28 +63,64 @@ class KeptStates:
             found = self._others.get(number, {}).get(state)
             if found is None:
                 raise WorkerError(f"what node {number} had is kept nowhere")
-            self._join(saved, from_bytes(found, like), like)
-        worlds.load_own(saved, home)
+            saved[self._first - 1] += self._join(saved, from_bytes(found, like), like)
+        if takers:
+            data = to_bytes(saved)
+            for taker in takers:
+                self._links.send(taker, FrameKind.KEEP, state, [data])
+        self._load_zones(saved, zones)
 
-    def _join(self, saved: list[Array], lost: Sequence[Array], like: Sequence[Array]) -> None:
-        """Add the vehicles of a lost node to the saved ones, and what is kept of its agents."""
+    def take_over(
+        self,
+        state: int,
+        donors: Sequence[int],  # nodes that have had the zones
+        zones: Sequence[int],
+        check: Callable[[], None],  # raises if what is awaited will never come
+    ) -> None:
+        """Go on from a state that others had, with some of their zones."""
+        like = self._worlds.save()
+        for donor in donors:
+            while state not in self._others.get(donor, {}):
+                check()
+                self._links.pump(None)
+        first, *rest = (from_bytes(self._others[donor][state], like) for donor in donors)
+        for found in rest:
+            self._join(first, found, like)
+        first[self._first - 1][...] = 0  # contacts stay where they were counted
+        self._load_zones(first, zones)
+
+    @property
+    def _first(self) -> int:
+        """Where in what is saved the vehicles of the first zone stand."""
         simulation, zones = self._worlds.simulation, self._worlds.world.partition.count
-        first = len(saved) - simulation.num_worlds * zones
-        of_agents = [
-            n
-            for n, array in enumerate(like)
-            if array is simulation.shards[0].worlds.pending
-            or array is simulation.outputs.observations
-        ]
-        saved[first - 1] += lost[first - 1]  # contacts
+        return len(self._worlds.save()) - simulation.num_worlds * zones
+
+    def _load_zones(self, saved: list[Array], zones: Sequence[int]) -> None:
+        count = self._worlds.world.partition.count
+        for n in range(self._first, len(saved)):
+            if (n - self._first) % count not in zones:
+                saved[n] = saved[n][:0]
+        self._worlds.load_own(saved, zones[0])
+
+    def _join(self, saved: list[Array], other: Sequence[Array], like: Sequence[Array]) -> Array:
+        """Add the vehicles of another node to the saved ones, and what is kept of its agents.
+
+        Returns:
+            (W,) the contacts that it has counted.
+        """
+        simulation, zones = self._worlds.simulation, self._worlds.world.partition.count
+        first = self._first
+        kept = {id(array) for array in simulation.of_agents()}
+        of_agents = [n for n, array in enumerate(like) if id(array) in kept]
         for n in range(first, len(saved)):
-            if not len(lost[n]):
+            if not len(other[n]):
                 continue
-            saved[n] = lost[n]
+            saved[n] = other[n]
             w = (n - first) // zones
-            agents = lost[n]["agent"][lost[n]["agent"] >= 0]
+            agents = other[n]["agent"][other[n]["agent"] >= 0]
             for k in of_agents:
-                saved[k][w, agents] = lost[k][w, agents]
+                saved[k][w, agents] = other[k][w, agents]
+        return other[first - 1]
 
 
 def _add(states: dict[int, bytes], state: int, data: bytes) -> None:

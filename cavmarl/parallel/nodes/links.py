@@ -15,15 +15,23 @@ import time
 import zlib
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from enum import IntEnum
 from typing import NamedTuple, TypeAlias
 
 from cavmarl.core.errors import MessageError
 
 MAGIC = b"cavN"
-VERSION = 1
+VERSION = 2
 MAX_FRAME = 1 << 32
 _HEAD = struct.Struct("<4sHHQIQ")
+
+# A machine that vanishes says nothing: after so many seconds it is asked, and again, so often.
+_ALIVE = [(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)] + [
+    (socket.IPPROTO_TCP, getattr(socket, name), value)
+    for name, value in (("TCP_KEEPIDLE", 10), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3))
+    if hasattr(socket, name)
+]
 
 Bytes: TypeAlias = bytes | bytearray | memoryview
 
@@ -33,7 +41,7 @@ class FrameKind(IntEnum):
 
     JOB = 0  # C → N: what to be
     READY = 1  # N → C: where other nodes can call
-    PEERS = 2  # C → N: where the others are
+    JOIN = 2  # N → C: what it runs
     COMMAND = 3  # C → N: a task, and what it needs
     LEASE = 4  # C → N: STEP messages
     REPORT = 5  # N → C: DONE messages, and what the next decision needs
@@ -42,10 +50,16 @@ class FrameKind(IntEnum):
     FAILED = 8  # N → C: an error
     SHARE = 9  # N → N: a part of a tick
     KEEP = 10  # N → N: the state of a node's zones, for when it is lost
-    RECOVER = 11  # C → N: nodes are lost; go back to a state that was kept
+    RECOVER = 11  # C → N: nodes are lost or new; begin, or go back to a state that was kept
     SYNC = 12  # N → N: all before this is of no use any more
     PING = 13  # C → N: answer at once
     PONG = 14  # N → C: the answer
+    AGENT = 15  # N → N: what is kept of an agent whose vehicle changes its node
+    WANTED = 16  # N → C: files that it does not have
+    FILES = 17  # C → N: those
+    MISSED = 18  # N → C: the connection to another node has ended
+    REFUSED = 19  # C → N: why it is of no use
+    END = 20  # C → N: it is needed no more
 
 
 class NodeFrame(NamedTuple):
@@ -56,7 +70,16 @@ class NodeFrame(NamedTuple):
     data: memoryview
 
 
-URGENT = frozenset({FrameKind.MESSAGES, FrameKind.KEEP, FrameKind.PING, FrameKind.PONG})
+URGENT = frozenset(
+    {
+        FrameKind.MESSAGES,
+        FrameKind.KEEP,
+        FrameKind.PING,
+        FrameKind.PONG,
+        FrameKind.MISSED,
+        FrameKind.AGENT,
+    }
+)
 Urgent: TypeAlias = Callable[[int, NodeFrame], None]
 """What is called with an urgent frame as soon as it has come, and the number of its sender."""
 
@@ -66,11 +89,16 @@ class SilenceError(Exception):
 
 
 class LinkLostError(Exception):
-    """A connection has ended."""
+    """A connection has ended, or what came over it was no frame."""
 
-    def __init__(self, peer: int) -> None:
-        super().__init__(f"the connection to node {peer} has ended")
+    def __init__(self, peer: int, cause: Exception | None = None) -> None:
+        why = f": {cause}" if isinstance(cause, MessageError) else ""
+        super().__init__(f"the connection to node {peer} has ended{why}")
         self.peer = peer
+
+
+class NeededNoMoreError(Exception):
+    """The coordinator says that this node may end."""
 
 
 class RecoveryOrderedError(Exception):
@@ -87,6 +115,8 @@ class _Link:
     def __init__(self, connection: socket.socket) -> None:
         if connection.family != socket.AF_UNIX:
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            for level, option, value in _ALIVE:
+                connection.setsockopt(level, option, value)
         connection.setblocking(False)
         self.socket = connection
         self.waiting: deque[memoryview] = deque()
@@ -94,6 +124,7 @@ class _Link:
         self._head = bytearray(_HEAD.size)
         self._into = memoryview(self._head)
         self._opened: tuple[FrameKind, int, int, bytearray] | None = None
+        self.ended: Exception | None = None  # why nothing comes any more but what has come
 
     def send(self, kind: FrameKind, number: int, pieces: Sequence[Bytes]) -> None:
         """Send what the system takes at once; the rest is kept, as a copy."""
@@ -197,7 +228,8 @@ class Links:
             LinkLostError: the other end has gone.
         """
         link = self._links.get(to)
-        if link is None:
+        if link is None or link.ended is not None:
+            self.drop(to)
             raise LinkLostError(to)
         self.sent_frames += 1
         self.sent_bytes += _HEAD.size + sum(memoryview(piece).nbytes for piece in pieces)
@@ -232,12 +264,34 @@ class Links:
                 if link.frames:
                     found[number] = link.frames.popleft()
                     missing.remove(number)
+                elif link.ended is not None:
+                    self.drop(number)
+                    raise LinkLostError(number, link.ended)
             if not missing:
                 return found
             left_ms = None if until_s is None else 1e3 * max(until_s - time.monotonic(), 0.0)
             if left_ms == 0.0:
                 raise SilenceError(f"nodes {sorted(missing)} do not answer within {timeout_s:g} s")
             self.pump(left_ms)
+
+    def arrived(self, number: int) -> NodeFrame | None:
+        """The next frame of one, if it has come. Raises LinkLostError: none will come."""
+        link = self._links[number]
+        if link.frames:
+            return link.frames.popleft()
+        if link.ended is not None:
+            self.drop(number)
+            raise LinkLostError(number, link.ended)
+        return None
+
+    def has(self, number: int) -> bool:
+        """Whether a frame of one has come, and nobody has taken it."""
+        return number in self._links and bool(self._links[number].frames)
+
+    def release(self, number: int) -> socket.socket:
+        """Leave a connection to somebody else, between two frames."""
+        link = self._forget(number)
+        return link.socket
 
     def put_back(self, number: int, frame: NodeFrame) -> None:
         """Let a frame be the next one of its sender once more."""
@@ -254,9 +308,13 @@ class Links:
                     if not link.waiting:
                         self._poll.modify(link.socket, select.POLLIN)
                 link.receive(self.urgent, number)
-            except (EOFError, OSError) as error:
+            except (EOFError, OSError, MessageError) as error:
+                if link.frames:  # its last words are heard first
+                    link.ended = error
+                    self._poll.unregister(link.socket)
+                    continue
                 self.drop(number)
-                raise LinkLostError(number) from error
+                raise LinkLostError(number, error) from error
 
     def flush(self) -> None:
         """Wait until all that is to be sent is sent."""
@@ -265,13 +323,36 @@ class Links:
 
     def drop(self, number: int) -> None:
         """End a connection, if there is one."""
-        link = self._links.pop(number, None)
-        if link is None:
-            return
-        self._poll.unregister(link.socket)
+        if number in self._links:
+            self._forget(number).socket.close()
+
+    def _forget(self, number: int) -> _Link:
+        link = self._links.pop(number)
+        if link.ended is None:
+            self._poll.unregister(link.socket)
         del self._by_socket[link.socket.fileno()]
-        link.socket.close()
+        return link
+
+    def end(self, timeout_s: float) -> None:
+        """Tell all that they are needed no more, and wait a while for them to end."""
+        for number in self.numbers:
+            with suppress(LinkLostError):
+                self.send(number, FrameKind.END, 0)
+        self.urgent = _unheard
+        until_s = time.monotonic() + timeout_s
+        while self._links and time.monotonic() < until_s:
+            for number, link in list(self._links.items()):
+                link.frames.clear()
+                if link.ended is not None:
+                    self.drop(number)
+            with suppress(LinkLostError):
+                self.pump(1e3 * max(until_s - time.monotonic(), 0.0))
+        self.close()
 
     def close(self) -> None:
         for number in self.numbers:
             self.drop(number)
+
+
+def _unheard(number: int, frame: NodeFrame) -> None:
+    """What is of no use any more."""

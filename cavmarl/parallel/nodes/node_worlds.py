@@ -14,13 +14,18 @@ from cavmarl.balance.balance_plan import Plan
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
-from cavmarl.parallel.commanded_worlds import uncopied, unsaved
-from cavmarl.parallel.nodes.node_frames import pieces_of, take_results
+from cavmarl.parallel.commanded_worlds import uncopied
+from cavmarl.parallel.nodes.node_frames import (
+    cases_of,
+    clear_sensed,
+    pieces_of,
+    take_results,
+    told_cases,
+)
 from cavmarl.parallel.nodes.node_pool import NodeCommand, NodePool
 from cavmarl.parallel.step_arrays import Driven
 from cavmarl.parallel.worlds_job import Task
 from cavmarl.shards.shard import Commands
-from cavmarl.traffic.demand import DemandFile
 
 
 class NodeWorlds(NodePool):
@@ -38,14 +43,15 @@ class NodeWorlds(NodePool):
         num_worlds: int,  # W
         nodes: int,  # n, from 1 to the zones of a world
         in_next_step: bool = False,  # when worlds begin anew; see `SteppedWorlds`
+        hosts: str = "",  # what starts the nodes; see `start_nodes`
     ) -> None:
         check_nodes(world, nodes)
-        super().__init__(world, base_dir, num_worlds, nodes, in_next_step)
+        super().__init__(world, base_dir, num_worlds, nodes, in_next_step, hosts)
 
     def reset(self, seed: int | None, first_world: int) -> None:
         arrays = self.arrays
         results = self.run(self._command(Task.RESET, {"seed": seed, "first_world": first_world}))
-        arrays.observations[arrays.chosen] = 0.0
+        clear_sensed(arrays, arrays.chosen)
         self._write(results, of_step=False)
         if not arrays.chosen.all():
             arrays.observations[~arrays.mask] = 0.0
@@ -58,11 +64,12 @@ class NodeWorlds(NodePool):
             arrays.meta_actions[:] = commands.meta_actions
         arrays.declared[:] = commands.declared if commands.declared.size else 0
         results = self.run(self._command(Task.STEP))
-        arrays.observations[...] = 0.0
+        clear_sensed(arrays, np.ones(len(arrays.chosen), dtype=np.bool_))
         self._write(results, of_step=True)
 
     def _command(self, task: Task, letter: Any = None) -> NodeCommand:
-        changes = task in (Task.STEP, Task.RESET)
+        loads = task == Task.LOAD and not letter["only_reads"]
+        changes = loads or task in (Task.STEP, Task.RESET)
         pieces = [bytes(piece) for piece in pieces_of(task, letter, self.arrays)]
         return NodeCommand(pieces, changes, self._ticks_per_step if task == Task.STEP else 0)
 
@@ -109,10 +116,17 @@ class NodeWorlds(NodePool):
         return range(len(self.arrays.mask))[world]
 
     def save_worlds(self) -> list[bytes]:
-        raise unsaved()
+        return cases_of(self._asked(Task.SAVE, None))
 
     def load_worlds(self, cases: Sequence[bytes]) -> None:
-        raise unsaved()
+        """Go on from what `save_worlds` gave; `arrays` stay as they are.
+
+        Raises:
+            ConfigError: it is of other worlds.
+        """
+        if refusal := self._asked(Task.LOAD, told_cases(cases, only_reads=True)):
+            raise ConfigError(refusal)
+        self.run(self._command(Task.LOAD, told_cases(cases)))
 
     @property
     def simulation(self) -> Simulation:
@@ -134,19 +148,14 @@ class NodeWorlds(NodePool):
 
 def check_nodes(world: World, nodes: int) -> None:
     """Refuse what worlds over nodes cannot have."""
-    config, count, demand = world.config, world.partition.count, world.demand
+    config, count = world.config, world.partition.count
     if not 1 <= nodes <= count:
         raise ConfigError(
             f"nodes = {nodes}: a world of {count} zone(s) is hosted by 1 to {count} nodes; use "
             "more zones or fewer nodes"
         )
-    looks = isinstance(demand, DemandFile) and (demand.may_look or len(demand.rerouters.rules))
     refused = {
-        "traffic.source": config.traffic.source != "native" and config.traffic.source,
-        "rig": bool(config.rig) and "…",
-        "v2x.enabled": config.v2x.enabled,
-        "scenario.name": config.scenario.name,
-        "a demand with rerouting devices or rerouters": bool(looks),
+        "v2x.channel.external": config.v2x.enabled and config.v2x.channel.external,
         "zones.faults": config.zones.faults,
         "zones.reproducers": config.zones.reproducers,
         "zones.check_invariants": config.zones.check_invariants,
