@@ -1,4 +1,4 @@
-"""`cavmarl node`: hosts zones of one world, or worlds and evaluations for a coordination service."""
+"""`cavmarl node`: hosts zones of one world, or worlds for a coordination service."""
 
 from __future__ import annotations
 

@@ -203,6 +203,19 @@ def test_what_no_one_asks_for_ends_and_is_forgotten(fleet: Fleet) -> None:
     assert fleet.log.store.blob(blob) is None
 
 
+def test_an_identity_has_so_many_sessions_at_most(tmp_path: Path) -> None:
+    fleet = Fleet(tmp_path / "other.sqlite", max_sessions=2)
+    fleet.join("a")
+    first = fleet.open()
+    fleet.open()
+    with pytest.raises(ServiceError, match="2 sessions are open") as refused:
+        fleet.open()
+    assert refused.value.problem == "too-many"
+    fleet.broker.close(fleet.client, first.id)
+    assert fleet.open().node == "a"
+    fleet.close()
+
+
 def test_a_replay_of_the_log_gives_the_same(fleet: Fleet, tmp_path: Path) -> None:
     fleet.join("a", "b")
     sessions = [fleet.open() for _ in range(3)]

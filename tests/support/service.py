@@ -60,16 +60,15 @@ class Cluster:
     service: RunningService
     processes: dict[str, subprocess.Popen[str]] = field(default_factory=dict)
 
-    def start(self, *names: str) -> None:
+    def start(self, *names: str, secret: str = "") -> None:
         for name in names:
-            self._begin(name)
+            self._begin(name, secret or self.service.grant(name, "node"))
         for name in names:
             stdout = self.processes[name].stdout
             assert stdout is not None
             assert name in stdout.readline()
 
-    def _begin(self, name: str) -> None:
-        secret = self.service.grant(name, "node")
+    def _begin(self, name: str, secret: str) -> None:
         words = [sys.executable, "-m", "cavmarl", "node", "--service", self.service.url]
         words += ["--name", name, "--snapshot", "idle"]
         environment = {**os.environ, "CAVMARL_SECRET": secret}
