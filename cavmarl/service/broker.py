@@ -284,12 +284,11 @@ class Broker:
 
     def assign_jobs(self) -> None:
         """Give jobs that wait to nodes that can take them."""
-        for session in list(self.log.state.sessions.values()):
-            if session.job is not None and session.state == "queued":
-                try:
-                    self._assign(session.id, self._choose(session, ()))
-                except NoNodeError:
-                    return
+        for number in sorted(self.log.state.waiting):
+            try:
+                self._assign(number, self._choose(self.log.state.sessions[number], ()))
+            except NoNodeError:
+                continue  # another may need less
 
     # Within
 

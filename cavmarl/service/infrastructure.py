@@ -93,6 +93,7 @@ class Infrastructure:
     identities: dict[str, IdentityRecord] = field(default_factory=dict)
     keys: dict[str, str] = field(default_factory=dict)  # id → private key, in order of making
     configurations: dict[str, list[str]] = field(default_factory=dict)  # name → hashes, by version
+    waiting: set[str] = field(default_factory=set)  # jobs that no node has
 
     def apply(self, event: LogEvent) -> None:
         """Change as `event` says; it has been checked before it was written."""
@@ -147,12 +148,16 @@ class Infrastructure:
         for session in self.sessions.values():
             if session.node == name and session.state == "active":
                 session.node, session.state = None, "queued"
+                if session.job is not None:
+                    self.waiting.add(session.id)
 
     def _apply_session(self, word: str, event: LogEvent) -> None:
         if word == "opened":
             self.sessions[event.subject] = SessionRecord(
                 id=event.subject, owner=event.owner, **event.data
             )
+            if event.data["job"] is not None:
+                self.waiting.add(event.subject)
             return
         if word == "refused":  # it was never opened
             return
@@ -165,9 +170,8 @@ class Infrastructure:
                 session.node, session.incarnation = event.data["node"], event.data["incarnation"]
                 session.reason, session.score = event.data["reason"], event.data["score"]
                 session.state = "active"
+                self.waiting.discard(event.subject)
                 session.placements += 1
-            case "released":
-                session.node, session.state = None, "queued"
             case "saved":
                 session.saved_number = event.data["number"]
                 session.saved_blob = event.data["sha256"]
@@ -175,4 +179,5 @@ class Infrastructure:
                 session.results[event.data["name"]] = event.data["sha256"]
             case "closed" | "done" | "failed":
                 session.state, session.node = word, None
+                self.waiting.discard(event.subject)
                 session.saved_blob, session.message = None, event.data.get("message", "")

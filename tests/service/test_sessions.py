@@ -179,3 +179,31 @@ def test_a_job_that_cannot_run_fails_with_its_cause(client: Client) -> None:
     job = client.submit("merge", policies=["merge_ippo"], overrides={"action.kind": "discrete"})
     with pytest.raises(ServiceError, match="failed"):
         client.wait(job, timeout_s=120.0)
+
+
+@pytest.mark.slow  # each kind of kill alone is in every run
+def test_kills_of_nodes_and_of_the_service_change_no_bit(tmp_path: Path) -> None:
+    options = ("--lease-s", "2", "--beat-s", "0.3")
+    with running_service(tmp_path / "store.sqlite", *options) as service:
+        nodes = Cluster(service)
+        nodes.start("a", "b")
+        with service.client() as client:
+            remote, local = open_world(client), make_local()
+            remote.reset(seed=8)
+            local.reset(seed=8)
+            assert_same(remote, local, range(40))
+            service.kill()
+            assert_same(remote, local, range(40, 60))  # without a service, while the lease lasts
+            service.start_again(*options)
+            assert_same(remote, local, range(60, 90))
+            nodes.processes[remote.flows.assignment["assigned"]].kill()
+            nodes.start("c")
+            assert_same(remote, local, range(90, 130))
+            service.kill()
+            service.start_again(*options)
+            nodes.processes[remote.flows.assignment["assigned"]].kill()
+            assert_same(remote, local, range(130, 160))
+            assert remote.flows.moves == 2
+            kinds = [one["kind"] for one in client.get("/events", limit=1000)["events"]]
+            assert kinds.count("node.down") >= 1
+        nodes.stop()

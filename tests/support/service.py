@@ -35,7 +35,16 @@ class RunningService:
 
     def kill(self) -> None:
         self.process.kill()
-        self.process.wait()
+        self.process.communicate()
+
+    def start_again(self, *options: str) -> None:
+        """Start it anew, at the same port and on the same store."""
+        port = self.url.rsplit(":", 1)[1]
+        words = [sys.executable, "-m", "cavmarl", "serve", "--port", port]
+        words += ["--store", str(self.store), *options]
+        self.process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+        assert self.process.stdout is not None
+        assert self.url in self.process.stdout.readline()
 
 
 @contextmanager
@@ -43,14 +52,17 @@ def running_service(store: Path, *options: str) -> Iterator[RunningService]:
     """A service on a socket; it ends with the block."""
     has_admin = store.exists()
     words = [sys.executable, "-m", "cavmarl", "serve", "--port", "0", "--store", str(store)]
-    with subprocess.Popen([*words, *options], stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout is not None
-            url = process.stdout.readline().split()[1].rstrip(",")
-            secret = "" if has_admin else process.stdout.readline().split()[-1]
-            yield RunningService(process, url, secret, store)
-        finally:
-            process.terminate()
+    process = subprocess.Popen([*words, *options], stdout=subprocess.PIPE, text=True)
+    running = RunningService(process, "", "", store)
+    try:
+        assert process.stdout is not None
+        running.url = process.stdout.readline().split()[1].rstrip(",")
+        running.secret = "" if has_admin else process.stdout.readline().split()[-1]
+        yield running
+    finally:
+        if running.process.poll() is None:
+            running.process.terminate()
+            running.process.communicate()
 
 
 @dataclass
@@ -79,4 +91,6 @@ class Cluster:
     def stop(self) -> None:
         for process in self.processes.values():
             process.send_signal(signal.SIGKILL)
-            process.communicate()
+            process.wait()
+            if process.stdout is not None:
+                process.stdout.close()
