@@ -20,6 +20,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from cavmarl.core.errors import ServiceError
 from cavmarl.service.guards import Service, rule_of
 from cavmarl.service.problems import add_handlers, answer
+from cavmarl.service.refusals import PROBLEM_TYPE
 from cavmarl.service.routes import ROUTERS
 from cavmarl.service.service_metrics import ServiceMetrics
 
@@ -32,7 +33,6 @@ NO_TELEMETRY: TelemetryConfig = {  # whatever the surroundings have set up: noth
     "auto_configure": False,
 }
 BODY_S = 10.0  # in which a body has to come
-PROBLEM_TYPE = b"application/problem+json"
 HEADERS = {
     b"x-content-type-options": b"nosniff",
     b"cache-control": b"no-store",
@@ -126,7 +126,7 @@ class GuardedRequests:
             if message["type"] == "http.response.start":
                 if (
                     message["status"] == 413
-                    and PROBLEM_TYPE not in dict(message["headers"]).values()
+                    and PROBLEM_TYPE.encode() not in dict(message["headers"]).values()
                 ):
                     await answer("too-large", "the body is too large for this route")(
                         scope, receive, send_with_headers

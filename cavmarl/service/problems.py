@@ -12,7 +12,7 @@ from starlette.exceptions import HTTPException
 
 from cavmarl.core.errors import CavmarlError, ServiceError
 from cavmarl.service.node_selection import NoNodeError
-from cavmarl.service.refusals import PROBLEMS
+from cavmarl.service.refusals import PROBLEM_TYPE, PROBLEMS
 
 MOST_EXCLUSIONS = 100  # that an answer names
 
@@ -38,7 +38,7 @@ def answer(
         "cure": cure,
         **(more or {}),
     }
-    return JSONResponse(body, status or known, headers, media_type="application/problem+json")
+    return JSONResponse(body, status or known, headers, media_type=PROBLEM_TYPE)
 
 
 def add_handlers(app: FastAPI) -> None:

@@ -4,6 +4,19 @@ from __future__ import annotations
 
 from cavmarl.core.errors import ServiceError
 
+PROBLEM_TYPE = "application/problem+json"
+PROBLEM_SCHEMA = {
+    "type": "object",
+    "required": ["type", "title", "status", "detail", "cure"],
+    "properties": {
+        "type": {"type": "string"},
+        "title": {"type": "string"},
+        "status": {"type": "integer"},
+        "detail": {"type": "string"},
+        "cure": {"type": "string"},
+    },
+}
+
 # name → status, what it means and what to do
 PROBLEMS = {
     "bad-body": (422, "the body or a parameter has an unknown field, a wrong type or value"),

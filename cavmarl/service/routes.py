@@ -27,12 +27,28 @@ from cavmarl.service.infrastructure import (
     SessionRecord,
 )
 from cavmarl.service.node_selection import NoNodeError, score_of
-from cavmarl.service.refusals import problem
+from cavmarl.service.refusals import PROBLEM_SCHEMA, PROBLEM_TYPE, problem
 
-open_routes = APIRouter(prefix="/v1", route_class=DurableRoute, tags=["open"])
-nodes = APIRouter(prefix="/v1/nodes", route_class=DurableRoute, tags=["nodes"])
-worlds = APIRouter(prefix="/v1", route_class=DurableRoute, tags=["sessions"])
-records = APIRouter(prefix="/v1", route_class=DurableRoute, tags=["records"])
+PROBLEM: dict[int | str, dict[str, Any]] = {
+    status: {"description": "A problem", "content": {PROBLEM_TYPE: {"schema": PROBLEM_SCHEMA}}}
+    for status in ("default", 422)
+}
+BYTES: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "Content",
+        "content": {"application/octet-stream": {"schema": {"type": "string"}}},
+    }
+}
+
+
+def _router(prefix: str, tag: str) -> APIRouter:
+    return APIRouter(prefix=prefix, route_class=DurableRoute, tags=[tag], responses=PROBLEM)
+
+
+open_routes = _router("/v1", "open")
+nodes = _router("/v1/nodes", "nodes")
+worlds = _router("/v1", "sessions")
+records = _router("/v1", "records")
 ROUTERS = (nodes, worlds, records, open_routes)  # beats are most of what comes
 
 PAGE = 1000
@@ -185,7 +201,11 @@ async def close_session(
     return _session(service.broker.close(identity, number))
 
 
-@worlds.get("/sessions/{number}/state")
+@worlds.get(
+    "/sessions/{number}/state",
+    response_class=Response,
+    responses={**BYTES, 204: {"description": "Nothing was saved yet"}},
+)
 async def get_state(identity: Nodes, service: TheService, number: SessionId) -> Response:
     """The newest saved state of a session, for the node that hosts it."""
     session = service.broker.hosted(identity, number)
@@ -241,7 +261,7 @@ async def put_result(
     service.broker.add_result(service.broker.hosted(identity, number), name, content)
 
 
-@worlds.get("/jobs/{number}/results/{name}")
+@worlds.get("/jobs/{number}/results/{name}", response_class=Response, responses=BYTES)
 async def get_result(
     identity: Readers, service: TheService, number: SessionId, name: FileName
 ) -> Response:
