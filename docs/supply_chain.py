@@ -20,13 +20,14 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[1]
 LOCKED = (
-    "sumo,maps,followers,render,report,service"  # torch's wheels differ by processor: not these
+    "sumo,maps,followers,nodes,render,report,service"  # torch's wheels differ by processor
 )
 EXTRAS = (
     "",
     "sumo",
     "maps",
     "followers",
+    "nodes",
     "render",
     "report",
     "service",

@@ -94,8 +94,8 @@ def _join(join: str, key_file: Path, wait_s: float) -> None:
         except (OSError, EOFError) as error:
             if time.monotonic() > until_s:
                 raise WorkerError(
-                    f"nobody lets this node in at {join} within {wait_s:g} s ({error}): start the "
-                    "caller, and look whether the two can reach each other"
+                    f"no caller lets this node in at {join} within {wait_s:g} s ({error}): start "
+                    "the caller, and look whether the two can reach each other"
                 ) from error
             time.sleep(AGAIN_S)
     console.print("the caller has ended" if is_done else "the caller is gone")

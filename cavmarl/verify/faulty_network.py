@@ -7,14 +7,16 @@ import socket
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from enum import StrEnum
+from functools import partial
 from typing import TypeAlias
 
 LOCAL = "127.0.0.1"
 CHUNK = 1 << 16
 LONGEST_DELAY_S = 0.05
+END_S = 2.0  # for a thread to end
 
 Place: TypeAlias = tuple[str, int]
 
@@ -43,45 +45,44 @@ class _Connection:
 
 
 class FaultyNetwork:
-    """Carries connections to places, and does something to one of them now and then.
+    """Carries connections to places; `strike` does something to one of them.
 
     Attributes:
         done: how often each fault has been done.
     """
 
-    def __init__(
-        self,
-        seed: int,
-        kinds: Sequence[NetworkFault],  # that are drawn from
-        every_s: float,  # mean time between two of them
-        most: int,  # of those that end a connection
-    ) -> None:
+    def __init__(self, seed: int) -> None:
         self.done: Counter[NetworkFault] = Counter()
         self._random = random.Random(seed)
-        self._kinds, self._every_s, self._most = tuple(kinds), every_s, most
         self._listeners: list[socket.socket] = []
         self._connections: list[_Connection] = []
         self._lock = threading.Lock()
-        self._ended = threading.Event()
-        self._is_on = threading.Event()
-        self._start(self._draw)
+        self._threads: list[threading.Thread] = []
+        self._is_closed = False
 
     def route(self, place: Place) -> Place:
         """Where to call in order to reach a place through this network."""
         listener = socket.create_server((LOCAL, 0))
         self._listeners.append(listener)
-        self._start(lambda: self._accept(listener, place))
+        self._start(partial(self._accept, listener, place))
         found: Place = listener.getsockname()
         return found
 
-    def begin(self) -> None:
-        """From now on there are faults."""
-        self._is_on.set()
+    def strike(self, kind: NetworkFault) -> None:
+        """Let a fault happen to a connection that is drawn."""
+        with self._lock:
+            if not self._connections:
+                return
+            connection = self._random.choice(self._connections)
+            self.done[kind] += 1
+        if kind is NetworkFault.CUT:
+            connection.cut()
+        else:
+            connection.due[self._random.randrange(2)] = kind
 
     def close(self) -> None:
         """End all connections."""
-        self._ended.set()
-        self._is_on.set()
+        self._is_closed = True
         for listener in self._listeners:
             with suppress(OSError):
                 listener.shutdown(socket.SHUT_RDWR)
@@ -89,14 +90,16 @@ class FaultyNetwork:
         with self._lock:
             for connection in self._connections:
                 connection.cut()
+        for thread in self._threads:
+            thread.join(END_S)
 
-    @staticmethod
-    def _start(run: Callable[[], None]) -> None:
-        threading.Thread(target=run, daemon=True).start()
+    def _start(self, run: Callable[[], None]) -> None:
+        self._threads.append(threading.Thread(target=run, daemon=True))
+        self._threads[-1].start()
 
     def _accept(self, listener: socket.socket, place: Place) -> None:
         with suppress(OSError):
-            while not self._ended.is_set():
+            while not self._is_closed:
                 caller, _ = listener.accept()
                 try:
                     called = socket.create_connection(place)
@@ -109,7 +112,7 @@ class FaultyNetwork:
                 with self._lock:
                     self._connections.append(connection)
                 for direction in (0, 1):
-                    self._start(lambda c=connection, d=direction: self._carry(c, d))  # type: ignore[misc]
+                    self._start(partial(self._carry, connection, direction))
 
     def _carry(self, connection: _Connection, direction: int) -> None:
         """Carry the bytes of one direction until one end closes."""
@@ -136,21 +139,3 @@ class FaultyNetwork:
             self._connections.remove(connection)
         for end in connection.ends:
             end.close()
-
-    def _draw(self) -> None:
-        """Do faults at random times."""
-        self._is_on.wait()
-        while not self._ended.wait(self._random.expovariate(1.0 / self._every_s)):
-            harmless = [kind for kind in self._kinds if kind is NetworkFault.DELAY]
-            ended = sum(n for kind, n in self.done.items() if kind is not NetworkFault.DELAY)
-            kinds = self._kinds if ended < self._most else harmless
-            with self._lock:
-                if not (kinds and self._connections):
-                    continue
-                connection = self._random.choice(self._connections)
-            kind = self._random.choice(kinds)
-            self.done[kind] += 1
-            if kind is NetworkFault.CUT:
-                connection.cut()
-            else:
-                connection.due[self._random.randrange(2)] = kind

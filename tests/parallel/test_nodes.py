@@ -247,3 +247,24 @@ def test_a_node_that_cannot_begin_says_so(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr("cavmarl.parallel.nodes.node_starters.NODE", "cavmarl.nothing")
     with pytest.raises(WorkerError, match="before it had begun"):
         make_vec("grid4x4", zones=2, nodes=2)
+
+
+def test_nodes_tell_what_they_have_done(make: Make) -> None:
+    vec = make("grid4x4", zones=4, nodes=2, num_envs=2, **WANTED)
+    drive(vec, steps=5)
+    over_nodes(vec).node_loads()
+    for _ in range(3):
+        vec.step(vec.suggest_actions())
+    loads = over_nodes(vec).node_loads()
+    running = sum(vec.traffic_stats(w)["running"] for w in range(2))
+    assert [load.node for load in loads] == [0, 1]
+    assert sum(load.vehicles for load in loads) == running
+    for load in loads:
+        assert load.ticks == 3 * vec.config.clock.ticks_per_step
+        assert 0.0 < load.cpu_s < 10.0
+        assert load.waited_s > 0.0
+        assert load.sent_frames >= 2 * load.ticks
+        assert load.sent_bytes > 40 * load.sent_frames
+        assert load.memory_bytes > 1 << 26
+        assert load.ghosts > 0
+    assert all(load.ticks == 0 for load in over_nodes(vec).node_loads())

@@ -2,8 +2,8 @@
 
 Now and then, between two steps, each node keeps what it needs to go on from there, and sends it to
 the next node that lives. When a node is lost, the next one hosts its zones, and all go back to the
-newest state that everyone has. What was done since is done again, which gives the same bytes. A
-new node gets its zones in the same way, from those that have had them.
+newest state that everyone has. What was done since is done again, which gives the same bytes. Zones
+that change their node, as to a new one, do it in the same way.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ class KeptStates:
         self._number = number
         self._own: dict[int, bytes] = {}  # by numbers of states
         self._others: dict[int, dict[int, bytes]] = {}  # node → the same
+        self._given: dict[int, NodeFrame] = {}  # by nodes that have given zones away
 
     def keep(self, state: int, living: Sequence[int]) -> None:
         """Keep what the worlds are now, here and at the next of the living nodes."""
@@ -44,63 +45,60 @@ class KeptStates:
         """What another node wants to have kept here."""
         _add(self._others.setdefault(number, {}), frame.number, bytes(frame.data))
 
+    def take_given(self, number: int, frame: NodeFrame) -> None:
+        """What another node has had of zones that are hosted here from now on."""
+        self._given[number] = frame
+
     def load(
         self,
         state: int,
         lost: Sequence[int],  # nodes whose zones are hosted here from now on
-        zones: Sequence[int],  # all that are
-        takers: Sequence[int],  # nodes that are given some of those that were
+        donors: Sequence[int],  # nodes that give zones to this one
+        takers: Sequence[int],  # nodes that are given some of those that were here
+        zones: Sequence[int],  # all that are here from now on
+        generation: int,  # how often nodes have come and gone
+        check: Callable[[], None],  # raises if what is awaited will never come
     ) -> None:
-        """Go back to a state.
+        """Go back to a state, or go on from it if this node was not there.
 
         Raises:
             WorkerError: what a lost node had is not here.
         """
-        worlds = self._worlds
-        like = worlds.save()
-        saved = from_bytes(self._own[state], like)
+        like = self._worlds.save()
+        own = self._own.get(state)
+        saved = None if own is None else from_bytes(own, like)
         for number in lost:
             found = self._others.get(number, {}).get(state)
-            if found is None:
+            if saved is None or found is None:
                 raise WorkerError(f"what node {number} had is kept nowhere")
             saved[self._first - 1] += self._join(saved, from_bytes(found, like), like)
-        if takers:
+        if takers and saved is not None:
             data = to_bytes(saved)
             for taker in takers:
-                self._links.send(taker, FrameKind.KEEP, state, [data])
-        self._load_zones(saved, zones)
-
-    def take_over(
-        self,
-        state: int,
-        donors: Sequence[int],  # nodes that have had the zones
-        zones: Sequence[int],
-        check: Callable[[], None],  # raises if what is awaited will never come
-    ) -> None:
-        """Go on from a state that others had, with some of their zones."""
-        like = self._worlds.save()
+                self._links.send(taker, FrameKind.GIVE, generation, [data])
         for donor in donors:
-            while state not in self._others.get(donor, {}):
+            while donor not in self._given or self._given[donor].number != generation:
                 check()
                 self._links.pump(None)
-        first, *rest = (from_bytes(self._others[donor][state], like) for donor in donors)
-        for found in rest:
-            self._join(first, found, like)
-        first[self._first - 1][...] = 0  # contacts stay where they were counted
-        self._load_zones(first, zones)
+            given = from_bytes(bytes(self._given.pop(donor).data), like)
+            if saved is None:
+                saved = given
+                saved[self._first - 1][...] = 0  # contacts stay where they were counted
+            else:
+                self._join(saved, given, like)
+        if saved is None:
+            raise WorkerError(f"state {state} is kept nowhere")
+        count = self._worlds.world.partition.count
+        for n in range(self._first, len(saved)):
+            if (n - self._first) % count not in zones:
+                saved[n] = saved[n][:0]
+        self._worlds.load_own(saved, zones[0])
 
     @property
     def _first(self) -> int:
         """Where in what is saved the vehicles of the first zone stand."""
         simulation, zones = self._worlds.simulation, self._worlds.world.partition.count
         return len(self._worlds.save()) - simulation.num_worlds * zones
-
-    def _load_zones(self, saved: list[Array], zones: Sequence[int]) -> None:
-        count = self._worlds.world.partition.count
-        for n in range(self._first, len(saved)):
-            if (n - self._first) % count not in zones:
-                saved[n] = saved[n][:0]
-        self._worlds.load_own(saved, zones[0])
 
     def _join(self, saved: list[Array], other: Sequence[Array], like: Sequence[Array]) -> Array:
         """Add the vehicles of another node to the saved ones, and what is kept of its agents.

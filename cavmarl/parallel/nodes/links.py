@@ -4,6 +4,9 @@ A frame is a head of fixed size and bytes. Frames of a connection arrive in thei
 connection has ended. Nothing in a frame is ever run.
 
     head    magic, version, kind, number, checksum of what follows, bytes of what follows
+
+A checksum begins with how many frames went before on that connection, so that one that comes twice
+or out of turn is no frame.
 """
 
 from __future__ import annotations
@@ -19,11 +22,12 @@ from contextlib import suppress
 from enum import IntEnum
 from typing import NamedTuple, TypeAlias
 
-from cavmarl.core.errors import MessageError
+from cavmarl.core.errors import MessageError, NodeRefusedError
 
 MAGIC = b"cavN"
 VERSION = 2
 MAX_FRAME = 1 << 32
+_ALL = (1 << 32) - 1
 _HEAD = struct.Struct("<4sHHQIQ")
 
 # A machine that vanishes says nothing: after so many seconds it is asked, and again, so often.
@@ -60,6 +64,7 @@ class FrameKind(IntEnum):
     MISSED = 18  # N → C: the connection to another node has ended
     REFUSED = 19  # C → N: why it is of no use
     END = 20  # C → N: it is needed no more
+    GIVE = 21  # N → N: the state of zones that another node hosts from now on
 
 
 class NodeFrame(NamedTuple):
@@ -78,6 +83,7 @@ URGENT = frozenset(
         FrameKind.PONG,
         FrameKind.MISSED,
         FrameKind.AGENT,
+        FrameKind.GIVE,
     }
 )
 Urgent: TypeAlias = Callable[[int, NodeFrame], None]
@@ -109,7 +115,7 @@ class RecoveryOrderedError(Exception):
         self.frame = frame
 
 
-class _Link:
+class Link:
     """One connection: what is to be sent, and what has come of the next frame."""
 
     def __init__(self, connection: socket.socket) -> None:
@@ -124,12 +130,12 @@ class _Link:
         self._head = bytearray(_HEAD.size)
         self._into = memoryview(self._head)
         self._opened: tuple[FrameKind, int, int, bytearray] | None = None
-        self.ended: Exception | None = None  # why nothing comes any more but what has come
+        self._num_sent = self._num_heard = 0  # frames
 
     def send(self, kind: FrameKind, number: int, pieces: Sequence[Bytes]) -> None:
         """Send what the system takes at once; the rest is kept, as a copy."""
         views = [memoryview(piece).cast("B") for piece in pieces if len(piece)]
-        checksum = 0
+        checksum = self._num_sent = self._num_sent + 1 & _ALL
         for view in views:
             checksum = zlib.crc32(view, checksum)
         size = sum(map(len, views))
@@ -156,7 +162,13 @@ class _Link:
         return pieces
 
     def receive(self, urgent: Urgent, number: int) -> None:
-        """Take what has come. Raises EOFError, OSError: the other end has gone."""
+        """Take what has come.
+
+        Raises:
+            EOFError, OSError: the other end has gone.
+            MessageError: what came is no frame.
+            NeededNoMoreError, NodeRefusedError: the coordinator has said its last word.
+        """
         while True:
             if len(self._into):
                 try:
@@ -172,6 +184,10 @@ class _Link:
                 self._open()
             else:
                 frame = self._close()
+                if frame.kind is FrameKind.END:
+                    raise NeededNoMoreError
+                if frame.kind is FrameKind.REFUSED:
+                    raise NodeRefusedError(f"the caller refuses this node: {_text(frame)}")
                 if frame.kind in URGENT:
                     urgent(number, frame)
                 else:
@@ -195,8 +211,9 @@ class _Link:
     def _close(self) -> NodeFrame:
         assert self._opened is not None
         kind, number, checksum, room = self._opened
-        if zlib.crc32(room) != checksum:
-            raise MessageError("a frame is not what was sent")
+        self._num_heard = self._num_heard + 1 & _ALL
+        if zlib.crc32(room, self._num_heard) != checksum:
+            raise MessageError("a frame is not what was sent, or not the next one")
         self._opened, self._into = None, memoryview(self._head)
         return NodeFrame(kind, number, memoryview(room))
 
@@ -206,16 +223,19 @@ class Links:
 
     def __init__(self, urgent: Urgent) -> None:
         self.urgent = urgent
-        self._links: dict[int, _Link] = {}
+        self._links: dict[int, Link] = {}
         self._poll = select.poll()
         self._by_socket: dict[int, int] = {}
+        self.awaited: set[int] = set()  # whose frames `take` waits for
+        self.waited_s = 0.0
         self.sent_bytes = 0
         self.sent_frames = 0
 
-    def add(self, number: int, connection: socket.socket) -> None:
-        self._links[number] = _Link(connection)
-        self._by_socket[connection.fileno()] = number
-        self._poll.register(connection, select.POLLIN)
+    def add(self, number: int, connection: socket.socket | Link) -> None:
+        link = connection if isinstance(connection, Link) else Link(connection)
+        self._links[number] = link
+        self._by_socket[link.socket.fileno()] = number
+        self._poll.register(link.socket, select.POLLIN)
 
     @property
     def numbers(self) -> tuple[int, ...]:
@@ -228,8 +248,7 @@ class Links:
             LinkLostError: the other end has gone.
         """
         link = self._links.get(to)
-        if link is None or link.ended is not None:
-            self.drop(to)
+        if link is None:
             raise LinkLostError(to)
         self.sent_frames += 1
         self.sent_bytes += _HEAD.size + sum(memoryview(piece).nbytes for piece in pieces)
@@ -253,7 +272,7 @@ class Links:
             MessageError: what came is no frame.
             SilenceError: nothing has come in time.
         """
-        missing = set(wanted)
+        self.awaited = missing = set(wanted)
         found: dict[int, NodeFrame] = {}
         until_s = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
@@ -264,9 +283,6 @@ class Links:
                 if link.frames:
                     found[number] = link.frames.popleft()
                     missing.remove(number)
-                elif link.ended is not None:
-                    self.drop(number)
-                    raise LinkLostError(number, link.ended)
             if not missing:
                 return found
             left_ms = None if until_s is None else 1e3 * max(until_s - time.monotonic(), 0.0)
@@ -275,23 +291,17 @@ class Links:
             self.pump(left_ms)
 
     def arrived(self, number: int) -> NodeFrame | None:
-        """The next frame of one, if it has come. Raises LinkLostError: none will come."""
-        link = self._links[number]
-        if link.frames:
-            return link.frames.popleft()
-        if link.ended is not None:
-            self.drop(number)
-            raise LinkLostError(number, link.ended)
-        return None
+        """The next frame of one, if it has come."""
+        frames = self._links[number].frames
+        return frames.popleft() if frames else None
 
     def has(self, number: int) -> bool:
         """Whether a frame of one has come, and nobody has taken it."""
         return number in self._links and bool(self._links[number].frames)
 
-    def release(self, number: int) -> socket.socket:
-        """Leave a connection to somebody else, between two frames."""
-        link = self._forget(number)
-        return link.socket
+    def release(self, number: int) -> Link:
+        """Leave a connection to somebody else."""
+        return self._forget(number)
 
     def put_back(self, number: int, frame: NodeFrame) -> None:
         """Let a frame be the next one of its sender once more."""
@@ -299,7 +309,10 @@ class Links:
 
     def pump(self, timeout_ms: float | None) -> None:
         """Send and receive what can be; wait so long for the first that can."""
-        for socket_number, _ in self._poll.poll(timeout_ms):
+        began_s = time.perf_counter()
+        ready = self._poll.poll(timeout_ms)
+        self.waited_s += time.perf_counter() - began_s
+        for socket_number, _ in ready:
             number = self._by_socket[socket_number]
             link = self._links[number]
             try:
@@ -309,10 +322,6 @@ class Links:
                         self._poll.modify(link.socket, select.POLLIN)
                 link.receive(self.urgent, number)
             except (EOFError, OSError, MessageError) as error:
-                if link.frames:  # its last words are heard first
-                    link.ended = error
-                    self._poll.unregister(link.socket)
-                    continue
                 self.drop(number)
                 raise LinkLostError(number, error) from error
 
@@ -326,10 +335,9 @@ class Links:
         if number in self._links:
             self._forget(number).socket.close()
 
-    def _forget(self, number: int) -> _Link:
+    def _forget(self, number: int) -> Link:
         link = self._links.pop(number)
-        if link.ended is None:
-            self._poll.unregister(link.socket)
+        self._poll.unregister(link.socket)
         del self._by_socket[link.socket.fileno()]
         return link
 
@@ -341,10 +349,6 @@ class Links:
         self.urgent = _unheard
         until_s = time.monotonic() + timeout_s
         while self._links and time.monotonic() < until_s:
-            for number, link in list(self._links.items()):
-                link.frames.clear()
-                if link.ended is not None:
-                    self.drop(number)
             with suppress(LinkLostError):
                 self.pump(1e3 * max(until_s - time.monotonic(), 0.0))
         self.close()
@@ -352,6 +356,10 @@ class Links:
     def close(self) -> None:
         for number in self.numbers:
             self.drop(number)
+
+
+def _text(frame: NodeFrame) -> str:
+    return bytes(frame.data).decode(errors="replace")
 
 
 def _unheard(number: int, frame: NodeFrame) -> None:

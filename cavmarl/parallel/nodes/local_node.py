@@ -11,4 +11,7 @@ from cavmarl.parallel.nodes.node_process import run_node
 
 if __name__ == "__main__":
     host, port, number = sys.argv[1:]
-    run_node((host, int(port)), bytes.fromhex(sys.stdin.readline().strip()), int(number))
+    try:
+        run_node((host, int(port)), bytes.fromhex(sys.stdin.readline().strip()), int(number))
+    except (EOFError, OSError):  # the caller has ended meanwhile
+        sys.exit(1)

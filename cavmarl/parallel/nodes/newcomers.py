@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import json
 import logging
-import socket
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cavmarl.core.errors import WorkerFailureError
+from cavmarl.core.errors import WorkerError, WorkerFailureError
+from cavmarl.parallel.commanded_worlds import own_error
 from cavmarl.parallel.hosts.host_process import code_stamp
 from cavmarl.parallel.hosts.listener import Listener
-from cavmarl.parallel.nodes.links import FrameKind, LinkLostError, Links, NodeFrame
-from cavmarl.parallel.nodes.world_files import WorldFile
+from cavmarl.parallel.nodes.links import FrameKind, Link, LinkLostError, Links, NodeFrame
+from cavmarl.parallel.nodes.node_files import WorldFile
 
 log = logging.getLogger("cavmarl.nodes")
 
+LOOK_MS = 20.0  # so often it is looked who has called, before the worlds begin
 ANYONE = (1 << 32) - 1  # the number of a node that takes any
 
 
@@ -76,7 +78,37 @@ class Newcomers:
         except LinkLostError as lost:
             self._forget(lost.peer)
 
-    def take(self, number: int) -> tuple[Newcomer, socket.socket]:
+    def await_ready(
+        self,
+        num: int,
+        timeout_s: float,
+        trouble: Callable[[], str | None],  # why they will not come, in words
+    ) -> None:
+        """Return when as many are ready.
+
+        Raises:
+            CavmarlError: what one of them has raised.
+            WorkerError: they have not come in time.
+        """
+        until_s = time.monotonic() + timeout_s
+        log.info("waiting for %d nodes at %s", num, self.place)
+        while len(self.ready) < num:
+            self.look(LOOK_MS)
+            for failure in self.failures:
+                raise own_error(failure) from failure
+            why = trouble()
+            if why is None and time.monotonic() > until_s:
+                why = "; refused ".join(
+                    (
+                        f"{len(self.ready)} of {num} nodes have joined at {self.place} within "
+                        f"workers.join_timeout_s = {timeout_s:g}",
+                        *self.refused,
+                    )
+                )
+            if why is not None:
+                raise WorkerError(why)
+
+    def take(self, number: int) -> tuple[Newcomer, Link]:
         """One that is ready, and its connection."""
         self.ready.remove(number)
         return self._all.pop(number), self._links.release(number)

@@ -6,6 +6,7 @@ import json
 import logging
 import struct
 import time
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -36,8 +37,8 @@ from cavmarl.parallel.nodes.links import (
 )
 from cavmarl.parallel.nodes.newcomers import Newcomer, Newcomers
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
-from cavmarl.parallel.nodes.node_starters import start_nodes
-from cavmarl.parallel.nodes.world_files import files_of
+from cavmarl.parallel.nodes.node_files import files_of
+from cavmarl.parallel.nodes.node_starters import Route, start_nodes, straight
 from cavmarl.parallel.nodes.zone_hosts import read_report
 from cavmarl.parallel.nodes.zone_moves import ZoneMoves, moves_of, name_of
 from cavmarl.parallel.recipe import recipe_of
@@ -49,7 +50,7 @@ log = logging.getLogger("cavmarl.nodes")
 
 PONG_S = 1.0  # for a living node to answer
 KEEP_S = 0.2  # so much of work may have to be done again
-LOOK_MS = 20.0  # so often it is looked who has called, before the worlds begin
+MISSED_S = 0.1  # to hear who else misses a node
 END_S = 1.0  # for nodes to hear that they are needed no more
 SPARES = 1  # nodes more than are wanted that may wait for another one's end
 
@@ -93,15 +94,16 @@ class NodePool:
         nodes: int,  # n, from 1 to the zones of a world
         in_next_step: bool = False,  # when worlds begin anew; see `SteppedWorlds`
         hosts: str = "",  # what starts the nodes; see `start_nodes`
+        route: Route = straight,  # where to call in order to reach a place
     ) -> None:
-        self.world = world
+        self.world, self._route = world, route
         self.in_next_step = in_next_step
         config, count = world.config, world.partition.count
         layout = layout_of(config, world.capacity, num_worlds).items()
         self.arrays = StepArrays.of({name: np.zeros(shape, kind) for name, (kind, shape) in layout})
         self._placement = StepPlacement(world, 1, nodes)
         self.zones = parts_of(self._placement.plans, count)[0].zones
-        self._first_zones = self.zones
+        self._homes = self.zones
         self._generation = 0
         self._teller = 0
         self._state = _State(1, self.zones, 0)  # that all nodes can go back to
@@ -110,10 +112,12 @@ class NodePool:
         self._keep_again_s = 0.0  # by `time.monotonic`
         self._log: list[NodeCommand] = []  # since that state
         self._lost: list[int] = []
+        self._missed: list[int] = []  # the two ends of connections that nodes have lost
         self._is_torn = False
         self.losses = self.recoveries = self.replacements = 0
         self._timeout_s = config.workers.timeout_s
-        self._answered: set[int] = set()  # nodes that answered the last PING
+        # nodes that answered the last PING, and whose frames each waits for
+        self._answered: dict[int, list[int]] = {}
         self._pings = 0
         self._ticks_per_step = config.clock.ticks_per_step
         self._links = Links(_nothing)
@@ -138,10 +142,10 @@ class NodePool:
             "in_next_step": in_next_step,
         }
         files = files_of(config, base_dir)
-        self._starter, listener = start_nodes(hosts, nodes, config.workers, base_dir)
+        self._starter, listener = start_nodes(hosts, nodes, config.workers, base_dir, route)
         self._newcomers = Newcomers(listener, job, files, self._room)
         try:
-            self._await_first(nodes, hosts or "this machine", config.workers.join_timeout_s)
+            self._newcomers.await_ready(nodes, config.workers.join_timeout_s, self._starter.trouble)
             self._seat()
             self._tell_zones(self._coordinator.host(), ZoneMoves(self.zones, {}, []), begins=True)
             self._commit()
@@ -158,40 +162,18 @@ class NodePool:
         return [self._nodes[number].pid for number in sorted(self._nodes)]
 
     def _room(self) -> int:
-        return len(self._first_zones) - len(self._nodes) + SPARES
-
-    def _await_first(self, nodes: int, hosts: str, timeout_s: float) -> None:
-        """Return when as many nodes are ready as are wanted.
-
-        Raises:
-            WorkerError: they have not come in time.
-        """
-        newcomers, until_s = self._newcomers, time.monotonic() + timeout_s
-        log.info("waiting for %d nodes at %s", nodes, newcomers.place)
-        while len(newcomers.ready) < nodes:
-            newcomers.look(LOOK_MS)
-            for failure in newcomers.failures:
-                raise own_error(failure) from failure
-            trouble = self._starter.trouble()
-            if trouble is None and time.monotonic() > until_s:
-                refused = "; refused ".join(("", *newcomers.refused))
-                trouble = (
-                    f"{len(newcomers.ready)} of {nodes} nodes have joined within "
-                    f"workers.join_timeout_s = {timeout_s:g} ({hosts}){refused}"
-                )
-            if trouble is not None:
-                raise WorkerError(trouble)
+        return len(self._homes) - len(self._nodes) + SPARES
 
     def _seat(self) -> None:
         """Let those that are ready host the zones that a lost node had at the beginning."""
-        empty = [n for n in range(len(self._first_zones)) if n not in self._nodes]
+        empty = [n for n in range(len(self._homes)) if n not in self._nodes]
         for ready in list(self._newcomers.ready)[: len(empty)]:
             newcomer, connection = self._newcomers.take(ready)
             number = newcomer.asked if newcomer.asked in empty else empty[0]
             empty.remove(number)
             assert newcomer.place is not None
             self._links.add(number, connection)
-            self._nodes[number], self._new[number] = newcomer, newcomer.place
+            self._nodes[number], self._new[number] = newcomer, self._route(newcomer.place)
             if number in self._lost:
                 self._lost.remove(number)
 
@@ -207,7 +189,7 @@ class NodePool:
                 if frame.kind is FrameKind.FAILED:
                     name, text, trace = json.loads(bytes(frame.data))
                     failure = WorkerFailureError(
-                        number, name_of(self._first_zones[number]), name, text, trace
+                        number, name_of(self._homes[number]), name, text, trace
                     )
                     raise own_error(failure) from failure
                 if frame.number == self._generation:
@@ -247,17 +229,18 @@ class NodePool:
             self._keep_again_s = time.monotonic() + KEEP_S
         return results
 
-    def _insist(self, command: NodeCommand) -> list[memoryview]:
-        """Do a command again and again, until no node is lost meanwhile."""
+    def _insist(self, command: NodeCommand | None) -> list[memoryview]:
+        """Do a command, or none, again and again, until no node is lost meanwhile."""
         while True:
             try:
                 if self._is_torn:
                     self._recover()
-                    for one in self._log[: -1 if command.changes else None]:
+                    changes = command is not None and command.changes
+                    for one in self._log[: -1 if changes else None]:
                         self._perform(one)
-                return self._perform(command)
+                return [] if command is None else self._perform(command)
             except LinkLostError as lost:
-                self._lose(lost)
+                self._lose(self._most_missed(lost))
             except SilenceError as silence:
                 self._lose(LinkLostError(self._silent(silence)), is_silent=True)
 
@@ -271,7 +254,7 @@ class NodePool:
             return False
         self._newcomers.look(0.0)
         is_fresh = self._state.zones == self.zones and not self._is_torn
-        if not (self._newcomers.ready and is_fresh and len(self._nodes) < len(self._first_zones)):
+        if not (self._newcomers.ready and is_fresh and len(self._nodes) < len(self._homes)):
             return False
         before = len(self._nodes)
         self._seat()
@@ -302,14 +285,15 @@ class NodePool:
         if frame.kind is FrameKind.MISSED:
             peer = int.from_bytes(frame.data, "little")
             if frame.number == self._generation and peer in self._nodes:
+                self._missed += (number, peer)
                 raise LinkLostError(peer)
         elif frame.kind is not FrameKind.PONG:
             self._coordinator.hear(number, frame)
         elif frame.number == self._pings:
-            self._answered.add(number)
+            self._answered[number] = json.loads(bytes(frame.data))
 
     def _silent(self, silence: SilenceError) -> int:
-        """A node that answers nothing: it has stopped.
+        """A node that answers nothing, for it has stopped; or that another one waits for in vain.
 
         Raises:
             WorkerError: all answer, and yet nothing comes of the command.
@@ -325,14 +309,30 @@ class NodePool:
         except LinkLostError as lost:
             return lost.peer
         mute = [number for number in self._living if number not in self._answered]
+        missed = Counter(peer for peers in self._answered.values() for peer in peers)
+        mute += [number for number, _ in missed.most_common() if number in self._nodes]
         if not mute:
             raise WorkerError(f"{silence}, though they live") from silence
         return mute[0]
+
+    def _most_missed(self, lost: LinkLostError) -> LinkLostError:
+        """The node that has ended, or else the one that cannot be reached by most others."""
+        until_s = time.monotonic() + MISSED_S
+        while lost.peer in self._links.numbers and time.monotonic() < until_s:
+            try:
+                self._links.pump(1e3 * (until_s - time.monotonic()))
+            except LinkLostError as more:
+                lost = more
+        if lost.peer not in self._links.numbers:
+            return lost
+        worst = max(self._missed, key=lambda number: (self._missed.count(number), number))
+        return LinkLostError(worst, MessageError("other nodes do not reach it"))
 
     def _lose(self, lost: LinkLostError, is_silent: bool = False) -> None:
         """A node is gone: nothing of it counts any more."""
         number = lost.peer
         self._is_torn = True
+        self._missed.clear()
         self._links.drop(number)
         node = self._nodes.pop(number, None)
         self._new.pop(number, None)
@@ -344,7 +344,7 @@ class NodePool:
             "node %d on %s (%s) is lost: %s",
             number,
             node.machine,
-            name_of(self._first_zones[number]),
+            name_of(self._homes[number]),
             lost,
         )
         self._starter.replace(node.asked, is_silent)
@@ -352,7 +352,7 @@ class NodePool:
     def _recover(self) -> None:
         """Let the living nodes host the zones of the lost ones, as of the newest state they have.
 
-        Nodes that are new get the zones that those had whom they replace.
+        Zones whose home is another node that lives go there.
 
         Raises:
             LinkLostError: another one is lost.
@@ -360,7 +360,7 @@ class NodePool:
         """
         state = self._state
         self._opened = None
-        moves = moves_of(state.zones, self._first_zones, self._lost, self._nodes, state.number)
+        moves = moves_of(state.zones, self._homes, self._lost, self._nodes, state.number)
         self.zones = moves.zones
         self._generation += 1
         hostings = self._coordinator.recover(self._node_of(), state.switched)

@@ -13,6 +13,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from cavmarl.core.errors import CavmarlError, ConfigError, MessageError, NodeRefusedError
+from cavmarl.engine.shard_clock import ShardClock
 from cavmarl.handoff.shard_setup import limits_of
 from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.ownership.reactions import Hosting
@@ -31,15 +32,17 @@ from cavmarl.parallel.nodes.links import (
     RecoveryOrderedError,
 )
 from cavmarl.parallel.nodes.meeting import call_node, calls_of
+from cavmarl.parallel.nodes.node_files import WorldFile, recipe_with
 from cavmarl.parallel.nodes.node_frames import cases_of, command_of, results_of, told_cases
+from cavmarl.parallel.nodes.node_loads import totals
 from cavmarl.parallel.nodes.node_peers import NodePeers
-from cavmarl.parallel.nodes.world_files import WorldFile, recipe_with
 from cavmarl.parallel.nodes.zone_hosts import ZoneHosts
 from cavmarl.parallel.recipe import world_of
 from cavmarl.parallel.worlds_job import Task, commands_of
-from cavmarl.shards.executor import SerialExecutor
+from cavmarl.shards.executor import Executor, SerialExecutor
 from cavmarl.shards.shard import Shard
 
+MEASURED_TICKS = 10  # one of so many shows what zones cost
 MEETING_S = 60.0  # for the other nodes to call
 DIFFERENT = "are read as something else on this machine: {} is the caller's folder"
 
@@ -47,8 +50,10 @@ DIFFERENT = "are read as something else on this machine: {} is the caller's fold
 class NodeExecutor:
     """Runs phases on the shards of this node; the other shards' rows stay on the same side."""
 
-    def __init__(self, own: Sequence[Shard], foreign: Sequence[Shard]) -> None:
-        self._executor = SerialExecutor(own)
+    def __init__(
+        self, own: Sequence[Shard], foreign: Sequence[Shard], clock: ShardClock | None
+    ) -> None:
+        self._executor: Executor = clock or SerialExecutor(own)
         self._first, self._foreign = own[0], foreign
 
     def each(self, phase: str, *arguments: Any) -> None:
@@ -110,10 +115,6 @@ class NodeProgram:
     def _take(self, kind: FrameKind) -> memoryview:
         """What the caller sends next, while it may send this node away."""
         frame = self._links.take([COORDINATOR])[COORDINATOR]
-        if frame.kind is FrameKind.REFUSED:
-            raise NodeRefusedError(f"the caller refuses this node: {bytes(frame.data).decode()}")
-        if frame.kind is FrameKind.END:
-            raise NeededNoMoreError
         if frame.kind is not kind:
             raise MessageError(f"the caller sent {frame.kind.name}, not {kind.name}")
         return frame.data
@@ -141,7 +142,9 @@ class NodeProgram:
         shards = simulation.shards
         own = [shards[zone] for zone in mine]
         foreign = [shard for shard in shards if shard.zone not in mine]
-        simulation.share(self._peers, self._hosts, NodeExecutor(own, foreign))
+        every = simulation.config.workers.balance_steps
+        self._clock = ShardClock(own, MEASURED_TICKS) if every else None
+        simulation.share(self._peers, self._hosts, NodeExecutor(own, foreign, self._clock))
 
     def _hear(self, number: int, frame: NodeFrame) -> None:
         """Take an urgent frame."""
@@ -149,8 +152,11 @@ class NodeProgram:
             self._kept.take(number, frame)
         elif frame.kind is FrameKind.AGENT:
             self._hosts.keep_agent(frame)
+        elif frame.kind is FrameKind.GIVE:
+            self._kept.take_given(number, frame)
         elif frame.kind is FrameKind.PING:
-            self._links.send(COORDINATOR, FrameKind.PONG, frame.number)
+            said = json.dumps(sorted(self._links.awaited)).encode()
+            self._links.send(COORDINATOR, FrameKind.PONG, frame.number, [said])
         else:
             self._hosts.hear(number, frame)
 
@@ -164,8 +170,6 @@ class NodeProgram:
         while True:
             try:
                 frame = self._links.take([COORDINATOR])[COORDINATOR]
-                if frame.kind is FrameKind.END:
-                    raise NeededNoMoreError
                 if frame.kind is FrameKind.RECOVER:
                     self._recover(frame)
                 else:
@@ -182,8 +186,6 @@ class NodeProgram:
             try:
                 while frame is None or frame.kind is not FrameKind.RECOVER:
                     frame = self._links.take([COORDINATOR])[COORDINATOR]
-                    if frame.kind is FrameKind.END:
-                        raise NeededNoMoreError
                 self._recover(frame)
                 return
             except RecoveryOrderedError as ordered:
@@ -223,16 +225,14 @@ class NodeProgram:
                 if found.kind is FrameKind.SYNC and found.number == frame.number:
                     break
         state, mine = int(told["state"]), zones[self._number]
-        donors = [donor for donor, taker in told["donors"] if taker == self._number]
         if told["begins"]:
             self._peers.keep_own(self._worlds.simulation.everywhere)
             self._kept.keep(state, self._living)
-        elif donors:
-            self._kept.take_over(state, donors, mine, self._check)
         else:
             adopted = [number for number, heir in told["heirs"] if heir == self._number]
+            donors = [donor for donor, taker in told["donors"] if taker == self._number]
             takers = [taker for donor, taker in told["donors"] if donor == self._number]
-            self._kept.load(state, adopted, mine, takers)
+            self._kept.load(state, adopted, donors, takers, mine, self._generation, self._check)
         self._hosts.report()
 
     def _meet(self, places: Mapping[int, tuple[str, int]], others: Sequence[int]) -> None:
@@ -279,6 +279,12 @@ class NodeProgram:
             case Task.LOAD if not letter["only_reads"]:
                 worlds.load_worlds(cases_of(letter))
                 self._hosts.report()
+            case Task.HOST:
+                spent_s = [] if self._clock is None else self._clock.take_s().tolist()
+                self._answer([json.dumps(list(zip(self.zones, spent_s, strict=False))).encode()])
+            case Task.LOADS:
+                said = [self._number, *totals(self._links, worlds.simulation, self.zones)]
+                self._answer([json.dumps(said).encode()])
             case Task.SUGGEST:
                 worlds.suggest()
                 where = np.flatnonzero(peers.own.reshape(-1))
@@ -378,7 +384,7 @@ def run_node(
             str(error),
             "" if isinstance(error, CavmarlError) else traceback.format_exc(),
         ]
-        with suppress(LinkLostError):
+        with suppress(LinkLostError, NeededNoMoreError):
             links.send(COORDINATOR, FrameKind.FAILED, node.generation, [json.dumps(said).encode()])
             links.flush()
             while True:

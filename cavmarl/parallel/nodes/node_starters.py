@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 from cavmarl.config.env import WorkersConfig
 from cavmarl.core.errors import ConfigError
@@ -21,6 +22,14 @@ LOCAL = "127.0.0.1"  # where nodes of this machine meet
 RAY = "ray"
 MIN_KEY = 32  # characters of a key file
 END_S = 5.0  # for nodes to end by themselves
+
+
+Route: TypeAlias = Callable[[tuple[str, int]], tuple[str, int]]
+
+
+def straight(place: tuple[str, int]) -> tuple[str, int]:
+    """Where to call in order to reach a place: there."""
+    return place
 
 
 class NodeStarter(Protocol):
@@ -40,8 +49,8 @@ class NodeStarter(Protocol):
 class LocalNodes:
     """Processes of this machine, which end with this one."""
 
-    def __init__(self, nodes: int, listener: Listener) -> None:
-        self._listener = listener
+    def __init__(self, nodes: int, listener: Listener, place: tuple[str, int]) -> None:
+        self._listener, self._place = listener, place
         self._processes: list[subprocess.Popen[Any]] = []
         try:
             self._processes = [self._start(number) for number in range(nodes)]
@@ -50,7 +59,7 @@ class LocalNodes:
             raise
 
     def _start(self, number: int) -> subprocess.Popen[Any]:
-        told = map(str, (*self._listener.place, number))
+        told = map(str, (*self._place, number))
         process = start_dying_with_process(
             [sys.executable, "-m", NODE, *told], stdin=subprocess.PIPE, text=True
         )
@@ -120,6 +129,7 @@ def start_nodes(
     nodes: int,
     settings: WorkersConfig,
     base_dir: Path,  # the folder that a relative key file starts from
+    route: Route,  # for nodes of this machine
 ) -> tuple[NodeStarter, Listener]:
     """Begin to start nodes; they call the listener.
 
@@ -130,7 +140,7 @@ def start_nodes(
     """
     if hosts == "":
         listener = Listener(LOCAL)
-        return LocalNodes(nodes, listener), listener
+        return LocalNodes(nodes, listener, route(listener.place)), listener
     if hosts == RAY:
         actors = RayActors(run_on_ray, lambda workers: "", nodes, nodes)
         listener = Listener(actors.address)

@@ -20,12 +20,12 @@ class ZoneMoves(NamedTuple):
 
 def moves_of(
     kept: Sequence[Sequence[int]],  # zones of each node when the state was kept
-    first: Sequence[Sequence[int]],  # zones of each node at the beginning
+    homes: Sequence[Sequence[int]],  # zones of each node if none is lost
     lost: Sequence[int],
     living: Collection[int],
     state: int,  # its number
 ) -> ZoneMoves:
-    """The next node of the ring has what a lost one had; a new one gets what it would have had.
+    """The next node of the ring has what a lost one had; zones go home where they can.
 
     Raises:
         WorkerDeathError: the next one is lost, too.
@@ -36,23 +36,26 @@ def moves_of(
     for number in (n for n in ring if n in lost):
         heir = ring[(ring.index(number) + 1) % len(ring)]
         if heir in lost:
-            both = "; ".join(name_of(first[n]) for n in (number, heir))
+            both = "; ".join(name_of(homes[n]) for n in (number, heir))
             causes = [f"node {n} was lost" for n in lost]
             raise WorkerDeathError(number, both, state, "step", causes)
         heirs[number] = heir
     for number, heir in heirs.items():
         zones[heir] += zones[number]
         zones[number] = []
-    donors: list[tuple[int, int]] = []
-    old = [number for number in sorted(living) if zones[number]]
-    for number in (n for n in sorted(living) if n not in old):
-        for donor in old:
-            given = set(first[number]) & set(zones[donor])
-            if given:
-                donors.append((donor, number))
-                zones[donor] = [zone for zone in zones[donor] if zone not in given]
-                zones[number] += given
-    return ZoneMoves([sorted(some) for some in zones], heirs, donors)
+    host = {zone: number for number, some in enumerate(zones) for zone in some}
+    goes: dict[int, int] = {
+        zone: number
+        for number, some in enumerate(homes)
+        for zone in some
+        if number in living and host[zone] != number
+    }
+    donors = sorted({(host[zone], number) for zone, number in goes.items()})
+    host |= goes
+    after: Zones = [[] for _ in kept]
+    for zone in sorted(host):
+        after[host[zone]].append(zone)
+    return ZoneMoves(after, heirs, donors)
 
 
 def name_of(zones: Sequence[int]) -> str:
