@@ -7,7 +7,6 @@ start.
 from __future__ import annotations
 
 import asyncio
-import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 
@@ -20,11 +19,11 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from cavmarl.core.errors import ServiceError
 from cavmarl.service.guards import Service, rule_of
 from cavmarl.service.problems import add_handlers, answer
-from cavmarl.service.refusals import PROBLEM_TYPE
 from cavmarl.service.routes import ROUTERS
 from cavmarl.service.service_metrics import ServiceMetrics
 
 MAX_BODY_BYTES = 256 * 1024
+MAX_CONTENT_BYTES = 64 * 1024 * 1024  # of a world's state, or a file of results
 MAX_PATH_BYTES = 1024
 NO_TELEMETRY: TelemetryConfig = {  # whatever the surroundings have set up: nothing is exported
     "tracing": False,
@@ -61,7 +60,6 @@ def make_app(service: Service, sweep_s: float = 0.5) -> ASGIApp:
         redirect_slashes=False,
         telemetry=NO_TELEMETRY,
         lifespan=lifespan,
-        max_body_size=MAX_BODY_BYTES,
     )
     app.state.service = service
     app.state.metrics = ServiceMetrics(service.broker)
@@ -91,48 +89,48 @@ async def _sweep(service: Service, every_s: float) -> None:
 
 
 class GuardedRequests:
-    """Long paths are refused, slow bodies given up, and answers get headers of safety."""
+    """Long paths, large and slow bodies are refused, and answers get headers of safety.
 
-    def __init__(self, app: ASGIApp) -> None:
+    Args:
+        app: what it guards.
+        content_bytes: the most that a PUT has.
+        body_bytes: the most that any other body has.
+    """
+
+    def __init__(
+        self,
+        app: ASGIApp,
+        content_bytes: int = MAX_CONTENT_BYTES,
+        body_bytes: int = MAX_BODY_BYTES,
+    ) -> None:
         self._app = app
+        self._content_bytes, self._body_bytes = content_bytes, body_bytes
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        until_s = time.monotonic() + BODY_S
+        until_s = asyncio.get_running_loop().time() + BODY_S
+        left = self._content_bytes if scope["method"] == "PUT" else self._body_bytes
         is_read = False
 
         async def receive_in_time() -> Message:
-            nonlocal is_read
+            nonlocal is_read, left
             if is_read:  # what comes now is that the caller has gone
                 return await receive()
             try:
-                async with asyncio.timeout_at(
-                    asyncio.get_running_loop().time() + until_s - time.monotonic()
-                ):
+                async with asyncio.timeout_at(until_s):
                     message = await receive()
             except TimeoutError:
                 raise HTTPException(408, f"the body did not come within {BODY_S:g} s") from None
+            left -= len(message.get("body", b""))
+            if left < 0:
+                raise HTTPException(413, "the body is too large for this route")
             is_read = not message.get("more_body", False)
             return message
 
-        is_replaced = False
-
         async def send_with_headers(message: Message) -> None:
-            nonlocal is_replaced
-            if is_replaced and message["type"] == "http.response.body":
-                return
             if message["type"] == "http.response.start":
-                if (
-                    message["status"] == 413
-                    and PROBLEM_TYPE.encode() not in dict(message["headers"]).values()
-                ):
-                    await answer("too-large", "the body is too large for this route")(
-                        scope, receive, send_with_headers
-                    )
-                    is_replaced = True  # it was the framework's own, in plain text
-                    return
                 message = {**message, "headers": [*message["headers"], *HEADERS.items()]}
             await send(message)
 

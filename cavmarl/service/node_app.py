@@ -71,12 +71,11 @@ def make_node_app(link: NodeLink, worlds: SessionWorlds) -> ASGIApp:
         redoc_url=None,
         redirect_slashes=False,
         telemetry=NO_TELEMETRY,
-        max_body_size=MAX_ACTIONS_BYTES,
     )
     app.state.link, app.state.worlds = link, worlds
     app.include_router(router)
     add_handlers(app)
-    return GuardedRequests(app)
+    return GuardedRequests(app, body_bytes=MAX_ACTIONS_BYTES)
 
 
 def _worlds(request: Request) -> SessionWorlds:

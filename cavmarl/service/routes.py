@@ -54,7 +54,6 @@ ROUTERS = (nodes, worlds, records, open_routes)  # beats are most of what comes
 PAGE = 1000
 TLS = "tls"  # the capability of nodes whose clients' port has it
 KEEP_ALIVE_S = 15.0
-MAX_CONTENT_BYTES = 64 * 1024 * 1024  # of a world's state, or a file of results
 
 Everyone = Annotated[IdentityRecord, Depends(may("viewer", "client", "operator", "admin", "node"))]
 Viewers = Annotated[IdentityRecord, Depends(may("viewer", "operator", "admin"))]
@@ -216,7 +215,7 @@ async def get_state(identity: Nodes, service: TheService, number: SessionId) -> 
     return Response(content, headers=headers, media_type="application/octet-stream")
 
 
-@worlds.put("/sessions/{number}/state", status_code=204, max_body_size=MAX_CONTENT_BYTES)
+@worlds.put("/sessions/{number}/state", status_code=204)
 async def put_state(
     identity: Nodes,
     service: TheService,
@@ -252,7 +251,7 @@ async def finish(
     return _session(session)
 
 
-@worlds.put("/jobs/{number}/results/{name}", status_code=204, max_body_size=MAX_CONTENT_BYTES)
+@worlds.put("/jobs/{number}/results/{name}", status_code=204)
 async def put_result(
     identity: Nodes, service: TheService, request: Request, number: SessionId, name: FileName
 ) -> None:
