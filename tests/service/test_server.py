@@ -14,6 +14,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
+from benchmarks import service as service_benchmark
 from cavmarl.client import Client
 from cavmarl.core.errors import ServiceError
 from cavmarl.service.server import check_transport
@@ -59,6 +60,15 @@ def test_it_starts_within_two_seconds(tmp_path: Path) -> None:
     with running_service(tmp_path / "store.sqlite") as service:
         assert httpx.get(f"{service.url}/v1/health").status_code == 200
         assert sum(psutil.Process(service.process.pid).cpu_times()[:2]) < 2.0
+
+
+def test_the_benchmark_measures_and_its_replay_is_equal() -> None:
+    found = service_benchmark.measure(nodes=20, requests=60, seconds=1, hours=0.1)
+    assert found.holds
+    assert found.facts["churn"]["sessions hosted that are not active"] == 0
+    assert found.facts["churn"]["events"] > 300
+    assert 0.0 < found.facts["selection_ms"]["p50"] <= found.facts["selection_ms"]["p99"]
+    assert found.facts["beats_share"] > 0.0
 
 
 def test_the_service_has_no_client_of_its_own() -> None:
