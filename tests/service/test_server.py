@@ -63,7 +63,7 @@ def test_it_starts_within_two_seconds(tmp_path: Path) -> None:
 
 
 def test_the_benchmark_measures_and_its_replay_is_equal() -> None:
-    found = service_benchmark.measure(nodes=20, requests=60, seconds=1, hours=0.1)
+    found = service_benchmark.measure(nodes=200, requests=60, seconds=2, hours=0.1)
     assert found.holds
     assert found.facts["churn"]["sessions hosted that are not active"] == 0
     assert found.facts["churn"]["events"] > 300
