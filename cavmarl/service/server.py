@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import ipaddress
 import socket
 from collections.abc import Callable
@@ -9,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import uvicorn
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from cavmarl.core.errors import ServiceError
 from cavmarl.service.access import Access, RateLimit
@@ -20,6 +22,8 @@ from cavmarl.service.guards import Service
 
 DEFAULT_STORE = Path("runs/service.sqlite")
 DEFAULT_PORT = 8700
+MAX_HEAD_BYTES = 16 * 1024
+HEAD_S = 10.0  # in which a head has to come
 SERVER_HEADER: list[tuple[str, str]] = [("server", "cavmarl")]
 
 
@@ -132,9 +136,51 @@ def uvicorn_config(app: object, options: ServerOptions) -> uvicorn.Config:
         timeout_graceful_shutdown=2,
         limit_concurrency=2048,
         loop="asyncio",
+        http=BoundedHeads,
         ws="none",
         proxy_headers=False,
     )
+
+
+class BoundedHeads(HttpToolsProtocol):
+    """Closes connections whose head is long or slow; the parser itself would take any."""
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self._begin_head()
+
+    def data_received(self, data: bytes) -> None:
+        super().data_received(data)
+        if self._late is None:  # the head is there
+            return
+        self._head_bytes += len(data)
+        if self._head_bytes > MAX_HEAD_BYTES:
+            self.transport.close()
+
+    def on_message_begin(self) -> None:
+        super().on_message_begin()
+        self._end_head()
+        self._begin_head()
+
+    def on_headers_complete(self) -> None:
+        self._end_head()
+        super().on_headers_complete()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._end_head()
+        super().connection_lost(exc)
+
+    def _begin_head(self) -> None:
+        self._head_bytes = 0
+        self._late = self.loop.call_later(HEAD_S, self.transport.close)
+
+    def _end_head(self) -> None:
+        if self._late is not None:
+            self._late.cancel()
+            self._late = None
+
+    _late: asyncio.TimerHandle | None = None
+    _head_bytes = 0
 
 
 def _shown(host: str) -> str:

@@ -301,6 +301,15 @@ def test_large_and_slow_and_deep_bodies_are_refused(service: RunningService) -> 
     assert problem_of(long) == "bad-body"
 
 
+def test_a_long_head_ends_the_connection(service: RunningService) -> None:
+    place = urlsplit(service.url)
+    with socket.create_connection((place.hostname, place.port)) as line:
+        line.sendall(b"GET /v1/health HTTP/1.1\r\nHost: x\r\nX-Long: ")
+        with pytest.raises(ConnectionError):
+            line.sendall(b"a" * 2**26)
+    assert httpx.get(f"{service.url}/v1/health").status_code == 200
+
+
 @pytest.mark.slow  # it waits for as long as a body may take
 def test_a_slow_body_is_given_up(service: RunningService) -> None:
     token = token_of(service, service.secret).json()["access_token"]

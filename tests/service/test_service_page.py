@@ -1,4 +1,7 @@
-"""`docs/service.md` is true: its session runs, its tests exist, its containers can run."""
+"""`docs/service.md` is true: its session runs, its tests exist, its containers can run.
+
+The session is in each run, though it starts a service and two nodes: it is what readers try first.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Worlds and evaluations on nodes in processes of their own; nodes and the service are killed."""
+"""Worlds and evaluations on nodes in processes of their own; nodes and the service are killed.
+
+Three nodes serve all tests; what they cost is counted at the last one. It is in each run, since no
+cheaper test shows that sessions outlive their nodes.
+"""
 
 from __future__ import annotations
 
