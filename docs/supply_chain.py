@@ -19,9 +19,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[1]
-LOCKED = (
-    "sumo,maps,followers,nodes,render,report"  # torch's wheels differ by processor: not among them
-)
+LOCKED = "sumo,maps,followers,nodes,render,report,service"  # torch's wheels differ by processor
 EXTRAS = (
     "",
     "sumo",
@@ -30,6 +28,7 @@ EXTRAS = (
     "nodes",
     "render",
     "report",
+    "service",
     "torch",
     "sb3",
     "torchrl",

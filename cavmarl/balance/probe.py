@@ -61,7 +61,7 @@ class Watch:
             for core in process.cores:
                 foreign[core] -= share
         ram = psutil.virtual_memory().percent / 100.0
-        gpu, source = _busiest_gpu()
+        gpu, source = busiest_gpu()
         states = []
         for number, process in self._watched.items():
             available = process.used_s() is not None
@@ -113,7 +113,7 @@ def _cores(pid: int) -> list[int]:
     return list(range(os.cpu_count() or 1))
 
 
-def _busiest_gpu() -> tuple[float, str]:
+def busiest_gpu() -> tuple[float, str]:
     """The share of the busiest GPU's time that is in use, and its source."""
     tool = shutil.which(GPU_TOOL)
     if tool is None:

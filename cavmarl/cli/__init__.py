@@ -22,6 +22,7 @@ from cavmarl.cli import (
     node,
     plan,
     scenario,
+    service,
     suite,
     train,
     verify,
@@ -55,6 +56,13 @@ app.command()(demo.demo)
 app.command(context_settings={"ignore_unknown_options": True, "allow_interspersed_args": False})(
     train.train
 )
+app.command()(service.serve)
+app.command()(service.grant)
+app.command()(service.submit)
+app.command()(service.nodes)
+app.command()(service.sessions)
+app.command()(service.events)
+app.command()(service.manifest)
 app.command("list")(listing.list_entries)
 app.add_typer(map.app, name="map")
 app.add_typer(demand.app, name="demand")

@@ -28,6 +28,7 @@
     ├── ClockError             time that another than its master advances, or wants to
     ├── FollowerError          an external stack with which the world cannot go on
     │   └── FollowerLostError     it has ended, or has not answered in time
+    ├── ServiceError           the coordination service, a node of it, or a request to it
     └── SumoError              SUMO as global traffic that cannot go on
 
 A message names the thing, the place and the cure.
@@ -250,6 +251,22 @@ class FollowerLostError(FollowerError):
     def __init__(self, message: str, is_late: bool = False) -> None:
         super().__init__(message)
         self.is_late = is_late
+
+
+class ServiceError(CavmarlError):
+    """The coordination service cannot start or go on, or has refused a request.
+
+    Attributes:
+        status: of the HTTP answer; 0: there was none.
+        problem: name of what was wrong, as in the table of `docs/service.md`.
+        retry_s: when to try again; None: that is of no use.
+    """
+
+    retry_s: float | None = None
+
+    def __init__(self, message: str, status: int = 0, problem: str = "") -> None:
+        super().__init__(message)
+        self.status, self.problem = status, problem
 
 
 class SumoError(CavmarlError):

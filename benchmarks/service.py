@@ -1,0 +1,254 @@
+"""What coordination costs: choosing among many nodes, their beats, a day of coming and going."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import secrets
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any
+from urllib.parse import urlsplit
+
+import httpx
+import numpy as np
+import psutil
+
+from benchmarks.harness import Report, Say, about, check_range, run, silent
+from cavmarl.cli.output import Seed
+from cavmarl.client import Client
+from cavmarl.core.errors import ServiceError
+from cavmarl.service.access import Access
+from cavmarl.service.bodies import BeatBody, NodeBody
+from cavmarl.service.broker import Broker, BrokerRules
+from cavmarl.service.event_log import EventLog
+from cavmarl.service.event_store import EventStore
+
+CONFIGURATION = "0" * 64
+NODES_AN_IDENTITY = 100  # whose requests are limited together
+SESSION_S, NODE_S = 600.0, 7200.0  # mean lives in the churn
+FLUSHED_EVERY = 20  # seconds of it
+
+
+def measure(
+    nodes: Annotated[int, about("Nodes.")] = 1000,
+    requests: Annotated[int, about("Selections that are timed.")] = 10_000,
+    seconds: Annotated[int, about("Seconds of beats at 1 Hz.")] = 20,
+    hours: Annotated[float, about("Simulated hours of churn, with a tenth of the nodes.")] = 24.0,
+    seed: Seed = 0,
+    say: Say = silent,
+) -> Report:
+    """Time selections and beats, and replay a day in which nodes and sessions come and go."""
+    check_range(
+        nodes=(nodes, 1, 10_000), requests=(requests, 1, 1_000_000),
+        seconds=(seconds, 1, 3600), hours=(hours, 0.01, 1000.0),
+    )  # fmt: skip
+    rng = np.random.default_rng(seed)
+    with TemporaryDirectory() as room:
+        say(f"{requests} selections among {nodes} nodes")
+        timed = _selections(Path(room) / "selection.sqlite", nodes, requests, rng)
+        say(f"{seconds} s of beats")
+        share, beats_hz = _beats(Path(room) / "beats.sqlite", nodes, seconds)
+        say(f"{hours:g} h of churn")
+        churn = _churn(Path(room) / "churn.sqlite", max(nodes // 10, 3), hours, rng)
+    rows = [
+        {"what": f"selection among {nodes} nodes, {name}, ms", "value": value}
+        for name, value in timed.items()
+    ]
+    rows.append({"what": f"{beats_hz:.0f} beats a second, share of one core", "value": share})
+    rows += [{"what": f"churn: {name}", "value": value} for name, value in churn.items()]
+    return Report(
+        "the coordination service",
+        {"": "what", "found": "value:.3f"},
+        rows,
+        facts={"nodes": nodes, "selection_ms": timed, "beats_share": share, "churn": churn},
+        holds=bool(churn["replay equal"]),
+    )
+
+
+class _Fleet:
+    """A broker and what speaks to it, with a clock of its own."""
+
+    def __init__(self, store: Path, rng: np.random.Generator) -> None:
+        self.now_s, self.beats, self.rng = 0.0, 0, rng
+        self.log = EventLog(EventStore(store), lambda: self.now_s)
+        access = Access(self.log, lambda: self.now_s)
+        self.broker = Broker(self.log, BrokerRules(), lambda: self.now_s)
+        self.nodes = access.add_identity("nodes", "node")[0]
+        self.client = access.add_identity("client", "client")[0]
+
+    def register(self, name: str) -> None:
+        body = NodeBody(name=name, address="127.0.0.1", client_port=1, simulator_port=1, slots=64)
+        self.broker.register(self.nodes, body)
+
+    def beat(self, name: str, load: Sequence[float]) -> None:
+        self.beats += 1
+        self.broker.beat(
+            self.nodes,
+            name,
+            BeatBody(
+                incarnation=self.log.state.nodes[name].incarnation, sequence=self.beats,
+                cpu=load[0], ram=load[1], gpu=load[2], sent_s=self.now_s,
+            ),
+        )  # fmt: skip
+
+
+def _selections(
+    store: Path, nodes: int, requests: int, rng: np.random.Generator
+) -> dict[str, float]:
+    """Percentiles of the time of a whole assignment without its wait for the disk, in ms."""
+    fleet = _Fleet(store, rng)
+    for k in range(nodes):
+        fleet.register(f"node-{k}")
+    spent: list[float] = []
+    opened: list[str] = []
+    for k in range(requests):
+        if k % 100 == 0:
+            for name in fleet.log.state.nodes:
+                fleet.beat(name, rng.uniform(0.0, 0.8, 3).tolist())
+            for number in opened:
+                fleet.broker.close(fleet.client, number)
+            opened.clear()
+            fleet.log.flush()
+        began = time.perf_counter_ns()
+        opened.append(fleet.broker.open(fleet.client, CONFIGURATION).id)
+        spent.append(1e-6 * (time.perf_counter_ns() - began))
+        if k % 1000 == 999:
+            fleet.now_s += 4000.0  # what is over is forgotten
+            fleet.broker.sweep()
+    fleet.log.store.close()
+    return {f"p{quantile}": float(np.percentile(spent, quantile)) for quantile in (50, 95, 99)}
+
+
+def _beats(store: Path, nodes: int, seconds: int) -> tuple[float, float]:
+    """Processor time of a real service a second of beats, and how many came in one."""
+    words = [sys.executable, "-m", "cavmarl", "serve", "--port", "0", "--store", str(store)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            url = process.stdout.readline().split()[1].rstrip(",")
+            secret = process.stdout.readline().split()[-1]
+            granted = []
+            with Client(url, secret) as admin:
+                for k in range(-(-nodes // NODES_AN_IDENTITY)):
+                    body = {"name": f"nodes-{k}", "role": "node"}
+                    granted.append(admin.post("/identities", body)["secret"])
+            return asyncio.run(_beat(url, granted, nodes, seconds, psutil.Process(process.pid)))
+        finally:
+            process.terminate()
+
+
+async def _beat(
+    url: str, granted: list[str], nodes: int, seconds: int, process: psutil.Process
+) -> tuple[float, float]:
+    """Each connection speaks for the nodes of one identity, one after the other."""
+    tokens = []
+    async with httpx.AsyncClient(base_url=f"{url}/v1") as http:
+        for secret in granted:
+            told = (await http.post("/token", json={"secret": secret})).json()
+            tokens.append(told["access_token"])
+    place = urlsplit(url)
+    lines = [await asyncio.open_connection(place.hostname, place.port) for _ in granted]
+    owned = [range(k, nodes, len(granted)) for k in range(len(granted))]
+
+    async def tell(k: int, path: str, body: dict[str, Any]) -> None:
+        reader, writer = lines[k]
+        content = json.dumps(body).encode()
+        head = (
+            f"POST /v1{path} HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {tokens[k]}\r\n"
+            f"Content-Type: application/json\r\nContent-Length: {len(content)}\r\n\r\n"
+        )
+        writer.write(head.encode() + content)
+        answer = (await reader.readuntil(b"\r\n\r\n")).lower()
+        assert answer.startswith(b"http/1.1 20"), answer
+        await reader.readexactly(int(answer.split(b"content-length:")[1].split(b"\r\n")[0]))
+
+    async def register(k: int) -> None:
+        for node in owned[k]:
+            port = {"address": "127.0.0.1", "client_port": 1, "simulator_port": 1}
+            await tell(k, "/nodes", {"name": f"node-{node}", **port})
+
+    async def beat(k: int, second: int) -> None:
+        load = {"cpu": 0.2, "ram": 0.3, "gpu": 0.0}
+        for node in owned[k]:
+            told = {"incarnation": 1, "sequence": second, "sent_s": time.time(), **load}
+            await tell(k, f"/nodes/node-{node}/beat", told)
+
+    await asyncio.gather(*map(register, range(len(granted))))
+    began_s, before_s = time.monotonic(), sum(process.cpu_times()[:2])
+    for second in range(seconds):
+        await asyncio.gather(*(beat(k, second) for k in range(len(granted))))
+        await asyncio.sleep(max(0.0, began_s + second + 1 - time.monotonic()))
+    took_s = time.monotonic() - began_s
+    used_s = sum(process.cpu_times()[:2]) - before_s
+    for _, writer in lines:
+        writer.close()
+    return used_s / seconds, nodes * seconds / took_s  # of a second in which each beats once
+
+
+def _churn(store: Path, nodes: int, hours: float, rng: np.random.Generator) -> dict[str, float]:
+    """Nodes die, drain and come back, sessions begin and end; then the log is replayed."""
+    fleet = _Fleet(store, rng)
+    names = [f"node-{k}" for k in range(nodes)]
+    dead_until = dict.fromkeys(names, 0.0)
+    opened: list[str] = []
+    for name in names:
+        fleet.register(name)
+    refused = most = 0
+    while fleet.now_s < hours * 3600.0:
+        fleet.now_s += 1.0
+        for name in names:
+            if fleet.now_s < dead_until[name]:
+                continue
+            if rng.random() < 1.0 / NODE_S:  # it dies, is drained, or begins again
+                dead_until[name] = fleet.now_s + rng.exponential(60.0)
+                if rng.random() < 0.5:
+                    fleet.broker.drain(fleet.nodes, name, rng.random() < 0.5)
+                elif rng.random() < 0.5:
+                    fleet.register(name)
+            elif int(fleet.now_s) % 2 == 0:
+                fleet.beat(name, (0.3, 0.3, 0.0))
+        try:
+            opened.append(fleet.broker.open(fleet.client, CONFIGURATION).id)
+            if rng.random() < 0.1:
+                number = opened[rng.integers(len(opened))]
+                session = fleet.broker.resolve(fleet.client, number)
+                fleet.broker.save(session, session.saved_number + 1, secrets.token_bytes(64))
+        except ServiceError:
+            refused += 1
+        for number in [one for one in opened if rng.random() < 1.0 / SESSION_S]:
+            fleet.broker.close(fleet.client, number)
+            opened.remove(number)
+        fleet.broker.sweep()
+        opened = [one for one in opened if fleet.log.state.sessions[one].state in
+                  ("active", "queued")]  # fmt: skip
+        most = max(most, len(fleet.log.state.sessions))
+        if int(fleet.now_s) % FLUSHED_EVERY == 0:
+            fleet.log.flush()
+    fleet.log.flush()
+    events = fleet.log.sequence
+    hosted = sum(len(live.hosted) for live in fleet.broker.live.values())
+    active = sum(one.node is not None for one in fleet.log.state.sessions.values())
+    state = fleet.log.state
+    fleet.log.store.close()
+    began_s = time.perf_counter()
+    again = EventLog(EventStore(store))
+    took_s = time.perf_counter() - began_s
+    again.store.close()
+    return {
+        "hours": hours,
+        "events": events,
+        "most sessions known at once": most,
+        "requests refused": refused,
+        "sessions hosted that are not active": hosted - active,
+        "replay, s": took_s,
+        "replay equal": float(again.state == state),
+    }
+
+
+if __name__ == "__main__":
+    run(measure)

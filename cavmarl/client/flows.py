@@ -1,0 +1,148 @@
+"""Conversations with the service and with nodes, without input or output.
+
+A flow yields what is to be asked and is sent the answer, so that the client that waits and the one
+that awaits have the same code.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Generator, Mapping
+from typing import Any, NamedTuple, TypeVar
+
+import httpx
+
+from cavmarl.core.errors import ServiceError
+
+T = TypeVar("T")
+RENEW_BEFORE_S = 60.0  # a token ends
+
+
+class Ask(NamedTuple):
+    """A request; the flow is sent its answer, or thrown `httpx.TransportError`."""
+
+    method: str
+    url: str
+    json: Any = None
+    content: bytes | None = None
+    params: Mapping[str, Any] | None = None
+    token: str = ""
+
+
+class Rest(NamedTuple):
+    """Wait."""
+
+    time_s: float
+
+
+Flow = Generator[Ask | Rest, Any, T]
+
+
+class ServiceFlows:
+    """What a service is asked, with a token that is renewed in time."""
+
+    def __init__(self, url: str, secret: str) -> None:
+        self.url = url.rstrip("/")
+        self._secret = secret
+        self._token = ""
+        self._until_s = 0.0
+
+    def ask(
+        self,
+        method: str,
+        path: str,
+        *,
+        json: Any = None,
+        content: bytes | None = None,
+        params: Mapping[str, Any] | None = None,
+    ) -> Flow[httpx.Response]:
+        """The answer to a request; raises ServiceError where it was refused."""
+        for is_second in (False, True):
+            if is_second or time.monotonic() > self._until_s:
+                yield from self._renew()
+            url = f"{self.url}/v1{path}"
+            answer: httpx.Response = yield Ask(method, url, json, content, params, self._token)
+            if answer.status_code != 401:
+                break
+        check(answer)
+        return answer
+
+    def token(self) -> Flow[str]:
+        """A token that is good for a while."""
+        if time.monotonic() > self._until_s:
+            yield from self._renew()
+        return self._token
+
+    def get(self, path: str, **params: Any) -> Flow[Any]:
+        """A document of the service."""
+        return (yield from self.ask("GET", path, params=params)).json()
+
+    def post(self, path: str, json: Any = None) -> Flow[Any]:
+        """What the service answers to a document."""
+        return (yield from self.ask("POST", path, json=json)).json()
+
+    def delete(self, path: str) -> Flow[None]:
+        """Take something away."""
+        yield from self.ask("DELETE", path)
+
+    def add_configuration(self, environment: str, keys: Mapping[str, Any]) -> Flow[str]:
+        """The hash of a configuration."""
+        body = {"environment": environment, **keys}
+        found = yield from self.post("/configurations", body)
+        return str(found["hash"])
+
+    def submit(
+        self,
+        environment: str,
+        keys: Mapping[str, Any],
+        job: Mapping[str, Any],
+    ) -> Flow[str]:
+        """The id of a new job."""
+        found = yield from self.add_configuration(environment, keys)
+        return str((yield from self.post("/jobs", {"configuration": found, **job}))["id"])
+
+    def wait(self, job: str, timeout_s: float, poll_s: float = 0.25) -> Flow[dict[str, Any]]:
+        """A job that is over; raises ServiceError if it has failed, or takes longer."""
+        until_s = time.monotonic() + timeout_s
+        while True:
+            found: dict[str, Any] = yield from self.get(f"/sessions/{job}")
+            if found["state"] == "done":
+                return found
+            if found["state"] in ("failed", "closed"):
+                raise ServiceError(f"job {job} is {found['state']}: {found['message']}")
+            if time.monotonic() > until_s:
+                raise ServiceError(
+                    f"job {job} is {found['state']} after {timeout_s:g} s; ask again later"
+                )
+            yield Rest(poll_s)
+
+    def results(self, job: str) -> Flow[dict[str, bytes]]:
+        """The files that a job has made, by name."""
+        found = yield from self.get(f"/sessions/{job}")
+        files = {}
+        for name in found["results"]:
+            answer = yield from self.ask("GET", f"/jobs/{job}/results/{name}")
+            files[name] = answer.content
+        return files
+
+    def _renew(self) -> Flow[None]:
+        answer = yield Ask("POST", f"{self.url}/v1/token", {"secret": self._secret})
+        check(answer)
+        found = answer.json()
+        self._token = found["access_token"]
+        self._until_s = time.monotonic() + found["expires_in"] - RENEW_BEFORE_S
+
+
+def check(answer: httpx.Response) -> None:
+    """Raise what an answer refuses."""
+    if answer.is_success:
+        return
+    retry_s = answer.headers.get("retry-after")
+    try:
+        found = answer.json()
+        message, name = f"{found['detail']}", str(found["title"])
+    except (ValueError, KeyError, TypeError):
+        message, name = f"HTTP {answer.status_code} from {answer.request.url.host}", ""
+    error = ServiceError(message, answer.status_code, name)
+    error.retry_s = float(retry_s) if retry_s and retry_s.isdigit() else None
+    raise error

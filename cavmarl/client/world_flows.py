@@ -1,0 +1,277 @@
+"""A world on a node: its commands, and how it goes on when the node is gone.
+
+Each command has a number. A node answers a repeated one from memory, and keeps the state of its
+worlds with the service now and then; the client keeps the commands since. When the node is lost,
+the service names another, which loads that state, and the client sends again what came after:
+the same commands give the same bytes. No address of a node is kept beyond its lease.
+"""
+
+from __future__ import annotations
+
+import io
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import httpx
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.client.flows import Ask, Flow, Rest, ServiceFlows, check
+from cavmarl.core.errors import ActionError, ServiceError
+
+RECOVERY_S = 60.0
+RETRY_S = 1.0
+_FOUND_ELSEWHERE = ("lost", "bad-token", "superseded")
+SAVED_HEADER = "cavmarl-saved"
+
+Arrays = dict[str, NDArray[Any]]
+
+
+class SentCommand(NamedTuple):
+    """A command as it was sent."""
+
+    word: str  # reset or step
+    params: dict[str, Any]
+    content: bytes
+
+
+class WorldFlows:
+    """A session and the commands that it has had.
+
+    Attributes:
+        description: shapes and names, as the node tells them.
+        assignment: what the service has answered last.
+        moves: how often another node has taken it up.
+    """
+
+    def __init__(self, service: ServiceFlows, recovery_s: float = RECOVERY_S) -> None:
+        self.description: dict[str, Any] = {}
+        self.assignment: dict[str, Any] = {}
+        self.moves = 0
+        self._service = service
+        self._recovery_s = recovery_s
+        self._sent: list[SentCommand] = []  # those after the saved state
+        self._saved = 0  # commands that it includes
+        self._is_pending = False  # whether the last command waits for its answer
+        self._url = ""
+        self._renew_s = 0.0
+
+    @property
+    def number(self) -> int:
+        """Commands up to now."""
+        return self._saved + len(self._sent)
+
+    @property
+    def session(self) -> str:
+        """Its id, by which another client can take it up."""
+        return str(self.assignment["session"])
+
+    def open(
+        self,
+        environment: str,
+        keys: Mapping[str, Any],
+        wanted: Mapping[str, Any],
+    ) -> Flow[None]:
+        """Begin a session."""
+        found = yield from self._service.add_configuration(environment, keys)
+        answer = yield from self._service.post("/sessions", {"configuration": found, **wanted})
+        self._take(answer)
+        yield from self._recover(is_known=True)
+
+    def take_up(self, session: str) -> Flow[None]:
+        """Go on with a session that another client has begun, where its node is."""
+        self.assignment = {"session": session, "assigned": ""}
+        yield from self._recover(is_known=False, is_foreign=True)
+
+    def reset(self, seed: int | None) -> Flow[tuple[Any, Arrays]]:
+        """Begin an episode in every world."""
+        params = {} if seed is None else {"seed": seed}
+        arrays = yield from self._command(SentCommand("reset", params, b""))
+        return _join(arrays, "observations"), _infos(arrays)
+
+    def step(self, actions: Any) -> Flow[tuple[Any, ...]]:
+        """Let every agent act."""
+        form = self.description["action"]
+        given = np.asarray(actions)
+        if list(given.shape) != form["shape"]:
+            raise ActionError(f"actions have shape {given.shape}: must be {tuple(form['shape'])}")
+        content = np.ascontiguousarray(given, dtype=form["dtype"]).tobytes()
+        arrays = yield from self._command(SentCommand("step", {}, content))
+        parts = [arrays[name] for name in ("rewards", "terminations", "truncations")]
+        return _join(arrays, "observations"), *parts, _infos(arrays)
+
+    def look(self, word: str) -> Flow[Any]:
+        """A question that changes nothing: `hash`, `suggestion`, `transfers`."""
+        answer = yield from self._asked("GET", word, {}, b"")
+        if answer.headers["content-type"] == "application/json":
+            return answer.json()
+        return unpack(answer.content)
+
+    def close(self) -> Flow[None]:
+        """End the session."""
+        yield from self._service.delete(f"/sessions/{self.session}")
+        try:
+            yield Ask("DELETE", self._url, token=self.assignment["token"])
+        except httpx.TransportError:
+            return  # the node hears of it with its next beat
+
+    def _command(self, sent: SentCommand) -> Flow[Arrays]:
+        self._sent.append(sent)
+        self._is_pending = True
+        try:
+            answer = yield from self._asked(
+                "POST", sent.word, {**sent.params, "number": self.number}, sent.content
+            )
+        except ServiceError as error:
+            if error.status in (400, 409, 422):  # refused before anything has changed
+                self._sent.pop()
+            raise
+        finally:
+            self._is_pending = False
+        self._trim(answer)
+        return unpack(answer.content)
+
+    def _asked(
+        self, method: str, word: str, params: Mapping[str, Any], content: bytes
+    ) -> Flow[httpx.Response]:
+        """The answer of the node, of whichever has the session."""
+        until_s = time.monotonic() + self._recovery_s
+        while True:
+            if time.monotonic() > self._renew_s:
+                yield from self._renew()
+            url = f"{self._url}/{word}"
+            try:
+                answer: httpx.Response = yield Ask(
+                    method, url, None, content, params, self.assignment["token"]
+                )
+                check(answer)
+            except (httpx.TransportError, ServiceError) as error:
+                if isinstance(error, ServiceError) and error.problem not in _FOUND_ELSEWHERE:
+                    raise
+                if time.monotonic() > until_s:
+                    raise
+                is_gone = isinstance(error, httpx.TransportError)
+                yield from self._recover(is_known=False, is_gone=is_gone)
+            else:
+                return answer
+
+    def _recover(
+        self, *, is_known: bool, is_gone: bool = False, is_foreign: bool = False
+    ) -> Flow[None]:
+        """Have a node open the session, and send it what it has not had."""
+        until_s = time.monotonic() + self._recovery_s
+        while True:
+            try:
+                if not is_known:
+                    yield from self._resolve(is_gone)
+            except (httpx.TransportError, ServiceError) as error:
+                if not _may_pass(error, ("no-node", "too-many"), until_s):
+                    raise
+                # Without a node left, the one that was gone is asked for again: it may be back.
+                is_gone = is_gone and not isinstance(error, ServiceError)
+                yield Rest(0.1)
+                continue
+            try:
+                params, token = {"save": 1} if is_foreign else None, self.assignment["token"]
+                answer = yield Ask("POST", self._url, None, None, params, token)
+                check(answer)
+                self.description = answer.json()
+                yield from self._send_again(self.description["number"], is_foreign)
+                return
+            except (httpx.TransportError, ServiceError) as error:
+                if not _may_pass(error, _FOUND_ELSEWHERE, until_s):
+                    raise
+                is_known, is_gone = False, isinstance(error, httpx.TransportError)
+                yield Rest(0.1)
+
+    def _renew(self) -> Flow[None]:
+        """A new lease; while the service is away, the old one is good until it ends."""
+        before = self.assignment["assigned"]
+        try:
+            yield from self._resolve(False)
+        except httpx.TransportError:
+            self._renew_s = time.monotonic() + RETRY_S
+            return
+        if self.assignment["assigned"] != before:
+            yield from self._recover(is_known=True)
+
+    def _resolve(self, is_gone: bool) -> Flow[None]:
+        before = self.assignment["assigned"]
+        body = {"unreachable": [before] if is_gone and before else [], "wait_s": 2.0}
+        answer = yield from self._service.post(f"/sessions/{self.session}/resolve", body)
+        self._take(answer)
+        if before and answer["assigned"] != before:
+            self.moves += 1
+
+    def _send_again(self, number: int, is_foreign: bool) -> Flow[None]:
+        if is_foreign:
+            self._saved, self._sent = number, []
+            return
+        if number < self._saved:
+            raise ServiceError(
+                f"session {self.session}: node {self.assignment['assigned']} has command {number}, "
+                f"but {self._saved} were saved: the store was changed; open another session"
+            )
+        # One that is pending is asked for anew by what waits for its answer.
+        for place in range(number + 1, self.number + (not self._is_pending)):
+            sent = self._sent[place - self._saved - 1]
+            params = {**sent.params, "number": place, "quiet": 1}
+            url, token = f"{self._url}/{sent.word}", self.assignment["token"]
+            answer = yield Ask("POST", url, None, sent.content, params, token)
+            check(answer)
+
+    def _take(self, answer: dict[str, Any]) -> None:
+        self.assignment = answer
+        host = answer["address"]
+        shown = f"[{host}]" if ":" in host else host
+        place = f"{answer['scheme']}://{shown}:{answer['client_port']}"
+        self._url = f"{place}/v1/worlds/{answer['session']}"
+        self._renew_s = time.monotonic() + 0.6 * answer["lease_s"]
+
+    def _trim(self, answer: httpx.Response) -> None:
+        """Forget commands that a saved state includes."""
+        saved = int(answer.headers.get(SAVED_HEADER, self._saved))
+        if saved > self._saved:
+            self._sent = self._sent[saved - self._saved :]
+            self._saved = saved
+
+
+def _may_pass(error: Exception, names: Sequence[str], until_s: float) -> bool:
+    """Whether it is worth trying again."""
+    if isinstance(error, ServiceError) and error.problem not in names:
+        return False
+    return time.monotonic() < until_s
+
+
+def pack(arrays: Mapping[str, NDArray[Any]]) -> bytes:
+    """Arrays as the bytes of an .npz, without compression."""
+    content = io.BytesIO()
+    np.savez(content, allow_pickle=False, **arrays)
+    return content.getvalue()
+
+
+def unpack(content: bytes) -> Arrays:
+    """The arrays of `pack`."""
+    with np.load(io.BytesIO(content), allow_pickle=False) as found:
+        return dict(found)
+
+
+def flatten(name: str, value: Any) -> Arrays:
+    """An array by its name, or arrays of a dict by theirs."""
+    if isinstance(value, Mapping):
+        return {f"{name}/{key}": one for key, one in value.items()}
+    return {name: value}
+
+
+def _join(arrays: Arrays, name: str) -> Any:
+    """The inverse of `flatten`."""
+    if name in arrays:
+        return arrays[name]
+    start = f"{name}/"
+    return {key[len(start) :]: one for key, one in arrays.items() if key.startswith(start)}
+
+
+def _infos(arrays: Arrays) -> Arrays:
+    names: Sequence[str] = [key for key in arrays if key.startswith("infos/")]
+    return {name[len("infos/") :]: arrays[name] for name in names}

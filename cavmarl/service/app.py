@@ -1,0 +1,141 @@
+"""The HTTP interface: an application of FastAPI around a broker and its access.
+
+Each route says which roles may use it, and an application with a route that says nothing does not
+start.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+
+from fastapi import APIRouter, FastAPI
+from fastapi.routing import APIRoute
+from fastapi.telemetry import TelemetryConfig
+from starlette.exceptions import HTTPException
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from cavmarl.core.errors import ServiceError
+from cavmarl.service.guards import Service, rule_of
+from cavmarl.service.problems import add_handlers, answer
+from cavmarl.service.routes import ROUTERS
+from cavmarl.service.service_metrics import ServiceMetrics
+
+MAX_BODY_BYTES = 256 * 1024
+MAX_CONTENT_BYTES = 64 * 1024 * 1024  # of a world's state, or a file of results
+MAX_PATH_BYTES = 1024
+NO_TELEMETRY: TelemetryConfig = {  # whatever the surroundings have set up: nothing is exported
+    "tracing": False,
+    "metrics": False,
+    "logs": False,
+    "auto_configure": False,
+}
+BODY_S = 10.0  # in which a body has to come
+HEADERS = {
+    b"x-content-type-options": b"nosniff",
+    b"cache-control": b"no-store",
+    b"content-security-policy": b"default-src 'none'",
+    b"referrer-policy": b"no-referrer",
+}
+
+
+def make_app(service: Service, sweep_s: float = 0.5) -> ASGIApp:
+    """The application; it sweeps the broker so often."""
+
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        sweeper = asyncio.create_task(_sweep(service, sweep_s))
+        yield
+        sweeper.cancel()
+        with suppress(asyncio.CancelledError):
+            await sweeper
+
+    app = FastAPI(
+        title="cavmarl coordination service",
+        version="1",
+        openapi_url="/v1/openapi.json",
+        docs_url=None,
+        redoc_url=None,
+        redirect_slashes=False,
+        telemetry=NO_TELEMETRY,
+        lifespan=lifespan,
+    )
+    app.state.service = service
+    app.state.metrics = ServiceMetrics(service.broker)
+    for router in ROUTERS:
+        _check_rules(router)
+        app.include_router(router)
+    add_handlers(app)
+    return GuardedRequests(app)
+
+
+def _check_rules(router: APIRouter) -> None:
+    for route in router.routes:
+        if isinstance(route, APIRoute) and rule_of(route) is None:
+            raise ServiceError(f"route {route.path}: does not say which roles may use it")
+
+
+async def _sweep(service: Service, every_s: float) -> None:
+    log = service.broker.log
+    while True:
+        await asyncio.sleep(every_s)
+        service.broker.sweep()
+        try:
+            await log.settle()
+        except ServiceError:
+            service.on_broken()
+            return
+
+
+class GuardedRequests:
+    """Long paths, large and slow bodies are refused, and answers get headers of safety.
+
+    Args:
+        app: what it guards.
+        content_bytes: the most that a PUT has.
+        body_bytes: the most that any other body has.
+    """
+
+    def __init__(
+        self,
+        app: ASGIApp,
+        content_bytes: int = MAX_CONTENT_BYTES,
+        body_bytes: int = MAX_BODY_BYTES,
+    ) -> None:
+        self._app = app
+        self._content_bytes, self._body_bytes = content_bytes, body_bytes
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        until_s = asyncio.get_running_loop().time() + BODY_S
+        left = self._content_bytes if scope["method"] == "PUT" else self._body_bytes
+        is_read = False
+
+        async def receive_in_time() -> Message:
+            nonlocal is_read, left
+            if is_read:  # what comes now is that the caller has gone
+                return await receive()
+            try:
+                async with asyncio.timeout_at(until_s):
+                    message = await receive()
+            except TimeoutError:
+                raise HTTPException(408, f"the body did not come within {BODY_S:g} s") from None
+            left -= len(message.get("body", b""))
+            if left < 0:
+                raise HTTPException(413, "the body is too large for this route")
+            is_read = not message.get("more_body", False)
+            return message
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                message = {**message, "headers": [*message["headers"], *HEADERS.items()]}
+            await send(message)
+
+        if len(scope["raw_path"]) + len(scope["query_string"]) > MAX_PATH_BYTES:
+            refusal = answer("bad-body", f"the path is longer than {MAX_PATH_BYTES} bytes")
+            await refusal(scope, receive, send_with_headers)
+            return
+        await self._app(scope, receive_in_time, send_with_headers)

@@ -1,0 +1,109 @@
+"""The bodies of requests: unknown fields, other types and values out of range are refused."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+
+from cavmarl.service.infrastructure import Role
+
+Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
+Word = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.+-]{0,63}$")]
+Host = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9:][A-Za-z0-9:.-]{0,254}$")]
+Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
+Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
+Port = Annotated[int, Field(ge=1, le=65535)]
+Words = Annotated[list[Word], Field(max_length=64)]
+
+
+class _Body(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+
+class NodeBody(_Body):
+    """A node registers."""
+
+    name: Name
+    address: Host
+    client_port: Port
+    simulator_port: Port
+    slots: Annotated[int, Field(ge=1, le=10_000)] = 4
+    capabilities: Words = []
+    versions: Annotated[dict[Word, Word], Field(max_length=32)] = {}
+    allowed: Words = []
+
+
+class BeatBody(_Body):
+    """A node is alive. Shares of its resources that are in use, from 0 to 1: 0.85, not 85."""
+
+    incarnation: Annotated[int, Field(ge=1)]
+    sequence: Annotated[int, Field(ge=0)]
+    cpu: Share
+    ram: Share
+    gpu: Share = 0.0
+    sent_s: Annotated[float, Field(allow_inf_nan=False)]
+    counters: Annotated[
+        dict[Word, Annotated[float, Field(allow_inf_nan=False)]], Field(max_length=32)
+    ] = {}
+
+
+class ConfigurationBody(_Body):
+    """A world; as the keywords of `cavmarl.make_vec`."""
+
+    name: Name | None = None
+    environment: Name
+    agents: Annotated[int, Field(ge=0, le=100_000)] | None = None
+    background: Annotated[int, Field(ge=0, le=100_000)] | None = None
+    max_cycles: Annotated[int, Field(ge=1, le=10_000_000)] | None = None
+    num_envs: Annotated[int, Field(ge=1, le=1024)] = 1
+    seed: Annotated[int, Field(ge=0, lt=1 << 63)] = 0
+    overrides: Annotated[dict[str, Any], Field(max_length=256)] = {}
+
+
+class SessionBody(_Body):
+    """A client wants a world."""
+
+    configuration: Sha256
+    node: Name | None = None
+    needs: Words = []
+    wait_s: Annotated[float, Field(ge=0.0, le=60.0)] = 0.0
+
+
+class ResolveBody(_Body):
+    """A client asks again where its session is."""
+
+    unreachable: Annotated[list[Name], Field(max_length=16)] = []
+    wait_s: Annotated[float, Field(ge=0.0, le=60.0)] = 0.0
+
+
+class JobBody(_Body):
+    """A client wants an evaluation."""
+
+    configuration: Sha256
+    policies: Annotated[list[Name], Field(min_length=1, max_length=16)] = ["idm"]
+    episodes: Annotated[int, Field(ge=1, le=100_000)] = 32
+    repeats: Annotated[int, Field(ge=1, le=1000)] = 1
+    node: Name | None = None
+    needs: Words = []
+
+
+class OutcomeBody(_Body):
+    """A node has ended a job."""
+
+    status: Literal["done", "failed"]
+    message: Annotated[str, StringConstraints(max_length=2000)] = ""
+
+
+class IdentityBody(_Body):
+    """A new identity; the answer has its secret, once."""
+
+    name: Name
+    role: Role
+
+
+class TokenBody(_Body):
+    """A secret, or a refresh token, in exchange for an access token."""
+
+    secret: Annotated[str, StringConstraints(max_length=256)] | None = None
+    refresh_token: Annotated[str, StringConstraints(max_length=4096)] | None = None

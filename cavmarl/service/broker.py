@@ -1,0 +1,371 @@
+"""The broker: nodes come and go, sessions and jobs are given to them.
+
+All is decided in one thread, between two events of its log; so requests that come at once see each
+other. Time comes from an injected clock.
+"""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from cavmarl.balance.load_score import Utilisation
+from cavmarl.service.bodies import BeatBody, NodeBody
+from cavmarl.service.event_log import EventLog
+from cavmarl.service.infrastructure import (
+    SESSION_OVER,
+    IdentityRecord,
+    NodeRecord,
+    SessionRecord,
+)
+from cavmarl.service.node_selection import Chosen, LiveNode, NoNodeError, choose, overloads
+from cavmarl.service.refusals import problem
+
+SHOWN_EXCLUSIONS = 10  # in an event
+
+
+@dataclass(frozen=True)
+class BrokerRules:
+    """Times and numbers of a service."""
+
+    beat_s: float = 1.0  # from beat to beat of a node
+    missed_beats: int = 3  # after which a node is down
+    lease_s: float = 30.0  # of a session's token; the client asks anew
+    idle_s: float = 600.0  # a session that nobody has asked for ends
+    keep_s: float = 3600.0  # sessions that are over can be read so long
+    max_skew_s: float = 5.0  # between the clocks of a node and of the service
+    max_nodes: int = 10_000
+    max_sessions: int = 1000  # of one identity, that are not over
+
+
+class Broker:
+    """Nodes, sessions and jobs."""
+
+    def __init__(
+        self,
+        log: EventLog,
+        rules: BrokerRules | None = None,
+        clock_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.log = log
+        self.rules = rules or BrokerRules()
+        self.live: dict[str, LiveNode] = {}
+        self.refusals = 0
+        self.waiting = 0  # requests that wait for a node
+        self.took_s: Callable[[float], None] = lambda _: None  # told how long a selection took
+        self._clock_s = clock_s
+        self._touched: dict[str, float] = {}  # session → when it was asked for last
+        self._skewed: set[str] = set()
+        now_s = clock_s()
+        for number, name in enumerate(log.state.nodes):
+            self.live[name] = LiveNode(number, now_s)
+        for session in log.state.sessions.values():
+            self._touched[session.id] = now_s
+            if session.node is not None:
+                self.live[session.node].hosted.add(session.id)
+
+    # Nodes
+
+    def register(self, identity: IdentityRecord, body: NodeBody) -> NodeRecord:
+        """A node comes, or comes back; what an earlier process of it says counts no more."""
+        known = self.log.state.nodes.get(body.name)
+        owner = known and self.log.state.identities.get(known.identity)
+        if owner and owner.id != identity.id and not owner.revoked:
+            raise problem("forbidden", f"node '{body.name}' belongs to another identity")
+        if known is None and len(self.log.state.nodes) >= self.rules.max_nodes:
+            raise problem("too-many", f"{self.rules.max_nodes} nodes are registered", 60.0)
+        incarnation = known.incarnation + 1 if known else 1
+        data = body.model_dump(exclude={"name"})
+        data |= {"identity": identity.id, "incarnation": incarnation}
+        self.log.record("node.registered", body.name, data, actor=identity.id)
+        number = self.live[body.name].number if known else len(self.live)
+        self.live[body.name] = LiveNode(number, self._clock_s())
+        return self.log.state.nodes[body.name]
+
+    def beat(self, identity: IdentityRecord, name: str, body: BeatBody) -> dict[str, Any]:
+        """A node is alive and so busy; the answer is what it has to do."""
+        node = self.own_node(identity, name)
+        live = self.live[name]
+        if body.incarnation != node.incarnation:
+            raise problem(
+                "superseded", f"node '{name}' is at incarnation {node.incarnation}: end this one"
+            )
+        if node.state == "left":
+            raise problem("conflict", f"node '{name}' has left: register it again")
+        if body.sequence <= live.beat:
+            raise problem("stale-beat", f"beat {body.sequence} of '{name}' after {live.beat}")
+        if node.state == "down":
+            self.log.record("node.up", name)
+        live.heard_s, live.beat = self._clock_s(), body.sequence
+        live.use = Utilisation(body.cpu, body.ram, body.gpu)
+        live.counters = dict(body.counters)
+        live.unheard.clear()
+        live.refresh()
+        resources = overloads(live.use)
+        if resources != node.excluded:
+            kind = "node.overloaded" if resources else "node.admissible"
+            self.log.record(kind, name, {"resources": resources, **asdict(live.use)})
+        self._watch_clock(name, body.sent_s)
+        self.assign_jobs()
+        return {
+            "draining": node.draining,
+            "beat_s": self.rules.beat_s,
+            "sessions": sorted(live.hosted),
+            "jobs": [self._job_of(one) for one in sorted(live.hosted)
+                     if self.log.state.sessions[one].job is not None],
+        }  # fmt: skip
+
+    def own_node(self, identity: IdentityRecord, name: str) -> NodeRecord:
+        """A node that this identity may speak for."""
+        node = self.log.state.nodes.get(name)
+        if node is None:
+            raise problem("not-found", f"there is no node '{name}': register it")
+        if identity.role == "node" and node.identity != identity.id:
+            raise problem("forbidden", f"node '{name}' belongs to another identity")
+        return node
+
+    def drain(self, identity: IdentityRecord, name: str, is_on: bool = True) -> NodeRecord:
+        """Give a node nothing more; its sessions move when their clients ask."""
+        node = self.own_node(identity, name)
+        if node.draining != is_on:
+            kind = "node.drained" if is_on else "node.resumed"
+            self.log.record(kind, name, actor=identity.id)
+        return node
+
+    def leave(self, identity: IdentityRecord, name: str) -> NodeRecord:
+        """A node ends; what it hosts waits for another."""
+        node = self.own_node(identity, name)
+        if node.state != "left":
+            self.log.record("node.left", name, actor=identity.id)
+            self._empty(name)
+        return node
+
+    def age_s(self, name: str) -> float:
+        """How long ago a node was heard."""
+        return self._clock_s() - self.live[name].heard_s
+
+    def sweep(self) -> None:
+        """Nodes that have missed their beats are down; what nobody asks for ends."""
+        now_s = self._clock_s()
+        for name, node in self.log.state.nodes.items():
+            missed = (now_s - self.live[name].heard_s) / self.rules.beat_s
+            if node.state == "up" and missed > self.rules.missed_beats:
+                self.log.record("node.down", name, {"missed_beats": int(missed)})
+                self._empty(name)
+        for session in list(self.log.state.sessions.values()):
+            idle_s = now_s - self._touched[session.id]
+            if session.state in SESSION_OVER:
+                if idle_s > self.rules.keep_s:
+                    self._forget(session)
+            elif session.job is None and idle_s > self.rules.idle_s:
+                self._end(session, "closed", "service", f"nobody asked for {idle_s:.0f} s")
+        self.assign_jobs()
+
+    # Sessions and jobs
+
+    def open(
+        self,
+        identity: IdentityRecord,
+        configuration: str,
+        *,
+        preferred: str | None = None,
+        needs: Sequence[str] = (),
+        job: dict[str, Any] | None = None,
+    ) -> SessionRecord:
+        """A session, assigned to a node; a job waits for one if there is none.
+
+        Raises:
+            NoNodeError: no node can take a session.
+        """
+        own = [
+            one
+            for one in self.log.state.sessions.values()
+            if one.owner == identity.id and one.state not in SESSION_OVER
+        ]
+        if len(own) >= self.rules.max_sessions:
+            raise problem("too-many", f"{len(own)} sessions are open: close some", 60.0)
+        number = f"s-{secrets.token_hex(12)}"
+        data: dict[str, Any] = {
+            "owner_name": identity.name,
+            "configuration": configuration,
+            "job": job,
+            "needs": list(needs),
+            "preferred": preferred,
+        }
+        session = SessionRecord(id=number, owner=identity.id, **data)
+        try:
+            chosen = self._choose(session, ())
+        except NoNodeError:
+            if job is None:
+                raise
+            chosen = None
+        self.log.record("session.opened", number, data, actor=identity.id, owner=identity.id)
+        self._touched[number] = self._clock_s()
+        if chosen is not None:
+            self._assign(number, chosen)
+        return self.log.state.sessions[number]
+
+    def resolve(
+        self, identity: IdentityRecord, number: str, unreachable: Sequence[str] = ()
+    ) -> SessionRecord:
+        """Where a session is: on its node, or on another if that is gone, drained or out of reach.
+
+        Raises:
+            NoNodeError: no node can take it.
+        """
+        session = self.session(identity, number)
+        if session.state in SESSION_OVER or session.job is not None:
+            raise problem("conflict", f"session '{number}' is {session.state}: open another")
+        self._touched[number] = self._clock_s()
+        node = self.log.state.nodes.get(session.node or "")
+        if node is not None and not node.draining and node.name not in unreachable:
+            return session
+        chosen = self._choose(session, unreachable)
+        if session.node is not None:
+            self.live[session.node].hosted.discard(number)
+        self._assign(number, chosen)
+        return session
+
+    def refuse(self, identity: IdentityRecord, subject: str, error: NoNodeError) -> None:
+        """Put on record that no node could take what `identity` wants."""
+        self.refusals += 1
+        shown = [one._asdict() for one in error.exclusions[:SHOWN_EXCLUSIONS]]
+        data = {"excluded": shown, "excluded_count": len(error.exclusions)}
+        self.log.record("session.refused", subject, data, actor=identity.id, owner=identity.id)
+
+    def session(self, identity: IdentityRecord, number: str) -> SessionRecord:
+        """A session that this identity may see: another's is not found."""
+        session = self.log.state.sessions.get(number)
+        is_own = session is not None and session.owner == identity.id
+        if session is None or not (is_own or identity.role in ("viewer", "operator", "admin")):
+            raise problem("not-found", f"there is no session '{number}' of yours")
+        return session
+
+    def hosted(self, identity: IdentityRecord, number: str) -> SessionRecord:
+        """A session that a node of this identity hosts now."""
+        session = self.log.state.sessions.get(number)
+        node = self.log.state.nodes.get(session.node or "") if session else None
+        is_own = node is not None and node.identity == identity.id
+        if session is None or node is None or not is_own:
+            raise problem("lost", f"session '{number}' is not on a node of yours")
+        if session.incarnation != node.incarnation:
+            raise problem("superseded", f"node '{node.name}' has registered anew since")
+        return session
+
+    def close(self, identity: IdentityRecord, number: str) -> SessionRecord:
+        """End a session or a job."""
+        session = self.session(identity, number)
+        if identity.role == "viewer":
+            raise problem("forbidden", "a viewer closes no session")
+        if session.state not in SESSION_OVER:
+            self._end(session, "closed", identity.id)
+        return session
+
+    def save(self, session: SessionRecord, number: int, content: bytes) -> None:
+        """Keep the state of a world; it includes so many commands."""
+        if number < session.saved_number:
+            raise problem("conflict", f"command {session.saved_number} is saved already")
+        before, sha256 = session.saved_blob, self.log.keep(content)
+        self._tell(session, "saved", {"number": number, "sha256": sha256, "bytes": len(content)})
+        if before != sha256:
+            self._drop(before)
+
+    def add_result(self, session: SessionRecord, name: str, content: bytes) -> None:
+        """Keep a file that a job has made."""
+        sha256 = self.log.keep(content)
+        self._tell(session, "result", {"name": name, "sha256": sha256, "bytes": len(content)})
+
+    def finish(self, session: SessionRecord, status: str, message: str) -> None:
+        """A job is done, or has failed."""
+        self._end(session, status, session.node or "service", message)
+
+    def assign_jobs(self) -> None:
+        """Give jobs that wait to nodes that can take them."""
+        for number in sorted(self.log.state.waiting):
+            try:
+                self._assign(number, self._choose(self.log.state.sessions[number], ()))
+            except NoNodeError:
+                continue  # another may need less
+
+    # Within
+
+    def _choose(self, session: SessionRecord, avoided: Sequence[str]) -> Chosen:
+        began_s = time.perf_counter()
+        age_s = self.rules.beat_s * self.rules.missed_beats
+        try:
+            return choose(
+                self.log.state.nodes, self.live, session,
+                now_s=self._clock_s(), max_age_s=age_s, avoided=avoided,
+            )  # fmt: skip
+        finally:
+            self.took_s(time.perf_counter() - began_s)
+
+    def _assign(self, number: str, chosen: Chosen) -> None:
+        session = self.log.state.sessions[number]
+        redirected = session.preferred not in (None, chosen.node)
+        data = {
+            "node": chosen.node,
+            "incarnation": self.log.state.nodes[chosen.node].incarnation,
+            "requested": session.preferred,
+            "reason": chosen.outcome,
+            "score": chosen.score,
+            "excluded": [one._asdict() for one in chosen.exclusions[:SHOWN_EXCLUSIONS]],
+            "excluded_count": len(chosen.exclusions),
+        }
+        self._tell(session, "redirected" if redirected else "assigned", data)
+        live = self.live[chosen.node]
+        live.hosted.add(number)
+        live.unheard.add(number)
+        live.refresh()
+
+    def _end(self, session: SessionRecord, word: str, actor: str, message: str = "") -> None:
+        if session.node is not None:
+            live = self.live[session.node]
+            live.hosted.discard(session.id)
+            live.unheard.discard(session.id)
+            live.refresh()
+        blob = session.saved_blob
+        data = {"message": message}
+        self.log.record(f"session.{word}", session.id, data, actor=actor, owner=session.owner)
+        self._touched[session.id] = self._clock_s()
+        self._drop(blob)
+
+    def _forget(self, session: SessionRecord) -> None:
+        self._tell(session, "forgotten", {})
+        del self._touched[session.id]
+        for sha256 in session.results.values():
+            self._drop(sha256)
+
+    def _drop(self, sha256: str | None) -> None:
+        """Delete content, unless another session has the same."""
+        for one in self.log.state.sessions.values():
+            if sha256 == one.saved_blob or sha256 in one.results.values():
+                return
+        self.log.drop(sha256)
+
+    def _empty(self, name: str) -> None:
+        live = self.live[name]
+        live.hosted.clear()
+        live.unheard.clear()
+        live.use = None
+        live.refresh()
+
+    def _tell(self, session: SessionRecord, word: str, data: dict[str, Any]) -> None:
+        actor = session.node if word in ("saved", "result") and session.node else "service"
+        self.log.record(f"session.{word}", session.id, data, actor=actor, owner=session.owner)
+
+    def _job_of(self, number: str) -> dict[str, Any]:
+        session = self.log.state.sessions[number]
+        return {"id": number, "configuration": session.configuration, **(session.job or {})}
+
+    def _watch_clock(self, name: str, sent_s: float) -> None:
+        """Tell once of a node whose clock is off, and once when it is right again."""
+        skew_s = sent_s - self.log.wall_s()
+        is_off = abs(skew_s) > self.rules.max_skew_s
+        if is_off != (name in self._skewed):
+            self._skewed ^= {name}
+            kind = "clock.anomaly" if is_off else "clock.right"
+            self.log.record(kind, name, {"skew_s": round(skew_s, 3)})

@@ -1,0 +1,110 @@
+"""Configurations: immutable, named by the hash of what they say, with versions by name.
+
+What comes over the network names entries of this installation. It names no file and no code: keys
+of files have to be as the entry has them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from dataclasses import asdict
+from typing import Any
+
+from cavmarl.config.registry import agent_entries, entries, load_config
+from cavmarl.core.errors import CavmarlError
+from cavmarl.service.bodies import ConfigurationBody
+from cavmarl.service.event_log import EventLog
+from cavmarl.service.infrastructure import IdentityRecord
+from cavmarl.service.refusals import problem
+
+_PLAIN = re.compile(r"[A-Za-z0-9_+:#,() -]{0,64}")
+_OF_FILES = (
+    "map.source",
+    "map.programs",
+    "map.buildings",
+    "traffic.demand",
+    "zones.journal",
+    "zones.faults",
+    "zones.reproducers",
+)
+
+
+def add_configuration(
+    log: EventLog, identity: IdentityRecord, body: ConfigurationBody
+) -> dict[str, Any]:
+    """Check a configuration and keep it; the same again is the same version."""
+    document = body.model_dump(exclude={"name"})
+    _check(document)
+    name = body.name or body.environment
+    content = json.dumps(document, sort_keys=True, separators=(",", ":")).encode()
+    found = hashlib.sha256(content).hexdigest()
+    versions = log.state.configurations.get(name, [])
+    if found not in versions:
+        log.keep(content)
+        data = {"hash": found, "version": len(versions) + 1}
+        log.record("configuration.added", name, data, actor=identity.id, owner=identity.id)
+        versions = log.state.configurations[name]
+    return {"name": name, "version": versions.index(found) + 1, "hash": found, **document}
+
+
+def read_configuration(log: EventLog, sha256: str) -> dict[str, Any]:
+    """What was kept under a hash; raises the problem `not-found`."""
+    if not any(sha256 in versions for versions in log.state.configurations.values()):
+        raise problem("not-found", f"there is no configuration {sha256}: add it first")
+    document: dict[str, Any] = json.loads(log.content(sha256))
+    return document
+
+
+def check_policies(policies: list[str]) -> None:
+    """Refuse what is not the name of a driver: a path would run code."""
+    known = agent_entries()
+    for policy in policies:
+        if policy not in known:
+            raise problem("refused", f"no driver '{policy}': there are {', '.join(known)}")
+
+
+def world_keywords(document: dict[str, Any]) -> dict[str, Any]:
+    """Keywords of `make_vec` and `evaluate` that name the world."""
+    names = ("agents", "background", "max_cycles", "overrides")
+    return {name: document[name] for name in names}
+
+
+def _check(document: dict[str, Any]) -> None:
+    environment = document["environment"]
+    if environment not in entries():
+        known = ", ".join(entries())
+        raise problem("refused", f"no environment '{environment}': there are {known}")
+    for text in _texts(document["overrides"]):
+        if not _PLAIN.fullmatch(text):
+            raise problem(
+                "refused",
+                f"overrides: {text[:64]!r} could name a file: letters, digits, _, + and - only",
+            )
+    try:
+        own = asdict(load_config(environment)[0])
+        wanted = asdict(load_config(environment, **world_keywords(document))[0])
+    except (CavmarlError, RecursionError) as error:
+        raise problem("refused", str(error)) from error
+    for key in _OF_FILES:
+        if _value(own, key) != _value(wanted, key):
+            raise problem("refused", f"{key}: names files, which stay as they are here")
+
+
+def _texts(value: Any) -> list[str]:
+    """All texts that are values somewhere inside."""
+    if isinstance(value, str):
+        return [value]
+    if isinstance(value, dict):
+        return [text for one in value.values() for text in _texts(one)]
+    if isinstance(value, list):
+        return [text for one in value for text in _texts(one)]
+    return []
+
+
+def _value(config: dict[str, Any], key: str) -> Any:
+    found: Any = config
+    for part in key.split("."):
+        found = found[part]
+    return found

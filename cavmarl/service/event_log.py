@@ -1,0 +1,126 @@
+"""The log as the service writes it: events act at once, and are answered when they are on disk.
+
+Requests that come together are written together: one transaction, one wait for the disk.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import time
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from cavmarl.core.errors import ServiceError
+from cavmarl.service.event_store import EventStore, digest_of
+from cavmarl.service.infrastructure import Infrastructure, LogEvent
+
+SERVICE = "service"
+
+
+class EventLog:
+    """The infrastructure, and the only way to change it.
+
+    Args:
+        store: where events are kept; what it has is replayed.
+        wall_s: the wall clock.
+    """
+
+    def __init__(self, store: EventStore, wall_s: Callable[[], float] = time.time) -> None:
+        self.store = store
+        self.state = Infrastructure()
+        self.sequence = 0  # of the last event
+        self.changed = asyncio.Condition()  # told of all that was written, and of what `stir` says
+        self.is_broken = False
+        self.wall_s = wall_s
+        self._digest = ""
+        self._lines: list[LogEvent] = []
+        self._blobs: dict[str, bytes] = {}
+        self._gone: list[str] = []
+        self._in_flight: dict[str, bytes] = {}  # content that is being written
+        self._writing = asyncio.Lock()
+        self.durable = 0  # the last event on disk
+        for line in store.read():
+            self.state.apply(line)
+            self.sequence, self._digest = line.sequence, line.digest
+        self.durable = self.sequence
+
+    def record(
+        self,
+        kind: str,
+        subject: str,
+        data: dict[str, Any] | None = None,
+        *,
+        actor: str = SERVICE,
+        owner: str = "",
+        private: dict[str, Any] | None = None,
+    ) -> LogEvent:
+        """Let something happen. It is on disk when `settle` or `flush` has returned."""
+        number, now_s = self.sequence + 1, self.wall_s()
+        line = LogEvent(number, now_s, kind, actor, subject, owner, data or {}, private or {}, "")
+        line = line._replace(digest=digest_of(self._digest, line))
+        self.state.apply(line)
+        self.sequence, self._digest = number, line.digest
+        self._lines.append(line)
+        return line
+
+    def keep(self, content: bytes) -> str:
+        """Keep content with the events that name it; its hash."""
+        sha256 = hashlib.sha256(content).hexdigest()
+        self._blobs[sha256] = content
+        if sha256 in self._gone:
+            self._gone.remove(sha256)
+        return sha256
+
+    def drop(self, sha256: str | None) -> None:
+        """Delete content that no event needs any more."""
+        if sha256 is not None:
+            self._gone.append(sha256)
+
+    def content(self, sha256: str) -> bytes:
+        """What was kept under a hash."""
+        kept = self._blobs.get(sha256) or self._in_flight.get(sha256)
+        found = kept or self.store.blob(sha256)
+        if found is None:
+            raise ServiceError(f"content {sha256[:12]}… is not in the store: it was damaged")
+        return found
+
+    def flush(self) -> None:
+        """Write all that has happened."""
+        lines, blobs, gone = self._lines, self._blobs, self._gone
+        self._lines, self._blobs, self._gone, self._in_flight = [], {}, [], blobs
+        if not (lines or blobs or gone):
+            return
+        try:
+            self.store.append(lines, blobs, gone)
+        except ServiceError:
+            self.is_broken = True  # what acts here is not on disk: only a new start can go on
+            raise
+        if lines:
+            self.durable = lines[-1].sequence
+
+    async def settle(self) -> None:
+        """Wait until all that has happened up to now is on disk.
+
+        Raises:
+            ServiceError: it cannot be written; the service has to end.
+        """
+        if not self._lines and not self._blobs and self.durable >= self.sequence:
+            return
+        async with self._writing:
+            if self.is_broken:
+                raise ServiceError(f"store {self.store.where}: cannot be written")
+            if self._lines or self._blobs:
+                await asyncio.to_thread(self.flush)
+        await self.stir()
+
+    async def stir(self) -> None:
+        """Wake what waits for a change."""
+        async with self.changed:
+            self.changed.notify_all()
+
+    def read(self, after: int, limit: int, owner: str | None) -> Iterable[LogEvent]:
+        """Lines that are on disk, of one owner or of all."""
+        for line in self.store.read(after, limit):
+            if owner is None or owner in (line.owner, line.actor):
+                yield line

@@ -1,0 +1,266 @@
+"""The store: an append-only table of events, and the content that they name by its hash.
+
+SQLite in its write-ahead mode, or PostgreSQL. What `append` has returned from is on disk.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import os
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import IO, Any
+
+from sqlalchemy import (
+    BigInteger,
+    Column,
+    Float,
+    LargeBinary,
+    MetaData,
+    String,
+    Table,
+    Text,
+    create_engine,
+    delete,
+    event,
+    insert,
+    inspect,
+    select,
+    text,
+)
+from sqlalchemy.engine import URL, make_url
+from sqlalchemy.exc import ArgumentError, NoSuchModuleError, SQLAlchemyError
+
+from cavmarl.core.errors import ServiceError, require
+from cavmarl.service.infrastructure import LogEvent
+
+SCHEMA = "cavmarl.service/1"
+_LOCK_KEY = 0x6361766D  # of PostgreSQL's advisory lock
+_PAGE = 1000
+
+_METADATA = MetaData()
+_ABOUT = Table("about", _METADATA, Column("schema", String(64), primary_key=True))
+_EVENTS = Table(
+    "events",
+    _METADATA,
+    Column("sequence", BigInteger, primary_key=True, autoincrement=False),
+    Column("time_s", Float(53), nullable=False),
+    Column("kind", String(64), nullable=False),
+    Column("actor", String(64), nullable=False),
+    Column("subject", String(128), nullable=False),
+    Column("owner", String(64), nullable=False),
+    Column("data", Text, nullable=False),
+    Column("private", Text, nullable=False),
+    Column("digest", String(64), nullable=False),
+)
+_BLOBS = Table(
+    "blobs",
+    _METADATA,
+    Column("sha256", String(64), primary_key=True),
+    Column("content", LargeBinary, nullable=False),
+)
+
+
+def digest_of(before: str, line: LogEvent) -> str:
+    """The digest of a line, over that of the line before it."""
+    content = json.dumps([before, *line[:-1]], sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(content.encode()).hexdigest()
+
+
+class EventStore:
+    """A store that this process alone writes.
+
+    Args:
+        where: a file of SQLite, or the URL of a database.
+
+    Raises:
+        ServiceError: it cannot be opened, another service has it, or it is one of another version.
+    """
+
+    def __init__(self, where: str | Path) -> None:
+        self.where = str(where)
+        self._lock: IO[bytes] | None = None
+        self._open = ExitStack()
+        self._guard = threading.Lock()  # of the one connection
+        self.url = url = _url_of(self.where)
+        self.is_embedded = url.get_backend_name() == "sqlite"
+        if self.is_embedded:
+            self._lock = _lock_file(Path(str(url.database)))
+        try:
+            engine = create_engine(url, pool_size=1, max_overflow=0)
+            self._open.callback(engine.dispose)
+            if self.is_embedded:
+                event.listen(engine, "connect", _make_durable)
+            self._connection = self._open.enter_context(engine.connect())
+            if not self.is_embedded:
+                self._hold_advisory_lock()
+            self._check_schema()
+        except SQLAlchemyError as error:
+            self.close()
+            cause = str(getattr(error, "orig", error)).strip().splitlines()[0]
+            raise ServiceError(
+                f"store {url.render_as_string()}: cannot be opened ({cause}); see that its folder "
+                "or server is there and may be written"
+            ) from error
+        except ServiceError:
+            self.close()
+            raise
+
+    def append(
+        self, lines: Sequence[LogEvent], blobs: dict[str, bytes], gone: Sequence[str] = ()
+    ) -> None:
+        """Write lines and content in one transaction; content that is `gone` is deleted.
+
+        Raises:
+            ServiceError: the store cannot be written; none of it has been.
+        """
+        try:
+            with self._guard, self._connection.begin():
+                if lines:
+                    self._connection.execute(insert(_EVENTS), [_row(line) for line in lines])
+                for sha256, content in blobs.items():
+                    there = select(_BLOBS.c.sha256).where(_BLOBS.c.sha256 == sha256)
+                    if self._connection.execute(there).scalar() is None:
+                        row = {"sha256": sha256, "content": content}
+                        self._connection.execute(insert(_BLOBS), row)
+                if gone:
+                    self._connection.execute(delete(_BLOBS).where(_BLOBS.c.sha256.in_(gone)))
+        except SQLAlchemyError as error:
+            raise ServiceError(
+                f"store {self.where}: cannot be written ({getattr(error, 'orig', error)}); nothing "
+                "of it was: make room, and start the service again"
+            ) from error
+
+    def read(self, after: int = 0, limit: int | None = None) -> Iterator[LogEvent]:
+        """The lines after a sequence number."""
+        left = limit
+        while left is None or left > 0:
+            size = _PAGE if left is None else min(left, _PAGE)
+            query = select(_EVENTS).where(_EVENTS.c.sequence > after)
+            ordered = query.order_by(_EVENTS.c.sequence).limit(size)
+            with self._guard, self._connection.begin():
+                rows = list(self._connection.execute(ordered))
+            for row in rows:
+                yield _line(row)
+            if len(rows) < size:
+                return
+            after = rows[-1].sequence
+            left = None if left is None else left - len(rows)
+
+    def blob(self, sha256: str) -> bytes | None:
+        """The content with this hash."""
+        query = select(_BLOBS.c.content).where(_BLOBS.c.sha256 == sha256)
+        with self._guard, self._connection.begin():
+            found = self._connection.execute(query).scalar()
+        return None if found is None else bytes(found)
+
+    def check_chain(self) -> int:
+        """How many lines there are, if each follows from the one before.
+
+        Raises:
+            ServiceError: a line was changed, removed or put in.
+        """
+        last, count = "", 0
+        for line in self.read():
+            count += 1
+            if line.sequence != count or line.digest != digest_of(last, line):
+                raise ServiceError(
+                    f"store {self.where}: event {line.sequence} does not follow from the one "
+                    "before: the log was changed; take a copy from before that"
+                )
+            last = line.digest
+        return count
+
+    def close(self) -> None:
+        """Let another service have it."""
+        self._open.close()
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+
+    def _check_schema(self) -> None:
+        connection = self._connection
+        with connection.begin():
+            there = set(inspect(connection).get_table_names())
+            if "about" not in there and there & {"events", "blobs"}:
+                raise _foreign(self.where, "none")
+            _METADATA.create_all(connection)
+            found = connection.execute(select(_ABOUT.c.schema)).scalar()
+            if found is None:
+                connection.execute(insert(_ABOUT), {"schema": SCHEMA})
+            elif found != SCHEMA:
+                raise _foreign(self.where, found)
+
+    def _hold_advisory_lock(self) -> None:
+        with self._connection.begin():
+            query = text("SELECT pg_try_advisory_lock(:key)")
+            if not self._connection.execute(query, {"key": _LOCK_KEY}).scalar():
+                raise _taken(self.url.render_as_string())
+
+
+def _url_of(where: str) -> URL:
+    if "://" not in where:
+        return URL.create("sqlite", database=where)
+    try:
+        url = make_url(where)
+        if url.get_backend_name() == "postgresql":
+            require("psycopg", "service")
+            return url.set(drivername="postgresql+psycopg")
+        url.get_dialect()
+    except (ArgumentError, NoSuchModuleError) as error:
+        raise ServiceError(f"store: {error}; give a file, or postgresql://…") from error
+    if url.get_backend_name() != "sqlite":
+        raise ServiceError(
+            f"store {url.render_as_string()}: only a file of SQLite or postgresql://… is known"
+        )
+    return url
+
+
+def _lock_file(path: Path) -> IO[bytes]:
+    """A file beside the store that is locked while a process has it."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        handle = os.open(f"{path}.lock", os.O_RDWR | os.O_CREAT, 0o600)
+        os.close(os.open(path, os.O_RDWR | os.O_CREAT, 0o600))  # it holds keys: ours alone
+    except OSError as error:
+        raise ServiceError(f"store {path}: cannot be opened ({error.strerror})") from error
+    lock = os.fdopen(handle, "r+b")
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        lock.close()
+        raise _taken(str(path)) from None
+    return lock
+
+
+def _taken(where: str) -> ServiceError:
+    return ServiceError(
+        f"store {where}: another service has it; end that one, or give another --store"
+    )
+
+
+def _foreign(where: str, schema: str) -> ServiceError:
+    return ServiceError(
+        f"store {where}: has schema {schema}, this version knows {SCHEMA}; give another --store"
+    )
+
+
+def _make_durable(connection: Any, _: Any) -> None:
+    cursor = connection.cursor()
+    cursor.execute("PRAGMA journal_mode=WAL")
+    cursor.execute("PRAGMA synchronous=FULL")  # a commit survives the machine, too
+    cursor.close()
+
+
+def _row(line: LogEvent) -> dict[str, Any]:
+    row = line._asdict()
+    return row | {name: json.dumps(row[name], sort_keys=True) for name in ("data", "private")}
+
+
+def _line(row: Any) -> LogEvent:
+    found = row._asdict()
+    return LogEvent(**found | {name: json.loads(found[name]) for name in ("data", "private")})

@@ -1,0 +1,182 @@
+"""The HTTP interface of a node: the worlds of sessions, opened by the tokens of their leases.
+
+A token says which session, on which node, at which incarnation of it; the service has signed it,
+and the node asks no one else. The state of a session goes to the service before a command is done,
+never after: so it includes no command whose answer may have been lost.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from typing import Annotated, Any
+
+import jwt
+from fastapi import APIRouter, Depends, FastAPI, Query, Request, Response
+from fastapi.responses import JSONResponse
+from starlette.types import ASGIApp
+
+from cavmarl.client.world_flows import SAVED_HEADER
+from cavmarl.core.errors import ServiceError
+from cavmarl.service.access import ALGORITHM, ISSUER
+from cavmarl.service.app import NO_TELEMETRY, GuardedRequests
+from cavmarl.service.node_link import NodeLink
+from cavmarl.service.problems import add_handlers
+from cavmarl.service.refusals import problem
+from cavmarl.service.session_worlds import SAVED_EVERY, SessionWorlds
+
+MAX_ACTIONS_BYTES = 16 * 1024 * 1024
+
+router = APIRouter(prefix="/v1/worlds/{session}")
+
+
+def _link(request: Request) -> NodeLink:
+    found: NodeLink = request.app.state.link
+    return found
+
+
+async def _opened(request: Request, session: str) -> str:
+    """The configuration of the session that the caller's token opens."""
+    link = _link(request)
+    kind, _, token = request.headers.get("authorization", "").partition(" ")
+    try:
+        number = str(jwt.get_unverified_header(token).get("kid"))
+        key = await link.public_key(number)
+        claims = jwt.decode(
+            token, key, [ALGORITHM], audience=f"node:{link.name}", issuer=ISSUER,
+            options={"require": ["exp", "iat", "sub"], "verify_iat": False},
+        )  # fmt: skip
+    except (jwt.InvalidTokenError, KeyError):
+        raise problem(
+            "bad-token", "no token of a lease on this node: resolve the session"
+        ) from None
+    if kind.lower() != "bearer" or claims.get("use") != "session" or claims["sub"] != session:
+        raise problem("bad-token", "the token is not of this session")
+    if claims["inc"] != link.incarnation:
+        raise problem("lost", "the token is of an earlier process of this node: resolve again")
+    return str(claims["cfg"])
+
+
+Opened = Annotated[str, Depends(_opened)]
+
+
+def make_node_app(link: NodeLink, worlds: SessionWorlds) -> ASGIApp:
+    """The application of a node."""
+    app = FastAPI(
+        title="cavmarl node",
+        version="1",
+        openapi_url="/v1/openapi.json",
+        docs_url=None,
+        redoc_url=None,
+        redirect_slashes=False,
+        telemetry=NO_TELEMETRY,
+    )
+    app.state.link, app.state.worlds = link, worlds
+    app.include_router(router)
+    add_handlers(app)
+    return GuardedRequests(app, body_bytes=MAX_ACTIONS_BYTES)
+
+
+def _worlds(request: Request) -> SessionWorlds:
+    found: SessionWorlds = request.app.state.worlds
+    return found
+
+
+@router.post("")
+async def open_worlds(
+    request: Request, session: str, configuration: Opened, save: bool = False
+) -> dict[str, Any]:
+    """Make the worlds of a session, or find them here; they go on from their saved state."""
+    link, worlds = _link(request), _worlds(request)
+    if session not in worlds:
+        document = await link.configuration(configuration)
+        state, number = await link.saved_state(session)
+        await asyncio.to_thread(worlds.add, session, document, state, number)
+        link.expect(session)
+    elif save:
+        await _save(link, worlds, session)
+    return worlds[session].describe()
+
+
+@router.post("/{word}")
+async def command(
+    request: Request,
+    session: str,
+    word: str,
+    _: Opened,
+    number: Annotated[int, Query(ge=1)],
+    seed: Annotated[int | None, Query(ge=0, lt=1 << 63)] = None,
+    quiet: bool = False,
+) -> Response:
+    """`reset`, or `step` with the actions as little-endian numbers; the answer is an .npz."""
+    if word not in ("reset", "step"):
+        raise problem("not-found", f"no command '{word}': there are reset and step")
+    link, worlds = _link(request), _worlds(request)
+    content = await request.body()
+    world = worlds[session]
+    if number == world.number + 1:
+        due = world.number - world.saved >= SAVED_EVERY
+        if due or link.is_draining:
+            await _save(link, worlds, session)
+        if link.is_draining:
+            raise problem("lost", "this node is being drained: resolve the session again")
+
+    def act() -> bytes:
+        return world.command(word, number, seed, content, quiet)
+
+    answer = await _in_turn(worlds, act)
+    worlds.steps += 1
+    headers = {SAVED_HEADER: str(world.saved)}
+    return Response(answer, headers=headers, media_type="application/octet-stream")
+
+
+@router.get("/{word}")
+async def look(request: Request, session: str, word: str, _: Opened) -> Response:
+    """`hash`, `suggestion` or `transfers`."""
+    worlds = _worlds(request)
+    world = worlds[session]
+    match word:
+        case "hash":
+            return JSONResponse({"hashes": await _in_turn(worlds, world.hashes)})
+        case "transfers":
+            return JSONResponse({"transfers": await _in_turn(worlds, world.transfers)})
+        case "suggestion":
+            content = await _in_turn(worlds, world.suggestion)
+            return Response(content, media_type="application/octet-stream")
+    raise problem("not-found", f"no question '{word}': there are hash, suggestion and transfers")
+
+
+@router.delete("", status_code=204)
+async def close_worlds(request: Request, session: str, _: Opened) -> None:
+    """Close the worlds of a session."""
+    await asyncio.to_thread(_worlds(request).close, session)
+
+
+async def _save(link: NodeLink, worlds: SessionWorlds, session: str) -> None:
+    world = worlds[session]
+    number = world.number
+    if number == world.saved:
+        return
+    state = await _in_turn(worlds, world.state)
+    if state is None:
+        return
+    try:
+        await link.save_state(session, number, state)
+    except ServiceError as error:
+        if error.status:
+            raise
+        return  # the service is away: the client has the commands since the last state
+    world.saved = number
+
+
+async def _in_turn(worlds: SessionWorlds, act: Callable[[], Any]) -> Any:
+    """Do something with worlds, in a thread, when no other does."""
+
+    def wait_and_act() -> Any:
+        began_s = time.perf_counter()
+        with worlds.lock:
+            worlds.wait_s += time.perf_counter() - began_s
+            return act()
+
+    return await asyncio.to_thread(wait_and_act)

@@ -1,0 +1,191 @@
+"""A node: registers with a service, hosts the worlds of sessions, and runs evaluations."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import signal
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import uvicorn
+
+from cavmarl.core.errors import CavmarlError, ServiceError
+from cavmarl.evaluate.evaluation import evaluate
+from cavmarl.evaluate.fresh import call_in_fresh_process
+from cavmarl.service.configurations import world_keywords
+from cavmarl.service.node_app import make_node_app
+from cavmarl.service.node_link import NodeLink, is_final
+from cavmarl.service.server import ServerOptions, check_transport, listen, uvicorn_config
+from cavmarl.service.session_worlds import SessionWorlds
+
+MOST_MESSAGE = 2000
+DRAIN_S = 60.0  # after which a node that is drained ends, whatever it has
+
+
+@dataclass(frozen=True)
+class NodeOptions:
+    """Where a node listens and what it offers."""
+
+    service: str  # URL
+    secret: str
+    name: str
+    host: str = "127.0.0.1"
+    port: int = 0  # of clients; 0: any that is free
+    simulator_port: int | None = None  # told to clients; None: the same
+    slots: int = 4
+    capabilities: tuple[str, ...] = ()
+    allowed: tuple[str, ...] = ()
+    is_supposed_idle: bool = False  # tell no load
+    certificate: Path | None = None
+    key: Path | None = None
+    authority: str | None = None  # file of the authority that has signed the service's certificate
+
+
+@dataclass
+class _Host:
+    link: NodeLink
+    worlds: SessionWorlds
+    tell: Callable[[str], None]
+    jobs: dict[str, asyncio.Task[None]] = field(default_factory=dict)
+    failure: ServiceError | None = None
+    is_ending: bool = False
+
+
+def host_node(options: NodeOptions, tell: Callable[[str], None]) -> None:
+    """Run a node until it is drained or interrupted; SIGTERM drains it.
+
+    Raises:
+        ServiceError: the service refuses it, or an address that others reach has no TLS.
+    """
+    check_transport(options.host, options.certificate, options.key)
+    asyncio.run(_run(options, tell))
+
+
+async def _run(options: NodeOptions, tell: Callable[[str], None]) -> None:
+    listener = listen(options.host, options.port)
+    port = listener.getsockname()[1]
+    tls = ["tls"] if options.certificate else []
+    body = {
+        "name": options.name,
+        "address": options.host,
+        "client_port": port,
+        "simulator_port": options.simulator_port or port,
+        "slots": options.slots,
+        "capabilities": [*tls, *options.capabilities],
+        "allowed": list(options.allowed),
+    }
+    trust = {"verify": options.authority or True}
+    link = NodeLink(options.service, options.secret, body, options.is_supposed_idle, **trust)
+    host = _Host(link, SessionWorlds(options.slots), tell)
+    server = uvicorn.Server(
+        uvicorn_config(
+            make_node_app(link, host.worlds),
+            ServerOptions(certificate=options.certificate, key=options.key),
+        )
+    )
+    try:
+        await link.register()
+        tell(f"node {options.name}: {options.host}:{port}, incarnation {link.incarnation}")
+        loop = asyncio.get_running_loop()
+        with contextlib.suppress(NotImplementedError):
+            loop.add_signal_handler(signal.SIGTERM, _end, host)
+        serving = asyncio.create_task(_serve(server, listener))
+        await _beat_until_end(host)
+        server.should_exit = True
+        await serving
+    finally:
+        for job in host.jobs.values():
+            job.cancel()
+        await link.close()
+        listener.close()
+    if host.failure is not None:
+        raise host.failure
+
+
+async def _serve(server: uvicorn.Server, listener: Any) -> None:
+    """Serve without uvicorn's own handlers of signals: this node has its own."""
+    server.config.load()
+    server.lifespan = server.config.lifespan_class(server.config)
+    await server._serve([listener])
+
+
+def _end(host: _Host) -> None:
+    host.is_ending = True
+
+
+async def _beat_until_end(host: _Host) -> None:
+    """Beat; ends when the node is drained and empty, or the service wants no more of it."""
+    link, loop = host.link, asyncio.get_running_loop()
+    pause_s, drained_s = 0.2, float("inf")
+    while True:
+        try:
+            if host.is_ending and not link.is_draining:
+                await link.drain()
+            told = await link.beat(
+                {"steps": float(host.worlds.steps), "wait_s": host.worlds.wait_s}
+            )
+            pause_s = told["beat_s"]
+            host.worlds.keep_only(link.own(told["sessions"]))
+            _start_jobs(host, told["jobs"])
+            if link.is_draining:
+                drained_s = min(drained_s, loop.time())
+                if not told["sessions"] or (host.is_ending and loop.time() > drained_s + DRAIN_S):
+                    await link.leave()
+                    host.tell(f"node {link.name}: drained")
+                    return
+        except ServiceError as error:
+            if error.problem == "conflict" or error.problem == "not-found":
+                await link.register()
+            elif is_final(error):
+                host.failure = error
+                return
+            elif host.is_ending:
+                return
+        await asyncio.sleep(pause_s)
+
+
+def _start_jobs(host: _Host, jobs: list[dict[str, Any]]) -> None:
+    for job in jobs:
+        if job["id"] not in host.jobs:
+            host.jobs[job["id"]] = asyncio.create_task(_run_job(host, job))
+    wanted = {job["id"] for job in jobs}
+    for number in [one for one, task in host.jobs.items() if task.done() and one not in wanted]:
+        del host.jobs[number]
+
+
+async def _run_job(host: _Host, job: dict[str, Any]) -> None:
+    """Evaluate in a process of its own, and leave the files with the service."""
+    link, path = host.link, f"/jobs/{job['id']}"
+    status, message = "done", ""
+    with TemporaryDirectory() as folder:
+        try:
+            document = await link.configuration(job["configuration"])
+            what = f"job {job['id']}"
+            place = Path(folder) / "results"
+            await asyncio.to_thread(
+                call_in_fresh_process, what, run_evaluation, document, job, place
+            )
+            for file in sorted(place.iterdir()):
+                await link.ask("PUT", f"{path}/results/{file.name}", content=file.read_bytes())
+        except CavmarlError as error:
+            status, message = "failed", str(error)[:MOST_MESSAGE]
+    # Where the service is away or the job is another's by now, it runs again elsewhere.
+    with contextlib.suppress(ServiceError):
+        await link.ask("POST", f"{path}/outcome", json={"status": status, "message": message})
+
+
+def run_evaluation(document: dict[str, Any], job: dict[str, Any], folder: Path) -> None:
+    """The work of a job."""
+    evaluate(
+        document["environment"],
+        job["policies"],
+        episodes=job["episodes"],
+        repeats=job["repeats"],
+        out=folder,
+        seed=document["seed"],
+        **world_keywords(document),
+    )

@@ -1,0 +1,133 @@
+"""What a node says to the service: it registers, beats, fetches what worlds need, saves them."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import time
+from importlib.metadata import version
+from typing import Any
+
+import jwt
+import psutil
+
+from cavmarl.balance.probe import busiest_gpu
+from cavmarl.client.clients import AsyncClient
+from cavmarl.core.errors import ServiceError
+
+NEW_S = 5.0  # for so long a session may be here before a beat's answer names it
+GPU_EVERY = 5  # beats
+
+
+class NodeLink:
+    """A node's side of its connection to the service.
+
+    Args:
+        url: of the service.
+        secret: of an identity with the role `node`.
+        body: with which it registers; docs/service.md has its fields.
+        is_supposed_idle: tell no load, so that selection goes by sessions alone.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        secret: str,
+        body: dict[str, Any],
+        is_supposed_idle: bool = False,
+        **options: Any,
+    ) -> None:
+        self._client = AsyncClient(url, secret, **options)
+        self._body = {**body, "versions": {"cavmarl": version("cavmarl")}}
+        self.name: str = body["name"]
+        self.incarnation = 0
+        self.is_draining = False
+        self._beats = itertools.count()
+        self._keys: dict[str, Any] = {}
+        self._expected: dict[str, float] = {}
+        self._gpu = 0.0
+        self._is_supposed_idle = is_supposed_idle
+
+    async def register(self) -> None:
+        """Say that this process is the node."""
+        found = await self.ask("POST", "/nodes", json=self._body)
+        self.incarnation = found.json()["incarnation"]
+        self.is_draining = found.json()["draining"]
+        psutil.cpu_percent(None)  # from now on
+
+    async def beat(self, counters: dict[str, float]) -> dict[str, Any]:
+        """Say how busy this machine is; what the node has to do."""
+        number = next(self._beats)
+        load = {"cpu": 0.0, "ram": 0.0, "gpu": 0.0}
+        if not self._is_supposed_idle:
+            if number % GPU_EVERY == 0:
+                self._gpu = (await asyncio.to_thread(busiest_gpu))[0]
+            load["cpu"] = min(psutil.cpu_percent(None) / 100.0, 1.0)
+            load["ram"] = psutil.virtual_memory().percent / 100.0
+            load["gpu"] = self._gpu
+        body = {
+            **load,
+            "incarnation": self.incarnation,
+            "sequence": number,
+            "sent_s": time.time(),
+            "counters": counters,
+        }
+        answer = await self.ask("POST", f"/nodes/{self.name}/beat", json=body)
+        told: dict[str, Any] = answer.json()
+        self.is_draining = told["draining"]
+        return told
+
+    def expect(self, session: str) -> None:
+        """A session has come with its client, before a beat has told of it."""
+        self._expected[session] = time.monotonic() + NEW_S
+
+    def own(self, told: list[str]) -> set[str]:
+        """The sessions that are this node's: those that were told, and new ones."""
+        now_s = time.monotonic()
+        self._expected = {one: until for one, until in self._expected.items() if until > now_s}
+        return {*told, *self._expected}
+
+    async def public_key(self, number: str) -> Any:
+        """A key that verifies tokens; raises KeyError where the service has none of that id."""
+        if number not in self._keys:
+            keys = (await self.ask("GET", "/keys")).json()["keys"]
+            self._keys = {one["kid"]: jwt.PyJWK(one).key for one in keys}
+        return self._keys[number]
+
+    async def configuration(self, sha256: str) -> dict[str, Any]:
+        """The document of a configuration."""
+        found: dict[str, Any] = (await self.ask("GET", f"/configurations/{sha256}")).json()
+        return found
+
+    async def saved_state(self, session: str) -> tuple[bytes | None, int]:
+        """The newest state of a session, and how many commands it includes."""
+        answer = await self.ask("GET", f"/sessions/{session}/state")
+        if answer.status_code == 204:
+            return None, 0
+        return answer.content, int(answer.headers["cavmarl-number"])
+
+    async def save_state(self, session: str, number: int, state: bytes) -> None:
+        """Leave a state with the service."""
+        path = f"/sessions/{session}/state"
+        await self.ask("PUT", path, content=state, params={"at": number})
+
+    async def drain(self) -> None:
+        """Ask for nothing more."""
+        await self.ask("POST", f"/nodes/{self.name}/drain")
+
+    async def leave(self) -> None:
+        """Say that this process ends."""
+        await self.ask("DELETE", f"/nodes/{self.name}")
+
+    async def ask(self, method: str, path: str, **given: Any) -> Any:
+        """The answer to any request; raises ServiceError."""
+        return await self._client.run(self._client.flows.ask(method, path, **given))
+
+    async def close(self) -> None:
+        """Close the connections."""
+        await self._client.close()
+
+
+def is_final(error: ServiceError) -> bool:
+    """Whether asking again cannot help."""
+    return error.problem in ("superseded", "forbidden", "bad-token")

@@ -1,0 +1,95 @@
+"""Errors as `application/problem+json` (RFC 9457), each with its cause and its cure."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
+
+from cavmarl.core.errors import CavmarlError, ServiceError
+from cavmarl.service.node_selection import NoNodeError
+from cavmarl.service.refusals import PROBLEM_TYPE, PROBLEMS
+
+MOST_EXCLUSIONS = 100  # that an answer names
+
+_BY_STATUS = {404: "not-found", 405: "wrong-method", 408: "slow-body", 413: "too-large"}
+_LOGGER = logging.getLogger("cavmarl.service")
+
+
+def answer(
+    name: str,
+    detail: str,
+    *,
+    status: int | None = None,
+    headers: dict[str, str] | None = None,
+    more: dict[str, Any] | None = None,
+) -> JSONResponse:
+    """A problem as the answer to a request."""
+    known, cure = PROBLEMS[name]
+    body = {
+        "type": f"urn:cavmarl:problem:{name}",
+        "title": name,
+        "status": status or known,
+        "detail": detail,
+        "cure": cure,
+        **(more or {}),
+    }
+    return JSONResponse(body, status or known, headers, media_type=PROBLEM_TYPE)
+
+
+def add_handlers(app: FastAPI) -> None:
+    """Let each error of an application be answered as a problem."""
+    app.add_exception_handler(CavmarlError, _on_error)
+    app.add_exception_handler(RequestValidationError, _on_validation)
+    app.add_exception_handler(HTTPException, _on_http)
+    app.add_exception_handler(Exception, _on_fault)
+
+
+async def _on_error(_: Request, error: Exception) -> JSONResponse:
+    if isinstance(error, NoNodeError):
+        shown = [one._asdict() for one in error.exclusions[:MOST_EXCLUSIONS]]
+        more = {"excluded": shown, "excluded_count": len(error.exclusions)}
+        return answer("no-node", str(error), headers={"Retry-After": "1"}, more=more)
+    if isinstance(error, ServiceError) and error.problem:
+        headers: dict[str, str] = {}
+        if error.status == 401:
+            headers["WWW-Authenticate"] = "Bearer"
+        if error.retry_s is not None:
+            headers["Retry-After"] = str(max(1, round(error.retry_s)))
+        return answer(error.problem, str(error), headers=headers)
+    if isinstance(error, ServiceError):
+        return await _on_fault(_, error)
+    return answer("refused", str(error))
+
+
+async def _on_validation(_: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, RequestValidationError)
+    places = [
+        f"{'.'.join(map(str, one['loc']))}: {one['msg']}{_percent(one)}"
+        for one in error.errors()[:8]
+    ]
+    return answer("bad-body", "; ".join(places))
+
+
+def _percent(found: dict[str, Any]) -> str:
+    """85 for 0.85 is the mistake to name."""
+    value = found.get("input")
+    if found["type"] == "less_than_equal" and isinstance(value, int | float) and value <= 100:
+        return f" (percent? send {value / 100:g})"
+    return ""
+
+
+async def _on_http(_: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, HTTPException)
+    name = _BY_STATUS.get(error.status_code, "bad-body")
+    headers = dict(error.headers or {})
+    return answer(name, str(error.detail), status=error.status_code, headers=headers)
+
+
+async def _on_fault(_: Request, error: Exception) -> JSONResponse:
+    _LOGGER.error("%s: %s", type(error).__name__, error, exc_info=error)
+    return answer("broken", "the service could not do this; nothing of it was kept")

@@ -1,0 +1,428 @@
+"""The routes: what each role may ask the service for."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import AsyncIterator, Callable
+from dataclasses import asdict
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Path, Query, Request, Response
+from fastapi.responses import JSONResponse, PlainTextResponse, StreamingResponse
+
+from cavmarl.service import bodies, configurations
+from cavmarl.service.guards import (
+    DurableRoute,
+    Service,
+    TheService,
+    may,
+    open_to_all,
+)
+from cavmarl.service.infrastructure import (
+    IdentityRecord,
+    LogEvent,
+    NodeRecord,
+    SessionRecord,
+)
+from cavmarl.service.node_selection import NoNodeError, score_of
+from cavmarl.service.refusals import PROBLEM_SCHEMA, PROBLEM_TYPE, problem
+
+PROBLEM: dict[int | str, dict[str, Any]] = {
+    status: {"description": "A problem", "content": {PROBLEM_TYPE: {"schema": PROBLEM_SCHEMA}}}
+    for status in ("default", 422)
+}
+BYTES: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "Content",
+        "content": {"application/octet-stream": {"schema": {"type": "string"}}},
+    }
+}
+
+
+def _router(prefix: str, tag: str) -> APIRouter:
+    return APIRouter(prefix=prefix, route_class=DurableRoute, tags=[tag], responses=PROBLEM)
+
+
+open_routes = _router("/v1", "open")
+nodes = _router("/v1/nodes", "nodes")
+worlds = _router("/v1", "sessions")
+records = _router("/v1", "records")
+ROUTERS = (nodes, worlds, records, open_routes)  # beats are most of what comes
+
+PAGE = 1000
+TLS = "tls"  # the capability of nodes whose clients' port has it
+KEEP_ALIVE_S = 15.0
+
+Everyone = Annotated[IdentityRecord, Depends(may("viewer", "client", "operator", "admin", "node"))]
+Viewers = Annotated[IdentityRecord, Depends(may("viewer", "operator", "admin"))]
+Readers = Annotated[IdentityRecord, Depends(may("viewer", "client", "operator", "admin"))]
+Clients = Annotated[IdentityRecord, Depends(may("client", "operator", "admin"))]
+Operators = Annotated[IdentityRecord, Depends(may("operator", "admin"))]
+Drainers = Annotated[IdentityRecord, Depends(may("operator", "admin", "node"))]
+Admins = Annotated[IdentityRecord, Depends(may("admin"))]
+Nodes = Annotated[IdentityRecord, Depends(may("node"))]
+Anybody = Annotated[IdentityRecord, Depends(open_to_all())]
+
+NodeName = Annotated[bodies.Name, Path()]
+SessionId = Annotated[str, Path(pattern=r"^s-[0-9a-f]{24}$")]
+FileName = Annotated[bodies.Name, Path()]
+
+
+@open_routes.get("/health")
+async def health(_: Anybody, service: TheService) -> dict[str, Any]:
+    """Whether the service is there, and how many events it has."""
+    return {"status": "ok", "events": service.broker.log.sequence}
+
+
+@open_routes.get("/keys")
+async def keys(_: Anybody, service: TheService) -> dict[str, Any]:
+    """The public keys that verify tokens: a JSON Web Key Set."""
+    return service.access.public_keys()
+
+
+@open_routes.post("/token")
+async def token(_: Anybody, service: TheService, body: bodies.TokenBody) -> dict[str, Any]:
+    """An access token and a refresh token for a secret, or for a refresh token."""
+    return service.access.exchange(body.secret, body.refresh_token)
+
+
+@open_routes.delete("/token", status_code=204)
+async def withdraw(identity: Everyone, service: TheService) -> None:
+    """Void all tokens of the caller."""
+    service.access.withdraw(identity)
+
+
+@nodes.post("/{name}/beat")
+async def beat(
+    identity: Nodes, service: TheService, name: NodeName, body: bodies.BeatBody
+) -> JSONResponse:
+    """Say that a node is alive; the answer says what it has to do."""
+    found = service.broker.beat(identity, name, body)
+    if service.broker.waiting:
+        await service.broker.log.stir()
+    return JSONResponse(found)
+
+
+@nodes.get("")
+async def list_nodes(_: Readers, service: TheService) -> dict[str, Any]:
+    """All nodes, with what their last beats said."""
+    return {"nodes": [_node(service, one) for one in service.broker.log.state.nodes.values()]}
+
+
+@nodes.post("", status_code=201)
+async def register(identity: Nodes, service: TheService, body: bodies.NodeBody) -> dict[str, Any]:
+    """Register a node, or register it anew after it has left, died or begun again."""
+    return _node(service, service.broker.register(identity, body))
+
+
+@nodes.post("/{name}/drain")
+async def drain(identity: Drainers, service: TheService, name: NodeName) -> dict[str, Any]:
+    """Give a node nothing more, and move what it has."""
+    return _node(service, service.broker.drain(identity, name))
+
+
+@nodes.post("/{name}/resume")
+async def resume(identity: Operators, service: TheService, name: NodeName) -> dict[str, Any]:
+    """Let a drained node take sessions again."""
+    return _node(service, service.broker.drain(identity, name, is_on=False))
+
+
+@nodes.delete("/{name}")
+async def leave(identity: Drainers, service: TheService, name: NodeName) -> dict[str, Any]:
+    """A node ends."""
+    return _node(service, service.broker.leave(identity, name))
+
+
+@worlds.post("/configurations", status_code=201)
+async def add_configuration(
+    identity: Clients, service: TheService, body: bodies.ConfigurationBody
+) -> dict[str, Any]:
+    """Check and keep a configuration; another content is another version."""
+    return configurations.add_configuration(service.broker.log, identity, body)
+
+
+@worlds.get("/configurations/{sha256}")
+async def get_configuration(
+    _: Everyone, service: TheService, sha256: Annotated[bodies.Sha256, Path()]
+) -> dict[str, Any]:
+    """A configuration by its hash."""
+    return configurations.read_configuration(service.broker.log, sha256)
+
+
+@worlds.post("/sessions", status_code=201)
+async def open_session(
+    identity: Clients, service: TheService, body: bodies.SessionBody
+) -> dict[str, Any]:
+    """Open a session on the node that eq. (1) and (2) choose, or on a preferred one."""
+    configurations.read_configuration(service.broker.log, body.configuration)
+
+    def opened() -> SessionRecord:
+        return service.broker.open(
+            identity, body.configuration, preferred=body.node, needs=body.needs
+        )
+
+    return await _assigned(service, identity, body.configuration, opened, body.wait_s)
+
+
+@worlds.post("/sessions/{number}/resolve")
+async def resolve(
+    identity: Clients, service: TheService, number: SessionId, body: bodies.ResolveBody
+) -> dict[str, Any]:
+    """Where a session is now, and a new lease of it."""
+
+    def resolved() -> SessionRecord:
+        return service.broker.resolve(identity, number, body.unreachable)
+
+    return await _assigned(service, identity, number, resolved, body.wait_s)
+
+
+@worlds.get("/sessions")
+async def list_sessions(identity: Readers, service: TheService) -> dict[str, Any]:
+    """Sessions and jobs: a client's own, or all."""
+    found = service.broker.log.state.sessions.values()
+    is_all = identity.role != "client"
+    return {"sessions": [_session(one) for one in found if is_all or one.owner == identity.id]}
+
+
+@worlds.get("/sessions/{number}")
+async def get_session(identity: Readers, service: TheService, number: SessionId) -> dict[str, Any]:
+    """A session or a job."""
+    return _session(service.broker.session(identity, number))
+
+
+@worlds.delete("/sessions/{number}")
+async def close_session(
+    identity: Clients, service: TheService, number: SessionId
+) -> dict[str, Any]:
+    """End a session or a job."""
+    return _session(service.broker.close(identity, number))
+
+
+@worlds.get(
+    "/sessions/{number}/state",
+    response_class=Response,
+    responses={**BYTES, 204: {"description": "Nothing was saved yet"}},
+)
+async def get_state(identity: Nodes, service: TheService, number: SessionId) -> Response:
+    """The newest saved state of a session, for the node that hosts it."""
+    session = service.broker.hosted(identity, number)
+    if session.saved_blob is None:
+        return Response(status_code=204)
+    content = service.broker.log.content(session.saved_blob)
+    headers = {"Cavmarl-Number": str(session.saved_number)}
+    return Response(content, headers=headers, media_type="application/octet-stream")
+
+
+@worlds.put("/sessions/{number}/state", status_code=204)
+async def put_state(
+    identity: Nodes,
+    service: TheService,
+    request: Request,
+    number: SessionId,
+    at: Annotated[int, Query(ge=0)],
+) -> None:
+    """Save the state of a session after so many commands."""
+    content = await request.body()
+    service.broker.save(service.broker.hosted(identity, number), at, content)
+
+
+@worlds.post("/jobs", status_code=201)
+async def submit(identity: Clients, service: TheService, body: bodies.JobBody) -> dict[str, Any]:
+    """Have a node evaluate drivers; where none can, the job waits for one."""
+    configurations.read_configuration(service.broker.log, body.configuration)
+    configurations.check_policies(body.policies)
+    job = body.model_dump(include={"policies", "episodes", "repeats"})
+    return _session(
+        service.broker.open(
+            identity, body.configuration, preferred=body.node, needs=body.needs, job=job
+        )
+    )
+
+
+@worlds.post("/jobs/{number}/outcome")
+async def finish(
+    identity: Nodes, service: TheService, number: SessionId, body: bodies.OutcomeBody
+) -> dict[str, Any]:
+    """A node has ended a job."""
+    session = service.broker.hosted(identity, number)
+    service.broker.finish(session, body.status, body.message)
+    return _session(session)
+
+
+@worlds.put("/jobs/{number}/results/{name}", status_code=204)
+async def put_result(
+    identity: Nodes, service: TheService, request: Request, number: SessionId, name: FileName
+) -> None:
+    """A node leaves a file that a job has made."""
+    content = await request.body()
+    service.broker.add_result(service.broker.hosted(identity, number), name, content)
+
+
+@worlds.get("/jobs/{number}/results/{name}", response_class=Response, responses=BYTES)
+async def get_result(
+    identity: Readers, service: TheService, number: SessionId, name: FileName
+) -> Response:
+    """A file that a job has made."""
+    results = service.broker.session(identity, number).results
+    if name not in results:
+        raise problem("not-found", f"there is no result '{name}': there are {sorted(results)}")
+    content = service.broker.log.content(results[name])
+    return Response(content, media_type="application/octet-stream")
+
+
+@records.get("/events")
+async def events(
+    identity: Readers,
+    service: TheService,
+    after: Annotated[int, Query(ge=0)] = 0,
+    limit: Annotated[int, Query(ge=1, le=PAGE)] = 100,
+) -> dict[str, Any]:
+    """Events after a sequence number: a client's own, or all."""
+    owner = identity.id if identity.role == "client" else None
+    await service.broker.log.settle()
+    return {"events": [_event(one) for one in service.broker.log.read(after, limit, owner)]}
+
+
+@records.get("/events/stream", response_class=StreamingResponse)
+async def stream(
+    identity: Readers,
+    service: TheService,
+    request: Request,
+    after: Annotated[int, Query(ge=0)] = 0,
+) -> StreamingResponse:
+    """Events as they come, as server-sent events; `Last-Event-ID` goes on where one ended."""
+    last = request.headers.get("last-event-id", "")
+    after = int(last) if last.isascii() and last.isdigit() and len(last) < 19 else after
+    lines = _stream(service, identity, after)
+    return StreamingResponse(lines, media_type="text/event-stream")
+
+
+@records.get("/metrics", response_class=PlainTextResponse)
+async def metrics(_: Viewers, request: Request) -> PlainTextResponse:
+    """The service in figures, as Prometheus reads them."""
+    return PlainTextResponse(request.app.state.metrics.text(), media_type="text/plain")
+
+
+@records.post("/identities", status_code=201)
+async def add_identity(
+    identity: Admins, service: TheService, body: bodies.IdentityBody
+) -> dict[str, Any]:
+    """A new identity, and its secret, which is shown this once."""
+    found, secret = service.access.add_identity(body.name, body.role, identity.id)
+    return {"identity": found.id, "name": found.name, "role": found.role, "secret": secret}
+
+
+@records.get("/identities")
+async def list_identities(_: Admins, service: TheService) -> dict[str, Any]:
+    """All identities."""
+    known = service.broker.log.state.identities.values()
+    names = ("id", "name", "role", "revoked")
+    return {"identities": [{name: getattr(one, name) for name in names} for one in known]}
+
+
+@records.delete("/identities/{number}", status_code=204)
+async def revoke(
+    identity: Admins,
+    service: TheService,
+    number: Annotated[str, Path(pattern=r"^id-[0-9a-f]{16}$")],
+) -> None:
+    """Void an identity, its secret and its tokens."""
+    service.access.revoke(number, identity.id)
+
+
+@records.post("/keys", status_code=201)
+async def rotate(identity: Admins, service: TheService) -> dict[str, Any]:
+    """Sign tokens with a new key; those of the key before stay valid."""
+    return {"key": service.access.rotate_key(identity.id)}
+
+
+async def _assigned(
+    service: Service,
+    identity: IdentityRecord,
+    subject: str,  # of the event, if there is no node
+    take: Callable[[], SessionRecord],
+    wait_s: float,
+) -> dict[str, Any]:
+    """What a client needs to reach its world; it waits for a node until a deadline."""
+    broker = service.broker
+    until_s = time.monotonic() + wait_s
+    while True:
+        try:
+            session = take()
+            break
+        except NoNodeError as error:
+            left_s = until_s - time.monotonic()
+            if left_s <= 0.0:
+                broker.refuse(identity, subject, error)
+                raise
+            await broker.log.settle()
+            broker.waiting += 1
+            try:
+                async with asyncio.timeout(left_s), broker.log.changed:
+                    await broker.log.changed.wait()
+            except TimeoutError:
+                continue
+            finally:
+                broker.waiting -= 1
+    node = broker.log.state.nodes[session.node or ""]
+    lease_s = broker.rules.lease_s
+    return {
+        "session": session.id,
+        "requested": session.preferred,
+        "assigned": node.name,
+        "redirected": session.preferred not in (None, node.name),
+        "reason": session.reason,
+        "score": session.score,
+        "scheme": "https" if TLS in node.capabilities else "http",
+        "address": node.address,
+        "client_port": node.client_port,
+        "simulator_port": node.simulator_port,
+        "configuration": session.configuration,
+        "lease_s": lease_s,
+        "expires_s": broker.log.wall_s() + lease_s,
+        "token": service.access.session_token(session, lease_s),
+    }
+
+
+def _node(service: Service, node: NodeRecord) -> dict[str, Any]:
+    live = service.broker.live[node.name]
+    return {
+        **asdict(node),
+        "load": live.use and asdict(live.use),
+        "score": score_of(node, live),
+        "sessions": len(live.hosted),
+        "age_s": round(service.broker.age_s(node.name), 3),
+    }
+
+
+def _session(session: SessionRecord) -> dict[str, Any]:
+    found = asdict(session)
+    del found["saved_blob"]
+    return found
+
+
+def _event(line: LogEvent) -> dict[str, Any]:
+    found = line._asdict()
+    del found["private"]
+    return found
+
+
+async def _stream(service: Service, identity: IdentityRecord, after: int) -> AsyncIterator[str]:
+    log = service.broker.log
+    owner = identity.id if identity.role == "client" else None
+    generation = identity.generation
+    while identity.generation == generation:  # its tokens are void: it hears no more
+        last = log.durable
+        for line in log.read(after, last - after, owner) if last > after else ():
+            text = json.dumps(_event(line), separators=(",", ":"))
+            yield f"id: {line.sequence}\nevent: {line.kind}\ndata: {text}\n\n"
+        after = max(after, last)
+        if log.durable > after:
+            continue
+        try:
+            async with asyncio.timeout(KEEP_ALIVE_S), log.changed:
+                await log.changed.wait()
+        except TimeoutError:
+            yield ": still here\n\n"

@@ -1,0 +1,187 @@
+"""Starts the service: store, broker, application, and uvicorn on a socket."""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import socket
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import uvicorn
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+
+from cavmarl.core.errors import ServiceError
+from cavmarl.service.access import Access, RateLimit
+from cavmarl.service.app import make_app
+from cavmarl.service.broker import Broker, BrokerRules
+from cavmarl.service.event_log import EventLog
+from cavmarl.service.event_store import EventStore
+from cavmarl.service.guards import Service
+
+DEFAULT_STORE = Path("runs/service.sqlite")
+DEFAULT_PORT = 8700
+MAX_HEAD_BYTES = 16 * 1024
+HEAD_S = 10.0  # in which a head has to come
+SERVER_HEADER: list[tuple[str, str]] = [("server", "cavmarl")]
+
+
+@dataclass(frozen=True)
+class ServerOptions:
+    """Where a service listens and what it keeps."""
+
+    host: str = "127.0.0.1"
+    port: int = DEFAULT_PORT  # 0: any that is free
+    store: str = str(DEFAULT_STORE)
+    certificate: Path | None = None
+    key: Path | None = None
+    rate_hz: float = 200.0  # requests of one identity
+    rules: BrokerRules = field(default_factory=BrokerRules)
+
+
+def serve(options: ServerOptions, tell: Callable[[str], None]) -> None:
+    """Run a service until it is interrupted.
+
+    Args:
+        options: where and what.
+        tell: told lines for the person that has started it; one of them is the first admin's
+            secret, which is shown nowhere else.
+
+    Raises:
+        ServiceError: an address without TLS that others can reach, a port that is taken, a store
+            that cannot be opened or written.
+    """
+    check_transport(options.host, options.certificate, options.key)
+    store = EventStore(options.store)
+    try:
+        log = EventLog(store)
+        access = Access(log)
+        admin = None
+        if not any(one.role == "admin" for one in log.state.identities.values()):
+            admin = access.add_identity("admin", "admin")[1]
+        log.flush()
+        broker = Broker(log, options.rules)
+        limits = RateLimit(options.rate_hz, 2.0 * options.rate_hz), RateLimit(20.0, 100.0)
+        service = Service(broker, access, *limits)
+        config = uvicorn_config(make_app(service), options)
+        server = uvicorn.Server(config)
+
+        def end() -> None:
+            server.should_exit = True
+
+        service.on_broken = end
+        listener = listen(options.host, options.port)
+        scheme = "https" if options.certificate else "http"
+        port = listener.getsockname()[1]
+        tell(f"service: {scheme}://{_shown(options.host)}:{port}, store {options.store}")
+        if admin is not None:
+            tell(f"admin secret, shown this once: {admin}")
+        server.run(sockets=[listener])
+        if log.is_broken:
+            raise ServiceError(f"store {options.store}: could not be written; see the log")
+        log.flush()
+    finally:
+        store.close()
+
+
+def check_transport(host: str, certificate: Path | None, key: Path | None) -> None:
+    """Refuse to send secrets in the clear to other machines."""
+    if (certificate is None) != (key is None):
+        raise ServiceError("give both --certificate and --key, or none of them")
+    for path in (certificate, key):
+        if path is not None and not path.is_file():
+            raise ServiceError(f"{path}: there is no such file; give the path of a PEM file")
+    if certificate is None and not is_loopback(host):
+        raise ServiceError(
+            f"--host {host}: others can reach it, and without TLS all can read its secrets: give "
+            "--certificate and --key, or 127.0.0.1"
+        )
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address is of this machine alone."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A socket that is bound."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    # asyncio switches Nagle's delays off where the protocol is named: else 40 ms an answer.
+    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((host, port))
+        listener.listen(2048)
+    except OSError as error:
+        listener.close()
+        raise ServiceError(f"{host}:{port}: {error.strerror}; give another --port") from error
+    return listener
+
+
+def uvicorn_config(app: object, options: ServerOptions) -> uvicorn.Config:
+    """As the service and its nodes are served; without an access log, which would name callers."""
+    return uvicorn.Config(
+        app,  # type: ignore[arg-type]
+        log_level="warning",
+        access_log=False,
+        server_header=False,
+        headers=SERVER_HEADER,
+        ssl_certfile=options.certificate,
+        ssl_keyfile=options.key,
+        timeout_keep_alive=30,
+        timeout_graceful_shutdown=2,
+        limit_concurrency=2048,
+        loop="asyncio",
+        http=BoundedHeads,
+        ws="none",
+        proxy_headers=False,
+    )
+
+
+class BoundedHeads(HttpToolsProtocol):
+    """Closes connections whose head is long or slow; the parser itself would take any."""
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self._begin_head()
+
+    def data_received(self, data: bytes) -> None:
+        super().data_received(data)
+        if self._late is None:  # the head is there
+            return
+        self._head_bytes += len(data)
+        if self._head_bytes > MAX_HEAD_BYTES:
+            self.transport.close()
+
+    def on_message_begin(self) -> None:
+        super().on_message_begin()
+        self._end_head()
+        self._begin_head()
+
+    def on_headers_complete(self) -> None:
+        self._end_head()
+        super().on_headers_complete()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._end_head()
+        super().connection_lost(exc)
+
+    def _begin_head(self) -> None:
+        self._head_bytes = 0
+        self._late = self.loop.call_later(HEAD_S, self.transport.close)
+
+    def _end_head(self) -> None:
+        if self._late is not None:
+            self._late.cancel()
+            self._late = None
+
+    _late: asyncio.TimerHandle | None = None
+    _head_bytes = 0
+
+
+def _shown(host: str) -> str:
+    return f"[{host}]" if ":" in host else host

@@ -1,0 +1,233 @@
+"""Nodes come and go, and sessions follow them; time is the test's."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from cavmarl.core.errors import ServiceError
+from cavmarl.service.event_log import EventLog
+from cavmarl.service.event_store import EventStore
+from cavmarl.service.node_selection import NoNodeError
+from tests.support.fleet import Fleet
+
+
+@pytest.fixture
+def fleet(tmp_path: Path) -> Iterator[Fleet]:
+    made = Fleet(tmp_path / "store.sqlite")
+    yield made
+    made.close()
+
+
+def reasons(fleet: Fleet, **given: object) -> dict[str, str]:
+    with pytest.raises(NoNodeError) as refused:
+        fleet.open(**given)
+    return {one.node: one.reason for one in refused.value.exclusions}
+
+
+def test_a_node_that_misses_its_beats_is_down_and_comes_back_with_the_next(fleet: Fleet) -> None:
+    fleet.join("a")
+    fleet.now_s += 3.0
+    fleet.broker.sweep()
+    assert fleet.log.state.nodes["a"].state == "up"
+    fleet.now_s += 0.1
+    fleet.broker.sweep()
+    assert fleet.log.state.nodes["a"].state == "down"
+    assert reasons(fleet) == {"a": "unavailable"}
+    fleet.beat("a")
+    assert fleet.open().node == "a"
+    assert fleet.kinds()[-4:-2] == ["node.down", "node.up"]
+
+
+def test_a_state_that_is_too_old_is_not_relied_upon(fleet: Fleet) -> None:
+    fleet.join("a")
+    fleet.now_s += 3.5  # nothing has swept yet
+    assert reasons(fleet) == {"a": "stale"}
+    fleet.register("b")  # and has told no load
+    assert reasons(fleet) == {"a": "stale", "b": "stale"}
+
+
+def test_fifty_requests_at_once_over_five_equal_nodes_give_ten_each(fleet: Fleet) -> None:
+    fleet.join(*"abcde", slots=16)
+    found = Counter(fleet.open().node for _ in range(50))
+    assert found == dict.fromkeys("abcde", 10)
+
+
+def test_a_node_with_a_little_less_load_is_not_stampeded(fleet: Fleet) -> None:
+    fleet.join("a", "b", slots=16)
+    fleet.beat("b", cpu=0.05)
+    found = Counter(fleet.open().node for _ in range(20))
+    assert found == {"a": 10, "b": 10}
+
+
+@pytest.mark.parametrize(
+    ("busy", "reason"),
+    [({"cpu": 0.851}, "cpu"), ({"ram": 0.901}, "ram"), ({"gpu": 0.951}, "gpu")],
+)
+def test_one_overloaded_resource_excludes_a_node(
+    fleet: Fleet, busy: dict[str, float], reason: str
+) -> None:
+    fleet.join("a")
+    fleet.beat("a", **busy)
+    assert reasons(fleet) == {"a": reason}
+    assert "node.overloaded" in fleet.kinds()
+    fleet.beat("a", **{name: value - 0.001 for name, value in busy.items()})
+    assert fleet.open().node == "a"
+
+
+def test_capacity_capability_and_access_exclude_nodes(fleet: Fleet) -> None:
+    fleet.join("full", slots=1)
+    fleet.open()
+    fleet.join("plain")
+    fleet.join("others", capabilities=["gpu"], allowed=["bob"])
+    assert reasons(fleet, needs=["gpu"]) == {
+        "full": "capability",
+        "plain": "capability",
+        "others": "access",
+    }
+    assert {fleet.open().node for _ in range(4)} == {"plain"}
+    assert reasons(fleet) == {"full": "capacity", "plain": "capacity", "others": "access"}
+
+
+def test_the_paper_s_redirect(fleet: Fleet) -> None:
+    fleet.join("a", "b", "c")
+    fleet.beat("b", cpu=0.12)
+    kept = fleet.open(preferred="b")
+    assert (kept.node, kept.reason) == ("b", "preferred")  # 0.012 above the best
+    fleet.beat("b", cpu=0.5)
+    moved = fleet.open(preferred="b")
+    assert (moved.node, moved.reason) == ("a", "preferred above margin")
+    fleet.beat("b", cpu=0.9)
+    assert fleet.open(preferred="b").reason == "preferred excluded"
+    fleet.broker.drain(fleet.nodes, "b")
+    assert fleet.open(preferred="b").reason == "preferred unavailable"
+    assert fleet.open(preferred="nowhere").reason == "preferred unknown"
+    assert fleet.kinds().count("session.redirected") == 4
+
+
+def test_a_session_moves_when_its_node_is_drained_gone_or_out_of_reach(fleet: Fleet) -> None:
+    fleet.join("a", "b")
+    session = fleet.open()
+    assert session.node == "a"
+    assert fleet.broker.resolve(fleet.client, session.id).node == "a"
+    assert fleet.broker.resolve(fleet.client, session.id, ["a"]).node == "b"
+    fleet.broker.drain(fleet.nodes, "b")
+    assert fleet.broker.resolve(fleet.client, session.id).node == "a"
+    fleet.broker.leave(fleet.nodes, "a")
+    assert session.state == "queued"
+    with pytest.raises(NoNodeError):
+        fleet.broker.resolve(fleet.client, session.id)
+    fleet.join("a")
+    assert fleet.broker.resolve(fleet.client, session.id).node == "a"
+    assert fleet.broker.live["b"].hosted == set()
+
+
+def test_a_process_that_was_superseded_is_told_so(fleet: Fleet) -> None:
+    assert fleet.register("a") == 1
+    old = fleet.beat_of("a")
+    assert fleet.register("a") == 2
+    with pytest.raises(ServiceError, match="incarnation 2") as refused:
+        fleet.broker.beat(fleet.nodes, "a", old)
+    assert refused.value.problem == "superseded"
+
+
+def test_a_beat_from_the_past_is_refused(fleet: Fleet) -> None:
+    fleet.join("a")
+    late = fleet.beat_of("a", sequence=0)
+    with pytest.raises(ServiceError) as refused:
+        fleet.broker.beat(fleet.nodes, "a", late)
+    assert refused.value.problem == "stale-beat"
+
+
+def test_a_node_belongs_to_the_identity_that_has_registered_it(fleet: Fleet) -> None:
+    fleet.join("a")
+    fleet.nodes = fleet.identity("others", "node")
+    for attempt in (fleet.register, fleet.beat):
+        with pytest.raises(ServiceError) as refused:
+            attempt("a")
+        assert refused.value.problem == "forbidden"
+
+
+@pytest.mark.parametrize("wrong", [{"cpu": 85.0}, {"cpu": "0.5"}, {"ram": float("nan")}, {"x": 1}])
+def test_a_load_that_is_no_share_is_refused(fleet: Fleet, wrong: dict[str, object]) -> None:
+    fleet.join("a")
+    with pytest.raises(ValidationError):
+        fleet.beat_of("a", **wrong)
+
+
+def test_a_clock_that_is_off_is_told_once(fleet: Fleet) -> None:
+    fleet.join("a")
+    for skew_s in (9.0, 9.0, 0.0):
+        beat = fleet.beat_of("a", sent_s=fleet.now_s + skew_s)
+        fleet.broker.beat(fleet.nodes, "a", beat)
+    assert [kind for kind in fleet.kinds() if kind.startswith("clock")] == [
+        "clock.anomaly",
+        "clock.right",
+    ]
+
+
+def test_a_job_waits_for_a_node_and_is_run_again_when_that_is_lost(fleet: Fleet) -> None:
+    job = fleet.open(job={"policies": ["idm"], "episodes": 1, "repeats": 1})
+    assert job.state == "queued"
+    fleet.join("a")
+    assert fleet.beat("a")["jobs"][0]["id"] == job.id
+    fleet.now_s += 10.0
+    fleet.broker.sweep()
+    assert job.state == "queued"
+    fleet.join("b")
+    assert job.node == "b"
+    with pytest.raises(ServiceError, match="not on a node"):
+        fleet.broker.hosted(fleet.identity("strangers", "node"), job.id)
+    fleet.broker.finish(fleet.broker.hosted(fleet.nodes, job.id), "done", "")
+    assert (job.state, fleet.beat("b")["jobs"]) == ("done", [])
+
+
+def test_what_no_one_asks_for_ends_and_is_forgotten(fleet: Fleet) -> None:
+    fleet.join("a")
+    session = fleet.open()
+    fleet.broker.save(session, 3, b"state")
+    fleet.log.flush()
+    blob = session.saved_blob
+    fleet.now_s += 601.0
+    fleet.broker.sweep()
+    assert session.state == "closed"
+    fleet.now_s += 3601.0
+    fleet.broker.sweep()
+    assert fleet.log.state.sessions == {}
+    fleet.log.flush()
+    assert blob is not None
+    assert fleet.log.store.blob(blob) is None
+
+
+def test_an_identity_has_so_many_sessions_at_most(tmp_path: Path) -> None:
+    fleet = Fleet(tmp_path / "other.sqlite", max_sessions=2)
+    fleet.join("a")
+    first = fleet.open()
+    fleet.open()
+    with pytest.raises(ServiceError, match="2 sessions are open") as refused:
+        fleet.open()
+    assert refused.value.problem == "too-many"
+    fleet.broker.close(fleet.client, first.id)
+    assert fleet.open().node == "a"
+    fleet.close()
+
+
+def test_a_replay_of_the_log_gives_the_same(fleet: Fleet, tmp_path: Path) -> None:
+    fleet.join("a", "b")
+    sessions = [fleet.open() for _ in range(3)]
+    fleet.broker.save(sessions[0], 7, b"content")
+    fleet.broker.close(fleet.client, sessions[1].id)
+    fleet.broker.drain(fleet.nodes, "a")
+    fleet.access.rotate_key()
+    fleet.log.flush()
+    known = fleet.log.state
+    fleet.log.store.close()
+    again = EventLog(EventStore(tmp_path / "store.sqlite"))
+    assert again.state == known
+    assert again.content(sessions[0].saved_blob or "") == b"content"
+    assert again.store.check_chain() == again.sequence
+    fleet.log.store = again.store

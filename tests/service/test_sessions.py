@@ -1,0 +1,213 @@
+"""Worlds and evaluations on nodes in processes of their own; nodes and the service are killed.
+
+Three nodes serve all tests; what they cost is counted at the last one. It is in each run, since no
+cheaper test shows that sessions outlive their nodes.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+
+import cavmarl
+from cavmarl.client import AsyncClient, Client, RemoteWorld
+from cavmarl.core.errors import ServiceError
+from cavmarl.evaluate import evaluate, load_report
+from tests.support.service import Cluster, running_service
+
+AGENTS = 4
+NUMBERS = itertools.count()
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+    store = tmp_path_factory.mktemp("service") / "store.sqlite"
+    with running_service(store, "--lease-s", "3", "--beat-s", "0.3") as service:
+        started = Cluster(service)
+        started.start("a", "b", "victim")
+        yield started
+        started.stop()
+
+
+@pytest.fixture
+def client(cluster: Cluster) -> Iterator[Client]:
+    with cluster.service.client(cluster.service.grant(f"user-{next(NUMBERS)}", "client")) as made:
+        yield made
+
+
+def open_world(client: Client, node: str | None = None) -> RemoteWorld:
+    return client.open("merge", agents=AGENTS, background=8, node=node, wait_s=30.0)
+
+
+def assert_same(remote: RemoteWorld, local: cavmarl.CavVectorEnv, steps: range) -> None:
+    """Both worlds give the same bytes for the same actions."""
+    for step in steps:
+        actions = local.suggest_actions()
+        ours, theirs = remote.step(actions), local.step(actions)
+        for one, other in zip(ours[:4], theirs[:4], strict=True):
+            np.testing.assert_array_equal(one, other, err_msg=f"step {step}")
+            assert one.dtype == other.dtype
+        assert ours[4].keys() == theirs[4].keys()
+        for name, other in theirs[4].items():
+            np.testing.assert_array_equal(ours[4][name], other, err_msg=f"{name}, step {step}")
+    assert remote.state_hash() == local.state_hash()
+
+
+def make_local() -> cavmarl.CavVectorEnv:
+    return cavmarl.make_vec("merge", agents=AGENTS, background=8)
+
+
+def test_a_session_goes_on_bit_for_bit_when_its_node_is_killed(
+    cluster: Cluster, client: Client
+) -> None:
+    remote, local = open_world(client, node="victim"), make_local()
+    assert remote.flows.assignment["assigned"] == "victim"
+    np.testing.assert_array_equal(remote.reset(seed=5)[0], local.reset(seed=5)[0])
+    np.testing.assert_array_equal(remote.suggest_actions(), local.suggest_actions())
+    assert_same(remote, local, range(60))  # past a saved state
+    cluster.processes["victim"].kill()
+    assert_same(remote, local, range(60, 75))
+    assert remote.flows.moves == 1
+    events = client.get("/events", limit=1000)["events"]  # of this client alone
+    kinds = [one["kind"] for one in events]
+    assert kinds == [
+        "configuration.added",
+        "session.opened",
+        "session.assigned",
+        "session.saved",
+        "session.redirected",
+    ]
+    remote.close()
+    assert client.get(f"/sessions/{remote.flows.session}")["state"] == "closed"
+
+
+def test_a_session_moves_from_a_drained_node(cluster: Cluster, client: Client) -> None:
+    remote, local = open_world(client), make_local()
+    remote.reset(seed=1)
+    local.reset(seed=1)
+    assert_same(remote, local, range(5))
+    place = remote.flows.assignment["assigned"]
+    with cluster.service.client() as admin:
+        admin.post(f"/nodes/{place}/drain")
+        while remote.flows.assignment["assigned"] == place:
+            assert_same(remote, local, range(1))
+        assert remote.flows.moves == 1
+    remote.close()
+
+
+def test_another_client_takes_a_session_up(cluster: Cluster, client: Client) -> None:
+    remote, local = open_world(client), make_local()
+    remote.reset(seed=2)
+    local.reset(seed=2)
+    assert_same(remote, local, range(3))
+    assert_same(client.take_up(remote.flows.session), local, range(3, 6))
+    with (
+        cluster.service.client(cluster.service.grant("thief", "client")) as thief,
+        pytest.raises(ServiceError, match="no session") as refused,
+    ):
+        thief.take_up(remote.flows.session)
+    assert refused.value.problem == "not-found"
+
+
+def test_a_node_opens_worlds_to_the_token_of_their_lease_alone(client: Client) -> None:
+    remote = open_world(client)
+    other = open_world(client)
+    remote.reset(seed=0)
+    place = remote.flows.assignment
+    url = f"http://{place['address']}:{place['client_port']}/v1/worlds/{place['session']}/hash"
+    for token in ("y", "x", other.flows.assignment["token"]):
+        answer = httpx.get(url, headers={"Authorization": f"Bearer {token}"})
+        assert answer.status_code == 401
+        assert answer.json()["title"] == "bad-token"
+
+
+def test_a_refused_step_changes_nothing(client: Client) -> None:
+    remote, local = open_world(client), make_local()
+    with pytest.raises(ServiceError, match="before reset"):
+        remote.step(np.zeros((1, AGENTS, 2), dtype=np.float32))
+    remote.reset(seed=4)
+    local.reset(seed=4)
+    with pytest.raises(ServiceError, match="nan"):
+        remote.step(np.full((1, AGENTS, 2), np.nan, dtype=np.float32))
+    with pytest.raises(cavmarl.ActionError, match="shape"):
+        remote.step(np.zeros((1, AGENTS + 1, 2), dtype=np.float32))
+    assert_same(remote, local, range(3))
+    remote.close()
+
+
+def test_the_client_that_awaits_does_the_same(cluster: Cluster) -> None:
+    secret = cluster.service.grant("awaiting", "client")
+
+    async def run() -> tuple[str, int]:
+        async with AsyncClient(cluster.service.url, secret) as client:
+            world = await client.open("merge", agents=AGENTS, background=8, wait_s=30.0)
+            async with world:
+                await world.reset(seed=6)
+                for _ in range(3):
+                    await world.step(await world.suggest_actions())
+                async for event in client.follow():
+                    return await world.state_hash(), event["sequence"]
+        raise AssertionError
+
+    local = make_local()
+    local.reset(seed=6)
+    for _ in range(3):
+        local.step(local.suggest_actions())
+    found, sequence = asyncio.run(run())
+    assert found == local.state_hash()
+    assert sequence > 0
+
+
+def test_a_job_gives_the_results_of_an_evaluation_here(client: Client, tmp_path: Path) -> None:
+    world = {"agents": 2, "background": 4, "seed": 3}
+    job = client.submit("ring", episodes=1, max_cycles=20, **world)
+    done = client.wait(job, tmp_path / "there", timeout_s=120.0)
+    assert done["state"] == "done"
+    there = load_report(tmp_path / "there")
+    evaluate("ring", "idm", episodes=1, max_cycles=20, out=tmp_path / "here", **world)
+    for name in ("trips.csv", "episodes.csv", "tracks.csv", "map.json"):
+        assert (tmp_path / "there" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
+    manifest = json.loads((tmp_path / "there" / "manifest.json").read_text())
+    assert manifest["status"] == "closed"
+    assert there.episodes == 1
+
+
+def test_a_job_that_cannot_run_fails_with_its_cause(client: Client) -> None:
+    job = client.submit("merge", policies=["merge_ippo"], overrides={"action.kind": "discrete"})
+    with pytest.raises(ServiceError, match="failed"):
+        client.wait(job, timeout_s=120.0)
+
+
+@pytest.mark.slow  # each kind of kill alone is in every run
+def test_kills_of_nodes_and_of_the_service_change_no_bit(tmp_path: Path) -> None:
+    options = ("--lease-s", "2", "--beat-s", "0.3")
+    with running_service(tmp_path / "store.sqlite", *options) as service:
+        nodes = Cluster(service)
+        nodes.start("a", "b")
+        with service.client() as client:
+            remote, local = open_world(client), make_local()
+            remote.reset(seed=8)
+            local.reset(seed=8)
+            assert_same(remote, local, range(40))
+            service.kill()
+            assert_same(remote, local, range(40, 60))  # without a service, while the lease lasts
+            service.start_again(*options)
+            assert_same(remote, local, range(60, 90))
+            nodes.processes[remote.flows.assignment["assigned"]].kill()
+            nodes.start("c")
+            assert_same(remote, local, range(90, 130))
+            service.kill()
+            service.start_again(*options)
+            nodes.processes[remote.flows.assignment["assigned"]].kill()
+            assert_same(remote, local, range(130, 160))
+            assert remote.flows.moves == 2
+            kinds = [one["kind"] for one in client.get("/events", limit=1000)["events"]]
+            assert kinds.count("node.down") >= 1
+        nodes.stop()

@@ -1,0 +1,96 @@
+"""A service and its nodes in processes of their own."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from cavmarl.client import Client
+
+__all__ = ["Cluster", "RunningService", "running_service"]
+
+
+@dataclass
+class RunningService:
+    """`cavmarl serve` in a process of its own."""
+
+    process: subprocess.Popen[str]
+    url: str
+    secret: str  # of the admin; nothing, if there was one before
+    store: Path
+
+    def client(self, secret: str = "", **options: Any) -> Client:
+        return Client(self.url, secret or self.secret, **options)
+
+    def grant(self, name: str, role: str) -> str:
+        with self.client() as admin:
+            return str(admin.post("/identities", {"name": name, "role": role})["secret"])
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.communicate()
+
+    def start_again(self, *options: str) -> None:
+        """Start it anew, at the same port and on the same store."""
+        port = self.url.rsplit(":", 1)[1]
+        words = [sys.executable, "-m", "cavmarl", "serve", "--port", port]
+        words += ["--store", str(self.store), *options]
+        self.process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+        assert self.process.stdout is not None
+        assert self.url in self.process.stdout.readline()
+
+
+@contextmanager
+def running_service(store: Path, *options: str) -> Iterator[RunningService]:
+    """A service on a socket; it ends with the block."""
+    has_admin = store.exists()
+    words = [sys.executable, "-m", "cavmarl", "serve", "--port", "0", "--store", str(store)]
+    process = subprocess.Popen([*words, *options], stdout=subprocess.PIPE, text=True)
+    running = RunningService(process, "", "", store)
+    try:
+        assert process.stdout is not None
+        running.url = process.stdout.readline().split()[1].rstrip(",")
+        running.secret = "" if has_admin else process.stdout.readline().split()[-1]
+        yield running
+    finally:
+        if running.process.poll() is None:
+            running.process.terminate()
+            running.process.communicate()
+
+
+@dataclass
+class Cluster:
+    """Node processes of a running service, by name."""
+
+    service: RunningService
+    processes: dict[str, subprocess.Popen[str]] = field(default_factory=dict)
+
+    def start(self, *names: str, secret: str = "") -> None:
+        for name in names:
+            self._begin(name, secret or self.service.grant(name, "node"))
+        for name in names:
+            stdout = self.processes[name].stdout
+            assert stdout is not None
+            assert name in stdout.readline()
+
+    def _begin(self, name: str, secret: str) -> None:
+        words = [sys.executable, "-m", "cavmarl", "node", "--service", self.service.url]
+        words += ["--name", name, "--snapshot", "idle"]
+        environment = {**os.environ, "CAVMARL_SECRET": secret}
+        self.processes[name] = subprocess.Popen(
+            words, env=environment, stdout=subprocess.PIPE, text=True
+        )
+
+    def stop(self) -> None:
+        for process in self.processes.values():
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+            if process.stdout is not None:
+                process.stdout.close()
