@@ -108,10 +108,7 @@ def verify_kills(
         raise ConfigError(f"{steps} steps: {kills} kills need at least {kills + FIRST_STEPS}")
     worlds = 2 * workers if worlds is None else worlds
     if hosts is not None and workers > worlds:
-        raise ConfigError(
-            f"{workers} workers on hosts = {hosts!r}, {worlds} world(s): they would be nodes; use "
-            "verify --nodes, or more worlds"
-        )
+        raise ConfigError(f"{workers} workers of {worlds} world(s) on Ray: use verify --nodes")
     wanted = {"num_envs": worlds, "zones": zones, **spec.keywords}
     whole = make_vec(spec.env, **wanted)
     parted = make_vec(spec.env, workers=workers, hosts=hosts, **wanted)
