@@ -40,6 +40,7 @@ from cavmarl.driving.kernels.lane_choice import (
 )
 from cavmarl.driving.kernels.lane_index import VIEW_M, ahead_on, beside_s, last_on
 from cavmarl.driving.kernels.stopping import way_to_stop
+from cavmarl.driving.kernels.swept_areas import swept_stop
 from cavmarl.driving.kernels.ways import leave, next_step
 
 SEE_LINE_M = 8.0
@@ -155,6 +156,26 @@ def _lane_end(
     return before_line(kind, row["speed"], distance - length + place, dt)
 
 
+@inlined_kernel
+def _before_swept(
+    roads: RoadArrays,
+    rows: NDArray[np.void],
+    i: int,
+    kind: np.void,
+    link: int,
+    front: float,
+    dt: float,
+    scratch: Scratch,
+) -> float:
+    """How a swept area presses row i, whose front is `front` m before the stop line of a link."""
+    if roads.links[link]["num_sweeps"] == 0:
+        return no_press(kind)
+    stop = swept_stop(roads, rows, i, link, -front, False, scratch)
+    if stop == math.inf:
+        return no_press(kind)
+    return before_line(kind, rows[i]["speed"], stop + front, dt)
+
+
 @kernel
 def _at_line(
     roads: RoadArrays,
@@ -177,8 +198,14 @@ def _at_line(
     if to_line <= 0.0:
         # Its front is over the line: it does not wait there any more.
         press, hold = press_inside(roads, travel, rows, i, link, -distance, way, phase, dt, scratch)
-        return press, hold, False
+        return max(press, _before_swept(roads, rows, i, kind, link, front, dt, scratch)), hold, False
     hold = may_enter(roads, travel, rows, i, link, distance, way, phase, scratch)
+    if roads.links[link]["num_sweeps"] > 0:
+        stop = front + swept_stop(roads, rows, i, link, -front, hold != HOLD_NONE, scratch)
+        if hold != HOLD_NONE:
+            to_line = min(to_line, max(stop, 0.0))
+        elif stop < math.inf:
+            return before_line(kind, speed, max(stop, 0.0), dt), HOLD_NONE, stop <= front
     if hold != HOLD_NONE:
         return before_line(kind, speed, to_line, dt), hold, True
     if front > SEE_FOES_M and kind["model"] == MODEL_KRAUSS and is_minor(roads, link, phase):
@@ -242,7 +269,8 @@ def _road_ahead(
         press, hold = press_inside(
             roads, travel, rows, i, here["link"], place, row["way"], phase, dt, scratch
         )
-        press = max(press, fork)
+        swept = _before_swept(roads, rows, i, kind, here["link"], -place - half, dt, scratch)
+        press = max(press, fork, swept)
     look = min(look_ahead_m(kind, speed), travel.view_m)
     see = min(see_line_m(kind, speed) + half, travel.see_m)
     # Behind a leader on its own lane a driver minds the next line only where it could not stop

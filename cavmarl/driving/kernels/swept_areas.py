@@ -1,0 +1,89 @@
+"""Swept areas: where a long vehicle in a bend, or one beside it, has to wait for the other.
+
+No right of way says who goes first there. A vehicle that is in the area does; of two before it the
+one that is further along, unless something else holds it. What it waits for is no reason for others
+to let it pass: a driver that gives way to it goes on.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.numba import inlined_kernel, kernel
+from cavmarl.core.records.arrays import RoadArrays, Scratch
+from cavmarl.core.records.codes import HOLD_NONE
+from cavmarl.core.records.rows import SIZE_LENGTHS_M
+from cavmarl.driving.kernels.announcing import APPROACH_STANDING_M
+from cavmarl.driving.kernels.following import LINE_MARGIN_M
+
+VAN_M, BUS_M = SIZE_LENGTHS_M
+EASY_STOP = 2.0  # m/s², one that needs more to stop before the area goes first
+SOON_M = 2.5  # one that is so near to the area may be in it at once
+GIVE_UP_S = 60.0  # who has stood so long goes on, whatever is in the area
+
+
+@inlined_kernel
+def _size(half: float) -> int:
+    return int(2.0 * half > VAN_M) + int(2.0 * half > BUS_M)
+
+
+@kernel
+def swept_stop(
+    roads: RoadArrays,
+    rows: NDArray[np.void],  # VEHICLE (C,)
+    i: int,  # the row that asks
+    link: int,  # that it is on, or takes next
+    place: float,  # of its front, m beyond its stop line
+    held: bool,  # whether it has to stop at that line anyway
+    scratch: Scratch,
+) -> float:
+    """How far beyond the stop line row i's front may go, in m; inf where nothing is in the way."""
+    row = rows[i]
+    size = _size(0.5 * row["length"])
+    stop = math.inf
+    first = roads.links[link]["first_sweep"]
+    for k in range(first, first + roads.links[link]["num_sweeps"]):
+        sweep = roads.sweeps[k]
+        if sweep["own"] != size or place - row["length"] > sweep["leave_m"]:
+            continue
+        if sweep["enter_m"] >= stop:
+            continue
+        for n in range(scratch.link_start[sweep["foe"]], scratch.link_end[sweep["foe"]]):
+            foe = scratch.approach[n]
+            if foe["row"] == i or _size(foe["half"]) != sweep["other"]:
+                continue
+            if _is_in_the_way(rows, row, foe, sweep, place, held):
+                # One that is in the area, too, stops where it is.
+                stop = min(stop, max(sweep["enter_m"], place))
+    return stop
+
+
+@inlined_kernel
+def _is_in_the_way(
+    rows: NDArray[np.void], row: np.void, foe: np.void, sweep: np.void, place: float, held: bool
+) -> bool:
+    """Whether a row whose front is at `place` has to wait for one APPROACH."""
+    foe_place = foe["half"] - foe["dist"]
+    if foe_place - 2.0 * foe["half"] > sweep["foe_leave_m"] or row["wait_s"] > GIVE_UP_S:
+        return False
+    inside = place > sweep["enter_m"]
+    foe_inside = foe_place > sweep["foe_enter_m"]
+    if foe_inside and not inside:
+        return True
+    if inside and not foe_inside:
+        return False
+    if held and not inside:
+        near: bool = foe_place > -APPROACH_STANDING_M
+        return near  # it loses nothing if it leaves room
+    if rows[foe["row"]]["hold"] != HOLD_NONE:
+        return False
+    if foe_place < place or (foe_place == place and foe["id"] > row["id"]):
+        return False
+    if inside:
+        return True
+    to_area = sweep["foe_enter_m"] - foe_place - LINE_MARGIN_M
+    soon: bool = to_area < SOON_M or foe["speed"] * foe["speed"] > 2.0 * EASY_STOP * to_area
+    return soon
