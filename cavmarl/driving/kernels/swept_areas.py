@@ -16,7 +16,7 @@ from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays, Scratch
 from cavmarl.core.records.codes import HOLD_NONE
 from cavmarl.core.records.rows import SIZE_LENGTHS_M
-from cavmarl.driving.kernels.announcing import APPROACH_STANDING_M
+from cavmarl.driving.kernels.announcing import APPROACH_STANDING_M, STANDING_MPS
 from cavmarl.driving.kernels.following import LINE_MARGIN_M
 
 VAN_M, BUS_M = SIZE_LENGTHS_M
@@ -49,15 +49,16 @@ def swept_stop(
         sweep = roads.sweeps[k]
         if sweep["own"] != size or place - row["length"] > sweep["leave_m"]:
             continue
-        if sweep["enter_m"] >= stop:
-            continue
         for n in range(scratch.link_start[sweep["foe"]], scratch.link_end[sweep["foe"]]):
             foe = scratch.approach[n]
             if foe["row"] == i or _size(foe["half"]) != sweep["other"]:
                 continue
             if _is_in_the_way(rows, row, foe, sweep, place, held):
-                # One that is in the area, too, stops where it is.
+                # One that is in the area, too, stops where it is. Behind one that stands, a driver
+                # waits before the junction: on it, the other might have to wait for it.
                 stop = min(stop, max(sweep["enter_m"], place))
+                if place <= 0.0 and foe["speed"] <= STANDING_MPS:
+                    stop = min(stop, 0.0)
     return stop
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.math.geometry import boxes_overlap
-from cavmarl.core.numba import kernel
+from cavmarl.core.numba import inlined_kernel, kernel
 
 
 @kernel
@@ -18,7 +18,7 @@ def swept_range(
     own: tuple[float, float, float],
     other: tuple[float, float, float],
     level_m: float,
-    same_road: tuple[bool, bool],
+    foes: bool,
 ) -> tuple[float, float, float, float]:
     """The first and last place of each centre at which two bodies touch; none: inf first.
 
@@ -28,8 +28,8 @@ def swept_range(
         own: half length and half width of the body in m, and the length of its path.
         other: the same of the other one.
         level_m: bodies that differ more in height do not touch.
-        same_road: whether both come from one road, and lead into one: beside each other there, they
-            are on lanes of their own.
+        foes: whether a conflict keeps them apart on the junction: only pairs count of which one
+            stands before its line or has left.
     """
     first, last = math.inf, -math.inf
     foe_first, foe_last = math.inf, -math.inf
@@ -42,9 +42,8 @@ def swept_range(
             if dx * dx + dy * dy > reach * reach or abs(mine[i, 3] - theirs[j, 3]) > level_m:
                 continue
             foe_s = theirs[j, 0]
-            if same_road[0] and s + own[0] <= 0.0 and foe_s + other[0] <= 0.0:
-                continue
-            if same_road[1] and s - own[0] >= own[2] and foe_s - other[0] >= other[2]:
+            on, foe_on = _is_on(s, own), _is_on(foe_s, other)
+            if (foes and on and foe_on) or not (on or foe_on):
                 continue
             if boxes_overlap(
                 mine[i, 1],
@@ -63,3 +62,10 @@ def swept_range(
                 first, last = min(first, s), max(last, s)
                 foe_first, foe_last = min(foe_first, foe_s), max(foe_last, foe_s)
     return first, last, foe_first, foe_last
+
+
+@inlined_kernel
+def _is_on(s: float, body: tuple[float, float, float]) -> bool:
+    """Whether a body at place `s` reaches over its junction."""
+    on: bool = s + body[0] > 0.0 and s - body[0] < body[2]
+    return on

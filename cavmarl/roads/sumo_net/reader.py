@@ -118,7 +118,7 @@ def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
     links["first_conflict"] = first_conflict[:-1]
     links["num_conflicts"] = np.diff(first_conflict)
     ways = [_path(move, lane_row, lanes, points, AHEAD_M, AHEAD_M) for move in chosen.movements]
-    sweeps = _fill_sweeps(Movements(links, conflicts, lanes["edge"], ways))
+    sweeps = _fill_sweeps(Movements(links, conflicts, ways))
     junctions, kinds = _junction_rows(nodes, links)
     detectors, phase_detectors = place_detectors(
         signal_rows, DetectorRoads(lanes, edges, links, conflicts, into, lane_ids)

@@ -26,7 +26,6 @@ BODIES = ((2.55, 0.95), (3.8, 1.25), (6.1, 1.3))
 STEP_M = 0.5
 BEFORE_M = 6.0  # of the front to its line, and
 BEYOND_M = 4.0  # of the rear behind the junction: where bodies are asked about
-COVERED_M = 0.75  # what a conflict misses by less is covered by it
 MARGIN_M = STEP_M
 AHEAD_M = BEFORE_M + 2.0 * BODIES[-1][0]  # of a way that `along` has to know
 assert len(BODIES) == len(SIZE_LENGTHS_M) + 1
@@ -37,7 +36,6 @@ class Movements(NamedTuple):
 
     links: NDArray[np.void]  # LINK (K,), conflicts filled
     conflicts: NDArray[np.void]  # CONFLICT
-    edges: NDArray[np.int32]  # (L,) EDGE row of each lane
     ways: Sequence[LinkPath | None]  # over the junction, with `AHEAD_M` of the lanes at its ends
 
 
@@ -72,16 +70,13 @@ def _find_pair(
     found: list[list[tuple[float, ...]]],
 ) -> None:
     a, b = movements.links[one], movements.links[other]
-    edges = movements.edges
     if a["from_lane"] == b["from_lane"]:
         return  # one follows the other
-    same_road = (
-        bool(edges[a["from_lane"]] == edges[b["from_lane"]]),
-        bool(edges[a["to_lane"]] == edges[b["to_lane"]]),
-    )
     if not _is_near(poses[one][0], poses[other][0]):
         return
     merging = a["to_lane"] == b["to_lane"]
+    own_foes = movements.conflicts["foe"][a["first_conflict"] :][: a["num_conflicts"]]
+    foes = bool((own_foes == other).any())
     for own, (half, wide) in enumerate(BODIES):
         for foe, (foe_half, foe_wide) in enumerate(BODIES):
             mine, theirs = poses[one][own], poses[other][foe]
@@ -94,15 +89,13 @@ def _find_pair(
                 (half, wide, float(a["length_m"])),
                 (foe_half, foe_wide, float(b["length_m"])),
                 CLEARANCE_M,
-                same_road,
+                foes,
             )
             if first == np.inf:
                 continue
             # In places of a front that comes and of a rear that leaves.
             here = (first + half - MARGIN_M, last - half + MARGIN_M)
             there = (foe_first + foe_half - MARGIN_M, foe_last - foe_half + MARGIN_M)
-            if _is_covered(movements, one, other, here, there):
-                continue
             found[one].append((other, own, foe, *here, *there))
             found[other].append((one, foe, own, *there, *here))
 
@@ -112,26 +105,6 @@ def _is_near(mine: NDArray[np.float64], theirs: NDArray[np.float64]) -> bool:
     apart = mine[::2, None, 1:3] - theirs[None, ::2, 1:3]
     square = apart[..., 0] * apart[..., 0] + apart[..., 1] * apart[..., 1]
     return bool(square.min() < 6.0 * 6.0)
-
-
-def _is_covered(
-    movements: Movements,
-    link: int,
-    foe: int,
-    here: tuple[float, float],
-    there: tuple[float, float],
-) -> bool:
-    """Whether a conflict of two links keeps all that bodies touch of both."""
-    row = movements.links[link]
-    first = row["first_conflict"]
-    for conflict in movements.conflicts[first : first + row["num_conflicts"]]:
-        if conflict["foe"] == foe:
-            enters = conflict["enter_m"] <= here[0] + COVERED_M
-            leaves = conflict["leave_m"] >= here[1] - COVERED_M
-            foe_enters = conflict["foe_enter_m"] <= there[0] + COVERED_M
-            foe_leaves = conflict["foe_leave_m"] >= there[1] - COVERED_M
-            return bool(enters and leaves and foe_enters and foe_leaves)
-    return False
 
 
 def _poses(way: LinkPath, half_m: float, length_m: float) -> NDArray[np.float64]:
