@@ -40,9 +40,10 @@ from cavmarl.driving.kernels.lane_choice import (
 )
 from cavmarl.driving.kernels.lane_index import VIEW_M, ahead_on, beside_s, last_on
 from cavmarl.driving.kernels.stopping import way_to_stop
-from cavmarl.driving.kernels.swept_areas import swept_stop
+from cavmarl.driving.kernels.swept_areas import VAN_M, swept_stop
 from cavmarl.driving.kernels.ways import leave, next_step
 
+LONG_FORK_M = 6.0  # how much further long vehicles need to be clear of one another at a fork
 SEE_LINE_M = 8.0
 SEE_FOES_M = 4.5  # before a line, a driver who has to give way is ready to stop, as SUMO's are
 NEAR_M = 8.0  # to a leader so near the corner between matters,
@@ -112,7 +113,9 @@ def _shared_start(
         for k in range(scratch.link_start[link], scratch.link_end[link]):
             other = scratch.approach[k]
             place = -other["dist"]
-            if place > max(-distance, 0.0) and place - other["half"] < roads.links[link]["fork_m"]:
+            longest = max(row["length"], 2.0 * other["half"])
+            fork_m = roads.links[link]["fork_m"] + (LONG_FORK_M if longest > VAN_M else 0.0)
+            if place > max(-distance, 0.0) and place - other["half"] < fork_m:
                 gap = distance + place - 0.5 * row["length"] - other["half"]
                 press = max(press, behind(kind, row["speed"], gap, other["speed"], kind["decel"]))
     return press
@@ -171,9 +174,16 @@ def _before_swept(
     if roads.links[link]["num_sweeps"] == 0:
         return no_press(kind)
     stop = swept_stop(roads, rows, i, link, -front, False, scratch)
-    if stop == math.inf:
-        return no_press(kind)
-    return before_line(kind, rows[i]["speed"], stop + front, dt)
+    return no_press(kind) if stop == math.inf else _gently(kind, rows[i], stop + front, dt)
+
+
+@inlined_kernel
+def _gently(kind: np.void, row: np.void, gap: float, dt: float) -> float:
+    """How a line presses before which nobody has to brake harder than those behind can."""
+    press = before_line(kind, row["speed"], gap, dt)
+    if kind["model"] == MODEL_KRAUSS:
+        return float(min(press, kind["decel"] * dt - row["speed"]))
+    return float(min(press, kind["accel"] + kind["decel"]))
 
 
 @kernel
@@ -205,7 +215,7 @@ def _at_line(
         if hold != HOLD_NONE:
             to_line = min(to_line, max(stop, 0.0))
         elif stop < math.inf:
-            return before_line(kind, speed, max(stop, 0.0), dt), HOLD_NONE, stop <= front
+            return _gently(kind, row, stop, dt), HOLD_NONE, stop <= front
     if hold != HOLD_NONE:
         return before_line(kind, speed, to_line, dt), hold, True
     if front > SEE_FOES_M and kind["model"] == MODEL_KRAUSS and is_minor(roads, link, phase):

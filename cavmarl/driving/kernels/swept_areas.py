@@ -17,11 +17,11 @@ from cavmarl.core.records.arrays import RoadArrays, Scratch
 from cavmarl.core.records.codes import HOLD_NONE
 from cavmarl.core.records.rows import SIZE_LENGTHS_M
 from cavmarl.driving.kernels.announcing import APPROACH_STANDING_M, STANDING_MPS
-from cavmarl.driving.kernels.following import LINE_MARGIN_M
 
 VAN_M, BUS_M = SIZE_LENGTHS_M
-EASY_STOP = 2.0  # m/s², one that needs more to stop before the area goes first
-SOON_M = 2.5  # one that is so near to the area may be in it at once
+EASY_STOP = 2.0  # m/s², of one that needs more to stop before the area it is said that it comes;
+HARD_STOP = 3.5  # one that needs more goes first
+SOON_M = 3.5  # one that is so near to the area may be in it at once
 GIVE_UP_S = 60.0  # who has stood so long goes on, whatever is in the area
 
 
@@ -76,15 +76,30 @@ def _is_in_the_way(
         return True
     if inside and not foe_inside:
         return False
-    if held and not inside:
-        near: bool = foe_place > -APPROACH_STANDING_M
-        return near  # it loses nothing if it leaves room
+    if held and not inside and foe_place > -APPROACH_STANDING_M:
+        return True  # it loses nothing if it leaves room
     if rows[foe["row"]]["hold"] != HOLD_NONE:
         return False
-    if foe_place < place or (foe_place == place and foe["id"] > row["id"]):
-        return False
     if inside:
+        return _is_ahead(foe, foe_place, row, place)
+    to_area = sweep["foe_enter_m"] - foe_place
+    own_to_area = sweep["enter_m"] - place
+    if _needs(foe["speed"], to_area, HARD_STOP) and not _needs(
+        row["speed"], own_to_area, HARD_STOP
+    ):
         return True
-    to_area = sweep["foe_enter_m"] - foe_place - LINE_MARGIN_M
-    soon: bool = to_area < SOON_M or foe["speed"] * foe["speed"] > 2.0 * EASY_STOP * to_area
-    return soon
+    soon = to_area < SOON_M or _needs(foe["speed"], to_area, EASY_STOP)
+    return soon and _is_ahead(foe, foe_place, row, place)
+
+
+@inlined_kernel
+def _needs(speed: float, distance: float, decel: float) -> bool:
+    """Whether stopping within a distance takes harder braking."""
+    needs: bool = speed * speed > 2.0 * decel * distance
+    return needs
+
+
+@inlined_kernel
+def _is_ahead(foe: np.void, foe_place: float, row: np.void, place: float) -> bool:
+    ahead: bool = foe_place > place or (foe_place == place and foe["id"] < row["id"])
+    return ahead

@@ -284,6 +284,8 @@ def _fill_sweeps(movements: Movements) -> NDArray[np.void]:
     links["first_sweep"], links["num_sweeps"] = first[:-1], np.diff(first)
     links["swept_m"] = links["length_m"]
     np.maximum.at(links["swept_m"], sweeps["foe"], sweeps["foe_leave_m"])
+    forks = np.bincount(links["from_lane"])[links["from_lane"]] > 1
+    links["swept_m"][forks] += SWEPT_BEYOND_M
     links["swept_m"] = np.minimum(links["swept_m"], links["length_m"] + SWEPT_BEYOND_M)
     return sweeps
 

@@ -24,9 +24,10 @@ from cavmarl.roads.sumo_net.conflicts import CLEARANCE_M, LinkPath
 # a bus. A vehicle counts as the next longer one.
 BODIES = ((2.55, 0.95), (3.8, 1.25), (6.1, 1.3))
 STEP_M = 0.5
-BEFORE_M = 6.0  # of the front to its line, and
+BEFORE_M = 10.0  # of the front to its line, and
 BEYOND_M = 4.0  # of the rear behind the junction: where bodies are asked about
 MARGIN_M = STEP_M
+TURNAROUND = ord("t")
 AHEAD_M = BEFORE_M + 2.0 * BODIES[-1][0]  # of a way that `along` has to know
 assert len(BODIES) == len(SIZE_LENGTHS_M) + 1
 
@@ -54,7 +55,11 @@ def sweep_rows(movements: Movements) -> tuple[NDArray[np.void], NDArray[np.int32
             length = float(movements.links["length_m"][link])
             poses[link] = [_poses(way, half, length) for half, _ in BODIES]
         for one, other in combinations(links, 2):
-            _find_pair(movements, one, other, poses, found)
+            if movements.links["from_lane"][one] != movements.links["from_lane"][other]:
+                _find_pair(movements, one, other, poses, found)
+        for turn in links:
+            if movements.links["direction"][turn] == TURNAROUND:
+                _find_behind(movements, turn, links, poses, found)
         poses.clear()
     counts = [len(rows) for rows in found]
     sweeps = np.zeros(sum(counts), SWEEP)
@@ -70,8 +75,6 @@ def _find_pair(
     found: list[list[tuple[float, ...]]],
 ) -> None:
     a, b = movements.links[one], movements.links[other]
-    if a["from_lane"] == b["from_lane"]:
-        return  # one follows the other
     if not _is_near(poses[one][0], poses[other][0]):
         return
     merging = a["to_lane"] == b["to_lane"]
@@ -98,6 +101,33 @@ def _find_pair(
             there = (foe_first + foe_half - MARGIN_M, foe_last - foe_half + MARGIN_M)
             found[one].append((other, own, foe, *here, *there))
             found[other].append((one, foe, own, *there, *here))
+
+
+def _find_behind(
+    movements: Movements,
+    turn: int,
+    links: Sequence[int],
+    poses: dict[int, list[NDArray[np.float64]]],
+    found: list[list[tuple[float, ...]]],
+) -> None:
+    """One that turns round comes back beside those that stand behind it."""
+    length = float(movements.links["length_m"][turn])
+    for foe, (foe_half, foe_wide) in enumerate(BODIES[1:], 1):
+        theirs = poses[turn][foe]
+        theirs = theirs[theirs[:, 0] >= foe_half]  # it has left their lane
+        for own, (half, wide) in enumerate(BODIES):
+            mine = poses[turn][own]
+            mine = mine[mine[:, 0] <= -half]
+            first, last, foe_first, foe_last = swept_range(
+                mine, theirs, (half, wide, 0.0), (foe_half, foe_wide, length), CLEARANCE_M, False
+            )
+            if first == np.inf:
+                continue
+            here = (first + half - MARGIN_M, last - half + MARGIN_M)
+            there = (foe_first + foe_half - MARGIN_M, foe_last - foe_half + MARGIN_M)
+            for link in links:
+                if movements.links["from_lane"][link] == movements.links["from_lane"][turn]:
+                    found[link].append((turn, own, foe, *here, *there))
 
 
 def _is_near(mine: NDArray[np.float64], theirs: NDArray[np.float64]) -> bool:
