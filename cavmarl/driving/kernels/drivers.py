@@ -208,7 +208,8 @@ def _at_line(
     if to_line <= 0.0:
         # Its front is over the line: it does not wait there any more.
         press, hold = press_inside(roads, travel, rows, i, link, -distance, way, phase, dt, scratch)
-        return max(press, _before_swept(roads, rows, i, kind, link, front, dt, scratch)), hold, False
+        press = max(press, _before_swept(roads, rows, i, kind, link, front, dt, scratch))
+        return press, hold, False
     hold = may_enter(roads, travel, rows, i, link, distance, way, phase, scratch)
     if roads.links[link]["num_sweeps"] > 0:
         stop = front + swept_stop(roads, rows, i, link, -front, hold != HOLD_NONE, scratch)
