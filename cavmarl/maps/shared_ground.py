@@ -20,7 +20,7 @@ def shared_ground(network: RoadNetwork) -> list[tuple[int, int]]:
     Asked is outside junctions, and not where the one road leads into the other.
     """
     grid = lane_grid(network)
-    links = network.links
+    links = network.links[network.links["direction"] != ord("t")]
     pairs = zip(links["from_lane"].tolist(), links["to_lane"].tolist(), strict=True)
     asked = {(min(pair), max(pair)) for pair in pairs}
     places = {

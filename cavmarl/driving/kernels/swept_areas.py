@@ -14,14 +14,16 @@ from numpy.typing import NDArray
 
 from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays, Scratch
-from cavmarl.core.records.codes import HOLD_NONE
+from cavmarl.core.records.codes import HOLD_NONE, MODEL_KRAUSS
 from cavmarl.core.records.rows import SIZE_LENGTHS_M
 from cavmarl.driving.kernels.announcing import APPROACH_STANDING_M, STANDING_MPS
+from cavmarl.driving.kernels.following import before_line, behind, no_press
 
 VAN_M, BUS_M = SIZE_LENGTHS_M
 EASY_STOP = 2.0  # m/s², of one that needs more to stop before the area it is said that it comes;
 HARD_STOP = 3.5  # one that needs more goes first
 SOON_M = 3.5  # one that is so near to the area may be in it at once
+LONG_FORK_M = 6.0  # how much further long vehicles need to be clear of one another at a fork
 GIVE_UP_S = 60.0  # who has stood so long goes on, whatever is in the area
 
 
@@ -103,3 +105,59 @@ def _needs(speed: float, distance: float, decel: float) -> bool:
 def _is_ahead(foe: np.void, foe_place: float, row: np.void, place: float) -> bool:
     ahead: bool = foe_place > place or (foe_place == place and foe["id"] < row["id"])
     return ahead
+
+
+@inlined_kernel
+def before_swept(
+    roads: RoadArrays,
+    rows: NDArray[np.void],
+    i: int,
+    kind: np.void,
+    link: int,
+    front: float,
+    dt: float,
+    scratch: Scratch,
+) -> float:
+    """How a swept area presses row i, whose front is `front` m before the stop line of a link."""
+    if roads.links[link]["num_sweeps"] == 0:
+        return no_press(kind)
+    stop = swept_stop(roads, rows, i, link, -front, False, scratch)
+    return (
+        no_press(kind) if stop == math.inf else before_line_gently(kind, rows[i], stop + front, dt)
+    )
+
+
+@inlined_kernel
+def before_line_gently(kind: np.void, row: np.void, gap: float, dt: float) -> float:
+    """How a line presses before which nobody has to brake harder than those behind can."""
+    press = before_line(kind, row["speed"], gap, dt)
+    if kind["model"] == MODEL_KRAUSS:
+        return float(min(press, kind["decel"] * dt - row["speed"]))
+    return float(min(press, kind["accel"] + kind["decel"]))
+
+
+@kernel
+def behind_fork(
+    roads: RoadArrays,
+    kind: np.void,
+    row: np.void,
+    lane: int,
+    chosen: int,
+    distance: float,
+    scratch: Scratch,
+) -> float:
+    """How vehicles press that have just turned off from the same lane into another link."""
+    press = no_press(kind)
+    first = roads.lanes[lane]["first_link"]
+    for link in range(first, first + roads.lanes[lane]["num_links"]):
+        if link == chosen:
+            continue
+        for k in range(scratch.link_start[link], scratch.link_end[link]):
+            other = scratch.approach[k]
+            place = -other["dist"]
+            longest = max(row["length"], 2.0 * other["half"])
+            fork_m = roads.links[link]["fork_m"] + (LONG_FORK_M if longest > VAN_M else 0.0)
+            if place > max(-distance, 0.0) and place - other["half"] < fork_m:
+                gap = distance + place - 0.5 * row["length"] - other["half"]
+                press = max(press, behind(kind, row["speed"], gap, other["speed"], kind["decel"]))
+    return press
