@@ -18,6 +18,7 @@ from tests.support.netgenerate import netgenerate
 from tests.support.traffic import on_lane, scratch
 
 GRID = ("--grid", "--grid.number=3", "--grid.length=80", "--no-turnarounds.except-deadend")
+CLOCK = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.5}
 CAR, BUS = 0, 2  # size classes
 CAR_M, BUS_M = 5.0, 12.0
 CROWD = """<routes>
@@ -127,10 +128,10 @@ def test_of_two_before_it_the_one_further_along_goes_first(network: RoadNetwork)
 def test_nothing_touches_buses_that_turn(path: Path, tmp_path: Path) -> None:
     routes = tmp_path / "crowd.rou.xml"
     routes.write_text(CROWD, encoding="utf-8")
-    world = make(path, [routes], overrides={"horizon_s": 200.0})
+    world = make(path, [routes], overrides={"horizon_s": 200.0, **CLOCK})
     start(world, 1)
     touched = set()
-    for _ in range(340):
+    for _ in range(360):
         drive(world)
         rows = world.vehicles()
         touched |= set(rows["id"][rows["hit"] >= 0].tolist())

@@ -129,21 +129,24 @@ def test_scenarios_are_staged_as_in_a_mirror(tmp_path: Path, name: str) -> None:
         np.testing.assert_allclose(right[field], MIRRORED[field] * left[field], atol=1e-9)
 
 
-def test_routes_with_lane_changes_and_stops_are_driven_as_in_a_mirror(tmp_path: Path) -> None:
+def test_routes_with_lane_changes_and_stops_go_on_where_one_drives_on_the_left(
+    tmp_path: Path,
+) -> None:
     plain = netgenerate(tmp_path / "right.net.xml", *GRID, "-L", "3")
     mirror = mirror_net(plain, tmp_path / "left.net.xml")
     routes = tmp_path / "routes.rou.xml"
     routes.write_text(ROUTES, encoding="utf-8")
-    worlds = [demand_worlds.make(path, [routes]) for path in (plain, mirror)]
-    for world in worlds:
+    found = []
+    for path in (plain, mirror):
+        clock = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.5}
+        world = demand_worlds.make(path, [routes], overrides=clock)
         start(world, 3)
-    changed = 0
-    for _ in range(120):
-        for world in worlds:
+        stopped_s = 0.0
+        for _ in range(200):
             drive(world)
-        right, left = (np.sort(world.vehicles(0), order="id") for world in worlds)
-        for field, sign in MIRRORED.items():
-            np.testing.assert_array_equal(right[field], sign * left[field], err_msg=field)
-        changed = max(changed, int(np.abs(right["blinker"]).sum()))
-    assert changed
-    assert worlds[0].traffic_stats().arrived > 5
+            stopped_s = max(stopped_s, float(world.vehicles()["stopped_s"].max(initial=0.0)))
+        stats = world.traffic_stats()
+        found.append((stats.departed, stats.waiting, stats.arrived, round(stopped_s)))
+    assert found[0] == found[1]
+    assert found[0][2] > 5, "some arrived"
+    assert found[0][3] > 3, "one stood at its stop"
