@@ -19,8 +19,22 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[1]
-LOCKED = "sumo,maps,followers,render,report"  # torch's wheels differ by processor: not among them
-EXTRAS = ("", "sumo", "maps", "followers", "render", "report", "torch", "sb3", "torchrl", "ray")
+LOCKED = (
+    "sumo,maps,followers,nodes,render,report"  # torch's wheels differ by processor: not among them
+)
+EXTRAS = (
+    "",
+    "sumo",
+    "maps",
+    "followers",
+    "nodes",
+    "render",
+    "report",
+    "torch",
+    "sb3",
+    "torchrl",
+    "ray",
+)
 HEAD = """\
 # Every file that `pip install '.[{extras}]'` takes on 64-bit Linux with Python
 # 3.11, with its hash; made by `make lock`. To install nothing else:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -30,6 +30,32 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         mark(item)
         if item.nodeid in rare:
             item.add_marker(pytest.mark.slow)
+
+
+def _let_start(patch: pytest.MonkeyPatch, start: Callable[..., object]) -> None:
+    from cavmarl.parallel.nodes import node_starters
+    from cavmarl.parallel.processes import fork_server
+
+    for module in (fork_server, node_starters):
+        patch.setattr(module, "start_dying_with_process", start)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def forked_processes() -> Iterator[None]:
+    """Pools get their processes as forks of one that has loaded the kernels."""
+    from tests.support.forked_processes import start_forked
+
+    with pytest.MonkeyPatch.context() as patch:
+        _let_start(patch, start_forked)
+        yield
+
+
+@pytest.fixture
+def fresh_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let pools start Pythons of their own, as they do outside of the tests."""
+    from cavmarl.core.processes import start_dying_with_process
+
+    _let_start(monkeypatch, start_dying_with_process)
 
 
 def pytest_runtest_setup() -> None:

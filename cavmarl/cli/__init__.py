@@ -19,6 +19,7 @@ from cavmarl.cli import (
     lead,
     listing,
     map,
+    node,
     plan,
     scenario,
     suite,
@@ -48,6 +49,7 @@ app.command()(journal.journal)
 app.command()(plan.plan)
 app.command()(lead.lead)
 app.command()(follow.follow)
+app.command()(node.node)
 app.command()(view.view)
 app.command()(demo.demo)
 app.command(context_settings={"ignore_unknown_options": True, "allow_interspersed_args": False})(

@@ -201,6 +201,8 @@ class WorkersConfig(Section, key="workers"):
             keeps the state of worlds; 0: it senses itself. Results do not depend on it. See
             docs/sensor_workers.md.
         sensor_placement: who of them senses what: by what it `cost` of late, or `in_turn`.
+        join_timeout_s: for so long is waited for zone nodes to join; see docs/nodes.md.
+        key_file: with the key that nodes started by hand have to know; relative to the environment.
     """
 
     timeout_s: Annotated[float, Within(1.0, 1e6)] = 300.0
@@ -212,6 +214,8 @@ class WorkersConfig(Section, key="workers"):
     monitor_cpu: bool = False
     sensors: Annotated[int, Whole(0, MAX_SENSOR_WORKERS)] = 0
     sensor_placement: Literal["cost", "in_turn"] = "cost"
+    join_timeout_s: Annotated[float, Within(1.0, 1e6)] = 300.0
+    key_file: str = ""
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@
     ├── WorkerError            worker processes that cannot start or go on
     │   ├── WorkerDeathError      every process that took up a step died of it
     │   ├── WorkerFailureError    an exception in a worker, with its traceback
+    │   ├── NodeRefusedError      a node that its caller does not want
     │   └── NoAdmissibleWorkerError   every worker is too busy to be given a shard
     ├── ClockError             time that another than its master advances, or wants to
     ├── FollowerError          an external stack with which the world cannot go on
@@ -205,6 +206,10 @@ class WorkerFailureError(WorkerError):
     def __init__(self, worker: int, part: str, kind: str, text: str, traceback: str) -> None:
         super().__init__(f"worker {worker} ({part}): {kind}: {text}\n{traceback}")
         self.worker, self.kind, self.text, self.traceback = worker, kind, text, traceback
+
+
+class NodeRefusedError(WorkerError):
+    """A node that its caller does not want, and why."""
 
 
 class NoAdmissibleWorkerError(WorkerError):

@@ -40,7 +40,14 @@ class Attached(Protocol):
     """A part that acts in each tick of W worlds.
 
     A tick may be begun again, with everything in `arrays` as it was before.
+
+    Attributes:
+        reads_all: the names of those calls, `begin` or `end`, that read vehicles of all zones; the
+            others read those of zones in this process and what these see, and what is in `arrays`
+            of an agent is kept where its vehicle is.
     """
+
+    reads_all: tuple[str, ...]
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
         """Begin an episode in the chosen worlds (W,): vehicles and signals are in their places."""

@@ -7,6 +7,7 @@ are worked out everywhere alike.
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from typing import Protocol
 
 import numpy as np
@@ -22,8 +23,16 @@ class Peers(Protocol):
         """After a reset of the chosen worlds (W,), of which all have made all vehicles."""
         ...
 
-    def go_on(self, gate: Gate, side: int) -> None:
-        """Zones have their vehicles of an earlier tick again, on `side`; ghosts follow."""
+    def take_up(self, gate: Gate, side: int) -> None:
+        """Zones have their vehicles of another tick, on `side`."""
+        ...
+
+    def everybody(self, gate: Gate, side: int) -> AbstractContextManager[None]:
+        """The time in which the owned rows of all zones, on `side`, are in each process.
+
+        What is changed of rows stays where they are owned. What is counted in `gate.counts`
+        meanwhile is counted everywhere alike.
+        """
         ...
 
     def share_rows(self, gate: Gate, side: int) -> None:

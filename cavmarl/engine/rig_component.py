@@ -23,6 +23,8 @@ class MountedSensors:
         platform: what the sensors are mounted on.
     """
 
+    reads_all: tuple[str, ...] = ()
+
     def __init__(self, host: ComponentContext) -> None:
         config = host.config
         self.platform = Platform(

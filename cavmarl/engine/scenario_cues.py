@@ -20,6 +20,8 @@ class Cues:
     Which cues have come is among what all shards have in common, `Worlds.cues`.
     """
 
+    reads_all: tuple[str, ...] = ("begin",)
+
     def __init__(self, cues: NDArray[np.void], shards: Sequence[Shard], division: Division) -> None:
         self._cues = cues
         self._worlds = shards[0].worlds

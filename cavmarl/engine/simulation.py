@@ -231,9 +231,10 @@ class Simulation(WorldViews):
 
         Raises:
             LostTickError: as of `run_tick`.
-            SumoError: SUMO cannot go on; the worlds are as they were before the step.
+            SumoError: SUMO cannot go on; the worlds are as they were before the step, but for
+                those that share zones with other processes: they end.
         """
-        if self._tick.sumo is None:
+        if self._tick.sumo is None or self._tick.peers is not None:
             self._run_ticks(commands)
             return
         before = [array.copy() for array in self.save()]
@@ -359,16 +360,23 @@ class Simulation(WorldViews):
                 `SumoTraffic.keep_logs`.
         """
         self._put_back(saved)
-        if self._tick.sumo is not None:
-            self._tick.sumo.catch_up(self._shard.worlds)
+        tick = self._tick
+        if tick.sumo is not None:
+            tick.sumo.catch_up(self._shard.worlds)
+        if tick.peers is not None:
+            tick.peers.keep_own(self.everywhere)
+            tick.peers.take_up(tick.gate, tick.division.side)
 
     def load_own(self, saved: Sequence[NDArray[Any]], home: int) -> None:
         """`load` where other processes hold zones: each goes on with its own, one is `home`."""
         self._put_back(saved, home)
         tick = self._tick
+        if tick.sumo is not None:
+            tick.sumo.catch_up(self._shard.worlds)
         if tick.peers is not None:
             tick.gate.num_passing[:] = 0
-            tick.peers.go_on(tick.gate, tick.division.side)
+            tick.peers.take_up(tick.gate, tick.division.side)
+            tick.peers.share_rows(tick.gate, tick.division.side)
 
     def _put_back(self, saved: Sequence[NDArray[Any]], home: int | None = None) -> None:
         roots, episodes, *rest = saved

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import numpy as np
@@ -66,19 +67,27 @@ class Tick:
         if self.coordination is not None:
             self.coordination.begin(commands)
         for part in self.attached:
-            part.begin(commands)
+            with self._all_rows("begin" in part.reads_all, self.division.side):
+                part.begin(commands)
         if is_first:
             self.executor.each("begin_step", commands)
         self._advance(commands)
         if self.attached:
             self._meet()
         for part in self.attached:
-            part.end()
+            with self._all_rows("end" in part.reads_all, self.division.side):
+                part.end()
         if is_last:
             self.sense(self._everywhere)
         self._meet()
         if self.coordination is not None:
             self.coordination.end()
+
+    def _all_rows(self, needed: bool, side: int) -> AbstractContextManager[None]:
+        """The time in which the vehicles of all zones are in this process, if that is needed."""
+        if self.peers is None or not needed:
+            return nullcontext()
+        return self.peers.everybody(self.gate, side)
 
     def _advance(self, commands: Commands) -> None:
         """Advance → leave → exchange → resolve → enter → commit → signals."""
@@ -105,16 +114,20 @@ class Tick:
         """SUMO takes its step; its own vehicles stand where they are then, or leave."""
         gate, worlds, side = self.gate, self._shard.worlds, self.division.next_side
         self._note_phase(SUMO)
-        sumo.step(worlds, side)
-        if not sumo.drives:
-            sumo.send_on(gate, worlds, side)
-            return
+        with self._all_rows(True, side):
+            sumo.step(worlds, side)
+            if not sumo.drives:
+                sumo.send_on(gate, worlds, side)
+                return
         self._note_phase(MIRROR)
         if sumo.mirror(worlds, side):
             for shard in self.shards:
                 shard.dismiss(gate)
             self._note_left()
             sumo.forgive(gate)
+        if self.peers is not None:
+            self.peers.share_leavers(gate)
+        if any(gate.num_passing.tolist()):
             self.traffic.settle(gate, worlds)
 
     def switch_signals(self) -> None:
@@ -152,7 +165,10 @@ class Tick:
                 if self.peers is None:  # else those of all zones settle together, a little later
                     traffic.settle(gate, worlds)
         if begins_second and traffic.rerouting is not None:
-            with self.division.everybody_next() as everybody:
+            with (
+                self._all_rows(True, self.division.next_side),
+                self.division.everybody_next() as everybody,
+            ):
                 traffic.rerouting.act(gate, everybody)
 
     def _note_left(self) -> None:
@@ -166,7 +182,7 @@ class Tick:
             self._meet()
             if not self.sumo.drives:
                 self.sumo.order(gate, worlds)
-            elif self.sumo.let_in(gate, worlds):
+            elif self.sumo.let_in(gate, worlds, self._running()):
                 self._admit()
         traffic.call_orders(gate, worlds)
         if any(gate.num_queue.tolist()):
@@ -186,8 +202,12 @@ class Tick:
             peers.share_proposals(gate)
         if not (all_phases or any(gate.num_passing.tolist())):
             return
-        traffic.accept(gate, self.division.running() if peers is None else peers.running())
+        traffic.accept(gate, self._running())
         self._admit()
+
+    def _running(self) -> NDArray[np.int64]:
+        """(W,) vehicles of each world, in all zones."""
+        return self.division.running() if self.peers is None else self.peers.running()
 
     def _admit(self) -> None:
         """Admitted vehicles become rows of the zones that they are in."""

@@ -21,6 +21,8 @@ class Messaging:
     What is received in a tick is in the inboxes when agents sense, at its end.
     """
 
+    reads_all: tuple[str, ...] = ("end",)
+
     def __init__(self, host: ComponentContext) -> None:
         worlds = host.shards[0].worlds
         self._division = host.division

@@ -46,8 +46,8 @@ def save(parts: Parts) -> list[Array]:
     return [
         *_fixed(parts),
         gate.queue[:, :waiting],
-        parts.division.contacts(),
         *_of_rerouting(parts),
+        parts.division.contacts(),
         *(
             parts.division.owned(w, zone)
             for w in range(len(worlds.ticks))
@@ -69,11 +69,12 @@ def load(
         array[...] = next(rest)
     # What is ordered follows from the keys; what has been ordered so far is in the gate.
     gate = parts.traffic.draw_orders(parts.gate, parts.worlds, everywhere)
-    queue, contacts = next(rest), next(rest)
+    queue = next(rest)
     gate.queue[:, : queue.shape[1]] = queue
     gate.num_passing[:] = 0
     for array in _of_rerouting(parts):
         _put(array, next(rest))
+    contacts = next(rest)
     vehicles = [[next(rest) for _ in range(parts.division.count)] for _ in everywhere]
     if home is None:
         parts.division.place([np.concatenate(zones) for zones in vehicles], contacts)
@@ -100,8 +101,8 @@ def share_of(parts: Parts, w: int) -> list[Array]:
     return [
         *(array[w : w + 1] for array in _fixed(parts)),
         waiting,
-        parts.division.contacts()[w : w + 1],
         *(() if rerouting is None else rerouting.arrays_of(w)),
+        parts.division.contacts()[w : w + 1],
         *owned,
     ]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -161,6 +162,11 @@ class WorldViews:
         """The rigs of the agents; None: they have none."""
         rigs = (part for part in self._tick.attached if isinstance(part, MountedSensors))
         return next(rigs, None)
+
+    def of_agents(self) -> list[NDArray[Any]]:
+        """What is kept of agents, (W, A, …); over nodes each has it of the vehicles it has."""
+        rig = () if self.mounted is None else self.mounted.arrays()
+        return [self._tick.shards[0].worlds.pending, self.outputs.observations, *rig]
 
     def signal_phases(self, world: int = 0) -> NDArray[np.int32]:
         """PHASE rows that are on, (num_signals,)."""

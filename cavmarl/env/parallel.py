@@ -63,8 +63,8 @@ def parallel_env(
         zones: shadows zones.count, how many shards run the world; results do not depend on it.
         workers: processes that the zones are shared out over; 0: the caller's process runs them.
             Results do not depend on it. "ray": as with hosts="ray", as many as are of use.
-        hosts: "ray" runs the workers on the machines of a Ray cluster (docs/cluster.md). None: on
-            this one.
+        hosts: "ray": workers or nodes run on the machines of a Ray cluster (docs/cluster.md).
+            None: on this one. HOST:PORT: where nodes that are started by hand join.
         nodes: in place of workers: processes that share nothing, each with some zones of each
             world (docs/nodes.md). Results do not depend on it.
         sensor_workers: shadows workers.sensors, how many processes the sensors of `rig` are shared

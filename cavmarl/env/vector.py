@@ -73,7 +73,7 @@ def make_vec(
         workers: processes that the worlds are shared out over, whole worlds each; where there are
             more of them than worlds, the zones of each world. 0: all run in the caller's process.
             "ray": as with hosts="ray", as many as CPUs and worlds. No result depends on it.
-        hosts: "ray" runs the workers on a Ray cluster (docs/cluster.md). None: on this machine.
+        hosts: "ray": on a Ray cluster (docs/cluster.md). None: here. HOST:PORT: where nodes join.
         nodes: in place of workers: processes with zones that share nothing (docs/nodes.md).
         sensor_workers: shadows workers.sensors: processes for `rig` (docs/sensor_workers.md).
         agents: shadows population.agents.

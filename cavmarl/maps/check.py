@@ -79,7 +79,9 @@ def check_map(source: str | Path | RoadNetwork) -> MapReport:
     findings = {
         "dead_ends": cars.dead_ends(),
         "lanes_without_successor": cars.lanes_without_successor(),
-        "junctions_without_right_of_way": _lawless_junctions(network),
+        "junctions_without_right_of_way": tuple(
+            network.junction_ids[row] for row in np.flatnonzero(network.junctions["unruled"])
+        ),
         "signals_without_lanes": _idle_signals(network),
         "lanes_never_green": _lanes_never_green(network),
         "programs_simplified": _simplified_programs(network),
@@ -184,19 +186,6 @@ def _crossroads(network: RoadNetwork) -> int:
 def _junctions_by_type(network: RoadNetwork) -> dict[str, int]:
     counts = np.bincount(network.junctions["kind"], minlength=len(network.junction_kinds))
     return {kind: int(count) for kind, count in zip(network.junction_kinds, counts, strict=True)}
-
-
-def _lawless_junctions(network: RoadNetwork) -> tuple[str, ...]:
-    """Junctions where two movements end in the same lane and no rule says which goes first."""
-    links = network.links
-    owner = np.repeat(np.arange(len(links)), links["num_conflicts"])
-    foe = network.conflicts["foe"]
-    ruled = owner[links["to_lane"][owner] == links["to_lane"][foe]]
-    _, lane, count = np.unique(links["to_lane"], return_inverse=True, return_counts=True)
-    lawless = count[lane] > 1
-    lawless[ruled] = False
-    rows = np.unique(links["junction"][lawless])
-    return tuple(network.junction_ids[row] for row in rows)
 
 
 def _idle_signals(network: RoadNetwork) -> tuple[str, ...]:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import World, check_workers
 from cavmarl.parallel.hosts.remote_worlds import RemoteWorlds
+from cavmarl.parallel.nodes.node_starters import place_of
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.parallel.pooled_worlds import PooledWorlds
 from cavmarl.parallel.sensor_workers.sensor_worker_setup import local_worlds
@@ -17,6 +19,7 @@ from cavmarl.parallel.split_hosts.divided_worlds import DividedWorlds
 from cavmarl.parallel.step_arrays import SteppedWorlds
 
 LOCAL, PROCESSES, RAY, NODES = "local", "processes", "ray", "nodes"
+AT = "@"  # between `nodes` and where they are started
 
 
 class MakeWorlds(Protocol):
@@ -68,9 +71,14 @@ def _ray(
 
 
 def _nodes(
-    world: World, base_dir: Path, num_worlds: int, workers: int | None, in_next_step: bool
+    world: World,
+    base_dir: Path,
+    num_worlds: int,
+    workers: int | None,
+    in_next_step: bool,
+    hosts: str = "",
 ) -> SteppedWorlds:
-    return NodeWorlds(world, base_dir, num_worlds, int(workers or 1), in_next_step)
+    return NodeWorlds(world, base_dir, num_worlds, int(workers or 1), in_next_step, hosts)
 
 
 _BACKENDS = {
@@ -102,23 +110,33 @@ def register_backend(name: str, make: MakeWorlds) -> None:
 def places_of(
     workers: int | str | None, hosts: str | None, nodes: int | None
 ) -> tuple[int | str | None, str | None]:
-    """`workers` and `hosts` where worlds may be over nodes instead."""
+    """`workers` and `hosts` where worlds may be over nodes instead; `_backend` reads them."""
     if nodes is None:
         return workers, hosts
-    if workers or hosts is not None:
+    if workers:
         raise ConfigError(
-            f"nodes = {nodes!r} with workers = {workers!r} and hosts = {hosts!r}: nodes are "
-            "processes of their own; leave the others out"
+            f"nodes = {nodes!r} with workers = {workers!r}: nodes are processes of their own; "
+            "leave one out"
         )
+    if hosts not in (None, RAY):
+        place_of(str(hosts))
     if not check_workers(nodes):
         raise ConfigError(f"nodes = {nodes!r}: must be 1 or more; leave it out for this process")
-    return nodes, NODES
+    return nodes, NODES if hosts is None else f"{NODES}{AT}{hosts}"
+
+
+def _backend(name: str) -> Backend | None:
+    """The one of a name, which for nodes may say where they are started."""
+    kind, _, where = name.partition(AT)
+    if where and kind == NODES:
+        return replace(_BACKENDS[NODES], make=partial(_nodes, hosts=where))
+    return _BACKENDS.get(name)
 
 
 def check_hosts(workers: int | str | None, hosts: str | None) -> tuple[str, int | None]:
     """The backend that both name, and its number of workers, None where it finds that out."""
     known = ", ".join(f"'{name}'" for name in sorted(_BACKENDS, key=lambda name: name != RAY))
-    if hosts is not None and hosts not in _BACKENDS:
+    if hosts is not None and _backend(hosts) is None:
         raise ConfigError(f"hosts = {hosts!r}: must be {known}, or None for this machine")
     if isinstance(workers, str) and (workers not in _BACKENDS or workers in (LOCAL, PROCESSES)):
         names = ", ".join(f"'{name}'" for name in _BACKENDS if name not in (LOCAL, PROCESSES))
@@ -135,7 +153,8 @@ def check_hosts(workers: int | str | None, hosts: str | None) -> tuple[str, int 
             f"hosts = 'local' with workers = {number}: it has none; name 'processes', or leave "
             "one out"
         )
-    if _BACKENDS[hosts].needs_workers and not number:
+    backend = _backend(hosts)
+    if backend is not None and backend.needs_workers and not number:
         by_name = "" if hosts in _OWN - {RAY} else f", or workers='{hosts}'"
         raise ConfigError(f"hosts = '{hosts}' without workers: say how many{by_name}")
     return hosts, number or None
@@ -144,7 +163,8 @@ def check_hosts(workers: int | str | None, hosts: str | None) -> tuple[str, int 
 def keeps_state(num_worlds: int, workers: int | str | None, hosts: str | None) -> bool:
     """Whether this process has the state of the worlds; the rest as of `check_hosts`."""
     name, number = check_hosts(workers, hosts)
-    return _BACKENDS[name].keeps_state(num_worlds, number)
+    backend = _backend(name)
+    return backend is not None and backend.keeps_state(num_worlds, number)
 
 
 def make_worlds(
@@ -164,4 +184,6 @@ def make_worlds(
         WorkerError: no process, no cluster, or no memory.
     """
     name, number = check_hosts(workers, hosts)
-    return _BACKENDS[name].make(world, base_dir, num_worlds, number, in_next_step)
+    backend = _backend(name)
+    assert backend is not None
+    return backend.make(world, base_dir, num_worlds, number, in_next_step)

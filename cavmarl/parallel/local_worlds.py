@@ -271,10 +271,14 @@ class LocalWorlds:
         Raises:
             ConfigError: it is of other worlds.
         """
+        self.load(self.read_worlds(cases))
+
+    def read_worlds(self, cases: Sequence[bytes]) -> list[NDArray[Any]]:
+        """What `load` takes, of what `save_worlds` gave; errors as of `load_worlds`."""
         zones = self.world.partition.count
         like = self.share_of(0)
         shares = [from_bytes(case, [*like[:-zones], like[-1]]) for case in cases]
-        self.load(self.join([[*share, *[share[-1][:0]] * (zones - 1)] for share in shares]))
+        return self.join([[*share, *[share[-1][:0]] * (zones - 1)] for share in shares])
 
     @property
     def num_parts(self) -> int:

@@ -33,6 +33,7 @@ class Task(IntEnum):
     SIGNAL_PHASES = 10
     SAVE = 11
     LOAD = 12
+    LOADS = 13
 
 
 TASK_NAMES = tuple(task.name.lower().replace("_", " ") for task in Task)

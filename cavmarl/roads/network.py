@@ -150,6 +150,7 @@ JUNCTION = record(
     ("z", np.float64),
     ("kind", np.int32),  # index into RoadNetwork.junction_kinds
     ("signal", np.int32),  # SIGNAL row of a traffic light here
+    ("unruled", np.bool_),  # the map has no rule for ways that end in one lane here
 )
 
 SIGNAL = record(

@@ -7,16 +7,21 @@ import random
 import signal
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from threading import Timer
 from typing import Any, Unpack
 
 from cavmarl.config.checks import check_count
+from cavmarl.config.registry import load_config
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError
-from cavmarl.env.vector import make_vec
+from cavmarl.engine.world_setup import make_world
+from cavmarl.env.vector import CavVectorEnv, make_vec
+from cavmarl.parallel.nodes.node_starters import Route, straight
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.verify.determinism import MAX_STEPS
 from cavmarl.verify.differences import DrivenRun, same_bytes
@@ -98,70 +103,87 @@ def verify_nodes(
             if progress is not None:
                 progress(done + step, steps * len(nodes))
 
-        run = _Run(spec, number, min(kills, number - 1), count, worlds, policy)
-        found.append(run.compare(steps, note))
+        pair = ComparedWorlds(spec, number, count, worlds, policy)
+        drawn = random.Random(spec.seed)
+        struck = drawn.sample(range(FIRST_STEPS, steps), min(kills, number - 1))
+        kill = partial(pair.strike, drawn, signal.SIGKILL)
+        found.append(pair.compare(steps, dict.fromkeys(struck, kill), note))
     return NodeReport(spec.env, count, worlds, steps, tuple(found))
 
 
-class _Run:
+class ComparedWorlds:
+    """Worlds over nodes beside undivided ones, with the same driver."""
+
     def __init__(
-        self, spec: WorldSpec, nodes: int, kills: int, zones: int, worlds: int, policy: str | Path
+        self,
+        spec: WorldSpec,
+        nodes: int,
+        zones: int,
+        worlds: int,
+        policy: str | Path,
+        route: Route = straight,  # where nodes call in order to reach a place
     ) -> None:
-        self._random = random.Random(spec.seed)
-        self._nodes, self._kills = nodes, kills
-        self._struck: set[int] = set()  # processes that were killed
-        self._timers: list[Timer] = []
+        self._nodes = nodes
+        self._struck: set[int] = set()  # processes that got a signal
         whole = make_vec(spec.env, num_envs=worlds, **spec.keywords)
-        over = make_vec(spec.env, num_envs=worlds, zones=zones, nodes=nodes, **spec.keywords)
-        assert isinstance(over.worlds, NodeWorlds)
-        self._worlds = over.worlds
+        config, base_dir = load_config(spec.env, zones=zones, **spec.keywords)
+        world = make_world(config, base_dir)
+        self.worlds = NodeWorlds(world, base_dir, worlds, nodes, route=route)
         try:
-            self._runs = [DrivenRun(vec, policy, spec.seed) for vec in (whole, over)]
+            vecs = (whole, CavVectorEnv(self.worlds))
+            self._runs = [DrivenRun(vec, policy, spec.seed) for vec in vecs]
         except BaseException:
-            over.close()
+            self.worlds.close()
             raise
 
-    def compare(self, steps: int, note: Callable[[int], None]) -> NodeRun:
-        struck = set(self._random.sample(range(FIRST_STEPS, steps), self._kills))
-        over = self._runs[1].vec
+    def compare(
+        self,
+        steps: int,
+        strikes: Mapping[int, Callable[[], None]],  # before which something is done in a step
+        note: Callable[[int], None],
+    ) -> NodeRun:
+        """Drive both, and close the nodes."""
         different: int | None = None
         calm_ms: list[float] = []
         recovery_ms: list[float] = []
+        timers: list[Timer] = []
+        drawn = random.Random(steps)
         try:
             for step in range(steps):
                 first = self._runs[0].step()
-                if step in struck:
-                    self._strike(statistics.median(calm_ms))
-                before, began = self._worlds.recoveries, time.perf_counter()
+                if step in strikes:  # some time in the next step, or soon after it
+                    latest_s = 1e-3 * LATEST * statistics.median(calm_ms)
+                    timers.append(Timer(drawn.uniform(0.0, latest_s), strikes[step]))
+                    timers[-1].start()
+                before, began = self.worlds.recoveries, time.perf_counter()
                 second = self._runs[1].step()
                 took_ms = 1e3 * (time.perf_counter() - began)
                 one, other = self._hashes()
                 if not same_bytes(first, second) or one != other:
                     different = step
                     break
-                lost = self._worlds.recoveries > before
+                lost = self.worlds.recoveries > before
                 (recovery_ms if lost else calm_ms).append(took_ms)
                 note(step + 1)
-            for timer in self._timers:
+            for timer in timers:
                 timer.join()
             one, other = self._hashes()  # a node that was killed last is missed now
             different = steps if different is None and one != other else different
-            migrations = self._worlds.migrations
-            killed = sum(not zones for zones in self._worlds.zones)
+            migrations = self.worlds.migrations
         finally:
-            over.close()
+            self.worlds.close()
         median_ms = statistics.median(calm_ms) if calm_ms else 0.0
         above_ms = tuple(took_ms - median_ms for took_ms in recovery_ms)
-        return NodeRun(self._nodes, killed, migrations, different, median_ms, above_ms)
+        return NodeRun(self._nodes, self.worlds.losses, migrations, different, median_ms, above_ms)
 
-    def _strike(self, step_ms: float) -> None:
-        """Kill a living node some time in the next step."""
-        pids = [process.pid for process in self._worlds.processes]
-        pid = self._random.choice([pid for pid in pids if pid not in self._struck])
-        self._struck.add(pid)
-        delay_s = 1e-3 * self._random.uniform(0.0, LATEST * step_ms)
-        self._timers.append(Timer(delay_s, os.kill, (pid, signal.SIGKILL)))
-        self._timers[-1].start()
+    def strike(self, drawn: random.Random, number: signal.Signals) -> None:
+        """Send a signal to a node that has got none yet."""
+        living = [pid for pid in self.worlds.pids if pid not in self._struck]
+        if living:
+            pid = drawn.choice(living)
+            self._struck.add(pid)
+            with suppress(ProcessLookupError):
+                os.kill(pid, number)
 
     def _hashes(self) -> list[list[str]]:
         vecs = [run.vec for run in self._runs]

@@ -36,19 +36,24 @@ def drive(vec: CavVectorEnv, steps: range) -> list[bytes]:
 
 
 @pytest.mark.parametrize(
-    ("mode", "zones", "workers", "balance_steps"),
-    [("SameStep", 1, 0, 0), ("NextStep", 2, 0, 0), ("NextStep", 2, 4, 0), ("SameStep", 1, 2, 3)],
+    ("mode", "arguments"),
+    [
+        ("SameStep", {}),
+        ("NextStep", {"zones": 2}),
+        ("NextStep", {"zones": 2, "workers": 4}),
+        ("SameStep", {"workers": 2, "overrides": {"workers.balance_steps": 3}}),
+        ("NextStep", {"zones": 3, "nodes": 2}),
+    ],
 )
 @pytest.mark.filterwarnings("ignore:workers = ")
-def test_worlds_go_on_bit_for_bit(mode: str, zones: int, workers: int, balance_steps: int) -> None:
+def test_worlds_go_on_bit_for_bit(mode: str, arguments: dict[str, Any]) -> None:
     before, middle, after = range(HORIZON + 4), range(20, 30), range(30, 50)
     whole = make(mode)
     whole.reset(seed=3)
     drive(whole, before)
     saved = whole.save_state()
     expected = drive(whole, middle), drive(whole, after)
-    moves = {"workers.balance_steps": balance_steps}
-    other = make(mode, zones=zones, workers=workers, overrides=moves)
+    other = make(mode, **arguments)
     try:
         other.load_state(saved)
         found = drive(other, middle)

@@ -124,7 +124,7 @@ def test_all_hosts_die_at_once(make: Make) -> None:
 @pytest.mark.parametrize("mode", ["ground_truth", "sensors"])
 def test_rigs_are_sensed_for_by_the_hosts(make: Make, mode: str) -> None:
     overrides = {"rig": "ten_sensors", "observation.mode": mode}
-    wanted = {"agents": 5, "background": 20, "max_cycles": 8, "overrides": overrides}
+    wanted = {"agents": 5, "background": 60, "max_cycles": 8, "overrides": overrides}
     one = make("town", **wanted)
     whole = drive(one)
     vec = make("town", zones=4, workers=2, hosts="ray", **wanted)

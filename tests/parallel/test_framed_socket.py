@@ -145,9 +145,10 @@ class Caller:
         until_s = time.monotonic() + 5.0
         while not self.found and time.monotonic() < until_s:
             time.sleep(0.005)
-            guest = guest or self.door.open()
             try:
-                connection = guest and guest.listen()
+                if guest is None:
+                    guest = PendingConnection(self.door._listener.accept()[0], self.door.secret)
+                connection = guest.listen()
             except BlockingIOError:
                 continue
             except (MessageError, OSError, EOFError) as error:

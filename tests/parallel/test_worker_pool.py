@@ -404,6 +404,7 @@ def test_memory_where_there_is_no_memfd(monkeypatch: pytest.MonkeyPatch, tmp_pat
     memory[4999] = 7
 
 
+@pytest.mark.usefixtures("fresh_processes")
 @pytest.mark.parametrize("room", [0, 3, 12, 16, 20])
 def test_descriptors_that_cannot_be_had(room: int) -> None:
     gc.collect()

@@ -24,7 +24,7 @@ from cavmarl.cli.output import (
 )
 from cavmarl.cli.verify.faults import check_campaign, print_figures, verify_campaign
 from cavmarl.cli.verify.kills import verify_with_kills
-from cavmarl.cli.verify.nodes import verify_over_nodes
+from cavmarl.cli.verify.nodes import verify_node_campaign, verify_over_nodes
 from cavmarl.config.env import ZONE_LAYOUTS
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError, LostTickError
@@ -70,7 +70,12 @@ def verify(
             metavar="PLAN",
         ),
     ] = None,
-    seeds: Annotated[int, about("Of a campaign: runs in which any process dies at any time.")] = 12,
+    seeds: Annotated[
+        int,
+        about(
+            "Of a campaign: runs in which any process dies at any time; over nodes, of each fault."
+        ),
+    ] = 12,
     kill: Annotated[
         int | None,
         about(
@@ -81,7 +86,8 @@ def verify(
     nodes: Annotated[
         str | None,
         about(
-            "Numbers of nodes, processes that share nothing; with --kill N of them are killed.",
+            "Numbers of nodes, processes that share nothing; with --kill N of them are killed, "
+            "with --faults campaign connections and nodes fail.",
             metavar="N,N,…",
         ),
     ] = None,
@@ -124,8 +130,23 @@ def verify(
     checked = {"zones.check_invariants": True} if check else {}
     strict = replace(world, overrides={**world.overrides, **checked})
     if kill is not None or nodes is not None:
-        others = {"--faults": faults, "--layout": layout, "--journal": journal}
+        plan = None if nodes is not None and kill is None and faults == "campaign" else faults
+        others = {"--faults": plan, "--layout": layout, "--journal": journal}
         _refuse_with_kill("--kill" if nodes is None else "--nodes", env, counts, others)
+    if nodes is not None and faults is not None:
+        if worlds is not None:
+            raise ConfigError(f"--worlds {worlds}: a campaign has one world; leave it out")
+        verify_node_campaign(
+            console,
+            strict,
+            _counts(nodes),
+            json_path,
+            zones=None if counts is None else counts[0],
+            steps=40 if steps is None else steps,
+            seeds=seeds,
+            policy=policy,
+        )
+        return
     if nodes is not None:
         verify_over_nodes(
             console,

@@ -39,3 +39,31 @@ def verify_over_nodes(
     console.print(grid(heads, rows, title))
     if not found.holds:
         raise typer.Exit(1)
+
+
+def verify_node_campaign(
+    console: Console, world: WorldSpec, nodes: list[int], json_path: Path | None, **arguments: Any
+) -> None:
+    """Compare while connections and nodes fail; exit code 1 if anything differs."""
+    from cavmarl.verify.node_faults import verify_node_faults
+
+    with counting(console, f"faults between the nodes of {world.env}") as progress:
+        found = verify_node_faults(world, nodes, progress=progress, **arguments)
+    write_json(json_path, found.to_dict())
+    rows = [
+        (
+            str(line.nodes),
+            line.fault,
+            str(line.runs),
+            str(line.done),
+            str(line.lost),
+            str(line.ended),
+            f"different with seeds {line.different}" if line.different else "equal",
+        )
+        for line in found.lines
+    ]
+    heads = ("nodes", "fault", "runs", "faults", "nodes lost", "ended", "")
+    title = f"{escape(Path(found.env).name)}: {found.zones} zones, {found.steps} steps a run"
+    console.print(grid(heads, rows, title))
+    if not found.holds:
+        raise typer.Exit(1)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import selectors
 import socket
-import time
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Protocol
 
 from cavmarl.core.errors import MessageError, WorkerError, WorkerFailureError
 from cavmarl.parallel.hosts.framed_socket import FramedSocket, Kind
-from cavmarl.parallel.hosts.listener import MAX_GUESTS, Listener, PendingConnection
+from cavmarl.parallel.hosts.listener import Listener
 
 ENDED = (EOFError, ConnectionError)  # of a connection, as it does when the process at its end dies
 
@@ -69,7 +68,6 @@ class HostRegistry:
         self._launcher = launcher
         self._code = code
         self._hosts: dict[int, HostConnection] = {}
-        self._guests: list[PendingConnection] = []
         self._door = Listener(launcher.address)
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._door, selectors.EVENT_READ, self._door)
@@ -92,18 +90,12 @@ class HostRegistry:
         speaking: list[HostConnection] = []
         for key, _ in self._selector.select(wait_s):
             match key.data:
-                case Listener():
-                    self._welcome()
-                case PendingConnection():
-                    if key.data in self._guests:  # not shown out meanwhile
-                        self._listen(key.data)
                 case HostConnection() as host if host.part >= 0:
                     speaking.append(host)
                 case HostConnection() as host:
                     self._wake(host)
-        now = time.monotonic()
-        for guest in [guest for guest in self._guests if guest.until_s < now]:
-            self._show_out(guest)
+        for number, connection in self._door.admit():
+            self._admit(connection, number)
         return speaking
 
     def drop(self, host: HostConnection, restart: bool) -> None:
@@ -129,39 +121,9 @@ class HostRegistry:
                 host.wire.send(Kind.END, 0)
         self._launcher.close()
         self._door.close()
-        for guest in self._guests:
-            guest.close()
         for host in self._hosts.values():
             host.wire.close()
         self._selector.close()
-
-    def _welcome(self) -> None:
-        """Accept all that call; where they are too many, the silent ones leave first."""
-        for _ in range(MAX_GUESTS):
-            guest = self._door.open()
-            if guest is None:
-                return
-            if len(self._guests) == MAX_GUESTS:
-                self._show_out(min(self._guests, key=lambda each: (each.number >= 0, each.until_s)))
-            self._guests.append(guest)
-            self._selector.register(guest, selectors.EVENT_READ, guest)
-            self._listen(guest)
-
-    def _listen(self, guest: PendingConnection) -> None:
-        try:
-            connection = guest.listen()
-        except (EOFError, OSError, MessageError):  # a stranger: ignored
-            self._show_out(guest)
-            return
-        if connection is not None:
-            self._guests.remove(guest)
-            self._selector.unregister(guest)
-            self._admit(connection, guest.number)
-
-    def _show_out(self, guest: PendingConnection) -> None:
-        self._guests.remove(guest)
-        self._selector.unregister(guest)
-        guest.close()
 
     def _admit(self, connection: socket.socket, number: int) -> None:
         if number in self._hosts and self._hosts[number].part < 0:

@@ -1,23 +1,30 @@
-"""Accepts hosts: only processes that know the secret get in.
+"""Accepts hosts and nodes: only processes that know the secret get in.
 
-The caller listens on one port, and hosts call there; they listen nowhere. Both prove that they know
-the secret, which Ray has handed to the host, without sending it: each answers the other's random
-number with its HMAC. Until that is done nothing else is read, and no more than a few bytes.
+One process listens, and others call there. Both prove that they know the secret without sending
+it: each answers the other's random number with its HMAC. Until that is done nothing else is read,
+and no more than a few bytes. What leaves this machine is encrypted before.
 
     host → caller   HELLO: magic, version, number of the host, random number
     caller → host   random number, proof
     host → caller   proof
+
+Who speaks another version is told which one is spoken here.
 """
 
 from __future__ import annotations
 
 import hmac
 import secrets
+import selectors
 import socket
+import ssl
 import struct
 import time
+from collections.abc import Iterator
+from contextlib import suppress
 
 from cavmarl.core.errors import MessageError, WorkerError
+from cavmarl.parallel.hosts.encryption import EncryptedSocket, encrypted, leaves_this_machine
 from cavmarl.parallel.hosts.framed_socket import MAGIC, VERSION, FramedSocket
 
 NONCE = 16  # bytes of a random number
@@ -27,6 +34,7 @@ GREETING_S = 5.0  # for a guest to prove its identity
 CALL_S = 5.0  # for the system to connect
 MAX_GUESTS = 64  # not authenticated yet
 BACKLOG = 1024  # callers that the system holds until they are accepted
+_SPOKEN = struct.Struct("<4sH")
 _HELLO = struct.Struct(f"<4sHI{NONCE}s")
 
 
@@ -38,6 +46,8 @@ class PendingConnection:
         self.until_s = time.monotonic() + GREETING_S  # for so long it may take, by `time.monotonic`
         self.number = -1  # that it says it has; -1: it has said nothing
         self._socket = connection
+        if leaves_this_machine(connection):
+            self._socket = encrypted(connection, secret, calls=False)
         self._secret = secret
         self._heard = b""
         self._expected = b""
@@ -51,6 +61,12 @@ class PendingConnection:
         Raises:
             OSError: it is gone.
         """
+        if isinstance(self._socket, EncryptedSocket) and self._socket.version() is None:
+            try:
+                self._socket.do_handshake()
+            except (ssl.SSLWantReadError, ssl.SSLWantWriteError):
+                return None
+            self._go_on()
         wanted = PROOF if self._expected else _HELLO.size
         try:
             heard = self._socket.recv(wanted - len(self._heard))
@@ -64,6 +80,7 @@ class PendingConnection:
         said, self._heard = self._heard, b""
         if not self._expected:
             self._answer(said)
+            self._go_on()
             return None
         if not hmac.compare_digest(said, self._expected):
             raise MessageError("somebody who does not know the secret has called")
@@ -72,11 +89,16 @@ class PendingConnection:
     def close(self) -> None:
         self._socket.close()
 
+    def _go_on(self) -> None:
+        """It may take as long again: whoever listens may be busy in between."""
+        self.until_s = time.monotonic() + GREETING_S
+
     def _answer(self, hello: bytes) -> None:
         magic, version, self.number, _ = _HELLO.unpack(hello)
         if magic != MAGIC:
             raise MessageError(f"somebody who says {hello[:4]!r} has called")
         if version != VERSION:
+            self._socket.sendall(_SPOKEN.pack(MAGIC, VERSION))
             raise MessageError(
                 f"host {self.number} speaks version {version}, this is {VERSION}: install the same "
                 "cavmarl on all machines"
@@ -87,30 +109,93 @@ class PendingConnection:
 
 
 class Listener:
-    """Listens."""
+    """Listens, and lets in who knows the secret; strangers cost little and are shown out.
 
-    def __init__(self, address: str, secret: bytes | None = None) -> None:
-        # that hosts have to know; None: one is drawn
+    Raises:
+        WorkerError: nobody can listen there.
+    """
+
+    def __init__(
+        self,
+        address: str,
+        secret: bytes | None = None,  # that callers have to know; None: one is drawn
+        port: int = 0,  # 0: the system chooses
+    ) -> None:
         self.secret = secrets.token_bytes(SECRET) if secret is None else secret
         try:
-            self._listener = socket.create_server((address, 0), backlog=BACKLOG)
-        except OSError as error:
-            raise WorkerError(f"cannot listen on {address}: {error}") from error
+            self._listener = socket.create_server((address, port), backlog=BACKLOG)
+        except (OSError, OverflowError) as error:
+            where = f"{address}:{port}" if port else address
+            raise WorkerError(
+                f"cannot listen on {where}: {error}; name an address of this machine, and a port "
+                "that no other program has"
+            ) from error
         self._listener.setblocking(False)
         self.place: tuple[str, int] = self._listener.getsockname()[:2]  # address and port
+        self._guests: list[PendingConnection] = []
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(self._listener, selectors.EVENT_READ)
 
     def fileno(self) -> int:
-        return self._listener.fileno()
+        """Readable when there is something to `admit`."""
+        return self._selector.fileno()
 
-    def open(self) -> PendingConnection | None:
-        """Accept a caller; None: there is none any more."""
+    def admit(self) -> list[tuple[int, socket.socket]]:
+        """Hear all who call, without waiting.
+
+        Returns:
+            who has proved that it knows the secret: the number that it says, its connection.
+        """
+        admitted: list[tuple[int, socket.socket]] = []
+        for key, _ in self._selector.select(0.0):
+            if key.fileobj is self._listener:
+                for guest in self._welcome():
+                    self._listen(guest, admitted)
+            elif key.fileobj in self._guests:  # not shown out meanwhile
+                self._listen(key.fileobj, admitted)
+        now = time.monotonic()
+        for guest in [guest for guest in self._guests if guest.until_s < now]:
+            self._show_out(guest)
+        return admitted
+
+    def _welcome(self) -> Iterator[PendingConnection]:
+        """Accept all that call; where they are too many, the silent ones leave first."""
+        for _ in range(MAX_GUESTS):
+            try:
+                connection, _ = self._listener.accept()
+            except OSError:
+                return
+            if len(self._guests) == MAX_GUESTS:
+                self._show_out(min(self._guests, key=lambda each: (each.number >= 0, each.until_s)))
+            try:
+                guest = PendingConnection(connection, self.secret)
+            except OSError:  # it is gone already
+                connection.close()
+                continue
+            self._guests.append(guest)
+            self._selector.register(guest, selectors.EVENT_READ)
+            yield guest
+
+    def _listen(self, guest: PendingConnection, admitted: list[tuple[int, socket.socket]]) -> None:
         try:
-            connection, _ = self._listener.accept()
-        except OSError:
-            return None
-        return PendingConnection(connection, self.secret)
+            connection = guest.listen()
+        except (EOFError, OSError, MessageError):  # a stranger: ignored
+            self._show_out(guest)
+            return
+        if connection is not None:
+            self._guests.remove(guest)
+            self._selector.unregister(guest)
+            admitted.append((guest.number, connection))
+
+    def _show_out(self, guest: PendingConnection) -> None:
+        self._guests.remove(guest)
+        self._selector.unregister(guest)
+        guest.close()
 
     def close(self) -> None:
+        self._selector.close()
+        for guest in self._guests:
+            guest.close()
         self._listener.close()
 
 
@@ -123,32 +208,69 @@ def knock(place: tuple[str, int], secret: bytes, number: int) -> FramedSocket:
     return FramedSocket(call(place, secret, number))
 
 
-def call(place: tuple[str, int], secret: bytes, number: int) -> socket.socket:
+def call(
+    place: tuple[str, int],
+    secret: bytes,
+    number: int,
+    answer_s: float | None = None,  # for whoever listens there to answer; None: as long as it takes
+) -> socket.socket:
     """A connection to a `Listener` on which both ends have proved that they know the secret.
 
     Raises:
         OSError: nothing listens there.
-        MessageError: what listens there does not know the secret.
+        EOFError: whoever listens there wants no more callers.
+        MessageError: it does not know the secret, or speaks another version.
     """
     connection = socket.create_connection(place, CALL_S)
     try:
+        connection.settimeout(answer_s)
+        if leaves_this_machine(connection):
+            connection = _encrypted(connection, place, secret)
+        _prove(connection, place, secret, number)
         connection.settimeout(None)
-        hello = _HELLO.pack(MAGIC, VERSION, number, secrets.token_bytes(NONCE))
-        connection.sendall(hello)
-        heard = b""
-        while len(heard) < NONCE + PROOF:
-            more = connection.recv(NONCE + PROOF - len(heard))
-            if not more:
-                raise EOFError(f"the process that listens at {place} has ended the connection")
-            heard += more
-        nonce, proof = heard[:NONCE], heard[NONCE:]
-        if not hmac.compare_digest(proof, _proof(secret, b"caller", hello + nonce)):
-            raise MessageError(f"who listens at {place} does not know the secret")
-        connection.sendall(_proof(secret, b"host", hello + nonce))
     except BaseException:
         connection.close()
         raise
     return connection
+
+
+def _encrypted(connection: socket.socket, place: tuple[str, int], secret: bytes) -> EncryptedSocket:
+    try:
+        return encrypted(connection, secret, calls=True)
+    except ssl.SSLCertVerificationError as error:
+        raise _foreign(place) from error
+    except ssl.SSLError as error:
+        raise MessageError(
+            f"what listens at {place[0]}:{place[1]} does not encrypt as cavmarl does: {error}"
+        ) from error
+
+
+def _prove(connection: socket.socket, place: tuple[str, int], secret: bytes, number: int) -> None:
+    hello = _HELLO.pack(MAGIC, VERSION, number, secrets.token_bytes(NONCE))
+    connection.sendall(hello)
+    heard = b""
+    while len(heard) < NONCE + PROOF:
+        more = b""
+        with suppress(ConnectionError, ssl.SSLError):
+            more = connection.recv(NONCE + PROOF - len(heard))
+        if not more and len(heard) == _SPOKEN.size and heard[:4] == MAGIC:
+            raise MessageError(
+                f"what listens at {place[0]}:{place[1]} speaks version {_SPOKEN.unpack(heard)[1]}, "
+                f"this is {VERSION}: install the same cavmarl on all machines"
+            )
+        if not more:
+            raise EOFError(f"the process that listens at {place} has ended the connection")
+        heard += more
+    nonce, proof = heard[:NONCE], heard[NONCE:]
+    if not hmac.compare_digest(proof, _proof(secret, b"caller", hello + nonce)):
+        raise _foreign(place)
+    connection.sendall(_proof(secret, b"host", hello + nonce))
+
+
+def _foreign(place: tuple[str, int]) -> MessageError:
+    return MessageError(
+        f"what listens at {place[0]}:{place[1]} does not know the secret: give both the same key"
+    )
 
 
 def _proof(secret: bytes, who: bytes, said: bytes) -> bytes:

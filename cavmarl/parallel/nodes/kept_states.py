@@ -2,12 +2,13 @@
 
 Now and then, between two steps, each node keeps what it needs to go on from there, and sends it to
 the next node that lives. When a node is lost, the next one hosts its zones, and all go back to the
-newest state that everyone has. What was done since is done again, which gives the same bytes.
+newest state that everyone has. What was done since is done again, which gives the same bytes. Zones
+that change their node, as to a new one, do it in the same way.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from numpy.typing import NDArray
@@ -30,6 +31,7 @@ class KeptStates:
         self._number = number
         self._own: dict[int, bytes] = {}  # by numbers of states
         self._others: dict[int, dict[int, bytes]] = {}  # node → the same
+        self._given: dict[int, NodeFrame] = {}  # by nodes that have given zones away
 
     def keep(self, state: int, living: Sequence[int]) -> None:
         """Keep what the worlds are now, here and at the next of the living nodes."""
@@ -43,41 +45,80 @@ class KeptStates:
         """What another node wants to have kept here."""
         _add(self._others.setdefault(number, {}), frame.number, bytes(frame.data))
 
-    def load(self, state: int, lost: Sequence[int], home: int) -> None:
-        """Go back to a state, with the zones of lost nodes.
+    def take_given(self, number: int, frame: NodeFrame) -> None:
+        """What another node has had of zones that are hosted here from now on."""
+        self._given[number] = frame
+
+    def load(
+        self,
+        state: int,
+        lost: Sequence[int],  # nodes whose zones are hosted here from now on
+        donors: Sequence[int],  # nodes that give zones to this one
+        takers: Sequence[int],  # nodes that are given some of those that were here
+        zones: Sequence[int],  # all that are here from now on
+        generation: int,  # how often nodes have come and gone
+        check: Callable[[], None],  # raises if what is awaited will never come
+    ) -> None:
+        """Go back to a state, or go on from it if this node was not there.
 
         Raises:
-            WorkerError: what one of them had is not here.
+            WorkerError: what a lost node had is not here.
         """
-        worlds = self._worlds
-        like = worlds.save()
-        saved = from_bytes(self._own[state], like)
+        like = self._worlds.save()
+        own = self._own.get(state)
+        saved = None if own is None else from_bytes(own, like)
         for number in lost:
             found = self._others.get(number, {}).get(state)
-            if found is None:
+            if saved is None or found is None:
                 raise WorkerError(f"what node {number} had is kept nowhere")
-            self._join(saved, from_bytes(found, like), like)
-        worlds.load_own(saved, home)
+            saved[self._first - 1] += self._join(saved, from_bytes(found, like), like)
+        if takers and saved is not None:
+            data = to_bytes(saved)
+            for taker in takers:
+                self._links.send(taker, FrameKind.GIVE, generation, [data])
+        for donor in donors:
+            while donor not in self._given or self._given[donor].number != generation:
+                check()
+                self._links.pump(None)
+            given = from_bytes(bytes(self._given.pop(donor).data), like)
+            if saved is None:
+                saved = given
+                saved[self._first - 1][...] = 0  # contacts stay where they were counted
+            else:
+                self._join(saved, given, like)
+        if saved is None:
+            raise WorkerError(f"state {state} is kept nowhere")
+        count = self._worlds.world.partition.count
+        for n in range(self._first, len(saved)):
+            if (n - self._first) % count not in zones:
+                saved[n] = saved[n][:0]
+        self._worlds.load_own(saved, zones[0])
 
-    def _join(self, saved: list[Array], lost: Sequence[Array], like: Sequence[Array]) -> None:
-        """Add the vehicles of a lost node to the saved ones, and what is kept of its agents."""
+    @property
+    def _first(self) -> int:
+        """Where in what is saved the vehicles of the first zone stand."""
         simulation, zones = self._worlds.simulation, self._worlds.world.partition.count
-        first = len(saved) - simulation.num_worlds * zones
-        of_agents = [
-            n
-            for n, array in enumerate(like)
-            if array is simulation.shards[0].worlds.pending
-            or array is simulation.outputs.observations
-        ]
-        saved[first - 1] += lost[first - 1]  # contacts
+        return len(self._worlds.save()) - simulation.num_worlds * zones
+
+    def _join(self, saved: list[Array], other: Sequence[Array], like: Sequence[Array]) -> Array:
+        """Add the vehicles of another node to the saved ones, and what is kept of its agents.
+
+        Returns:
+            (W,) the contacts that it has counted.
+        """
+        simulation, zones = self._worlds.simulation, self._worlds.world.partition.count
+        first = self._first
+        kept = {id(array) for array in simulation.of_agents()}
+        of_agents = [n for n, array in enumerate(like) if id(array) in kept]
         for n in range(first, len(saved)):
-            if not len(lost[n]):
+            if not len(other[n]):
                 continue
-            saved[n] = lost[n]
+            saved[n] = other[n]
             w = (n - first) // zones
-            agents = lost[n]["agent"][lost[n]["agent"] >= 0]
+            agents = other[n]["agent"][other[n]["agent"] >= 0]
             for k in of_agents:
-                saved[k][w, agents] = lost[k][w, agents]
+                saved[k][w, agents] = other[k][w, agents]
+        return other[first - 1]
 
 
 def _add(states: dict[int, bytes], state: int, data: bytes) -> None:

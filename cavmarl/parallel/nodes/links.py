@@ -4,6 +4,9 @@ A frame is a head of fixed size and bytes. Frames of a connection arrive in thei
 connection has ended. Nothing in a frame is ever run.
 
     head    magic, version, kind, number, checksum of what follows, bytes of what follows
+
+A checksum begins with how many frames went before on that connection, so that one that comes twice
+or out of turn is no frame.
 """
 
 from __future__ import annotations
@@ -15,15 +18,24 @@ import time
 import zlib
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from enum import IntEnum
 from typing import NamedTuple, TypeAlias
 
-from cavmarl.core.errors import MessageError
+from cavmarl.core.errors import MessageError, NodeRefusedError
 
 MAGIC = b"cavN"
-VERSION = 1
+VERSION = 2
 MAX_FRAME = 1 << 32
+_ALL = (1 << 32) - 1
 _HEAD = struct.Struct("<4sHHQIQ")
+
+# A machine that vanishes says nothing: after so many seconds it is asked, and again, so often.
+_ALIVE = [(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)] + [
+    (socket.IPPROTO_TCP, getattr(socket, name), value)
+    for name, value in (("TCP_KEEPIDLE", 10), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3))
+    if hasattr(socket, name)
+]
 
 Bytes: TypeAlias = bytes | bytearray | memoryview
 
@@ -33,7 +45,7 @@ class FrameKind(IntEnum):
 
     JOB = 0  # C → N: what to be
     READY = 1  # N → C: where other nodes can call
-    PEERS = 2  # C → N: where the others are
+    JOIN = 2  # N → C: what it runs
     COMMAND = 3  # C → N: a task, and what it needs
     LEASE = 4  # C → N: STEP messages
     REPORT = 5  # N → C: DONE messages, and what the next decision needs
@@ -42,10 +54,17 @@ class FrameKind(IntEnum):
     FAILED = 8  # N → C: an error
     SHARE = 9  # N → N: a part of a tick
     KEEP = 10  # N → N: the state of a node's zones, for when it is lost
-    RECOVER = 11  # C → N: nodes are lost; go back to a state that was kept
+    RECOVER = 11  # C → N: nodes are lost or new; begin, or go back to a state that was kept
     SYNC = 12  # N → N: all before this is of no use any more
     PING = 13  # C → N: answer at once
     PONG = 14  # N → C: the answer
+    AGENT = 15  # N → N: what is kept of an agent whose vehicle changes its node
+    WANTED = 16  # N → C: files that it does not have
+    FILES = 17  # C → N: those
+    MISSED = 18  # N → C: the connection to another node has ended
+    REFUSED = 19  # C → N: why it is of no use
+    END = 20  # C → N: it is needed no more
+    GIVE = 21  # N → N: the state of zones that another node hosts from now on
 
 
 class NodeFrame(NamedTuple):
@@ -56,7 +75,17 @@ class NodeFrame(NamedTuple):
     data: memoryview
 
 
-URGENT = frozenset({FrameKind.MESSAGES, FrameKind.KEEP, FrameKind.PING, FrameKind.PONG})
+URGENT = frozenset(
+    {
+        FrameKind.MESSAGES,
+        FrameKind.KEEP,
+        FrameKind.PING,
+        FrameKind.PONG,
+        FrameKind.MISSED,
+        FrameKind.AGENT,
+        FrameKind.GIVE,
+    }
+)
 Urgent: TypeAlias = Callable[[int, NodeFrame], None]
 """What is called with an urgent frame as soon as it has come, and the number of its sender."""
 
@@ -66,11 +95,16 @@ class SilenceError(Exception):
 
 
 class LinkLostError(Exception):
-    """A connection has ended."""
+    """A connection has ended, or what came over it was no frame."""
 
-    def __init__(self, peer: int) -> None:
-        super().__init__(f"the connection to node {peer} has ended")
+    def __init__(self, peer: int, cause: Exception | None = None) -> None:
+        why = f": {cause}" if isinstance(cause, MessageError) else ""
+        super().__init__(f"the connection to node {peer} has ended{why}")
         self.peer = peer
+
+
+class NeededNoMoreError(Exception):
+    """The coordinator says that this node may end."""
 
 
 class RecoveryOrderedError(Exception):
@@ -81,12 +115,14 @@ class RecoveryOrderedError(Exception):
         self.frame = frame
 
 
-class _Link:
+class Link:
     """One connection: what is to be sent, and what has come of the next frame."""
 
     def __init__(self, connection: socket.socket) -> None:
         if connection.family != socket.AF_UNIX:
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            for level, option, value in _ALIVE:
+                connection.setsockopt(level, option, value)
         connection.setblocking(False)
         self.socket = connection
         self.waiting: deque[memoryview] = deque()
@@ -94,11 +130,12 @@ class _Link:
         self._head = bytearray(_HEAD.size)
         self._into = memoryview(self._head)
         self._opened: tuple[FrameKind, int, int, bytearray] | None = None
+        self._num_sent = self._num_heard = 0  # frames
 
     def send(self, kind: FrameKind, number: int, pieces: Sequence[Bytes]) -> None:
         """Send what the system takes at once; the rest is kept, as a copy."""
         views = [memoryview(piece).cast("B") for piece in pieces if len(piece)]
-        checksum = 0
+        checksum = self._num_sent = self._num_sent + 1 & _ALL
         for view in views:
             checksum = zlib.crc32(view, checksum)
         size = sum(map(len, views))
@@ -125,7 +162,13 @@ class _Link:
         return pieces
 
     def receive(self, urgent: Urgent, number: int) -> None:
-        """Take what has come. Raises EOFError, OSError: the other end has gone."""
+        """Take what has come.
+
+        Raises:
+            EOFError, OSError: the other end has gone.
+            MessageError: what came is no frame.
+            NeededNoMoreError, NodeRefusedError: the coordinator has said its last word.
+        """
         while True:
             if len(self._into):
                 try:
@@ -141,6 +184,10 @@ class _Link:
                 self._open()
             else:
                 frame = self._close()
+                if frame.kind is FrameKind.END:
+                    raise NeededNoMoreError
+                if frame.kind is FrameKind.REFUSED:
+                    raise NodeRefusedError(f"the caller refuses this node: {_text(frame)}")
                 if frame.kind in URGENT:
                     urgent(number, frame)
                 else:
@@ -164,8 +211,9 @@ class _Link:
     def _close(self) -> NodeFrame:
         assert self._opened is not None
         kind, number, checksum, room = self._opened
-        if zlib.crc32(room) != checksum:
-            raise MessageError("a frame is not what was sent")
+        self._num_heard = self._num_heard + 1 & _ALL
+        if zlib.crc32(room, self._num_heard) != checksum:
+            raise MessageError("a frame is not what was sent, or not the next one")
         self._opened, self._into = None, memoryview(self._head)
         return NodeFrame(kind, number, memoryview(room))
 
@@ -175,16 +223,19 @@ class Links:
 
     def __init__(self, urgent: Urgent) -> None:
         self.urgent = urgent
-        self._links: dict[int, _Link] = {}
+        self._links: dict[int, Link] = {}
         self._poll = select.poll()
         self._by_socket: dict[int, int] = {}
+        self.awaited: set[int] = set()  # whose frames `take` waits for
+        self.waited_s = 0.0
         self.sent_bytes = 0
         self.sent_frames = 0
 
-    def add(self, number: int, connection: socket.socket) -> None:
-        self._links[number] = _Link(connection)
-        self._by_socket[connection.fileno()] = number
-        self._poll.register(connection, select.POLLIN)
+    def add(self, number: int, connection: socket.socket | Link) -> None:
+        link = connection if isinstance(connection, Link) else Link(connection)
+        self._links[number] = link
+        self._by_socket[link.socket.fileno()] = number
+        self._poll.register(link.socket, select.POLLIN)
 
     @property
     def numbers(self) -> tuple[int, ...]:
@@ -221,7 +272,7 @@ class Links:
             MessageError: what came is no frame.
             SilenceError: nothing has come in time.
         """
-        missing = set(wanted)
+        self.awaited = missing = set(wanted)
         found: dict[int, NodeFrame] = {}
         until_s = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
@@ -239,13 +290,29 @@ class Links:
                 raise SilenceError(f"nodes {sorted(missing)} do not answer within {timeout_s:g} s")
             self.pump(left_ms)
 
+    def arrived(self, number: int) -> NodeFrame | None:
+        """The next frame of one, if it has come."""
+        frames = self._links[number].frames
+        return frames.popleft() if frames else None
+
+    def has(self, number: int) -> bool:
+        """Whether a frame of one has come, and nobody has taken it."""
+        return number in self._links and bool(self._links[number].frames)
+
+    def release(self, number: int) -> Link:
+        """Leave a connection to somebody else."""
+        return self._forget(number)
+
     def put_back(self, number: int, frame: NodeFrame) -> None:
         """Let a frame be the next one of its sender once more."""
         self._links[number].frames.appendleft(frame)
 
     def pump(self, timeout_ms: float | None) -> None:
         """Send and receive what can be; wait so long for the first that can."""
-        for socket_number, _ in self._poll.poll(timeout_ms):
+        began_s = time.perf_counter()
+        ready = self._poll.poll(timeout_ms)
+        self.waited_s += time.perf_counter() - began_s
+        for socket_number, _ in ready:
             number = self._by_socket[socket_number]
             link = self._links[number]
             try:
@@ -254,9 +321,9 @@ class Links:
                     if not link.waiting:
                         self._poll.modify(link.socket, select.POLLIN)
                 link.receive(self.urgent, number)
-            except (EOFError, OSError) as error:
+            except (EOFError, OSError, MessageError) as error:
                 self.drop(number)
-                raise LinkLostError(number) from error
+                raise LinkLostError(number, error) from error
 
     def flush(self) -> None:
         """Wait until all that is to be sent is sent."""
@@ -265,13 +332,35 @@ class Links:
 
     def drop(self, number: int) -> None:
         """End a connection, if there is one."""
-        link = self._links.pop(number, None)
-        if link is None:
-            return
+        if number in self._links:
+            self._forget(number).socket.close()
+
+    def _forget(self, number: int) -> Link:
+        link = self._links.pop(number)
         self._poll.unregister(link.socket)
         del self._by_socket[link.socket.fileno()]
-        link.socket.close()
+        return link
+
+    def end(self, timeout_s: float) -> None:
+        """Tell all that they are needed no more, and wait a while for them to end."""
+        for number in self.numbers:
+            with suppress(LinkLostError):
+                self.send(number, FrameKind.END, 0)
+        self.urgent = _unheard
+        until_s = time.monotonic() + timeout_s
+        while self._links and time.monotonic() < until_s:
+            with suppress(LinkLostError):
+                self.pump(1e3 * max(until_s - time.monotonic(), 0.0))
+        self.close()
 
     def close(self) -> None:
         for number in self.numbers:
             self.drop(number)
+
+
+def _text(frame: NodeFrame) -> str:
+    return bytes(frame.data).decode(errors="replace")
+
+
+def _unheard(number: int, frame: NodeFrame) -> None:
+    """What is of no use any more."""

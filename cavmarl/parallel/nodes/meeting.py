@@ -1,4 +1,4 @@
-"""How nodes and their coordinator find each other: each proves that it knows the secret."""
+"""How nodes find each other: each proves that it knows the secret."""
 
 from __future__ import annotations
 
@@ -8,16 +8,18 @@ import time
 from collections.abc import Callable, Iterable
 
 from cavmarl.core.errors import MessageError, WorkerError
-from cavmarl.parallel.hosts.listener import MAX_GUESTS, Listener, PendingConnection
+from cavmarl.parallel.hosts.listener import Listener, call
+from cavmarl.parallel.nodes.links import LinkLostError
 
-LOOK_MS = 200.0  # so often it is looked whether those that are awaited still live
+LOOK_MS = 50.0  # so often it is looked whether those that are awaited still live
+ANSWER_S = 5.0  # for a node to answer a call
 
 
 def calls_of(
     listener: Listener,
     wanted: Iterable[int],  # numbers of those that are to call
     timeout_s: float,
-    check: Callable[[], None] = lambda: None,  # raises if one will never call
+    check: Callable[[], None],  # raises if one will never call
 ) -> dict[int, socket.socket]:
     """The connections of all that are awaited; other callers are turned away.
 
@@ -25,36 +27,35 @@ def calls_of(
         WorkerError: one has not called in time.
     """
     missing, found = set(wanted), dict[int, socket.socket]()
-    guests: dict[int, PendingConnection] = {}
     until_s = time.monotonic() + timeout_s
     poll = select.poll()
     poll.register(listener, select.POLLIN)
-    while missing:
-        check()
-        if time.monotonic() > until_s:
-            raise WorkerError(f"nodes {sorted(missing)} have not called within {timeout_s:g} s")
-        for ready, _ in poll.poll(LOOK_MS):
-            if ready == listener.fileno():
-                guest = listener.open()
-                if guest is not None and len(guests) < MAX_GUESTS:
-                    guests[guest.fileno()] = guest
-                    poll.register(guest, select.POLLIN)
-                elif guest is not None:
-                    guest.close()
-                continue
-            guest = guests[ready]
-            try:
-                connection = guest.listen()
-                if connection is None:
-                    continue
-                if guest.number not in missing:
-                    raise MessageError(f"node {guest.number} is not awaited")
-                found[guest.number] = connection
-                missing.remove(guest.number)
-            except (MessageError, EOFError, OSError):
-                guest.close()
-            poll.unregister(ready)
-            del guests[ready]
-    for guest in guests.values():
-        guest.close()
+    try:
+        while missing:
+            check()
+            if time.monotonic() > until_s:
+                raise WorkerError(f"nodes {sorted(missing)} have not called within {timeout_s:g} s")
+            poll.poll(LOOK_MS)
+            for number, connection in listener.admit():
+                if number in missing:
+                    found[number] = connection
+                    missing.remove(number)
+                else:
+                    connection.close()
+    except BaseException:
+        for connection in found.values():
+            connection.close()
+        raise
     return found
+
+
+def call_node(place: tuple[str, int], secret: bytes, number: int, of: int) -> socket.socket:
+    """A connection to node `of` of node `number`.
+
+    Raises:
+        LinkLostError: it cannot be reached.
+    """
+    try:
+        return call(place, secret, number, ANSWER_S)
+    except (OSError, EOFError, MessageError) as error:
+        raise LinkLostError(of) from error

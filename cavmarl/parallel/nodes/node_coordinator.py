@@ -6,7 +6,7 @@ import time
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 
-from cavmarl.core.errors import ProtocolError
+from cavmarl.core.errors import MessageError, ProtocolError
 from cavmarl.handoff.coordinator.journal import AnyJournal
 from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.limits import Limits
@@ -105,9 +105,24 @@ class NodeCoordinator:
         return [[world.directory.hosting(zone) for zone in zones] for world in self._worlds]
 
     def hear(self, number: int, frame: NodeFrame) -> None:
-        """Acknowledgements, as soon as they come."""
-        for w, message in unpacked(frame.data):
+        """Acknowledgements, as soon as they come.
+
+        Raises:
+            MessageError: it is none, or of a zone of another node.
+        """
+        messages = unpacked(frame.data)
+        self.check(number, messages)
+        for w, message in messages:
             self._take(w, message)
+
+    def check(self, number: int, messages: Sequence[tuple[int, Message]]) -> None:
+        """Raises MessageError: node `number` speaks for a zone that it does not host."""
+        for w, message in messages:
+            zone, table = getattr(message, "zone", None), self._worlds[w].directory.table
+            if zone is None or message.episode != table.episode or message.tick < table.tick:
+                continue
+            if not 0 <= zone < len(self._node_of) or self._node_of[zone] != number:
+                raise MessageError(f"node {number} speaks for zone {zone}, which it does not host")
 
     def _take(self, w: int, message: Message) -> None:
         world = self._worlds[w]

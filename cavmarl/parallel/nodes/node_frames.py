@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Mapping
+from base64 import b64decode, b64encode
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -52,11 +53,33 @@ def results_of(
     pieces: list[Bytes] = []
     if with_common:
         pieces += [_flat(getattr(arrays, name)).data for name in _COMMON]
-    for mask, name in ((own, "observations"), (before & ended[:, None], "final_observations")):
+    for mask, sensed in zip((own, before & ended[:, None]), _sensed(arrays), strict=True):
         where = np.flatnonzero(mask.reshape(-1))
-        rows = getattr(arrays, name).reshape(mask.size, -1)[where]
-        pieces += [np.int64(where.size).tobytes(), where.data, _flat(rows).data]
+        pieces += [np.int64(where.size).tobytes(), where.data]
+        pieces += [_flat(_by_agent(array)[where]).data for array in sensed]
     return pieces
+
+
+def _sensed(arrays: StepArrays) -> tuple[list[NDArray[Any]], list[NDArray[Any]]]:
+    """What agents have sensed, (W, A, …), and the same of those that have ended."""
+    found = []
+    for observations, rig in (
+        (arrays.observations, arrays.frames),
+        (arrays.final_observations, arrays.final_frames),
+    ):
+        found.append([observations, *(array for frames in rig.values() for array in frames)])
+    return found[0], found[1]
+
+
+def clear_sensed(arrays: StepArrays, chosen: NDArray[np.bool_]) -> None:
+    """Agents without a vehicle have zeros, in the chosen worlds (W,)."""
+    for array in _sensed(arrays)[0]:
+        array[chosen] = 0
+
+
+def _by_agent(array: NDArray[Any]) -> NDArray[Any]:
+    """(W, A, …) as (W · A, …), a view."""
+    return array.reshape(-1, *array.shape[2:])
 
 
 def take_results(
@@ -72,18 +95,27 @@ def take_results(
             at = _fill(_flat(getattr(arrays, name)), data, at)
         if of_step:
             ended = arrays.episode_over | arrays.terminations.any(axis=1)
-            arrays.final_observations[ended] = 0.0
-    for name in ("observations", "final_observations"):
+            for array in _sensed(arrays)[1]:
+                array[ended] = 0
+    for sensed in _sensed(arrays):
         num = int(np.frombuffer(data, np.int64, 1, at)[0])
         at += 8
         if num:
-            target = getattr(arrays, name)
-            target = target.reshape(-1, target.shape[2])
             where = np.frombuffer(data, np.int64, num, at)
             at += where.nbytes
-            rows = np.frombuffer(data, target.dtype, num * target.shape[1], at)
-            target[where] = rows.reshape(num, -1)
-            at += rows.nbytes
+            for target in map(_by_agent, sensed):
+                rows = np.frombuffer(data, target.dtype, num * target[0].size, at)
+                target[where] = rows.reshape(num, *target.shape[1:])
+                at += rows.nbytes
+
+
+def told_cases(cases: Sequence[bytes], only_reads: bool = False) -> dict[str, Any]:
+    """Worlds as bytes, as a letter; see `LocalWorlds.save_worlds`."""
+    return {"cases": [b64encode(case).decode() for case in cases], "only_reads": only_reads}
+
+
+def cases_of(letter: Mapping[str, Any]) -> list[bytes]:
+    return [b64decode(case) for case in letter["cases"]]
 
 
 def _flat(array: NDArray[Any]) -> NDArray[np.uint8]:

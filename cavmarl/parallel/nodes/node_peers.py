@@ -71,7 +71,7 @@ class NodePeers:
         self._take = specialized(take_ghosts)
         self._sent = first_share
         self._is_stepping = False
-        self.own = np.zeros(simulation.outputs.present.shape, dtype=np.bool_)
+        self.own: Array = np.zeros_like(simulation.outputs.present)
         self.stepped = self.own.copy()
 
     def begin_step(self) -> None:
@@ -90,7 +90,7 @@ class NodePeers:
                     forget(array)
         self._rerouted[chosen] = 0
 
-    def go_on(self, gate: Gate, side: int) -> None:
+    def take_up(self, gate: Gate, side: int) -> None:
         self._rerouted[:] = gate.counts[:, COUNT_REROUTED]
         self._seen_s[...] = self._detected_s
         self.own[...] = False
@@ -98,7 +98,6 @@ class NodePeers:
             for w, num in enumerate(self._zoned.num_owned[zone].tolist()):
                 agents = self._zoned.rows["agent"][side, zone, w, :num]
                 self.own[w, agents[agents >= 0]] = True
-        self.share_rows(gate, side)
 
     def share_rows(self, gate: Gate, side: int) -> None:
         zoned = self._zoned
@@ -225,39 +224,61 @@ class NodePeers:
                 array[agents] = found.reshape(int(num), *array.shape[1:])
 
     @contextmanager
-    def whole(self, simulation: Simulation, world: int) -> Iterator[None]:
-        """The time in which the first node that lives has a whole world; all have to call it.
-
-        Vehicles of another node are those of the first of its zones meanwhile.
-        """
-        zoned, side = self._zoned, simulation.division.side
-        pending = simulation.shards[0].worlds.pending
-        owned = zoned.num_owned[:, world].tolist()
-        mine = np.concatenate(
-            [zoned.rows[side, zone, world, : owned[zone]] for zone in self._mine.tolist()]
-        )
-        agents = mine["agent"][mine["agent"] >= 0].astype(np.int64)
-        contacts = zoned.num_contacts[self._mine, world].sum()
-        head = np.array([len(mine), len(agents), contacts], dtype=np.int64)
-        self._sent += 1
-        first = min(self._number, *self._others, self._number)
-        if self._number != first:
-            pieces = [head.data, _bytes(mine), agents.data, _bytes(pending[world, agents])]
-            self._links.send(first, FrameKind.SHARE, self._sent, pieces)
+    def everybody(self, gate: Gate, side: int) -> Iterator[None]:
+        """Vehicles of another node are those of the first of its zones meanwhile."""
+        before = gate.counts[:, COUNT_REROUTED].copy()
+        with self._rows_of_all(side):
             yield
-            return
-        for number, frame in self._take_all().items():
+        self._rerouted += gate.counts[:, COUNT_REROUTED] - before
+
+    @contextmanager
+    def whole(self, simulation: Simulation) -> Iterator[None]:
+        """The time in which each node has whole worlds; all have to call it."""
+        arrays = simulation.of_agents()
+        mine = self._agents(simulation.division.side)
+        with self._rows_of_all(simulation.division.side):
+            pieces: list[Bytes] = [np.int64(len(mine)).tobytes(), mine.data]
+            pieces += [_bytes(_by_agent(array)[mine]) for array in arrays]
+            for _, data in self._swap(pieces for _ in self._others):
+                (num,), at = _read(data, 0, np.int64, 1)
+                agents, at = _read(data, at, np.int64, int(num))
+                for array in map(_by_agent, arrays):
+                    found, at = _read(data, at, array.dtype, int(num) * array[0].size)
+                    array[agents] = found.reshape(int(num), *array.shape[1:])
+            yield
+
+    def _agents(self, side: int) -> Array:
+        """(n,) agents whose vehicles are here, counted over all worlds."""
+        zoned, num_agents = self._zoned, self.own.shape[1]
+        found = [
+            agents[agents >= 0].astype(np.int64) + w * num_agents
+            for zone in self._mine.tolist()
+            for w in range(self._num_worlds)
+            for agents in [zoned.rows["agent"][side, zone, w, : zoned.num_owned[zone, w]]]
+        ]
+        return np.concatenate(found)
+
+    @contextmanager
+    def _rows_of_all(self, side: int) -> Iterator[None]:
+        zoned = self._zoned
+        owned = [
+            zoned.rows[side, zone, w, : zoned.num_owned[zone, w]]
+            for w in range(self._num_worlds)
+            for zone in self._mine.tolist()
+        ]
+        numbers = [array[self._mine].sum(axis=0) for array in (zoned.num_owned, zoned.num_contacts)]
+        pieces = [*map(_bytes, numbers), *map(_bytes, filter(len, owned))]
+        for number, data in self._swap(pieces for _ in self._others):
             zone = self._zones[number][0]
-            (num, num_agents, found), at = _read(frame.data, 0, np.int64, 3)
-            zoned.rows[side, zone, world, :num], at = _read(frame.data, at, mine.dtype, int(num))
-            theirs, at = _read(frame.data, at, np.int64, int(num_agents))
-            kept, _ = _read(frame.data, at, np.float64, int(num_agents) * pending[0, :1].size)
-            pending[world, theirs] = kept.reshape(-1, *pending.shape[2:])
-            zoned.num_owned[zone, world], zoned.num_contacts[zone, world] = num, found
-        yield
-        for number in self._others:
-            zone = self._zones[number][0]
-            zoned.num_owned[zone, world] = zoned.num_contacts[zone, world] = 0
+            zoned.num_owned[zone], at = _read(data, 0, np.int64, self._num_worlds)
+            zoned.num_contacts[zone], at = _read(data, at, np.int64, self._num_worlds)
+            for w, num in enumerate(zoned.num_owned[zone].tolist()):
+                zoned.rows[side, zone, w, :num], at = _read(data, at, zoned.rows.dtype, num)
+        try:
+            yield
+        finally:
+            for array in (zoned.num_owned, zoned.num_contacts):
+                array[self._foreign] = 0
 
     def _take_all(self) -> dict[int, NodeFrame]:
         """The next frame of each of the others.

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import json
 import logging
-import math
-import subprocess
-import sys
+import struct
 import time
+from collections import Counter
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from cavmarl.core.errors import WorkerDeathError, WorkerError, WorkerFailureError
-from cavmarl.core.processes import start_dying_with_process
+from cavmarl.core.errors import (
+    MessageError,
+    ProtocolError,
+    WorkerError,
+    WorkerFailureError,
+)
 from cavmarl.engine.compilation import compiled_before
 from cavmarl.engine.world_setup import World
 from cavmarl.handoff.coordinator.coordinator_setup import prepare_runs
@@ -24,7 +26,6 @@ from cavmarl.handoff.coordinator.journal import Journal
 from cavmarl.handoff.shard_setup import limits_of
 from cavmarl.ownership.reactions import Hosting
 from cavmarl.parallel.commanded_worlds import own_error
-from cavmarl.parallel.hosts.listener import Listener
 from cavmarl.parallel.journaled_worlds import unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.nodes.links import (
@@ -34,9 +35,12 @@ from cavmarl.parallel.nodes.links import (
     NodeFrame,
     SilenceError,
 )
-from cavmarl.parallel.nodes.meeting import calls_of
+from cavmarl.parallel.nodes.newcomers import Newcomer, Newcomers
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
+from cavmarl.parallel.nodes.node_files import files_of
+from cavmarl.parallel.nodes.node_starters import Route, start_nodes, straight
 from cavmarl.parallel.nodes.zone_hosts import read_report
+from cavmarl.parallel.nodes.zone_moves import ZoneMoves, moves_of, name_of
 from cavmarl.parallel.recipe import recipe_of
 from cavmarl.parallel.step_arrays import StepArrays, layout_of
 from cavmarl.parallel.step_placement import StepPlacement
@@ -44,11 +48,11 @@ from cavmarl.parallel.work_shares import parts_of
 
 log = logging.getLogger("cavmarl.nodes")
 
-NODE = "cavmarl.parallel.nodes.node_process"  # the program of a node
-ADDRESS = "127.0.0.1"  # where nodes of this machine meet
 PONG_S = 1.0  # for a living node to answer
 KEEP_S = 0.2  # so much of work may have to be done again
-START_S = 120.0  # for nodes to load their world; compiling takes longest
+MISSED_S = 0.1  # to hear who else misses a node
+END_S = 1.0  # for nodes to hear that they are needed no more
+SPARES = 1  # nodes more than are wanted that may wait for another one's end
 
 
 class NodeCommand(NamedTuple):
@@ -72,8 +76,10 @@ class NodePool:
 
     Attributes:
         zones: that each node hosts.
-        processes: of the nodes.
-        recoveries: how often the worlds have gone back because nodes were lost.
+        pids: of the nodes' processes, each on its machine.
+        losses: how many nodes were lost.
+        recoveries: how often the worlds have gone back because of that.
+        replacements: how many nodes host zones in the place of others.
 
     Raises:
         ConfigError: a setting that such worlds cannot have, or more nodes than zones.
@@ -87,30 +93,36 @@ class NodePool:
         num_worlds: int,  # W
         nodes: int,  # n, from 1 to the zones of a world
         in_next_step: bool = False,  # when worlds begin anew; see `SteppedWorlds`
+        hosts: str = "",  # what starts the nodes; see `start_nodes`
+        route: Route = straight,  # where to call in order to reach a place
     ) -> None:
-        self.world = world
+        self.world, self._route = world, route
         self.in_next_step = in_next_step
         config, count = world.config, world.partition.count
         layout = layout_of(config, world.capacity, num_worlds).items()
         self.arrays = StepArrays.of({name: np.zeros(shape, kind) for name, (kind, shape) in layout})
         self._placement = StepPlacement(world, 1, nodes)
         self.zones = parts_of(self._placement.plans, count)[0].zones
-        self._first_zones = self.zones
+        self._homes = self.zones
         self._generation = 0
+        self._teller = 0
         self._state = _State(1, self.zones, 0)  # that all nodes can go back to
-        self._opened: _State | None = self._state  # that they keep before the next command
+        self._opened: _State | None = None  # that they keep before the next command
         self._next_state = 2
-        self._keep_again_s = math.inf  # by `time.monotonic`; the first command keeps a state
+        self._keep_again_s = 0.0  # by `time.monotonic`
         self._log: list[NodeCommand] = []  # since that state
         self._lost: list[int] = []
+        self._missed: list[int] = []  # the two ends of connections that nodes have lost
         self._is_torn = False
-        self.recoveries = 0
+        self.losses = self.recoveries = self.replacements = 0
         self._timeout_s = config.workers.timeout_s
-        self._answered: set[int] = set()  # nodes that answered the last PING
+        # nodes that answered the last PING, and whose frames each waits for
+        self._answered: dict[int, list[int]] = {}
         self._pings = 0
         self._ticks_per_step = config.clock.ticks_per_step
         self._links = Links(_nothing)
-        self.processes: list[subprocess.Popen[Any]] = []
+        self._nodes: dict[int, Newcomer] = {}  # what is known of each that lives
+        self._new: dict[int, tuple[str, int]] = {}  # where the others can call those of them
         runs = prepare_runs(config.zones, num_worlds)
         journals = [None if r.journal is None else Journal(r.journal, anew=True) for r in runs]
         self._coordinator = NodeCoordinator(
@@ -121,21 +133,23 @@ class NodePool:
             journals,
         )
         self._links.urgent = self._hear
-        hostings = self._coordinator.host()
         self._runs = [run.run.hex() for run in runs]
+        if not compiled_before():
+            LocalWorlds(unwatched(world), 1, warm=True)
         job = {
             "recipe": recipe_of(world, base_dir),
             "num_worlds": num_worlds,
             "in_next_step": in_next_step,
-            "zones": self.zones,
-            "address": ADDRESS,
-            "runs": self._runs,
-            "hostings": _told(hostings),
         }
-        if not compiled_before():
-            LocalWorlds(unwatched(world), 1, warm=True)
+        files = files_of(config, base_dir)
+        self._starter, listener = start_nodes(hosts, nodes, config.workers, base_dir, route)
+        self._newcomers = Newcomers(listener, job, files, self._room)
         try:
-            self._start(nodes, json.dumps(job).encode())
+            self._newcomers.await_ready(nodes, config.workers.join_timeout_s, self._starter.trouble)
+            self._seat()
+            self._tell_zones(self._coordinator.host(), ZoneMoves(self.zones, {}, []), begins=True)
+            self._commit()
+            self._new.clear()
         except (LinkLostError, SilenceError) as error:
             self.close()
             raise WorkerError(f"{error} before it had begun; see standard error") from error
@@ -143,36 +157,25 @@ class NodePool:
             self.close()
             raise
 
-    def _start(self, nodes: int, job: bytes) -> None:
-        listener = Listener(ADDRESS)
-        words = [sys.executable, "-m", NODE]
-        try:
-            for number in range(nodes):
-                process = start_dying_with_process(
-                    [*words, *map(str, (*listener.place, number))], stdin=subprocess.PIPE, text=True
-                )
-                self.processes.append(process)
-                assert process.stdin is not None
-                with process.stdin as told:
-                    told.write(f"{listener.secret.hex()}\n")
-            calls = calls_of(listener, range(nodes), START_S, self._look_after)
-        finally:
-            listener.close()
-        for number, connection in sorted(calls.items()):
-            self._links.add(number, connection)
-            self._links.send(number, FrameKind.JOB, 0, [job])
-        places = self._take(FrameKind.READY, START_S)
-        told_places = json.dumps([json.loads(bytes(f.data)) for f in places.values()]).encode()
-        for number in places:
-            self._links.send(number, FrameKind.PEERS, 0, [told_places])
+    @property
+    def pids(self) -> list[int]:
+        return [self._nodes[number].pid for number in sorted(self._nodes)]
 
-    def _look_after(self) -> None:
-        for number, process in enumerate(self.processes):
-            if process.poll() is not None:
-                raise WorkerError(
-                    f"node {number} ended with {process.returncode} before it had begun; what it "
-                    "printed stands on standard error"
-                )
+    def _room(self) -> int:
+        return len(self._homes) - len(self._nodes) + SPARES
+
+    def _seat(self) -> None:
+        """Let those that are ready host the zones that a lost node had at the beginning."""
+        empty = [n for n in range(len(self._homes)) if n not in self._nodes]
+        for ready in list(self._newcomers.ready)[: len(empty)]:
+            newcomer, connection = self._newcomers.take(ready)
+            number = newcomer.asked if newcomer.asked in empty else empty[0]
+            empty.remove(number)
+            assert newcomer.place is not None
+            self._links.add(number, connection)
+            self._nodes[number], self._new[number] = newcomer, self._route(newcomer.place)
+            if number in self._lost:
+                self._lost.remove(number)
 
     def _take(self, kind: FrameKind, timeout_s: float | None = None) -> dict[int, NodeFrame]:
         """The next frame of all living nodes, by rising numbers; an error of one is raised here.
@@ -185,21 +188,20 @@ class NodePool:
             for number, frame in self._links.take(missing, timeout_s or self._timeout_s).items():
                 if frame.kind is FrameKind.FAILED:
                     name, text, trace = json.loads(bytes(frame.data))
-                    failure = WorkerFailureError(number, self._name(number), name, text, trace)
+                    failure = WorkerFailureError(
+                        number, name_of(self._homes[number]), name, text, trace
+                    )
                     raise own_error(failure) from failure
                 if frame.number == self._generation:
                     found[number] = frame
         for number, frame in found.items():
             if frame.kind is not kind:
-                raise WorkerError(f"node {number} sent {frame.kind.name}, not {kind.name}")
+                raise LinkLostError(number, MessageError(f"{frame.kind.name}, not {kind.name}"))
         return dict(sorted(found.items()))
 
     @property
     def _living(self) -> list[int]:
         return [number for number, zones in enumerate(self.zones) if zones]
-
-    def _name(self, number: int) -> str:
-        return f"zones {', '.join(map(str, self._first_zones[number]))}"
 
     # Commands, and what becomes of them when nodes are lost
 
@@ -210,7 +212,8 @@ class NodePool:
             WorkerDeathError: nodes are lost whose zones nobody has kept, or too many for one step.
         """
         if command.changes and time.monotonic() > self._keep_again_s:
-            self._begin_state()
+            if not self._replace_lost():
+                self._begin_state()
         if command.changes:
             self._log.append(command)
         try:
@@ -226,19 +229,38 @@ class NodePool:
             self._keep_again_s = time.monotonic() + KEEP_S
         return results
 
-    def _insist(self, command: NodeCommand) -> list[memoryview]:
-        """Do a command again and again, until no node is lost meanwhile."""
+    def _insist(self, command: NodeCommand | None) -> list[memoryview]:
+        """Do a command, or none, again and again, until no node is lost meanwhile."""
         while True:
             try:
                 if self._is_torn:
                     self._recover()
-                    for one in self._log[: -1 if command.changes else None]:
+                    changes = command is not None and command.changes
+                    for one in self._log[: -1 if changes else None]:
                         self._perform(one)
-                return self._perform(command)
+                return [] if command is None else self._perform(command)
             except LinkLostError as lost:
-                self._lose(lost.peer)
+                self._lose(self._most_missed(lost))
             except SilenceError as silence:
-                self._lose(self._silent(silence))
+                self._lose(LinkLostError(self._silent(silence)), is_silent=True)
+
+    def _replace_lost(self) -> bool:  # whether the worlds go back for that
+        """Let nodes that have joined meanwhile host what lost ones had.
+
+        They get it from those that have it now, out of the newest state. With SUMO none can: what
+        SUMO was told up to now is in no state.
+        """
+        if self.world.config.traffic.source != "native":
+            return False
+        self._newcomers.look(0.0)
+        is_fresh = self._state.zones == self.zones and not self._is_torn
+        if not (self._newcomers.ready and is_fresh and len(self._nodes) < len(self._homes)):
+            return False
+        before = len(self._nodes)
+        self._seat()
+        self.replacements += len(self._nodes) - before
+        self._is_torn, self._opened = True, None
+        return True
 
     def _begin_state(self) -> None:
         """Let all nodes keep what they have before the next command."""
@@ -247,7 +269,7 @@ class NodePool:
 
     def _perform(self, command: NodeCommand) -> list[memoryview]:
         """Do a command once. Raises LinkLostError: a node is lost."""
-        kept = self._opened.number if self._opened and command is self._log[-1] else 0
+        kept = self._opened.number if self._opened and self._log and command is self._log[-1] else 0
         for number in self._living:
             self._links.send(number, FrameKind.COMMAND, kept, command.pieces)
         if not command.changes:
@@ -260,13 +282,18 @@ class NodePool:
 
     def _hear(self, number: int, frame: NodeFrame) -> None:
         """Take an urgent frame."""
-        if frame.kind is not FrameKind.PONG:
+        if frame.kind is FrameKind.MISSED:
+            peer = int.from_bytes(frame.data, "little")
+            if frame.number == self._generation and peer in self._nodes:
+                self._missed += (number, peer)
+                raise LinkLostError(peer)
+        elif frame.kind is not FrameKind.PONG:
             self._coordinator.hear(number, frame)
         elif frame.number == self._pings:
-            self._answered.add(number)
+            self._answered[number] = json.loads(bytes(frame.data))
 
     def _silent(self, silence: SilenceError) -> int:
-        """A node that answers nothing: it has stopped.
+        """A node that answers nothing, for it has stopped; or that another one waits for in vain.
 
         Raises:
             WorkerError: all answer, and yet nothing comes of the command.
@@ -282,20 +309,50 @@ class NodePool:
         except LinkLostError as lost:
             return lost.peer
         mute = [number for number in self._living if number not in self._answered]
+        missed = Counter(peer for peers in self._answered.values() for peer in peers)
+        mute += [number for number, _ in missed.most_common() if number in self._nodes]
         if not mute:
             raise WorkerError(f"{silence}, though they live") from silence
         return mute[0]
 
-    def _lose(self, number: int) -> None:
+    def _most_missed(self, lost: LinkLostError) -> LinkLostError:
+        """The node that has ended, or else the one that cannot be reached by most others."""
+        until_s = time.monotonic() + MISSED_S
+        while lost.peer in self._links.numbers and time.monotonic() < until_s:
+            try:
+                self._links.pump(1e3 * (until_s - time.monotonic()))
+            except LinkLostError as more:
+                lost = more
+        if lost.peer not in self._links.numbers:
+            return lost
+        worst = max(self._missed, key=lambda number: (self._missed.count(number), number))
+        return LinkLostError(worst, MessageError("other nodes do not reach it"))
+
+    def _lose(self, lost: LinkLostError, is_silent: bool = False) -> None:
         """A node is gone: nothing of it counts any more."""
+        number = lost.peer
         self._is_torn = True
+        self._missed.clear()
         self._links.drop(number)
+        node = self._nodes.pop(number, None)
+        self._new.pop(number, None)
+        if node is None:
+            return
         self._lost.append(number)
-        self.processes[number].kill()
-        log.warning("node %d (%s) is lost", number, self._name(number))
+        self.losses += 1
+        log.warning(
+            "node %d on %s (%s) is lost: %s",
+            number,
+            node.machine,
+            name_of(self._homes[number]),
+            lost,
+        )
+        self._starter.replace(node.asked, is_silent)
 
     def _recover(self) -> None:
         """Let the living nodes host the zones of the lost ones, as of the newest state they have.
+
+        Zones whose home is another node that lives go there.
 
         Raises:
             LinkLostError: another one is lost.
@@ -303,41 +360,62 @@ class NodePool:
         """
         state = self._state
         self._opened = None
-        ring = [number for number, zones in enumerate(state.zones) if zones]
-        heirs: dict[int, int] = {}
-        for number in (n for n in ring if n in self._lost):
-            heir = ring[(ring.index(number) + 1) % len(ring)]
-            if heir in self._lost:
-                both = f"{self._name(number)}; {self._name(heir)}"
-                causes = [f"node {n} was lost" for n in self._lost]
-                raise WorkerDeathError(number, both, state.number, "step", causes)
-            heirs[number] = heir
-        zones = [list(some) for some in state.zones]
-        for number, heir in heirs.items():
-            zones[heir] += zones[number]
-            zones[number] = []
-        self.zones = [sorted(some) for some in zones]
+        moves = moves_of(state.zones, self._homes, self._lost, self._nodes, state.number)
+        self.zones = moves.zones
         self._generation += 1
         hostings = self._coordinator.recover(self._node_of(), state.switched)
+        self._tell_zones(hostings, moves, begins=False)
+        self._commit()
+        self._new.clear()
+        self._is_torn = False
+        self._keep_again_s = 0.0
+        self.recoveries += bool(moves.heirs)
+
+    def _tell_zones(
+        self,
+        hostings: Sequence[Sequence[Hosting]],
+        moves: ZoneMoves,
+        begins: bool,
+    ) -> None:
+        """Let the nodes host their zones from now on."""
         told = {
+            "begins": begins,
             "lost": self._lost,
-            "heirs": list(heirs.items()),
-            "zones": self.zones,
-            "state": state.number,
+            "heirs": list(moves.heirs.items()),
+            "donors": moves.donors,
+            "places": list(self._new.items()),
+            "zones": moves.zones,
+            "first": self._first_teller(),
+            "state": self._state.number,
             "runs": self._runs,
             "hostings": _told(hostings),
         }
         for number in self._living:
-            data = json.dumps(told).encode()
+            data = json.dumps({**told, "number": number}).encode()
             self._links.send(number, FrameKind.RECOVER, self._generation, [data])
-        self._commit()
-        self._is_torn = False
-        self._keep_again_s = 0.0
-        self.recoveries += bool(heirs)
+
+    def _first_teller(self) -> int:
+        """The node that tells what all know alike: one that has been there in the last step."""
+        old = [number for number in self._living if number not in self._new]
+        self._teller = self._teller if self._teller in old else (old or self._living)[0]
+        return self._teller
 
     def _commit(self) -> list[memoryview]:
-        """Wait for the nodes to be through with a tick; what else they have sent with it."""
-        read = {n: read_report(frame.data) for n, frame in self._take(FrameKind.REPORT).items()}
+        """Wait for the nodes to be through with a tick.
+
+        Returns:
+            what else they have sent with it, first of all the one that tells what all know alike.
+
+        Raises:
+            LinkLostError: one is lost, or has sent what cannot be.
+        """
+        read, frames = {}, self._take(FrameKind.REPORT)
+        for number in sorted(frames, key=lambda number: (number != self._teller, number)):
+            try:
+                read[number] = read_report(frames[number].data)
+                self._coordinator.check(number, read[number][0])
+            except (ValueError, TypeError, struct.error, ProtocolError) as error:
+                raise LinkLostError(number, MessageError(f"no report: {error}")) from error
         self._coordinator.commit({n: (messages, said) for n, (messages, said, _) in read.items()})
         return [more for _, _, more in read.values()]
 
@@ -350,14 +428,10 @@ class NodePool:
 
     def close(self) -> None:
         """End the nodes."""
-        self._links.close()
+        self._links.end(END_S)
+        self._newcomers.close()
         self._coordinator.close()
-        for process in self.processes:
-            with suppress(subprocess.TimeoutExpired):
-                process.wait(5.0)
-            process.kill()
-            process.wait()
-        self.processes = []
+        self._starter.close()
 
 
 def _told(hostings: Sequence[Sequence[Hosting]]) -> list[list[list[int]]]:

@@ -1,23 +1,23 @@
-"""The process of a node: it hosts some zones of W worlds, and runs the ticks beside the others.
-
-python -m cavmarl.parallel.nodes.node_process HOST PORT NUMBER    # the secret on standard input
-"""
+"""The process of a node: it hosts some zones of W worlds, and runs the ticks beside the others."""
 
 from __future__ import annotations
 
 import json
-import sys
+import os
+import socket
 import traceback
-from collections.abc import Sequence
-from contextlib import ExitStack
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from typing import Any, NoReturn
 
 import numpy as np
 
-from cavmarl.core.errors import CavmarlError
+from cavmarl.core.errors import CavmarlError, ConfigError, MessageError, NodeRefusedError
+from cavmarl.engine.shard_clock import ShardClock
 from cavmarl.handoff.shard_setup import limits_of
 from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.ownership.reactions import Hosting
+from cavmarl.parallel.hosts.host_process import code_stamp
 from cavmarl.parallel.hosts.listener import Listener, call
 from cavmarl.parallel.journaled_worlds import unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
@@ -27,26 +27,33 @@ from cavmarl.parallel.nodes.links import (
     FrameKind,
     LinkLostError,
     Links,
+    NeededNoMoreError,
     NodeFrame,
     RecoveryOrderedError,
 )
-from cavmarl.parallel.nodes.meeting import calls_of
-from cavmarl.parallel.nodes.node_frames import command_of, results_of
+from cavmarl.parallel.nodes.meeting import call_node, calls_of
+from cavmarl.parallel.nodes.node_files import WorldFile, recipe_with
+from cavmarl.parallel.nodes.node_frames import cases_of, command_of, results_of, told_cases
+from cavmarl.parallel.nodes.node_loads import totals
 from cavmarl.parallel.nodes.node_peers import NodePeers
 from cavmarl.parallel.nodes.zone_hosts import ZoneHosts
-from cavmarl.parallel.recipe import CHANGED, world_of
+from cavmarl.parallel.recipe import world_of
 from cavmarl.parallel.worlds_job import Task, commands_of
-from cavmarl.shards.executor import SerialExecutor
+from cavmarl.shards.executor import Executor, SerialExecutor
 from cavmarl.shards.shard import Shard
 
+MEASURED_TICKS = 10  # one of so many shows what zones cost
 MEETING_S = 60.0  # for the other nodes to call
+DIFFERENT = "are read as something else on this machine: {} is the caller's folder"
 
 
 class NodeExecutor:
     """Runs phases on the shards of this node; the other shards' rows stay on the same side."""
 
-    def __init__(self, own: Sequence[Shard], foreign: Sequence[Shard]) -> None:
-        self._executor = SerialExecutor(own)
+    def __init__(
+        self, own: Sequence[Shard], foreign: Sequence[Shard], clock: ShardClock | None
+    ) -> None:
+        self._executor: Executor = clock or SerialExecutor(own)
         self._first, self._foreign = own[0], foreign
 
     def each(self, phase: str, *arguments: Any) -> None:
@@ -57,43 +64,66 @@ class NodeExecutor:
 
 
 class NodeProgram:
-    """One node."""
+    """One node.
 
-    def __init__(self, links: Links, number: int, secret: bytes) -> None:
+    Attributes:
+        zones: that it hosts.
+    """
+
+    def __init__(self, links: Links, address: str, secret: bytes) -> None:
+        self.zones: tuple[int, ...] = ()
         self._links = links
-        self._number = number
+        self._address = address  # of this machine, as the caller reaches it
         self._secret = secret
+        self._number = -1  # until the caller has said it
+        self._generation = 0
 
     def join(self) -> None:
-        """Load the world and meet the other nodes."""
+        """Load the world, and say where other nodes can call.
+
+        Raises:
+            NodeRefusedError: the caller does not want this one.
+        """
         links = self._links
-        job = json.loads(bytes(links.take([COORDINATOR])[COORDINATOR].data))
-        world = unwatched(world_of(job["recipe"], CHANGED))
-        num_worlds, zones = job["num_worlds"], job["zones"]
+        told = {"code": code_stamp(), "machine": socket.gethostname(), "pid": os.getpid()}
+        links.send(COORDINATOR, FrameKind.JOIN, 0, [json.dumps(told).encode()])
+        job = json.loads(bytes(self._take(FrameKind.JOB)))
+        files = [WorldFile(*told) for told in job["files"]]
+        self._fetch(files)
+        world = unwatched(world_of(recipe_with(job["recipe"], files), DIFFERENT))
         self._worlds = worlds = LocalWorlds(
-            world, num_worlds, warm=True, in_next_step=job["in_next_step"]
+            world, job["num_worlds"], warm=True, in_next_step=job["in_next_step"]
         )
         self._commands = commands_of(worlds.arrays)
-        listener = Listener(job["address"], self._secret)
-        links.send(COORDINATOR, FrameKind.READY, 0, [json.dumps(listener.place).encode()])
-        places = json.loads(bytes(links.take([COORDINATOR])[COORDINATOR].data))
-        for other in range(self._number):
-            place = (str(places[other][0]), int(places[other][1]))
-            links.add(other, call(place, self._secret, self._number))
-        later = range(self._number + 1, len(places))
-        for other, connection in sorted(calls_of(listener, later, MEETING_S).items()):
-            links.add(other, connection)
-        listener.close()
-        self._kept = KeptStates(worlds, links, self._number)
-        links.urgent = self._hear
-        self._share(zones, job["runs"], job["hostings"], 0)
-        self._peers.keep_own(worlds.simulation.everywhere)
+        worlds.keep_logs()
+        self._listener = Listener(self._address, self._secret)
+        said = json.dumps(self._listener.place).encode()
+        links.send(COORDINATOR, FrameKind.READY, 0, [said])
+
+    def _fetch(self, files: Sequence[WorldFile]) -> None:
+        """Get those that this machine does not have."""
+        wanted = [n for n, file in enumerate(files) if file.found() is None]
+        if not wanted:
+            return
+        self._links.send(COORDINATOR, FrameKind.WANTED, 0, [json.dumps(wanted).encode()])
+        data = self._take(FrameKind.FILES)
+        at = 8 + int.from_bytes(data[:8], "little")
+        for n, size in zip(wanted, json.loads(bytes(data[8:at])), strict=True):
+            files[n].keep(bytes(data[at : at + size]))
+            at += size
+
+    def _take(self, kind: FrameKind) -> memoryview:
+        """What the caller sends next, while it may send this node away."""
+        frame = self._links.take([COORDINATOR])[COORDINATOR]
+        if frame.kind is not kind:
+            raise MessageError(f"the caller sent {frame.kind.name}, not {kind.name}")
+        return frame.data
 
     def _share(self, zones: Any, runs: Any, hostings: Any, generation: int) -> None:
         """Host the zones that are this node's from now on."""
         simulation, mine = self._worlds.simulation, zones[self._number]
+        self.zones = tuple(mine)
         self._living = [node for node, some in enumerate(zones) if some]
-        self._generation = generation
         node_of = [0] * simulation.partition.count
         for node, some in enumerate(zones):
             for zone in some:
@@ -104,25 +134,39 @@ class NodeProgram:
         ]
         self._peers = NodePeers(simulation, self._links, zones, self._number, generation << 32)
         limits = limits_of(simulation.config.zones, simulation.division.codec.schema)
+        mounted = simulation.mounted
+        carried = [] if mounted is None else [*mounted.arrays()]
         self._hosts = ZoneHosts(
-            simulation.division, mine, node_of, told, limits, self._links, generation
+            simulation.division, mine, node_of, told, limits, self._links, carried, generation
         )
         shards = simulation.shards
         own = [shards[zone] for zone in mine]
         foreign = [shard for shard in shards if shard.zone not in mine]
-        simulation.share(self._peers, self._hosts, NodeExecutor(own, foreign))
+        every = simulation.config.workers.balance_steps
+        self._clock = ShardClock(own, MEASURED_TICKS) if every else None
+        simulation.share(self._peers, self._hosts, NodeExecutor(own, foreign, self._clock))
 
     def _hear(self, number: int, frame: NodeFrame) -> None:
         """Take an urgent frame."""
         if frame.kind is FrameKind.KEEP:
             self._kept.take(number, frame)
+        elif frame.kind is FrameKind.AGENT:
+            self._hosts.keep_agent(frame)
+        elif frame.kind is FrameKind.GIVE:
+            self._kept.take_given(number, frame)
         elif frame.kind is FrameKind.PING:
-            self._links.send(COORDINATOR, FrameKind.PONG, frame.number)
+            said = json.dumps(sorted(self._links.awaited)).encode()
+            self._links.send(COORDINATOR, FrameKind.PONG, frame.number, [said])
         else:
             self._hosts.hear(number, frame)
 
-    def serve(self) -> None:
-        """Do what the coordinator asks for, until it asks for no more."""
+    def serve(self) -> NoReturn:
+        """Do what the coordinator asks for.
+
+        Raises:
+            NeededNoMoreError: it asks for no more.
+            LinkLostError: it is gone.
+        """
         while True:
             try:
                 frame = self._links.take([COORDINATOR])[COORDINATOR]
@@ -133,8 +177,7 @@ class NodeProgram:
             except RecoveryOrderedError as ordered:
                 self._go_back(ordered.frame)
             except LinkLostError as lost:
-                if lost.peer == COORDINATOR:
-                    raise
+                self._miss(lost)
                 self._go_back(None)
 
     def _go_back(self, frame: NodeFrame | None) -> None:
@@ -148,17 +191,32 @@ class NodeProgram:
             except RecoveryOrderedError as ordered:
                 frame = ordered.frame
             except LinkLostError as lost:
-                if lost.peer == COORDINATOR:
-                    raise
+                self._miss(lost)
                 frame = None
 
+    def _miss(self, lost: LinkLostError) -> None:
+        """Tell the coordinator of a node that cannot be reached: nobody else may see it."""
+        if lost.peer == COORDINATOR:
+            raise lost
+        self._links.drop(lost.peer)
+        said = lost.peer.to_bytes(4, "little")
+        self._links.send(COORDINATOR, FrameKind.MISSED, self._generation, [said])
+
     def _recover(self, frame: NodeFrame) -> None:
-        """Go back to a state that was kept, with the zones that the coordinator names."""
+        """Begin, or go back to a state that was kept, with the zones that the coordinator names."""
         links, told = self._links, json.loads(bytes(frame.data))
+        self._generation = frame.number
+        if self._number < 0:
+            self._number = int(told["number"])
+            self._kept = KeptStates(self._worlds, links, self._number)
+            links.urgent = self._hear
+        self._tells = told["first"] == self._number
         for number in told["lost"]:
             links.drop(number)
-        self._share(told["zones"], told["runs"], told["hostings"], frame.number)
-        others = [node for node in self._living if node != self._number]
+        zones = told["zones"]
+        others = [node for node, some in enumerate(zones) if some and node != self._number]
+        self._meet(dict(told["places"]), others)
+        self._share(zones, told["runs"], told["hostings"], frame.number)
         for node in others:
             links.send(node, FrameKind.SYNC, frame.number)
         for node in others:
@@ -166,9 +224,43 @@ class NodeProgram:
                 found = links.take([node])[node]
                 if found.kind is FrameKind.SYNC and found.number == frame.number:
                     break
-        adopted = [number for number, heir in told["heirs"] if heir == self._number]
-        self._kept.load(told["state"], adopted, told["zones"][self._number][0])
+        state, mine = int(told["state"]), zones[self._number]
+        if told["begins"]:
+            self._peers.keep_own(self._worlds.simulation.everywhere)
+            self._kept.keep(state, self._living)
+        else:
+            adopted = [number for number, heir in told["heirs"] if heir == self._number]
+            donors = [donor for donor, taker in told["donors"] if taker == self._number]
+            takers = [taker for donor, taker in told["donors"] if donor == self._number]
+            self._kept.load(state, adopted, donors, takers, mine, self._generation, self._check)
         self._hosts.report()
+
+    def _meet(self, places: Mapping[int, tuple[str, int]], others: Sequence[int]) -> None:
+        """Connect with new nodes, by their places; of two of them the higher one calls.
+
+        Raises:
+            LinkLostError: one cannot be reached.
+            RecoveryOrderedError: the coordinator knows of more by now.
+        """
+        links, number = self._links, self._number
+        is_new = number in places
+        for other in others if is_new else places:
+            links.drop(other)  # of an attempt that came to nothing
+        for other in others:
+            if other in places and (not is_new or other < number):
+                host, port = places[other]
+                links.add(other, call_node((host, port), self._secret, number, other))
+        if is_new:
+            callers = [node for node in others if node not in places or node > number]
+            found = calls_of(self._listener, callers, MEETING_S, self._check)
+            for other, connection in found.items():
+                links.add(other, connection)
+
+    def _check(self) -> None:
+        """Raises RecoveryOrderedError: the coordinator has something newer to say."""
+        self._links.pump(0.0)
+        if self._links.has(COORDINATOR):
+            raise RecoveryOrderedError(None)
 
     def _perform(self, frame: NodeFrame) -> None:
         worlds, peers = self._worlds, self._peers
@@ -184,6 +276,15 @@ class NodeProgram:
                 chosen = worlds.arrays.chosen.copy()
                 worlds.reset(letter["seed"], letter["first_world"])
                 self._hosts.report(self._results(chosen, stepped=False))
+            case Task.LOAD if not letter["only_reads"]:
+                worlds.load_worlds(cases_of(letter))
+                self._hosts.report()
+            case Task.HOST:
+                spent_s = [] if self._clock is None else self._clock.take_s().tolist()
+                self._answer([json.dumps(list(zip(self.zones, spent_s, strict=False))).encode()])
+            case Task.LOADS:
+                said = [self._number, *totals(self._links, worlds.simulation, self.zones)]
+                self._answer([json.dumps(said).encode()])
             case Task.SUGGEST:
                 worlds.suggest()
                 where = np.flatnonzero(peers.own.reshape(-1))
@@ -196,16 +297,12 @@ class NodeProgram:
         peers = self._peers
         own = peers.own & sensed[:, None]
         before = peers.stepped if stepped else np.zeros_like(own)
-        return results_of(self._worlds.arrays, own, before, with_common=self._is_first)
+        return results_of(self._worlds.arrays, own, before, with_common=self._tells)
 
     def _look(self, task: Task, letter: Any) -> None:
         """Answer what only the first node can, which has the whole world meanwhile."""
         worlds, answer = self._worlds, None
-        every = task == Task.WRITE_STATES
-        world = None if every else int(letter[0] if isinstance(letter, list) else letter)
-        with ExitStack() as stack:
-            for w in range(worlds.simulation.num_worlds) if every else [world or 0]:
-                stack.enter_context(self._peers.whole(worlds.simulation, w))
+        with self._peers.whole(worlds.simulation):
             if self._is_first:
                 answer = self._found(task, letter)
         self._answer([] if answer is None else answer)
@@ -218,6 +315,10 @@ class NodeProgram:
             return [worlds.arrays.states.reshape(-1).data]
         if task == Task.STATE_HASH:
             found = worlds.state_hash(letter)
+        elif task == Task.SAVE:
+            found = told_cases(worlds.save_worlds())
+        elif task == Task.LOAD:
+            found = _refusal(worlds, cases_of(letter))
         elif task == Task.TRAFFIC_STATS:
             found = worlds.traffic_stats(letter)
         elif task == Task.DRIVEN:
@@ -228,56 +329,86 @@ class NodeProgram:
 
     @property
     def _is_first(self) -> bool:
-        """Whether this node tells what all know alike."""
+        """Whether this node has whole worlds where one is asked for."""
         return self._number == self._living[0]
 
     def _answer(self, pieces: Sequence[Bytes]) -> None:
         self._links.send(COORDINATOR, FrameKind.RESULT, self._generation, pieces)
 
-    def close(self) -> None:
-        self._links.flush()
+    @property
+    def generation(self) -> int:
+        """How often nodes have come and gone."""
+        return self._generation
 
 
 def _ignore(number: int, frame: NodeFrame) -> None:
-    """Before a node has joined, it hears no messages of the protocol."""
+    """Before a node has begun, it hears no messages of the protocol."""
 
 
-def main() -> int:
-    host, port, number = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
-    secret = bytes.fromhex(sys.stdin.readline().strip())
+def run_node(
+    place: tuple[str, int],  # where the caller listens
+    secret: bytes,
+    number: int,  # that it would have; ANYONE: any
+    note: Callable[[str], None] = lambda text: None,  # what is told of its life
+) -> bool:
+    """The whole life of a node.
+
+    Returns:
+        whether it is needed no more, as the caller has said; else the caller is gone.
+
+    Raises:
+        OSError: nobody listens there.
+        EOFError: the caller wants no more, or is busy.
+        MessageError: who listens there does not know the secret, or speaks another version.
+        NodeRefusedError: the caller does not want it.
+    """
+    connection = call(place, secret, number)
+    address = str(connection.getsockname()[0])
     links = Links(_ignore)
-    links.add(COORDINATOR, call((host, port), secret, number))
-    node = NodeProgram(links, number, secret)
+    links.add(COORDINATOR, connection)
+    node = NodeProgram(links, address, secret)
+    note(f"has joined {place[0]}:{place[1]}")
     try:
         node.join()
+        note("is ready")
         node.serve()
-    except LinkLostError as lost:
-        return 0 if lost.peer == COORDINATOR else _wait_for_the_end(links)
+    except NodeRefusedError:
+        raise
+    except NeededNoMoreError:
+        return True
+    except LinkLostError:
+        return False
     except Exception as error:
         said = [
             type(error).__name__,
             str(error),
             "" if isinstance(error, CavmarlError) else traceback.format_exc(),
         ]
-        links.send(COORDINATOR, FrameKind.FAILED, 0, [json.dumps(said).encode()])
-        links.flush()
-        return _wait_for_the_end(links)
-    return 0
+        with suppress(LinkLostError, NeededNoMoreError):
+            links.send(COORDINATOR, FrameKind.FAILED, node.generation, [json.dumps(said).encode()])
+            links.flush()
+            while True:
+                links.pump(None)
+        return False
+    finally:
+        links.close()
+
+
+def run_on_ray(recipe: str, place: tuple[str, int], secret: bytes, number: int) -> None:
+    """The same as an actor, which Ray starts again if it ends before it is needed no more."""
+    if not run_node(place, secret, number):
+        os._exit(1)
+
+
+def _refusal(worlds: LocalWorlds, cases: Sequence[bytes]) -> str:
+    """Why worlds cannot go on from these; empty: they can."""
+    try:
+        worlds.read_worlds(cases)
+    except ConfigError as error:
+        return str(error)
+    return ""
 
 
 def _hosting(run: bytes, numbers: Sequence[int]) -> Hosting:
     episode, tick, zone, incarnation = numbers
     return Hosting(run, episode, tick, zone, incarnation, {})
-
-
-def _wait_for_the_end(links: Links) -> int:
-    """Another node has gone: the coordinator says what becomes of this one, or ends."""
-    try:
-        while True:
-            links.pump(None)
-    except LinkLostError:
-        return 1
-
-
-if __name__ == "__main__":
-    sys.exit(main())

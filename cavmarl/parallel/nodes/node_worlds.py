@@ -14,17 +14,28 @@ from cavmarl.balance.balance_plan import Plan
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
-from cavmarl.parallel.commanded_worlds import uncopied, unsaved
-from cavmarl.parallel.nodes.node_frames import pieces_of, take_results
+from cavmarl.parallel.commanded_worlds import uncopied
+from cavmarl.parallel.mover import Mover
+from cavmarl.parallel.nodes.node_frames import (
+    cases_of,
+    clear_sensed,
+    pieces_of,
+    take_results,
+    told_cases,
+)
+from cavmarl.parallel.nodes.node_loads import NodeLoad, since
 from cavmarl.parallel.nodes.node_pool import NodeCommand, NodePool
+from cavmarl.parallel.nodes.node_starters import Route, straight
 from cavmarl.parallel.step_arrays import Driven
 from cavmarl.parallel.worlds_job import Task
 from cavmarl.shards.shard import Commands
-from cavmarl.traffic.demand import DemandFile
 
 
 class NodeWorlds(NodePool):
     """W worlds over n nodes; a `SteppedWorlds`.
+
+    Attributes:
+        mover: has zones change their node by what they cost; None: they stay.
 
     Raises:
         ConfigError: a setting that such worlds cannot have, or more nodes than zones.
@@ -38,14 +49,21 @@ class NodeWorlds(NodePool):
         num_worlds: int,  # W
         nodes: int,  # n, from 1 to the zones of a world
         in_next_step: bool = False,  # when worlds begin anew; see `SteppedWorlds`
+        hosts: str = "",  # what starts the nodes; see `start_nodes`
+        route: Route = straight,  # where nodes of this machine call in order to reach a place
     ) -> None:
         check_nodes(world, nodes)
-        super().__init__(world, base_dir, num_worlds, nodes, in_next_step)
+        super().__init__(world, base_dir, num_worlds, nodes, in_next_step, hosts, route)
+        count, every = world.partition.count, world.config.workers.balance_steps
+        self._spent_s = np.zeros((1, count))
+        self._ticks_done = self._ticks_told = 0
+        self._told: dict[int, list[Any]] = {}  # what nodes have said of themselves last
+        self.mover = Mover(self._placement, count, every, self._spent_s) if every else None
 
     def reset(self, seed: int | None, first_world: int) -> None:
         arrays = self.arrays
         results = self.run(self._command(Task.RESET, {"seed": seed, "first_world": first_world}))
-        arrays.observations[arrays.chosen] = 0.0
+        clear_sensed(arrays, arrays.chosen)
         self._write(results, of_step=False)
         if not arrays.chosen.all():
             arrays.observations[~arrays.mask] = 0.0
@@ -56,13 +74,36 @@ class NodeWorlds(NodePool):
         if commands.controls is not arrays.controls:
             arrays.controls[:] = commands.controls
             arrays.meta_actions[:] = commands.meta_actions
+        if self.mover is not None:
+            self.mover.before_step(self._move, self._measured)
         arrays.declared[:] = commands.declared if commands.declared.size else 0
         results = self.run(self._command(Task.STEP))
-        arrays.observations[...] = 0.0
+        self._ticks_done += self._ticks_per_step
+        clear_sensed(arrays, np.ones(len(arrays.chosen), dtype=np.bool_))
         self._write(results, of_step=True)
 
+    def _measured(self) -> dict[int, int]:
+        """Ask what zones have cost, before they are balanced by it; a number for each node."""
+        for data in self.run(self._command(Task.HOST)):
+            for zone, spent_s in json.loads(bytes(data)):
+                self._spent_s[0, zone] += spent_s
+        return dict.fromkeys(range(len(self._homes)), 0)
+
+    def _move(self, task: Task, zones: list[Any], commits: bool) -> None:
+        """Let zones have other homes from now on; no node is left without one."""
+        if not all(zones[0]):
+            return
+        before, self._homes = self._homes, zones[0]
+        self._is_torn, self._opened = True, None
+        try:
+            self._insist(None)
+        except BaseException:
+            self._homes = before
+            raise
+
     def _command(self, task: Task, letter: Any = None) -> NodeCommand:
-        changes = task in (Task.STEP, Task.RESET)
+        loads = task == Task.LOAD and not letter["only_reads"]
+        changes = loads or task in (Task.STEP, Task.RESET)
         pieces = [bytes(piece) for piece in pieces_of(task, letter, self.arrays)]
         return NodeCommand(pieces, changes, self._ticks_per_step if task == Task.STEP else 0)
 
@@ -79,6 +120,21 @@ class NodeWorlds(NodePool):
             where = np.frombuffer(data, np.int64, num)
             found = np.frombuffer(data, suggested.dtype, 2 * num, 8 * num)
             suggested.reshape(-1, 2)[where] = found.reshape(-1, 2)
+
+    def node_loads(self) -> list[NodeLoad]:
+        """What each node has done since this was asked last, by rising numbers.
+
+        After a node was lost its successor's time is that since it began.
+        """
+        found = []
+        ticks, self._ticks_told = self._ticks_done - self._ticks_told, self._ticks_done
+        for data in self.run(self._command(Task.LOADS)):
+            node, *now = json.loads(bytes(data))
+            before = self._told.get(node)
+            is_same = before is not None and before[0] <= now[0]
+            found.append(since(node, ticks, now, before if is_same else None))
+            self._told[node] = now
+        return sorted(found)
 
     def _asked(self, task: Task, letter: Any) -> Any:
         return json.loads(bytes(self.run(self._command(task, letter))[0]))
@@ -109,10 +165,17 @@ class NodeWorlds(NodePool):
         return range(len(self.arrays.mask))[world]
 
     def save_worlds(self) -> list[bytes]:
-        raise unsaved()
+        return cases_of(self._asked(Task.SAVE, None))
 
     def load_worlds(self, cases: Sequence[bytes]) -> None:
-        raise unsaved()
+        """Go on from what `save_worlds` gave; `arrays` stay as they are.
+
+        Raises:
+            ConfigError: it is of other worlds.
+        """
+        if refusal := self._asked(Task.LOAD, told_cases(cases, only_reads=True)):
+            raise ConfigError(refusal)
+        self.run(self._command(Task.LOAD, told_cases(cases)))
 
     @property
     def simulation(self) -> Simulation:
@@ -134,25 +197,19 @@ class NodeWorlds(NodePool):
 
 def check_nodes(world: World, nodes: int) -> None:
     """Refuse what worlds over nodes cannot have."""
-    config, count, demand = world.config, world.partition.count, world.demand
+    config, count = world.config, world.partition.count
     if not 1 <= nodes <= count:
         raise ConfigError(
             f"nodes = {nodes}: a world of {count} zone(s) is hosted by 1 to {count} nodes; use "
             "more zones or fewer nodes"
         )
-    looks = isinstance(demand, DemandFile) and (demand.may_look or len(demand.rerouters.rules))
     refused = {
-        "traffic.source": config.traffic.source != "native" and config.traffic.source,
-        "rig": bool(config.rig) and "…",
-        "v2x.enabled": config.v2x.enabled,
-        "scenario.name": config.scenario.name,
-        "a demand with rerouting devices or rerouters": bool(looks),
+        "v2x.channel.external": config.v2x.enabled and config.v2x.channel.external,
         "zones.faults": config.zones.faults,
         "zones.reproducers": config.zones.reproducers,
         "zones.check_invariants": config.zones.check_invariants,
         "zones.repartition_steps": config.zones.repartition_steps,
         "workers.sensors": config.workers.sensors,
-        "workers.balance_steps": config.workers.balance_steps,
         "workers.monitor_cpu": config.workers.monitor_cpu,
     }
     for key, value in refused.items():

@@ -55,9 +55,12 @@ class ZoneHosts:
         hostings: Sequence[Sequence[Hosting]],  # of each world, of these zones
         limits: Limits,
         links: Links,  # to the coordinator and to all other nodes
+        carried: Sequence[NDArray[Any]],  # (W, A, …) kept of agents beside their vehicles' states
         generation: int = 0,  # how often nodes have been lost
     ) -> None:
         self._generation = generation
+        self._carried = carried
+        self._come: dict[tuple[int, int], memoryview] = {}  # world, vehicle → what is to be kept
         self._division = division
         self._zones = frozenset(zones)
         self._node_of = node_of
@@ -215,13 +218,56 @@ class ZoneHosts:
 
     def _change_hands(self, w: int, leases: dict[int, Advance]) -> None:
         division = self._division
+        left = set()
         for zone, advance in leases.items():
             for vehicle in advance.leave:
+                self._send_agent(w, zone, vehicle)
                 division.give_up(w, zone, vehicle)
+                left.add(vehicle)
         for zone, advance in leases.items():
             owned = self._endpoints[w][zone].owned
             for vehicle, state in advance.enter:
                 division.take_over(w, zone, vehicle, owned[vehicle], state)
+                if vehicle not in left:
+                    self._take_agent(w, vehicle)
+
+    def _agent(self, w: int, vehicle: int) -> int:
+        """The agent whose vehicle it is, of which something is carried; -1: none."""
+        if not self._carried:
+            return -1
+        zone, row = self._division.find(w, vehicle)
+        return int(self._division.owned(w, zone)["agent"][row])
+
+    def _send_agent(self, w: int, zone: int, vehicle: int) -> None:
+        """Send what is kept of an agent to the node that its vehicle goes to, if it is another."""
+        agent = self._agent(w, vehicle)
+        if agent < 0:
+            return
+        (target,) = (t for v, t in self._endpoints[w][zone].offers.open if v == vehicle)
+        if target not in self._zones:
+            kept = (np.ascontiguousarray(array[w, agent]).tobytes() for array in self._carried)
+            pieces = [_LENGTH.pack(w, 0), np.int64(vehicle).tobytes(), *kept]
+            self._links.send(self._node_of[target], FrameKind.AGENT, self._generation, pieces)
+
+    def _take_agent(self, w: int, vehicle: int) -> None:
+        """Wait for the same from the node that its vehicle comes from."""
+        agent = self._agent(w, vehicle)
+        if agent < 0:
+            return
+        while (w, vehicle) not in self._come:
+            self._links.pump(None)
+        data, at = self._come.pop((w, vehicle)), 0
+        for array in self._carried:
+            kept = array[w, agent : agent + 1]
+            kept[...] = np.frombuffer(data, array.dtype, kept.size, at).reshape(kept.shape)
+            at += kept.nbytes
+
+    def keep_agent(self, frame: NodeFrame) -> None:
+        """Take what another node had of an agent, until its vehicle comes."""
+        if frame.number == self._generation:
+            w, _ = _LENGTH.unpack_from(frame.data)
+            vehicle = int(np.frombuffer(frame.data, np.int64, 1, _LENGTH.size)[0])
+            self._come[w, vehicle] = frame.data[_LENGTH.size + 8 :]
 
 
 def packed(messages: Sequence[tuple[int, Message]]) -> bytes:

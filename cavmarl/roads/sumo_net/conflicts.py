@@ -275,13 +275,14 @@ Row = tuple[int, bool, bool, float, float, float, float]
 
 def conflict_rows(
     movements: Sequence[Movement], paths: Sequence[LinkPath | None], left_hand: bool
-) -> tuple[NDArray[np.void], NDArray[np.int32]]:
-    """All conflicts of all links, and each link's first row with the end as last entry.
+) -> tuple[NDArray[np.void], NDArray[np.int32], list[int]]:
+    """All conflicts of all links, each link's first row with the end as last entry, unruled links.
 
     Two links are foes if either names the other: some maps set the bit on one side only, but a
     shared area is shared. Links over a bridge and below it are none, whatever the map says. Links
     from different lanes that the map calls free of each other, but that pass so narrowly that cars
-    would touch, are foes too; of these the turn across the road gives way.
+    would touch, are foes too; of these the turn across the road gives way. Unruled links end in the
+    same lane as another one, and the map has no rule for the two.
 
     Args:
         movements: one a LINK row.
@@ -295,6 +296,7 @@ def conflict_rows(
     for link, movement in enumerate(movements):
         by_node[id(movement.node)].append(link)
     found: list[list[Row]] = [[] for _ in movements]
+    unruled: list[int] = []
     for links in by_node.values():
         for one, other in combinations(links, 2):
             a, b = movements[one], movements[other]
@@ -304,6 +306,7 @@ def conflict_rows(
                 yields = _bit(a, b, a.node._prohibits), _bit(b, a, a.node._prohibits)
             elif a.connection.getFromLane() is not b.connection.getFromLane():
                 if merging:
+                    unruled.append(one)
                     shared = _shared(paths[one], paths[other], merging=True)
                 else:
                     shared = _grazing(paths[one], paths[other])
@@ -322,7 +325,8 @@ def conflict_rows(
     counts = [len(rows) for rows in found]
     conflicts = np.zeros(sum(counts), CONFLICT)
     conflicts[:] = [row for rows in found for row in sorted(rows)]
-    return conflicts, np.concatenate([[0], np.cumsum(counts, dtype=np.int32)]).astype(np.int32)
+    first = np.concatenate([[0], np.cumsum(counts, dtype=np.int32)]).astype(np.int32)
+    return conflicts, first, unruled
 
 
 def _bit(mine: Movement, foe: Movement, requests: dict[int, str]) -> bool:

@@ -103,7 +103,7 @@ def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
     links = _link_rows(chosen.movements, lane_row, lanes, node_row, signal_rows)
     into = _connect(lanes, links, chosen.movements, lane_row)
     paths = [_path(move, lane_row, lanes, points) for move in chosen.movements]
-    conflicts, first_conflict = conflict_rows(chosen.movements, paths, parsed.left_hand)
+    conflicts, first_conflict, unruled = conflict_rows(chosen.movements, paths, parsed.left_hand)
     fork_m = fork_lengths(links["from_lane"].tolist(), paths)
     links["fork_m"] = np.minimum(fork_m, links["length_m"] + FORK_BEYOND_M)
     _map_neighbors(lanes, points)
@@ -120,6 +120,7 @@ def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
     ways = [_path(move, lane_row, lanes, points, AHEAD_M, AHEAD_M) for move in chosen.movements]
     sweeps = _fill_sweeps(Movements(links, conflicts, ways))
     junctions, kinds = _junction_rows(nodes, links)
+    junctions["unruled"][links["junction"][unruled]] = True
     detectors, phase_detectors = place_detectors(
         signal_rows, DetectorRoads(lanes, edges, links, conflicts, into, lane_ids)
     )

@@ -195,8 +195,10 @@ class SumoTraffic:
             lifted = np.isin(leaving["order"], self.worlds.at(w).teleported)
             leaving["events"][lifted] = 0
 
-    def let_in(self, gate: Gate, worlds: Worlds) -> bool:
+    def let_in(self, gate: Gate, worlds: Worlds, running: NDArray[np.int64]) -> bool:
         """Fill `gate.passing` with the vehicles that SUMO has let in; whether there are any.
+
+        `running`: (W,) vehicles that are in each world.
 
         Raises CapacityError: more than there is room for.
         """
@@ -204,8 +206,7 @@ class SumoTraffic:
             now = self.worlds.at(w)
             if not len(now.departed):
                 continue
-            running = int(self._zoned.num_owned[:, w].sum())
-            self._check_room(running + len(now.departed))
+            self._check_room(running.item(w) + len(now.departed))
             self._greet(
                 self._roads,
                 self._travel,

@@ -1,0 +1,176 @@
+"""`Newcomers`: nodes that have called, and host no zones yet."""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cavmarl.core.errors import WorkerError, WorkerFailureError
+from cavmarl.parallel.commanded_worlds import own_error
+from cavmarl.parallel.hosts.host_process import code_stamp
+from cavmarl.parallel.hosts.listener import Listener
+from cavmarl.parallel.nodes.links import FrameKind, Link, LinkLostError, Links, NodeFrame
+from cavmarl.parallel.nodes.node_files import WorldFile
+
+log = logging.getLogger("cavmarl.nodes")
+
+LOOK_MS = 20.0  # so often it is looked who has called, before the worlds begin
+ANYONE = (1 << 32) - 1  # the number of a node that takes any
+
+
+@dataclass
+class Newcomer:
+    """One of them."""
+
+    asked: int  # the number that it was started with, or ANYONE
+    machine: str = "a machine"
+    pid: int = 0  # of its process, there
+    is_let_in: bool = False  # it runs what the caller runs
+    place: tuple[str, int] | None = None  # where other nodes can call, once it has loaded the world
+
+
+class Newcomers:
+    """Tells those who may join what to be, and waits until they are.
+
+    Attributes:
+        place: where they call.
+        ready: who has loaded the world, by numbers of their own.
+        refused: why others were sent away.
+        failures: exceptions while they loaded the world.
+    """
+
+    def __init__(
+        self,
+        listener: Listener,
+        job: Any,  # what they are told, as JSON knows it
+        files: Sequence[WorldFile],  # that the world is made of
+        room: Callable[[], int],  # how many more would be of use
+    ) -> None:
+        self._listener = listener
+        self._job = json.dumps({**job, "files": files}).encode()
+        self._files = files
+        self._room = room
+        self._links = Links(_unheard)
+        self.place = "{}:{}".format(*listener.place)
+        self._all: dict[int, Newcomer] = {}
+        self._next = 0
+        self.ready: list[int] = []
+        self.refused: list[str] = []
+        self.failures: list[WorkerFailureError] = []
+
+    def look(self, wait_ms: float) -> None:
+        """Hear who calls, and what those say who have called."""
+        for asked, connection in self._listener.admit():
+            self._all[self._next] = Newcomer(asked)
+            self._links.add(self._next, connection)
+            self._next += 1
+        try:
+            self._links.pump(wait_ms)
+            for number in list(self._all):
+                frame = self._links.arrived(number)
+                if frame is not None:
+                    self._hear(number, self._all[number], frame)
+        except LinkLostError as lost:
+            self._forget(lost.peer)
+
+    def await_ready(
+        self,
+        num: int,
+        timeout_s: float,
+        trouble: Callable[[], str | None],  # why they will not come, in words
+    ) -> None:
+        """Return when as many are ready.
+
+        Raises:
+            CavmarlError: what one of them has raised.
+            WorkerError: they have not come in time.
+        """
+        until_s = time.monotonic() + timeout_s
+        log.info("waiting for %d nodes at %s", num, self.place)
+        while len(self.ready) < num:
+            self.look(LOOK_MS)
+            for failure in self.failures:
+                raise own_error(failure) from failure
+            why = trouble()
+            if why is None and time.monotonic() > until_s:
+                why = "; refused ".join(
+                    (
+                        f"{len(self.ready)} of {num} nodes have joined at {self.place} within "
+                        f"workers.join_timeout_s = {timeout_s:g}",
+                        *self.refused,
+                    )
+                )
+            if why is not None:
+                raise WorkerError(why)
+
+    def take(self, number: int) -> tuple[Newcomer, Link]:
+        """One that is ready, and its connection."""
+        self.ready.remove(number)
+        return self._all.pop(number), self._links.release(number)
+
+    def _hear(self, number: int, newcomer: Newcomer, frame: NodeFrame) -> None:
+        try:
+            match frame.kind:
+                case FrameKind.JOIN:
+                    self._examine(number, newcomer, json.loads(bytes(frame.data)))
+                case FrameKind.WANTED if newcomer.is_let_in:
+                    self._send_files(number, json.loads(bytes(frame.data)))
+                case FrameKind.READY if newcomer.is_let_in:
+                    host, port = json.loads(bytes(frame.data))
+                    newcomer.place = str(host), int(port)
+                    self.ready.append(number)
+                case FrameKind.FAILED:
+                    name, text, trace = json.loads(bytes(frame.data))
+                    where = f"node on {newcomer.machine}"
+                    failure = WorkerFailureError(newcomer.asked, where, name, text, trace)
+                    self.failures.append(failure)
+                    log.warning("%s", failure)
+                    self._forget(number)
+                case _:
+                    self._forget(number)
+        except (LinkLostError, ValueError, KeyError, TypeError, IndexError):  # it is no node
+            self._forget(number)
+
+    def _examine(self, number: int, newcomer: Newcomer, told: dict[str, Any]) -> None:
+        newcomer.machine, newcomer.pid = str(told["machine"]), int(told["pid"])
+        if told["code"] != code_stamp():
+            why = (
+                f"it runs {told['code']}, the caller {code_stamp()}: install the same versions on "
+                "all machines, or results would differ"
+            )
+        elif self._room() <= sum(each.is_let_in for each in self._all.values()):
+            why = "no more nodes are wanted: all zones have theirs, and one more waits"
+        else:
+            newcomer.is_let_in = True
+            self._links.send(number, FrameKind.JOB, 0, [self._job])
+            return
+        self.refused.append(f"a node on {newcomer.machine}: {why}")
+        log.warning("refused %s", self.refused[-1])
+        self._links.send(number, FrameKind.REFUSED, 0, [why.encode()])
+        self._forget(number)
+
+    def _send_files(self, number: int, wanted: Sequence[int]) -> None:
+        contents = [Path(self._files[n].path).read_bytes() for n in wanted]
+        head = json.dumps([len(content) for content in contents]).encode()
+        size = len(head).to_bytes(8, "little")
+        self._links.send(number, FrameKind.FILES, 0, [size, head, *contents])
+
+    def _forget(self, number: int) -> None:
+        self._links.drop(number)
+        self._all.pop(number, None)
+        if number in self.ready:
+            self.ready.remove(number)
+
+    def close(self) -> None:
+        """Send all away, and hear no more."""
+        self._links.end(0.0)
+        self._listener.close()
+
+
+def _unheard(number: int, frame: NodeFrame) -> None:
+    """They have nothing to say in the middle of something."""

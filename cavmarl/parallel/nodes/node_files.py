@@ -1,0 +1,104 @@
+"""The files of a world, as nodes on other machines get them: once, by their content."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from cavmarl.config.env import EnvConfig
+from cavmarl.config.registry import (
+    resolve_buildings,
+    resolve_demand,
+    resolve_map,
+    resolve_programs,
+    resolve_zones,
+)
+from cavmarl.core.cache_folder import cache_dir
+from cavmarl.core.errors import MessageError, WorkerError
+
+_DIGEST = re.compile("[0-9a-f]{64}")
+
+
+class WorldFile(NamedTuple):
+    """One file, and the key of the configuration that names it."""
+
+    key: str
+    nth: int  # which one of that key; -1: the only one
+    path: str  # where the caller has it
+    digest: str  # SHA-256 of its content
+
+    @property
+    def kept(self) -> Path:
+        """Where a node keeps it that has no such file at the path."""
+        if not _DIGEST.fullmatch(self.digest):
+            raise MessageError(f"{self.digest!r} is no SHA-256")
+        return cache_dir() / "files" / self.digest / Path(self.path).name
+
+    def found(self) -> Path | None:
+        """Where it is on this machine."""
+        for path in (Path(self.path), self.kept):
+            if path.is_file() and _digest(path) == self.digest:
+                return path
+        return None
+
+    def keep(self, content: bytes) -> None:
+        """Put it where `found` looks, whole or not at all.
+
+        Raises:
+            MessageError: it is another file's content.
+            WorkerError: it cannot be written.
+        """
+        if hashlib.sha256(content).hexdigest() != self.digest:
+            raise MessageError(f"what has come for {self.path} is something else")
+        try:
+            self.kept.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.NamedTemporaryFile(dir=self.kept.parent, delete=False) as target:
+                target.write(content)
+            os.replace(target.name, self.kept)
+        except OSError as error:
+            raise WorkerError(
+                f"{self.kept}: {error}; set CAVMARL_CACHE_DIR to a folder with room"
+            ) from error
+
+
+def files_of(config: EnvConfig, base_dir: Path) -> list[WorldFile]:
+    """Those that a configuration names."""
+    buildings = resolve_buildings(config, base_dir) if config.map.buildings != "osm" else None
+    paths = [
+        ("map.source", -1, resolve_map(config, base_dir)),
+        ("map.buildings", -1, buildings),
+        ("zones.layout", -1, resolve_zones(config, base_dir)),
+        *(("map.programs", n, path) for n, path in enumerate(resolve_programs(config, base_dir))),
+        *(("traffic.demand", n, path) for n, path in enumerate(resolve_demand(config, base_dir))),
+    ]
+    return [
+        WorldFile(key, n, str(path.resolve()), _digest(path))
+        for key, n, path in paths
+        if path is not None
+    ]
+
+
+def recipe_with(recipe: Mapping[str, Any], files: Sequence[WorldFile]) -> dict[str, Any]:
+    """A recipe whose configuration names the files as they are on this machine."""
+    config = dict(recipe["config"])
+    for file in files:
+        section, _, field = file.key.partition(".")
+        values = dict(config[section])
+        path = str(file.found())
+        if file.nth < 0:
+            values[field] = path
+        else:
+            values[field] = [*values[field]]
+            values[field][file.nth] = path
+        config[section] = values
+    return {**recipe, "config": config}
+
+
+def _digest(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,181 @@
+"""What starts nodes: this machine, Ray, or somebody by hand on any machine."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Protocol, TypeAlias
+
+from cavmarl.config.env import WorkersConfig
+from cavmarl.core.errors import ConfigError
+from cavmarl.core.processes import start_dying_with_process
+from cavmarl.parallel.hosts.host_registry import Launcher
+from cavmarl.parallel.hosts.listener import Listener
+from cavmarl.parallel.hosts.ray_actors import RayActors
+from cavmarl.parallel.nodes.node_process import run_on_ray
+
+NODE = "cavmarl.parallel.nodes.local_node"  # the program of a node
+LOCAL = "127.0.0.1"  # where nodes of this machine meet
+RAY = "ray"
+MIN_KEY = 32  # characters of a key file
+END_S = 5.0  # for nodes to end by themselves
+
+
+Route: TypeAlias = Callable[[tuple[str, int]], tuple[str, int]]
+
+
+def straight(place: tuple[str, int]) -> tuple[str, int]:
+    """Where to call in order to reach a place: there."""
+    return place
+
+
+class NodeStarter(Protocol):
+    """Starts nodes, and starts others in the place of those that are lost."""
+
+    def trouble(self) -> str | None:
+        """Why a node does not come, in words."""
+        ...
+
+    def replace(self, number: int, is_silent: bool) -> None:
+        """One is lost, or silent, and may still run."""
+        ...
+
+    def close(self) -> None: ...
+
+
+class LocalNodes:
+    """Processes of this machine, which end with this one."""
+
+    def __init__(self, nodes: int, listener: Listener, place: tuple[str, int]) -> None:
+        self._listener, self._place = listener, place
+        self._processes: list[subprocess.Popen[Any]] = []
+        try:
+            self._processes = [self._start(number) for number in range(nodes)]
+        except BaseException:
+            self.close()
+            raise
+
+    def _start(self, number: int) -> subprocess.Popen[Any]:
+        told = map(str, (*self._place, number))
+        process = start_dying_with_process(
+            [sys.executable, "-m", NODE, *told], stdin=subprocess.PIPE, text=True
+        )
+        assert process.stdin is not None
+        with suppress(BrokenPipeError), process.stdin as pipe:
+            pipe.write(f"{self._listener.secret.hex()}\n")
+        return process
+
+    def trouble(self) -> str | None:
+        for number, process in enumerate(self._processes):
+            if process.poll() is not None:
+                return (
+                    f"node {number} ended with {process.returncode} before it had begun; what it "
+                    "printed stands on standard error"
+                )
+        return None
+
+    def replace(self, number: int, is_silent: bool) -> None:
+        self._processes[number].kill()
+        self._processes[number].wait()
+        self._processes[number] = self._start(number)
+
+    def close(self) -> None:
+        for process in self._processes:
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(END_S)
+            process.kill()
+            process.wait()
+        self._processes = []
+
+
+class RayNodes:
+    """Actors of a Ray cluster."""
+
+    def __init__(self, actors: Launcher, listener: Listener) -> None:
+        self._actors = actors
+        actors.start(listener.place, listener.secret)
+
+    def trouble(self) -> str | None:
+        return self._actors.trouble()
+
+    def replace(self, number: int, is_silent: bool) -> None:
+        if is_silent:
+            self._actors.restart(number)
+        else:  # Ray starts it again
+            self._actors.trouble()
+
+    def close(self) -> None:
+        self._actors.close()
+
+
+class JoinedNodes:
+    """Nodes that somebody starts by hand: `cavmarl node --join`."""
+
+    def trouble(self) -> str | None:
+        return None
+
+    def replace(self, number: int, is_silent: bool) -> None:
+        """Whoever has started it may start another one."""
+
+    def close(self) -> None:
+        """They end with the connection."""
+
+
+def start_nodes(
+    hosts: str,  # "": this machine; "ray"; else HOST:PORT, for nodes that are started by hand
+    nodes: int,
+    settings: WorkersConfig,
+    base_dir: Path,  # the folder that a relative key file starts from
+    route: Route,  # for nodes of this machine
+) -> tuple[NodeStarter, Listener]:
+    """Begin to start nodes; they call the listener.
+
+    Raises:
+        ConfigError: a place or a key file that cannot be.
+        MissingExtraError: Ray is not installed.
+        WorkerError: nobody can listen, or nodes cannot be started.
+    """
+    if hosts == "":
+        listener = Listener(LOCAL)
+        return LocalNodes(nodes, listener, route(listener.place)), listener
+    if hosts == RAY:
+        actors = RayActors(run_on_ray, lambda workers: "", nodes, nodes)
+        listener = Listener(actors.address)
+        return RayNodes(actors, listener), listener
+    host, port = place_of(hosts)
+    if not settings.key_file:
+        raise ConfigError(
+            f"hosts = {hosts!r} without workers.key_file: name the file with the key that nodes "
+            "have to know"
+        )
+    return JoinedNodes(), Listener(host, read_key(base_dir / settings.key_file), port)
+
+
+def place_of(text: str) -> tuple[str, int]:
+    """HOST:PORT, read. Raises ConfigError: it is none."""
+    host, colon, port = text.rpartition(":")
+    if not (host and colon and port.isascii() and port.isdigit() and 0 < int(port) < 1 << 16):
+        raise ConfigError(f"{text!r}: must be HOST:PORT, as 192.168.1.10:7600")
+    return host, int(port)
+
+
+def read_key(path: Path) -> bytes:
+    """The key of a file, which this user alone can read.
+
+    Raises:
+        ConfigError: it cannot be read, is too short, or others can read it.
+    """
+    make = "make one: (umask 077; openssl rand -hex 32 > FILE), the same file on all machines"
+    try:
+        with open(path, "rb") as file:
+            key, mode = file.read(1 << 16).strip(), path.stat().st_mode
+    except OSError as error:
+        raise ConfigError(f"key file {path}: {error.strerror or error}; {make}") from error
+    if mode & 0o077:
+        raise ConfigError(f"key file {path}: others can read it; chmod 600 {path}")
+    if len(key) < MIN_KEY:
+        raise ConfigError(f"key file {path}: has {len(key)} of {MIN_KEY} characters; {make}")
+    return key

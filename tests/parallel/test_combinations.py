@@ -1,0 +1,147 @@
+"""Each feature of a world goes with each way to host it, bit for bit, or is refused by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cavmarl.core.errors import ConfigError
+from tests.support.actuated import actuated_grid
+from tests.support.generated import check_block, table
+from tests.support.rerouting import CARS, DEVICE, FLOW, make_map, write_demand
+from tests.support.sumo_worlds import write_stops
+from tests.support.vec_runs import Make, drive, same
+
+pytestmark = pytest.mark.filterwarnings("ignore:workers = ")
+
+Keywords = dict[str, Any]
+SMALL: Keywords = {"agents": 4, "background": 20, "max_cycles": 6}
+
+
+def _with(**overrides: Any) -> Callable[[Path], Keywords]:
+    named = {name.replace("__", "."): value for name, value in overrides.items()}
+    return lambda folder: {"env": "grid4x4", **SMALL, "overrides": named}
+
+
+def _rerouting(folder: Path) -> Keywords:
+    files = write_demand(folder, CARS.format(device=DEVICE) + FLOW)
+    overrides = {
+        "traffic.demand": [str(path) for path in files],
+        "clock.sim_dt_s": 0.2,
+        "clock.ctrl_dt_s": 1.0,
+    }
+    return {"env": make_map(folder), **SMALL, "background": 0, "overrides": overrides}
+
+
+def _sumo(source: str) -> Callable[[Path], Keywords]:
+    def keywords(folder: Path) -> Keywords:
+        overrides = {
+            "traffic.source": source,
+            "traffic.demand": [str(path) for path in write_stops(folder)],
+            "sensors.signal.timing": False,
+        }
+        return {"env": "merge", **SMALL, "agents": 2, "background": 0, "overrides": overrides}
+
+    return keywords
+
+
+def _faults(folder: Path) -> Keywords:
+    plan = folder / "faults.json"
+    plan.write_text('{"seed": 1, "messages": {"Prepare": {"drop": 0.3}}}')
+    return _with(zones__faults=str(plan))(folder)
+
+
+FEATURES: dict[str, Callable[[Path], Keywords]] = {
+    "frames, discrete actions, seats": _with(
+        sensors__stack=3, action__kind="discrete", population__mode="respawn"
+    ),
+    "delayed commands": _with(clock__control_latency_ticks=2),
+    "mounted sensors": _with(rig="ten_sensors", observation__mode="sensors"),
+    "messages": _with(v2x__enabled=True),
+    "a scenario": lambda folder: {
+        **_with(scenario__name="unprotected_left_turn")(folder),
+        "agents": 1,
+    },
+    "actuated signals": lambda folder: {**_with()(folder), "env": str(actuated_grid(folder))},
+    "rerouting": _rerouting,
+    "SUMO's demand": _sumo("sumo-demand"),
+    "SUMO's traffic": _sumo("sumo-traffic"),
+    "sensor workers": lambda folder: {
+        **_with(rig="ten_sensors")(folder),
+        "sensor_workers": 1,
+    },
+    "balance": _with(workers__balance_steps=3),
+    "a journal": lambda folder: _with(zones__journal=str(folder / "run.jsonl"))(folder),
+    "invariant checks": _with(zones__check_invariants=True),
+    "repartitions": _with(zones__repartition_steps=3),
+    "planned faults": _faults,
+}
+PLACES: dict[str, Keywords] = {
+    "zones": {"zones": 3},
+    "workers": {"num_envs": 2, "workers": 2},
+    "zones over workers": {"zones": 2, "workers": 2},
+    "nodes": {"zones": 3, "nodes": 2},
+}
+# What an undivided world, beside which others are run, does not know.
+ONLY_DIVIDED = (
+    "zones.faults", "zones.journal", "zones.check_invariants", "zones.repartition_steps",
+    "workers.balance_steps",
+)  # fmt: skip
+OF_ONE_WORLD = "of one world over"
+NOT_OVER_NODES = "worlds over nodes do not have it"
+REFUSED = {
+    ("a journal", "zones over workers"): OF_ONE_WORLD,
+    ("planned faults", "zones over workers"): OF_ONE_WORLD,
+    ("repartitions", "zones over workers"): "needs zones that stay",
+    ("sensor workers", "nodes"): NOT_OVER_NODES,
+    ("invariant checks", "nodes"): NOT_OVER_NODES,
+    ("repartitions", "nodes"): NOT_OVER_NODES,
+    ("planned faults", "nodes"): NOT_OVER_NODES,
+}
+
+
+def check(make: Make, folder: Path, feature: str, place: str) -> None:
+    """They are the undivided world bit for bit, or refused as the table says."""
+    keywords, where = FEATURES[feature](folder), PLACES[place]
+    if words := REFUSED.get((feature, place)):
+        with pytest.raises(ConfigError, match=words):
+            make(**keywords, **where)
+        return
+    overrides = keywords.get("overrides", {})
+    plain = {name: value for name, value in overrides.items() if name not in ONLY_DIVIDED}
+    alone = {**keywords, "overrides": plain, "num_envs": where.get("num_envs", 1)}
+    alone.pop("sensor_workers", None)
+    whole = drive(make(**alone), steps=8)
+    assert same(drive(make(**keywords, **where), steps=8), whole)
+
+
+@pytest.mark.parametrize("feature", FEATURES)
+def test_in_zones(make: Make, tmp_path: Path, feature: str) -> None:
+    check(make, tmp_path, feature, "zones")
+
+
+@pytest.mark.parametrize("feature", FEATURES)
+def test_over_workers(make: Make, tmp_path: Path, feature: str) -> None:
+    check(make, tmp_path, feature, "workers")
+
+
+@pytest.mark.parametrize("feature", FEATURES)
+def test_zones_over_workers(make: Make, tmp_path: Path, feature: str) -> None:
+    check(make, tmp_path, feature, "zones over workers")
+
+
+@pytest.mark.parametrize("feature", FEATURES)
+def test_over_nodes(make: Make, tmp_path: Path, feature: str) -> None:
+    check(make, tmp_path, feature, "nodes")
+
+
+def test_the_table_of_the_page_is_this_one() -> None:
+    rows = [
+        (feature, *("refused" if (feature, place) in REFUSED else "yes" for place in PLACES))
+        for feature in FEATURES
+    ]
+    page = Path(__file__).resolve().parents[2] / "docs" / "workers.md"
+    check_block(page, "combinations", table(("", *PLACES), rows))

@@ -1,0 +1,450 @@
+"""Nodes that join a world from anywhere: who is let in, and what goes over the wire."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import secrets
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, suppress
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from cavmarl import ConfigError, make_vec
+from cavmarl.core.cache_folder import cache_dir
+from cavmarl.core.errors import MessageError, NodeRefusedError, WorkerDeathError, WorkerError
+from cavmarl.env.vector import CavVectorEnv
+from cavmarl.ownership.messages import COORDINATOR
+from cavmarl.parallel.hosts.framed_socket import VERSION
+from cavmarl.parallel.hosts.host_process import code_stamp
+from cavmarl.parallel.hosts.listener import MAX_GUESTS, Listener, call
+from cavmarl.parallel.nodes import newcomers as newcomers_module
+from cavmarl.parallel.nodes import node_starters
+from cavmarl.parallel.nodes.links import FrameKind, Link, LinkLostError, Links
+from cavmarl.parallel.nodes.newcomers import ANYONE, Newcomer, Newcomers
+from cavmarl.parallel.nodes.node_files import WorldFile
+from cavmarl.parallel.nodes.node_process import run_node
+from cavmarl.parallel.nodes.node_starters import read_key
+from cavmarl.parallel.nodes.zone_moves import moves_of
+from tests.parallel.test_moving import RESTLESS, uneven
+from tests.parallel.test_nodes import over_nodes
+from tests.support.actuated import actuated_grid
+from tests.support.vec_runs import Make, drive, same
+from tests.support.wires import Proxy, free_port, own_address
+from tests.support.world_hosts import FORKS, WorldHosts
+
+__all__ = ["uneven"]
+
+WANTED: dict[str, Any] = {"agents": 6, "background": 40, "max_cycles": 20}
+KEY = secrets.token_hex(32)
+WAIT_S = 60.0
+
+
+def join(place: tuple[str, int], key: bytes, keeps_files: bool = False) -> None:
+    """A node; it may see no file of the caller."""
+    if keeps_files:
+        found = WorldFile.found
+
+        def kept(file: WorldFile) -> Path | None:
+            return found(file._replace(path="/nowhere/" + Path(file.path).name))
+
+        setattr(WorldFile, "found", kept)  # noqa: B010
+    until_s = time.monotonic() + WAIT_S
+    while time.monotonic() < until_s:
+        with suppress(ConnectionRefusedError, EOFError, ConnectionResetError):
+            run_node(place, key, ANYONE)
+            return
+        time.sleep(0.05)
+
+
+class Crowd:
+    """Nodes that somebody has started by hand."""
+
+    def __init__(self) -> None:
+        self.processes: list[Any] = []
+
+    def call(self, place: tuple[str, int], num: int = 1, **more: Any) -> None:
+        for _ in range(num):
+            process = FORKS.Process(
+                target=join, args=(place, KEY.encode()), kwargs=more, daemon=True
+            )
+            process.start()
+            self.processes.append(process)
+
+    def close(self) -> None:
+        for process in self.processes:
+            process.kill()
+            process.join()
+
+
+@pytest.fixture
+def crowd() -> Iterator[Crowd]:
+    with closing(Crowd()) as found:
+        yield found
+
+
+@pytest.fixture
+def key_file(tmp_path: Path) -> Path:
+    path = tmp_path / "run.key"
+    path.touch(0o600)
+    path.write_text(KEY + "\n")
+    return path
+
+
+@pytest.fixture(scope="module")
+def whole() -> Any:
+    with closing(make_vec("grid4x4", **WANTED)) as vec:
+        return drive(vec, steps=20)
+
+
+def keyed(key_file: Path, **more: Any) -> dict[str, Any]:
+    return {"overrides": {"workers.key_file": str(key_file), **more}}
+
+
+def elsewhere() -> str:
+    address = own_address()
+    if address is None:
+        pytest.skip("this machine has no address but its own")
+    return address
+
+
+@pytest.mark.parametrize("is_elsewhere", [False, True])
+def test_what_goes_over_the_wire(
+    make: Make, crowd: Crowd, key_file: Path, whole: Any, is_elsewhere: bool
+) -> None:
+    """Beyond this machine nobody can read it, and what is spoiled is a node that is lost."""
+    address = elsewhere() if is_elsewhere else "127.0.0.1"
+    place = (address, free_port(address))
+    wire = Proxy(place)
+    crowd.call(place)
+    crowd.call(wire.place, keeps_files=True)
+    hosts = "{}:{}".format(*place)
+    vec = make("grid4x4", zones=4, nodes=2, hosts=hosts, **keyed(key_file), **WANTED)
+    said = bytes(wire.said) + b"".join(wire.heard)
+    assert (b"grid4x4" in said) == (b"cavN" in said) == (not is_elsewhere)
+    assert KEY.encode() not in said
+
+    def spoil(step: int) -> None:
+        if step == 12:
+            wire.spoiler = bytes(100)
+
+    assert same(drive(vec, steps=20, before=spoil), whole)
+    assert over_nodes(vec).losses == 1
+    said = bytes(wire.said) + b"".join(wire.heard)
+    assert (b"cavN" in said) == (not is_elsewhere)
+    assert KEY.encode() not in said
+    newcomers = over_nodes(vec)._newcomers
+    for heard in wire.heard:  # said again, it is nothing
+        with socket.create_connection(place) as stranger, suppress(OSError):
+            stranger.sendall(heard)
+            for _ in range(3):
+                newcomers.look(10.0)
+            assert newcomers.ready == []
+            assert stranger.recv(1 << 16)[:4] != b"cavN"
+    assert over_nodes(vec).losses == 1
+    wire.close()
+
+
+def test_a_node_that_joins_later_takes_the_place_of_a_lost_one(
+    make: Make, crowd: Crowd, key_file: Path
+) -> None:
+    place = ("127.0.0.1", free_port("127.0.0.1"))
+    crowd.call(place, 2)
+    one = make("grid4x4", **WANTED)
+    vec = make(
+        "grid4x4", zones=4, nodes=2, hosts="{}:{}".format(*place), **keyed(key_file), **WANTED
+    )
+    worlds = over_nodes(vec)
+    for each in (one, vec):
+        each.reset(seed=3)
+    os.kill(worlds.pids[0], signal.SIGKILL)
+    crowd.call(place)
+    lost = step_alike(one, vec, lambda: bool(worlds.replacements))
+    assert (worlds.losses, worlds.recoveries, worlds.replacements) == (1, 1, 1)
+    assert worlds.zones == [[0, 1], [2, 3]]
+    os.kill(worlds.pids[1], signal.SIGKILL)  # now the new one has all
+    step_alike(one, vec, lambda: worlds.zones[1] == [])
+    assert worlds.zones == [[0, 1, 2, 3], []]
+    assert lost > 1
+
+
+def step_alike(one: CavVectorEnv, vec: CavVectorEnv, is_done: Callable[[], bool]) -> int:
+    """Step both until something is so, and a little further."""
+    until_s, steps, more = time.monotonic() + WAIT_S, 0, 5
+    while more:
+        assert time.monotonic() < until_s
+        more -= is_done()
+        actions = one.suggest_actions()
+        for each in (one, vec):
+            each.step(actions)
+        steps += 1
+        time.sleep(0.01)
+    assert one.state_hash() == vec.state_hash()
+    return steps
+
+
+def test_a_node_of_this_machine_is_started_again(make: Make) -> None:
+    one, vec = (make("grid4x4", **WANTED, **more) for more in ({}, {"zones": 4, "nodes": 2}))
+    worlds = over_nodes(vec)
+    for each in (one, vec):
+        each.reset(seed=3)
+    os.kill(worlds.pids[1], signal.SIGKILL)
+    step_alike(one, vec, lambda: bool(worlds.replacements))
+    assert worlds.zones == [[0, 1], [2, 3]]
+
+
+@pytest.mark.parametrize("is_lost", [False, True])
+def test_zones_that_change_their_node(make: Make, uneven: list[int], is_lost: bool) -> None:
+    wanted = {"agents": 8, "background": 30, "max_cycles": 8}
+    whole = drive(make("town", **wanted), steps=20)
+    vec = make("town", zones=4, nodes=3, overrides=RESTLESS, **wanted)
+
+    def strike(step: int) -> None:
+        if is_lost and step == 9:
+            os.kill(over_nodes(vec).pids[1], signal.SIGKILL)
+
+    assert same(drive(vec, steps=20, before=strike), whole)
+    mover = over_nodes(vec).mover
+    assert mover is not None
+    assert mover.moves == sum(uneven) > 0
+    assert over_nodes(vec)._generation > 1 + is_lost
+
+
+def test_hosts_of_ray_are_nodes(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(node_starters, "RayActors", WorldHosts)
+    one = make("grid4x4", **WANTED)
+    vec = make("grid4x4", zones=4, nodes=2, hosts="ray", **WANTED)
+    worlds = over_nodes(vec)
+    for each in (one, vec):
+        each.reset(seed=3)
+    os.kill(worlds.pids[0], signal.SIGKILL)
+    step_alike(one, vec, lambda: bool(worlds.replacements))
+    assert worlds.zones == [[0, 1], [2, 3]]
+
+
+def test_a_node_that_the_others_cannot_reach(
+    make: Make, monkeypatch: pytest.MonkeyPatch, whole: Any
+) -> None:
+    """The one that two others miss is lost, though it lives."""
+    wires: list[Proxy] = []
+    take = Newcomers.take
+
+    def through_a_wire(newcomers: Newcomers, number: int) -> tuple[Newcomer, Link]:
+        newcomer, link = take(newcomers, number)
+        assert newcomer.place is not None
+        wires.append(Proxy(newcomer.place))
+        newcomer.place = wires[-1].place
+        return newcomer, link
+
+    monkeypatch.setattr(Newcomers, "take", through_a_wire)
+    vec = make("grid4x4", zones=4, nodes=3, **WANTED)
+
+    def cut(step: int) -> None:
+        if step == 9:
+            max(wires, key=lambda wire: len(wire.heard)).cut()
+
+    assert same(drive(vec, steps=20, before=cut), whole)
+    assert over_nodes(vec).losses == 1
+    for wire in wires:
+        wire.close()
+
+
+def test_a_crowd_of_strangers_disturbs_nobody(make: Make, whole: Any) -> None:
+    vec = make("grid4x4", zones=4, nodes=2, **WANTED)
+    worlds = over_nodes(vec)
+    address, port = worlds._newcomers.place.split(":")
+    before = psutil.Process().num_fds()
+    strangers: list[socket.socket] = []
+
+    def call_often(step: int) -> None:
+        for n in range(20):
+            strangers.append(socket.create_connection((address, int(port))))
+            if n % 2:
+                strangers[-1].sendall(secrets.token_bytes(100))
+
+    assert same(drive(vec, steps=20, before=call_often), whole)
+    assert worlds.losses == 0
+    assert psutil.Process().num_fds() <= before + len(strangers) + MAX_GUESTS
+    for stranger in strangers:
+        stranger.close()
+    pids = worlds.pids
+    vec.close()
+    assert psutil.Process().num_fds() < before
+    assert not any(map(psutil.pid_exists, pids))
+
+
+class Door:
+    """A caller's end, in a thread."""
+
+    def __init__(self, key: bytes, address: str = "127.0.0.1", room: int = 1) -> None:
+        self.listener = Listener(address, key)
+        self.newcomers = Newcomers(self.listener, {}, [], lambda: room)
+        self._is_open = True
+        self._thread = threading.Thread(target=self._look)
+        self._thread.start()
+
+    def _look(self) -> None:
+        while self._is_open:
+            self.newcomers.look(5.0)
+
+    def close(self) -> None:
+        self._is_open = False
+        self._thread.join()
+        self.newcomers.close()
+
+
+def test_who_has_another_key_stays_outside() -> None:
+    for address in ("127.0.0.1", elsewhere()):
+        with closing(Door(b"a" * 32, address)) as door:
+            with pytest.raises(MessageError, match="give both the same key"):
+                run_node(door.listener.place, b"b" * 32, ANYONE)
+
+
+def answer(server: socket.socket, said: bytes) -> threading.Thread:
+    """Somebody who answers the first caller, and ends."""
+
+    def run() -> None:
+        connection, _ = server.accept()
+        with connection:
+            connection.recv(1 << 16)
+            connection.sendall(said)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    return thread
+
+
+def test_who_does_not_encrypt_stays_outside() -> None:
+    with closing(Door(b"a" * 32, elsewhere())) as door:
+        with socket.create_connection(door.listener.place) as stranger:
+            stranger.settimeout(5.0)
+            stranger.sendall(secrets.token_bytes(100))
+            with suppress(ConnectionResetError):
+                assert b"cav" not in stranger.recv(100)
+    with socket.create_server((elsewhere(), 0)) as server:
+        answering = answer(server, bytes(100))
+        with pytest.raises(MessageError, match="does not encrypt as cavmarl does"):
+            call(server.getsockname()[:2], b"a" * 32, ANYONE)
+        answering.join()
+
+
+def test_another_version_is_told_which_one_is_spoken() -> None:
+    with closing(Door(b"a" * 32)) as door:
+        with socket.create_connection(door.listener.place) as stranger:
+            stranger.settimeout(5.0)
+            stranger.sendall(b"cavW" + (VERSION + 1).to_bytes(2, "little") + bytes(20))
+            assert stranger.recv(100) == b"cavW" + VERSION.to_bytes(2, "little")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        answering = answer(server, b"cavW\x63\x00")
+        with pytest.raises(MessageError, match=f"speaks version 99, this is {VERSION}"):
+            call(server.getsockname()[:2], b"a" * 32, ANYONE)
+        answering.join()
+
+
+@pytest.mark.parametrize(
+    ("code", "room", "words"),
+    [
+        ("cavmarl of another day", 1, "runs cavmarl of another day.*install the same versions"),
+        ("", 0, "no more nodes are wanted"),
+    ],
+)
+def test_nodes_that_are_not_wanted(
+    monkeypatch: pytest.MonkeyPatch, code: str, room: int, words: str
+) -> None:
+    if code:
+        monkeypatch.setattr(newcomers_module, "code_stamp", code_stamp)
+        monkeypatch.setattr("cavmarl.parallel.nodes.node_process.code_stamp", lambda: code)
+    with closing(Door(b"a" * 32, room=room)) as door:
+        with pytest.raises(NodeRefusedError, match=words):
+            run_node(door.listener.place, b"a" * 32, ANYONE)
+
+
+def test_who_has_come_in_and_talks_nonsense_is_sent_away() -> None:
+    with closing(Door(b"a" * 32)) as door:
+        for said in (b"no JSON", b"[]", b"{}"):
+            links = Links(lambda number, frame: None)
+            links.add(COORDINATOR, call(door.listener.place, b"a" * 32, ANYONE))
+            links.send(COORDINATOR, FrameKind.JOIN, 0, [said])
+            with pytest.raises(LinkLostError):
+                links.take([COORDINATOR], WAIT_S)
+            links.close()
+
+
+def test_a_caller_waits_for_so_long(key_file: Path) -> None:
+    port = free_port("127.0.0.1")
+    limited = keyed(key_file, **{"workers.join_timeout_s": 1.0})
+    with closing(Listener("127.0.0.1", b"", port)):
+        with pytest.raises(WorkerError, match=f"cannot listen on 127.0.0.1:{port}"):
+            make_vec("grid4x4", zones=2, nodes=2, hosts=f"127.0.0.1:{port}", **limited)
+    with pytest.raises(WorkerError, match="0 of 2 nodes have joined at"):
+        make_vec("grid4x4", zones=2, nodes=2, hosts=f"127.0.0.1:{port}", **limited)
+
+
+def test_a_key_is_a_secret(tmp_path: Path) -> None:
+    path = tmp_path / "key"
+    with pytest.raises(ConfigError, match="openssl rand"):
+        read_key(path)
+    path.write_text("a" * 64)
+    path.chmod(0o640)
+    with pytest.raises(ConfigError, match="chmod 600"):
+        read_key(path)
+    path.chmod(0o600)
+    assert read_key(path) == b"a" * 64
+    path.write_text("a" * 31)
+    with pytest.raises(ConfigError, match="31 of 32"):
+        read_key(path)
+
+
+def test_files_are_kept_by_what_is_in_them(tmp_path: Path) -> None:
+    content = secrets.token_bytes(100)
+    digest = hashlib.sha256(content).hexdigest()
+    file = WorldFile("map.source", -1, "/nowhere/map.net.xml", digest)
+    assert file.found() is None
+    with pytest.raises(MessageError, match="something else"):
+        file.keep(content[:-1])
+    file.keep(content)
+    assert file.found() == cache_dir() / "files" / digest / "map.net.xml"
+    file.kept.write_bytes(b"")
+    assert file.found() is None
+    file.kept.unlink()
+    file.kept.parent.rmdir()
+    with pytest.raises(MessageError, match="no SHA-256"):
+        _ = file._replace(digest="../../x").kept
+
+
+def test_a_node_by_its_command(make: Make, key_file: Path, tmp_path: Path) -> None:
+    net = actuated_grid(tmp_path)
+    port = free_port("127.0.0.1")
+    words = ["node", "--join", f"127.0.0.1:{port}", "--key-file", str(key_file)]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "cavmarl", *words], stdout=subprocess.PIPE, text=True
+    )
+    vec = make(net, zones=2, nodes=1, hosts=f"127.0.0.1:{port}", **keyed(key_file), agents=2)
+    vec.reset(seed=1)
+    vec.close()
+    said, _ = process.communicate(timeout=WAIT_S)
+    assert said.endswith("the caller has ended\n")
+    assert process.returncode == 0
+
+
+def test_who_hosts_what_after_losses_and_newcomers() -> None:
+    first = [[0, 1], [2], [3, 4]]
+    found = moves_of(first, first, lost=[1], living=[0, 2], state=1)
+    assert found.zones == [[0, 1], [], [2, 3, 4]]
+    assert found.heirs == {1: 2}
+    again = moves_of(found.zones, first, lost=[], living=[0, 1, 2], state=2)
+    assert again.zones == first
+    assert again.donors == [(2, 1)]
+    with pytest.raises(WorkerDeathError, match="zones 2; zones 3, 4"):
+        moves_of(first, first, lost=[1, 2], living=[0], state=1)
+    assert json.dumps(again)  # it is told as JSON

@@ -1,0 +1,96 @@
+"""Frames between nodes: their bytes, what is none, and who may say what."""
+
+from __future__ import annotations
+
+import socket
+
+import pytest
+
+from cavmarl.core.errors import MessageError
+from cavmarl.ownership.limits import Limits
+from cavmarl.ownership.messages import Done
+from cavmarl.parallel.nodes.links import MAX_FRAME, FrameKind, LinkLostError, Links
+from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
+from cavmarl.parallel.nodes.zone_hosts import packed
+from tests.parallel.test_node_joining import WAIT_S
+
+
+def pair() -> tuple[Links, socket.socket]:
+    near, far = socket.socketpair()
+    links = Links(lambda number, frame: None)
+    links.add(0, near)
+    return links, far
+
+
+def frame(kind: FrameKind, data: bytes) -> bytes:
+    links, far = pair()
+    links.send(0, kind, 7, [data])
+    with far:
+        said = far.recv(1 << 16)
+    links.close()
+    return said
+
+
+def test_the_bytes_of_a_frame() -> None:
+    assert frame(FrameKind.PING, b"abc").hex() == (
+        "6361764e02000d000700000000000000" + "f52be634" + "0300000000000000" + b"abc".hex()
+    )
+
+
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        (b"GET / HTTP/1.1\r\n" * 9, "begins no frame"),
+        (frame(FrameKind.PING, b"abc")[:20] + (MAX_FRAME + 1).to_bytes(8, "little"), "is none"),
+        (b"cavN\x09\x00" + bytes(22), "version 9"),
+        (b"cavN\x02\x00\xff\x00" + bytes(20), "kind 255"),
+        (frame(FrameKind.PING, b"abc")[:-1] + b"d", "not what was sent"),
+        (2 * frame(FrameKind.SYNC, b"abc"), "not the next one"),
+        (frame(FrameKind.SYNC, b"abc")[:-1], "has ended"),
+    ],
+)
+def test_what_is_no_frame_ends_a_connection(said: bytes, words: str) -> None:
+    links, far = pair()
+    far.sendall(said)
+    far.close()
+    with pytest.raises(LinkLostError, match=words):
+        _ = [links.take([0], WAIT_S) for _ in range(3)]
+
+
+def test_a_node_speaks_for_its_own_zones() -> None:
+    """One that says something of another's zone is cut off."""
+    links, far = pair()
+    coordinator = NodeCoordinator([bytes(16)], [0, 0, 1], Limits(), links, [None])
+    coordinator.host()
+    links.urgent = coordinator.hear
+    table = coordinator._worlds[0].directory.table
+    done = {
+        zone: Done(bytes(16), table.episode, table.tick, zone=zone, incarnation=1)
+        for zone in (1, 2, 9)
+    }
+    coordinator.check(0, [(0, done[1])])
+    coordinator.check(1, [(0, done[2])])
+    for number, zone in ((0, 2), (1, 1), (0, 9)):
+        with pytest.raises(MessageError, match=f"node {number} speaks for zone {zone}"):
+            coordinator.check(number, [(0, done[zone])])
+    others, theirs = pair()
+    others.send(0, FrameKind.MESSAGES, 0, [packed([(0, done[2])])])
+    with far, theirs:
+        far.sendall(theirs.recv(1 << 16))
+        with pytest.raises(LinkLostError, match="speaks for zone 2"):
+            links.pump(1000.0)
+    others.close()
+
+
+def test_machines_that_vanish_are_missed() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        connection = socket.create_connection(server.getsockname())
+    links = Links(lambda number, frame: None)
+    links.add(0, connection)
+    asked_s = sum(
+        connection.getsockopt(socket.IPPROTO_TCP, option) * times
+        for option, times in ((socket.TCP_KEEPIDLE, 1), (socket.TCP_KEEPINTVL, 3))
+    )
+    assert connection.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
+    assert asked_s <= 25
+    links.close()

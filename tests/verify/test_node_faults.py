@@ -1,0 +1,137 @@
+"""A network that fails on request, and worlds over nodes that do not."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from cavmarl.cli import app
+from cavmarl.core.errors import ConfigError
+from cavmarl.verify.faulty_network import FaultyNetwork, NetworkFault
+from cavmarl.verify.node_faults import STOP, verify_node_faults
+
+SMALL: dict[str, Any] = {"agents": 4, "background": 20}
+
+
+@pytest.fixture
+def ends() -> Iterator[tuple[FaultyNetwork, socket.socket, socket.socket]]:
+    """A network, and both ends of a connection through it."""
+    network = FaultyNetwork(seed=0)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        host, port = network.route(server.getsockname())
+        with socket.create_connection((host, port), timeout=5.0) as one:
+            other, _ = server.accept()
+            with other:
+                other.settimeout(5.0)
+                one.sendall(b"hello")
+                assert other.recv(100) == b"hello"
+                yield network, one, other
+    network.close()
+
+
+def test_a_connection_carries_both_directions(
+    ends: tuple[FaultyNetwork, socket.socket, socket.socket],
+) -> None:
+    _, one, other = ends
+    other.sendall(b"there")
+    assert one.recv(100) == b"there"
+    one.close()
+    assert other.recv(100) == b""
+
+
+def exchanged(one: socket.socket, other: socket.socket) -> list[bytes]:
+    """What comes of a word each way; None that comes counts as nothing."""
+    found = []
+    for source, target in ((one, other), (other, one)):
+        source.sendall(b"word")
+        try:
+            found.append(target.recv(100))
+        except TimeoutError:
+            found.append(b"")
+    return found
+
+
+@pytest.mark.parametrize(("fault", "wanted"), [(NetworkFault.DELAY, 0), (NetworkFault.DAMAGE, 1)])
+def test_what_comes_is_late_or_damaged(
+    ends: tuple[FaultyNetwork, socket.socket, socket.socket], fault: NetworkFault, wanted: int
+) -> None:
+    network, one, other = ends
+    network.strike(fault)
+    first = exchanged(one, other)
+    bits = sum(
+        (mine ^ theirs).bit_count()
+        for came in first
+        for mine, theirs in zip(came, b"word", strict=True)
+    )
+    assert bits == wanted
+    assert exchanged(one, other) == [b"word", b"word"]
+    assert network.done == {fault: 1}
+
+
+def test_one_direction_is_silent_for_good(
+    ends: tuple[FaultyNetwork, socket.socket, socket.socket],
+) -> None:
+    network, one, other = ends
+    for end in (one, other):
+        end.settimeout(0.2)
+    network.strike(NetworkFault.SILENCE)
+    assert sorted(exchanged(one, other)) == [b"", b"word"]
+    assert sorted(exchanged(one, other)) == [b"", b"word"]
+
+
+def test_a_cut_ends_both_ends(ends: tuple[FaultyNetwork, socket.socket, socket.socket]) -> None:
+    network, one, other = ends
+    network.strike(NetworkFault.CUT)
+    assert one.recv(100) == other.recv(100) == b""
+
+
+def test_nothing_stays_behind() -> None:
+    before = threading.active_count()
+    network = FaultyNetwork(seed=0)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        with socket.create_connection(network.route(server.getsockname())) as one:
+            other, _ = server.accept()
+            other.close()
+            assert one.recv(1) == b""
+    network.close()
+    for thread in threading.enumerate():
+        if thread is not threading.current_thread() and thread.daemon:
+            thread.join(1.0)
+    assert threading.active_count() <= before
+
+
+@pytest.mark.parametrize("fault", [NetworkFault.DAMAGE, NetworkFault.SILENCE, STOP])
+def test_worlds_go_through_it(fault: str) -> None:
+    found = verify_node_faults("merge", [3], faults=[fault], seeds=1, zones=3, steps=25, **SMALL)
+    (line,) = found.lines
+    assert found.holds
+    assert (line.fault, line.runs, line.done, line.ended) == (fault, 1, 2, 0)
+    assert 1 <= line.lost <= 2
+
+
+@pytest.mark.slow
+def test_the_command(tmp_path: Path) -> None:
+    words = ("verify", "merge", "--nodes", "2,3", "--faults", "campaign", "--seeds", "2")
+    result = CliRunner().invoke(app, [*words, "--json", str(tmp_path / "found.json")])
+    assert result.exit_code == 0, result.output
+    assert result.output.count("equal") == 14
+
+
+@pytest.mark.parametrize(
+    ("nodes", "keys", "words"),
+    [
+        ([1], {}, "needs 2 nodes or more"),
+        ([], {}, "needs 2 nodes or more"),
+        ([2], {"steps": 10}, "steps = 10"),
+        ([2], {"faults": ["flood"]}, "must be among delay"),
+    ],
+)
+def test_bad_input(nodes: list[int], keys: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        verify_node_faults("merge", nodes, **keys)
