@@ -331,7 +331,6 @@ def test_a_number_of_worlds_that_cannot_be_is_refused(num_envs: Any) -> None:
         ({"zones": 0}, ("zones.count", "0", "1 to 256")),
         ({"workers": 2}, ("workers = 2", "more zones")),
         ({"workers": -1}, ("workers = -1", "from 0")),
-        ({"workers": 1, "render_mode": "rgb_array"}, ("rgb_array", "workers=0")),
         ({"max_cycles": 0}, ("max_cycles", "0")),
         ({"max_cycles": -5}, ("max_cycles", "-5")),
         ({"max_cycles": 1.5}, ("max_cycles", "1.5")),

@@ -88,7 +88,6 @@ def parallel_env(
     workers, hosts = places_of(workers, hosts, nodes)
     check_hosts(workers, hosts)
     first_seed = None if seed is None else check_seed(seed)
-    check_rendering(render_mode, 1, workers, hosts)
     if lenient and isinstance(overrides, Mapping | None):
         overrides = {**LENIENT, **(overrides or {})}
     config, base_dir = load_config(
@@ -101,6 +100,7 @@ def parallel_env(
         overrides=overrides,
     )
     check_agents(config)
+    check_rendering(config, render_mode, 1, workers, hosts)
     world = make_world(config, base_dir)
     worlds = make_worlds(world, base_dir, 1, workers, hosts, in_next_step=True)
     return CavEnv(worlds, seed=first_seed, render_mode=render_mode)

@@ -96,7 +96,6 @@ def make_vec(
     workers, hosts = places_of(workers, hosts, nodes)
     check_hosts(workers, hosts)
     mode = known_mode(autoreset_mode)
-    check_rendering(render_mode, num_envs, workers, hosts, ("rgb_array",))
     first_seed = None if seed is None else check_seed(seed)
     config, base_dir = load_config(
         env,
@@ -108,6 +107,7 @@ def make_vec(
         overrides=overrides,
     )
     check_agents(config)
+    check_rendering(config, render_mode, num_envs, workers, hosts, ("rgb_array",))
     world = make_world(config, base_dir)
     in_next_step = mode is not AutoresetMode.SAME_STEP
     worlds = make_worlds(world, base_dir, num_envs, workers, hosts, in_next_step)

@@ -40,14 +40,17 @@ class Backend:
     make: MakeWorlds  # makes them there
     # whether the number of workers, or the name in its place, has to be given
     needs_workers: bool = False
-    # whether the caller's process has the state of so many worlds with so many workers, so that it
-    # can draw them
-    keeps_state: Callable[[int, int | None], bool] = lambda num_worlds, workers: False
+    # whether the caller can have the state of so many worlds with so many workers, to draw it
+    shows_state: Callable[[int, int | None], bool] = lambda num_worlds, workers: False
 
 
 def _is_split(num_worlds: int, workers: int | None) -> bool:
     """Whether there are more workers than worlds: this process leads, workers run zones."""
     return workers is not None and workers > num_worlds
+
+
+def _always(num_worlds: int, workers: int | None) -> bool:
+    return True
 
 
 def _local(
@@ -82,10 +85,10 @@ def _nodes(
 
 
 _BACKENDS = {
-    LOCAL: Backend(_local, keeps_state=lambda num_worlds, workers: True),
-    PROCESSES: Backend(_processes, needs_workers=True),
-    RAY: Backend(_ray, needs_workers=True, keeps_state=_is_split),
-    NODES: Backend(_nodes, needs_workers=True),
+    LOCAL: Backend(_local, shows_state=_always),
+    PROCESSES: Backend(_processes, needs_workers=True, shows_state=_always),
+    RAY: Backend(_ray, needs_workers=True, shows_state=_is_split),
+    NODES: Backend(_nodes, needs_workers=True, shows_state=_always),
 }
 _OWN = frozenset(_BACKENDS)
 
@@ -160,11 +163,11 @@ def check_hosts(workers: int | str | None, hosts: str | None) -> tuple[str, int 
     return hosts, number or None
 
 
-def keeps_state(num_worlds: int, workers: int | str | None, hosts: str | None) -> bool:
-    """Whether this process has the state of the worlds; the rest as of `check_hosts`."""
+def shows_state(num_worlds: int, workers: int | str | None, hosts: str | None) -> bool:
+    """Whether this process can have the state of the worlds; the rest as of `check_hosts`."""
     name, number = check_hosts(workers, hosts)
     backend = _backend(name)
-    return backend is not None and backend.keeps_state(num_worlds, number)
+    return backend is not None and backend.shows_state(num_worlds, number)
 
 
 def make_worlds(

@@ -51,9 +51,13 @@ class FaultyNetwork:
         done: how often each fault has been done.
     """
 
-    def __init__(self, seed: int) -> None:
+    def __init__(
+        self,
+        seed: int,
+        latency_s: float = 0.0,  # by which all comes later
+    ) -> None:
         self.done: Counter[NetworkFault] = Counter()
-        self._random = random.Random(seed)
+        self._random, self._latency_s = random.Random(seed), latency_s
         self._listeners: list[socket.socket] = []
         self._connections: list[_Connection] = []
         self._lock = threading.Lock()
@@ -120,6 +124,8 @@ class FaultyNetwork:
         is_mute = False
         with suppress(OSError):
             while data := source.recv(CHUNK):
+                if self._latency_s:
+                    time.sleep(self._latency_s)
                 fault, connection.due[direction] = connection.due[direction], None
                 if fault is NetworkFault.DELAY:
                     time.sleep(self._random.uniform(0.001, LONGEST_DELAY_S))

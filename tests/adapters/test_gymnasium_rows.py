@@ -183,7 +183,6 @@ def test_the_same_seed_gives_the_same_rows() -> None:
         ({"num_worlds": 0}, "num_envs = 8: must be a multiple of num_worlds = 0"),
         ({"autoreset_mode": "Never"}, "autoreset_mode = 'Never': must be"),
         ({"render_mode": "human"}, "render_mode = 'human': must be rgb_array, or None"),
-        ({"render_mode": "rgb_array", "workers": 1}, "use workers=0"),
         ({"overrides": {"population.mode": "opened"}}, r"population\.mode"),
     ],
 )

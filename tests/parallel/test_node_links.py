@@ -9,7 +9,14 @@ import pytest
 from cavmarl.core.errors import MessageError
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import Done
-from cavmarl.parallel.nodes.links import MAX_FRAME, FrameKind, LinkLostError, Links
+from cavmarl.parallel.nodes.links import (
+    MAX_FRAME,
+    FrameKind,
+    LinkLostError,
+    Links,
+    NodeFrame,
+    said_by,
+)
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
 from cavmarl.parallel.nodes.zone_hosts import packed
 from tests.parallel.test_node_joining import WAIT_S
@@ -80,6 +87,12 @@ def test_a_node_speaks_for_its_own_zones() -> None:
         with pytest.raises(LinkLostError, match="speaks for zone 2"):
             links.pump(1000.0)
     others.close()
+
+
+@pytest.mark.parametrize("said", [b"no JSON", b"{}", b"\xff"])
+def test_a_list_is_a_list(said: bytes) -> None:
+    with pytest.raises(MessageError, match="a frame of kind PONG says"):
+        said_by(NodeFrame(FrameKind.PONG, 1, memoryview(said)))
 
 
 def test_machines_that_vanish_are_missed() -> None:

@@ -93,7 +93,7 @@ def test_the_processes_end_with_the_environment() -> None:
         ({"workers": "two"}, r"workers = 'two': must be a whole number, or 'ray'"),
         ({"workers": -1, "hosts": "ray"}, r"workers = -1: must be a number from 0"),
         ({"workers": 5, "hosts": "ray", "zones": 4}, r"workers = 5, .* at most as many as zones"),
-        ({"workers": "ray", "render_mode": "rgb_array"}, r"workers = 'ray': only worlds of the"),
+        ({"workers": "ray", "render_mode": "rgb_array"}, r"workers = 'ray': such worlds are only"),
     ],
 )
 def test_hosts_that_cannot_be(arguments: dict[str, Any], words: str) -> None:

@@ -44,6 +44,41 @@ def test_a_cluster_that_was_started_for_them_ends_with_the_last_of_them() -> Non
     assert not done.stderr.strip()
 
 
+NODES = """
+import os, psutil, signal, time
+from cavmarl import make_vec
+
+if __name__ == "__main__":
+    wanted = {"agents": 4, "background": 20}
+    one = make_vec("grid4x4", **wanted)
+    vec = make_vec("grid4x4", zones=4, nodes=2, hosts="ray", **wanted)
+    for each in (one, vec):
+        each.reset(seed=1)
+    os.kill(vec.worlds.pids[0], signal.SIGKILL)
+    until_s = time.monotonic() + 60.0
+    while not vec.worlds.replacements and time.monotonic() < until_s:
+        actions = one.suggest_actions()
+        for each in (one, vec):
+            each.step(actions)
+        time.sleep(0.01)
+    print(one.state_hash() == vec.state_hash(), vec.worlds.losses, vec.worlds.replacements)
+    children = psutil.Process().children(recursive=True)
+    vec.close()
+    gone, alive = psutil.wait_procs(children, timeout=20)
+    print("left:", [one.cmdline() for one in alive])
+"""
+
+
+def test_nodes_are_actors_and_a_lost_one_comes_back() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", NODES], cwd=ROOT, capture_output=True, text=True, timeout=180
+    )
+    assert done.returncode == 0, done.stderr
+    said = [line for line in done.stdout.splitlines() if "raylet" not in line]
+    assert said[0] == "True 1 1", done.stdout
+    assert said[-1] == "left: []"
+
+
 @pytest.mark.parametrize(
     "env", [["ring"], ["town", "--worlds", "1", "--zones", "4", "--workers", "2"]]
 )

@@ -11,6 +11,7 @@ or out of turn is no frame.
 
 from __future__ import annotations
 
+import json
 import select
 import socket
 import struct
@@ -20,7 +21,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from enum import IntEnum
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 from cavmarl.core.errors import MessageError, NodeRefusedError
 
@@ -83,6 +84,7 @@ URGENT = frozenset(
         FrameKind.PONG,
         FrameKind.MISSED,
         FrameKind.AGENT,
+        FrameKind.FAILED,
         FrameKind.GIVE,
     }
 )
@@ -356,6 +358,17 @@ class Links:
     def close(self) -> None:
         for number in self.numbers:
             self.drop(number)
+
+
+def said_by(frame: NodeFrame) -> list[Any]:
+    """A list as JSON. Raises MessageError: it is none."""
+    try:
+        said = json.loads(bytes(frame.data))
+    except ValueError as error:
+        raise MessageError(f"a frame of kind {frame.kind.name} says nothing: {error}") from error
+    if not isinstance(said, list):
+        raise MessageError(f"a frame of kind {frame.kind.name} says {said!r}")
+    return said
 
 
 def _text(frame: NodeFrame) -> str:

@@ -55,7 +55,7 @@ class Newcomers:
         self._job = json.dumps({**job, "files": files}).encode()
         self._files = files
         self._room = room
-        self._links = Links(_unheard)
+        self._links = Links(lambda number, frame: self._hear(number, self._all[number], frame))
         self.place = "{}:{}".format(*listener.place)
         self._all: dict[int, Newcomer] = {}
         self._next = 0
@@ -170,7 +170,3 @@ class Newcomers:
         """Send all away, and hear no more."""
         self._links.end(0.0)
         self._listener.close()
-
-
-def _unheard(number: int, frame: NodeFrame) -> None:
-    """They have nothing to say in the middle of something."""

@@ -34,6 +34,7 @@ from cavmarl.parallel.nodes.links import (
     Links,
     NodeFrame,
     SilenceError,
+    said_by,
 )
 from cavmarl.parallel.nodes.newcomers import Newcomer, Newcomers
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
@@ -178,7 +179,7 @@ class NodePool:
                 self._lost.remove(number)
 
     def _take(self, kind: FrameKind, timeout_s: float | None = None) -> dict[int, NodeFrame]:
-        """The next frame of all living nodes, by rising numbers; an error of one is raised here.
+        """The next frame of all living nodes, by rising numbers.
 
         Raises:
             LinkLostError: a node is lost.
@@ -186,12 +187,6 @@ class NodePool:
         found: dict[int, NodeFrame] = {}
         while missing := [number for number in self._living if number not in found]:
             for number, frame in self._links.take(missing, timeout_s or self._timeout_s).items():
-                if frame.kind is FrameKind.FAILED:
-                    name, text, trace = json.loads(bytes(frame.data))
-                    failure = WorkerFailureError(
-                        number, name_of(self._homes[number]), name, text, trace
-                    )
-                    raise own_error(failure) from failure
                 if frame.number == self._generation:
                     found[number] = frame
         for number, frame in found.items():
@@ -281,16 +276,20 @@ class NodePool:
         return results if command.ticks else self._commit()
 
     def _hear(self, number: int, frame: NodeFrame) -> None:
-        """Take an urgent frame."""
+        """Take an urgent frame; an error of a node is raised here."""
         if frame.kind is FrameKind.MISSED:
             peer = int.from_bytes(frame.data, "little")
             if frame.number == self._generation and peer in self._nodes:
                 self._missed += (number, peer)
                 raise LinkLostError(peer)
+        elif frame.kind is FrameKind.FAILED:
+            name, text, trace = said_by(frame)
+            failure = WorkerFailureError(number, name_of(self._homes[number]), name, text, trace)
+            raise own_error(failure) from failure
         elif frame.kind is not FrameKind.PONG:
             self._coordinator.hear(number, frame)
         elif frame.number == self._pings:
-            self._answered[number] = json.loads(bytes(frame.data))
+            self._answered[number] = list(said_by(frame))
 
     def _silent(self, silence: SilenceError) -> int:
         """A node that answers nothing, for it has stopped; or that another one waits for in vain.

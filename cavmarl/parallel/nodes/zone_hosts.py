@@ -72,6 +72,8 @@ class ZoneHosts:
         self._leases: list[dict[int, Advance]] = [{} for _ in range(num_worlds)]
         self._births: list[list[tuple[int, int]]] = [[] for _ in range(num_worlds)]
         self._gone: list[dict[int, int]] = [{} for _ in range(num_worlds)]
+        # of vehicles that were offered, and have not left: the zones that they are to go to
+        self._targets: list[dict[int, int]] = [{} for _ in range(num_worlds)]
         self._began = [False] * num_worlds
         self._stirred = [True] * num_worlds
         self._is_open = False
@@ -121,6 +123,7 @@ class ZoneHosts:
             owned = self._division.owners(w)
             self._births[w] = [(vehicle, zone) for vehicle, zone in owned if zone in self._zones]
             self._gone[w] = {}
+            self._targets[w] = {}
             self._stirred[w] = True
 
     def save(self) -> None:
@@ -179,6 +182,7 @@ class ZoneHosts:
             if entry.crossed and endpoint is not None and entry.vehicle in endpoint.owned:
                 state = division.state(w, entry.source, entry.row)
                 approaches[entry.source].append(Approach(entry.vehicle, entry.target, state))
+                self._targets[w][entry.vehicle] = entry.target
                 movers.append((entry.vehicle, entry.target, state_digest(state).hex()))
         for zone, endpoint in endpoints.items():
             if approaches[zone] or endpoint.offers.open:
@@ -241,9 +245,9 @@ class ZoneHosts:
     def _send_agent(self, w: int, zone: int, vehicle: int) -> None:
         """Send what is kept of an agent to the node that its vehicle goes to, if it is another."""
         agent = self._agent(w, vehicle)
+        target = self._targets[w].pop(vehicle, -1)
         if agent < 0:
             return
-        (target,) = (t for v, t in self._endpoints[w][zone].offers.open if v == vehicle)
         if target not in self._zones:
             kept = (np.ascontiguousarray(array[w, agent]).tobytes() for array in self._carried)
             pieces = [_LENGTH.pack(w, 0), np.int64(vehicle).tobytes(), *kept]

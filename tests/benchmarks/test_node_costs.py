@@ -1,0 +1,81 @@
+"""The model of what nodes cost finds the parameters that made its samples."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, replace
+
+import pytest
+
+from benchmarks.node_costs import NodeCosts, NodeSample, borders, fitted
+
+KNOWN = NodeCosts(
+    tick_s=2e-4,
+    vehicle_s=1.5e-6,
+    ghost_s=5e-7,
+    whole_s=5e-5,
+    whole_vehicle_s=1.4e-6,
+    caller_s=8e-5,
+    caller_node_s=4e-5,
+    wake_s=3e-5,
+    base_bytes=2e8,
+    city_bytes=1e3,
+    own_bytes=2e3,
+    ghost_factor=4.0,
+)
+
+
+def sample(vehicles: int, nodes: int, latency_s: float = 0.0) -> NodeSample:
+    own, ghosts = vehicles / max(nodes, 1), KNOWN.ghosts(vehicles, nodes) if nodes else 0.0
+    node_s = KNOWN.tick_s + KNOWN.vehicle_s * own + KNOWN.ghost_s * ghosts
+    return NodeSample(
+        vehicles=vehicles,
+        nodes=nodes,
+        latency_s=latency_s,
+        tick_s=KNOWN.tick(vehicles, nodes, latency_s, cores=64),
+        node_s=node_s if nodes else KNOWN.whole_s + KNOWN.whole_vehicle_s * vehicles,
+        caller_s=KNOWN.caller_s + KNOWN.caller_node_s * nodes if nodes else 0.0,
+        own=own,
+        ghosts=ghosts,
+        memory_bytes=KNOWN.memory(vehicles, nodes),
+    )
+
+
+def test_the_parameters_are_found() -> None:
+    samples = [sample(size, nodes) for size in (1_000, 5_000, 20_000) for nodes in (0, 1, 2)]
+    found = asdict(fitted(samples))
+    assert found == pytest.approx(asdict(KNOWN), rel=1e-6)
+    costs = NodeCosts(**found)
+    assert costs.tick(10**6, 16, 1e-3, 64) == pytest.approx(KNOWN.tick(10**6, 16, 1e-3, 64))
+
+
+def test_what_would_be_negative_is_none() -> None:
+    samples = [sample(size, nodes) for size in (1_000, 5_000, 20_000) for nodes in (0, 1, 2)]
+    cheap = [replace(s, caller_s=1e-4 / max(s.nodes, 1)) for s in samples]
+    assert fitted(cheap).caller_node_s == 0.0
+
+
+def test_latency_counts_once_for_each_hop() -> None:
+    near, far = (KNOWN.tick(5_000, 4, latency_s, 64) for latency_s in (0.0, 1e-3))
+    assert far - near == pytest.approx(3e-3)
+    alone = KNOWN.tick(5_000, 1, 1e-3, 64) - KNOWN.tick(5_000, 1, 0.0, 64)
+    assert alone == pytest.approx(2e-3)
+
+
+def test_nodes_beyond_the_cores_take_turns() -> None:
+    assert KNOWN.tick(10**6, 4, 0.0, 2) > 1.5 * KNOWN.tick(10**6, 4, 0.0, 4)
+
+
+@pytest.mark.parametrize("side", [2, 3, 4])
+def test_borders_of_a_square_of_zones(side: int) -> None:
+    inner = 2 * side * (side - 1)
+    assert borders(side * side) == pytest.approx(2 * inner / side**2)
+    assert borders(1) == 0.0
+    assert KNOWN.ghosts(4e4, side * side) == pytest.approx(
+        KNOWN.ghost_factor * borders(side * side) * math.sqrt(4e4) / side
+    )
+
+
+def test_too_few_runs_are_refused() -> None:
+    with pytest.raises(ValueError, match="two sizes undivided"):
+        fitted([sample(1_000, nodes) for nodes in (0, 1, 2)])
