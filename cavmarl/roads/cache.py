@@ -26,6 +26,7 @@ from cavmarl.roads.network import (
     POINT,
     PROGRAM,
     SIGNAL,
+    SWEEP,
     SWITCH,
     GeoReference,
     RoadNetwork,
@@ -33,7 +34,7 @@ from cavmarl.roads.network import (
 from cavmarl.roads.sumo_net.reader import map_name, read_network, source_hash
 
 # Raise this when the reader gives other rows for the same file; record types count by themselves.
-FORMAT = 20
+FORMAT = 26
 
 _DIGEST_BYTES = 32  # SHA-256 of the rest begins an entry: NumPy would stumble over a broken one
 
@@ -43,6 +44,7 @@ _DTYPES = {
     "edges": EDGE,
     "links": LINK,
     "conflicts": CONFLICT,
+    "sweeps": SWEEP,
     "junctions": JUNCTION,
     "into": np.dtype(np.int32),
     "signals": SIGNAL,

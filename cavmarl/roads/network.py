@@ -119,6 +119,9 @@ LINK = record(
     ("state", np.uint8),  # ord of SUMO's link state without a signal: M m = s w Z o …
     ("first_conflict", np.int32),  # CONFLICT rows, sorted by the foe's LINK row
     ("num_conflicts", np.int32),
+    ("first_sweep", np.int32),  # SWEEP rows, sorted by the foe's LINK row and sizes
+    ("num_sweeps", np.int32),
+    ("swept_m", np.float64),  # up to where a rear, m from the stop line, is minded by others
 )
 
 CONFLICT = record(
@@ -128,6 +131,16 @@ CONFLICT = record(
     ("enter_m", np.float64),  # where on this link's path the shared area begins and ends,
     ("leave_m", np.float64),  # from the stop line; leave = the whole length where both merge
     ("foe_enter_m", np.float64),  # the same area on the foe's path
+    ("foe_leave_m", np.float64),
+)
+
+SWEEP = record(
+    ("foe", np.int32),  # LINK of the same junction, other than from one lane
+    ("own", np.int32),  # size class (`SIZE_LENGTHS_M`) of the vehicle on this link,
+    ("other", np.int32),  # and of the one on the foe's
+    ("enter_m", np.float64),  # from the stop line to where a front begins to be in the way,
+    ("leave_m", np.float64),  # and where a rear ceases to be; both may lie outside the junction,
+    ("foe_enter_m", np.float64),  # and a body longer than the shared area leaves before it enters
     ("foe_leave_m", np.float64),
 )
 
@@ -211,6 +224,7 @@ class RoadNetwork:
     edges: NDArray[np.void]
     links: NDArray[np.void]
     conflicts: NDArray[np.void]
+    sweeps: NDArray[np.void]
     junctions: NDArray[np.void]
     into: NDArray[np.int32]  # LANE rows, see LANE["first_into"]
     signals: NDArray[np.void]
@@ -249,6 +263,7 @@ class RoadNetwork:
             self.edges,
             self.links,
             self.conflicts,
+            self.sweeps,
             self.into,
             self.signals,
             self.programs,

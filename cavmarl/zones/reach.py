@@ -93,9 +93,15 @@ def _across_m(network: RoadNetwork) -> float:
     starts, ends = _ends(network)
     leaves = ends[links["from_lane"]]
     through = leaves - starts[links["to_lane"]]
-    own = np.repeat(np.arange(len(links)), links["num_conflicts"])
-    between = leaves[own] - leaves[network.conflicts["foe"]]
-    apart = np.concatenate([through, between])
+    rows = np.arange(len(links))
+    between = [
+        leaves[np.repeat(rows, links[number])] - leaves[table["foe"]]
+        for number, table in (
+            ("num_conflicts", network.conflicts),
+            ("num_sweeps", network.sweeps),
+        )
+    ]
+    apart = np.concatenate([through, *between])
     return float(np.hypot(apart[:, 0], apart[:, 1]).max(initial=0.0))
 
 

@@ -82,18 +82,18 @@ def test_one_that_comes_is_let_over_the_whole_junction(
     assert not blocks(over_s + 0.05, "line", 20.0)
 
 
-def test_before_one_that_comes_to_its_line_it_is_two_seconds(blocks: Blocks) -> None:
-    # Its front reaches its line in 4 s.
-    assert blocks(2.05, "out", 40.0)
-    assert not blocks(1.95, "out", 40.0)
+def test_before_one_that_comes_to_its_line_it_is_three_seconds(blocks: Blocks) -> None:
+    # Its front reaches its line in 5 s.
+    assert blocks(2.05, "out", 50.0)
+    assert not blocks(1.95, "out", 50.0)
 
 
 @pytest.mark.parametrize(("wait_s", "arrives_s"), [(90.0, 6.0), (180.0, 8.0), (900.0, 8.0)])
 def test_one_that_has_waited_for_long_counts_on_others_to_brake(
     blocks: Blocks, wait_s: float, arrives_s: float
 ) -> None:
-    assert blocks(arrives_s - 1.95, "out", 40.0, wait_s)
-    assert not blocks(arrives_s - 2.05, "out", 40.0, wait_s)
+    assert blocks(arrives_s - 2.95, "out", 40.0, wait_s)
+    assert not blocks(arrives_s - 3.05, "out", 40.0, wait_s)
 
 
 def waiting_pair(**fields: Any) -> Any:

@@ -21,7 +21,7 @@ def announcements(roads: RoadNetwork, travel: Travel, row: np.void) -> list[Entr
     elif row["link"] >= 0 and roads.links[row["link"]]["to_lane"] == lane:
         link = roads.links[row["link"]]
         rear = float(link["length_m"] + row["s"] - 0.5 * row["length"])
-        if rear < max(link["length_m"], link["fork_m"]):
+        if rear < max(link["length_m"], link["fork_m"], link["swept_m"]):
             found.append((int(row["link"]), name, -float(link["length_m"] + row["s"])))
     sight = min(30.0 + 8.0 * float(row["speed"]), 150.0)
     to_end = float(here["length_m"] - row["s"])
@@ -38,6 +38,6 @@ def announcements(roads: RoadNetwork, travel: Travel, row: np.void) -> list[Entr
         here = roads.lanes[lane]
         to_end += float(here["length_m"])
     for link, distance in ahead:
-        if roads.links[link]["num_conflicts"]:
+        if roads.links[link]["num_conflicts"] or roads.links[link]["num_sweeps"]:
             found.append((link, name, max(distance, 0.0)))
     return found

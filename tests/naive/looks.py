@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.records.rows import ENTER_REACH_M, FORK_BEYOND_M
+from cavmarl.core.records.rows import ENTER_REACH_M, SWEPT_BEYOND_M
 from cavmarl.driving.kernels.announcing import APPROACH_M
 from cavmarl.driving.kernels.junctions import EXIT_LOOK_M
 from cavmarl.driving.kernels.lane_choice import LOOK_BACK_M
@@ -57,12 +57,13 @@ class Looks:
         ahead = self._along(view_m)
         asked = self._asked(ahead, see_m)
         foes = {int(conflict["foe"]) for link in asked for conflict in self._conflicts(link)}
+        foes |= {int(sweep["foe"]) for link in asked for sweep in self._sweeps(link)}
         self._at_lines(foes)
         for link in asked | foes:
             *inside, lane = self._path(link)
             for each in inside:
                 self._see(each, 0.0, self.lengths[each])
-            self._see(lane, 0.0, FORK_BEYOND_M + half_m)
+            self._see(lane, 0.0, SWEPT_BEYOND_M + half_m)
         crossed = {self._path(link)[-1]: 0.0 for link in asked if len(self._conflicts(link))}
         beyond = self._ways(crossed, self._after, EXIT_LOOK_M)
         for lane, way in beyond.items():
@@ -182,6 +183,11 @@ class Looks:
         while self.network.lanes["internal"][path[-1]]:
             path += self._after(path[-1])
         return path
+
+    def _sweeps(self, link: int) -> NDArray[np.void]:
+        row = self.network.links[link]
+        found: NDArray[np.void] = self.network.sweeps[row["first_sweep"] :]
+        return found[: row["num_sweeps"]]
 
     def _conflicts(self, link: int) -> NDArray[np.void]:
         row = self.network.links[link]

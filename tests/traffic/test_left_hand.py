@@ -9,6 +9,7 @@ from cavmarl.core.errors import MapError
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.sumo_net.reader import read_network
 from cavmarl.traffic.scenarios.library import scenario_names
+from tests.support import demand_worlds
 from tests.support.driving import drive, make_simulation, make_traffic, start, suggested
 from tests.support.mirrored import mirror_net
 from tests.support.netgenerate import netgenerate
@@ -20,6 +21,13 @@ NETS = {
     "spider": ["--spider", "--spider.arm-number", "5", "--spider.circle-number", "2", *TWO_LANES],
     "random": ["--rand", "--rand.iterations", "40", "--seed", "4", *TWO_LANES],
 }
+ROUTES = """<routes>
+  <flow id="left" from="A1B1" to="B1B2" begin="0" end="60" period="6" departLane="first"/>
+  <flow id="right" from="A1B1" to="B1B0" begin="0" end="60" period="7" departLane="2"/>
+  <flow id="best" from="B0B1" to="B1A1" begin="0" end="60" period="8" departLane="best"/>
+  <vehicle id="stops" depart="1" departLane="2"><route edges="C1B1 B1A1"/>
+    <stop lane="C1B1_0" endPos="60" duration="5"/></vehicle>
+</routes>"""
 MIRRORED = {"x": 1.0, "y": -1.0, "s": 1.0, "d": -1.0, "speed": 1.0, "to_go": 1.0}
 
 
@@ -119,3 +127,26 @@ def test_scenarios_are_staged_as_in_a_mirror(tmp_path: Path, name: str) -> None:
     assert right.size > 1
     for field in ("x", "y", "s"):
         np.testing.assert_allclose(right[field], MIRRORED[field] * left[field], atol=1e-9)
+
+
+def test_routes_with_lane_changes_and_stops_go_on_where_one_drives_on_the_left(
+    tmp_path: Path,
+) -> None:
+    plain = netgenerate(tmp_path / "right.net.xml", *GRID, "-L", "3")
+    mirror = mirror_net(plain, tmp_path / "left.net.xml")
+    routes = tmp_path / "routes.rou.xml"
+    routes.write_text(ROUTES, encoding="utf-8")
+    found = []
+    for path in (plain, mirror):
+        clock = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.5}
+        world = demand_worlds.make(path, [routes], overrides=clock)
+        start(world, 3)
+        stopped_s = 0.0
+        for _ in range(200):
+            drive(world)
+            stopped_s = max(stopped_s, float(world.vehicles()["stopped_s"].max(initial=0.0)))
+        stats = world.traffic_stats()
+        found.append((stats.departed, stats.waiting, stats.arrived, round(stopped_s)))
+    assert found[0] == found[1]
+    assert found[0][2] > 5, "some arrived"
+    assert found[0][3] > 3, "one stood at its stop"

@@ -29,20 +29,24 @@ def compare_worlds(
     """Run the worlds that have no row yet; print what all rows come to, and the worst."""
     from cavmarl.evaluate.traffic.world_rows import by_feature, summary, worst
     from cavmarl.evaluate.traffic.world_runs import KEPT, WorldSeries, run_worlds
+    from cavmarl.maps.shared_ground import GROUND_FEATURES
 
     job = WorldSeries(out, worlds, first_seed, seconds, dt, without, maps)
     console = Console()
     with counting(console, "worlds") as bar:
         rows = run_worlds(job, bar)
     found, parts = summary(rows), by_feature(rows)
+    sound = [row for row in rows if not GROUND_FEATURES.intersection(row["features"])]
     console.print(_shares(found))
+    console.print(_shares(summary(sound), f", without {' and '.join(sorted(GROUND_FEATURES))}"))
     console.print(_features(parts))
     console.print(_worst(worst(rows, KEPT), out))
-    write_json(json_path, {"summary": found, "features": parts, "rows": rows})
+    found_sound = summary(sound)
+    write_json(json_path, {"summary": found, "sound": found_sound, "features": parts, "rows": rows})
 
 
-def _shares(found: Row) -> Table:
-    title = f"{found['worlds']} worlds, {found['failed']} failed"
+def _shares(found: Row, which: str = "") -> Table:
+    title = f"{found['worlds']} worlds{which}, {found['failed']} failed"
     rows = [
         (label, *(_percent(found.get(name, {}).get(key)) for key in keys))
         for label, name in (

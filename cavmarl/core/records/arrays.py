@@ -23,6 +23,7 @@ class RoadArrays(NamedTuple):
     edges: NDArray[np.void]  # EDGE (num_edges,)
     links: NDArray[np.void]  # LINK (K,)
     conflicts: NDArray[np.void]  # CONFLICT (num_conflicts,)
+    sweeps: NDArray[np.void]  # SWEEP (num_sweeps,)
     into: NDArray[np.int32]  # (num_into,) see LANE["first_into"]
     signals: NDArray[np.void]  # SIGNAL (num_signals,)
     programs: NDArray[np.void]  # PROGRAM (num_programs,)

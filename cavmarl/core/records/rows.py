@@ -8,6 +8,8 @@ from cavmarl.core.numba import inlined_kernel
 from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_SCRIPTED
 
 ENTER_REACH_M = 80.0  # how far along its lane a departing vehicle looks for others
+SIZE_LENGTHS_M = (5.5, 8.0)  # longer vehicles are of the next size class: car, van or truck, bus
+SWEPT_BEYOND_M = 5.0  # how far beyond a junction others may still mind a vehicle's rear
 FORK_BEYOND_M = 3.0  # how far beyond a junction paths from one lane can still run together
 LOST_M = (
     10.0  # from its place on its lane: a vehicle that is steered off further is no longer there

@@ -13,7 +13,7 @@ from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.numba.prefetch import SOON, prefetch
 from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
 from cavmarl.core.records.codes import DRIVER_SCRIPTED
-from cavmarl.core.records.rows import FORK_BEYOND_M, is_lost
+from cavmarl.core.records.rows import SWEPT_BEYOND_M, is_lost
 from cavmarl.driving.kernels.announcing import announced_m
 from cavmarl.driving.kernels.ways import leave, next_step, own_step
 
@@ -122,11 +122,12 @@ def _announce(
     s = row["s"]
     if here["internal"]:
         pairs = _note(scratch, pairs, here["link"], row, i, -(here["link_offset_m"] + s))
-    elif row["link"] >= 0 and s - 0.5 * row["length"] < FORK_BEYOND_M:
-        # Its centre has left the junction, its rear has not, or not the fork before it.
+    elif row["link"] >= 0 and s - 0.5 * row["length"] < SWEPT_BEYOND_M:
+        # Its centre has left the junction, its rear has not, or not the fork before it, or where
+        # others wait for it.
         left = roads.links[row["link"]]
-        rear = s - 0.5 * row["length"]
-        if left["to_lane"] == lane and (rear < 0.0 or left["length_m"] + rear < left["fork_m"]):
+        minded = max(left["length_m"], left["fork_m"], left["swept_m"])
+        if left["to_lane"] == lane and left["length_m"] + s - 0.5 * row["length"] < minded:
             pairs = _note(scratch, pairs, row["link"], row, i, -(left["length_m"] + s))
     reach = announced_m(row["speed"])
     distance = here["length_m"] - s
@@ -140,7 +141,7 @@ def _announce(
         if lane < 0:
             break
         if link >= 0:
-            if roads.links[link]["num_conflicts"] > 0:
+            if roads.links[link]["num_conflicts"] + roads.links[link]["num_sweeps"] > 0:
                 pairs = _note(scratch, pairs, link, row, i, max(distance, 0.0))
             found += 1
             if found == MAX_LINKS_AHEAD:

@@ -40,6 +40,12 @@ from cavmarl.driving.kernels.lane_choice import (
 )
 from cavmarl.driving.kernels.lane_index import VIEW_M, ahead_on, beside_s, last_on
 from cavmarl.driving.kernels.stopping import way_to_stop
+from cavmarl.driving.kernels.swept_areas import (
+    before_line_gently,
+    before_swept,
+    behind_fork,
+    swept_stop,
+)
 from cavmarl.driving.kernels.ways import leave, next_step
 
 SEE_LINE_M = 8.0
@@ -90,31 +96,6 @@ def _slowing_to(kind: np.void, limit: float, distance: float, speed: float, dt: 
         decel = kind["decel"]
         lead_s = dt
     return math.sqrt(limit * limit + 2.0 * decel * max(distance - lead_s * speed, 0.0))
-
-
-@kernel
-def _shared_start(
-    roads: RoadArrays,
-    kind: np.void,
-    row: np.void,
-    lane: int,
-    chosen: int,
-    distance: float,
-    scratch: Scratch,
-) -> float:
-    """How vehicles press that have just turned off from the same lane into another link."""
-    press = no_press(kind)
-    first = roads.lanes[lane]["first_link"]
-    for link in range(first, first + roads.lanes[lane]["num_links"]):
-        if link == chosen:
-            continue
-        for k in range(scratch.link_start[link], scratch.link_end[link]):
-            other = scratch.approach[k]
-            place = -other["dist"]
-            if place > max(-distance, 0.0) and place - other["half"] < roads.links[link]["fork_m"]:
-                gap = distance + place - 0.5 * row["length"] - other["half"]
-                press = max(press, behind(kind, row["speed"], gap, other["speed"], kind["decel"]))
-    return press
 
 
 @inlined_kernel
@@ -177,8 +158,15 @@ def _at_line(
     if to_line <= 0.0:
         # Its front is over the line: it does not wait there any more.
         press, hold = press_inside(roads, travel, rows, i, link, -distance, way, phase, dt, scratch)
+        press = max(press, before_swept(roads, rows, i, kind, link, front, dt, scratch))
         return press, hold, False
     hold = may_enter(roads, travel, rows, i, link, distance, way, phase, scratch)
+    if roads.links[link]["num_sweeps"] > 0:
+        stop = front + swept_stop(roads, rows, i, link, -front, hold != HOLD_NONE, scratch)
+        if hold != HOLD_NONE:
+            to_line = min(to_line, max(stop, 0.0))
+        elif stop < math.inf:
+            return before_line_gently(kind, row, stop, dt), HOLD_NONE, stop <= front
     if hold != HOLD_NONE:
         return before_line(kind, speed, to_line, dt), hold, True
     if front > SEE_FOES_M and kind["model"] == MODEL_KRAUSS and is_minor(roads, link, phase):
@@ -238,11 +226,12 @@ def _road_ahead(
     if here["internal"]:
         place = here["link_offset_m"] + row["s"]
         before = roads.links[here["link"]]["from_lane"]
-        fork = _shared_start(roads, kind, row, before, here["link"], -place, scratch)
+        fork = behind_fork(roads, kind, row, before, here["link"], -place, scratch)
         press, hold = press_inside(
             roads, travel, rows, i, here["link"], place, row["way"], phase, dt, scratch
         )
-        press = max(press, fork)
+        swept = before_swept(roads, rows, i, kind, here["link"], -place - half, dt, scratch)
+        press = max(press, fork, swept)
     look = min(look_ahead_m(kind, speed), travel.view_m)
     see = min(see_line_m(kind, speed) + half, travel.see_m)
     # Behind a leader on its own lane a driver minds the next line only where it could not stop
@@ -272,7 +261,7 @@ def _road_ahead(
         if link >= 0 and distance < see:
             if distance - half - roads.lanes[before]["stop_back_m"] < STOP_LINE_M:
                 link_ahead = link if link_ahead < 0 else link_ahead
-            fork = _shared_start(roads, kind, row, before, link, distance, scratch)
+            fork = behind_fork(roads, kind, row, before, link, distance, scratch)
             at_line, found, stops = _at_line(
                 roads, travel, rows, i, kind, link, distance, way, phase, dt, scratch
             )

@@ -32,9 +32,9 @@ from cavmarl.driving.kernels.following import LINE_MARGIN_M
 BRISK_ACCEL = 2.5  # m/s², with which a driver may soon be in a shared area,
 GENTLE_ACCEL = 1.8  # and, to be safe, with which it and others are out of it
 HARD_STOP = 5.0  # m/s², a vehicle that needs more to stop before the line will not stop
-AHEAD_S = (
-    2.0  # s before a foe is at its line: SUMO's drivers take 1 s, of foes that do not speed up
-)
+# s before a foe is at its line: SUMO's drivers take 1 s, of foes that do not speed up;
+AHEAD_S = 3.0
+MERGE_AHEAD_S = 1.5  # before one that leads into the same lane, which may fall in behind
 GAP_S = 1.0  # s between the last of one and the first of the other in a shared area
 ROOM_M = 3.0  # free way left behind a vehicle that clears a junction
 IMPATIENCE_S = 180.0  # after which a vehicle that gives way counts on others to brake,
@@ -244,5 +244,5 @@ def foe_blocks(
     # With the speed that it has; it is counted on to brake by those who have waited for long.
     arrives = (foe["dist"] - foe["half"]) / max(foe["speed"], STANDING_MPS)
     arrives *= 1.0 + min(row["wait_s"] / IMPATIENCE_S, 1.0)
-    blocks: bool = arrives < time_out + AHEAD_S
+    blocks: bool = arrives < time_out + (MERGE_AHEAD_S if conflict["merging"] else AHEAD_S)
     return blocks

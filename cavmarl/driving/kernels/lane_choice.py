@@ -83,6 +83,18 @@ def wish_on_lane(
     return accel_behind(kind, row["speed"], desired, gap, leader["speed"], leader["decel"])
 
 
+@inlined_kernel
+def _is_left_slowly(scratch: Scratch, lane: np.void, front: float) -> bool:
+    """Whether a rear still covers the end of a lane, which is `front` m ahead, wherever it goes."""
+    for link in range(lane["first_link"], lane["first_link"] + lane["num_links"]):
+        for k in range(scratch.link_start[link], scratch.link_end[link]):
+            leaves = scratch.approach[k]
+            rear = -leaves["dist"] - leaves["half"]
+            if leaves["dist"] <= 0.0 and rear < 0.0 and front + rear < SIDE_GAP_M:
+                return True
+    return False
+
+
 @kernel
 def _change_is_safe(
     roads: RoadArrays,
@@ -117,6 +129,8 @@ def _change_is_safe(
                 break
             ahead += roads.lanes[beyond]["length_m"]
             beyond, way, _ = next_step(roads, travel, beyond, way)
+        if _is_left_slowly(scratch, lane, lane["length_m"] - s - half):
+            return False
     after = wish(kind, speed, desired, no_press(kind))
     if j >= 0:
         leader = scratch.entries[j]

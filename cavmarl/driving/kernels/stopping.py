@@ -42,7 +42,11 @@ def lane_to_stop(roads: RoadArrays, travel: Travel, row: np.void) -> int:
     stop = travel.stops[row["stop"]]
     if stop["lane"] == row["lane"]:
         return STAY
-    return 1 if stop["lane"] > row["lane"] else -1
+    inwards = 1 if stop["lane"] > row["lane"] else -1
+    # Lanes count from the kerb: where one drives on the left, the next one lies to the right.
+    here = roads.lanes[row["lane"]]
+    mirrored = here["right"] == row["lane"] + 1 or here["left"] == row["lane"] - 1
+    return -inwards if mirrored else inwards
 
 
 @inlined_kernel

@@ -19,12 +19,15 @@ LOCK_S = 120.0
 _SPREAD_OF = ("departed", "arrived", "mean_speed_mps", "mean_delay_s", "queue", "longest_lock_s")
 
 
-def row_of(draw: WorldDraw, found: TrafficComparison) -> Row:
-    """What is kept of a comparison: all figures, and SUMO's of each of its seeds."""
+def row_of(draw: WorldDraw, found: TrafficComparison, ground: Sequence[str] = ()) -> Row:
+    """What is kept of a comparison: all figures, and SUMO's of each of its seeds.
+
+    `ground`: names of `ground_features` that the net turned out to have.
+    """
     sumo = [asdict(figures) for figures in (found.sumo.figures, *found.sumo_others)]
     return {
         "seed": draw.seed,
-        "features": list(draw.features),
+        "features": [*draw.features, *ground],
         "seconds": found.seconds,
         "dt_s": found.dt_s,
         "ours": asdict(found.ours.figures),

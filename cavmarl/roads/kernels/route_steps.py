@@ -60,11 +60,11 @@ def plan_route(
                 cost[way + lane] = roads.lanes[lane]["length_m"] / roads.lanes[lane]["speed_mps"]
             else:
                 _go_through(roads, lane, way, edges[n + 1], way_after, steps, cost)
-        # Changes spread over the lanes of an edge, to the left and then to the right.
+        # Changes spread over the lanes of an edge, from the kerb inwards and back again.
         for lane in range(first + 1, first + edge["num_lanes"]):
-            _go_sideways(roads, lane, -1, permission, way, steps, cost)
+            _go_sideways(roads, lane, lane - 1, permission, way, steps, cost)
         for lane in range(first + edge["num_lanes"] - 2, first - 1, -1):
-            _go_sideways(roads, lane, 1, permission, way, steps, cost)
+            _go_sideways(roads, lane, lane + 1, permission, way, steps, cost)
         way_after = way
     return end - first_step
 
@@ -114,16 +114,16 @@ def _go_through(
 def _go_sideways(
     roads: RoadArrays,
     lane: int,
-    side: int,
+    beside: int,
     permission: int,
     way: int,
     steps: NDArray[np.void],
     cost: NDArray[np.float64],
 ) -> None:
-    """Leave a lane to one side where that is cheaper than what its step says so far."""
+    """Leave a lane for one beside it where that is cheaper than what its step says so far."""
     row = roads.lanes[lane]
-    beside = row["left"] if side > 0 else row["right"]
-    if beside < 0 or not row["permissions"] & permission:
+    side = int(row["left"] == beside) - int(row["right"] == beside)
+    if side == 0 or not row["permissions"] & permission:
         return
     reached = cost[way + beside] + change_cost(roads, lane, 1.0)
     if reached < cost[way + lane]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import MapError
 from cavmarl.core.math.geometry import project
-from cavmarl.core.records.rows import FORK_BEYOND_M
+from cavmarl.core.records.rows import FORK_BEYOND_M, SWEPT_BEYOND_M
 from cavmarl.roads.network import EDGE, JUNCTION, LANE, LINK, GeoReference, RoadNetwork
 from cavmarl.roads.polylines import clean_shape, extend_stubs, point_rows, refuse_points
 from cavmarl.roads.sumo_net.backward_paths import Way, mend_backward_paths
@@ -27,6 +27,7 @@ from cavmarl.roads.sumo_net.conflicts import (
 from cavmarl.roads.sumo_net.detectors import DetectorRoads, place_detectors
 from cavmarl.roads.sumo_net.selection import Movement, NetworkSelection, permission_bits, select
 from cavmarl.roads.sumo_net.signal_rows import SignalRows, read_signals
+from cavmarl.roads.sumo_net.sweeps import AHEAD_M, Movements, sweep_rows
 
 if TYPE_CHECKING:
     from cavmarl.roads.sumo_net.sumo_xml import ParsedNet
@@ -116,6 +117,8 @@ def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
     )
     links["first_conflict"] = first_conflict[:-1]
     links["num_conflicts"] = np.diff(first_conflict)
+    ways = [_path(move, lane_row, lanes, points, AHEAD_M, AHEAD_M) for move in chosen.movements]
+    sweeps = _fill_sweeps(Movements(links, conflicts, ways))
     junctions, kinds = _junction_rows(nodes, links)
     junctions["unruled"][links["junction"][unruled]] = True
     detectors, phase_detectors = place_detectors(
@@ -129,6 +132,7 @@ def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
         edges=edges,
         links=links,
         conflicts=conflicts,
+        sweeps=sweeps,
         junctions=junctions,
         into=into,
         **signal_rows.arrays()._asdict(),
@@ -274,6 +278,19 @@ def _link_rows(
     return links
 
 
+def _fill_sweeps(movements: Movements) -> NDArray[np.void]:
+    """The SWEEP rows; what links say of them is filled."""
+    sweeps, first = sweep_rows(movements)
+    links = movements.links
+    links["first_sweep"], links["num_sweeps"] = first[:-1], np.diff(first)
+    links["swept_m"] = links["length_m"]
+    np.maximum.at(links["swept_m"], sweeps["foe"], sweeps["foe_leave_m"])
+    forks = np.bincount(links["from_lane"])[links["from_lane"]] > 1
+    links["swept_m"][forks] += SWEPT_BEYOND_M
+    links["swept_m"] = np.minimum(links["swept_m"], links["length_m"] + SWEPT_BEYOND_M)
+    return sweeps
+
+
 def _map_neighbors(lanes: NDArray[np.void], points: NDArray[np.void]) -> None:
     """Fill where the points of each lane lie on its neighbours, in driving order."""
     for row in lanes:
@@ -336,10 +353,12 @@ def _path(
     lanes: NDArray[np.void],
     points: NDArray[np.void],
     approach_m: float = 0.0,
+    beyond_m: float = 0.0,
 ) -> LinkPath | None:
     """The sampled path of a link along its chain of internal lanes.
 
-    It may begin `approach_m` before the junction, with places below zero.
+    It may begin `approach_m` before the junction, with places below zero, and end `beyond_m` behind
+    it.
     """
     if not movement.chain:
         return None
@@ -356,6 +375,13 @@ def _path(
         part = points[row["first_point"] : row["first_point"] + row["num_points"]]
         s.append(part["s"] + row["link_offset_m"])
         xyz.append(np.stack([part["x"], part["y"], part["z"]], axis=1))
+    if beyond_m > 0.0:
+        row = lanes[lane_row[id(movement.connection.getToLane())]]
+        part = points[row["first_point"] : row["first_point"] + row["num_points"]]
+        end = min(beyond_m, row["length_m"])
+        at = np.append(part["s"][(part["s"] > 0.0) & (part["s"] < end)], end)
+        s.append(at + s[-1][-1])
+        xyz.append(np.stack([np.interp(at, part["s"], part[axis]) for axis in "xyz"], axis=1))
     return sample_path(np.concatenate(s), np.concatenate(xyz))
 
 

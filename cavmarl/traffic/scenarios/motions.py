@@ -168,7 +168,8 @@ class Ride:
             if link < 0:
                 continue
             dist = line_m - u
-            behind = float(network.links["length_m"][link]) + 0.5 * length
+            row = network.links[link]
+            behind = float(max(row["length_m"], row["fork_m"], row["swept_m"])) + 0.5 * length
             if dist > reach or ahead == MAX_LINKS_AHEAD:
                 return
             if dist > -behind:

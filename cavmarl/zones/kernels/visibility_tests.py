@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays
-from cavmarl.core.records.rows import ENTER_REACH_M, FORK_BEYOND_M
+from cavmarl.core.records.rows import ENTER_REACH_M, SWEPT_BEYOND_M
 from cavmarl.driving.kernels.announcing import APPROACH_M
 from cavmarl.driving.kernels.junctions import EXIT_LOOK_M
 from cavmarl.driving.kernels.lane_choice import LOOK_BACK_M
@@ -254,6 +254,9 @@ def _find_lines(roads: RoadArrays, see_m: float, room: VisibilityScratch) -> Non
             first = roads.links[link]["first_conflict"]
             for c in range(first, first + roads.links[link]["num_conflicts"]):
                 room.foe[roads.conflicts[c]["foe"]] = True
+            first = roads.links[link]["first_sweep"]
+            for k in range(first, first + roads.links[link]["num_sweeps"]):
+                room.foe[roads.sweeps[k]["foe"]] = True
 
 
 @kernel
@@ -282,7 +285,7 @@ def _look_at_junctions(
         while roads.lanes[lane]["internal"]:
             _see(roads, lane, 0.0, roads.lanes[lane]["length_m"], looks)
             lane = roads.lanes[lane]["successor"]
-        _see(roads, lane, 0.0, FORK_BEYOND_M + half_m, looks)
+        _see(roads, lane, 0.0, SWEPT_BEYOND_M + half_m, looks)
         if room.asked[link] and row["num_conflicts"] > 0:
             room.beyond[lane] = 0.0
         if room.foe[link]:

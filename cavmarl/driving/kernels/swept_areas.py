@@ -1,0 +1,163 @@
+"""Swept areas: where a long vehicle in a bend, or one beside it, has to wait for the other.
+
+No right of way says who goes first there. A vehicle that is in the area does; of two before it the
+one that is further along, unless something else holds it. What it waits for is no reason for others
+to let it pass: a driver that gives way to it goes on.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.numba import inlined_kernel, kernel
+from cavmarl.core.records.arrays import RoadArrays, Scratch
+from cavmarl.core.records.codes import HOLD_NONE, MODEL_KRAUSS
+from cavmarl.core.records.rows import SIZE_LENGTHS_M
+from cavmarl.driving.kernels.announcing import APPROACH_STANDING_M, STANDING_MPS
+from cavmarl.driving.kernels.following import before_line, behind, no_press
+
+VAN_M, BUS_M = SIZE_LENGTHS_M
+EASY_STOP = 2.0  # m/s², of one that needs more to stop before the area it is said that it comes;
+HARD_STOP = 3.5  # one that needs more goes first
+SOON_M = 3.5  # one that is so near to the area may be in it at once
+LONG_FORK_M = 6.0  # how much further long vehicles need to be clear of one another at a fork
+GIVE_UP_S = 60.0  # who has stood so long goes on, whatever is in the area
+
+
+@inlined_kernel
+def _size(half: float) -> int:
+    return int(2.0 * half > VAN_M) + int(2.0 * half > BUS_M)
+
+
+@kernel
+def swept_stop(
+    roads: RoadArrays,
+    rows: NDArray[np.void],  # VEHICLE (C,)
+    i: int,  # the row that asks
+    link: int,  # that it is on, or takes next
+    place: float,  # of its front, m beyond its stop line
+    held: bool,  # whether it has to stop at that line anyway
+    scratch: Scratch,
+) -> float:
+    """How far beyond the stop line row i's front may go, in m; inf where nothing is in the way."""
+    row = rows[i]
+    size = _size(0.5 * row["length"])
+    stop = math.inf
+    first = roads.links[link]["first_sweep"]
+    for k in range(first, first + roads.links[link]["num_sweeps"]):
+        sweep = roads.sweeps[k]
+        if sweep["own"] != size or place - row["length"] > sweep["leave_m"]:
+            continue
+        for n in range(scratch.link_start[sweep["foe"]], scratch.link_end[sweep["foe"]]):
+            foe = scratch.approach[n]
+            if foe["row"] == i or _size(foe["half"]) != sweep["other"]:
+                continue
+            if _is_in_the_way(rows, row, foe, sweep, place, held):
+                # One that is in the area, too, stops where it is. Behind one that stands, a driver
+                # waits before the junction: on it, the other might have to wait for it.
+                stop = min(stop, max(sweep["enter_m"], place))
+                if place <= 0.0 and foe["speed"] <= STANDING_MPS:
+                    stop = min(stop, 0.0)
+    return stop
+
+
+@inlined_kernel
+def _is_in_the_way(
+    rows: NDArray[np.void], row: np.void, foe: np.void, sweep: np.void, place: float, held: bool
+) -> bool:
+    """Whether a row whose front is at `place` has to wait for one APPROACH."""
+    foe_place = foe["half"] - foe["dist"]
+    if foe_place - 2.0 * foe["half"] > sweep["foe_leave_m"] or row["wait_s"] > GIVE_UP_S:
+        return False
+    inside = place > sweep["enter_m"]
+    foe_inside = foe_place > sweep["foe_enter_m"]
+    if foe_inside and not inside:
+        return True
+    if inside and not foe_inside:
+        return False
+    if held and not inside and foe_place > -APPROACH_STANDING_M:
+        return True  # it loses nothing if it leaves room
+    if rows[foe["row"]]["hold"] != HOLD_NONE:
+        return False
+    if inside:
+        return _is_ahead(foe, foe_place, row, place)
+    to_area = sweep["foe_enter_m"] - foe_place
+    own_to_area = sweep["enter_m"] - place
+    if _needs(foe["speed"], to_area, HARD_STOP) and not _needs(
+        row["speed"], own_to_area, HARD_STOP
+    ):
+        return True
+    soon = to_area < SOON_M or _needs(foe["speed"], to_area, EASY_STOP)
+    return soon and _is_ahead(foe, foe_place, row, place)
+
+
+@inlined_kernel
+def _needs(speed: float, distance: float, decel: float) -> bool:
+    """Whether stopping within a distance takes harder braking."""
+    needs: bool = speed * speed > 2.0 * decel * distance
+    return needs
+
+
+@inlined_kernel
+def _is_ahead(foe: np.void, foe_place: float, row: np.void, place: float) -> bool:
+    ahead: bool = foe_place > place or (foe_place == place and foe["id"] < row["id"])
+    return ahead
+
+
+@inlined_kernel
+def before_swept(
+    roads: RoadArrays,
+    rows: NDArray[np.void],
+    i: int,
+    kind: np.void,
+    link: int,
+    front: float,
+    dt: float,
+    scratch: Scratch,
+) -> float:
+    """How a swept area presses row i, whose front is `front` m before the stop line of a link."""
+    if roads.links[link]["num_sweeps"] == 0:
+        return no_press(kind)
+    stop = swept_stop(roads, rows, i, link, -front, False, scratch)
+    return (
+        no_press(kind) if stop == math.inf else before_line_gently(kind, rows[i], stop + front, dt)
+    )
+
+
+@inlined_kernel
+def before_line_gently(kind: np.void, row: np.void, gap: float, dt: float) -> float:
+    """How a line presses before which nobody has to brake harder than those behind can."""
+    press = before_line(kind, row["speed"], gap, dt)
+    if kind["model"] == MODEL_KRAUSS:
+        return float(min(press, kind["decel"] * dt - row["speed"]))
+    return float(min(press, kind["accel"] + kind["decel"]))
+
+
+@kernel
+def behind_fork(
+    roads: RoadArrays,
+    kind: np.void,
+    row: np.void,
+    lane: int,
+    chosen: int,
+    distance: float,
+    scratch: Scratch,
+) -> float:
+    """How vehicles press that have just turned off from the same lane into another link."""
+    press = no_press(kind)
+    first = roads.lanes[lane]["first_link"]
+    for link in range(first, first + roads.lanes[lane]["num_links"]):
+        if link == chosen:
+            continue
+        for k in range(scratch.link_start[link], scratch.link_end[link]):
+            other = scratch.approach[k]
+            place = -other["dist"]
+            longest = max(row["length"], 2.0 * other["half"])
+            fork_m = roads.links[link]["fork_m"] + (LONG_FORK_M if longest > VAN_M else 0.0)
+            if place > max(-distance, 0.0) and place - other["half"] < fork_m:
+                gap = distance + place - 0.5 * row["length"] - other["half"]
+                press = max(press, behind(kind, row["speed"], gap, other["speed"], kind["decel"]))
+    return press

@@ -1,0 +1,71 @@
+"""Where bodies on two paths touch: the hull of all pairs of places at which they overlap."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.math.geometry import boxes_overlap
+from cavmarl.core.numba import inlined_kernel, kernel
+
+
+@kernel
+def swept_range(
+    mine: NDArray[np.float64],
+    theirs: NDArray[np.float64],
+    own: tuple[float, float, float],
+    other: tuple[float, float, float],
+    level_m: float,
+    foes: bool,
+) -> tuple[float, float, float, float]:
+    """The first and last place of each centre at which two bodies touch; none: inf first.
+
+    Args:
+        mine: (n, 6) place of the centre from the stop line, x, y, z, cosine and sine of the body.
+        theirs: (m, 6) the same of the other path.
+        own: half length and half width of the body in m, and the length of its path.
+        other: the same of the other one.
+        level_m: bodies that differ more in height do not touch.
+        foes: whether a conflict keeps them apart on the junction: only pairs count of which one
+            stands before its line or has left.
+    """
+    first, last = math.inf, -math.inf
+    foe_first, foe_last = math.inf, -math.inf
+    reach = math.hypot(own[0], own[1]) + math.hypot(other[0], other[1])
+    for i in range(mine.shape[0]):
+        s = mine[i, 0]
+        for j in range(theirs.shape[0]):
+            dx = mine[i, 1] - theirs[j, 1]
+            dy = mine[i, 2] - theirs[j, 2]
+            if dx * dx + dy * dy > reach * reach or abs(mine[i, 3] - theirs[j, 3]) > level_m:
+                continue
+            foe_s = theirs[j, 0]
+            on, foe_on = _is_on(s, own), _is_on(foe_s, other)
+            if (foes and on and foe_on) or not (on or foe_on):
+                continue
+            if boxes_overlap(
+                mine[i, 1],
+                mine[i, 2],
+                mine[i, 4],
+                mine[i, 5],
+                own[0],
+                own[1],
+                theirs[j, 1],
+                theirs[j, 2],
+                theirs[j, 4],
+                theirs[j, 5],
+                other[0],
+                other[1],
+            ):
+                first, last = min(first, s), max(last, s)
+                foe_first, foe_last = min(foe_first, foe_s), max(foe_last, foe_s)
+    return first, last, foe_first, foe_last
+
+
+@inlined_kernel
+def _is_on(s: float, body: tuple[float, float, float]) -> bool:
+    """Whether a body at place `s` reaches over its junction."""
+    on: bool = s + body[0] > 0.0 and s - body[0] < body[2]
+    return on

@@ -1,0 +1,157 @@
+"""Where vehicles on two movements over a junction would touch that no conflict keeps apart.
+
+Conflicts are those of cars between two stop lines. A bus in a bend cuts it, over lanes beside it,
+over those that wait at the next line, and over those that have just left the junction; so for each
+pair of sizes the bodies are laid along both ways, some metres before and behind the junction, too.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.records.rows import SIZE_LENGTHS_M
+from cavmarl.roads.kernels.swept_range import swept_range
+from cavmarl.roads.network import SWEEP
+from cavmarl.roads.sumo_net.conflicts import CLEARANCE_M, LinkPath
+
+# Half length and half width of the bodies of each size class, with a margin: a car, a van or truck,
+# a bus. A vehicle counts as the next longer one.
+BODIES = ((2.55, 0.95), (3.8, 1.25), (6.1, 1.3))
+STEP_M = 0.5
+BEFORE_M = 10.0  # of the front to its line, and
+BEYOND_M = 4.0  # of the rear behind the junction: where bodies are asked about
+MARGIN_M = STEP_M
+TURNAROUND = ord("t")
+AHEAD_M = BEFORE_M + 2.0 * BODIES[-1][0]  # of a way that `along` has to know
+assert len(BODIES) == len(SIZE_LENGTHS_M) + 1
+
+
+class Movements(NamedTuple):
+    """What is asked of the links of a network, each array by LINK row."""
+
+    links: NDArray[np.void]  # LINK (K,), conflicts filled
+    conflicts: NDArray[np.void]  # CONFLICT
+    ways: Sequence[LinkPath | None]  # over the junction, with `AHEAD_M` of the lanes at its ends
+
+
+def sweep_rows(movements: Movements) -> tuple[NDArray[np.void], NDArray[np.int32]]:
+    """SWEEP rows of all links, and each link's first row with the end as last entry."""
+    by_junction: dict[int, list[int]] = defaultdict(list)
+    for link, way in enumerate(movements.ways):
+        if way is not None:
+            by_junction[int(movements.links["junction"][link])].append(link)
+    found: list[list[tuple[float, ...]]] = [[] for _ in movements.ways]
+    poses = {}
+    for links in by_junction.values():
+        for link in links:
+            way = movements.ways[link]
+            assert way is not None
+            length = float(movements.links["length_m"][link])
+            poses[link] = [_poses(way, half, length) for half, _ in BODIES]
+        for one, other in combinations(links, 2):
+            if movements.links["from_lane"][one] != movements.links["from_lane"][other]:
+                _find_pair(movements, one, other, poses, found)
+        for turn in links:
+            if movements.links["direction"][turn] == TURNAROUND:
+                _find_behind(movements, turn, links, poses, found)
+        poses.clear()
+    counts = [len(rows) for rows in found]
+    sweeps = np.zeros(sum(counts), SWEEP)
+    sweeps[:] = [row for rows in found for row in sorted(rows)]
+    return sweeps, np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+
+
+def _find_pair(
+    movements: Movements,
+    one: int,
+    other: int,
+    poses: dict[int, list[NDArray[np.float64]]],
+    found: list[list[tuple[float, ...]]],
+) -> None:
+    a, b = movements.links[one], movements.links[other]
+    if not _is_near(poses[one][0], poses[other][0]):
+        return
+    merging = a["to_lane"] == b["to_lane"]
+    own_foes = movements.conflicts["foe"][a["first_conflict"] :][: a["num_conflicts"]]
+    foes = bool((own_foes == other).any())
+    for own, (half, wide) in enumerate(BODIES):
+        for foe, (foe_half, foe_wide) in enumerate(BODIES):
+            mine, theirs = poses[one][own], poses[other][foe]
+            if merging:  # behind the junction one follows the other
+                mine = mine[mine[:, 0] <= a["length_m"]]
+                theirs = theirs[theirs[:, 0] <= b["length_m"]]
+            first, last, foe_first, foe_last = swept_range(
+                mine,
+                theirs,
+                (half, wide, float(a["length_m"])),
+                (foe_half, foe_wide, float(b["length_m"])),
+                CLEARANCE_M,
+                foes,
+            )
+            if first == np.inf:
+                continue
+            # In places of a front that comes and of a rear that leaves.
+            here = (first + half - MARGIN_M, last - half + MARGIN_M)
+            there = (foe_first + foe_half - MARGIN_M, foe_last - foe_half + MARGIN_M)
+            found[one].append((other, own, foe, *here, *there))
+            found[other].append((one, foe, own, *there, *here))
+
+
+def _find_behind(
+    movements: Movements,
+    turn: int,
+    links: Sequence[int],
+    poses: dict[int, list[NDArray[np.float64]]],
+    found: list[list[tuple[float, ...]]],
+) -> None:
+    """One that turns round comes back beside those that stand behind it."""
+    length = float(movements.links["length_m"][turn])
+    for foe, (foe_half, foe_wide) in enumerate(BODIES[1:], 1):
+        theirs = poses[turn][foe]
+        theirs = theirs[theirs[:, 0] >= foe_half]  # it has left their lane
+        for own, (half, wide) in enumerate(BODIES):
+            mine = poses[turn][own]
+            mine = mine[mine[:, 0] <= -half]
+            first, last, foe_first, foe_last = swept_range(
+                mine, theirs, (half, wide, 0.0), (foe_half, foe_wide, length), CLEARANCE_M, False
+            )
+            if first == np.inf:
+                continue
+            here = (first + half - MARGIN_M, last - half + MARGIN_M)
+            there = (foe_first + foe_half - MARGIN_M, foe_last - foe_half + MARGIN_M)
+            for link in links:
+                if movements.links["from_lane"][link] == movements.links["from_lane"][turn]:
+                    found[link].append((turn, own, foe, *here, *there))
+
+
+def _is_near(mine: NDArray[np.float64], theirs: NDArray[np.float64]) -> bool:
+    """Whether two ways come so near that bodies of any size might touch."""
+    apart = mine[::2, None, 1:3] - theirs[None, ::2, 1:3]
+    square = apart[..., 0] * apart[..., 0] + apart[..., 1] * apart[..., 1]
+    return bool(square.min() < 6.0 * 6.0)
+
+
+def _poses(way: LinkPath, half_m: float, length_m: float) -> NDArray[np.float64]:
+    """(n, 6) place of the centre, x, y, z, cosine and sine of bodies with both bumpers on a way."""
+    at = np.arange(-(BEFORE_M + half_m), length_m + BEYOND_M + half_m + STEP_M, STEP_M)
+    front, rear = _points(way, at + half_m), _points(way, at - half_m)
+    chord = front - rear
+    size = np.maximum(np.hypot(chord[:, 0], chord[:, 1]), 1e-6)
+    middle = 0.5 * (front + rear)
+    return np.column_stack([at, middle, chord[:, 0] / size, chord[:, 1] / size])
+
+
+def _points(way: LinkPath, at: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n, 3) places on a way, which goes on straight before and behind its ends."""
+    ends = np.concatenate([[way.s[0] - 100.0], way.s, [way.s[-1] + 100.0]])
+    first, last = way.xyz[1] - way.xyz[0], way.xyz[-1] - way.xyz[-2]
+    first = first / max(float(np.hypot(*first[:2])), 1e-6)
+    last = last / max(float(np.hypot(*last[:2])), 1e-6)
+    xyz = np.concatenate([[way.xyz[0] - 100.0 * first], way.xyz, [way.xyz[-1] + 100.0 * last]])
+    return np.stack([np.interp(at, ends, xyz[:, axis]) for axis in range(3)], axis=1)

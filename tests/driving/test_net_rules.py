@@ -1,0 +1,98 @@
+"""Rules of background drivers on small nets: yellow, minor lines, lane changes at a stand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cavmarl.core.records.codes import HOLD_NONE, HOLD_SIGNAL, MODEL_KRAUSS
+from cavmarl.driving.kernels.gaps import is_minor
+from cavmarl.driving.kernels.junctions import may_enter
+from cavmarl.driving.kernels.motion import move_background
+from cavmarl.engine.simulation import Simulation
+from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
+from cavmarl.roads.sumo_net.reader import read_network
+from tests.support.demand_worlds import make
+from tests.support.driving import drive, start
+from tests.support.netgenerate import netgenerate
+from tests.support.traffic import network as entry_network
+from tests.support.traffic import on_lane, scratch, travel
+
+GRID = ("--grid", "--grid.number=3", "--grid.length=100", "--no-turnarounds.except-deadend")
+CLOCK = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.1, "horizon_s": 120.0}
+ALONE = """<routes>
+  <vType id="car" sigma="0"/>
+  <vehicle id="one" type="car" depart="0" departSpeed="max" departLane="best">
+    <route edges="B0B1 B1B2"/></vehicle>
+</routes>"""
+
+
+def test_krauss_stops_for_yellow_where_its_brakes_are_enough() -> None:
+    roads = entry_network("grid4x4")
+    link = int(np.flatnonzero(roads.links["signal"] >= 0)[0])
+    yellow = SIGNAL_STATES.index("y")
+    states = np.array(roads.phase_states)
+    states[:] = yellow
+    arrays = roads.arrays._replace(phase_states=states)
+    phase = roads.signals["program"].astype(np.int32)
+    phase[:] = 0
+    lane = int(roads.links[link]["from_lane"])
+    length_m = float(roads.lanes["length_m"][lane])
+    room, decel = scratch(roads, 1), 4.5
+    types = np.array(travel("grid4x4").types)
+    types["model"], types["decel"] = MODEL_KRAUSS, decel
+    tables = travel("grid4x4")._replace(types=types)
+    back_m = float(roads.lanes["stop_back_m"][lane])
+    for needs, holds in ((0.9 * decel, HOLD_SIGNAL), (1.1 * decel, HOLD_NONE)):
+        front_m = 10.0**2 / (2.0 * needs)
+        row = on_lane(roads, lane, length_m - front_m - back_m - 2.5, speed=10.0, length=5.0)
+        distance = length_m - float(row["s"][0])
+        held = may_enter(arrays, tables, row, 0, link, distance, 0, phase, room)
+        assert held == holds
+
+
+def only(path: Path, routes: Path) -> Simulation:
+    """A world with the one vehicle of a file."""
+    world = make(path, [routes], overrides=CLOCK)
+    start(world, 1)
+    return world
+
+
+@pytest.mark.parametrize(("junctions", "slows"), [("priority", False), ("right_before_left", True)])
+def test_who_gives_way_can_stop_until_it_sees_the_others(
+    tmp_path: Path, junctions: str, slows: bool
+) -> None:
+    path = netgenerate(tmp_path / "net.net.xml", *GRID, "-j", junctions)
+    network = read_network(path)
+    minor = is_minor_to(network, "B0B1_0", "B1B2_0")
+    routes = tmp_path / "one.rou.xml"
+    routes.write_text(ALONE, encoding="utf-8")
+    world = only(path, routes)
+    slowest = np.inf
+    for _ in range(300):
+        drive(world)
+        rows = world.vehicles()
+        if rows.size:
+            slowest = min(slowest, float(rows["speed"].min()))
+    limit = float(network.lanes["speed_mps"].max())
+    assert minor == slows or junctions == "priority"
+    assert (slowest < 0.75 * limit) == minor
+    assert slowest > 1.0, "nobody comes: it need not stand"
+
+
+def is_minor_to(network: RoadNetwork, before: str, after: str) -> bool:
+    pair = (network.lane_ids.index(before), network.lane_ids.index(after))
+    links = network.links
+    link = np.flatnonzero((links["from_lane"] == pair[0]) & (links["to_lane"] == pair[1]))[0]
+    phase = np.zeros(max(len(network.signals), 1), np.int32)
+    return bool(is_minor(network.arrays, int(link), phase))
+
+
+@pytest.mark.parametrize(("speed", "sideways_mps"), [(0.0, 0.5), (1.0, 0.5), (10.0, 1.4)])
+def test_a_lane_change_goes_on_at_a_stand(speed: float, sideways_mps: float) -> None:
+    tables, roads = travel("grid4x4"), entry_network("grid4x4")
+    row = on_lane(roads, 0, 10.0, speed=speed, d=1.0)
+    move_background(roads.arrays, tables, row[0], tables.steps[0], 0.0, 0, 0.1)
+    assert row["d"][0] == pytest.approx(1.0 - 0.1 * sideways_mps)

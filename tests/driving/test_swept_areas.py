@@ -1,0 +1,140 @@
+"""Long vehicles in bends: where they sweep, who waits there, and that nothing touches them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cavmarl.core.records.codes import HOLD_NONE, HOLD_SIGNAL
+from cavmarl.driving.kernels.approach import APPROACH
+from cavmarl.driving.kernels.swept_areas import swept_stop
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.sumo_net.reader import read_network
+from tests.support.demand_worlds import make
+from tests.support.driving import drive, start
+from tests.support.netgenerate import netgenerate
+from tests.support.traffic import on_lane, scratch
+
+GRID = ("--grid", "--grid.number=3", "--grid.length=80", "--no-turnarounds.except-deadend")
+CLOCK = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.5}
+CAR, BUS = 0, 2  # size classes
+CAR_M, BUS_M = 5.0, 12.0
+CROWD = """<routes>
+  <vType id="bus" vClass="bus" length="12" width="2.5"/>
+  <vType id="car" length="5"/>
+  <flow id="turns" type="bus" from="A1B1" to="B1B0" begin="0" end="150" period="15"/>
+  <flow id="left" type="bus" from="B2B1" to="B1C1" begin="0" end="150" period="15"/>
+  <flow id="north" type="car" from="B0B1" to="B1B2" begin="0" end="150" period="5"/>
+  <flow id="west" type="car" from="C1B1" to="B1A1" begin="0" end="150" period="5"/>
+</routes>"""
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return netgenerate(tmp_path_factory.mktemp("swept") / "grid.net.xml", *GRID)
+
+
+@pytest.fixture(scope="module")
+def network(path: Path) -> RoadNetwork:
+    return read_network(path)
+
+
+def bus_over_a_line(network: RoadNetwork) -> tuple[int, np.void]:
+    """A link on which a bus sweeps over cars that wait at the line of another, and its row."""
+    for link, row in enumerate(network.links):
+        for sweep in network.sweeps[row["first_sweep"] :][: row["num_sweeps"]]:
+            over = sweep["own"] == BUS and sweep["other"] == CAR and sweep["foe_enter_m"] < -1.5
+            if over and sweep["enter_m"] > 1.0:
+                return link, sweep
+    raise AssertionError("no bus sweeps over a line")
+
+
+def test_each_sweep_is_known_from_both_sides(network: RoadNetwork) -> None:
+    own = np.repeat(np.arange(len(network.links)), network.links["num_sweeps"])
+    rows = {
+        (int(link), *(row[name].item() for name in network.sweeps.dtype.names or ()))
+        for link, row in zip(own, network.sweeps, strict=True)
+    }
+    assert len(rows) == len(network.sweeps) > 100
+    for link, foe, size, other, enter, leave, foe_enter, foe_leave in rows:
+        assert (foe, link, other, size, foe_enter, foe_leave, enter, leave) in rows
+
+
+def test_stop_lines_are_clear_of_cars_but_not_of_buses(network: RoadNetwork) -> None:
+    over = network.sweeps[network.sweeps["foe_enter_m"] < -1.0]
+    assert not ((over["own"] == CAR) & (over["other"] == CAR)).any()
+    assert ((over["own"] == BUS) & (over["other"] == CAR)).any()
+
+
+class Meeting:
+    """A bus before a link and a car before the line that it sweeps."""
+
+    def __init__(self, network: RoadNetwork) -> None:
+        self.network = network
+        self.link, self.sweep = bus_over_a_line(network)
+        lanes = [int(network.links[k]["from_lane"]) for k in (self.link, self.sweep["foe"])]
+        self.rows = np.concatenate(
+            [on_lane(network, lane, 30.0, id=k, length=length, hold=HOLD_NONE)
+             for k, (lane, length) in enumerate(zip(lanes, (BUS_M, CAR_M), strict=True))]
+        )  # fmt: skip
+
+    def stop(self, asks: int, places: tuple[float, float], held: bool = False) -> float:
+        """Where the front of one has to stop; `places`: of both fronts beyond their lines."""
+        room = scratch(self.network, 2)
+        other = 1 - asks
+        links = (self.link, int(self.sweep["foe"]))
+        entry = np.zeros(1, APPROACH)
+        half = 0.5 * self.rows["length"][other]
+        entry["link"], entry["row"], entry["id"], entry["half"] = links[other], other, other, half
+        entry["dist"], entry["speed"] = half - places[other], self.rows["speed"][other]
+        room.approach[0] = entry[0]
+        room.link_start[:] = room.link_end[:] = 0
+        room.link_end[links[other]] = 1
+        roads = self.network.arrays
+        return float(swept_stop(roads, self.rows, asks, links[asks], places[asks], held, room))
+
+
+def test_a_bus_waits_before_the_junction_for_a_car_that_stands_at_the_line(
+    network: RoadNetwork,
+) -> None:
+    meeting = Meeting(network)
+    assert meeting.stop(0, (-2.0, -1.0)) == 0.0
+    meeting.rows["speed"][1] = 3.0  # it goes: up to where it is in the way
+    assert meeting.stop(0, (-2.0, -1.0)) == meeting.sweep["enter_m"]
+    assert meeting.stop(0, (-2.0, 30.0)) == np.inf
+
+
+def test_a_car_that_has_to_stop_anyway_leaves_room_for_a_bus(network: RoadNetwork) -> None:
+    meeting = Meeting(network)
+    enter_m = meeting.sweep["foe_enter_m"]
+    meeting.rows["hold"][0] = HOLD_SIGNAL  # it waits for its green
+    assert meeting.stop(1, (-20.0, -12.0), held=True) == enter_m
+    assert meeting.stop(1, (-40.0, -12.0), held=True) == np.inf
+    assert meeting.stop(1, (-2.0, -12.0)) == np.inf, "it drives on where nothing stops it"
+
+
+def test_of_two_before_it_the_one_further_along_goes_first(network: RoadNetwork) -> None:
+    meeting = Meeting(network)
+    enter_m, bus_enter_m = meeting.sweep["foe_enter_m"], meeting.sweep["enter_m"]
+    places = (bus_enter_m - 1.0, enter_m - 1.0)
+    assert meeting.stop(1, places) == enter_m
+    assert meeting.stop(0, places) == np.inf
+    meeting.rows["speed"][1] = 15.0  # it cannot stop any more
+    assert meeting.stop(0, (bus_enter_m - 9.0, enter_m - 6.0)) == bus_enter_m
+
+
+def test_nothing_touches_buses_that_turn(path: Path, tmp_path: Path) -> None:
+    routes = tmp_path / "crowd.rou.xml"
+    routes.write_text(CROWD, encoding="utf-8")
+    world = make(path, [routes], overrides={"horizon_s": 200.0, **CLOCK})
+    start(world, 1)
+    touched = set()
+    for _ in range(360):
+        drive(world)
+        rows = world.vehicles()
+        touched |= set(rows["id"][rows["hit"] >= 0].tolist())
+    stats = world.traffic_stats()
+    assert not touched
+    assert stats.arrived > 40
