@@ -107,8 +107,6 @@ def verify_kills(
     if steps < kills + FIRST_STEPS:
         raise ConfigError(f"{steps} steps: {kills} kills need at least {kills + FIRST_STEPS}")
     worlds = 2 * workers if worlds is None else worlds
-    if hosts is not None and workers > worlds:
-        raise ConfigError(f"{workers} workers of {worlds} world(s) on Ray: use verify --nodes")
     wanted = {"num_envs": worlds, "zones": zones, **spec.keywords}
     whole = make_vec(spec.env, **wanted)
     parted = make_vec(spec.env, workers=workers, hosts=hosts, **wanted)
@@ -142,7 +140,8 @@ def verify_kills(
 
 
 def _pool(vec: CavVectorEnv) -> Pool | HostPool:
-    assert isinstance(vec.worlds, PooledWorlds | RemoteWorlds)
+    if not isinstance(vec.worlds, PooledWorlds | RemoteWorlds):
+        raise ConfigError("fewer worlds than workers on Ray: use verify --nodes, or more worlds")
     return vec.worlds.pool
 
 
