@@ -77,9 +77,10 @@ class KeptStates:
             for taker in takers:
                 self._links.send(taker, FrameKind.GIVE, generation, [data])
         for donor in donors:
+            check()
             while donor not in self._given or self._given[donor].number != generation:
-                check()
                 self._links.pump(None)
+                check()  # it may take what is awaited
             given = from_bytes(bytes(self._given.pop(donor).data), like)
             if saved is None:
                 saved = given
