@@ -42,8 +42,8 @@ def test_more_workers_than_cpus() -> None:
         ({"hosts": "ray"}, "without workers"),
         ({"workers": 0, "hosts": "ray"}, "without workers"),
         ({"workers": -1, "hosts": "ray"}, "workers = -1"),
-        ({"workers": 3, "hosts": "ray", "num_envs": 2}, "2 world.s. of 1 zone.s. each: more hosts"),
-        ({"workers": 5, "hosts": "ray", "zones": 4}, "1 world.s. of 4 .* at most as many as zones"),
+        ({"workers": 3, "hosts": "ray", "num_envs": 2}, "nodes = 3: a world of 1 zone"),
+        ({"workers": 5, "hosts": "ray", "zones": 4}, "nodes = 5: a world of 4 zone"),
         (
             {"workers": "ray", "sensor_workers": 1, "overrides": {"rig": "ten_sensors"}},
             "workers.sensors = 1, hosts = 'ray': sensor workers are on the machine",

@@ -9,6 +9,7 @@ import os
 import shutil
 import socket
 import subprocess
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -23,11 +24,11 @@ from tests.support.service import running_service
 
 
 @pytest.fixture(scope="module")
-def postgresql(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def postgresql() -> Iterator[str]:
     """URL of a real server that is started for these tests."""
     if shutil.which("initdb") is None or shutil.which("postgres") is None:
         pytest.skip("no PostgreSQL on this machine: initdb and postgres are not in the path")
-    folder = tmp_path_factory.mktemp("pg", numbered=True)
+    folder = Path(tempfile.mkdtemp(prefix="cavmarl-pg-"))  # where every user may go
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -35,8 +36,6 @@ def postgresql(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     prefix = user if os.geteuid() == 0 else []  # it does not run for root
     if prefix:
         os.chown(folder, 65534, 65534)
-        for parent in list(folder.parents)[:2]:
-            parent.chmod(0o755)
     data = folder / "data"
     words = ["initdb", "-D", str(data), "-U", "postgres", "-A", "trust", "--no-sync"]
     subprocess.run([*prefix, *words], check=True, capture_output=True)
@@ -45,6 +44,7 @@ def postgresql(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     subprocess.run([*server, "-o", options, "start"], check=True, capture_output=True)
     yield f"postgresql://postgres@127.0.0.1:{port}/postgres"
     subprocess.run([*server, "-m", "immediate", "stop"], check=False, capture_output=True)
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def history(where: str | Path) -> tuple[list[str], EventLog]:

@@ -33,7 +33,7 @@ def commands() -> list[str]:
 def test_the_page_s_session_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     said = {}
-    with running_service(tmp_path / "store.sqlite", "--beat-s", "0.2") as service:
+    with running_service(tmp_path / "store.sqlite", "--beat-s", "0.5") as service:
         monkeypatch.setenv("CAVMARL_SERVICE", service.url)
         monkeypatch.setenv("CAVMARL_SECRET", service.secret)
         cluster = Cluster(service)
@@ -65,7 +65,7 @@ def test_the_page_s_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.chdir(tmp_path)
     block = re.search(r"```python\n(.*?)```", PAGE, re.DOTALL)
     assert block
-    with running_service(tmp_path / "store.sqlite", "--beat-s", "0.2") as service:
+    with running_service(tmp_path / "store.sqlite", "--beat-s", "0.5") as service:
         cluster = Cluster(service)
         cluster.start("b")
         example = block[1].replace("http://127.0.0.1:8700", service.url)

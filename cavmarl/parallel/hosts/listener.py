@@ -250,6 +250,8 @@ def _encrypted(connection: socket.socket, place: tuple[str, int], secret: bytes)
         return encrypted(connection, secret, calls=True)
     except ssl.SSLCertVerificationError as error:
         raise _foreign(place) from error
+    except ssl.SSLEOFError as error:
+        raise EOFError(f"the process that listens at {place} has ended the connection") from error
     except ssl.SSLError as error:
         raise MessageError(
             f"what listens at {place[0]}:{place[1]} does not encrypt as cavmarl does: {error}"
