@@ -522,12 +522,17 @@ class EnvConfig(Section, key=""):
             f"traffic.source = {source}: a process that takes up a SUMO has to run it again from "
             "the beginning of the episode; leave it 0",
         )
-        _check(
-            not self.sensors.signal.timing,
-            "sensors.signal.timing",
-            True,
-            f"traffic.source = {source}: nobody knows when SUMO's signals change; leave it out",
-        )
+        way = self.sensors.way
+        for key, timed in (
+            ("sensors.signal.timing", self.sensors.signal.timing),
+            ("sensors.way.timing", way.timing and way.lines > 0),
+        ):
+            _check(
+                not timed,
+                key,
+                True,
+                f"traffic.source = {source}: nobody knows when SUMO's signals change; set it false",
+            )
         self.need(
             "scenario.name",
             not self.scenario.name,

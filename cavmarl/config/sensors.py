@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Annotated, Literal
 
 from cavmarl.config.checks import Section, Whole, Within, check, check_finite
@@ -264,6 +265,60 @@ class MessagesConfig(Section, key="sensors.messages"):
 
 
 @dataclass(frozen=True)
+class WayConfig(Section, key="sensors.way"):
+    """The way ahead by its shape, its lanes and the stop lines on it.
+
+    Attributes:
+        distances_m: at which places are told, rising; an empty list: none.
+        lines: next stop lines with a signal or a duty to give way that are told; 0: none.
+        range_m: how far ahead a line is seen.
+        timing: adds the time until a line's signal changes, as roadside units broadcast it.
+    """
+
+    distances_m: tuple[float, ...] = ()
+    lines: Annotated[int, Whole(0, 8)] = 0
+    range_m: Annotated[float, Within(1.0, 300.0)] = 100.0
+    timing: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        distances = self.distances_m
+        self.need(
+            "distances_m",
+            len(distances) <= 64
+            and all(0.5 <= distance <= 300.0 for distance in distances)
+            and all(a < b for a, b in pairwise(distances)),
+            "must be rising distances from 0.5 to 300, 64 at most",
+        )
+
+
+@dataclass(frozen=True)
+class ConflictsConfig(Section, key="sensors.conflicts"):
+    """The vehicles that come nearest to the own way, the soonest and nearest ones first.
+
+    Nothing of their plans is told: each is taken to go on as it goes, along its heading.
+
+    Attributes:
+        count: how many at most; 0 switches the sensor off.
+        range_m: distance up to which a vehicle is seen.
+    """
+
+    count: Annotated[int, Whole(0, 64)] = 0
+    range_m: Annotated[float, Within(1.0, 300.0)] = 60.0
+
+
+@dataclass(frozen=True)
+class HistoryConfig(Section, key="sensors.history"):
+    """What the vehicle was told to do, and its speeds.
+
+    Attributes:
+        steps: how many of the last ones; 0 switches the sensor off.
+    """
+
+    steps: Annotated[int, Whole(0, 64)] = 0
+
+
+@dataclass(frozen=True)
 class SensorsConfig(Section, key="sensors"):
     """The sensors of every agent; counts and ranges of 0 switch one off.
 
@@ -285,6 +340,9 @@ class SensorsConfig(Section, key="sensors"):
     lidar_observation: LidarObservationConfig = field(default_factory=LidarObservationConfig)
     roadgraph: RoadgraphConfig = field(default_factory=RoadgraphConfig)
     messages: MessagesConfig = field(default_factory=MessagesConfig)
+    way: WayConfig = field(default_factory=WayConfig)
+    conflicts: ConflictsConfig = field(default_factory=ConflictsConfig)
+    history: HistoryConfig = field(default_factory=HistoryConfig)
     registered: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -303,6 +361,10 @@ class SensorsConfig(Section, key="sensors"):
             self.messages.objects,
             self.messages.events,
             self.messages.signal,
+            len(self.way.distances_m),
+            self.way.lines,
+            self.conflicts.count,
+            self.history.steps,
             len(self.registered),
         )
         for name in self.registered:
@@ -323,6 +385,8 @@ class SensorsConfig(Section, key="sensors"):
             kinematics=replace(self.kinematics, vehicles_count=0),
             occupancy_grid=replace(self.occupancy_grid, features=()),
             lidar_observation=replace(self.lidar_observation, cells=0),
+            way=replace(self.way, lines=0),
+            conflicts=replace(self.conflicts, count=0),
             registered=(),
         )
 

@@ -36,6 +36,7 @@ from cavmarl.ownership.messages import Switch
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.mounted.frames import Frames
+from cavmarl.sensors.observed import carried_from
 from cavmarl.shards.executor import Executor, SerialExecutor, Together
 from cavmarl.shards.shard import Commands, Shard
 from cavmarl.traffic.demand import DemandFile
@@ -405,7 +406,7 @@ class Simulation(WorldViews):
             traffic=tick.traffic,
             outputs=self.outputs,
             coordination=tick.coordination,
-            has_frames=self.config.sensors.stack > 1,
+            has_past=carried_from(self.config.sensors) < self.outputs.observations.shape[2],
             attached=tick.attached,
             sumo=tick.sumo,
         )

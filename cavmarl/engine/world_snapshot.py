@@ -34,7 +34,7 @@ class Parts(NamedTuple):
     traffic: NativeTraffic  # what comes
     outputs: Outputs  # what agents have got; the frames of the next observation, too
     coordination: Coordination | None  # decides ownership; None: all is one zone
-    has_frames: bool  # an observation has frames of the ones before
+    has_past: bool  # an observation takes something from the one before
     attached: tuple[Attached, ...]  # what acts in each tick beside the traffic
     sumo: SumoTraffic | None  # beside the worlds; None: there is none
 
@@ -151,7 +151,7 @@ def _fixed(parts: Parts) -> Iterator[Array]:
     yield from arrays_of(parts.worlds, Common, Use.SAVED)
     yield from arrays_of(parts.gate, Gate, Use.SAVED)
     for array in arrays_of(parts.outputs, Outputs, Use.SAVED):
-        if array is not parts.outputs.observations or parts.has_frames:
+        if array is not parts.outputs.observations or parts.has_past:
             yield array
     for part in parts.attached:
         yield from part.arrays()

@@ -14,7 +14,7 @@ from cavmarl.ownership.distances import Distances, check_coverage, needed_overla
 from cavmarl.ownership.limits import DeadlinePolicy, Limits
 from cavmarl.rewards.registered_terms import terms_reach_m
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.sensors.observed import largest_radius_m, sensing_reach_m
+from cavmarl.sensors.observed import carried_from, largest_radius_m, sensing_reach_m
 from cavmarl.sensors.registry import rig_reach_m
 from cavmarl.shards.shard import Shard, make_zoned
 from cavmarl.shards.vehicle_codec import TransferCodec
@@ -89,7 +89,7 @@ def divide(
         sight=sight,
         touching_m=touching_m,
         borders=Borders(settings.hysteresis_m, settings.approach_ticks * dt, MAX_SPEED_MPS),
-        codec=TransferCodec.of(shards[0].worlds, outputs, config.sensors.stack),
+        codec=TransferCodec.of(shards[0].worlds, outputs, carried_from(config.sensors)),
     )
     return shards, division
 

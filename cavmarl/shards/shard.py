@@ -182,16 +182,11 @@ class Shard:
         """
         observations, stack = self.outputs.observations, self.config.sensors.stack
         if self._further is not None:
+            clock = self.config.clock
             self._call_observe_further(
-                self.roads,
-                self.lane_grid,
-                self.worlds,
-                self.grid,
-                self._further,
-                stack,
-                chosen,
-                observations,
-            )
+                self.roads, self.travel, self.lane_grid, self.worlds, self.grid, self._further,
+                clock.sim_dt_s, clock.ticks_per_step, stack, chosen, observations,
+            )  # fmt: skip
         if self.mail is not None and self._messages_at is not None:
             messages = self.config.sensors.messages
             self._call_observe_messages(

@@ -101,10 +101,9 @@ class TransferCodec:
         self.schema = int.from_bytes(blake2b(same, digest_size=8).digest()) >> 1
 
     @classmethod
-    def of(cls, worlds: Worlds, outputs: Outputs, stack: int) -> TransferCodec:
-        """The codec of a shard's worlds, whose observations hold `stack` frames."""
-        oldest = outputs.observations.shape[2] // stack
-        return cls(worlds.rows.dtype, worlds.pending, outputs.observations[:, :, oldest:])
+    def of(cls, worlds: Worlds, outputs: Outputs, carried_from: int) -> TransferCodec:
+        """The codec of a shard's worlds; `carried_from` is that of `sensors.observed`."""
+        return cls(worlds.rows.dtype, worlds.pending, outputs.observations[:, :, carried_from:])
 
     def pack(
         self,

@@ -38,6 +38,10 @@ EVERYTHING = {
     "sensors.occupancy_grid.features": ["presence", "vx", "long_off", "heading", "on_road"],
     "sensors.lidar_observation.cells": 16,
     "sensors.roadgraph.points": 50,
+    "sensors.way.distances_m": [5.0, 20.0, 60.0],
+    "sensors.way.lines": 2,
+    "sensors.conflicts.count": 5,
+    "sensors.history.steps": 3,
     "sensors.stack": 3,
 }
 IMAGE = {**EVERYTHING, "sensors.occupancy_grid.as_image": True}
@@ -78,6 +82,9 @@ def wild(env: Any, rng: np.random.Generator) -> dict[str, Any]:
         ("occupancy_grid.features", ["presence"]),
         ("lidar_observation.cells", 8),
         ("roadgraph.points", 8),
+        ("way.lines", 2),
+        ("conflicts.count", 3),
+        ("history.steps", 2),
     ],
 )
 def test_any_one_sensor_is_enough(key: str, value: object) -> None:

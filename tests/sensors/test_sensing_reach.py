@@ -54,8 +54,11 @@ ON: dict[str, dict[str, Any]] = {
         "sensors.lidar_observation.maximum_range_m": 75.0,
     },
     "roadgraph": {"sensors.roadgraph.points": 20},
+    "way": {"sensors.way.distances_m": [5.0, 40.0], "sensors.way.lines": 2},
+    "conflicts": {"sensors.conflicts.count": 6, "sensors.conflicts.range_m": 70.0},
+    "history": {"sensors.history.steps": 2},
 }
-BLIND = {"route", "signal", "roadgraph"}  # look at no vehicle
+BLIND = {"route", "signal", "roadgraph", "way", "history"}  # look at no vehicle
 # Shows an inbox, which one bus fills for all zones, however far away senders are (tests/v2x).
 TOLD = {"messages"}
 

@@ -22,6 +22,7 @@ from cavmarl.core.errors import (
 from cavmarl.driving.vehicles import RECORD_VERSION, VEHICLE
 from cavmarl.engine.simulation import Simulation
 from cavmarl.shards.shard import Commands
+from cavmarl.sensors.observed import carried_from
 from cavmarl.shards.vehicle_codec import GROUPS, TransferCodec, layout_text
 from tests.support.demand_worlds import make
 from tests.support.driving import idle, make_simulation, start, suggested
@@ -33,8 +34,8 @@ SCRIBBLE = 0xAB
 
 
 def codec_of(simulation: Simulation) -> TransferCodec:
-    stack = simulation.config.sensors.stack
-    return TransferCodec.of(simulation._shard.worlds, simulation.outputs, stack)
+    carried = carried_from(simulation.config.sensors)
+    return TransferCodec.of(simulation._shard.worlds, simulation.outputs, carried)
 
 
 # Whole worlds

@@ -218,6 +218,8 @@ class Sensors(NamedTuple):
     near_body: NDArray[np.int32]  # (neighbors,) room
     near_squared: NDArray[np.float64]
     echoes: NDArray[np.void]  # ECHO (lidar_rays,) room
+    history_at: int
+    history: int  # numbers of the frame before that stay in the next one
 
 
 class Outputs(NamedTuple):

@@ -1,4 +1,4 @@
-"""The sensors that most environments leave off: highway-env's, and road points."""
+"""The sensors that most environments leave off: highway-env's, road points, those for any map."""
 
 from __future__ import annotations
 
@@ -7,23 +7,29 @@ from numpy.typing import NDArray
 
 from cavmarl.core.math.neighbors import Grid, fill_grid
 from cavmarl.core.numba import kernel
-from cavmarl.core.records.arrays import LaneGrid, RoadArrays, Worlds
+from cavmarl.core.records.arrays import LaneGrid, RoadArrays, Travel, Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.sensors.kernels.kinematics_observation import observe_kinematics
 from cavmarl.sensors.kernels.lidar_cells import observe_lidar_cells
 from cavmarl.sensors.kernels.nearest_road_points import observe_roadgraph
+from cavmarl.sensors.kernels.observing_conflicts import observe_conflicts
+from cavmarl.sensors.kernels.observing_history import observe_history
+from cavmarl.sensors.kernels.observing_way import observe_way
 from cavmarl.sensors.kernels.occupancy import observe_occupancy
-from cavmarl.sensors.kernels.output_reset import newest_frame
+from cavmarl.sensors.kernels.output_reset import has_entered, newest_frame
 from cavmarl.sensors.kernels.sensor_arrays import OptionalSensors
 
 
 @kernel
 def observe_optional(
     roads: RoadArrays,
+    travel: Travel,
     lane_grid: LaneGrid,
     worlds: Worlds,
     grid: Grid,
     further: OptionalSensors,
+    tick_s: float,
+    ticks_per_step: int,
     stack: int,
     chosen: NDArray[np.bool_],
     observations: NDArray[np.float32],
@@ -33,7 +39,7 @@ def observe_optional(
     `further`: settings and room; sensors that are off write nothing. `observations`: (W, A, D), the
     parts 0 before.
     """
-    kinematics, occupancy, lidar_cells, roadgraph = further
+    kinematics, occupancy, lidar_cells, roadgraph, path, conflicts, history = further
     for w in range(chosen.size):
         if not chosen[w]:
             continue
@@ -56,3 +62,13 @@ def observe_optional(
                 observe_lidar_cells(rows, i, grid, lidar_cells, out)
             if roadgraph.num_points > 0:
                 observe_roadgraph(row, roadgraph, out)
+            phase = worlds.signal_phase[w]
+            if path.distances_m.size > 0 or path.lines > 0:
+                time = worlds.ticks[w] * tick_s
+                controllers = worlds.controllers[w]
+                observe_way(roads, travel, controllers, row, phase, time, tick_s, path, out)
+            if conflicts.count > 0:
+                observe_conflicts(roads, travel, rows, i, grid, phase, conflicts, out)
+            if history.size > 0:
+                entered = has_entered(row, ticks_per_step)
+                observe_history(row, entered, history.at, history.size, out)

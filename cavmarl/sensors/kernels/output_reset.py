@@ -3,9 +3,9 @@
 The order at the end of a step: `clear_outputs`, `sense` of every shard, `settle_outputs`, `credit`
 of every shard. Sums go in agent order, so that results do not depend on which shard wrote what.
 
-Observations can hold the last few frames, one after the other, oldest first. The frames of an agent
-stand in the output arrays at its index and nowhere else, so a carrier of the outputs of an agent
-carries its past.
+Observations can hold the last few frames, one after the other, oldest first, and in each frame what
+the vehicle did before. That of an agent stands in the output arrays at its index and nowhere else,
+so a carrier of the outputs of an agent carries its past.
 """
 
 from __future__ import annotations
@@ -30,12 +30,14 @@ def newest_frame(observation: NDArray[np.float32], stack: int) -> int:
 
 
 @kernel
-def shift_frames(observation: NDArray[np.float32], stack: int) -> None:
+def shift_frames(observation: NDArray[np.float32], stack: int, kept_at: int, kept: int) -> None:
+    """Move the frames up and clear the newest, but for `kept` numbers from `kept_at` on."""
     newest = newest_frame(observation, stack)
     size = observation.size - newest
     for k in range(newest):
         observation[k] = observation[k + size]
-    observation[newest:] = 0.0
+    observation[newest : newest + kept_at] = 0.0
+    observation[newest + kept_at + kept :] = 0.0
 
 
 @kernel

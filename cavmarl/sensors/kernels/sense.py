@@ -52,12 +52,12 @@ SLOWEST_MPS = 1.0  # a standing vehicle is taken to come on with
 
 
 @kernel
-def _unit(value: float) -> float:
+def unit(value: float) -> float:
     return clamp(value, -1.0, 1.0)
 
 
 @kernel
-def _soonness(time: float) -> float:
+def soonness(time: float) -> float:
     """1 now, 0.5 in `HALF_S`, 0 in a long time: seconds count where they are few."""
     return HALF_S / (HALF_S + time)
 
@@ -73,19 +73,19 @@ def observe_ego(
         roads.points, lane["first_point"], lane["num_points"], row["s"]
     )
     error = wrap_angle(row["heading"] - math.atan2(sin, cos))
-    out[0] = _unit(row["speed"] / SPEED_SCALE)
-    out[1] = _unit(row["accel"] / ACCEL_SCALE)
-    out[2] = _unit(row["steering"] / STEERING_SCALE)
-    out[3] = _unit(row["yaw_rate"] / YAW_SCALE)
-    out[4] = _unit(row["d"] / OFFSET_SCALE)
+    out[0] = unit(row["speed"] / SPEED_SCALE)
+    out[1] = unit(row["accel"] / ACCEL_SCALE)
+    out[2] = unit(row["steering"] / STEERING_SCALE)
+    out[3] = unit(row["yaw_rate"] / YAW_SCALE)
+    out[4] = unit(row["d"] / OFFSET_SCALE)
     out[5] = error / math.pi
-    out[6] = _unit(lane["speed_mps"] / SPEED_SCALE)
+    out[6] = unit(lane["speed_mps"] / SPEED_SCALE)
     out[7] = 1.0 if lane["left"] >= 0 else 0.0
     out[8] = 1.0 if lane["right"] >= 0 else 0.0
     out[9] = step["change"]
-    out[10] = _unit(max(step["room"] - row["s"], 0.0) / ROOM_SCALE)
-    out[11] = _unit(max(row["to_go"], 0.0) / TO_GO_SCALE)
-    out[12] = _unit(row["target_speed"] / SPEED_SCALE)
+    out[10] = unit(max(step["room"] - row["s"], 0.0) / ROOM_SCALE)
+    out[11] = unit(max(row["to_go"], 0.0) / TO_GO_SCALE)
+    out[12] = unit(row["target_speed"] / SPEED_SCALE)
 
 
 @kernel
@@ -116,8 +116,8 @@ def observe_route(
         dx = x - row["x"]
         dy = y - row["y"]
         at = sensors.route_at + 2 * k
-        out[at] = _unit((dx * cos_heading + dy * sin_heading) / scale)
-        out[at + 1] = _unit((dy * cos_heading - dx * sin_heading) / scale)
+        out[at] = unit((dx * cos_heading + dy * sin_heading) / scale)
+        out[at + 1] = unit((dy * cos_heading - dx * sin_heading) / scale)
 
 
 @kernel
@@ -153,14 +153,14 @@ def observe_neighbors(
         out[at] = 1.0
         out[at + 1] = (dx * cos_heading + dy * sin_heading) / sensors.neighbors_range_m
         out[at + 2] = (dy * cos_heading - dx * sin_heading) / sensors.neighbors_range_m
-        out[at + 3] = _unit((dvx * cos_heading + dvy * sin_heading) / SPEED_SCALE)
-        out[at + 4] = _unit((dvy * cos_heading - dvx * sin_heading) / SPEED_SCALE)
-        out[at + 5] = _unit(cos_other * cos_heading + sin_other * sin_heading)
-        out[at + 6] = _unit(sin_other * cos_heading - cos_other * sin_heading)
+        out[at + 3] = unit((dvx * cos_heading + dvy * sin_heading) / SPEED_SCALE)
+        out[at + 4] = unit((dvy * cos_heading - dvx * sin_heading) / SPEED_SCALE)
+        out[at + 5] = unit(cos_other * cos_heading + sin_other * sin_heading)
+        out[at + 6] = unit(sin_other * cos_heading - cos_other * sin_heading)
 
 
 @kernel
-def _gives_way(roads: RoadArrays, link: int, signal: int) -> bool:
+def gives_way_on(roads: RoadArrays, link: int, signal: int) -> bool:
     """Whether a driver on this link has to give way to some other link now."""
     if signal == SIGNAL_GREEN_MAJOR or signal == SIGNAL_OFF:
         return False
@@ -197,7 +197,7 @@ def observe_signal(
             return
         if step["link"] >= 0:
             signal = link_signal(roads, step["link"], phase)
-            gives_way = _gives_way(roads, step["link"], signal)
+            gives_way = gives_way_on(roads, step["link"], signal)
             if signal != SIGNAL_NONE or gives_way:
                 break
         lane = step["next"]
@@ -212,8 +212,8 @@ def observe_signal(
     out[at + 5] = 1.0 if gives_way else 0.0
     if sensors.signal_timing and signal != SIGNAL_NONE:
         change = time_to_change(roads, controllers, step["link"], phase, time, tick_s)
-        out[at + 6] = _soonness(change)
-        out[at + 7] = _soonness(max(distance, 0.0) / max(row["speed"], SLOWEST_MPS))
+        out[at + 6] = soonness(change)
+        out[at + 7] = soonness(max(distance, 0.0) / max(row["speed"], SLOWEST_MPS))
 
 
 @kernel
@@ -234,7 +234,7 @@ def observe_lidar(
             continue
         out[at + k] = echo["distance"] / sensors.lidar_range_m
         if sensors.lidar_speeds:
-            out[at + rays + k] = _unit(echo["speed"] / SPEED_SCALE)
+            out[at + rays + k] = unit(echo["speed"] / SPEED_SCALE)
 
 
 @kernel
@@ -274,7 +274,7 @@ def sense(
                 is_filled = True
             agent = row["agent"]
             seen = outputs.observations[w, agent]
-            shift_frames(seen, sensors.stack)
+            shift_frames(seen, sensors.stack, sensors.history_at, sensors.history)
             out = seen[newest_frame(seen, sensors.stack) :]
             if sensors.ego:
                 observe_ego(roads, plans, row, out)

@@ -10,6 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.records import record
+
 
 class KinematicsSensor(NamedTuple):
     """highway-env's `Kinematics`: see `kernels.kinematics_observation`."""
@@ -88,6 +90,41 @@ class RoadgraphSensor(NamedTuple):
     ring_start: NDArray[np.int64]  # (NUM_RINGS + 1,) room
 
 
+RANKED = record(
+    ("counts", np.float64),  # m, what it is ranked by
+    ("near", np.float64),  # m, the gap of its approach
+    ("when", np.float64),  # s until then
+    ("body", np.int64),  # position in `Grid.bodies`
+)
+
+
+class WaySensor(NamedTuple):
+    """The way ahead: see `kernels.observing_way`."""
+
+    at: int
+    distances_m: NDArray[np.float64]  # (P,) of the places that are told, rising
+    lines: int  # stop lines that are told
+    range_m: float  # up to where
+    timing: bool
+
+
+class ConflictsSensor(NamedTuple):
+    """Vehicles that come near the own way: see `kernels.observing_conflicts`."""
+
+    at: int
+    count: int  # 0: off
+    range_m: float
+    looks: NDArray[np.float64]  # (NUM_LOOKS, 4) room
+    ranked: NDArray[np.void]  # RANKED (count,) room
+
+
+class HistorySensor(NamedTuple):
+    """What the vehicle did before: see `kernels.observing_history`."""
+
+    at: int
+    size: int  # numbers; 0: off
+
+
 class OptionalSensors(NamedTuple):
     """All of them; apart from `arrays.Sensors`, so that `sense` need not unpack what is off."""
 
@@ -95,3 +132,6 @@ class OptionalSensors(NamedTuple):
     occupancy: OccupancyGrid
     lidar_cells: LidarCells
     roadgraph: RoadgraphSensor
+    way: WaySensor
+    conflicts: ConflictsSensor
+    history: HistorySensor

@@ -19,7 +19,7 @@ from cavmarl.sensors.kernels.lidar_fan import ECHO, ray_directions
 from cavmarl.sensors.kernels.sensor_arrays import OptionalSensors
 from cavmarl.sensors.observed import ego_features as seen
 from cavmarl.sensors.observed import highway_kinematics as kinematics
-from cavmarl.sensors.observed import lidar_observation, occupancy_grid, roadgraph
+from cavmarl.sensors.observed import lidar_observation, occupancy_grid, roadgraph, way_features
 from cavmarl.sensors.observed.feature import Sensor
 from cavmarl.sensors.observed.highway import goal_places
 
@@ -48,10 +48,24 @@ SENSORS: tuple[Sensor, ...] = (
     ),
     Sensor("roadgraph", roadgraph.features, shape=roadgraph.shape),
     Sensor("messages", seen.messages),  # they come from the bus, which knows no zones
+    Sensor("way", way_features.way),
+    Sensor(
+        "conflicts",
+        way_features.conflicts,
+        lambda c: c.conflicts.range_m * (c.conflicts.count > 0),
+        way_features.conflicts_shape,
+    ),
+    # The last of the package: see `carried_from`.
+    Sensor("history", way_features.history, shape=way_features.history_shape),
 )
 
 # Those that `observe_optional` writes.
-FURTHER = frozenset(("kinematics", "occupancy_grid", "lidar_observation", "roadgraph"))
+FURTHER = frozenset(
+    (
+        "kinematics", "occupancy_grid", "lidar_observation", "roadgraph",
+        "way", "conflicts", "history",
+    )
+)  # fmt: skip
 
 
 def sensors_of(config: SensorsConfig) -> tuple[Sensor, ...]:
@@ -74,6 +88,17 @@ def layout(config: SensorsConfig) -> dict[str, slice]:
 def frame_size(config: SensorsConfig) -> int:
     """Numbers in one frame; a flat observation holds `config.stack` of them."""
     return sum(place.stop - place.start for place in layout(config).values())
+
+
+def carried_from(config: SensorsConfig) -> int:
+    """From where on an observation holds what the next one takes from it; its size: nothing.
+
+    What comes before is the oldest frame, or what is observed anew in every step.
+    """
+    if config.stack > 1:
+        return frame_size(config)
+    places = layout(config)
+    return places["history"].start if "history" in places else frame_size(config)
 
 
 def largest_radius_m(types: NDArray[np.void]) -> float:
@@ -110,6 +135,7 @@ def sensor_arrays(config: SensorsConfig) -> Sensors:
     """The settings and the room that `sense` takes."""
     places = layout(config)
     starts = _starts(config)
+    history = places.get("history", slice(0, 0))
     return Sensors(
         stack=config.stack,
         ego="ego" in places,
@@ -133,6 +159,8 @@ def sensor_arrays(config: SensorsConfig) -> Sensors:
         echoes=np.zeros(config.lidar.rays, dtype=ECHO),
         near_body=np.zeros(config.neighbors.count, dtype=np.int32),
         near_squared=np.zeros(config.neighbors.count, dtype=np.float64),
+        history_at=history.start,
+        history=history.stop - history.start,
     )
 
 
@@ -149,4 +177,7 @@ def optional_arrays(
         occupancy=occupancy_grid.settings(config, starts["occupancy_grid"], network, goals),
         lidar_cells=lidar_observation.settings(config, starts["lidar_observation"]),
         roadgraph=roadgraph.settings(config, starts["roadgraph"], network),
+        way=way_features.way_settings(config, starts["way"]),
+        conflicts=way_features.conflicts_settings(config, starts["conflicts"]),
+        history=way_features.history_settings(config, starts["history"]),
     )

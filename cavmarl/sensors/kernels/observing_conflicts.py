@@ -1,0 +1,240 @@
+"""What the `conflicts` sensor writes: the vehicles that come nearest to the own way.
+
+All are taken to go on as they go now: the others straight on along their headings, as nobody knows
+their plans, the own one along its way. At a few moments ahead the gap between the bodies is taken,
+as boxes along the own one; what comes nearest and soonest stands first. Right of way is that of the
+map: by the lane that the other is on, whichever way it takes from there.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.math.geometry import lane_pose
+from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
+from cavmarl.core.numba import kernel
+from cavmarl.core.records.arrays import RoadArrays, Travel
+from cavmarl.core.records.codes import SIGNAL_GREEN_MAJOR, SIGNAL_RED, SIGNAL_RED_YELLOW
+from cavmarl.core.records.rows import is_off_lanes
+from cavmarl.driving.kernels.gaps import link_signal
+from cavmarl.sensors.kernels.observing_way import MOST_LANES, goes_on
+from cavmarl.sensors.kernels.sensor_arrays import ConflictsSensor
+
+CONFLICT_FEATURES = 9
+NUM_LOOKS = 10  # moments that are looked at,
+LOOK_S = 0.5  # so far apart
+SLOWEST_MPS = 3.0  # the own vehicle is taken to go on with: one that stands wants to set off
+WAIT_MPS = 2.0  # so much nearer counts what comes a second sooner
+GAP_HALF_M = 2.0  # a gap of this length is a nearness of 0.5
+WHEN_HALF_S = 2.0  # a time of this length is a soonness of 0.5
+PLACE_HALF_M = 10.0  # a distance of this length is 0.5
+SPEED_HALF_MPS = 10.0  # a relative speed of this is 0.5
+
+
+@kernel
+def _bent(value: float, half: float) -> float:
+    """0.5 at `half`, towards 1 far beyond it, likewise below 0."""
+    return value / (half + abs(value))
+
+
+@kernel
+def _foresee(
+    roads: RoadArrays, travel: Travel, row: np.void, looks: NDArray[np.float64]
+) -> tuple[int, bool]:
+    """Write where the own vehicle will be, `looks` (NUM_LOOKS, 4): x, y, cos and sin.
+
+    Returns the link that it is on or comes to first within these, -1: none, and whether it is on
+    it.
+    """
+    looks[0, 0] = row["x"]
+    looks[0, 1] = row["y"]
+    looks[0, 2] = math.cos(row["heading"])
+    looks[0, 3] = math.sin(row["heading"])
+    stride = LOOK_S * max(row["speed"], SLOWEST_MPS)
+    lane, way = row["lane"], row["way"]
+    here = roads.lanes[lane]
+    crossed = here["link"] if here["internal"] else -1
+    is_on = crossed >= 0
+    start = -row["s"]
+    told = 1
+    for _ in range(MOST_LANES):
+        end = start + here["length_m"]
+        following, way_there, link = goes_on(roads, travel, lane, way)
+        while told < NUM_LOOKS and (told * stride <= end or following < 0):
+            x, y, _, cos, sin, _ = lane_pose(
+                roads.points, here["first_point"], here["num_points"], told * stride - start
+            )
+            looks[told, 0] = x
+            looks[told, 1] = y
+            looks[told, 2] = cos
+            looks[told, 3] = sin
+            told += 1
+        if crossed < 0 and link >= 0:
+            crossed = link
+        if told == NUM_LOOKS or following < 0:
+            break
+        lane, way, start = following, way_there, end
+        here = roads.lanes[lane]
+    # A way of very many short lanes: it is not looked at any further.
+    for k in range(told, NUM_LOOKS):
+        for axis in range(4):
+            looks[k, axis] = looks[told - 1, axis]
+    return crossed, is_on
+
+
+@kernel
+def _nearest_approach(
+    row: np.void, body: np.void, looks: NDArray[np.float64]
+) -> tuple[float, float]:
+    """The gap in m that counts most, between two boxes, and in how many seconds it is so.
+
+    The gap is the sum of those along and across the own vehicle.
+    """
+    half_length = 0.5 * row["length"]
+    half_width = 0.5 * row["width"]
+    best = math.inf
+    near = 0.0
+    when = 0.0
+    for k in range(NUM_LOOKS):
+        time = LOOK_S * k
+        cos, sin = looks[k, 2], looks[k, 3]
+        dx = body["x"] + time * body["speed"] * body["cos"] - looks[k, 0]
+        dy = body["y"] + time * body["speed"] * body["sin"] - looks[k, 1]
+        along = abs(dx * cos + dy * sin)
+        across = abs(dy * cos - dx * sin)
+        same = abs(body["cos"] * cos + body["sin"] * sin)
+        turned = abs(body["sin"] * cos - body["cos"] * sin)
+        along -= half_length + same * body["half_length"] + turned * body["half_width"]
+        across -= half_width + turned * body["half_length"] + same * body["half_width"]
+        gap = max(along, 0.0) + max(across, 0.0)
+        if gap + WAIT_MPS * time < best:
+            best = gap + WAIT_MPS * time
+            near = gap
+            when = time
+    return near, when
+
+
+@kernel
+def _is_held(roads: RoadArrays, link: int, phase: NDArray[np.int32]) -> bool:
+    signal = link_signal(roads, link, phase)
+    return signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW
+
+
+@kernel
+def _right_of_way(
+    roads: RoadArrays, link: int, is_on: bool, other: np.void, phase: NDArray[np.int32]
+) -> float:
+    """1: the other is on, or may take, a link that goes before `link`; -1: it gives way; 0."""
+    if link < 0 or is_off_lanes(other):
+        return 0.0
+    there = roads.lanes[other["lane"]]
+    is_held = _is_held(roads, link, phase)
+    is_protected = link_signal(roads, link, phase) == SIGNAL_GREEN_MAJOR
+    gives_way = False
+    first = roads.links[link]["first_conflict"]
+    for c in range(first, first + roads.links[link]["num_conflicts"]):
+        conflict = roads.conflicts[c]
+        foe = conflict["foe"]
+        if there["internal"]:
+            if foe == there["link"]:
+                return 0.0 if is_on else 1.0
+        elif roads.links[foe]["from_lane"] == other["lane"]:
+            foe_is_held = _is_held(roads, foe, phase)
+            if is_on or foe_is_held:
+                gives_way = gives_way or is_on or not is_held
+            elif is_held or (conflict["must_yield"] and not is_protected):
+                return 1.0
+            else:
+                gives_way = True
+    return -1.0 if gives_way else 0.0
+
+
+@kernel
+def _rank(
+    grid: Grid,
+    rows: NDArray[np.void],
+    i: int,
+    sensor: ConflictsSensor,
+) -> int:
+    """Put those that count most into the sensor's room, first by their approach, then by id."""
+    row = rows[i]
+    limit = sensor.range_m * sensor.range_m
+    first_column, last_column = cell_columns(grid, row["x"], sensor.range_m)
+    first_row, last_row = cell_rows(grid, row["y"], sensor.range_m)
+    found = 0
+    for j in range(first_row, last_row + 1):
+        begin = grid.start[j * grid.num_x + first_column]
+        end = grid.start[j * grid.num_x + last_column + 1]
+        for b in range(begin, end):
+            body = grid.bodies[b]
+            dx = body["x"] - row["x"]
+            dy = body["y"] - row["y"]
+            if not dx * dx + dy * dy <= limit or body["row"] == i:
+                continue
+            if abs(body["z"] - row["z"]) > LEVEL_HEIGHT_M:
+                continue
+            near, when = _nearest_approach(row, body, sensor.looks)
+            counts = near + WAIT_MPS * when
+            place = found
+            while place > 0:
+                other = sensor.ranked[place - 1]
+                if counts > other["counts"] or (
+                    counts == other["counts"] and body["id"] > grid.bodies[other["body"]]["id"]
+                ):
+                    break
+                place -= 1
+            if place == sensor.count:
+                continue
+            if found < sensor.count:
+                found += 1
+            for k in range(found - 1, place, -1):
+                sensor.ranked[k] = sensor.ranked[k - 1]
+            ranked = sensor.ranked[place]
+            ranked["counts"] = counts
+            ranked["near"] = near
+            ranked["when"] = when
+            ranked["body"] = b
+    return found
+
+
+@kernel
+def observe_conflicts(
+    roads: RoadArrays,
+    travel: Travel,
+    rows: NDArray[np.void],
+    i: int,
+    grid: Grid,
+    phase: NDArray[np.int32],
+    sensor: ConflictsSensor,
+    observation: NDArray[np.float32],
+) -> None:
+    """Nine numbers each of the vehicles that count most; zeros where there are fewer.
+
+    `i`: row of the agent's vehicle. `phase`: (num_signals,) PHASE rows that are on.
+    """
+    row = rows[i]
+    link, is_on = _foresee(roads, travel, row, sensor.looks)
+    found = _rank(grid, rows, i, sensor)
+    cos_heading = sensor.looks[0, 2]
+    sin_heading = sensor.looks[0, 3]
+    for k in range(found):
+        ranked = sensor.ranked[k]
+        body = grid.bodies[ranked["body"]]
+        dx = body["x"] - row["x"]
+        dy = body["y"] - row["y"]
+        dvx = body["speed"] * body["cos"] - row["speed"] * cos_heading
+        dvy = body["speed"] * body["sin"] - row["speed"] * sin_heading
+        at = sensor.at + CONFLICT_FEATURES * k
+        out = observation[at : at + CONFLICT_FEATURES]
+        out[0] = GAP_HALF_M / (GAP_HALF_M + ranked["near"])
+        out[1] = WHEN_HALF_S / (WHEN_HALF_S + ranked["when"])
+        out[2] = _bent(dx * cos_heading + dy * sin_heading, PLACE_HALF_M)
+        out[3] = _bent(dy * cos_heading - dx * sin_heading, PLACE_HALF_M)
+        out[4] = _bent(dvx * cos_heading + dvy * sin_heading, SPEED_HALF_MPS)
+        out[5] = _bent(dvy * cos_heading - dvx * sin_heading, SPEED_HALF_MPS)
+        out[6] = min(max(body["cos"] * cos_heading + body["sin"] * sin_heading, -1.0), 1.0)
+        out[7] = min(max(body["sin"] * cos_heading - body["cos"] * sin_heading, -1.0), 1.0)
+        out[8] = _right_of_way(roads, link, is_on, rows[body["row"]], phase)

@@ -1,0 +1,151 @@
+"""What the `way` sensor writes: the shape of the way ahead and the stop lines on it.
+
+Where the plan asks for another lane the way goes on from that one, so that the next turn is seen
+from any lane of a road.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.math.geometry import lane_pose, wrap_angle
+from cavmarl.core.numba import kernel
+from cavmarl.core.records.arrays import RoadArrays, Travel
+from cavmarl.core.records.codes import (
+    SIGNAL_GREEN_MAJOR,
+    SIGNAL_GREEN_MINOR,
+    SIGNAL_NONE,
+    SIGNAL_RED,
+    SIGNAL_RED_YELLOW,
+    SIGNAL_YELLOW_MAJOR,
+    SIGNAL_YELLOW_MINOR,
+)
+from cavmarl.driving.kernels.gaps import link_signal, must_stop
+from cavmarl.driving.kernels.signal_timing import time_to_change
+from cavmarl.driving.kernels.ways import next_step
+from cavmarl.sensors.kernels.sense import SPEED_SCALE, gives_way_on, soonness, unit
+from cavmarl.sensors.kernels.sensor_arrays import WaySensor
+
+PLACE_FEATURES = 4  # of a place of the way
+LINE_FEATURES = 5  # of a stop line, one more with the time of its signal
+CURVATURE_SCALE = 0.2  # 1/m
+WIDTH_SCALE = 8.0  # m
+LINE_HALF_M = 20.0  # a line at this distance is half as near as can be
+MOST_LANES = 48  # that a way is followed over
+MOST_CHANGES = 8  # of lanes at the end of one of them
+
+
+@kernel
+def goes_on(roads: RoadArrays, travel: Travel, lane: int, way: int) -> tuple[int, int, int]:
+    """`next_step`, from the lane that the plan asks for where it does not go on from this one."""
+    for _ in range(MOST_CHANGES):
+        following, way_there, link = next_step(roads, travel, lane, way)
+        if following >= 0 or roads.lanes[lane]["internal"]:
+            return following, way_there, link
+        change = travel.steps[way + lane]["change"]
+        if change == 0:
+            break
+        lane = roads.lanes[lane]["left"] if change > 0 else roads.lanes[lane]["right"]
+        if lane < 0:
+            break
+    return -1, way, -1
+
+
+@kernel
+def _observe_line(
+    roads: RoadArrays,
+    controllers: NDArray[np.void],
+    link: int,
+    distance: float,
+    phase: NDArray[np.int32],
+    time: float,
+    tick_s: float,
+    timing: bool,
+    out: NDArray[np.float32],
+) -> bool:
+    """Write the stop line before a link, if there is a reason to stop at it."""
+    signal = link_signal(roads, link, phase)
+    gives_way = gives_way_on(roads, link, signal)
+    stops = must_stop(roads, link, signal)
+    if signal == SIGNAL_NONE and not (gives_way or stops):
+        return False
+    out[0] = LINE_HALF_M / (LINE_HALF_M + max(distance, 0.0))
+    if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW or stops:
+        out[1] = 1.0
+    elif signal == SIGNAL_YELLOW_MINOR or signal == SIGNAL_YELLOW_MAJOR:
+        out[2] = 1.0
+    elif signal == SIGNAL_GREEN_MAJOR or signal == SIGNAL_GREEN_MINOR:
+        out[3] = 1.0
+    out[4] = 1.0 if gives_way else 0.0
+    if timing and signal != SIGNAL_NONE:
+        out[5] = soonness(time_to_change(roads, controllers, link, phase, time, tick_s))
+    return True
+
+
+@kernel
+def observe_way(
+    roads: RoadArrays,
+    travel: Travel,
+    controllers: NDArray[np.void],
+    row: np.void,
+    phase: NDArray[np.int32],
+    time: float,
+    tick_s: float,
+    sensor: WaySensor,
+    observation: NDArray[np.float32],
+) -> None:
+    """Places of the way at given distances, then its next stop lines.
+
+    Beyond the end of the way its last place is told, without a curve. `time` is that of the tick,
+    in s since the world's reset. `observation`: (D,), 0 before.
+    """
+    cos_heading = math.cos(row["heading"])
+    sin_heading = math.sin(row["heading"])
+    distances = sensor.distances_m
+    lines_at = sensor.at + PLACE_FEATURES * distances.size
+    size = LINE_FEATURES + 1 if sensor.timing else LINE_FEATURES
+    lane, way = row["lane"], row["way"]
+    here = roads.lanes[lane]
+    start = -row["s"]  # the way to the beginning of the lane
+    _, _, _, cos, sin, _ = lane_pose(
+        roads.points, here["first_point"], here["num_points"], row["s"]
+    )
+    before_m = 0.0
+    direction = math.atan2(sin, cos)
+    told = 0
+    lines = 0
+    for _ in range(MOST_LANES):
+        end = start + here["length_m"]
+        following, way_there, link = goes_on(roads, travel, lane, way)
+        while told < distances.size and (distances[told] <= end or following < 0):
+            at = sensor.at + PLACE_FEATURES * told
+            distance = min(distances[told], end)
+            x, y, _, cos, sin, _ = lane_pose(
+                roads.points, here["first_point"], here["num_points"], distance - start
+            )
+            left = (y - row["y"]) * cos_heading - (x - row["x"]) * sin_heading
+            turned = math.atan2(sin, cos)
+            out = observation[at : at + PLACE_FEATURES]
+            out[0] = unit(left / distances[told])
+            if distance > before_m:
+                curvature = wrap_angle(turned - direction) / (distance - before_m)
+                out[1] = unit(curvature / CURVATURE_SCALE)
+            out[2] = unit(here["width_m"] / WIDTH_SCALE)
+            out[3] = unit(here["speed_mps"] / SPEED_SCALE)
+            direction = turned
+            before_m = distance
+            told += 1
+        if link >= 0 and lines < sensor.lines and end <= sensor.range_m:
+            out = observation[lines_at + size * lines : lines_at + size * (lines + 1)]
+            if _observe_line(
+                roads, controllers, link, end, phase, time, tick_s, sensor.timing, out
+            ):
+                lines += 1
+        is_beyond = lines == sensor.lines or end > sensor.range_m
+        if following < 0 or (told == distances.size and is_beyond):
+            break
+        lane, way, start = following, way_there, end
+        here = roads.lanes[lane]

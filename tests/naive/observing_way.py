@@ -1,0 +1,242 @@
+"""The `way` and `conflicts` sensors by listing the whole way and by sorting all vehicles."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.roads.network import RoadNetwork
+
+RED, YELLOW, GREEN = "ru", "yY", "gG"
+LOOKS_S = [0.5 * k for k in range(10)]
+
+
+@dataclass
+class Stretch:
+    """A lane of the way."""
+
+    lane: int
+    start_m: float  # from the vehicle
+    end_m: float
+    link: int  # at its end, or -1
+
+
+def way_of(
+    roads: RoadNetwork, plans: NDArray[np.void], vehicle: np.void, most: int = 48
+) -> list[Stretch]:
+    """The lanes of the way from the vehicle on."""
+    lane, start = int(vehicle["lane"]), -float(vehicle["s"])
+    found: list[Stretch] = []
+    while lane >= 0 and len(found) < most:
+        end = start + float(roads.lanes[lane]["length_m"])
+        following, link = _beyond(roads, plans[vehicle["goal"]], lane)
+        found.append(Stretch(lane, start, end, link))
+        lane, start = following, end
+    return found
+
+
+def _beyond(roads: RoadNetwork, plan: NDArray[np.void], lane: int) -> tuple[int, int]:
+    if roads.lanes[lane]["internal"]:
+        return int(roads.lanes[lane]["successor"]), -1
+    for _ in range(8):
+        if lane < 0:
+            break
+        if plan[lane]["next"] >= 0:
+            return int(plan[lane]["next"]), int(plan[lane]["link"])
+        if plan[lane]["change"] == 0:
+            break
+        lane = int(roads.lanes[lane]["left" if plan[lane]["change"] > 0 else "right"])
+    return -1, -1
+
+
+def pose(roads: RoadNetwork, lane: int, s: float) -> tuple[float, float, float]:
+    """X, y and direction at a place of a lane; beyond its ends straight on."""
+    points = roads.lane_points(lane)
+    k = min(max(int(np.searchsorted(points["s"], s, side="right")) - 1, 0), len(points) - 2)
+    one, other = points[k], points[k + 1]
+    direction = math.atan2(other["y"] - one["y"], other["x"] - one["x"])
+    along = s - one["s"]
+    return one["x"] + along * math.cos(direction), one["y"] + along * math.sin(direction), direction
+
+
+def on_way(way: list[Stretch], distance: float) -> tuple[Stretch, float]:
+    """The stretch that lies so far ahead, and where on it."""
+    for stretch in way:
+        if distance <= stretch.end_m:
+            return stretch, distance - stretch.start_m
+    return way[-1], distance - way[-1].start_m
+
+
+def clip(value: float) -> float:
+    return min(max(value, -1.0), 1.0)
+
+
+def places(
+    roads: RoadNetwork, plans: NDArray[np.void], vehicle: np.void, distances_m: list[float]
+) -> list[float]:
+    """Left, curvature, width and limit at each distance."""
+    way = way_of(roads, plans, vehicle)
+    reach = way[-1].end_m
+    numbers: list[float] = []
+    heading = float(vehicle["heading"])
+    before, direction = 0.0, pose(roads, int(vehicle["lane"]), float(vehicle["s"]))[2]
+    for wanted in distances_m:
+        distance = min(wanted, reach)
+        stretch, s = on_way(way, distance)
+        x, y, turned = pose(roads, stretch.lane, s)
+        aside = (y - vehicle["y"]) * math.cos(heading) - (x - vehicle["x"]) * math.sin(heading)
+        curvature = 0.0
+        if distance > before:
+            turn = (turned - direction + math.pi) % (2.0 * math.pi) - math.pi
+            curvature = turn / (distance - before)
+        lane = roads.lanes[stretch.lane]
+        numbers += [clip(aside / wanted), clip(curvature / 0.2)]
+        numbers += [clip(lane["width_m"] / 8.0), clip(lane["speed_mps"] / 40.0)]
+        before, direction = distance, turned
+    return numbers
+
+
+def lines(
+    roads: RoadNetwork,
+    plans: NDArray[np.void],
+    vehicle: np.void,
+    shown: dict[int, str],
+    count: int,
+    range_m: float,
+) -> list[float]:
+    """Nearness, red, yellow, green and duty of each stop line; `shown` is the letter of a link."""
+    found = []
+    for stretch in way_of(roads, plans, vehicle):
+        if stretch.end_m > range_m:
+            break
+        if stretch.link < 0:
+            continue
+        letter = shown.get(stretch.link, "")
+        link = roads.links[stretch.link]
+        own = slice(link["first_conflict"], link["first_conflict"] + link["num_conflicts"])
+        yields = letter not in ("G", "O") and bool(roads.conflicts["must_yield"][own].any())
+        stops = letter == "s" or (not letter and chr(link["state"]) in "sw")
+        if not letter and not yields and not stops:
+            continue
+        colours = [letter in RED or stops, letter in YELLOW, letter in GREEN]
+        if not letter:
+            colours = [stops, False, False]
+        near = 20.0 / (20.0 + max(stretch.end_m, 0.0))
+        found.append([near, *map(float, colours), float(yields)])
+    found = [*found, *([[0.0] * 5] * count)][:count]
+    return [number for line in found for number in line]
+
+
+def own_looks(
+    roads: RoadNetwork, plans: NDArray[np.void], vehicle: np.void
+) -> list[tuple[float, float, float]]:
+    """Where the vehicle is now, and will be at each look: x, y, direction."""
+    way = way_of(roads, plans, vehicle)
+    speed = max(float(vehicle["speed"]), 3.0)
+    found = [(float(vehicle["x"]), float(vehicle["y"]), float(vehicle["heading"]))]
+    for time in LOOKS_S[1:]:
+        stretch, s = on_way(way, speed * time)
+        found.append(pose(roads, stretch.lane, s))
+    return found
+
+
+def approach(
+    looks: list[tuple[float, float, float]], ego: np.void, other: np.void
+) -> tuple[float, float]:
+    """The gap of the approach that counts most, and its time."""
+    gaps = []
+    for time, (x, y, direction) in zip(LOOKS_S, looks, strict=True):
+        dx = other["x"] + time * other["speed"] * math.cos(other["heading"]) - x
+        dy = other["y"] + time * other["speed"] * math.sin(other["heading"]) - y
+        turned = other["heading"] - direction
+        ends = [
+            (0.5 * a * other["length"], 0.5 * b * other["width"]) for a in (1, -1) for b in (1, -1)
+        ]
+        half_along = max(a * math.cos(turned) - b * math.sin(turned) for a, b in ends)
+        half_across = max(a * math.sin(turned) + b * math.cos(turned) for a, b in ends)
+        along = abs(dx * math.cos(direction) + dy * math.sin(direction))
+        across = abs(dy * math.cos(direction) - dx * math.sin(direction))
+        gap = max(along - half_along - 0.5 * ego["length"], 0.0)
+        gap += max(across - half_across - 0.5 * ego["width"], 0.0)
+        gaps.append((gap + 2.0 * time, gap, time))
+    return min(gaps)[1:]
+
+
+def goes_first(
+    roads: RoadNetwork, way: list[Stretch], reach_m: float, other: np.void, shown: dict[int, str]
+) -> float:
+    """1 if the other goes first at the next junction of the way, -1 if it gives way."""
+    here = roads.lanes[way[0].lane]
+    ahead = [int(here["link"])] if here["internal"] else []
+    for stretch in way:
+        if stretch.start_m < reach_m and stretch.link >= 0:
+            ahead.append(stretch.link)
+    if not ahead:
+        return 0.0
+    link = roads.links[ahead[0]]
+    own = slice(link["first_conflict"], link["first_conflict"] + link["num_conflicts"])
+    there = roads.lanes[other["lane"]]
+    answers = []
+    for conflict in roads.conflicts[own]:
+        foe = int(conflict["foe"])
+        if there["internal"]:
+            if foe == there["link"]:
+                return 0.0 if here["internal"] else 1.0
+            continue
+        if roads.links[foe]["from_lane"] != other["lane"]:
+            continue
+        mine, its = shown.get(ahead[0], ""), shown.get(foe, "")
+        if here["internal"]:
+            answers.append(-1.0)
+        elif its and its in RED:
+            answers.append(0.0 if mine and mine in RED else -1.0)
+        elif mine and mine in RED:
+            answers.append(1.0)
+        else:
+            answers.append(1.0 if conflict["must_yield"] and mine != "G" else -1.0)
+    return next((value for value in (1.0, -1.0) if value in answers), 0.0)
+
+
+def bent(value: float, half: float) -> float:
+    return value / (half + abs(value))
+
+
+def conflicts(
+    roads: RoadNetwork,
+    plans: NDArray[np.void],
+    rows: NDArray[np.void],
+    i: int,
+    shown: dict[int, str],
+    count: int,
+    range_m: float,
+) -> list[float]:
+    """Nine numbers of each of the `count` vehicles that count most."""
+    ego = rows[i]
+    looks = own_looks(roads, plans, ego)
+    way = way_of(roads, plans, ego)
+    ranked = []
+    for k, other in enumerate(rows):
+        away = math.hypot(other["x"] - ego["x"], other["y"] - ego["y"])
+        if k == i or away > range_m or abs(other["z"] - ego["z"]) > 4.0:
+            continue
+        near, when = approach(looks, ego, other)
+        # Of equal ones the sum rounds differently here and there: these are told apart by id.
+        ranked.append((round(near + 2.0 * when, 6), int(other["id"]), near, when, k))
+    numbers: list[float] = []
+    for _, _, near, when, k in sorted(ranked)[:count]:
+        other = rows[k]
+        cos, sin = math.cos(ego["heading"]), math.sin(ego["heading"])
+        dx, dy = other["x"] - ego["x"], other["y"] - ego["y"]
+        vx = other["speed"] * math.cos(other["heading"]) - ego["speed"] * cos
+        vy = other["speed"] * math.sin(other["heading"]) - ego["speed"] * sin
+        turned = other["heading"] - ego["heading"]
+        reach_m = LOOKS_S[-1] * max(float(ego["speed"]), 3.0)
+        numbers += [2.0 / (2.0 + near), 2.0 / (2.0 + when)]
+        numbers += [bent(dx * cos + dy * sin, 10.0), bent(dy * cos - dx * sin, 10.0)]
+        numbers += [bent(vx * cos + vy * sin, 10.0), bent(vy * cos - vx * sin, 10.0)]
+        numbers += [math.cos(turned), math.sin(turned)]
+        numbers.append(goes_first(roads, way, reach_m, other, shown))
+    return [*numbers, *([0.0] * (9 * count))][: 9 * count]

@@ -1,0 +1,205 @@
+"""The sensors for any map equal their twins, and tell of places, lines and vehicles as they are."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+import cavmarl
+from cavmarl.config.sensors import ConflictsConfig, HistoryConfig, SensorsConfig, WayConfig
+from cavmarl.core.math.neighbors import fill_grid, make_grid
+from cavmarl.driving.kernels.gaps import link_signal
+from cavmarl.roads.network import SIGNAL_STATES
+from cavmarl.sensors.kernels.observing_conflicts import observe_conflicts
+from cavmarl.sensors.kernels.observing_way import observe_way
+from cavmarl.sensors.observed import frame_size, layout
+from cavmarl.sensors.observed.way_features import conflicts_settings, way_settings
+from cavmarl.shards.shard import CONTROLLER
+from tests.naive import observing_way as naive
+from tests.sensors.test_observing_lanes import phases, traffic
+from tests.support.traffic import NAMES, network, on_lane, plans, travel
+
+DISTANCES_M = [3.0, 8.0, 20.0, 45.0, 90.0]
+COUNT, RANGE_M, LINES = 4, 60.0, 2
+CONFIG = SensorsConfig(
+    way=WayConfig(distances_m=tuple(DISTANCES_M), lines=LINES, timing=False),
+    conflicts=ConflictsConfig(count=COUNT, range_m=RANGE_M),
+)
+# What the entry `cities` has.
+ON = {
+    "sensors.way.distances_m": DISTANCES_M,
+    "sensors.way.lines": LINES,
+    "sensors.conflicts.count": 8,
+    "sensors.history.steps": 3,
+}
+
+
+def observed_way(name: str, row: np.void, phase: NDArray[np.int32]) -> list[float]:
+    roads = network(name)
+    place = layout(CONFIG)["way"]
+    out = np.zeros(frame_size(CONFIG), np.float32)
+    controllers = np.zeros(roads.num_controllers, CONTROLLER)
+    sensor = way_settings(CONFIG, place.start)
+    observe_way(roads.arrays, travel(name), controllers, row, phase, 0.0, 0.1, sensor, out)
+    assert not out[: place.start].any() and not out[place.stop :].any()
+    return [float(value) for value in out[place]]
+
+
+def observed_conflicts(
+    name: str, rows: NDArray[np.void], i: int, phase: NDArray[np.int32]
+) -> list[float]:
+    roads = network(name)
+    grid = make_grid(roads.extent_m, 25.0, len(rows))
+    fill_grid(rows, len(rows), grid)
+    place = layout(CONFIG)["conflicts"]
+    out = np.zeros(frame_size(CONFIG), np.float32)
+    sensor = conflicts_settings(CONFIG, place.start)
+    observe_conflicts(roads.arrays, travel(name), rows, i, grid, phase, sensor, out)
+    assert not out[: place.start].any() and not out[place.stop :].any()
+    return [float(value) for value in out[place]]
+
+
+def shown(name: str, phase: NDArray[np.int32]) -> dict[int, str]:
+    """The letter of each link that has a signal."""
+    roads = network(name)
+    with_signal = np.flatnonzero(roads.links["signal"] >= 0)
+    return {int(k): SIGNAL_STATES[link_signal(roads.arrays, int(k), phase)] for k in with_signal}
+
+
+@pytest.mark.parametrize("name", NAMES)
+@settings(deadline=None, max_examples=25)
+@given(data=st.data(), random=st.randoms(use_true_random=False))
+def test_way_and_conflicts_equal_their_twins_whatever_the_order(
+    name: str, data: st.DataObject, random: object
+) -> None:
+    rows = data.draw(traffic(name))
+    rows["width"] = 2.0
+    # Vehicles stand at equal places: their ranks must not hang on the last bit of a sum.
+    nudge = 0.0137 * np.arange(len(rows)) ** 2
+    rows["x"], rows["y"] = rows["x"] + nudge, rows["y"] + nudge
+    phase = phases(name, random)
+    letters = shown(name, phase)
+    roads, ways = network(name), plans(name)
+    order = data.draw(st.permutations(range(len(rows))))
+    for place, i in enumerate(order):
+        found = observed_way(name, rows[i], phase)
+        twin = naive.places(roads, ways, rows[i], DISTANCES_M)
+        twin += naive.lines(roads, ways, rows[i], letters, LINES, 100.0)
+        assert found == pytest.approx(twin, abs=2e-5)
+        seen = observed_conflicts(name, rows, i, phase)
+        assert seen == observed_conflicts(name, rows[order], place, phase)
+        twin = naive.conflicts(roads, ways, rows, i, letters, COUNT, RANGE_M)
+        assert seen == pytest.approx(twin, abs=2e-5)
+
+
+def on_main_road(*cars: tuple[float, float, float]) -> NDArray[np.void]:
+    """Cars at (s, d, speed) of the road behind the merge, on their way to its end."""
+    roads = network("merge")
+    lane = roads.lane_ids.index("main_out_0")
+    rows = np.concatenate([on_lane(roads, lane, s, d=d, speed=speed) for s, d, speed in cars])
+    rows["goal"] = len(plans("merge")) - 1
+    rows["way"] = rows["goal"] * len(roads.lanes)
+    rows["id"] = np.arange(len(rows))
+    return rows
+
+
+def test_the_one_that_is_hit_first_stands_first_and_the_nearest_in_space_may_not() -> None:
+    # Ahead by 30 m and standing; behind by 10 m and falling back.
+    rows = on_main_road((100.0, 0.0, 20.0), (90.0, 0.0, 2.0), (130.0, 0.0, 0.0))
+    numbers = np.array(observed_conflicts("merge", rows, 0, np.zeros(0, np.int32))).reshape(-1, 9)
+    assert numbers[0, 2] == pytest.approx(30.0 / 40.0)
+    assert numbers[0, 4] == pytest.approx(-20.0 / 30.0)
+    assert numbers[0, :2] == pytest.approx([1.0, 2.0 / 3.5])  # it is hit within 1.5 s
+    assert numbers[1, 2] == pytest.approx(-10.0 / 20.0)
+    assert not numbers[2:].any()
+
+
+def test_the_plan_of_another_changes_nothing() -> None:
+    rows = on_main_road((100.0, 0.0, 20.0), (90.0, 0.0, 2.0), (130.0, 0.0, 0.0))
+    phase = np.zeros(0, np.int32)
+    before = observed_conflicts("merge", rows, 0, phase)
+    for name in ("goal", "way", "target_lane", "link", "throttle", "steering", "to_go"):
+        rows[name][1:] = 0
+    assert observed_conflicts("merge", rows, 0, phase) == before
+
+
+def made(env: str = "grid4x4", **overrides: Any) -> Any:
+    settings: dict[str, Any] = {"population.mode": "respawn", **ON, **overrides}
+    return cavmarl.make_vec(env, num_envs=2, agents=6, background=12, seed=1, overrides=settings)
+
+
+def test_history_is_what_was_observed_before_and_begins_with_the_first() -> None:
+    vec = made()
+    place = layout(vec.config.sensors)["history"]
+    observations, infos = vec.reset()
+    assert place.stop == observations.shape[2], "it stands last"
+    rng = np.random.default_rng(0)
+    fresh = 0
+    before = None
+    for _ in range(60):
+        history = observations[..., place].reshape(2, 6, 3, 3)
+        mask = infos["mask"]
+        if before is None:
+            entered = mask
+        else:
+            entered = mask & ~infos["acted"]
+            stayed = mask & infos["acted"] & ~infos["vehicle_done"]
+            np.testing.assert_array_equal(history[stayed][:, 1:], before[stayed][:, :-1])
+        fresh += int(entered.sum())
+        np.testing.assert_array_equal(history[entered][:, 1:], history[entered][:, :-1])
+        before = history
+        actions = rng.uniform(-1.0, 1.0, (2, 6, 2)).astype(np.float32)
+        observations, *_, infos = vec.step(actions)
+    assert fresh > 12, "nobody came later"
+    vec.close()
+
+
+@pytest.mark.parametrize("zones", [4])
+def test_a_divided_world_observes_the_same(zones: int) -> None:
+    whole, divided = made(), made(**{"zones.count": zones})
+    rng = np.random.default_rng(1)
+    one, other = whole.reset()[0], divided.reset()[0]
+    for _ in range(40):
+        np.testing.assert_array_equal(one, other)
+        assert whole.observation_space.contains(one)
+        actions = rng.uniform(-0.4, 0.6, (2, 6, 2)).astype(np.float32)
+        actions[..., 1] *= 0.05
+        one, other = whole.step(actions)[0], divided.step(actions)[0]
+    whole.close()
+    divided.close()
+
+
+def test_a_saved_state_keeps_the_history() -> None:
+    vec = made()
+    vec.reset()
+    actions = np.full((2, 6, 2), 0.1, np.float32)
+    for _ in range(5):
+        vec.step(actions)
+    saved = vec.save_state()
+    expected = vec.step(actions)[0]
+    vec.load_state(saved)
+    np.testing.assert_array_equal(vec.step(actions)[0], expected)
+    vec.close()
+
+
+@pytest.mark.parametrize("wrong", [(5.0, 5.0), (9.0, 4.0), (0.1,), (400.0,), (math.nan,)])
+def test_distances_that_cannot_be_are_refused(wrong: tuple[float, ...]) -> None:
+    with pytest.raises(cavmarl.ConfigError, match=r"sensors\.way\.distances_m"):
+        WayConfig(distances_m=wrong)
+
+
+def test_what_is_not_seen_is_off_where_only_messages_are_told() -> None:
+    config = SensorsConfig(
+        way=WayConfig(distances_m=(5.0,), lines=2),
+        conflicts=ConflictsConfig(count=3),
+        history=HistoryConfig(steps=1),
+    )
+    assert {"way", "conflicts", "history"} <= set(layout(config))
+    assert "conflicts" not in layout(config.without_sight())
+    assert config.without_sight().way.lines == 0
