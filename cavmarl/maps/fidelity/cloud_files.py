@@ -83,8 +83,8 @@ def _read(path: Path, head: bytes, stream: BinaryIO) -> Points:
         return _read_ply(path, stream)
     if head.startswith(b"LASF"):
         return _read_las(path)
-    if b"PCD" in head and (head.startswith(b"#") or head.startswith(b"VERSION")):
-        return _read_pcd(path)
+    if b"PCD" in head or head.startswith(b"VERSION"):
+        return _read_pcd(path, stream.read(4096))
     if path.suffix.lower() in (".csv", ".txt", ".xyz"):
         return _read_text(path, stream)
     raise MapError(f"{path}: its content is not what '{path.suffix}' says: {_known()}")
@@ -114,7 +114,7 @@ def _read_text(path: Path, stream: BinaryIO) -> Points:
             )
         columns = tuple(words.index(axis) for axis in "xyz")
         skipped = first
-    if number == skipped:
+    if not head or number == skipped:
         return np.zeros((0, 3))
     stream.seek(0)
     rows = (line.replace(b";", b" ").replace(b",", b" ") for line in stream)
@@ -163,7 +163,8 @@ def _read_ply(path: Path, stream: BinaryIO) -> Points:
 
 def _ply_head(path: Path, stream: BinaryIO) -> tuple[str, int, list[tuple[str, str]]]:
     """The order of its bytes, the number of its vertices, and name and type of their values."""
-    order, number, properties, element = "", -1, [], ""
+    order, number, element = "", -1, ""
+    properties: list[tuple[str, str]] = []
     for _ in range(1000):
         words = stream.readline().decode("ascii", "replace").split()
         match words:
@@ -192,9 +193,8 @@ def _cut_short(path: Path, number: int, found: int) -> MapError:
     )
 
 
-def _read_pcd(path: Path) -> Points:
+def _read_pcd(path: Path, head: bytes) -> Points:
     pypcd4: Any = require("pypcd4", "clouds")
-    head = path.open("rb").read(4096)
     said = re.search(rb"^POINTS\s+(\d+)", head, re.MULTILINE)
     number = int(said[1]) if said else -1
     _check_number(path, number)

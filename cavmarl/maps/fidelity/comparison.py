@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError
 from cavmarl.maps.fidelity.cloud_files import Cloud
-from cavmarl.maps.fidelity.registration import Alignment, Target, align, moved
+from cavmarl.maps.fidelity.registration import Alignment, Target, align, moved, nearest_distances
 
 Points = NDArray[np.float64]
 
@@ -95,7 +95,7 @@ def compare(
     transform = begin if alignment is None else alignment.transform @ begin
     laid = moved(source.points, transform)
     _, distance_m = target.nearest(laid)
-    _, reverse_m = Target(laid, threads).nearest(reference.points)
+    reverse_m = nearest_distances(reference.points, laid, threads)
     return Comparison(
         source, reference, float(before_m.mean()), alignment, distance_m, reverse_m, transform
     )

@@ -70,7 +70,10 @@ def _walls_in(network: RoadNetwork, box_m: Box) -> NDArray[np.void]:
     x = np.stack([walls["ax"], walls["bx"]])
     y = np.stack([walls["ay"], walls["by"]])
     meets = (x.max(axis=0) >= box_m[0]) & (x.min(axis=0) <= box_m[2])
-    return walls[meets & (y.max(axis=0) >= box_m[1]) & (y.min(axis=0) <= box_m[3])]
+    found: NDArray[np.void] = walls[
+        meets & (y.max(axis=0) >= box_m[1]) & (y.min(axis=0) <= box_m[3])
+    ]
+    return found
 
 
 def _lengths(walls: NDArray[np.void]) -> Points:

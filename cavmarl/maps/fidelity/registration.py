@@ -62,6 +62,17 @@ def moved(points: Points, transform: Points) -> Points:
     return found
 
 
+def nearest_distances(points: Points, others: Points, threads: int = 2) -> Points:
+    """(n,) distances in m of points (n, 3) to the nearest of others (m, 3) each."""
+    gicp: Any = require("small_gicp", "clouds")
+    middle = others.mean(axis=0)
+    tree = gicp.KdTree(others - middle, threads)
+    found: Points = np.sqrt(
+        np.asarray(tree.batch_nearest_neighbor_search(points - middle, threads)[1])
+    )
+    return found
+
+
 class Target:
     """A cloud that others are laid onto, with its tree; about its own middle, for the digits."""
 
@@ -110,8 +121,9 @@ def align(source: Points, target: Target, *, keep: float = 0.8) -> Alignment:
     motion, last_m = np.eye(4), np.inf
     rows, distance_m = target.nearest(source)
     gate_m = min(max(2.0 * float(np.quantile(distance_m, 0.95)), 1.0), _WIDEST_M)
-    stage = 0
-    for stage in range(1, _STAGES + 1):
+    stages = 0
+    while stages < _STAGES:
+        stages += 1
         found = gicp.align(
             target.cloud,
             cloud,
@@ -131,7 +143,7 @@ def align(source: Points, target: Target, *, keep: float = 0.8) -> Alignment:
         if last_m < _SETTLED_M and narrower_m > 0.95 * gate_m:
             break
         gate_m = narrower_m
-    return _judged(own, target, motion, rows, distance_m, keep, stage, last_m)
+    return _judged(own, target, motion, rows, distance_m, keep, stages, last_m)
 
 
 def _size_m(step: Points, points: Points) -> float:

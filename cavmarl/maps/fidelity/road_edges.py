@@ -1,8 +1,8 @@
 """A cloud beside the borders and heights of a map's roads.
 
 A border is found where, from the middle of the outer lane outwards, the ground first leaves the
-road's height by more than a kerb's least: a kerb, a bank, a ditch or a wall. Where roads end without
-a step there is nothing to find, and nothing is counted.
+road's height by more than a kerb's least: a kerb, a bank, a ditch or a wall. Where roads end
+without a step there is nothing to find, and nothing is counted.
 """
 
 from __future__ import annotations

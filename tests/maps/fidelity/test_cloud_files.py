@@ -89,7 +89,7 @@ def test_what_is_no_place_is_left_out_and_counted(tmp_path: Path) -> None:
         ("a.csv", "", "has no points"),
         ("a.csv", "x,y,z\n", "has no points"),
         ("a.csv", "x,y,z\nnan,nan,nan\n", "all 1 points are NaN"),
-        ("a.csv", "a,b,c\n1,2,3\n", "line 1: the head names no x, y and z"),
+        ("a.csv", "a,b,c\n1,2,3\n", "line 1: the head has no columns x, y and z"),
         ("a.csv", "x,y,z\n1,2,3\n1,2\n", "needs three numbers"),
         ("a.csv", "x,y,z\n1,2,three\n", "needs three numbers"),
         ("a.ply", "x,y,z\n1,2,3\n", "not what '.ply' says"),
