@@ -16,11 +16,11 @@ from cavmarl.engine.world_setup import find_map
 from cavmarl.maps.buildings import with_buildings
 from cavmarl.maps.fidelity.cloud_files import Cloud, is_cloud, read_cloud
 from cavmarl.maps.fidelity.cloud_filters import crop, drop_outliers, thin_out
+from cavmarl.maps.fidelity.cloud_frames import FRAMES, in_map_frame
+from cavmarl.maps.fidelity.cloud_registration import moved
 from cavmarl.maps.fidelity.comparison import PAPER_TABLE, Comparison, compare, start_transform
 from cavmarl.maps.fidelity.exports import write_page, write_points
-from cavmarl.maps.fidelity.frames import FRAMES, in_map_frame
 from cavmarl.maps.fidelity.map_surface import map_surface
-from cavmarl.maps.fidelity.registration import moved
 from cavmarl.maps.fidelity.road_edges import RoadFit, fit_roads
 from cavmarl.maps.netconvert import map_file
 from cavmarl.roads.cache import load_network

@@ -15,7 +15,13 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError
 from cavmarl.maps.fidelity.cloud_files import Cloud
-from cavmarl.maps.fidelity.registration import Alignment, Target, align, moved, nearest_distances
+from cavmarl.maps.fidelity.cloud_registration import (
+    Alignment,
+    Target,
+    align,
+    moved,
+    nearest_distances,
+)
 
 Points = NDArray[np.float64]
 

@@ -13,8 +13,8 @@ from cavmarl.cli import app
 from cavmarl.core.errors import CavmarlError
 from cavmarl.engine.world_setup import find_map
 from cavmarl.maps.fidelity.cloud_files import read_cloud
+from cavmarl.maps.fidelity.cloud_registration import moved, nearest_distances
 from cavmarl.maps.fidelity.map_surface import map_surface
-from cavmarl.maps.fidelity.registration import moved, nearest_distances
 from cavmarl.maps.fidelity.road_edges import fit_roads
 from cavmarl.maps.netconvert import map_file
 from cavmarl.roads.cache import load_network
@@ -58,7 +58,7 @@ def run(*words: object) -> tuple[int, str]:
 def test_edges_and_heights_of_roads_are_found_where_they_were_put(
     network: RoadNetwork, scan: np.ndarray
 ) -> None:
-    shifted = scan + [0.2, -0.1, 0.3]
+    shifted = scan + np.array([0.2, -0.1, 0.3])
     fit = fit_roads(network, shifted, network.extent_m)
     assert len(fit.edge_offset_m) > 50
     assert fit.transform is not None

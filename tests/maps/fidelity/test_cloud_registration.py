@@ -9,8 +9,8 @@ import pytest
 from cavmarl.core.errors import ConfigError, MapError
 from cavmarl.maps.fidelity.cloud_files import Cloud, read_cloud
 from cavmarl.maps.fidelity.cloud_filters import drop_outliers, thin_out
+from cavmarl.maps.fidelity.cloud_registration import Target, align, moved, nearest_distances
 from cavmarl.maps.fidelity.comparison import compare, histogram, start_transform
-from cavmarl.maps.fidelity.registration import Target, align, moved, nearest_distances
 from tests.maps.fidelity.scenes import motion, street
 
 pytest.importorskip("small_gicp", reason="needs the extra 'clouds'")
