@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from cavmarl.cli import map_zones
+from cavmarl.cli import map_fidelity, map_zones
 from cavmarl.cli.output import Environment, JsonPath, about, write_json
 from cavmarl.engine.world_setup import find_map
 from cavmarl.maps.check import MapReport, check_map
@@ -30,6 +30,7 @@ Source = Annotated[
 ]
 
 app.command("zones")(map_zones.zones)
+app.command("fidelity")(map_fidelity.fidelity)
 
 _NETWORK_ENDINGS = (".net.xml", ".net.xml.gz")
 _SHOWN_WARNINGS = 12

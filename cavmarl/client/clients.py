@@ -40,6 +40,8 @@ def _write(files: dict[str, bytes], folder: str | Path) -> Path:
 
 def _request(http: httpx.Client | httpx.AsyncClient, ask: Ask) -> httpx.Request:
     headers = {"Authorization": f"Bearer {ask.token}"} if ask.token else {}
+    if ask.key:
+        headers["Idempotency-Key"] = ask.key
     return http.build_request(
         ask.method, ask.url, json=ask.json, content=ask.content, params=ask.params, headers=headers
     )
@@ -85,8 +87,9 @@ class Client:
             needs: capabilities that a node must have.
             wait_s: how long to wait for a node.
             recovery_s: how long to look for another node when one is lost.
-            keys: agents, background, max_cycles, num_envs, seed, overrides, as in `make_vec`; and
-                name, under which the service counts versions.
+            keys: zones, nodes, agents, background, max_cycles, num_envs, seed, overrides, as in
+                `make_vec`; nodes are those of the service. And name, under which the service
+                counts versions.
 
         Raises:
             ServiceError: it was refused; `problem` says why.

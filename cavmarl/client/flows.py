@@ -6,6 +6,7 @@ that awaits have the same code.
 
 from __future__ import annotations
 
+import secrets
 import time
 from collections.abc import Generator, Mapping
 from typing import Any, NamedTuple, TypeVar
@@ -16,6 +17,8 @@ from cavmarl.core.errors import ServiceError
 
 T = TypeVar("T")
 RENEW_BEFORE_S = 60.0  # a token ends
+AGAIN_S = 0.2  # between two attempts
+RETRIED_S = 10.0  # for so long is asked again for an answer that was lost
 
 
 class Ask(NamedTuple):
@@ -27,6 +30,7 @@ class Ask(NamedTuple):
     content: bytes | None = None
     params: Mapping[str, Any] | None = None
     token: str = ""
+    key: str = ""  # by which the service knows the same request again
 
 
 class Rest(NamedTuple):
@@ -55,13 +59,14 @@ class ServiceFlows:
         json: Any = None,
         content: bytes | None = None,
         params: Mapping[str, Any] | None = None,
+        key: str = "",
     ) -> Flow[httpx.Response]:
         """The answer to a request; raises ServiceError where it was refused."""
         for is_second in (False, True):
             if is_second or time.monotonic() > self._until_s:
                 yield from self._renew()
             url = f"{self.url}/v1{path}"
-            answer: httpx.Response = yield Ask(method, url, json, content, params, self._token)
+            answer: httpx.Response = yield Ask(method, url, json, content, params, self._token, key)
             if answer.status_code != 401:
                 break
         check(answer)
@@ -81,6 +86,17 @@ class ServiceFlows:
         """What the service answers to a document."""
         return (yield from self.ask("POST", path, json=json)).json()
 
+    def post_once(self, path: str, json: Any, within_s: float) -> Flow[Any]:
+        """As `post`; asked again where the answer is lost, and carried out once."""
+        key, until_s = secrets.token_hex(16), time.monotonic() + within_s
+        while True:
+            try:
+                return (yield from self.ask("POST", path, json=json, key=key)).json()
+            except httpx.TransportError:
+                if time.monotonic() > until_s:
+                    raise
+                yield Rest(AGAIN_S)
+
     def delete(self, path: str) -> Flow[None]:
         """Take something away."""
         yield from self.ask("DELETE", path)
@@ -99,7 +115,9 @@ class ServiceFlows:
     ) -> Flow[str]:
         """The id of a new job."""
         found = yield from self.add_configuration(environment, keys)
-        return str((yield from self.post("/jobs", {"configuration": found, **job}))["id"])
+        return str(
+            (yield from self.post_once("/jobs", {"configuration": found, **job}, RETRIED_S))["id"]
+        )
 
     def wait(self, job: str, timeout_s: float, poll_s: float = 0.25) -> Flow[dict[str, Any]]:
         """A job that is over; raises ServiceError if it has failed, or takes longer."""

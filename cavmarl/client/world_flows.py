@@ -75,7 +75,8 @@ class WorldFlows:
     ) -> Flow[None]:
         """Begin a session."""
         found = yield from self._service.add_configuration(environment, keys)
-        answer = yield from self._service.post("/sessions", {"configuration": found, **wanted})
+        body = {"configuration": found, **wanted}
+        answer = yield from self._service.post_once("/sessions", body, self._recovery_s)
         self._take(answer)
         yield from self._recover(is_known=True)
 

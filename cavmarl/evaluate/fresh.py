@@ -24,18 +24,25 @@ PROGRAM = "from cavmarl.evaluate.fresh import main; main()"
 
 
 def call_in_fresh_process(
-    what: str, call: Callable[..., Found], *given: Any, hear: Tell | None = None
+    what: str,
+    call: Callable[..., Found],
+    *given: Any,
+    hear: Tell | None = None,
+    began: Callable[[subprocess.Popen[bytes]], None] | None = None,
 ) -> Found:
     """What `call(*given)` returns in a new interpreter, or raises on purpose.
 
     With `hear`, `call` gets a last argument, too: what that is called with is told to `hear`. If
-    the process dies, an `EvaluationError` says `what` that was.
+    the process dies, an `EvaluationError` says `what` that was. `began` is given the process, for
+    another thread to end it.
     """
     program = start_dying_with_process(
         [sys.executable, "-c", PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     )
     assert program.stdin is not None
     assert program.stdout is not None
+    if began is not None:
+        began(program)
     try:
         pickle.dump((call, given, hear is not None), program.stdin)
         program.stdin.close()

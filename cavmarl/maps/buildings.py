@@ -18,7 +18,8 @@ from xml.sax.handler import ContentHandler
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import MapError, require
+from cavmarl.core.errors import MapError
+from cavmarl.maps.projection import project
 from cavmarl.roads.kernels.backdrop_pieces import WALL
 from cavmarl.roads.network import GeoReference, RoadNetwork
 from cavmarl.roads.sumo_net.reader import source_hash
@@ -240,15 +241,7 @@ def _project(path: Path, ring: Ring, geo: GeoReference | None) -> Ring:
             f"{path}: says where its buildings lie on the earth, and the map does not say where it "
             "lies: build it with a projection, or give buildings in the map's own frame"
         )
-    pyproj: Any = require("pyproj", "maps")
-    x, y = pyproj.Proj(projparams=geo.projection)(ring[:, 0], ring[:, 1])
-    placed: Ring = np.stack([x + geo.offset_x_m, y + geo.offset_y_m], axis=1)
-    if not np.isfinite(placed).all():
-        raise MapError(
-            f"{path}: a building near longitude {ring[0, 0]:g}, latitude {ring[0, 1]:g} cannot be "
-            "projected as the map is: export the file again for this map"
-        )
-    return placed
+    return project(path, ring, geo)
 
 
 # Buildings that are farther from every road's bounding box than any sensor sees are left out.

@@ -21,6 +21,8 @@ from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.spaces import global_state, state_space, write_sensed
 from cavmarl.engine.world_setup import World
 from cavmarl.handoff.coordinator.coordinator_setup import WorldRun
+from cavmarl.handoff.zone_view import TransferInFlight
+from cavmarl.ownership.transfers import TransferLog
 from cavmarl.parallel.checkpoint.world_cases import from_bytes, to_bytes
 from cavmarl.parallel.sensor_workers.sensor_pool import SensorWorkers
 from cavmarl.parallel.step_arrays import Driven, StepArrays, layout_of
@@ -84,6 +86,15 @@ class LocalWorlds:
             self._write_who_goes_on()
             self._keep_observations()
             self._steps[:] = 0
+
+    @property
+    def transfers(self) -> tuple[TransferLog, ...]:
+        """What became of each change of owner, by worlds; none where they are undivided."""
+        return self.simulation.transfers
+
+    def in_flight(self, world: int) -> Sequence[TransferInFlight]:
+        """Vehicles of one world whose next zone holds their state already."""
+        return self.simulation.zone_view(world).transfers
 
     def reset(self, seed: int | None, first_world: int) -> None:
         arrays, chosen = self.arrays, self.arrays.chosen

@@ -56,6 +56,8 @@ class ConfigurationBody(_Body):
     agents: Annotated[int, Field(ge=0, le=100_000)] | None = None
     background: Annotated[int, Field(ge=0, le=100_000)] | None = None
     max_cycles: Annotated[int, Field(ge=1, le=10_000_000)] | None = None
+    zones: Annotated[int, Field(ge=1, le=1024)] | None = None
+    nodes: Annotated[int, Field(ge=1, le=64)] | None = None  # that host the zones; None: one
     num_envs: Annotated[int, Field(ge=1, le=1024)] = 1
     seed: Annotated[int, Field(ge=0, lt=1 << 63)] = 0
     overrides: Annotated[dict[str, Any], Field(max_length=256)] = {}
@@ -75,6 +77,31 @@ class ResolveBody(_Body):
 
     unreachable: Annotated[list[Name], Field(max_length=16)] = []
     wait_s: Annotated[float, Field(ge=0.0, le=60.0)] = 0.0
+
+
+Whole = Annotated[int, Field(ge=0, lt=1 << 63)]
+
+
+class TransfersBody(_Body):
+    """A node tells which vehicles of a session have changed their zone, and which are about to."""
+
+    at: Whole  # commands up to then
+    # world, episode, tick, vehicle, source, target, epoch
+    transfers: Annotated[
+        list[Annotated[list[Whole], Field(min_length=7, max_length=7)]], Field(max_length=2000)
+    ] = []
+    # world, vehicle, source, target: the target holds its state, the source owns it still
+    prepared: Annotated[
+        list[Annotated[list[Whole], Field(min_length=4, max_length=4)]], Field(max_length=2000)
+    ] = []
+
+
+class DoorBody(_Body):
+    """A node tells where it awaits those that host zones of a session, and the key for them."""
+
+    host: Host
+    port: Port
+    key: Sha256
 
 
 class JobBody(_Body):

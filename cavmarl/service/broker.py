@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from cavmarl.balance.load_score import Utilisation
-from cavmarl.service.bodies import BeatBody, NodeBody
+from cavmarl.service.bodies import BeatBody, NodeBody, TransfersBody
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.infrastructure import (
     SESSION_OVER,
@@ -23,6 +23,7 @@ from cavmarl.service.infrastructure import (
 )
 from cavmarl.service.node_selection import Chosen, LiveNode, NoNodeError, choose, overloads
 from cavmarl.service.refusals import problem
+from cavmarl.service.zone_nodes import ZoneNodes
 
 SHOWN_EXCLUSIONS = 10  # in an event
 
@@ -59,6 +60,8 @@ class Broker:
         self._clock_s = clock_s
         self._touched: dict[str, float] = {}  # session → when it was asked for last
         self._skewed: set[str] = set()
+        # sessions → world, vehicle, source and target of what is about to change its zone
+        self.prepared: dict[str, list[list[int]]] = {}
         now_s = clock_s()
         for number, name in enumerate(log.state.nodes):
             self.live[name] = LiveNode(number, now_s)
@@ -66,6 +69,7 @@ class Broker:
             self._touched[session.id] = now_s
             if session.node is not None:
                 self.live[session.node].hosted.add(session.id)
+        self.zone_nodes = ZoneNodes(log, self.live, self._choose)
 
     # Nodes
 
@@ -114,6 +118,8 @@ class Broker:
             "draining": node.draining,
             "beat_s": self.rules.beat_s,
             "sessions": sorted(live.hosted),
+            "zones_of": self.zone_nodes.tasks(name),
+            "without_door": self.zone_nodes.without_door(sorted(live.hosted)),
             "jobs": [self._job_of(one) for one in sorted(live.hosted)
                      if self.log.state.sessions[one].job is not None],
         }  # fmt: skip
@@ -162,6 +168,7 @@ class Broker:
                     self._forget(session)
             elif session.job is None and idle_s > self.rules.idle_s:
                 self._end(session, "closed", "service", f"nobody asked for {idle_s:.0f} s")
+        self.zone_nodes.sweep()
         self.assign_jobs()
 
     # Sessions and jobs
@@ -174,8 +181,12 @@ class Broker:
         preferred: str | None = None,
         needs: Sequence[str] = (),
         job: dict[str, Any] | None = None,
+        zone_nodes: int = 0,
+        key: str = "",
     ) -> SessionRecord:
         """A session, assigned to a node; a job waits for one if there is none.
+
+        With the `key` of a request that was carried out, it is the session of that request.
 
         Raises:
             NoNodeError: no node can take a session.
@@ -185,16 +196,20 @@ class Broker:
             for one in self.log.state.sessions.values()
             if one.owner == identity.id and one.state not in SESSION_OVER
         ]
-        if len(own) >= self.rules.max_sessions:
-            raise problem("too-many", f"{len(own)} sessions are open: close some", 60.0)
-        number = f"s-{secrets.token_hex(12)}"
         data: dict[str, Any] = {
             "owner_name": identity.name,
             "configuration": configuration,
             "job": job,
             "needs": list(needs),
             "preferred": preferred,
+            "zone_nodes": zone_nodes,
+            "key": key,
         }
+        if key and (known := self._of_key(identity, data)) is not None:
+            return known
+        if len(own) >= self.rules.max_sessions:
+            raise problem("too-many", f"{len(own)} sessions are open: close some", 60.0)
+        number = f"s-{secrets.token_hex(12)}"
         session = SessionRecord(id=number, owner=identity.id, **data)
         try:
             chosen = self._choose(session, ())
@@ -273,6 +288,13 @@ class Broker:
         if before != sha256:
             self._drop(before)
 
+    def hand_over(self, session: SessionRecord, body: TransfersBody) -> None:
+        """Vehicles of a session have changed their zone; others are about to."""
+        if body.transfers:
+            data = {"number": body.at, "transfers": body.transfers}
+            self._tell(session, "handed_over", data)
+        self.prepared[session.id] = body.prepared
+
     def add_result(self, session: SessionRecord, name: str, content: bytes) -> None:
         """Keep a file that a job has made."""
         sha256 = self.log.keep(content)
@@ -291,6 +313,17 @@ class Broker:
                 continue  # another may need less
 
     # Within
+
+    def _of_key(self, identity: IdentityRecord, data: dict[str, Any]) -> SessionRecord | None:
+        """The session that an identity has opened with a key before."""
+        for one in self.log.state.sessions.values():
+            if one.owner == identity.id and one.key == data["key"]:
+                if any(getattr(one, name) != value for name, value in data.items()):
+                    raise problem("conflict", f"key '{one.key}' was of another request")
+                if one.node is None and one.job is None:
+                    return self.resolve(identity, one.id)
+                return one
+        return None
 
     def _choose(self, session: SessionRecord, avoided: Sequence[str]) -> Chosen:
         began_s = time.perf_counter()
@@ -320,6 +353,8 @@ class Broker:
         live.hosted.add(number)
         live.unheard.add(number)
         live.refresh()
+        if session.zone_nodes:
+            self.zone_nodes.gather(session)
 
     def _end(self, session: SessionRecord, word: str, actor: str, message: str = "") -> None:
         if session.node is not None:
@@ -328,6 +363,8 @@ class Broker:
             live.unheard.discard(session.id)
             live.refresh()
         blob = session.saved_blob
+        self.zone_nodes.end(session)
+        self.prepared.pop(session.id, None)
         data = {"message": message}
         self.log.record(f"session.{word}", session.id, data, actor=actor, owner=session.owner)
         self._touched[session.id] = self._clock_s()
@@ -350,11 +387,13 @@ class Broker:
         live = self.live[name]
         live.hosted.clear()
         live.unheard.clear()
+        live.zones_of.clear()
         live.use = None
         live.refresh()
 
     def _tell(self, session: SessionRecord, word: str, data: dict[str, Any]) -> None:
-        actor = session.node if word in ("saved", "result") and session.node else "service"
+        is_nodes = word in ("saved", "result", "handed_over")
+        actor = session.node if is_nodes and session.node else "service"
         self.log.record(f"session.{word}", session.id, data, actor=actor, owner=session.owner)
 
     def _job_of(self, number: str) -> dict[str, Any]:

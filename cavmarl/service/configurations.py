@@ -67,8 +67,11 @@ def check_policies(policies: list[str]) -> None:
 
 def world_keywords(document: dict[str, Any]) -> dict[str, Any]:
     """Keywords of `make_vec` and `evaluate` that name the world."""
-    names = ("agents", "background", "max_cycles", "overrides")
-    return {name: document[name] for name in names}
+    names = ("agents", "background", "max_cycles")
+    zones = document.get("zones")
+    divided = {} if zones is None else {"zones.count": zones}
+    keys: dict[str, Any] = {name: document[name] for name in names}
+    return keys | {"overrides": document["overrides"] | divided}
 
 
 def _check(document: dict[str, Any]) -> None:

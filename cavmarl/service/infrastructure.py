@@ -13,6 +13,7 @@ ROLES = ("viewer", "client", "operator", "admin", "node")
 Role = Literal["viewer", "client", "operator", "admin", "node"]
 
 SESSION_OVER = ("closed", "done", "failed")
+KEPT_OWNERS = 10_000  # of a world
 
 
 class LogEvent(NamedTuple):
@@ -69,6 +70,20 @@ class SessionRecord:
     saved_blob: str | None = None
     results: dict[str, str] = field(default_factory=dict)  # name → hash
     message: str = ""
+    key: str = ""  # by which the same request is known again
+    zone_nodes: int = 0  # how many nodes host the zones of its worlds; 0: its node has all
+    members: list[str] = field(default_factory=list)  # these nodes
+    told_number: int = 0  # commands up to which it is told which vehicles have changed their zone
+    # world → its episode, and vehicle → [zone that owns it, epoch], of those that have changed
+    owners: dict[str, OwnerTable] = field(default_factory=dict)
+
+
+@dataclass
+class OwnerTable:
+    """Owners of the vehicles of one world that have changed their zone, the newest last."""
+
+    episode: int
+    zones: dict[int, list[int]] = field(default_factory=dict)
 
 
 @dataclass
@@ -175,9 +190,34 @@ class Infrastructure:
             case "saved":
                 session.saved_number = event.data["number"]
                 session.saved_blob = event.data["sha256"]
+            case "repartitioned":
+                session.members = event.data["members"]
+            case "handed_over":
+                session.told_number = event.data["number"]
+                for transfer in event.data["transfers"]:
+                    _hand_over(session.owners, *transfer)
             case "result":
                 session.results[event.data["name"]] = event.data["sha256"]
             case "closed" | "done" | "failed":
                 session.state, session.node = word, None
                 self.waiting.discard(event.subject)
                 session.saved_blob, session.message = None, event.data.get("message", "")
+
+
+def _hand_over(
+    owners: dict[str, OwnerTable],
+    world: int,
+    episode: int,
+    tick: int,
+    vehicle: int,
+    source: int,
+    target: int,
+    epoch: int,
+) -> None:
+    table = owners.get(str(world))
+    if table is None or table.episode != episode:
+        table = owners[str(world)] = OwnerTable(episode)
+    table.zones.pop(vehicle, None)
+    table.zones[vehicle] = [target, epoch]
+    if len(table.zones) > KEPT_OWNERS:
+        del table.zones[next(iter(table.zones))]

@@ -18,7 +18,7 @@ from fastapi.responses import JSONResponse
 from starlette.types import ASGIApp
 
 from cavmarl.client.world_flows import SAVED_HEADER
-from cavmarl.core.errors import ServiceError
+from cavmarl.core.errors import ServiceError, WorkerError
 from cavmarl.service.access import ALGORITHM, ISSUER
 from cavmarl.service.app import NO_TELEMETRY, GuardedRequests
 from cavmarl.service.node_link import NodeLink
@@ -92,7 +92,11 @@ async def open_worlds(
     if session not in worlds:
         document = await link.configuration(configuration)
         state, number = await link.saved_state(session)
-        await asyncio.to_thread(worlds.add, session, document, state, number)
+        keys = await link.open_door(session, document)
+        try:
+            await asyncio.to_thread(worlds.add, session, document, state, number, keys)
+        except WorkerError as error:
+            raise problem("lost", f"its zones have no nodes: {error}") from error
         link.expect(session)
     elif save:
         await _save(link, worlds, session)
@@ -125,8 +129,14 @@ async def command(
     def act() -> bytes:
         return world.command(word, number, seed, content, quiet)
 
-    answer = await _in_turn(worlds, act)
-    worlds.steps += 1
+    try:
+        answer = await in_turn(worlds, act)
+    except (
+        WorkerError
+    ) as error:  # the nodes of its zones are gone: it begins anew from what is saved
+        await asyncio.to_thread(worlds.close, session)
+        raise problem("lost", f"its zones have no nodes: {error}") from error
+    worlds.ended(session, word)
     headers = {SAVED_HEADER: str(world.saved)}
     return Response(answer, headers=headers, media_type="application/octet-stream")
 
@@ -138,11 +148,11 @@ async def look(request: Request, session: str, word: str, _: Opened) -> Response
     world = worlds[session]
     match word:
         case "hash":
-            return JSONResponse({"hashes": await _in_turn(worlds, world.hashes)})
+            return JSONResponse({"hashes": await in_turn(worlds, world.hashes)})
         case "transfers":
-            return JSONResponse({"transfers": await _in_turn(worlds, world.transfers)})
+            return JSONResponse({"transfers": await in_turn(worlds, world.transfers)})
         case "suggestion":
-            content = await _in_turn(worlds, world.suggestion)
+            content = await in_turn(worlds, world.suggestion)
             return Response(content, media_type="application/octet-stream")
     raise problem("not-found", f"no question '{word}': there are hash, suggestion and transfers")
 
@@ -158,7 +168,7 @@ async def _save(link: NodeLink, worlds: SessionWorlds, session: str) -> None:
     number = world.number
     if number == world.saved:
         return
-    state = await _in_turn(worlds, world.state)
+    state = await in_turn(worlds, world.state)
     if state is None:
         return
     try:
@@ -170,7 +180,7 @@ async def _save(link: NodeLink, worlds: SessionWorlds, session: str) -> None:
     world.saved = number
 
 
-async def _in_turn(worlds: SessionWorlds, act: Callable[[], Any]) -> Any:
+async def in_turn(worlds: SessionWorlds, act: Callable[[], Any]) -> Any:
     """Do something with worlds, in a thread, when no other does."""
 
     def wait_and_act() -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import signal
+import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,10 +18,11 @@ from cavmarl.core.errors import CavmarlError, ServiceError
 from cavmarl.evaluate.evaluation import evaluate
 from cavmarl.evaluate.fresh import call_in_fresh_process
 from cavmarl.service.configurations import world_keywords
-from cavmarl.service.node_app import make_node_app
+from cavmarl.service.node_app import in_turn, make_node_app
 from cavmarl.service.node_link import NodeLink, is_final
 from cavmarl.service.server import ServerOptions, check_transport, listen, uvicorn_config
 from cavmarl.service.session_worlds import SessionWorlds
+from cavmarl.service.zone_processes import ZoneProcesses
 
 MOST_MESSAGE = 2000
 DRAIN_S = 60.0  # after which a node that is drained ends, whatever it has
@@ -51,6 +53,8 @@ class _Host:
     worlds: SessionWorlds
     tell: Callable[[str], None]
     jobs: dict[str, asyncio.Task[None]] = field(default_factory=dict)
+    zones: ZoneProcesses = field(default_factory=ZoneProcesses)
+    telling: asyncio.Task[None] | None = None
     failure: ServiceError | None = None
     is_ending: bool = False
 
@@ -100,6 +104,7 @@ async def _run(options: NodeOptions, tell: Callable[[str], None]) -> None:
     finally:
         for job in host.jobs.values():
             job.cancel()
+        host.zones.end()
         await link.close()
         listener.close()
     if host.failure is not None:
@@ -125,12 +130,13 @@ async def _beat_until_end(host: _Host) -> None:
         try:
             if host.is_ending and not link.is_draining:
                 await link.drain()
-            told = await link.beat(
-                {"steps": float(host.worlds.steps), "wait_s": host.worlds.wait_s}
-            )
+            told = await link.beat(host.worlds.counters())
             pause_s = told["beat_s"]
             host.worlds.keep_only(link.own(told["sessions"]))
             _start_jobs(host, told["jobs"])
+            host.zones.follow(told["zones_of"])
+            if host.telling is None or host.telling.done():
+                host.telling = asyncio.create_task(_tell_transfers(host))
             if link.is_draining:
                 drained_s = min(drained_s, loop.time())
                 if not told["sessions"] or (host.is_ending and loop.time() > drained_s + DRAIN_S):
@@ -153,26 +159,41 @@ def _start_jobs(host: _Host, jobs: list[dict[str, Any]]) -> None:
         if job["id"] not in host.jobs:
             host.jobs[job["id"]] = asyncio.create_task(_run_job(host, job))
     wanted = {job["id"] for job in jobs}
-    for number in [one for one, task in host.jobs.items() if task.done() and one not in wanted]:
-        del host.jobs[number]
+    for number in [one for one in host.jobs if one not in wanted]:
+        host.jobs.pop(number).cancel()
+
+
+async def _tell_transfers(host: _Host) -> None:
+    """Tell the service which vehicles have changed their zone since it was told last."""
+    for session in host.worlds.divided():
+        with contextlib.suppress(ServiceError):  # the session, or the service, is gone
+            world = host.worlds[session]
+            rows = await in_turn(host.worlds, world.ownership)
+            await host.link.tell_transfers(session, world.number, rows)
 
 
 async def _run_job(host: _Host, job: dict[str, Any]) -> None:
     """Evaluate in a process of its own, and leave the files with the service."""
     link, path = host.link, f"/jobs/{job['id']}"
     status, message = "done", ""
+    started: list[subprocess.Popen[bytes]] = []
     with TemporaryDirectory() as folder:
         try:
             document = await link.configuration(job["configuration"])
             what = f"job {job['id']}"
             place = Path(folder) / "results"
             await asyncio.to_thread(
-                call_in_fresh_process, what, run_evaluation, document, job, place
-            )
+                call_in_fresh_process, what, run_evaluation, document, job, place,
+                began=started.append,
+            )  # fmt: skip
             for file in sorted(place.iterdir()):
                 await link.ask("PUT", f"{path}/results/{file.name}", content=file.read_bytes())
         except CavmarlError as error:
             status, message = "failed", str(error)[:MOST_MESSAGE]
+        except asyncio.CancelledError:  # it is closed, or another node's by now
+            for process in started:
+                process.kill()
+            raise
     # Where the service is away or the job is another's by now, it runs again elsewhere.
     with contextlib.suppress(ServiceError):
         await link.ask("POST", f"{path}/outcome", json={"status": status, "message": message})

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import secrets
+import socket
 import time
 from importlib.metadata import version
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import jwt
@@ -14,9 +18,12 @@ import psutil
 from cavmarl.balance.probe import busiest_gpu
 from cavmarl.client.clients import AsyncClient
 from cavmarl.core.errors import ServiceError
+from cavmarl.service.configurations import world_keywords
 
 NEW_S = 5.0  # for so long a session may be here before a beat's answer names it
 GPU_EVERY = 5  # beats
+JOIN_S = 60.0  # in which the nodes of a session's zones have to come
+MOST_ROWS = 2000  # in one body
 
 
 class NodeLink:
@@ -45,6 +52,8 @@ class NodeLink:
         self._beats = itertools.count()
         self._keys: dict[str, Any] = {}
         self._expected: dict[str, float] = {}
+        self._doors: dict[str, dict[str, Any]] = {}
+        self._key_files = TemporaryDirectory(prefix="cavmarl-")
         self._gpu = 0.0
         self._is_supposed_idle = is_supposed_idle
 
@@ -75,6 +84,9 @@ class NodeLink:
         answer = await self.ask("POST", f"/nodes/{self.name}/beat", json=body)
         told: dict[str, Any] = answer.json()
         self.is_draining = told["draining"]
+        for session in told["without_door"]:  # the service has begun again
+            if session in self._doors:
+                await self._tell_door(session)
         return told
 
     def expect(self, session: str) -> None:
@@ -111,6 +123,39 @@ class NodeLink:
         path = f"/sessions/{session}/state"
         await self.ask("PUT", path, content=state, params={"at": number})
 
+    async def open_door(self, session: str, document: dict[str, Any]) -> dict[str, Any]:
+        """Have other nodes host the zones of a session; the keywords of `make_vec` for that."""
+        if not document.get("nodes"):
+            return {}
+        host: str = self._body["address"]
+        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as free:
+            free.bind((host, 0))
+            port = free.getsockname()[1]
+        key = secrets.token_hex(16)
+        self._doors[session] = {"host": host, "port": port, "key": key.encode().hex()}
+        path = Path(self._key_files.name) / session
+        path.touch(mode=0o600)
+        path.write_text(key)
+        await self._tell_door(session)
+        keys = {"workers.key_file": str(path), "workers.join_timeout_s": JOIN_S}
+        shown = f"[{host}]" if ":" in host else host
+        return {
+            "nodes": document["nodes"],
+            "hosts": f"{shown}:{port}",
+            "overrides": world_keywords(document)["overrides"] | keys,
+        }
+
+    async def _tell_door(self, session: str) -> None:
+        await self.ask("PUT", f"/sessions/{session}/door", json=self._doors[session])
+
+    async def tell_transfers(self, session: str, number: int, rows: dict[str, list[Any]]) -> None:
+        """Tell which vehicles have changed their zone, and which are prepared to."""
+        told, prepared = rows["transfers"], rows["prepared"][-MOST_ROWS:]
+        for first in range(0, max(len(told), 1), MOST_ROWS):
+            some = told[first : first + MOST_ROWS]
+            body = {"at": number, "transfers": some, "prepared": prepared}
+            await self.ask("PUT", f"/sessions/{session}/transfers", json=body)
+
     async def drain(self) -> None:
         """Ask for nothing more."""
         await self.ask("POST", f"/nodes/{self.name}/drain")
@@ -126,6 +171,7 @@ class NodeLink:
     async def close(self) -> None:
         """Close the connections."""
         await self._client.close()
+        self._key_files.cleanup()
 
 
 def is_final(error: ServiceError) -> bool:

@@ -49,6 +49,7 @@ class LiveNode:
     use: Utilisation | None = None  # None: no beat yet
     hosted: set[str] = field(default_factory=set)  # ids of sessions that are assigned to it
     unheard: set[str] = field(default_factory=set)  # of these, since its last beat
+    zones_of: list[str] = field(default_factory=list)  # sessions, a time for each part that it has
     counters: dict[str, float] = field(default_factory=dict)  # that it tells for /metrics
     candidate: Candidate | None = None  # as `select` takes it; None: to be made
 
@@ -159,7 +160,7 @@ def _reason_against(
         return "access"
     if session.needs and not set(session.needs) <= set(node.capabilities):
         return "capability"
-    if len(known.hosted) >= node.slots:
+    if len(known.hosted) + len(known.zones_of) >= node.slots:
         return "capacity"
     return None
 
@@ -169,7 +170,8 @@ def _candidate(node: NodeRecord, known: LiveNode, rule: LoadRule) -> Candidate:
     assert use is not None
     reserved = use.cpu + len(known.unheard) / node.slots
     cpu = max(use.cpu, min(reserved, rule.thresholds[0]))
-    return Candidate(known.number, Utilisation(cpu, use.ram, use.gpu), len(known.hosted))
+    busy = len(known.hosted) + len(known.zones_of)
+    return Candidate(known.number, Utilisation(cpu, use.ram, use.gpu), busy)
 
 
 def _why_not(preferred: str, exclusions: Sequence[Exclusion]) -> str:

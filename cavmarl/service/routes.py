@@ -9,17 +9,11 @@ from collections.abc import AsyncIterator, Callable
 from dataclasses import asdict
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Path, Query, Request, Response
+from fastapi import Header, Path, Query, Request, Response
 from fastapi.responses import JSONResponse, PlainTextResponse, StreamingResponse
 
 from cavmarl.service import bodies, configurations
-from cavmarl.service.guards import (
-    DurableRoute,
-    Service,
-    TheService,
-    may,
-    open_to_all,
-)
+from cavmarl.service.guards import Service, TheService
 from cavmarl.service.infrastructure import (
     IdentityRecord,
     LogEvent,
@@ -27,47 +21,37 @@ from cavmarl.service.infrastructure import (
     SessionRecord,
 )
 from cavmarl.service.node_selection import NoNodeError, score_of
-from cavmarl.service.refusals import PROBLEM_SCHEMA, PROBLEM_TYPE, problem
+from cavmarl.service.ownership_routes import ownership
+from cavmarl.service.refusals import problem
+from cavmarl.service.route_parts import (
+    BYTES,
+    Admins,
+    Anybody,
+    Clients,
+    Drainers,
+    Everyone,
+    FileName,
+    NodeName,
+    Nodes,
+    Operators,
+    Readers,
+    SessionId,
+    Viewers,
+    make_router,
+)
 
-PROBLEM: dict[int | str, dict[str, Any]] = {
-    status: {"description": "A problem", "content": {PROBLEM_TYPE: {"schema": PROBLEM_SCHEMA}}}
-    for status in ("default", 422)
-}
-BYTES: dict[int | str, dict[str, Any]] = {
-    200: {
-        "description": "Content",
-        "content": {"application/octet-stream": {"schema": {"type": "string"}}},
-    }
-}
-
-
-def _router(prefix: str, tag: str) -> APIRouter:
-    return APIRouter(prefix=prefix, route_class=DurableRoute, tags=[tag], responses=PROBLEM)
-
-
-open_routes = _router("/v1", "open")
-nodes = _router("/v1/nodes", "nodes")
-worlds = _router("/v1", "sessions")
-records = _router("/v1", "records")
-ROUTERS = (nodes, worlds, records, open_routes)  # beats are most of what comes
+open_routes = make_router("/v1", "open")
+nodes = make_router("/v1/nodes", "nodes")
+worlds = make_router("/v1", "sessions")
+records = make_router("/v1", "records")
+ROUTERS = (nodes, worlds, ownership, records, open_routes)  # beats are most of what comes
 
 PAGE = 1000
+IdempotencyKey = Annotated[
+    str, Header(alias="Idempotency-Key", pattern=r"^[A-Za-z0-9-]{0,64}$")
+]  # the same request with the same key is carried out once
 TLS = "tls"  # the capability of nodes whose clients' port has it
 KEEP_ALIVE_S = 15.0
-
-Everyone = Annotated[IdentityRecord, Depends(may("viewer", "client", "operator", "admin", "node"))]
-Viewers = Annotated[IdentityRecord, Depends(may("viewer", "operator", "admin"))]
-Readers = Annotated[IdentityRecord, Depends(may("viewer", "client", "operator", "admin"))]
-Clients = Annotated[IdentityRecord, Depends(may("client", "operator", "admin"))]
-Operators = Annotated[IdentityRecord, Depends(may("operator", "admin"))]
-Drainers = Annotated[IdentityRecord, Depends(may("operator", "admin", "node"))]
-Admins = Annotated[IdentityRecord, Depends(may("admin"))]
-Nodes = Annotated[IdentityRecord, Depends(may("node"))]
-Anybody = Annotated[IdentityRecord, Depends(open_to_all())]
-
-NodeName = Annotated[bodies.Name, Path()]
-SessionId = Annotated[str, Path(pattern=r"^s-[0-9a-f]{24}$")]
-FileName = Annotated[bodies.Name, Path()]
 
 
 @open_routes.get("/health")
@@ -153,14 +137,19 @@ async def get_configuration(
 
 @worlds.post("/sessions", status_code=201)
 async def open_session(
-    identity: Clients, service: TheService, body: bodies.SessionBody
+    identity: Clients, service: TheService, body: bodies.SessionBody, key: IdempotencyKey = ""
 ) -> dict[str, Any]:
     """Open a session on the node that eq. (1) and (2) choose, or on a preferred one."""
-    configurations.read_configuration(service.broker.log, body.configuration)
+    found = configurations.read_configuration(service.broker.log, body.configuration)
 
     def opened() -> SessionRecord:
         return service.broker.open(
-            identity, body.configuration, preferred=body.node, needs=body.needs
+            identity,
+            body.configuration,
+            preferred=body.node,
+            needs=body.needs,
+            zone_nodes=found.get("nodes") or 0,
+            key=key,
         )
 
     return await _assigned(service, identity, body.configuration, opened, body.wait_s)
@@ -229,14 +218,17 @@ async def put_state(
 
 
 @worlds.post("/jobs", status_code=201)
-async def submit(identity: Clients, service: TheService, body: bodies.JobBody) -> dict[str, Any]:
+async def submit(
+    identity: Clients, service: TheService, body: bodies.JobBody, key: IdempotencyKey = ""
+) -> dict[str, Any]:
     """Have a node evaluate drivers; where none can, the job waits for one."""
-    configurations.read_configuration(service.broker.log, body.configuration)
+    if configurations.read_configuration(service.broker.log, body.configuration).get("nodes"):
+        raise problem("refused", "nodes: an evaluation runs on one node; leave it out")
     configurations.check_policies(body.policies)
     job = body.model_dump(include={"policies", "episodes", "repeats"})
     return _session(
         service.broker.open(
-            identity, body.configuration, preferred=body.node, needs=body.needs, job=job
+            identity, body.configuration, preferred=body.node, needs=body.needs, job=job, key=key
         )
     )
 
@@ -399,7 +391,7 @@ def _node(service: Service, node: NodeRecord) -> dict[str, Any]:
 
 def _session(session: SessionRecord) -> dict[str, Any]:
     found = asdict(session)
-    del found["saved_blob"]
+    del found["saved_blob"], found["owners"]
     return found
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 from typing import Any
 
@@ -10,10 +11,13 @@ import numpy as np
 from cavmarl.client.world_flows import flatten, pack
 from cavmarl.core.errors import CapacityError, ConfigError
 from cavmarl.env.vector import make_vec
+from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.service.configurations import world_keywords
 from cavmarl.service.refusals import problem
 
 SAVED_EVERY = 50  # commands
+TOLD_OF_TRANSFERS = ("episode", "tick", "vehicle", "source", "target", "epoch")
 
 
 class SessionWorld:
@@ -21,6 +25,7 @@ class SessionWorld:
 
     Args:
         document: their configuration.
+        keys: for `make_vec`, beside it.
         state: what another node has saved; None: they begin.
         number: commands that it includes.
 
@@ -29,14 +34,19 @@ class SessionWorld:
         saved: those that the state includes which the service has.
     """
 
-    def __init__(self, document: dict[str, Any], state: bytes | None, number: int) -> None:
+    def __init__(
+        self, document: dict[str, Any], state: bytes | None, number: int, keys: dict[str, Any]
+    ) -> None:
         self.number = self.saved = number
         self._vec = make_vec(
             document["environment"],
             num_envs=document["num_envs"],
             seed=document["seed"],
-            **world_keywords(document),
+            **(world_keywords(document) | keys),
         )
+        # Their zones are here or at nodes, never at workers.
+        self._worlds: LocalWorlds | NodeWorlds = self._vec.worlds  # type: ignore[assignment]
+        self._told = [0] * len(self._worlds.transfers)  # transfers that the service has of each
         self._last = b""  # the answer to the last command
         if state:
             self._vec.load_state(state)
@@ -105,10 +115,44 @@ class SessionWorld:
 
     def transfers(self) -> list[dict[str, Any]]:
         """The newest changes of owner of divided worlds."""
-        found = self._vec.simulation.transfers
+        found = self._worlds.transfers
         return [
             {"world": world, **row._asdict()} for world, log in enumerate(found) for row in log.rows
         ]
+
+    def ownership(self) -> dict[str, list[list[int]]]:
+        """Transfers since this was asked last, and those that are prepared: see `TransfersBody`."""
+        rows, prepared = [], []
+        for world, log in enumerate(self._worlds.transfers):
+            known, number = self._told[world], self._num_transfers(world)
+            self._told[world] = number
+            for row in itertools.islice(log.rows, max(len(log.rows) - (number - known), 0), None):
+                rows.append([world, *(getattr(row, name) for name in TOLD_OF_TRANSFERS)])
+            prepared += [
+                [world, one.vehicle, one.source, one.target]
+                for one in self._worlds.in_flight(world)
+                if one.state.casefold() == "prepared"
+            ]
+        return {"transfers": rows, "prepared": prepared}
+
+    @property
+    def num_transfers(self) -> int:
+        """How many vehicles have changed their zone."""
+        return sum(self._num_transfers(world) for world in range(len(self._told)))
+
+    @property
+    def is_divided(self) -> bool:
+        """Whether vehicles can change their zone."""
+        return bool(self._told)
+
+    @property
+    def num_ticks(self) -> int:
+        """Ticks of one step of all worlds."""
+        return self._vec.num_envs * self._vec.config.clock.ticks_per_step
+
+    def _num_transfers(self, world: int) -> int:
+        counts = self._worlds.transfers[world].counts
+        return counts["switched"] + counts["forced"]
 
     def close(self) -> None:
         """Let go of their memory and processes."""
@@ -124,7 +168,7 @@ class SessionWorlds:
 
     def __init__(self, slots: int) -> None:
         self.lock = threading.Lock()
-        self.ticks = self.steps = 0
+        self.ticks = self.steps = self._past_transfers = 0
         self.wait_s = 0.0
         self._slots = slots
         self._worlds: dict[str, SessionWorld] = {}
@@ -137,13 +181,40 @@ class SessionWorlds:
             raise problem("lost", f"session '{session}' is not on this node: resolve it again")
         return self._worlds[session]
 
-    def add(self, session: str, document: dict[str, Any], state: bytes | None, number: int) -> None:
+    def add(
+        self,
+        session: str,
+        document: dict[str, Any],
+        state: bytes | None,
+        number: int,
+        keys: dict[str, Any],
+    ) -> None:
         """Make the worlds of a session."""
         if len(self._worlds) >= self._slots:
             raise CapacityError(f"{self._slots} sessions are on this node: resolve it again later")
         with self.lock:
             if session not in self._worlds:
-                self._worlds[session] = SessionWorld(document, state, number)
+                self._worlds[session] = SessionWorld(document, state, number, keys)
+
+    def ended(self, session: str, word: str) -> None:
+        """A command of a session is done."""
+        if word == "step":
+            self.steps += 1
+            self.ticks += self[session].num_ticks
+
+    def counters(self) -> dict[str, float]:
+        """What a beat tells."""
+        present = sum(world.num_transfers for world in list(self._worlds.values()))
+        return {
+            "ticks": float(self.ticks),
+            "steps": float(self.steps),
+            "wait_s": self.wait_s,
+            "transfers": float(self._past_transfers + present),
+        }
+
+    def divided(self) -> list[str]:
+        """Sessions whose worlds have zones."""
+        return [session for session, world in list(self._worlds.items()) if world.is_divided]
 
     def keep_only(self, sessions: set[str]) -> None:
         """Close those that are another node's now."""
@@ -155,6 +226,7 @@ class SessionWorlds:
         with self.lock:
             world = self._worlds.pop(session, None)
             if world is not None:
+                self._past_transfers += world.num_transfers
                 world.close()
 
 

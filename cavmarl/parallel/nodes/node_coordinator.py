@@ -8,10 +8,12 @@ from collections.abc import Mapping, Sequence
 
 from cavmarl.core.errors import MessageError, ProtocolError
 from cavmarl.handoff.coordinator.journal import AnyJournal
+from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import Ack, Begin, Birth, Message, Nack, Output
 from cavmarl.ownership.reactions import Hosting
+from cavmarl.ownership.transfers import TransferLog
 from cavmarl.parallel.nodes.links import FrameKind, Links, NodeFrame, SilenceError
 from cavmarl.parallel.nodes.zone_hosts import Report, packed, unpacked
 
@@ -39,6 +41,7 @@ class _World:
         self.states = CrossingDigests()
         self.directory = Directory(run, range(zones), self.states, limits)
         self.journal = journal
+        self.log = TransferLog(limits.lifetime)
         self.movers: list[tuple[int, int]] = []
         self.births: list[Birth] = []
         self.answered: set[tuple[int, int]] = set()
@@ -47,6 +50,7 @@ class _World:
         """Write records down; how many vehicles change their owner by them."""
         if self.journal is not None and output.records:
             self.journal.append(output.records)
+        self.log.logged(output.records)
         return sum(len(r.switches) for r in output.records if isinstance(r, Begin))
 
 
@@ -170,6 +174,21 @@ class NodeCoordinator:
             self.switched += world.write(output)
             messages += [(w, message) for message in output.messages]
         self._send(messages)
+
+    @property
+    def transfers(self) -> tuple[TransferLog, ...]:
+        """What became of each change of owner, by worlds."""
+        return tuple(world.log for world in self._worlds)
+
+    def in_flight(self, w: int) -> list[TransferInFlight]:
+        """Vehicles whose next zone has said that it holds their state, in one world."""
+        world = self._worlds[w]
+        owners = world.directory.table.owners
+        return [
+            TransferInFlight(vehicle, owners[vehicle][0], zone, "prepared")
+            for vehicle, zone in sorted(world.answered)
+            if vehicle in owners and owners[vehicle][0] != zone
+        ]
 
     def _send(self, messages: Sequence[tuple[int, Message]]) -> None:
         by_node: defaultdict[int, list[tuple[int, Message]]] = defaultdict(list)

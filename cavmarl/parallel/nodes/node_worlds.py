@@ -14,6 +14,8 @@ from cavmarl.balance.balance_plan import Plan
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
+from cavmarl.handoff.zone_view import TransferInFlight
+from cavmarl.ownership.transfers import TransferLog
 from cavmarl.parallel.commanded_worlds import uncopied
 from cavmarl.parallel.mover import Mover
 from cavmarl.parallel.nodes.node_frames import (
@@ -185,6 +187,15 @@ class NodeWorlds(NodePool):
     @property
     def plans(self) -> tuple[Plan, ...]:
         return self._placement.plans
+
+    @property
+    def transfers(self) -> tuple[TransferLog, ...]:
+        """What became of each change of owner, by worlds."""
+        return self._coordinator.transfers
+
+    def in_flight(self, world: int) -> Sequence[TransferInFlight]:
+        """Vehicles of one world whose next zone holds their state already."""
+        return self._coordinator.in_flight(world)
 
     @property
     def migrations(self) -> int:

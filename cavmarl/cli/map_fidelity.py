@@ -1,0 +1,184 @@
+"""`cavmarl map fidelity`: how true a map, or a cloud, is to measured point clouds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.text import Text
+
+from cavmarl.cli.output import JsonPath, about, about_file, grid, write_json
+from cavmarl.core.errors import ConfigError
+from cavmarl.engine.world_setup import find_map
+from cavmarl.maps.buildings import with_buildings
+from cavmarl.maps.fidelity.cloud_files import Cloud, is_cloud, read_cloud
+from cavmarl.maps.fidelity.cloud_filters import crop, drop_outliers, thin_out
+from cavmarl.maps.fidelity.cloud_frames import FRAMES, in_map_frame
+from cavmarl.maps.fidelity.cloud_registration import moved
+from cavmarl.maps.fidelity.comparison import PAPER_TABLE, Comparison, compare, start_transform
+from cavmarl.maps.fidelity.exports import write_page, write_points
+from cavmarl.maps.fidelity.map_surface import map_surface
+from cavmarl.maps.fidelity.road_edges import RoadFit, fit_roads
+from cavmarl.maps.netconvert import map_file
+from cavmarl.roads.cache import load_network
+from cavmarl.roads.network import RoadNetwork
+
+_ALIGNMENTS = ("icp", "edges", "none")
+_MARGIN_M = 5.0  # around the map, and of the map around a cloud
+
+Reference = Annotated[
+    str, typer.Argument(metavar="MAP", help="A map, or a cloud that others are compared with.")
+]
+Measured = Annotated[
+    Path, typer.Argument(help="A point cloud: csv, ply, pcd, las, laz.", dir_okay=False)
+]
+
+
+def fidelity(
+    reference: Reference,
+    cloud: Measured,
+    cloud2: Annotated[
+        Path | None, typer.Argument(help="Another one, in a second column.", dir_okay=False)
+    ] = None,
+    frame: Annotated[str, about(f"Of the clouds: {', '.join(FRAMES)}.")] = "map",
+    start: Annotated[
+        str | None, about("Where a cloud lies about: x,y,z,yaw, m and degrees.")
+    ] = None,
+    voxel: Annotated[float, about("Side of the voxel filter's cubes, m; 0: no filter.")] = 0.05,
+    outliers: Annotated[
+        float, about("Sigmas beyond which the outlier filter removes points; 0: no filter.")
+    ] = 4.0,
+    keep: Annotated[float, about("Share of the nearest pairs that trimmed ICP keeps.")] = 0.8,
+    align: Annotated[
+        str, about("By icp, by the edges and heights of roads, or none: as they are.")
+    ] = "icp",
+    buildings: Annotated[
+        Path | None, about("OSM or SUMO polygons: their walls are part of the map's surface.")
+    ] = None,
+    points: Annotated[Path | None, about_file("Write each point's distance: .csv, .ply.")] = None,
+    page: Annotated[Path | None, about_file("Write a page with a picture to turn.")] = None,
+    json_path: JsonPath = None,
+) -> None:
+    """Compare clouds with a map's surface or a cloud; exit code 1 if an alignment fails."""
+    if align not in _ALIGNMENTS:
+        raise ConfigError(f"--align {align}: is none of {', '.join(_ALIGNMENTS)}")
+    begin = start_transform(start)
+    network = None if is_cloud(Path(reference)) else _network(reference, buildings)
+    if network is None and align == "edges":
+        raise ConfigError(f"--align edges: {reference} is a cloud and has no roads: give a map")
+    console = Console()
+    rows, fits = [], []
+    with console.status("comparing clouds …"):
+        for path in filter(None, (cloud, cloud2)):
+            one = _filtered(read_cloud(path), frame, network, begin, voxel, outliers)
+            motion, other = begin, None
+            if network is None:
+                other = _filtered(read_cloud(Path(reference)), "map", None, None, voxel, outliers)
+            else:
+                one, motion, other = _beside_map(one, network, begin, align)
+            rows.append(compare(one, other, start=motion, keep=keep, registered=align == "icp"))
+            if network is not None:
+                fits.append(fit_roads(network, rows[-1].aligned, network.extent_m))
+    _print(console, rows, fits)
+    write_json(json_path, _document(rows, fits))
+    if points is not None:
+        write_points(points, rows[0])
+    if page is not None:
+        write_page(page, rows)
+    sound = all(row.alignment is None or row.alignment.converged for row in rows)
+    raise typer.Exit(0 if sound else 1)
+
+
+def _network(name: str, buildings: Path | None) -> RoadNetwork:
+    network = load_network(map_file(find_map(name)))
+    return network if buildings is None else with_buildings(network, buildings)
+
+
+def _filtered(
+    cloud: Cloud,
+    frame: str,
+    network: RoadNetwork | None,
+    begin: Any,
+    voxel_m: float,
+    sigmas: float,
+) -> Cloud:
+    cloud = in_map_frame(cloud, frame, network)
+    if network is not None:
+        inverse = np.linalg.inv(begin)
+        placed = crop(
+            Cloud(cloud.name, moved(cloud.points, begin), cloud.counts),
+            network.extent_m,
+            _MARGIN_M,
+        )
+        cloud = Cloud(cloud.name, moved(placed.points, inverse), placed.counts)
+    return drop_outliers(thin_out(cloud, voxel_m), sigmas)
+
+
+def _beside_map(
+    cloud: Cloud, network: RoadNetwork, begin: Any, align: str
+) -> tuple[Cloud, Any, Cloud]:
+    """The cloud, where it begins, and the map's surface around it."""
+    placed = moved(cloud.points, begin)
+    box = (*(placed[:, :2].min(axis=0) - _MARGIN_M), *(placed[:, :2].max(axis=0) + _MARGIN_M))
+    if align == "edges":
+        fit = fit_roads(network, placed, box)
+        if fit.transform is None:
+            raise ConfigError(
+                f"{cloud.name}: {len(fit.edge_offset_m)} road edges of {fit.stations} sections "
+                "were found, too few or all of one direction: use --align icp or none"
+            )
+        begin = fit.transform @ begin
+    return cloud, begin, map_surface(network, box)[0]
+
+
+def _document(rows: list[Comparison], fits: list[RoadFit]) -> dict[str, Any]:
+    document: dict[str, Any] = {"comparisons": [row.to_dict() for row in rows]}
+    for comparison, fit in zip(document["comparisons"], fits, strict=False):
+        comparison["roads"] = fit.to_dict()
+    return document | {"paper": PAPER_TABLE}
+
+
+def _print(console: Console, rows: list[Comparison], fits: list[RoadFit]) -> None:
+    heads = ["", *(f"{row.source.name} → {row.reference.name}" for row in rows), *PAPER_TABLE]
+    told = [row.to_dict() for row in rows]
+    columns = [*told, *PAPER_TABLE.values()]
+    names = {
+        "ICP RMSE, eq. (1), m": "icp_rmse_m",
+        "mean distance, eq. (2), m": "mean_distance_m",
+        "… the other way, m": "mean_distance_reverse_m",
+        "… both ways, m": "mean_distance_symmetric_m",
+        "… before alignment, m": "mean_distance_before_m",
+        "RMSE of the pairs kept, m": "trimmed_rmse_m",
+        "median, m": "median_distance_m",
+        "95 % lie within, m": "p95_distance_m",
+        "yaw, °": "yaw_deg",
+    }
+    table = [
+        [name, *(_shown(column.get(key)) for column in columns)] for name, key in names.items()
+    ]
+    for name, key in (
+        ("road edges, lateral RMSE, m", "lateral_rmse_m"),
+        ("… found / sections of the map", ""),
+        ("road heights, RMSE, m", "height_rmse_m"),
+        ("… median, m", "height_median_m"),
+    ):
+        if fits:
+            cells = [
+                _shown(fit.to_dict()[key]) if key else f"{len(fit.edge_offset_m)} / {fit.stations}"
+                for fit in fits
+            ]
+            table.append([name, *cells, *("-" for _ in PAPER_TABLE)])
+    console.print(grid(heads, table, wraps=True))
+    for row in rows:
+        for cloud in (row.source, row.reference):
+            counts = ", ".join(f"{name} {count}" for name, count in cloud.counts.items())
+            console.print(Text(f"{cloud.name}: {counts}; compared {len(cloud.points)}"))
+        for problem in row.alignment.problems if row.alignment else ():
+            console.print(Text(f"{row.source.name}: NOT converged: {problem}", style="red"))
+
+
+def _shown(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"

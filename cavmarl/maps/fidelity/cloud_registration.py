@@ -1,0 +1,195 @@
+"""One cloud laid onto another: trimmed ICP by small_gicp, and whether it can be believed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import ConfigError, MapError, require
+from cavmarl.maps.fidelity.cloud_filters import neighbour_distances
+
+Points = NDArray[np.float64]
+
+FEWEST_POINTS = 50
+_NORMAL_NEIGHBOURS = 20
+_STAGES = 12
+_SETTLED_M, _SETTLED_RAD = 1e-4, 1e-6
+_ITERATIONS = 50
+_WIDEST_M = 10.0  # what is farther from the other cloud is never taken for the same place
+# A part of so few normals along a direction leaves the cloud free to slide along it.
+_HELD = 0.005
+# The kept part lies on the other cloud if it is nearer to it than its own neighbours are, about.
+_SPACINGS, _LEAST_LIMIT_M, _MOST_LIMIT_M = 2.5, 0.1, 0.5
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """The rigid motion that lays a source onto a target, and what speaks for it."""
+
+    transform: Points  # (4, 4), from the source's frame to the target's
+    trimmed_rmse_m: float  # of the share of the points that is kept
+    limit_m: float  # of `trimmed_rmse_m`
+    stages: int
+    problems: tuple[str, ...]  # why it is not to be believed; empty if it is
+
+    @property
+    def converged(self) -> bool:
+        return not self.problems
+
+    @property
+    def yaw_deg(self) -> float:
+        return float(np.degrees(np.arctan2(self.transform[1, 0], self.transform[0, 0])))
+
+    @property
+    def angle_deg(self) -> float:
+        """Of the whole rotation, about whatever axis."""
+        # By the sine too: near 0 the cosine alone has no digits.
+        turn = self.transform[:3, :3]
+        skew = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+        return float(np.degrees(np.arctan2(np.linalg.norm(skew), np.trace(turn) - 1.0)))
+
+    @property
+    def shift_m(self) -> float:
+        return float(np.linalg.norm(self.transform[:3, 3]))
+
+
+def moved(points: Points, transform: Points) -> Points:
+    """Points (n, 3) by a motion (4, 4)."""
+    found: Points = points @ transform[:3, :3].T + transform[:3, 3]
+    return found
+
+
+def nearest_distances(points: Points, others: Points, threads: int = 2) -> Points:
+    """(n,) distances in m of points (n, 3) to the nearest of others (m, 3) each."""
+    gicp: Any = require("small_gicp", "clouds")
+    middle = others.mean(axis=0)
+    tree = gicp.KdTree(others - middle, threads)
+    found: Points = np.sqrt(
+        np.asarray(tree.batch_nearest_neighbor_search(points - middle, threads)[1])
+    )
+    return found
+
+
+class Target:
+    """A cloud that others are laid onto, with its tree; about its own middle, for the digits."""
+
+    def __init__(self, points: Points, threads: int = 2) -> None:
+        gicp: Any = require("small_gicp", "clouds")
+        if len(points) < FEWEST_POINTS:
+            raise MapError(
+                f"a cloud of {len(points)} points: {FEWEST_POINTS} are needed at least: take "
+                "smaller voxels, or another cloud"
+            )
+        self.middle_m = points.mean(axis=0)
+        self.points = points - self.middle_m
+        self.threads = threads
+        self.cloud = gicp.PointCloud(self.points)
+        self.tree = gicp.KdTree(self.cloud, threads)
+        gicp.estimate_normals_covariances(self.cloud, self.tree, _NORMAL_NEIGHBOURS, threads)
+
+    def nearest(self, points: Points) -> tuple[NDArray[np.int64], Points]:
+        """The number of the nearest point of each of (n, 3) places, and the distance in m."""
+        rows, squares = self.tree.batch_nearest_neighbor_search(
+            points - self.middle_m, self.threads
+        )
+        return np.asarray(rows), np.sqrt(np.asarray(squares))
+
+
+def align(source: Points, target: Target, *, keep: float = 0.8) -> Alignment:
+    """Lay a source onto a target by ICP that keeps a share of the nearest pairs.
+
+    Stage by stage pairs farther than twice the distance of the `keep` nearest are left out
+    (Chetverikov et al., "The trimmed iterative closest point algorithm", 2002); within a stage
+    small_gicp minimises distances between surfaces (generalized ICP).
+
+    Raises:
+        ConfigError: `keep` is no share.
+        MapError: too few points.
+    """
+    gicp: Any = require("small_gicp", "clouds")
+    if not 0.1 <= keep <= 1.0:
+        raise ConfigError(f"keep {keep:g}: must be a share from 0.1 to 1 of the points")
+    own = Target(source, target.threads)
+    cloud = gicp.PointCloud(source - target.middle_m)
+    gicp.estimate_normals_covariances(
+        cloud, gicp.KdTree(cloud, own.threads), _NORMAL_NEIGHBOURS, own.threads
+    )
+    centred = source - target.middle_m
+    motion, last_m = np.eye(4), np.inf
+    rows, distance_m = target.nearest(source)
+    gate_m = min(max(2.0 * float(np.quantile(distance_m, 0.95)), 1.0), _WIDEST_M)
+    stages = 0
+    while stages < _STAGES:
+        stages += 1
+        found = gicp.align(
+            target.cloud,
+            cloud,
+            target.tree,
+            motion,
+            max_correspondence_distance=gate_m,
+            num_threads=target.threads,
+            max_iterations=_ITERATIONS,
+            rotation_epsilon=_SETTLED_RAD,
+            translation_epsilon=0.1 * _SETTLED_M,
+        )
+        step = np.linalg.inv(motion) @ found.T_target_source
+        last_m = _size_m(step, centred)
+        motion = np.asarray(found.T_target_source)
+        rows, distance_m = target.nearest(moved(centred, motion) + target.middle_m)
+        narrower_m = min(gate_m, max(2.0 * float(np.quantile(distance_m, keep)), 1e-3))
+        if last_m < _SETTLED_M and narrower_m > 0.95 * gate_m:
+            break
+        gate_m = narrower_m
+    return _judged(own, target, motion, rows, distance_m, keep, stages, last_m)
+
+
+def _size_m(step: Points, points: Points) -> float:
+    """How far a motion moves the corners of a cloud, at most."""
+    corners = np.stack([points.min(axis=0), points.max(axis=0)])
+    return float(np.linalg.norm(moved(corners, step) - corners, axis=1).max())
+
+
+def _judged(
+    own: Target,
+    target: Target,
+    motion: Points,
+    rows: NDArray[np.int64],
+    distance_m: Points,
+    keep: float,
+    stages: int,
+    last_m: float,
+) -> Alignment:
+    order = np.argsort(distance_m, kind="stable")[: max(int(keep * len(distance_m)), 1)]
+    rmse_m = float(np.sqrt(np.mean(distance_m[order] ** 2)))
+    spacing_m = max(_spacing_m(own), _spacing_m(target))
+    limit_m = float(np.clip(_SPACINGS * spacing_m, _LEAST_LIMIT_M, _MOST_LIMIT_M))
+    problems = []
+    if last_m > 10.0 * _SETTLED_M:
+        problems.append(f"it still moved by {1e3 * last_m:.1f} mm in stage {stages}, the last one")
+    if rmse_m > limit_m:
+        problems.append(
+            f"the nearest {keep:.0%} of the points are {rmse_m:.3f} m off, more than "
+            f"{limit_m:.3f} m: other places, or a start too far away (--start)"
+        )
+    normals = np.asarray(target.cloud.normals())[rows[order], :3]
+    share, axes = np.linalg.eigh(normals.T @ normals / len(normals))
+    if share[0] < _HELD:
+        along = ", ".join(f"{value:.2f}" for value in axes[:, 0])
+        problems.append(
+            f"nothing holds it along ({along}), where it can slide: give walls (--buildings), or "
+            "a cloud with more than a plane"
+        )
+    turn = motion[:3, :3]
+    absolute = np.eye(4)
+    absolute[:3, :3] = turn
+    absolute[:3, 3] = motion[:3, 3] + target.middle_m - turn @ target.middle_m
+    return Alignment(absolute, rmse_m, limit_m, stages, tuple(problems))
+
+
+def _spacing_m(cloud: Target) -> float:
+    """The median distance of a point to its nearest neighbour."""
+    distance_m = neighbour_distances(cloud.points, 1, cloud.threads)[:, 0]
+    return float(np.median(distance_m))

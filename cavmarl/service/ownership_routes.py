@@ -1,0 +1,49 @@
+"""Routes of divided worlds: which zone owns a vehicle, and where the nodes of zones meet."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from cavmarl.service import bodies
+from cavmarl.service.guards import TheService
+from cavmarl.service.route_parts import Nodes, Readers, SessionId, make_router
+
+ownership = make_router("/v1/sessions/{number}", "ownership")
+
+
+@ownership.get("/transfers")
+async def get_transfers(
+    identity: Readers, service: TheService, number: SessionId
+) -> dict[str, Any]:
+    """Owners of vehicles that have changed their zone, and vehicles that another has PREPARED."""
+    session = service.broker.session(identity, number)
+    return {
+        "number": session.told_number,
+        "owners": [
+            {"world": int(world), "episode": table.episode, "vehicle": vehicle, "zone": zone,
+             "epoch": epoch}
+            for world, table in session.owners.items()
+            for vehicle, (zone, epoch) in table.zones.items()
+        ],
+        "in_flight": [
+            dict(zip(("world", "vehicle", "source", "target"), row, strict=True), state="PREPARED")
+            for row in service.broker.prepared.get(number, ())
+        ],
+    }  # fmt: skip
+
+
+@ownership.put("/transfers", status_code=204)
+async def put_transfers(
+    identity: Nodes, service: TheService, number: SessionId, body: bodies.TransfersBody
+) -> None:
+    """A node tells which vehicles have changed their zone since it told last."""
+    service.broker.hand_over(service.broker.hosted(identity, number), body)
+
+
+@ownership.put("/door", status_code=204)
+async def put_door(
+    identity: Nodes, service: TheService, number: SessionId, body: bodies.DoorBody
+) -> None:
+    """Where the node of a session awaits those that host zones of it."""
+    session = service.broker.hosted(identity, number)
+    service.broker.zone_nodes.open_door(session, body)

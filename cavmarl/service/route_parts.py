@@ -1,0 +1,43 @@
+"""What routes are made of: roles, names in paths, what is documented of all answers."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Path
+
+from cavmarl.service import bodies
+from cavmarl.service.guards import DurableRoute, may, open_to_all
+from cavmarl.service.infrastructure import IdentityRecord
+from cavmarl.service.refusals import PROBLEM_SCHEMA, PROBLEM_TYPE
+
+PROBLEM: dict[int | str, dict[str, Any]] = {
+    status: {"description": "A problem", "content": {PROBLEM_TYPE: {"schema": PROBLEM_SCHEMA}}}
+    for status in ("default", 422)
+}
+BYTES: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "Content",
+        "content": {"application/octet-stream": {"schema": {"type": "string"}}},
+    }
+}
+
+
+def make_router(prefix: str, tag: str) -> APIRouter:
+    """A router whose answers leave when what they tell of is on disk."""
+    return APIRouter(prefix=prefix, route_class=DurableRoute, tags=[tag], responses=PROBLEM)
+
+
+Everyone = Annotated[IdentityRecord, Depends(may("viewer", "client", "operator", "admin", "node"))]
+Viewers = Annotated[IdentityRecord, Depends(may("viewer", "operator", "admin"))]
+Readers = Annotated[IdentityRecord, Depends(may("viewer", "client", "operator", "admin"))]
+Clients = Annotated[IdentityRecord, Depends(may("client", "operator", "admin"))]
+Operators = Annotated[IdentityRecord, Depends(may("operator", "admin"))]
+Drainers = Annotated[IdentityRecord, Depends(may("operator", "admin", "node"))]
+Admins = Annotated[IdentityRecord, Depends(may("admin"))]
+Nodes = Annotated[IdentityRecord, Depends(may("node"))]
+Anybody = Annotated[IdentityRecord, Depends(open_to_all())]
+
+NodeName = Annotated[bodies.Name, Path()]
+SessionId = Annotated[str, Path(pattern=r"^s-[0-9a-f]{24}$")]
+FileName = Annotated[bodies.Name, Path()]

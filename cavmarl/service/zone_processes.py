@@ -1,0 +1,53 @@
+"""Zones of other nodes' sessions: a process for each part that this node has, at their doors."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any
+
+from cavmarl.core.processes import start_dying_with_process
+from cavmarl.parallel.nodes.newcomers import ANYONE
+from cavmarl.parallel.nodes.node_starters import NODE
+
+Door = tuple[str, int, str]  # host, port, key
+
+
+class ZoneProcesses:
+    """The processes of a node that host zones."""
+
+    def __init__(self) -> None:
+        self._of: dict[Door, list[subprocess.Popen[Any]]] = {}
+
+    def __len__(self) -> int:
+        return sum(len(some) for some in self._of.values())
+
+    def follow(self, tasks: Sequence[dict[str, Any]]) -> None:
+        """Have as many as `ZoneNodes.tasks` says; one that has ended is started again."""
+        wanted = Counter((one["host"], one["port"], one["key"]) for one in tasks)
+        for door in {*self._of, *wanted}:
+            alive = [one for one in self._of.get(door, []) if one.poll() is None]
+            for process in alive[wanted[door] :]:
+                process.kill()
+                process.wait()
+            started = [_start(door) for _ in range(wanted[door] - len(alive))]
+            self._of[door] = alive[: wanted[door]] + started
+            if not self._of[door]:
+                del self._of[door]
+
+    def end(self) -> None:
+        """End all."""
+        self.follow([])
+
+
+def _start(door: Door) -> subprocess.Popen[Any]:
+    host, port, key = door
+    words = [sys.executable, "-m", NODE, host, str(port), str(ANYONE)]
+    process = start_dying_with_process(words, stdin=subprocess.PIPE, text=True)
+    assert process.stdin is not None
+    with suppress(BrokenPipeError), process.stdin as pipe:
+        pipe.write(f"{key}\n")
+    return process
