@@ -47,7 +47,8 @@ def observed_way(name: str, row: np.void, phase: NDArray[np.int32]) -> list[floa
     controllers = np.zeros(roads.num_controllers, CONTROLLER)
     sensor = way_settings(CONFIG, place.start)
     observe_way(roads.arrays, travel(name), controllers, row, phase, 0.0, 0.1, sensor, out)
-    assert not out[: place.start].any() and not out[place.stop :].any()
+    assert not out[: place.start].any()
+    assert not out[place.stop :].any()
     return [float(value) for value in out[place]]
 
 
@@ -61,7 +62,8 @@ def observed_conflicts(
     out = np.zeros(frame_size(CONFIG), np.float32)
     sensor = conflicts_settings(CONFIG, place.start)
     observe_conflicts(roads.arrays, travel(name), rows, i, grid, phase, sensor, out)
-    assert not out[: place.start].any() and not out[place.stop :].any()
+    assert not out[: place.start].any()
+    assert not out[place.stop :].any()
     return [float(value) for value in out[place]]
 
 

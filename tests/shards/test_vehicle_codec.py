@@ -21,8 +21,8 @@ from cavmarl.core.errors import (
 )
 from cavmarl.driving.vehicles import RECORD_VERSION, VEHICLE
 from cavmarl.engine.simulation import Simulation
-from cavmarl.shards.shard import Commands
 from cavmarl.sensors.observed import carried_from
+from cavmarl.shards.shard import Commands
 from cavmarl.shards.vehicle_codec import GROUPS, TransferCodec, layout_text
 from tests.support.demand_worlds import make
 from tests.support.driving import idle, make_simulation, start, suggested

@@ -67,7 +67,7 @@ def observe_optional(
                 time = worlds.ticks[w] * tick_s
                 controllers = worlds.controllers[w]
                 observe_way(roads, travel, controllers, row, phase, time, tick_s, path, out)
-            if conflicts.count > 0:
+            if conflicts.most > 0:
                 observe_conflicts(roads, travel, rows, i, grid, phase, conflicts, out)
             if history.size > 0:
                 entered = has_entered(row, ticks_per_step)

@@ -186,9 +186,9 @@ def _rank(
                 ):
                     break
                 place -= 1
-            if place == sensor.count:
+            if place == sensor.most:
                 continue
-            if found < sensor.count:
+            if found < sensor.most:
                 found += 1
             for k in range(found - 1, place, -1):
                 sensor.ranked[k] = sensor.ranked[k - 1]

@@ -112,7 +112,7 @@ class ConflictsSensor(NamedTuple):
     """Vehicles that come near the own way: see `kernels.observing_conflicts`."""
 
     at: int
-    count: int  # 0: off
+    most: int  # vehicles that are told; 0: off
     range_m: float
     looks: NDArray[np.float64]  # (NUM_LOOKS, 4) room
     ranked: NDArray[np.void]  # RANKED (count,) room
