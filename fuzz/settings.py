@@ -122,7 +122,7 @@ def _checkpoint(content: bytes) -> None:
 @cache
 def _checkpoints() -> tuple[bytes, ...]:
     parts = {"weights": torch.zeros(2, 3), "trips": [1.0, 2.0], "next": None}
-    state = RunState("ippo_torch.py", {"seed": 0}, "ring", logs={"progress.csv": 9}, parts=parts)
+    state = RunState("ppo.py", {"seed": 0}, "ring", logs={"progress.csv": 9}, parts=parts)
     with tempfile.TemporaryDirectory() as name:
         write_checkpoint(Path(name), state)
         whole = (Path(name) / CHECKPOINT_FILE).read_bytes()

@@ -93,7 +93,7 @@ def test_the_installed_command_runs(elsewhere: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_an_installed_wheel_trains(elsewhere: Path, tmp_path: Path) -> None:
-    command = [str(elsewhere / "cavmarl"), "train", "ippo_torch", "--config", "merge"]
+    command = [str(elsewhere / "cavmarl"), "train", "ppo", "--config", "merge"]
     small = {"agents": 2, "background": 0, "num-envs": 2, "num-steps": 8, "minibatches": 2}
     words = [f"--{key}={value}" for key, value in {**small, "total-agent-steps": 40}.items()]
     assert "driver:" in run([*command, *words, "--name", "tiny"], tmp_path)

@@ -2,7 +2,7 @@
 
     python train/five_seeds.py --config configs/train/merge.yaml
 
-Trains with each seed (`ippo_torch.py`, one core each), lets all drivers and the scripted ones
+Trains with each seed (`ppo.py`, one core each), lets all drivers and the scripted ones
 drive the same episodes, which no training has seen, and writes into the folder: `table.md`,
 `result.json`, `curves.svg`, `evaluation/` with its manifest and raw tables, and the runs, each with
 its own manifest. A seed that is trained already is not trained again, and one that was cut short
@@ -34,7 +34,7 @@ from cavmarl.evaluate import EvaluationReport, evaluate
 from cavmarl.evaluate.provenance.training_record import CHECKPOINT_FILE, is_trained
 from cavmarl.evaluate.statistics import Interval, mean_interval
 
-PROGRAM = Path(__file__).with_name("ippo_torch.py")
+PROGRAM = Path(__file__).with_name("ppo.py")
 SCRIPTED = ("idm", "random_actions")
 METRICS = {
     "success": "success, %",
@@ -66,7 +66,7 @@ class Args:
 def parse_args(words: Sequence[str] | None = None) -> Args:
     """The settings that the command line asks for."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--config", type=Path, required=True, help="settings of ippo_torch.py")
+    parser.add_argument("--config", type=Path, required=True, help="settings of ppo.py")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4], help="of training")
     parser.add_argument("--jobs", type=int, default=1, help="seeds that are trained side by side")
     parser.add_argument("--episodes", type=int, default=64, help="of an evaluation run")
@@ -231,7 +231,7 @@ def draw_curves(path: Path, folders: Sequence[Path], others: Sequence[Path], tit
         for k, folder in enumerate((*folders, *others)):
             curve = read_curve(folder)
             millions = [steps / 1e6 for steps in curve["agent_steps"]]
-            name = folder.name if folder in others else "ippo_torch.py" if k == 0 else None
+            name = folder.name if folder in others else "ppo.py" if k == 0 else None
             color = f"C{1 + others.index(folder)}" if folder in others else "C0"
             axis.plot(millions, curve[column], color=color, label=name, linewidth=0.9)
         axis.set(xlabel="decisions, million", ylabel=label)

@@ -7,14 +7,18 @@ new episodes after 40 s. Each has a process a core for its worlds, and one threa
 
 from __future__ import annotations
 
+import importlib.util
 import math
+import sys
 import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,14 +32,12 @@ from cavmarl.bench.highway_worlds import (
     overrides,
     straight_road,
 )
-from cavmarl.config.registry import shadow
+from cavmarl.config.registry import programs, shadow
 from cavmarl.core.errors import ConfigError, require
 from cavmarl.evaluate.provenance.machine import describe_hardware
 
 if TYPE_CHECKING:
     from cavmarl.bench.highway_rows import HighwayRows
-    from cavmarl.learning.ppo_settings import PpoSettings
-    from cavmarl.learning.run import Run
 
 _Update = tuple[int, dict[str, float]]
 
@@ -45,6 +47,16 @@ EPOCHS = 4
 MINIBATCHES = 8
 HIDDEN = 64
 STEPPING_STEPS = 100
+RECIPE = {"num_envs": 64, "epochs": 2, "keep": 0.3, "hidden": 128, "shared": True}
+RECIPE_KEYS: dict[str, Any] = {
+    "action.kind": "grid",
+    "sensors.kinematics.vehicles_count": 0,
+    "sensors.ego.enabled": True,
+    "sensors.way.distances_m": [5.0, 10.0, 20.0, 40.0, 60.0],
+    "sensors.way.lines": 1,
+    "sensors.conflicts.count": 6,
+    "sensors.history.steps": 2,
+}
 OUR_SENSORS: dict[str, Any] = {
     "sensors.kinematics.vehicles_count": 5,
     "sensors.ego.enabled": False,
@@ -59,7 +71,7 @@ OUR_SENSORS: dict[str, Any] = {
 class TrainingRow:
     """One side."""
 
-    who: str  # `cavmarl` or `stable_baselines3`; `cavmarl_overlap` collects while it learns
+    who: str  # `cavmarl` or `stable_baselines3`; `cavmarl_recipe` with what we learn best with
     worlds: int  # stepped together
     decisions: int  # of an update
     rates: tuple[float, ...]  # agent-steps a second of each turn: one update, learning among it
@@ -74,6 +86,7 @@ class TrainingSpeed(Result):
     agents: int  # of a world
     workers: int  # of each side
     numbers: int  # in an observation
+    recipe_numbers: int  # in one of our own recipe
     end_to_end: tuple[TrainingRow, ...]  # PPO, collecting and learning
     stepping: tuple[float, ...]  # agent-steps a second of our worlds and sensors alone, by turns
     hardware: dict[str, Any]  # that it ran on
@@ -84,9 +97,10 @@ class TrainingSpeed(Result):
         return self._over("cavmarl", "stable_baselines3")
 
     @property
-    def overlap_ratio(self) -> float:
-        """What collecting while learning brings: the same over ours without."""
-        return self._over("cavmarl_overlap", "cavmarl")
+    def recipe_rate(self) -> float:
+        """Agent-steps a second of our own recipe; median of the turns."""
+        (row,) = (row for row in self.end_to_end if row.who == "cavmarl_recipe")
+        return median(row.rates)
 
     @property
     def is_crowded(self) -> bool:
@@ -104,7 +118,7 @@ class TrainingSpeed(Result):
                 "kind": "end_to_end",
                 "rows": plain["end_to_end"],
                 "ratio": self.ratio,
-                "overlap_ratio": self.overlap_ratio,
+                "recipe_rate": self.recipe_rate,
             },
             "stepping": {"kind": "sensors", "agent_steps_per_s": self.stepping},
             "is_crowded": self.is_crowded,
@@ -124,7 +138,8 @@ def measure_training(
     for module, extra in needs.items():
         require(module, extra)
     from cavmarl.bench.highway_rows import HighwayRows
-    from cavmarl.learning.run import opened
+
+    opened = training_program().opened
 
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -135,9 +150,8 @@ def measure_training(
         settings = _settings(folder, agents, worlds, workers)
         say("starting ours")
         plain = stack.enter_context(opened(settings))
-        overlap = replace(settings, overlap=True, name="overlap")
-        other = stack.enter_context(opened(overlap))
-        sides = [_ours("cavmarl", plain), _ours("cavmarl_overlap", other), theirs]
+        other = stack.enter_context(opened(_recipe(folder, settings)))
+        sides = [_ours("cavmarl", plain), _ours("cavmarl_recipe", other), theirs]
         stepping = []
         for turn in range(repeats + 1):
             for side in sides:
@@ -146,12 +160,34 @@ def measure_training(
             stepping.append(_stepping(plain))
         found = tuple(side.row() for side in sides)
         size = plain.config.observation_size
-    return TrainingSpeed(agents, workers, size, found, tuple(stepping[1:]), describe_hardware())
+        wide = other.config.observation_size
+    rates = tuple(stepping[1:])
+    return TrainingSpeed(agents, workers, size, wide, found, rates, describe_hardware())
 
 
-def _settings(folder: Path, agents: int, worlds: int, workers: int) -> PpoSettings:
-    from cavmarl.learning.ppo_settings import PpoSettings
+@cache
+def training_program() -> Any:
+    """`train/ppo.py` as a module: a file that is read, for `train` is no package."""
+    spec = importlib.util.spec_from_file_location("ppo", programs()["ppo"])
+    if spec is None or spec.loader is None:
+        raise ConfigError("train/ppo.py: cannot be read as a module")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
 
+
+def _recipe(folder: Path, settings: Any) -> Any:
+    """The same road with what we learn best with: see docs/learning.md."""
+    entry = yaml.safe_load((folder / "env.yaml").read_text(encoding="utf-8"))
+    for key, value in RECIPE_KEYS.items():
+        shadow(entry, key, value)
+    (folder / "recipe").mkdir()
+    (folder / "recipe" / "env.yaml").write_text(yaml.safe_dump(entry), encoding="utf-8")
+    return replace(settings, env=str(folder / "recipe"), name="recipe", **RECIPE)
+
+
+def _settings(folder: Path, agents: int, worlds: int, workers: int) -> Any:
     road_m = length_m(highway_env(agents, THEIR_KINEMATICS))
     entry: dict[str, Any] = {
         "name": "straight",
@@ -161,7 +197,7 @@ def _settings(folder: Path, agents: int, worlds: int, workers: int) -> PpoSettin
     for key, value in (overrides(OUR_SENSORS, agents) | {"population.mode": "respawn"}).items():
         shadow(entry, key, value)
     (folder / "env.yaml").write_text(yaml.safe_dump(entry), encoding="utf-8")
-    return PpoSettings(
+    return training_program().Args(
         env=str(folder),
         agents=agents,
         background=0,
@@ -206,13 +242,13 @@ class _Side:
         return TrainingRow(self.who, self._worlds, decisions, tuple(self._rates), shares)
 
 
-def _ours(who: str, run: Run) -> _Side:
-    from cavmarl.learning.collector import PHASES
+def _ours(who: str, run: Any) -> _Side:
+    phases = training_program().PHASES
 
     def update() -> _Update:
         before = run.agent_steps
         row = run.update()
-        return run.agent_steps - before, {phase: row[f"{phase}_s"] for phase in PHASES}
+        return run.agent_steps - before, {phase: row[f"{phase}_s"] for phase in phases}
 
     return _Side(who, run.settings.num_envs, update)
 
@@ -261,7 +297,7 @@ def _watch() -> Any:
     return Watch()
 
 
-def _stepping(run: Run) -> float:
+def _stepping(run: Any) -> float:
     """Agent-steps a second of the worlds of a run, all agents keeping to one action."""
     vec = run.vec
     actions = np.ones((vec.num_envs, vec.num_agents), dtype=np.int64)

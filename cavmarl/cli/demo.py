@@ -75,7 +75,7 @@ def demo(
 def _train(out: Path, name: str, minutes: float, seed: int) -> Path:
     """Run the training program; the folder of the driver."""
     settings = find_settings("train", "demo")
-    command = [sys.executable, str(programs()["ippo_torch"]), "--config", str(settings)]
+    command = [sys.executable, str(programs()["ppo"]), "--config", str(settings)]
     command += ["--minutes", str(minutes), "--seed", str(seed), "--runs", str(out), "--name", name]
     done = subprocess.run(command, check=False)
     if done.returncode:

@@ -25,7 +25,7 @@ def train(
         typer.Argument(metavar="OPTIONS", help="Its own; --help shows them. --config takes names."),
     ] = None,
 ) -> None:
-    """Train with one of the programs of `train/`: `cavmarl train ippo_torch --config merge`."""
+    """Train with one of the programs of `train/`: `cavmarl train ppo --config merge`."""
     known = programs()
     if name is None:
         shown = Table("program", "what it does")

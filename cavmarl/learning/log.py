@@ -4,22 +4,29 @@ from __future__ import annotations
 
 import csv
 import os
+from collections import deque
 from collections.abc import Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+from cavmarl.config.env import TERMS
 from cavmarl.core.errors import TrainingError, require
-from cavmarl.learning.checkpoint import writing
+from cavmarl.learning.checkpoint import Parts, writing
 
 CSV_FILE = "progress.csv"
 BOARD_FILES = "events.out.tfevents.*"
 
-WINDOW = 400  # trips that a row's means are of
+WINDOW = 1000  # trips that a row's means are of
+
+ENDS = ("arrival", "collision", "off_road", "red_light")
+COLUMNS = [TERMS.index(name) for name in ENDS]
 
 
 def curve_row(
@@ -39,6 +46,42 @@ def curve_row(
         "trip_return": trip_return,
         "success": success,
     }
+
+
+class Trips:
+    """Returns and ends of the last `WINDOW` trips, and those under way in W worlds, A agents."""
+
+    def __init__(self, num_envs: int, num_agents: int) -> None:
+        self._sums = np.zeros((num_envs, num_agents, 2))  # return, red lights run
+        self._ended: deque[list[float]] = deque(maxlen=WINDOW)
+        self._count = 0
+
+    def add(
+        self, rewards: NDArray[Any], done: NDArray[Any], cut: NDArray[Any], terms: NDArray[Any]
+    ) -> None:
+        """Take in one step; `done` (W, A) ends trips, `cut` (W, A) forgets them."""
+        self._sums[..., 0] += rewards
+        self._sums[..., 1] += terms[..., COLUMNS[3]]
+        if (gone := done | cut).any():
+            ran_red = self._sums[done][:, 1:] > 0.0
+            rows = [self._sums[done][:, :1], terms[done][:, COLUMNS[:3]], ran_red]
+            self._ended.extend(np.concatenate(rows, axis=1, dtype=np.float64).tolist())
+            self._count += int(done.sum())
+            self._sums[gone] = 0.0
+
+    def save(self) -> Parts:
+        return {"sums": torch.from_numpy(self._sums), "ended": list(self._ended), "n": self._count}
+
+    def load(self, saved: Parts) -> None:
+        self._sums[:] = saved["sums"].numpy()
+        self._ended.extend(saved["ended"])
+        self._count = saved["n"]
+
+    def means(self) -> dict[str, float]:
+        """Of the last trips; and how many there have been."""
+        names = ("trip_return", "success", *ENDS[1:])
+        columns = np.array(self._ended).mean(axis=0) if self._ended else np.full(5, np.nan)
+        return {"trips": self._count, **dict(zip(names, columns.tolist(), strict=True))}
 
 
 class Log:

@@ -51,6 +51,7 @@ class NetworkConfig:
         agent_steps: decisions that it learned from.
         state_size: numbers of the world's state that its critic sees beside the observation. The
             driver itself never does.
+        shared: one body for actor and critic, of ReLU with LayerNorm; else each is a tanh network.
     """
 
     environment: str
@@ -61,6 +62,7 @@ class NetworkConfig:
     seed: int = 0
     agent_steps: int = 0
     state_size: int = 0
+    shared: bool = False
 
     def __post_init__(self) -> None:
         if not 1 <= self.observation_size <= MAX_OBSERVATION_SIZE:
@@ -68,6 +70,8 @@ class NetworkConfig:
                 f"observation_size = {self.observation_size}: must be from 1 to "
                 f"{MAX_OBSERVATION_SIZE}"
             )
+        if self.shared and self.state_size:
+            raise ConfigError("shared: a critic that sees the world's state has a body of its own")
         if not 0 <= self.state_size <= MAX_STATE_SIZE:
             raise ConfigError(f"state_size = {self.state_size}: must be from 0 to {MAX_STATE_SIZE}")
         if not 1 <= len(self.hidden) <= MAX_LAYERS or not all(
@@ -81,26 +85,26 @@ class NetworkConfig:
     @property
     def num_weights(self) -> int:
         """How many numbers an `ActorCritic` learns, with the scaling of its observations."""
-        continuous = self.action.kind == "continuous"
+        deviations = CONTINUOUS_ACTIONS if self.action.kind == "continuous" else 0
         actions = self.action.choices or CONTINUOUS_ACTIONS
-        deviations = actions if continuous else 0
-        scaling = 2 * self.observation_size
-        return (
-            scaling
-            + deviations
-            + sum(
-                (inputs + 1) * outputs
-                for sizes in (
-                    (self.observation_size, *self.hidden, actions),
-                    (self.observation_size + self.state_size, *self.hidden, 1),
-                )
-                for inputs, outputs in pairwise(sizes)
-            )
-        )
+        size, last = self.observation_size, self.hidden[-1]
+        if self.shared:
+            norms = 2 * sum(self.hidden)
+            weights = _weights((size, *self.hidden)) + norms
+            weights += _weights((last, actions)) + _weights((last, 1))
+        else:
+            weights = _weights((size, *self.hidden, actions))
+            weights += _weights((size + self.state_size, *self.hidden, 1))
+        return 2 * size + deviations + weights
+
+
+def _weights(sizes: tuple[int, ...]) -> int:
+    """Of linear layers."""
+    return sum((inputs + 1) * outputs for inputs, outputs in pairwise(sizes))
 
 
 class ActorCritic(nn.Module):
-    """A policy and a value function, each a small tanh network of its own.
+    """A policy and a value function: small tanh networks, or two heads of one body with LayerNorm.
 
     Both see observations less their `mean`, over their `deviation`: buffers that training fills and
     a checkpoint keeps. With a `state_size` the value function is a central critic, which also sees
@@ -130,63 +134,86 @@ class ActorCritic(nn.Module):
         # Small last weights: the first policy does nothing in particular (Andrychowicz et al.
         # 2021).
         size = config.observation_size
-        self.actor = _perceptron((size, *config.hidden, actions), last_gain=0.01)
-        self.critic = _perceptron((size + config.state_size, *config.hidden, 1), last_gain=1.0)
+        self.body = _body((size, *config.hidden)) if config.shared else None
+        self.actor: nn.Module
+        self.critic: nn.Module
+        if config.shared:
+            self.actor = _linear(config.hidden[-1], actions, 0.01)
+            self.critic = _linear(config.hidden[-1], 1, 1.0)
+        else:
+            self.actor = _perceptron((size, *config.hidden, actions), last_gain=0.01)
+            self.critic = _perceptron((size + config.state_size, *config.hidden, 1), last_gain=1.0)
         if self.continuous:
             self.log_std = nn.Parameter(torch.tensor(initial_std).log())
 
+    @property
+    def parts(self) -> list[list[nn.Parameter]]:
+        """The weights whose gradients are shortened together."""
+        if self.body is not None:
+            return [list(self.parameters())]
+        return [list(self.actor.parameters()), list(self.critic.parameters())]
+
+    def normal(self, observations: Tensor) -> Tensor:
+        """Observations (…, D) less their mean, over their deviation."""
+        normal: Tensor = (observations - self.mean) / self.deviation
+        return normal.clamp_(-MAX_DEVIATIONS, MAX_DEVIATIONS)
+
+    def heads(self, seen: Tensor, states: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """`forward` and `value` at once, of observations that are `normal` already."""
+        if self.body is not None:
+            seen = self.body(seen)
+        judged = seen
+        if self.state_size and states is not None:
+            judged = torch.cat([seen, states], dim=-1)
+        return self.actor(seen), self.critic(judged).squeeze(-1)
+
     def forward(self, observations: Tensor) -> Tensor:
         """The policy's numbers: means (N, 2) of actions, or log-weights (N, choices)."""
-        output: Tensor = self.actor(self._normal(observations))
+        seen = self.normal(observations)
+        output: Tensor = self.actor(seen if self.body is None else self.body(seen))
         return output
 
     def value(self, observations: Tensor, states: Tensor | None = None) -> Tensor:
         """Expected return (N,) of observations (N, D), for a central critic in states (N, S)."""
-        seen = self._normal(observations)
-        if self.state_size and states is not None:
-            seen = torch.cat([seen, states], dim=-1)
-        values: Tensor = self.critic(seen).squeeze(-1)
-        return values
+        return self.heads(self.normal(observations), states)[1]
 
     def best(self, observations: Tensor) -> Tensor:
-        """The most likely actions: (N, 2) within [-1, 1], or (N,) meta-actions."""
+        """The most likely actions: (N, 2) within [-1, 1], or (N,) choices."""
         output = self.forward(observations)
         return output.clamp(-1.0, 1.0) if self.continuous else output.argmax(-1)
 
-    def sample(
-        self, observations: Tensor, generator: torch.Generator | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def sample(self, observations: Tensor) -> tuple[Tensor, Tensor]:
         """Random actions, continuous ones not clipped, and their log probabilities (N,)."""
-        output = self.forward(observations)
+        return self.draw(self.forward(observations))
+
+    def draw(self, output: Tensor) -> tuple[Tensor, Tensor]:
+        """`sample`, of what `forward` gave."""
         noise = torch.empty_like(output)
         if self.continuous:
-            actions = output + noise.normal_(generator=generator) * self.log_std.exp()
+            actions = output + noise.normal_() * self.log_std.exp()
         else:
             # The largest of log-weights plus Gumbel noise is a draw by these weights.
-            noise = noise.exponential_(generator=generator).log()
-            actions = (output - noise).argmax(-1)
+            actions = (output - noise.exponential_().log_()).argmax(-1)
         return actions, self._log_prob(output, actions)
 
     def evaluate(self, observations: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
         """Log probabilities (N,) of what `sample` gave, and entropies (N,)."""
-        output = self.forward(observations)
+        return self.judge(self.forward(observations), actions)
+
+    def judge(self, output: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        """`evaluate`, of what `forward` gave."""
         if self.continuous:
             entropy = (0.5 + 0.5 * LOG_2_PI + self.log_std).sum().expand(output.shape[0])
-        else:
-            log_probs = output.log_softmax(-1)
-            entropy = -(log_probs.exp() * log_probs).sum(-1)
-        return self._log_prob(output, actions), entropy
+            return self._log_prob(output, actions), entropy
+        log_probs = output.log_softmax(-1)
+        entropy = -(log_probs.exp() * log_probs).sum(-1)
+        return log_probs.gather(-1, actions.unsqueeze(-1)).squeeze(-1), entropy
 
-    def distance(self, observations: Tensor, actions: Tensor) -> Tensor:
-        """How far (N,) the policy is from given actions: squares, or surprise at meta-actions."""
-        output = self.forward(observations)
+    def distance(self, output: Tensor, actions: Tensor) -> Tensor:
+        """How far (N,) what `forward` gave is from actions: squares, or surprise at choices."""
         if self.continuous:
             return (output - actions).square().sum(-1)
         return nn.functional.cross_entropy(output, actions, reduction="none")
-
-    def _normal(self, observations: Tensor) -> Tensor:
-        normal: Tensor = (observations - self.mean) / self.deviation
-        return normal.clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS)
 
     def _log_prob(self, output: Tensor, actions: Tensor) -> Tensor:
         if self.continuous:
@@ -200,11 +227,24 @@ def _perceptron(sizes: tuple[int, ...], last_gain: float) -> nn.Sequential:
     layers: list[nn.Module] = []
     last = len(sizes) - 2
     for k, (inputs, outputs) in enumerate(pairwise(sizes)):
-        layer = nn.Linear(inputs, outputs)
-        nn.init.orthogonal_(layer.weight, last_gain if k == last else math.sqrt(2.0))
-        nn.init.zeros_(layer.bias)
+        layer = _linear(inputs, outputs, last_gain if k == last else math.sqrt(2.0))
         layers += [layer] if k == last else [layer, nn.Tanh()]
     return nn.Sequential(*layers)
+
+
+def _body(sizes: tuple[int, ...]) -> nn.Sequential:
+    """Linear layers, each with LayerNorm (Ba et al. 2016) and ReLU, orthogonal weights."""
+    layers: list[nn.Module] = []
+    for inputs, outputs in pairwise(sizes):
+        layers += [_linear(inputs, outputs, math.sqrt(2.0)), nn.LayerNorm(outputs), nn.ReLU()]
+    return nn.Sequential(*layers)
+
+
+def _linear(inputs: int, outputs: int, gain: float) -> nn.Linear:
+    layer = nn.Linear(inputs, outputs)
+    nn.init.orthogonal_(layer.weight, gain)
+    nn.init.zeros_(layer.bias)
+    return layer
 
 
 def save_network(folder: Path, network: ActorCritic, config: NetworkConfig) -> None:

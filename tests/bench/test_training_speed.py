@@ -25,12 +25,12 @@ def test_both_sides_learn_from_the_same_numbers(
     small = ("--agents", "2", "--worlds", "2", "--repeats", "1")
     assert run("bench", "train", *small, "--at-least", "1e9", "--json", str(path)) == 1
     found = json.loads(path.read_text())
-    ours, overlap, theirs = found["end_to_end"]["rows"]
+    ours, recipe, theirs = found["end_to_end"]["rows"]
     assert (ours["who"], theirs["who"]) == ("cavmarl", "stable_baselines3")
     assert ours["worlds"] * training_speed.OUR_STEPS * 2 == theirs["decisions"]
     assert 0 < ours["decisions"] <= theirs["decisions"]
     assert found["numbers"] == 25
-    for row in (ours, overlap, theirs):
+    for row in (ours, recipe, theirs):
         assert sum(row["shares"].values()) == pytest.approx(1.0)
         assert all(rate > 0.0 for rate in row["rates"])
     assert found["end_to_end"]["kind"] != found["stepping"]["kind"]
@@ -45,12 +45,12 @@ def test_ratios_are_of_the_same_turn() -> None:
 
     rows = (
         row("cavmarl", 10.0, 30.0, 20.0),
-        row("cavmarl_overlap", 20.0, 30.0, 30.0),
+        row("cavmarl_recipe", 20.0, 30.0, 30.0),
         row("stable_baselines3", 1.0, 2.0, 1.0),
     )
-    found = TrainingSpeed(2, 3, 25, rows, (1.0,), {"usable_cores": 2})
+    found = TrainingSpeed(2, 3, 25, 105, rows, (1.0,), {"usable_cores": 2})
     assert found.ratio == 15.0
-    assert found.overlap_ratio == 1.5
+    assert found.recipe_rate == 30.0
     assert found.is_crowded
 
 

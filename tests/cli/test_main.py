@@ -396,8 +396,8 @@ def test_train_says_what_programs_there_are(capsys: pytest.CaptureFixture[str]) 
     assert set(programs()) == {path.stem for path in (ROOT / "train").glob("*.py")}
     for name in programs():
         assert name in shown
-    assert "ippo_torch" in refusal(capsys, "train", "ippo")
-    assert "merge" in refusal(capsys, "train", "ippo_torch", "--config", "nowhere")
+    assert "ppo" in refusal(capsys, "train", "ippo")
+    assert "merge" in refusal(capsys, "train", "ppo", "--config", "nowhere")
 
 
 @pytest.mark.parametrize("config", [["--config", "demo"], ["--config=demo"]])

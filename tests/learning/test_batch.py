@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from cavmarl.learning.batch import Batch
+from tests.support.training import load_program
+
+Batch = load_program("ppo").Batch
 
 
 def batch_of_one_seat(
     rewards: list[float], acted: list[bool], goes_on: list[bool], cut_value: float
-) -> Batch:
+) -> Any:
     steps = len(rewards)
 
     def column(values: list[float] | list[bool]) -> Tensor:

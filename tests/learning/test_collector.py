@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 
 from cavmarl.env.vector import CavVectorEnv, make_vec
-from cavmarl.learning.collector import Collector
 from cavmarl.policies.networks import ActorCritic, NetworkConfig
+from tests.support.training import load_program
+
+PPO = load_program("ppo")
 
 STEPS, HORIZON = 60, 25
 
@@ -18,7 +22,7 @@ def make_worlds(mode: str) -> CavVectorEnv:
     )
 
 
-def make_collector(vec: CavVectorEnv, state_size: int) -> Collector:
+def make_collector(vec: CavVectorEnv, state_size: int) -> Any:
     torch.manual_seed(0)
     config = NetworkConfig(
         "merge",
@@ -28,7 +32,8 @@ def make_collector(vec: CavVectorEnv, state_size: int) -> Collector:
         (8,),
         state_size=state_size,
     )
-    return Collector(vec, ActorCritic(config, (2.0, 2.0)), STEPS, seed=0)
+    args = PPO.Args(num_steps=STEPS)
+    return PPO.Collector(vec, ActorCritic(config, (2.0, 2.0)), args, seed=0)
 
 
 @pytest.mark.parametrize("central", [False, True])
@@ -68,9 +73,39 @@ def test_values_are_of_the_state_that_the_world_was_in() -> None:
 
 def test_the_clock_accounts_for_all_time() -> None:
     collector = make_collector(make_worlds("SameStep"), 0)
-    collector.clock.take()
     collector.collect(with_suggested=True)
-    spent_s = collector.clock.take()
-    assert spent_s["learning"] == 0.0
-    assert all(spent_s[phase] > 0.0 for phase in ("simulation", "transfer", "inference"))
-    assert sum(collector.clock.take().values()) == 0.0
+    assert collector.spent_s["learning"] == 0.0
+    assert all(collector.spent_s[phase] > 0.0 for phase in PPO.PHASES[:3])
+
+
+def test_seats_of_opponents_teach_nothing_and_drive_as_they_do() -> None:
+    vec = make_worlds("SameStep")
+    size = vec.single_observation_space.shape[0]
+    config = NetworkConfig("merge", size, vec.config.sensors, vec.config.action, (8,))
+    args = PPO.Args(num_steps=STEPS, opponents="idm,random_actions", opponent_share=0.3)
+    collector = PPO.Collector(vec, ActorCritic(config), args, seed=0)
+    batch = collector.collect(with_suggested=False)
+    theirs = collector._seats >= 0
+    assert 0 < int(theirs.sum()) < theirs.numel()
+    assert not batch.acted[:, theirs].any()
+    assert not batch.goes_on[:, theirs].any()
+    assert batch.acted[:, ~theirs].float().mean() > 0.5
+
+
+def test_nothing_is_expected_after_a_red_light() -> None:
+    found = {}
+    for end_at_red in (False, True):
+        vec = make_vec("grid4x4", num_envs=4, seed=0)
+        size = vec.single_observation_space.shape[0]
+        config = NetworkConfig("grid4x4", size, vec.config.sensors, vec.config.action, (8,))
+        torch.manual_seed(0)
+        args = PPO.Args(num_steps=100, end_at_red=end_at_red, opponents="")
+        network = ActorCritic(config, (0.1, 0.01))
+        with torch.no_grad():
+            network.actor[-1].bias[0] = 0.6  # full speed ahead
+        found[end_at_red] = PPO.Collector(vec, network, args, seed=0).collect(False)
+    calm, strict = found[False], found[True]
+    assert torch.equal(calm.rewards, strict.rewards)
+    ended = calm.goes_on & ~strict.goes_on
+    assert ended.any()
+    assert (strict.next_values[ended] == 0.0).all()

@@ -19,7 +19,7 @@ from cavmarl.env.vector import make_vec
 from cavmarl.policies.policy import load_policy
 
 pytest.importorskip("torch")
-SCRIPT = Path(__file__).resolve().parents[2] / "train" / "ippo_torch.py"
+SCRIPT = Path(__file__).resolve().parents[2] / "train" / "ppo.py"
 CROSSING = Path(__file__).with_name("crossing")
 WORLDS = 64
 ARRIVAL, COLLISION = TERMS.index("arrival"), TERMS.index("collision")
@@ -27,7 +27,7 @@ ARRIVAL, COLLISION = TERMS.index("arrival"), TERMS.index("collision")
 
 @pytest.fixture(scope="module")
 def ippo() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("ippo_torch", SCRIPT)
+    spec = importlib.util.spec_from_file_location("ppo", SCRIPT)
     assert spec
     assert spec.loader
     module = importlib.util.module_from_spec(spec)

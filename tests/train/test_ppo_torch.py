@@ -11,6 +11,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 import yaml
@@ -20,9 +21,7 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.env.vector import make_vec
 from cavmarl.evaluate.provenance.manifest import read_closed
 from cavmarl.evaluate.provenance.training_record import CHECKPOINT_FILE
-from cavmarl.learning.batch import Batch
 from cavmarl.learning.checkpoint import read_checkpoint, write_checkpoint
-from cavmarl.learning.collector import Collector
 from cavmarl.learning.run_folder import parse_run
 from cavmarl.parallel.pooled_worlds import PooledWorlds
 from cavmarl.policies.networks import load_network
@@ -30,7 +29,7 @@ from cavmarl.policies.policy import load_policy
 from tests.support.training import TRAIN, load_program
 
 CONFIGS = sorted((TRAIN.parent / "configs" / "train").glob("*.yaml"))
-PROGRAMS = ("ippo_torch", "mappo_torch")
+FORMS = ([], ["--mappo"], ["--shared", "--keep", "0.4"])
 TIMES = {"seconds", "agent_steps_per_s", "simulation_s", "transfer_s", "inference_s", "learning_s"}
 TINY = [
     "--env", "merge", "--num-envs", "2", "--agents", "2", "--background", "2", "--hidden", "8",
@@ -40,12 +39,13 @@ TINY = [
 
 @pytest.fixture(scope="module")
 def ippo() -> ModuleType:
-    return load_program("ippo_torch")
+    return load_program("ppo")
 
 
-@pytest.fixture(scope="module", params=PROGRAMS)
-def program(request: pytest.FixtureRequest) -> ModuleType:
-    return load_program(request.param)
+@pytest.fixture(params=FORMS, ids=" ".join)
+def form(request: pytest.FixtureRequest) -> list[str]:
+    words: list[str] = request.param
+    return words
 
 
 @pytest.fixture
@@ -79,11 +79,10 @@ def log(folder: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-@pytest.mark.parametrize("name", PROGRAMS)
-def test_two_updates_by_command_line(tmp_path: Path, name: str) -> None:
+def test_two_updates_by_command_line(tmp_path: Path) -> None:
     words = [*TINY, "--total-agent-steps", "60", "--runs", str(tmp_path), "--name", "one"]
     done = subprocess.run(
-        [sys.executable, str(TRAIN / f"{name}.py"), *words],
+        [sys.executable, str(TRAIN / "ppo.py"), *words],
         capture_output=True,
         text=True,
         check=False,
@@ -95,16 +94,16 @@ def test_two_updates_by_command_line(tmp_path: Path, name: str) -> None:
     assert int(rows[-1]["agent_steps"]) >= 60
     assert (tmp_path / "one" / "model.safetensors").stat().st_size < 1_000_000
     manifest = read_closed(tmp_path / "one")
-    assert manifest["program"] == f"{name}.py"
+    assert manifest["program"] == "ppo.py"
     assert manifest["settings"]["total_agent_steps"] == 60
     assert manifest["world"]["map"]
     assert "model.safetensors" in manifest["results_sha256"]
 
 
-def test_the_same_seed_learns_the_same(program: ModuleType, here: Path) -> None:
-    words = [*TINY, "--total-agent-steps", "100"]
+def test_the_same_seed_learns_the_same(ippo: ModuleType, here: Path, form: list[str]) -> None:
+    words = [*TINY, *form, "--total-agent-steps", "100"]
     for name, seed in (("a", "1"), ("b", "1"), ("c", "2")):
-        assert program.main([*words, "--name", name, "--seed", seed]) == 0
+        assert ippo.main([*words, "--name", name, "--seed", seed]) == 0
     weights = [(here / "runs" / name / "model.safetensors").read_bytes() for name in "abc"]
     assert weights[0] == weights[1] != weights[2]
 
@@ -115,39 +114,37 @@ def learnt(folder: Path) -> tuple[bytes, list[dict[str, str]]]:
     return (folder / "model.safetensors").read_bytes(), rows
 
 
-@pytest.mark.parametrize("overlap", ["--no-overlap", "--overlap"])
 def test_workers_that_are_killed_change_nothing_that_is_learnt(
-    program: ModuleType, here: Path, monkeypatch: pytest.MonkeyPatch, overlap: str
+    ippo: ModuleType, here: Path, monkeypatch: pytest.MonkeyPatch, form: list[str]
 ) -> None:
-    words = [*TINY, "--total-agent-steps", "100", overlap]
-    assert program.main([*words, "--name", "whole"]) == 0
-    collect = Collector.collect
+    words = [*TINY, "--total-agent-steps", "100", *form]
+    assert ippo.main([*words, "--name", "whole"]) == 0
+    collect = ippo.Collector.collect
     killed: list[int] = []
 
-    def collect_after_a_kill(self: Collector, with_suggested: bool) -> Batch:
+    def collect_after_a_kill(self: Any, with_suggested: bool) -> Any:
         worlds = self.vec.worlds
         assert isinstance(worlds, PooledWorlds)
         killed.append(worlds.pool.pids[0])
         os.kill(killed[-1], signal.SIGKILL)
         return collect(self, with_suggested)
 
-    monkeypatch.setattr(Collector, "collect", collect_after_a_kill)
-    assert program.main([*words, "--name", "killed", "--workers", "2"]) == 0
+    monkeypatch.setattr(ippo.Collector, "collect", collect_after_a_kill)
+    assert ippo.main([*words, "--name", "killed", "--workers", "2"]) == 0
     assert len(set(killed)) >= 2
     assert learnt(here / "runs" / "whole") == learnt(here / "runs" / "killed")
 
 
-def test_zones_over_workers_change_nothing_that_is_learnt(here: Path) -> None:
-    mappo = load_program("mappo_torch")
-    words = [*TINY, "--num-envs", "1", "--total-agent-steps", "40"]
-    assert mappo.main([*words, "--name", "whole"]) == 0
-    assert mappo.main([*words, "--name", "split", "--zones", "2", "--workers", "2"]) == 0
+def test_zones_over_workers_change_nothing_that_is_learnt(ippo: ModuleType, here: Path) -> None:
+    words = [*TINY, "--mappo", "--num-envs", "1", "--total-agent-steps", "40"]
+    assert ippo.main([*words, "--name", "whole"]) == 0
+    assert ippo.main([*words, "--name", "split", "--zones", "2", "--workers", "2"]) == 0
     assert learnt(here / "runs" / "whole") == learnt(here / "runs" / "split")
 
 
-def test_a_central_critic_is_no_part_of_what_drives(here: Path) -> None:
-    words = [*TINY, "--total-agent-steps", "20", "--name", "run"]
-    assert load_program("mappo_torch").main(words) == 0
+def test_a_central_critic_is_no_part_of_what_drives(ippo: ModuleType, here: Path) -> None:
+    words = [*TINY, "--mappo", "--total-agent-steps", "20", "--name", "run"]
+    assert ippo.main(words) == 0
     network, config = load_network(here / "runs" / "run")
     vec = make_vec("merge", agents=2, background=2)
     observations, infos = vec.reset(seed=0)
@@ -157,7 +154,7 @@ def test_a_central_critic_is_no_part_of_what_drives(here: Path) -> None:
     vec.step(driver.act_batch(observations, infos["mask"]))
 
 
-@pytest.mark.parametrize("kind", ["continuous", "discrete"])
+@pytest.mark.parametrize("kind", ["continuous", "discrete", "grid"])
 def test_a_run_goes_on_where_it_stopped_and_drives(ippo: ModuleType, here: Path, kind: str) -> None:
     entry = here / "envs" / "small"
     entry.mkdir(parents=True)
@@ -201,6 +198,8 @@ def test_tensorboard_gets_the_same_numbers(ippo: ModuleType, here: Path) -> None
         (["--env", "merg"], "did you mean merge"),
         (["--num-envs", "0"], "--num-envs 0: must be at least 1"),
         (["--learning-rate", "nan"], "--learning-rate nan: must be above 0"),
+        (["--mappo", "--shared"], "--shared: not with --mappo"),
+        (["--keep", "0"], "--keep 0.0: must be above 0"),
         (["--gamma", "1.5"], "--gamma 1.5: must be from 0 to 1"),
         (["--agents", "-1"], "--agents -1: must be at least 0"),
         (["--resume", "nowhere"], "--resume nowhere: no checkpoint there"),
@@ -253,3 +252,16 @@ def test_a_pickle_is_not_run(
     write_checkpoint(folder, replace(state, parts={"learner": Path("anything")}))
     assert ippo.main(["--resume", str(folder), "--total-agent-steps", "100"]) == 2
     assert f"{CHECKPOINT_FILE}: is damaged" in capsys.readouterr().err.replace("\n", "")
+
+
+def test_a_run_begins_with_the_weights_of_a_driver(
+    ippo: ModuleType, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert ippo.main([*TINY, "--total-agent-steps", "60", "--name", "first"]) == 0
+    still = [*TINY, "--total-agent-steps", "20", "--learning-rate", "1e-12"]
+    assert ippo.main([*still, "--name", "next", "--start", "runs/first"]) == 0
+    one, other = (load_network(here / "runs" / name)[0] for name in ("first", "next"))
+    for mine, theirs in zip(one.parameters(), other.parameters(), strict=True):
+        assert (mine - theirs).abs().max() < 1e-6
+    assert ippo.main([*TINY, "--hidden", "9", "--name", "wide", "--start", "runs/first"]) == 2
+    assert "--start runs/first: does not fit this run" in capsys.readouterr().err

@@ -14,6 +14,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
@@ -23,7 +24,6 @@ from cavmarl.core.errors import ConfigError, TrainingError
 from cavmarl.evaluate.provenance.training_record import CHECKPOINT_FILE, is_trained
 from cavmarl.learning.checkpoint import read_checkpoint
 from cavmarl.learning.log import Log
-from cavmarl.learning.run import Run
 from cavmarl.learning.run_folder import parse_run
 from tests.support.training import TRAIN, load_program
 
@@ -59,7 +59,7 @@ class Cut(BaseException):
 
 @pytest.fixture(scope="module")
 def ippo() -> ModuleType:
-    return load_program("ippo_torch")
+    return load_program("ppo")
 
 
 @pytest.fixture(scope="module")
@@ -94,16 +94,16 @@ def learnt(folder: Path) -> Learnt:
 
 def cut(program: ModuleType, words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """Let a run end after `CUT_AFTER` updates."""
-    update = Run.update
+    update = program.Run.update
 
-    def update_and_end(self: Run) -> dict[str, float]:
+    def update_and_end(self: Any) -> dict[str, float]:
         row = update(self)
         if self.updates == CUT_AFTER:
             raise Cut
         return row
 
     with monkeypatch.context() as patch:
-        patch.setattr(Run, "update", update_and_end)
+        patch.setattr(program.Run, "update", update_and_end)
         with pytest.raises(Cut):
             program.main(words)
 
@@ -112,7 +112,7 @@ def test_a_run_that_is_killed_goes_on_bit_for_bit(
     ippo: ModuleType, here: Path, whole: Learnt
 ) -> None:
     words = [*TINY, *LENGTH]
-    command = [sys.executable, "-c", KILLED, str(TRAIN / "ippo_torch.py"), *words, "--name", "cut"]
+    command = [sys.executable, "-c", KILLED, str(TRAIN / "ppo.py"), *words, "--name", "cut"]
     killed = subprocess.run(command, capture_output=True, check=False)
     assert killed.returncode == -signal.SIGKILL
     assert not is_trained(here / "runs" / "cut")
@@ -129,18 +129,19 @@ def test_a_run_that_is_killed_goes_on_bit_for_bit(
 
 
 @pytest.mark.parametrize(
-    ("name", "words", "others"),
+    ("words", "others"),
     [
-        ("ippo_torch", ["--overlap", "--imitation-weight", "1"], []),
-        ("mappo_torch", [], ["--zones", "2"]),
-        ("mappo_torch", ["--overlap"], ["--workers", "2"]),
+        (["--imitation-weight", "1", "--end-at-red"], []),
+        (["--shared", "--keep", "0.5", "--opponents", "idm,random_actions"], []),
+        (["--mappo"], ["--zones", "2"]),
+        (["--mappo"], ["--workers", "2"]),
     ],
 )
 @pytest.mark.filterwarnings("ignore:workers = 2")
 def test_a_run_goes_on_bit_for_bit_in_every_way_to_collect(
-    here: Path, monkeypatch: pytest.MonkeyPatch, name: str, words: list[str], others: list[str]
+    here: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], others: list[str]
 ) -> None:
-    program = load_program(name)
+    program = load_program("ppo")
     words = [*TINY, *LENGTH, *words]
     assert program.main([*words, "--name", "whole"]) == 0
     cut(program, [*words, "--name", "cut"], monkeypatch)
@@ -175,15 +176,15 @@ def test_a_folder_has_one_run_and_one_process(
 ) -> None:
     words = [*TINY, "--total-agent-steps", "60", "--name", "run"]
     locked: list[str] = []
-    update = Run.update
+    update = ippo.Run.update
 
-    def update_beside_another(self: Run) -> dict[str, float]:
+    def update_beside_another(self: Any) -> dict[str, float]:
         if not locked:
             locked.append("")
             locked[0] = refusal(*words) + refusal("--resume", "runs/run")
         return update(self)
 
-    monkeypatch.setattr(Run, "update", update_beside_another)
+    monkeypatch.setattr(ippo.Run, "update", update_beside_another)
     assert ippo.main(words) == 0
     assert locked[0].count(f"runs/run: process {os.getpid()} trains here: wait until") == 2
     before = learnt(here / "runs" / "run")
@@ -256,9 +257,9 @@ def test_what_is_damaged_or_of_another_run_is_refused(
         path.write_bytes(broken)
         assert "runs/run/checkpoint.pt: is damaged, or of another version" in refusal(*resume)
     path.write_bytes(written)
-    mappo = load_program("mappo_torch")
-    with pytest.raises(ConfigError, match=r"is a run of ippo_torch\.py: go on with that one"):
-        parse_run(mappo.Args, resume, "")
+    other = load_program("ppo_gymnasium")
+    with pytest.raises(ConfigError, match=r"is a run of ppo\.py: go on with that one"):
+        parse_run(other.Args, resume, "")
     (path.parent / "progress.csv").write_text("rows\n")
     assert "progress.csv: rows are missing that were there at the checkpoint" in refusal(*resume)
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _SIDES = {
     "cavmarl": "cavmarl",
-    "cavmarl_overlap": "cavmarl, --overlap",
+    "cavmarl_recipe": "cavmarl, our recipe",
     "stable_baselines3": "SB3 on highway-env",
 }
 _PHASES = ("simulation", "transfer", "inference", "learning")
@@ -45,8 +45,8 @@ def train(
     write_json(json_path, found.to_dict())
     console.print(_table(found))
     console.print(
-        f"end to end, ours over theirs: [bold]{found.ratio:,.1f}[/]; collecting while learning "
-        f"over one after the other: [bold]{found.overlap_ratio:.2f}[/]\n"
+        f"end to end, ours over theirs: [bold]{found.ratio:,.1f}[/]; our own recipe "
+        f"({found.recipe_numbers} numbers): [bold]{found.recipe_rate:,.0f}[/] agent-steps/s\n"
         f"worlds and sensors alone, without learning: {median(found.stepping):,.0f} agent-steps/s",
         highlight=False,
     )

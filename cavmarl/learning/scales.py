@@ -1,0 +1,55 @@
+"""`Scales`: how observations are brought to one scale, learnt beside the weights."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from cavmarl.core.errors import PolicyError
+from cavmarl.learning.checkpoint import Parts
+from cavmarl.policies.networks import ActorCritic, load_network
+
+LEAST_DEVIATION = 0.02  # of an observation; those that hardly change are not blown up
+
+
+class Scales:
+    """Keeps the network's mean and deviation of observations: of all decisions of a run so far."""
+
+    def __init__(self, network: ActorCritic) -> None:
+        self._network = network
+        self._count = 0
+        self._squares = torch.zeros_like(network.deviation)
+
+    def start(self, folder: Path) -> None:
+        """Begin with the weights and the scales of a driver.
+
+        Raises PolicyError: it is not of the network's form.
+        """
+        driver, config = load_network(folder)
+        try:
+            self._network.load_state_dict(driver.state_dict())
+        except RuntimeError as error:
+            reason = str(error).splitlines()[-1].strip()
+            raise PolicyError(f"--start {folder}: does not fit this run: {reason}") from error
+        self._count = config.agent_steps
+        self._squares = self._network.deviation.square() * self._count
+
+    def add(self, observations: Tensor) -> None:
+        """Take in the observations (N, D) of new decisions (Chan et al. 1979)."""
+        network, new = self._network, len(observations)
+        if new == 0:
+            return
+        squares, mean = torch.var_mean(observations, 0, correction=0)
+        apart, total = mean - network.mean, self._count + new
+        self._squares += squares * new + apart.square() * (self._count * new / total)
+        network.mean += apart * (new / total)
+        network.deviation.copy_((self._squares / total).sqrt().clamp(min=LEAST_DEVIATION))
+        self._count = total
+
+    def save(self) -> Parts:
+        return {"count": self._count, "squares": self._squares}
+
+    def load(self, saved: Parts) -> None:
+        self._count, self._squares = saved["count"], saved["squares"]

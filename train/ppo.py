@@ -1,0 +1,455 @@
+"""PPO with one network shared by all agents, on batched worlds: IPPO, or MAPPO with `--mappo`.
+
+    python train/ppo.py --env merge --minutes 2
+    python train/ppo.py --env town --shared --keep 0.35 --epochs 2 --workers 2
+    python train/ppo.py --resume runs/merge_ippo_1 --total-agent-steps 8000000
+
+Read from top to bottom: the settings; `Batch`, what is learnt from; `Collector`, which drives the
+worlds; `Learner`, the update; `Run`, which takes turns between both.
+
+Every agent learns from its own observations and rewards, all share the weights (Schulman et al.
+2017; de Witt et al. 2020). With `--mappo` the critic also sees the state of the world (Yu et al.
+2022); the driver never does. A run's folder holds the driver (`model.safetensors`, `config.json`,
+for `cavmarl evaluate --policy FOLDER`), `manifest.json`, `progress.csv` and `checkpoint.pt`. With
+the same seed, threads and machine a run repeats itself for any number of workers, unless the clock
+ends it (`--minutes`); so does one that was cut short and goes on. It is never overwritten.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, ClassVar
+
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode
+from rich.console import Console
+from torch import Tensor, nn
+
+from cavmarl.config.env import TERMS
+from cavmarl.core.errors import ConfigError
+from cavmarl.env.vector import CavVectorEnv, make_vec
+from cavmarl.learning import options
+from cavmarl.learning.checkpoint import Parts, bytes_of, tensor_of
+from cavmarl.learning.log import Trips, describe, progress_bar
+from cavmarl.learning.options import check_above_zero, check_at_least, check_shares
+from cavmarl.learning.run_folder import RunFolder, parse_run
+from cavmarl.learning.scales import Scales
+from cavmarl.parallel.local_worlds import kept_elsewhere
+from cavmarl.policies.networks import ActorCritic, NetworkConfig
+from cavmarl.policies.policy import load_policy
+
+PHASES = ("simulation", "transfer", "inference", "learning")
+RED_LIGHT = TERMS.index("red_light")
+NUMBERS = ("policy_loss", "value_loss", "entropy", "kl", "clipped")
+
+
+@dataclass(frozen=True)
+class Args:
+    """The settings of a run; each is an option of the command line."""
+
+    program: ClassVar[str] = "ppo.py"
+
+    env: Annotated[str, "environment: a name, a folder or a map file"] = "merge"
+    agents: Annotated[int, "agents a world; 0: as the environment says"] = 0
+    background: Annotated[int, "background vehicles a world; -1: as the environment says"] = -1
+    num_envs: Annotated[int, "worlds that are stepped together"] = 16
+    zones: Annotated[int, "zones a world; 0: as the environment says"] = 0
+    workers: Annotated[int, "processes that the worlds are shared out over; 0: this one"] = 0
+    seed: Annotated[int, "root of all random numbers"] = 0
+    total_agent_steps: Annotated[int, "decisions to learn from"] = 4_000_000
+    minutes: Annotated[float, "stop after this time, whatever is left; 0: no limit"] = 0.0
+    num_steps: Annotated[int, "steps of every world between two updates"] = 128
+    epochs: Annotated[int, "passes over the decisions of an update"] = 4
+    minibatches: Annotated[int, "parts that a pass is cut into"] = 8
+    keep: Annotated[float, "share of the decisions learnt from, of the largest advantages"] = 1.0
+    learning_rate: Annotated[float, "of Adam, at the start"] = 1e-3
+    anneal: Annotated[bool, "let the learning rate fall to 0 at the end"] = True
+    gamma: Annotated[float, "discount a step"] = 0.99
+    gae_lambda: Annotated[float, "of generalised advantage estimation"] = 0.95
+    clip: Annotated[float, "how far the ratio of probabilities may leave 1"] = 0.2
+    entropy_weight: Annotated[float, "of the entropy in the loss"] = 0.0
+    value_weight: Annotated[float, "of the value loss"] = 0.5
+    imitation_weight: Annotated[float, "of the distance to the built-in driver, at the start"] = 0.0
+    imitation_share: Annotated[float, "share of the run in which that weight falls to 0"] = 0.1
+    start: Annotated[str, "folder of a driver whose weights it begins with"] = ""
+    end_at_red: Annotated[bool, "expect nothing after running a red light, as at a crash"] = False
+    opponents: Annotated[str, "drivers of some seats, not learnt from: names, by commas"] = ""
+    opponent_share: Annotated[float, "share of the seats that each opponent drives"] = 0.1
+    max_gradient_norm: Annotated[float, "longer gradients are shortened"] = 0.5
+    throttle_std: Annotated[float, "standard deviation of the throttle at the start"] = 0.3
+    steering_std: Annotated[float, "standard deviation of the steering at the start"] = 0.1
+    mappo: Annotated[bool, "the critic sees the state of the whole world"] = False
+    hidden: Annotated[int, "width of the two hidden layers"] = 128
+    shared: Annotated[bool, "one body with LayerNorm for actor and critic"] = False
+    threads: Annotated[int, "of torch"] = 1
+    checkpoint_updates: Annotated[int, "updates between two checkpoints"] = 20
+    runs: Annotated[str, "folder of all runs"] = "runs"
+    name: Annotated[str, "folder of this run; empty: ENV_ALGORITHM_SEED"] = ""
+    resume: Annotated[str, options.RESUME] = ""
+    tensorboard: Annotated[bool, "write TensorBoard's files"] = False
+
+    def __post_init__(self) -> None:
+        ones = "num_envs total_agent_steps num_steps epochs minibatches hidden threads"
+        zeros = "agents zones workers seed minutes entropy_weight value_weight imitation_weight"
+        above = "keep learning_rate clip max_gradient_norm throttle_std steering_std"
+        check_at_least(self, dict.fromkeys(f"{ones} checkpoint_updates".split(), 1))
+        check_at_least(self, {"background": -1, **dict.fromkeys(zeros.split(), 0)})
+        check_above_zero(self, [*above.split(), "imitation_share"])
+        check_shares(self, ("gamma", "gae_lambda", "keep", "opponent_share"))
+        if self.shared and self.mappo:
+            raise ConfigError("--shared: not with --mappo, whose critic sees more than the actor")
+
+    @property
+    def folder(self) -> Path:
+        algorithm = "mappo" if self.mappo else "ippo"
+        name = (self.name, self.env, algorithm, self.seed)
+        return options.run_folder(self.runs, *name, self.resume)
+
+
+@dataclass
+class Batch:
+    """What one round of steps brought; T steps, W worlds, A agents."""
+
+    observations: Tensor  # (T, W, A, D)
+    states: Tensor  # (T, W, S) of the worlds; S is 0 where the critic does not see them
+    actions: Tensor  # (T, W, A, …) as sampled
+    log_probs: Tensor  # (T, W, A) of them
+    values: Tensor  # (T, W, A)
+    rewards: Tensor  # (T, W, A)
+    acted: Tensor  # (T, W, A) which entries are decisions of the network
+    next_values: Tensor  # (T, W, A) what was to be expected after the step; 0 where a vehicle ended
+    goes_on: Tensor  # (T, W, A) whether entry t + 1 is of the same vehicle and episode
+    # (T, W, A, …) what the built-in driver would have done, while it is imitated
+    suggested: Tensor | None = None
+
+    def advantages(self, gamma: float, gae_lambda: float) -> Tensor:
+        """(T, W, A) generalised advantage estimates (Schulman et al. 2016); 0 where no agent acted.
+
+        The sums go along the way of one vehicle: they begin anew where `goes_on` is False.
+        """
+        deltas = self.rewards + gamma * self.next_values - self.values
+        decay = gamma * gae_lambda * self.goes_on
+        following = torch.zeros_like(self.values[0])
+        advantages = torch.zeros_like(self.values)
+        for t in reversed(range(len(deltas))):
+            following = (deltas[t] + decay[t] * following) * self.acted[t]
+            advantages[t] = following
+        return advantages
+
+
+class Collector:
+    """Drives the worlds with a network and keeps what comes of it, with the time that it took.
+
+    If the critic sees their states, worlds begin anew in the next step: the last state of an
+    episode is gone when they do so in the same.
+    """
+
+    def __init__(self, vec: CavVectorEnv, network: ActorCritic, args: Args, seed: int) -> None:
+        self.vec, self.network, self._args = vec, network, args
+        self.trips = Trips(vec.num_envs, vec.num_agents)
+        self.spent_s = dict.fromkeys(PHASES, 0.0)
+        self._mask = torch.from_numpy(vec.reset(seed=seed)[1]["mask"])
+        # Worlds write here what is seen: it is copied once, into a batch.
+        self._observations = torch.from_numpy(vec.worlds.arrays.observations)
+        self._opponents = [load_policy(name, vec) for name in args.opponents.split(",") if name]
+        drawn = torch.from_numpy(np.random.default_rng(args.seed).random(self._mask.shape))
+        self._seats = torch.floor(drawn / max(args.opponent_share, 1e-9)).long()  # whose they are
+        self._seats[self._seats >= len(self._opponents)] = -1  # the network's
+
+    @contextmanager
+    def phase(self, name: str) -> Iterator[None]:
+        """The time of a block goes to this phase; not to be nested."""
+        began = time.perf_counter()
+        yield
+        self.spent_s[name] += time.perf_counter() - began
+
+    @torch.inference_mode()
+    def collect(self, with_suggested: bool) -> Batch:
+        """Some steps of all worlds, on request with what the built-in driver would do."""
+        began, simulated_s = time.perf_counter(), self.vec.simulated_s
+        before_s = sum(self.spent_s.values())
+        batch = self._empty(with_suggested)
+        for opponent in self._opponents:
+            opponent.reset(self._args.seed)  # so that a run that goes on has the same ones
+        for t in range(self._args.num_steps):
+            self._step(batch, t)
+        self._expect(batch)
+        self.spent_s["simulation"] += self.vec.simulated_s - simulated_s
+        elsewhere_s = sum(self.spent_s.values()) - before_s
+        self.spent_s["transfer"] += time.perf_counter() - began - elsewhere_s
+        return batch
+
+    def _empty(self, with_suggested: bool) -> Batch:
+        shape = (self._args.num_steps, *self._mask.shape)
+        continuous = self.network.continuous
+        actions = torch.zeros((*shape, 2)) if continuous else torch.zeros(shape, dtype=torch.int64)
+        numbers = ("log_probs", "values", "rewards", "next_values")
+        return Batch(
+            observations=torch.empty((*shape, self._observations.shape[-1])),
+            states=torch.zeros((*shape[:2], self.network.state_size)),
+            actions=actions,
+            acted=torch.zeros(shape, dtype=torch.bool),
+            goes_on=torch.zeros(shape, dtype=torch.bool),
+            suggested=torch.zeros_like(actions) if with_suggested else None,
+            **{name: torch.zeros(shape) for name in numbers},
+        )
+
+    def _step(self, batch: Batch, t: int) -> None:
+        """Let the network decide, and write down what is entry `t` of a batch."""
+        if batch.suggested is not None:
+            with self.phase("simulation"):
+                batch.suggested[t] = torch.from_numpy(self.vec.suggest_actions())
+        batch.observations[t] = self._observations
+        batch.states[t] = self._look()
+        with self.phase("inference"):
+            output, values = self._heads(batch.observations[t], batch.states[t])
+            actions, batch.log_probs[t] = self.network.draw(output)
+            batch.values[t], batch.actions[t] = values, actions
+        given = (actions.clamp(-1.0, 1.0) if self.network.continuous else actions).numpy()
+        for k, opponent in enumerate(self._opponents):
+            theirs = (self._seats == k).numpy()
+            seen = self._observations.numpy()
+            given[theirs] = opponent.act_batch(seen, self._mask.numpy() & theirs)[theirs]
+        _, reward, ended, cut, infos = self.vec.step(given)
+        terms = infos["terms"]
+        if self._args.end_at_red:
+            ended = ended | (terms[..., RED_LIGHT] > 0.0)
+        ours = self._seats < 0
+        self._mask = torch.from_numpy(infos["mask"])
+        batch.rewards[t] = torch.from_numpy(reward)
+        batch.acted[t] = torch.from_numpy(infos["acted"]) & ours
+        batch.goes_on[t] = batch.acted[t] & torch.from_numpy(infos["mask"] & ~ended & ~cut)
+        if cut.any():
+            last = torch.from_numpy(infos["final_observations"])
+            expected = self._heads(last, self._look())[1]
+            batch.next_values[t] = expected * torch.from_numpy(cut & ~ended)
+        self.trips.add(reward, infos["vehicle_done"] & ours.numpy(), cut, terms)
+
+    def _expect(self, batch: Batch) -> None:
+        """What was to be expected after each step of a vehicle that goes on."""
+        with self.phase("inference"):
+            after = self._heads(self._observations, self._look())[1]
+        following = torch.cat([batch.values[1:], after[None]])
+        batch.next_values = torch.where(batch.goes_on, following, batch.next_values)
+
+    def _heads(self, observations: Tensor, states: Tensor) -> tuple[Tensor, Tensor]:
+        """What the network says of all seats, (W, A, …) and (W, A)."""
+        each = states[:, None].expand(*observations.shape[:2], states.shape[1])
+        return self.network.heads(self.network.normal(observations), each)
+
+    def _look(self) -> Tensor:
+        """States (W, S) of the worlds; S is 0 where the critic does not see them."""
+        if not self.network.state_size:
+            return torch.zeros((self.vec.num_envs, 0))
+        return torch.from_numpy(self.vec.state())
+
+    def save(self) -> Parts:
+        """Where worlds and trips stand."""
+        kept: Parts = {"trips": self.trips.save()}
+        if kept_elsewhere(self.vec.config):
+            return kept
+        return {**kept, "worlds": tensor_of(self.vec.save_state()), "mask": self._mask.clone()}
+
+    def load(self, saved: Parts) -> None:
+        """Go on from what `save` gave; worlds that it could not save have begun new episodes."""
+        self.trips.load(saved["trips"])
+        if "worlds" in saved:
+            self.vec.load_state(bytes_of(saved["worlds"]))
+            self._mask = saved["mask"]
+
+
+class Learner:
+    """The network, its optimiser, and PPO's update (Schulman et al. 2017)."""
+
+    def __init__(self, network: ActorCritic, args: Args) -> None:
+        self.network, self._args = network, args
+        self.optimizer = torch.optim.Adam(network.parameters(), lr=args.learning_rate, eps=1e-5)
+        self.scales = Scales(network)
+
+    def imitation_weight(self, left: float) -> float:
+        """How much the built-in driver's example counts with `left` of the run to go."""
+        args = self._args
+        return args.imitation_weight * max(1.0 - (1.0 - left) / args.imitation_share, 0.0)
+
+    def update(self, batch: Batch, left: float) -> dict[str, float]:
+        """Learn from the decisions of a batch; `left` is the share of the run that is left."""
+        args, network = self._args, self.network
+        share = left if args.anneal else 1.0
+        for group in self.optimizer.param_groups:
+            group["lr"] = args.learning_rate * share
+        advantages = batch.advantages(args.gamma, args.gae_lambda)
+        acted = batch.acted.flatten().nonzero().squeeze(1)
+        chosen = self._filtered(advantages.flatten(), acted, batch.suggested is not None)
+        seats = batch.acted.shape[2]
+
+        def of(values: Tensor, rows: Tensor) -> Tensor:
+            return values.flatten(0, 2)[rows]
+
+        found: list[Tensor] = []
+        for _ in range(args.epochs):
+            order = chosen[torch.randperm(len(chosen))]
+            for rows in order.tensor_split(args.minibatches):
+                if rows.numel() < 2:  # one decision has no advantage over others
+                    continue
+                states = batch.states.flatten(0, 1)
+                seen = network.normal(of(batch.observations, rows))
+                output, values = network.heads(seen, states[rows // seats])
+                log_prob, entropy = network.judge(output, of(batch.actions, rows))
+                change = log_prob - of(batch.log_probs, rows)
+                ratio = change.exp()
+                gains = of(advantages, rows)
+                returns = gains + of(batch.values, rows)
+                gains = (gains - gains.mean()) / (gains.std() + 1e-8)
+                bounded = ratio.clamp(1.0 - args.clip, 1.0 + args.clip)
+                policy_loss = -torch.min(gains * ratio, gains * bounded).mean()
+                value_loss = (values - returns).square().mean()
+                loss = policy_loss + 0.5 * args.value_weight * value_loss
+                loss = loss - args.entropy_weight * share * entropy.mean()
+                if batch.suggested is not None:
+                    distance = network.distance(output, of(batch.suggested, rows))
+                    loss = loss + self.imitation_weight(left) * distance.mean()
+                self.optimizer.zero_grad()
+                loss.backward()  # type: ignore[no-untyped-call]
+                for group in network.parts:
+                    nn.utils.clip_grad_norm_(group, args.max_gradient_norm)
+                self.optimizer.step()
+                with torch.no_grad():
+                    kl = (ratio - 1.0 - change).mean()
+                    clipped = ((ratio - 1.0).abs() > args.clip).float().mean()
+                found.append(torch.stack([policy_loss, value_loss, entropy.mean(), kl, clipped]))
+        self.scales.add(of(batch.observations, acted))
+        means = torch.stack(found).detach().mean(0) if found else torch.zeros(len(NUMBERS))
+        return dict(zip(NUMBERS, means.tolist(), strict=True))
+
+    def _filtered(self, advantages: Tensor, acted: Tensor, all_of_them: bool) -> Tensor:
+        """Rows to learn from: small advantages teach little (Cusumano-Towner et al. 2025)."""
+        if all_of_them or self._args.keep == 1.0:
+            return acted
+        size = advantages[acted].abs()
+        kept = size.topk(max(int(self._args.keep * len(size)), 1), sorted=False).indices
+        return acted[kept.sort().values]
+
+    def save(self) -> Parts:
+        network, optimizer = self.network.state_dict(), self.optimizer.state_dict()
+        return {"network": network, "optimizer": optimizer, "scales": self.scales.save()}
+
+    def load(self, saved: Parts) -> None:
+        self.network.load_state_dict(saved["network"])
+        self.optimizer.load_state_dict(saved["optimizer"])
+        self.scales.load(saved["scales"])
+
+
+class Run:
+    """A run of PPO: where it stands and how it goes on."""
+
+    def __init__(self, args: Args, vec: CavVectorEnv, folder: RunFolder) -> None:
+        self.args, self.vec, self.folder = args, vec, folder
+        self.agent_steps, self.updates = folder.began.agent_steps, folder.began.updates
+        torch.set_num_threads(args.threads)
+        torch.manual_seed(args.seed + self.updates)
+        self.config = NetworkConfig(
+            environment=vec.config.name,
+            observation_size=vec.single_observation_space.shape[0],
+            sensors=vec.config.sensors,
+            action=vec.config.action,
+            hidden=(args.hidden, args.hidden),
+            seed=args.seed,
+            state_size=vec.state_size if args.mappo else 0,
+            shared=args.shared,
+        )
+        self.network = ActorCritic(self.config, (args.throttle_std, args.steering_std))
+        self.learner = Learner(self.network, args)
+        if args.start and not folder.began.parts:
+            self.learner.scales.start(Path(args.start))
+        self.collector = Collector(vec, self.network, args, args.seed + self.updates)
+        if not folder.began.parts:
+            self.save()  # a run that is killed early begins from here
+        if parts := folder.resume():
+            self.learner.load(parts["learner"])
+            self.collector.load(parts["collector"])
+
+    def done(self) -> float:
+        """The share of the run that is over, by decisions or by the clock."""
+        done = self.agent_steps / self.args.total_agent_steps
+        if self.args.minutes:
+            done = max(done, self.folder.seconds / (60.0 * self.args.minutes))
+        return min(done, 1.0)
+
+    def update(self) -> dict[str, float]:
+        """Collect, learn, and log the numbers, which are returned."""
+        started, left, collector = time.perf_counter(), 1.0 - self.done(), self.collector
+        collector.spent_s = dict.fromkeys(PHASES, 0.0)
+        batch = collector.collect(self.learner.imitation_weight(left) > 0.0)
+        with collector.phase("learning"):
+            numbers = self.learner.update(batch, left)
+        new = int(batch.acted.sum())
+        self.agent_steps += new
+        self.updates += 1
+        row = {
+            "updates": self.updates,
+            "agent_steps": self.agent_steps,
+            "seconds": self.folder.seconds,
+            "agent_steps_per_s": new / (time.perf_counter() - started),
+            **collector.trips.means(),
+            **numbers,
+            **{f"{phase}_s": seconds for phase, seconds in collector.spent_s.items()},
+        }
+        self.folder.log.write(row)
+        return row
+
+    def save(self) -> None:
+        """A checkpoint of what is now; and the driver."""
+        parts = {"learner": self.learner.save(), "collector": self.collector.save()}
+        self.folder.save(self.agent_steps, self.updates, parts)
+        self.folder.save_driver(self.network, replace(self.config, agent_steps=self.agent_steps))
+
+
+@contextmanager
+def opened(args: Args) -> Iterator[Run]:
+    """A run in its worlds and its folder, which are closed at the end."""
+    vec = make_vec(
+        args.env,
+        num_envs=args.num_envs,
+        zones=args.zones or None,
+        workers=args.workers,
+        agents=args.agents or None,
+        background=None if args.background < 0 else args.background,
+        autoreset_mode=AutoresetMode.NEXT_STEP if args.mappo else AutoresetMode.SAME_STEP,
+        copy=False,
+    )
+    try:
+        with RunFolder(args, vec.worlds.world, vec.plans) as folder:
+            yield Run(args, vec, folder)
+    finally:
+        vec.close()
+
+
+def train(args: Args, console: Console) -> Path:
+    """Run PPO until its decisions or its minutes are used up; returns the folder of the run."""
+    with opened(args) as run, progress_bar(console) as bar:
+        if run.vec.plans:
+            console.print(run.vec.plan_text(), highlight=False)
+        task = bar.add_task("", total=1.0)
+        done = run.done() if run.updates else 0.0
+        while done < 1.0:
+            row = run.update()
+            done = run.done()
+            if done == 1.0 or run.folder.is_due(run.updates):
+                run.save()
+            bar.update(task, completed=done, description=describe(row))
+        return run.folder.end(plans=run.vec.plans)
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Train; 0: trained, 2: wrong use."""
+    return options.run_program(lambda: train(parse_run(Args, words, __doc__), Console()))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
