@@ -57,7 +57,7 @@ class Load(_Answer):
     gpu: float
 
 
-class Node(_Answer):
+class NodeStatus(_Answer):
     """A node."""
 
     name: str
@@ -82,7 +82,7 @@ class Node(_Answer):
 class NodeList(_Answer):
     """All nodes."""
 
-    nodes: list[Node]
+    nodes: list[NodeStatus]
 
 
 class Door(_Answer):
@@ -211,7 +211,7 @@ class Ownership(_Answer):
     in_flight: list[InFlight]
 
 
-class Event(_Answer):
+class EventLine(_Answer):
     """A line of the log."""
 
     sequence: int
@@ -227,7 +227,7 @@ class Event(_Answer):
 class EventList(_Answer):
     """Lines of the log, the oldest first."""
 
-    events: list[Event]
+    events: list[EventLine]
 
 
 class Identity(_Answer):

@@ -69,10 +69,10 @@ async def assigned(
     )
 
 
-def node_answer(service: Service, node: NodeRecord) -> answers.Node:
+def node_answer(service: Service, node: NodeRecord) -> answers.NodeStatus:
     """A node, with what its last beat said."""
     live = service.broker.live[node.name]
-    return answers.Node(
+    return answers.NodeStatus(
         **asdict(node),
         load=None if live.use is None else answers.Load(**asdict(live.use)),
         score=score_of(node, live),
@@ -88,11 +88,11 @@ def session_answer(session: SessionRecord) -> answers.Session:
     return answers.Session(**found)
 
 
-def event_answer(line: LogEvent) -> answers.Event:
+def event_answer(line: LogEvent) -> answers.EventLine:
     """A line of the log, without what is never shown."""
     found = line._asdict()
     del found["private"]
-    return answers.Event(**found)
+    return answers.EventLine(**found)
 
 
 async def event_stream(

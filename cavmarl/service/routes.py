@@ -96,25 +96,27 @@ async def list_nodes(_: Readers, service: TheService) -> answers.NodeList:
 
 
 @nodes.post("", status_code=201)
-async def register(identity: Nodes, service: TheService, body: bodies.NodeBody) -> answers.Node:
+async def register(
+    identity: Nodes, service: TheService, body: bodies.NodeBody
+) -> answers.NodeStatus:
     """Register a node, or register it anew after it has left, died or begun again."""
     return node_answer(service, service.broker.register(identity, body))
 
 
 @nodes.post("/{name}/drain")
-async def drain(identity: Drainers, service: TheService, name: NodeName) -> answers.Node:
+async def drain(identity: Drainers, service: TheService, name: NodeName) -> answers.NodeStatus:
     """Give a node nothing more, and move what it has."""
     return node_answer(service, service.broker.drain(identity, name))
 
 
 @nodes.post("/{name}/resume")
-async def resume(identity: Operators, service: TheService, name: NodeName) -> answers.Node:
+async def resume(identity: Operators, service: TheService, name: NodeName) -> answers.NodeStatus:
     """Let a drained node take sessions again."""
     return node_answer(service, service.broker.drain(identity, name, is_on=False))
 
 
 @nodes.delete("/{name}")
-async def leave(identity: Drainers, service: TheService, name: NodeName) -> answers.Node:
+async def leave(identity: Drainers, service: TheService, name: NodeName) -> answers.NodeStatus:
     """A node ends."""
     return node_answer(service, service.broker.leave(identity, name))
 
