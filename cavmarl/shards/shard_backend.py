@@ -75,7 +75,10 @@ class ShardBackend(Protocol):
         ...
 
     def read_sensors(self) -> dict[int, NDArray[np.float32]]:
-        """What the owned vehicles of agents have sensed last, by their ids: (D,) each."""
+        """What the owned vehicles of agents have sensed last, by their ids: (D,) each.
+
+        Those that have not sensed yet, or not here, are left out.
+        """
         ...
 
     def snapshot(self) -> bytes:

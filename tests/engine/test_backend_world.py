@@ -5,7 +5,10 @@ The other is CARLA's client, of which there is a fake alone: `tests/support/carl
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,6 +25,7 @@ from cavmarl.shards.shard_backend import ShardBackend, VehicleControl
 from tests.support.carla_shard import CarlaShard, FakeCarlaWorld
 from tests.support.driving import idle, start, suggested
 
+ROOT = Path(__file__).resolve().parents[2]
 CLOSED = {"population.mode": "closed", "traffic.origins": [], "traffic.destinations": []}
 Make = Callable[[World], ShardBackend]
 
@@ -187,3 +191,12 @@ def test_what_is_no_snapshot_is_refused() -> None:
         with pytest.raises(MessageError, match="snapshot"):
             backend.restore(data)
     assert backend.snapshot() == before
+
+
+def test_the_page_s_example_runs() -> None:
+    page = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+    block = re.search(r"```python\n(.*?)```", page.split("## A simulator for zones")[1], re.DOTALL)
+    assert block
+    names: dict[str, Any] = {}
+    exec(compile(block[1], "docs/extending.md", "exec"), names)
+    assert names["seen"].size > 0
