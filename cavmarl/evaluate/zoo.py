@@ -6,7 +6,8 @@ An entry is the folder of a trained driver with a folder `result/` in it: a clos
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -150,6 +151,7 @@ def cross(
     return Cross(tuple(policies), tables)
 
 
+_WORLD_KEYS = ("environment", "map_content_sha256", "demand_content_sha256")
 _KEYS = ("agents", "background", "max_cycles", "seed", "overrides")
 
 
@@ -188,12 +190,23 @@ def _check_weights(document: Mapping[str, Any], name: str, files: Sequence[Path]
 
 
 def _check_world(document: Mapping[str, Any], name: str, spec: WorldSpec) -> None:
-    here = describe_world(*load_world(spec.env, **spec.keywords))
+    """Refuse a world that is not the result's; keys that this version has added do not count."""
+    here = json.loads(json.dumps(describe_world(*load_world(spec.env, **spec.keywords))))
     there = document["world"]
-    for key in ("environment", "config_sha256", "map_content_sha256", "demand_content_sha256"):
-        if here[key] != there[key]:
-            raise ManifestError(
-                f"{name}: its result is of {there['environment']}, but {key} is another in this "
-                f"version ({here['environment']}); figures of different worlds are not compared: "
-                "evaluate the driver again"
-            )
+    others = [key for key in _WORLD_KEYS if here[key] != there[key]]
+    others += _differing("config", there["config"], here["config"])
+    if others:
+        raise ManifestError(
+            f"{name}: its result is of {there['environment']}, but {others[0]} is another in this "
+            f"version ({here['environment']}); figures of different worlds are not compared: "
+            "evaluate the driver again"
+        )
+
+
+def _differing(key: str, there: Any, here: Any) -> Iterator[str]:
+    """Keys of a config that have another value, or none, in the config of today."""
+    if isinstance(there, dict) and isinstance(here, dict):
+        for name, value in there.items():
+            yield from _differing(f"{key}.{name}", value, here.get(name))
+    elif there != here:
+        yield key

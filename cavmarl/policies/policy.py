@@ -57,7 +57,7 @@ class Policy(ABC):
             mask: (W, A) agents that act; the others' actions are not read.
 
         Returns:
-            (W, A, 2) float32 within [-1, 1], or (W, A) int64 meta-actions.
+            (W, A, 2) float32 within [-1, 1], or (W, A) int64 choices.
         """
 
     def act(self, observations: Mapping[str, Any]) -> dict[str, Any]:
@@ -271,6 +271,7 @@ def _differences(config: NetworkConfig, here: EnvConfig) -> dict[str, tuple[Any,
     scales = {
         "continuous": ("acceleration_mps2", "steering_rad"),
         "discrete": ("target_speeds_mps",),
+        "grid": ("acceleration_mps2", "steering_rad", "grid_throttle", "grid_steering"),
     }[kind]
     found: dict[str, tuple[Any, Any]] = {}
     for key in ("kind", *scales):

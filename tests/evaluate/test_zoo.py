@@ -54,9 +54,9 @@ def test_results_that_were_changed_are_refused(entry: Path) -> None:
 def test_another_world_is_not_compared(entry: Path) -> None:
     path = entry / "result" / "manifest.json"
     document = json.loads(path.read_text())
-    document["world"]["config_sha256"] = "0" * 64
+    document["world"]["config"]["clock"]["sim_dt_s"] = 0.1
     path.write_text(json.dumps(document))
-    with pytest.raises(ManifestError, match="config_sha256 is another in this version"):
+    with pytest.raises(ManifestError, match=r"config\.clock\.sim_dt_s is another in this version"):
         verify_entry(entry)
 
 
