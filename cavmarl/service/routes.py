@@ -213,7 +213,7 @@ async def put_state(
     service: TheService,
     request: Request,
     number: SessionId,
-    at: Annotated[int, Query(ge=0)],
+    at: Annotated[bodies.Whole, Query()],
 ) -> None:
     """Save the state of a session after so many commands."""
     content = await request.body()
@@ -271,7 +271,7 @@ async def get_result(
 async def events(
     identity: Readers,
     service: TheService,
-    after: Annotated[int, Query(ge=0)] = 0,
+    after: Annotated[bodies.Whole, Query()] = 0,
     limit: Annotated[int, Query(ge=1, le=PAGE)] = 100,
 ) -> answers.EventList:
     """Events after a sequence number: a client's own, or all."""
@@ -286,7 +286,7 @@ async def stream(
     identity: Readers,
     service: TheService,
     request: Request,
-    after: Annotated[int, Query(ge=0)] = 0,
+    after: Annotated[bodies.Whole, Query()] = 0,
 ) -> StreamingResponse:
     """Events as they come, as server-sent events; `Last-Event-ID` goes on where one ended."""
     last = request.headers.get("last-event-id", "")
