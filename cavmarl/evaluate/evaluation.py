@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from cavmarl.config.checks import check_count
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError, JournalError, PolicyError
+from cavmarl.engine.world_description import describe_world
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.evaluate.episodes import (
@@ -31,7 +32,6 @@ from cavmarl.evaluate.fresh import call_in_fresh_process
 from cavmarl.evaluate.provenance.manifest import (
     close_manifest,
     describe_policies,
-    describe_world,
     open_manifest,
     read_closed,
     write_text,
