@@ -171,7 +171,6 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
         self._decoder = ActionDecoder(config.action, 1, self.possible_agents)
         self._events = DeclaredEvents(config, 1)
         self._first_seed = seed
-        self._steps = -1
         self._view = None
 
     @property
@@ -224,13 +223,14 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
             seed: root of all random numbers; None goes on with the next episode of the last seed.
             options: not used; accepted because the API has it.
         """
-        if seed is not None or self._steps < 0:
+        if seed is not None or not self._ready:
             seed = first_seed(seed, self._first_seed)
         arrays = self.worlds.arrays
         arrays.chosen[:] = True
         self.worlds.reset(seed, 0)
         self._decoder.forget(arrays.chosen)
         self._steps = 0
+        self._ready = True
         self._list(np.flatnonzero(arrays.mask[0] | self._seats))
         if not self.agents:
             self._wait_for_agents()
@@ -254,7 +254,7 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
             EpisodeError: before the first reset; actions after everybody has left.
             ActionError: a refused action; nothing has changed and the step can be repeated.
         """
-        if self._steps < 0:
+        if not self._ready:
             raise EpisodeError("step() before reset(): call env.reset(seed=…) first")
         if not self.agents:
             if actions and self.config.action.late_actions == "error":
@@ -439,7 +439,7 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
             ConfigError: no zone of that number.
             EpisodeError: before the first reset.
         """
-        return self._frame(self._steps >= 0, ghosts_of=self.ghosts_of)
+        return self._frame(ghosts_of=self.ghosts_of)
 
     def close(self) -> None:
         """Close the window and end the worker processes, if there are any.

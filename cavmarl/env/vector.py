@@ -432,7 +432,7 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
             EpisodeError: before the first reset.
         """
         drawn = range(self.num_envs if self.render_mode else 1)  # one is enough to warn
-        frames = [self._frame(self._ready, world) for world in drawn]
+        frames = [self._frame(world) for world in drawn]
         return tuple(frame for frame in frames if frame is not None) or None
 
     def close(self) -> None:
