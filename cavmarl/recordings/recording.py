@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import RecordingError
-from cavmarl.engine.frame import Frame
+from cavmarl.engine.world_frame import WorldFrame
 from cavmarl.recordings.recording_format import (
     HEAD_FILE,
     NETWORK_FILE,
@@ -113,14 +113,14 @@ class Recording:
 
     def episodes(self, world: int = 0) -> list[int]:
         """The numbers of the episodes of a world, from 0."""
-        return np.unique(self._index(world)["episode"]).tolist()
+        return [int(number) for number in np.unique(self._index(world)["episode"])]
 
     def ticks(self, world: int = 0, episode: int = 0) -> list[int]:
         """The ticks of an episode of which there are frames, in order."""
         index = self._index(world)
-        return index["tick"][index["episode"] == episode].tolist()
+        return [int(tick) for tick in index["tick"][index["episode"] == episode]]
 
-    def frames(self, world: int = 0, episode: int | None = None) -> Iterator[Frame]:
+    def frames(self, world: int = 0, episode: int | None = None) -> Iterator[WorldFrame]:
         """All frames of a world, or of one episode, in order; equal to those that were recorded.
 
         Raises:
@@ -135,7 +135,7 @@ class Recording:
         for path in self._paths(world):
             yield from self._read(path, world)
 
-    def at(self, tick: int, world: int = 0, episode: int = 0) -> Frame:
+    def at(self, tick: int, world: int = 0, episode: int = 0) -> WorldFrame:
         """The last frame of an episode that is not after a tick.
 
         Raises:

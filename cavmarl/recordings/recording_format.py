@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import RecordingError, require
-from cavmarl.engine.frame import ENDED, SEEN, Frame, FrameEvent
+from cavmarl.engine.world_frame import ENDED, SEEN, FrameEvent, WorldFrame
 from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
@@ -34,8 +34,7 @@ TABLES = ("vehicles", "events", "frames")  # in the order in which a part's are 
 # Numbers that hardly repeat: their bytes are split into streams, which compress.
 _SPLIT = [name for name in SEEN.names or () if SEEN[name].kind == "f"]
 _OPTIONS: dict[str, Any] = {
-    "compression": "zstd",
-    "compression_level": 1,
+    "compression": "lz4",
     "use_dictionary": ["kind", "detail"],
     "use_byte_stream_split": _SPLIT,
     "write_statistics": False,
@@ -47,7 +46,7 @@ class RecordedFrame(NamedTuple):
     """A frame, and which episode of its world it belongs to."""
 
     episode: int  # from 0, since the recording began
-    frame: Frame
+    frame: WorldFrame
 
 
 class RecordedEvent(NamedTuple):
@@ -176,10 +175,8 @@ def vehicle_table(frames: Sequence[RecordedFrame]) -> Any:
 
 def frame_table(frames: Sequence[RecordedFrame]) -> Any:
     pa = arrow()
-    transfer = pa.struct(
-        [("vehicle", pa.int64()), ("source", pa.int32()), ("target", pa.int32())]
-        + [("state", pa.string())]
-    )
+    kinds = (pa.int64(), pa.int32(), pa.int32(), pa.string())
+    transfer = pa.struct(list(zip(TransferInFlight._fields, kinds, strict=True)))
     ended = pa.struct([("agent", pa.int32()), ("events", pa.int32())])
     schema = pa.schema(
         [
@@ -202,9 +199,7 @@ def frame_table(frames: Sequence[RecordedFrame]) -> Any:
             "signals": frame.signals.tolist(),
             "transfers": [transfer._asdict() for transfer in frame.transfers],
             "ghosts": [ghosts.tolist() for ghosts in frame.ghosts],
-            "ended": [
-                {"agent": agent, "events": events} for agent, events in frame.ended.tolist()
-            ],
+            "ended": [{"agent": agent, "events": events} for agent, events in frame.ended.tolist()],
         }
         for episode, frame in frames
     ]
@@ -252,9 +247,9 @@ def frames_of(path: Path, world: int, table: Any, vehicles: Any) -> list[Recorde
         raise damaged(path, str(error)) from error
 
 
-def _frame(world: int, row: Mapping[str, Any], vehicles: NDArray[np.void]) -> Frame:
+def _frame(world: int, row: Mapping[str, Any], vehicles: NDArray[np.void]) -> WorldFrame:
     ended = [(end["agent"], end["events"]) for end in row["ended"]]
-    return Frame(
+    return WorldFrame(
         world,
         row["tick"],
         row["time_s"],

@@ -14,7 +14,7 @@ import numpy as np
 
 from cavmarl.core.errors import RecordingError
 from cavmarl.core.whole_file import write_whole
-from cavmarl.engine.frame import Frame, FrameEvent, events_between
+from cavmarl.engine.world_frame import FrameEvent, WorldFrame, events_between
 from cavmarl.recordings.recording_format import (
     HEAD_FILE,
     NETWORK_FILE,
@@ -99,7 +99,7 @@ class RecordingWriter:
         self._sink = _Sink(self.path, head)
         self._finish = weakref.finalize(self, self._sink.close)  # at the end of the process, too
 
-    def add(self, frames: Iterable[Frame]) -> None:
+    def add(self, frames: Iterable[WorldFrame]) -> None:
         """Take frames, one a world; a tick that is not after the last one begins an episode.
 
         Raises:
@@ -125,7 +125,7 @@ class _Sink:
     def __init__(self, path: Path, head: RecordingHead) -> None:
         self._path = path
         self._head = head
-        self._waiting: list[Frame] = []
+        self._waiting: list[WorldFrame] = []
         self._waiting_bytes = 0
         self._changed = threading.Condition()
         self._closing = False
@@ -133,7 +133,7 @@ class _Sink:
         self._worlds: dict[int, _WorldParts] = {}
         self._thread: threading.Thread | None = None
 
-    def add(self, frames: list[Frame]) -> None:
+    def add(self, frames: list[WorldFrame]) -> None:
         self.check()
         size = sum(frame.vehicles.nbytes for frame in frames)
         with self._changed:
@@ -184,7 +184,7 @@ class _Sink:
     def _is_due(self) -> bool:
         return self._closing or self._waiting_bytes > MOST_WAITING_BYTES
 
-    def _commit(self, frames: list[Frame]) -> None:
+    def _commit(self, frames: list[WorldFrame]) -> None:
         for frame in frames:
             if frame.world not in self._worlds:
                 folder = self._path / f"world-{frame.world}"
@@ -207,7 +207,7 @@ class _WorldParts:
         for table in TABLES:
             (folder / table).mkdir(parents=True)
 
-    def take(self, frame: Frame) -> None:
+    def take(self, frame: WorldFrame) -> None:
         last = self._last
         episode = 0 if last is None else last.episode
         if last is not None and frame.tick <= last.frame.tick:
@@ -221,7 +221,7 @@ class _WorldParts:
         self._last = RecordedFrame(episode, frame)
         self._frames.append(self._last)
 
-    def _at_the_end(self, last: Frame, first: Frame) -> Iterator[FrameEvent]:
+    def _at_the_end(self, last: WorldFrame, first: WorldFrame) -> Iterator[FrameEvent]:
         """What happened in the step that ended an episode; its last frame is not to be had."""
         ended = first.ended["agent"]
         stay = last.vehicles[~np.isin(last.vehicles["agent"], ended) | (last.vehicles["agent"] < 0)]
