@@ -45,9 +45,7 @@ def refuse_over(over: NDArray[np.bool_]) -> None:
         )
 
 
-def with_rows(
-    array: NDArray[Any], others: NDArray[Any], chosen: NDArray[np.bool_]
-) -> NDArray[Any]:
+def with_rows(array: NDArray[Any], others: NDArray[Any], chosen: NDArray[np.bool_]) -> NDArray[Any]:
     """A copy of an array (W, …) with the chosen rows (W,) of another one."""
     found = array.copy()
     found[chosen] = others[chosen]

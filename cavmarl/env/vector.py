@@ -310,9 +310,9 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
         Returns:
             observations (W, A, D), rewards (W, A), terminations (W, A): the agent's vehicle ended;
             truncations (W, A): the episode was cut at the horizon; and infos: `mask` (W, A) agents
-            that act next; `acted` (W, A) agents that acted in this step, so their rewards count; `terms`
-            (W, A, T) in the order of `config.TERMS`; `arrivals` (W,) vehicles that reached their
-            goal since the reset, agents included; `episode_over` (W,) which worlds are over;
+            that act next; `acted` (W, A) agents that acted in this step, so their rewards count;
+            `terms` (W, A, T) in the order of `config.TERMS`; `arrivals` (W,) vehicles that reached
+            their goal since the reset, agents included; `episode_over` (W,) which worlds are over;
             `final_observations` (W, A, D) before a reset and with the last ones of agents that
             left: the same array as the observations in a step where none did.
 
