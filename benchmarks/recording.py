@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
@@ -41,18 +42,21 @@ def measure(
         raise ConfigError(
             f"vehicles = {vehicles}, steps = {steps}, turns = {turns}: must be at least 10, 1, 1"
         )
-    counts = {"agents": vehicles // 10, "background": vehicles - vehicles // 10}
+    agents = vehicles // 10
+
+    def made(record: Path | None) -> CavVectorEnv:
+        background = vehicles - agents
+        return make_vec(env, seed=seed, agents=agents, background=background, record=record)
+
     with TemporaryDirectory() as room:
         say("making the worlds")
         path = Path(room) / "recording"
-        sides = {"not recorded": make_vec(env, seed=seed, **counts)}
-        sides["recorded"] = make_vec(env, seed=seed, record=path, **counts)
+        sides = {"not recorded": made(None), "recorded": made(path)}
         for vec in sides.values():
             vec.reset()
             _steps_s(vec, steps)
-        found = take_turns(
-            {name: lambda vec=vec: _steps_s(vec, steps) for name, vec in sides.items()}, turns, say
-        )
+        timed = {name: partial(_steps_s, vec, steps) for name, vec in sides.items()}
+        found = take_turns(timed, turns, say)
         for vec in sides.values():
             vec.close()
         size = sum(file.stat().st_size for file in path.rglob("*.parquet"))

@@ -28,6 +28,7 @@ from cavmarl.cli import (
     train,
     verify,
     view,
+    zoo,
 )
 from cavmarl.cli.output import about, print_error
 from cavmarl.cli.verify import determinism as verify_determinism
@@ -70,6 +71,7 @@ app.add_typer(map.app, name="map")
 app.add_typer(demand.app, name="demand")
 app.add_typer(bench.app, name="bench")
 app.add_typer(scenario.app, name="scenario")
+app.add_typer(zoo.app, name="zoo")
 
 
 def _print_version(wanted: bool) -> None:

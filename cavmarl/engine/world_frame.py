@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,7 +118,9 @@ def frame_of(
 def events_between(before: WorldFrame, after: WorldFrame) -> Iterator[FrameEvent]:
     """What happened from one frame to the next of the same episode, in the order of vehicles."""
     ids, were = after.vehicles["id"], before.vehicles["id"]
-    both, old, new = ids, slice(None), slice(None)
+    both = ids
+    old: Any = slice(None)
+    new: Any = slice(None)
     if not np.array_equal(ids, were):
         for row in after.vehicles[~np.isin(ids, were)]:
             yield FrameEvent(after.tick, "departed", int(row["id"]), int(row["agent"]), "")

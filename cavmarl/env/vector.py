@@ -82,9 +82,8 @@ def make_vec(
         background: shadows population.background.
         seed: of the first reset, if that is given none.
         max_cycles: steps until truncation; shadows horizon_s.
-        autoreset_mode: when a world that is over begins anew: in the `SameStep`, in the `NextStep`,
-            or when `reset` says so (`Disabled`); see `CavVectorEnv`.
-        copy: False returns observations without a copy; see `CavVectorEnv`.
+        autoreset_mode: when a world that is over begins anew; see `CavVectorEnv`.
+        copy: False returns observations without a copy.
         render_mode: `rgb_array` or None.
         record: a new folder to record into, a subfolder a world (docs/recordings.md).
         overrides: values for any other key.
@@ -93,13 +92,11 @@ def make_vec(
         ConfigError: a key, value or combination that cannot work.
         MapError: the map cannot be read or driven.
         WorkerError: worker processes cannot be started, or have no memory.
-        MissingExtraError: hosts on Ray without Ray, or `record` without pyarrow.
-        RecordingError: `record` cannot be written.
+        MissingExtraError, RecordingError: `hosts` or `record` without its extra; a taken path.
     """
-    num_envs = _checked(num_envs)
+    num_envs, mode = _checked(num_envs), known_mode(autoreset_mode)
     workers, hosts = places_of(workers, hosts, nodes)
     check_hosts(workers, hosts)
-    mode = known_mode(autoreset_mode)
     first_seed = None if seed is None else check_seed(seed)
     config, base_dir = load_config(
         env,
@@ -116,9 +113,8 @@ def make_vec(
     world = make_world(config, base_dir)
     in_next_step = mode is not AutoresetMode.SAME_STEP
     worlds = make_worlds(world, base_dir, num_envs, workers, hosts, in_next_step)
-    forms: dict[str, Any] = {"copy": copy, "render_mode": render_mode}
-    disabled = mode is AutoresetMode.DISABLED
-    made = CavVectorEnv(worlds, seed=first_seed, disabled=disabled, **forms)
+    forms: dict[str, Any] = {"copy": copy, "render_mode": render_mode, "seed": first_seed}
+    made = CavVectorEnv(worlds, disabled=mode is AutoresetMode.DISABLED, **forms)
     made.record(record)
     return made
 

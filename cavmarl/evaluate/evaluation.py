@@ -117,8 +117,14 @@ def evaluate(
         check_count("failures", failures, MAX_FAILURES)
         require("jinja2", "report")
     folders = "" if record is None else str(Path(record).absolute())
-    more = {"runs": repeats, "record": folders, "failures": failures}
-    job = EpisodeJob(**vars(spec), policies=_named(policies), episodes=episodes, **more)
+    job = EpisodeJob(
+        **vars(spec),
+        policies=_named(policies),
+        episodes=episodes,
+        runs=repeats,
+        record=folders,
+        failures=failures,
+    )
     _check_record(folders)
     with TemporaryDirectory() as room:
         folder = Path(room) if out is None else out

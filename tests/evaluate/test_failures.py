@@ -49,10 +49,11 @@ def told(page: Path) -> Any:
 
 def test_the_page_has_the_worst_trips_with_clips_of_ten_seconds(folder: Path) -> None:
     data = told(folder / "out" / "failures.html")
-    trips, _ = load_tables(folder / "out")["random_actions"]
-    failed = trips[trips["counted"] & ~trips["success"]]
+    tables = load_tables(folder / "out")
     assert len(data["failures"]) == 6
     for failure in data["failures"]:
+        trips, _ = tables[failure["policy"]]
+        failed = trips[trips["counted"] & ~trips["success"]]
         (trip,) = failed[
             (failed["episode"] == failure["episode"])
             & (failed["agent"] == failure["agent"])

@@ -10,7 +10,8 @@ from __future__ import annotations
 import hashlib
 import json
 import sys
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from os.path import isfile
 from pathlib import Path
@@ -32,9 +33,20 @@ def describe_policies(policies: Mapping[str, str]) -> Document:
     return {
         name: {
             "given": given,
-            "sha256": {file.name: hash_of_file(file) for file in policy_files(given)},
+            "sha256": _hashes(policy_files(given)),
         }
         for name, given in policies.items()
+    }
+
+
+def _hashes(files: Sequence[Path]) -> dict[str, str]:
+    """By name, with the folder in front where two files have one name."""
+    names = Counter(file.name for file in files)
+    return {
+        file.name if names[file.name] == 1 else f"{file.parent.name}/{file.name}": hash_of_file(
+            file
+        )
+        for file in files
     }
 
 
