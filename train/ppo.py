@@ -5,14 +5,10 @@
     python train/ppo.py --resume runs/merge_ippo_1 --total-agent-steps 8000000
 
 Read from top to bottom: the settings; `Batch`, what is learnt from; `Collector`, which drives the
-worlds; `Learner`, the update; `Run`, which takes turns between both.
-
-Every agent learns from its own observations and rewards, all share the weights (Schulman et al.
-2017; de Witt et al. 2020). With `--mappo` the critic also sees the state of the world (Yu et al.
-2022); the driver never does. A run's folder holds the driver (`model.safetensors`, `config.json`,
-for `cavmarl evaluate --policy FOLDER`), `manifest.json`, `progress.csv` and `checkpoint.pt`. With
-the same seed, threads and machine a run repeats itself for any number of workers, unless the clock
-ends it (`--minutes`); so does one that was cut short and goes on. It is never overwritten.
+worlds; `Learner`, the update; `Run`, which takes turns between both. Every agent learns from its
+own observations and rewards, all share the weights (Schulman et al. 2017; de Witt et al. 2020);
+with `--mappo` the critic also sees the state of the world (Yu et al. 2022), the driver never does.
+docs/learning.md says what a run leaves behind, how it goes on, and when it repeats itself.
 """
 
 from __future__ import annotations

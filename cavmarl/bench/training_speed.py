@@ -250,7 +250,7 @@ def _ours(who: str, run: Any) -> _Side:
         row = run.update()
         return run.agent_steps - before, {phase: row[f"{phase}_s"] for phase in phases}
 
-    return _Side(who, run.settings.num_envs, update)
+    return _Side(who, run.args.num_envs, update)
 
 
 def _theirs(rows: HighwayRows, worlds: int, num_steps: int) -> _Side:
