@@ -11,8 +11,6 @@ from cavmarl.env.parallel import CavEnv
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.policies.policy import Policy
 
-NUM_META_ACTIONS = 5
-
 
 class RandomPolicy(Policy):
     """Draws every action by the seed of `reset` and the number of the step."""
@@ -29,7 +27,7 @@ class RandomPolicy(Policy):
         """Uniform over the action space, for every agent."""
         if self.env.config.action.kind == "continuous":
             return self._random.uniform(-1.0, 1.0, (*mask.shape, 2)).astype(np.float32)
-        return self._random.integers(0, NUM_META_ACTIONS, mask.shape)
+        return self._random.integers(0, self.env.config.action.choices, mask.shape)
 
 
 def make_policy(env: CavEnv | CavVectorEnv) -> Policy:

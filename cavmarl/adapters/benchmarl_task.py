@@ -10,6 +10,7 @@ from typing import Any
 
 from cavmarl.adapters.observations import refuse_decided
 from cavmarl.adapters.torchrl_env import GROUP, CavTorchRLEnv
+from cavmarl.config.registry import load_config
 from cavmarl.core.errors import missing
 
 try:
@@ -47,7 +48,7 @@ class CavTaskClass(TaskClass):  # type: ignore[misc] # found in an environment o
         overrides = {
             "population.mode": "respawn",
             **self.config.get("overrides", {}),
-            "action.kind": "continuous" if continuous_actions else "discrete",
+            "action.kind": "continuous" if continuous_actions else self._choices,
         }
         arguments = {**self.config, "overrides": overrides, "num_envs": num_envs, "device": device}
 
@@ -58,12 +59,18 @@ class CavTaskClass(TaskClass):  # type: ignore[misc] # found in an environment o
 
         return make
 
+    @property
+    def _choices(self) -> str:
+        """The kind of action with choices that the environment has; without one: meta-actions."""
+        kind = load_config(self.config["env"])[0].action.kind
+        return "discrete" if kind == "continuous" else kind
+
     def supports_continuous_actions(self) -> bool:
         """Throttle and steering."""
         return True
 
     def supports_discrete_actions(self) -> bool:
-        """Meta-actions."""
+        """Meta-actions, or the grid of an environment that has one."""
         return True
 
     def max_steps(self, env: CavTorchRLEnv) -> int:

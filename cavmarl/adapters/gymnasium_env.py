@@ -34,7 +34,7 @@ class CavEgoEnv(WithSpec, OwnWorlds, gymnasium.Env[Any, Any]):
         background: other vehicles; None: all of the entry but one.
         overrides: as for `parallel_env`.
         config: the same, nested as in an env.yaml: `{"sensors": {"lidar": {"rays": 8}}}`.
-        action_kind: shadows action.kind, `continuous` or `discrete`.
+        action_kind: shadows action.kind, `continuous`, `discrete` or `grid`.
         arguments: other keywords of `parallel_env`.
 
     Raises:

@@ -47,7 +47,7 @@ class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
         autoreset_mode: when rows and worlds that ended begin anew.
         max_episode_steps: Gymnasium's name of `max_cycles`.
         render_mode: `rgb_array` or None.
-        action_kind: shadows action.kind, `continuous` or `discrete`.
+        action_kind: shadows action.kind, `continuous`, `discrete` or `grid`.
         overrides: values for any other key.
         arguments: other keywords of `make_vec`.
 

@@ -21,12 +21,14 @@ from cavmarl.cli import (
     map,
     node,
     plan,
+    replay,
     scenario,
     service,
     suite,
     train,
     verify,
     view,
+    zoo,
 )
 from cavmarl.cli.output import about, print_error
 from cavmarl.cli.verify import determinism as verify_determinism
@@ -52,6 +54,7 @@ app.command()(lead.lead)
 app.command()(follow.follow)
 app.command()(node.node)
 app.command()(view.view)
+app.command()(replay.replay)
 app.command()(demo.demo)
 app.command(context_settings={"ignore_unknown_options": True, "allow_interspersed_args": False})(
     train.train
@@ -68,6 +71,7 @@ app.add_typer(map.app, name="map")
 app.add_typer(demand.app, name="demand")
 app.add_typer(bench.app, name="bench")
 app.add_typer(scenario.app, name="scenario")
+app.add_typer(zoo.app, name="zoo")
 
 
 def _print_version(wanted: bool) -> None:

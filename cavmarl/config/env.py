@@ -7,11 +7,10 @@ the border by `registry.load_config`.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import Annotated, Literal
 
+from cavmarl.config.action import ActionConfig as ActionConfig
 from cavmarl.config.checks import Section, Whole, Within
 from cavmarl.config.checks import check as _check
 from cavmarl.config.checks import check_finite as _check_finite
@@ -305,41 +304,6 @@ class TrafficConfig(Section, key="traffic"):
             "max_trip_m",
             self.max_trip_m == 0.0 or self.max_trip_m > self.min_trip_m,
             f"must be 0 (no limit) or above traffic.min_trip_m = {self.min_trip_m:g}",
-        )
-
-
-@dataclass(frozen=True)
-class ActionConfig(Section, key="action"):
-    """What an agent can do.
-
-    Attributes:
-        kind: `continuous`: (throttle, steering) in [-1, 1]; `discrete`: highway-env's five
-            meta-actions LANE_LEFT, IDLE, LANE_RIGHT, FASTER, SLOWER.
-        acceleration_mps2: what throttle ±1 means.
-        steering_rad: what steering ±1 means (front wheels, left positive).
-        target_speeds_mps: `discrete`: the speeds that FASTER and SLOWER step through.
-        out_of_range: continuous values beyond ±1: `error`, or `clip` (see `traffic_stats`).
-        missing_action: a live agent without an action: `error`, or `hold` its last one (counted).
-        late_actions: an action for an agent that has left: `error`, or `ignore` (counted).
-    """
-
-    kind: Literal["continuous", "discrete"] = "continuous"
-    acceleration_mps2: Annotated[float, Within(0.1, 20.0)] = 5.0
-    steering_rad: Annotated[float, Within(0.01, 1.2)] = 0.7853981633974483
-    target_speeds_mps: tuple[float, ...] = (0.0, 3.0, 6.0, 9.0, 12.0, 15.0, 20.0, 25.0, 30.0)
-    out_of_range: Literal["error", "clip"] = "error"
-    missing_action: Literal["error", "hold"] = "error"
-    late_actions: Literal["error", "ignore"] = "error"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        speeds = self.target_speeds_mps
-        self.need(
-            "target_speeds_mps",
-            len(speeds) >= 2
-            and all(math.isfinite(v) and 0.0 <= v <= 60.0 for v in speeds)
-            and all(a < b for a, b in pairwise(speeds)),
-            "must be at least two rising speeds from 0 to 60",
         )
 
 

@@ -21,7 +21,6 @@ from cavmarl.sensors.registry import type_of
 
 # Features of one vehicle in the global state: present, x, y, cos, sin, speed.
 STATE_FEATURES = 6
-NUM_META_ACTIONS = 5
 STATE_SPEED_MPS = 40.0  # that is 1 in it
 
 
@@ -164,10 +163,10 @@ def write_sensed(
 
 
 def action_space(config: ActionConfig) -> spaces.Box | spaces.Discrete:
-    """What one agent does: (throttle, steering) in [-1, 1], or one of five meta-actions."""
+    """What one agent does: (throttle, steering) in [-1, 1], or the number of a choice."""
     if config.kind == "continuous":
         return spaces.Box(-1.0, 1.0, (2,), np.float32)
-    return spaces.Discrete(NUM_META_ACTIONS)
+    return spaces.Discrete(config.choices)
 
 
 def state_space(capacity: int) -> spaces.Box:

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config.env import ActionConfig
+from cavmarl.config.action import ActionConfig
 from cavmarl.core.errors import ActionError
 from cavmarl.core.numba.specialized import specialized
-from cavmarl.core.records.codes import ACTION_IDLE, ACTION_SLOWER
+from cavmarl.core.records.codes import ACTION_IDLE
 from cavmarl.engine.kernels.decoding import decode_choices, decode_pairs
 from cavmarl.shards.shard import Commands
 
@@ -48,7 +48,7 @@ class ActionDecoder:
         self._last: NDArray[Any] = (
             np.zeros((*shape, 2), dtype=np.float64)
             if self._continuous
-            else np.full(shape, ACTION_IDLE, dtype=np.int64)
+            else np.full(shape, config.idle_choice, dtype=np.int64)
         )
         self._idle = self._last.copy()
         # One for each number: over pairs NumPy takes four times as long.
@@ -56,6 +56,8 @@ class ActionDecoder:
         self._scale[:] = config.acceleration_mps2, config.steering_rad
         if commands is None:
             commands = Commands(np.empty((*shape, 2)), np.empty(shape, dtype=np.int64))
+        # (choices, 2) what each choice of a grid means
+        self._pairs = np.array(config.pairs) * (config.acceleration_mps2, config.steering_rad)
         commands.controls[:] = 0.0
         commands.meta_actions[:] = ACTION_IDLE
         self._decoded = commands
@@ -158,7 +160,13 @@ class ActionDecoder:
         if not self._continuous:
             if actions.dtype != np.int64:
                 return False
-            return self._decode_choices(actions, mask, self._last, self._decoded.meta_actions)
+            config = self._config
+            if not self._decode_choices(
+                actions, mask, config.idle_choice, config.choices, self._last
+            ):
+                return False
+            self._commands(self._last)
+            return True
         decode = self._decode_pairs.get(actions.dtype)
         if decode is None:
             return False
@@ -173,7 +181,12 @@ class ActionDecoder:
         if self._continuous:
             shares: NDArray[Any] = np.clip(raw / self._scale, -1.0, 1.0).astype(np.float32)
             return shares
-        return raw[..., 0].astype(np.int64)
+        config = self._config
+        if config.kind == "discrete":
+            return raw[..., 0].astype(np.int64)
+        pair = raw / self._scale
+        rows = _nearest(config.grid_throttle, pair[..., 0])
+        return rows * len(config.grid_steering) + _nearest(config.grid_steering, pair[..., 1])
 
     def _rows_of(self, agents: Sequence[str]) -> NDArray[np.intp] | slice:
         if tuple(agents) == self._agents:
@@ -246,9 +259,9 @@ class ActionDecoder:
     def _check_values(self, batch: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.int64] | int]:
         """(values in range, how many were clipped in each world)."""
         if not self._continuous:
-            wrong = (batch < 0) | (batch > ACTION_SLOWER)
+            wrong = (batch < 0) | (batch >= self._config.choices)
             if wrong.any():
-                self._refuse(batch, wrong, f"must be from 0 to {ACTION_SLOWER}")
+                self._refuse(batch, wrong, f"must be from 0 to {self._config.choices - 1}")
             return batch, 0
         size = np.abs(batch)
         if size.max(initial=0.0) <= 1.0:  # False of what is no number, too
@@ -276,6 +289,15 @@ class ActionDecoder:
         if self._continuous:
             np.multiply(batch, self._scale, out=decoded.controls)
             np.add(decoded.controls, 0.0, out=decoded.controls)  # of -0.0 too, 0.0
+        elif self._config.kind == "grid":
+            decoded.controls[:] = self._pairs[batch]
         else:
             decoded.meta_actions[:] = batch
         return decoded
+
+
+def _nearest(values: tuple[float, ...], wanted: NDArray[np.float64]) -> NDArray[np.int64]:
+    """The places of the values that are nearest to the wanted ones; of two, the first."""
+    away = np.abs(wanted[..., None] - np.array(values))
+    found: NDArray[np.int64] = away.argmin(axis=-1)
+    return found

@@ -1,23 +1,44 @@
-"""What `render` shows of the worlds that an environment steps: frames, or a window."""
+"""What can be seen of the worlds that an environment steps: pictures, frames, recordings."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from gymnasium import logger
 from numpy.typing import NDArray
 
-from cavmarl.config.env import EnvConfig
+from cavmarl.config.env import TERMS, EnvConfig
 from cavmarl.core.errors import ConfigError, EpisodeError
+from cavmarl.core.records.codes import (
+    EVENT_ARRIVED,
+    EVENT_COLLIDED,
+    EVENT_OFF_ROAD,
+    EVENT_RED_LIGHT,
+    EVENT_WRONG_WAY,
+)
 from cavmarl.engine.simulation import Simulation
+from cavmarl.engine.world_frame import ENDED, WorldFrame, frame_of
+from cavmarl.env.recorded_worlds import recording_of
 from cavmarl.parallel.backends import shows_state
 from cavmarl.parallel.journaled_worlds import unwatched
-from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.local_worlds import LocalWorlds, kept_elsewhere
 from cavmarl.parallel.step_arrays import SteppedWorlds
+from cavmarl.recordings.recording_writer import RecordingWriter
 from cavmarl.render.topdown import WorldView
 
 RENDER_MODES = ("human", "rgb_array")
+
+# The terms that say how an agent's vehicle ended.
+_ENDS = {
+    TERMS.index("collision"): EVENT_COLLIDED,
+    TERMS.index("off_road"): EVENT_OFF_ROAD,
+    TERMS.index("wrong_way"): EVENT_WRONG_WAY,
+    TERMS.index("red_light"): EVENT_RED_LIGHT,
+    TERMS.index("arrival"): EVENT_ARRIVED,
+}
 
 
 def check_rendering(
@@ -48,7 +69,7 @@ def check_rendering(
 
 
 class DrawnWorlds:
-    """Base of an environment that draws its worlds; pygame is loaded at the first frame.
+    """Base of an environment whose worlds can be seen; pygame is loaded at the first picture.
 
     Attributes:
         worlds: that it steps.
@@ -59,12 +80,12 @@ class DrawnWorlds:
     worlds: SteppedWorlds
     metadata: dict[str, Any]
     render_mode: str | None
+    _ready: bool = False  # whether `reset` has been called
     _view: WorldView | None
     _copied: LocalWorlds | None = None  # of worlds that other processes have
+    _writer: RecordingWriter | None = None
 
-    def _frame(
-        self, begun: bool, world: int = 0, ghosts_of: int | None = None
-    ) -> NDArray[np.uint8] | None:
+    def _frame(self, world: int = 0, ghosts_of: int | None = None) -> NDArray[np.uint8] | None:
         """A world as it is now; None and a warning without a render_mode, as Gymnasium has it."""
         if self.render_mode is None:
             logger.warn(
@@ -72,7 +93,7 @@ class DrawnWorlds:
                 "render_mode='rgb_array'"
             )
             return None
-        if not begun:
+        if not self._ready:
             raise EpisodeError("render() before reset(): call reset(seed=…) first")
         simulation = self._shown()
         if self._view is None:
@@ -80,18 +101,89 @@ class DrawnWorlds:
             self._view = WorldView(simulation, self.render_mode, name, fps)
         return self._view.show(ghosts_of, world)
 
-    def _shown(self) -> Simulation:
-        """The worlds, or a copy of them as they are now where they live in other processes."""
+    def world_frames(self, chosen: Sequence[int] = (0,), ghosts: bool = False) -> list[WorldFrame]:
+        """What is to be seen of some worlds now, as data; see `engine.world_frame.WorldFrame`.
+
+        Where worlds live in other processes, all of them are copied from there.
+
+        Args:
+            chosen: numbers of worlds.
+            ghosts: whether to tell what each zone sees of the others' vehicles.
+
+        Raises:
+            ConfigError: no such world, or one whose state cannot be had here.
+            EpisodeError: before the first reset.
+        """
+        worlds = self.worlds
+        count = len(worlds.arrays.mask)
+        if wrong := [world for world in chosen if not 0 <= world < count]:
+            raise ConfigError(f"world {wrong[0]}: there are the worlds 0 to {count - 1}")
+        if not self._ready:
+            raise EpisodeError("world_frames() before reset(): call reset(seed=…) first")
+        key = kept_elsewhere(worlds.world.config)
+        if key and not isinstance(worlds, LocalWorlds):
+            raise ConfigError(
+                f"{key}: frames of such worlds can only be had in the caller's process; use "
+                "workers=0"
+            )
+        simulation = self._shown()
+        return [frame_of(simulation, world, ghosts, self._ended(world)) for world in chosen]
+
+    def _ended(self, world: int) -> NDArray[np.void]:
+        """ENDED of the last step."""
+        arrays = self.worlds.arrays
+        agents = np.flatnonzero(arrays.vehicle_done[world])
+        ended = np.zeros(len(agents), dtype=ENDED)
+        ended["agent"] = agents
+        for term, bit in _ENDS.items():
+            ended["events"][arrays.terms[world, agents, term] > 0.0] |= bit
+        return ended
+
+    def record(self, path: str | Path | None) -> None:
+        """Record all worlds from the next reset or step on, until `close`; see docs/recordings.md.
+
+        Args:
+            path: a new folder; None: record nothing.
+
+        Raises:
+            EpisodeError: a recording has begun already.
+            RecordingError: there is something at `path`, or it cannot be written.
+            MissingExtraError: pyarrow is not installed.
+        """
+        if path is None:
+            return
+        if self._writer is not None:
+            raise EpisodeError(f"record({str(path)!r}): {self._writer.path} is recorded already")
+        self._writer = recording_of(path, self.worlds.world, self._standing())
+
+    def _record_frames(self, chosen: NDArray[np.bool_] | None = None) -> None:
+        """Add the present moment of the chosen worlds (W,), or of all, to what is recorded."""
+        if self._writer is not None:
+            every = range(len(self.worlds.arrays.mask))
+            some = every if chosen is None else np.flatnonzero(chosen).tolist()
+            self._writer.add(self.world_frames(some, ghosts=True))
+
+    def _standing(self) -> Simulation:
+        """The worlds, or a copy of them as they have been at some time."""
         worlds = self.worlds
         if isinstance(worlds, LocalWorlds):
             return worlds.simulation
         if self._copied is None:
             self._copied = LocalWorlds(unwatched(worlds.world), len(worlds.arrays.mask))
-        self._copied.load_worlds(worlds.save_worlds())
         return self._copied.simulation
 
+    def _shown(self) -> Simulation:
+        """The worlds, or a copy of them as they are now where they live in other processes."""
+        simulation = self._standing()
+        if self._copied is not None:
+            self._copied.load_worlds(self.worlds.save_worlds())
+        return simulation
+
     def _close_view(self) -> None:
-        """Close the window, if there is one."""
+        """Close the window and the recording, if there are any."""
+        if self._writer is not None:
+            writer, self._writer = self._writer, None
+            writer.close()
         if self._view is not None:
             self._view.close()
             self._view = None

@@ -29,7 +29,6 @@ WEIGHTS_FILE = "model.safetensors"
 CONFIG_FILE = "config.json"
 
 CONTINUOUS_ACTIONS = 2
-META_ACTIONS = 5
 MAX_LAYERS = 8
 MAX_WIDTH = 4096
 MAX_OBSERVATION_SIZE = 65_536
@@ -83,7 +82,7 @@ class NetworkConfig:
     def num_weights(self) -> int:
         """How many numbers an `ActorCritic` learns, with the scaling of its observations."""
         continuous = self.action.kind == "continuous"
-        actions = CONTINUOUS_ACTIONS if continuous else META_ACTIONS
+        actions = self.action.choices or CONTINUOUS_ACTIONS
         deviations = actions if continuous else 0
         scaling = 2 * self.observation_size
         return (
@@ -125,7 +124,7 @@ class ActorCritic(nn.Module):
         super().__init__()
         self.continuous = config.action.kind == "continuous"
         self.state_size = config.state_size
-        actions = CONTINUOUS_ACTIONS if self.continuous else META_ACTIONS
+        actions = config.action.choices or CONTINUOUS_ACTIONS
         self.register_buffer("mean", torch.zeros(config.observation_size))
         self.register_buffer("deviation", torch.ones(config.observation_size))
         # Small last weights: the first policy does nothing in particular (Andrychowicz et al.
@@ -137,7 +136,7 @@ class ActorCritic(nn.Module):
             self.log_std = nn.Parameter(torch.tensor(initial_std).log())
 
     def forward(self, observations: Tensor) -> Tensor:
-        """The policy's numbers: means (N, 2) of actions, or log-weights (N, 5) of meta-actions."""
+        """The policy's numbers: means (N, 2) of actions, or log-weights (N, choices)."""
         output: Tensor = self.actor(self._normal(observations))
         return output
 

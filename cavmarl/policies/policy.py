@@ -10,7 +10,7 @@ import difflib
 import importlib.util
 import inspect
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from operator import attrgetter
 from os.path import isdir, isfile
 from pathlib import Path
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from cavmarl.policies.networks import ActorCritic, NetworkConfig
 
 Environment = CavEnv | CavVectorEnv
+
+TOGETHER = "+"  # between drivers that share the agents of a world
 
 
 class Policy(ABC):
@@ -55,7 +57,7 @@ class Policy(ABC):
             mask: (W, A) agents that act; the others' actions are not read.
 
         Returns:
-            (W, A, 2) float32 within [-1, 1], or (W, A) int64 meta-actions.
+            (W, A, 2) float32 within [-1, 1], or (W, A) int64 choices.
         """
 
     def act(self, observations: Mapping[str, Any]) -> dict[str, Any]:
@@ -108,12 +110,39 @@ class NetworkPolicy(Policy):
         return actions
 
 
+class SharedPolicy(Policy):
+    """Several drivers in one world: agent k is driven by driver k modulo their number."""
+
+    def __init__(self, env: Environment, drivers: Sequence[Policy]) -> None:
+        super().__init__(env)
+        self.drivers = tuple(drivers)
+
+    def reset(self, seed: int | None = None) -> None:
+        """Begin anew, each driver with the same seed."""
+        for driver in self.drivers:
+            driver.reset(seed)
+
+    def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
+        """Each driver's actions of its agents."""
+        turn = np.arange(mask.shape[1]) % len(self.drivers)
+        actions: NDArray[Any] | None = None
+        for k, driver in enumerate(self.drivers):
+            own = driver.act_batch(observations, mask & (turn == k))
+            if actions is None:
+                actions = own.copy()
+            else:
+                actions[:, turn == k] = own[:, turn == k]
+        assert actions is not None
+        return actions
+
+
 def load_policy(policy: str | Path, env: Environment) -> Policy:
     """Seat a policy in an environment.
 
     Args:
         policy: a name of `agents/`, a folder with model.safetensors and config.json, or a `.py`
-            file that defines `make_policy(env)`.
+            file that defines `make_policy(env)`; several with `+` between them share the agents by
+            turns (`merge_ippo+idm`: agents 0, 2, … and agents 1, 3, …).
         env: a `CavEnv`, also wrapped, or a `CavVectorEnv`.
 
     Raises:
@@ -127,6 +156,8 @@ def load_policy(policy: str | Path, env: Environment) -> Policy:
         raise PolicyError(
             f"env is a {type(env).__name__}: pass what parallel_env() or make_vec() returned"
         )
+    if parts := _shared(policy):
+        return SharedPolicy(env, [load_policy(part, env) for part in parts])
     path = _find(policy)
     if path.is_dir():
         return _load_network_policy(path, env)
@@ -135,6 +166,8 @@ def load_policy(policy: str | Path, env: Environment) -> Policy:
 
 def policy_files(policy: str | Path) -> tuple[Path, ...]:
     """The files that make a policy what it is: its script, or its weights and their description."""
+    if parts := _shared(policy):
+        return tuple(dict.fromkeys(file for part in parts for file in policy_files(part)))
     path = _find(policy)
     if not path.is_dir():
         return (path,)
@@ -147,6 +180,13 @@ def policy_files(policy: str | Path) -> tuple[Path, ...]:
         if not file.is_file():
             raise PolicyError(f"no {file.name} in {path}: not the folder of a trained driver")
     return files
+
+
+def _shared(policy: str | Path) -> list[str]:
+    """The drivers that share the agents; none where `policy` is one driver."""
+    if not isinstance(policy, str) or TOGETHER not in policy or Path(policy).exists():
+        return []
+    return policy.split(TOGETHER)
 
 
 def _find(policy: str | Path) -> Path:
@@ -231,6 +271,7 @@ def _differences(config: NetworkConfig, here: EnvConfig) -> dict[str, tuple[Any,
     scales = {
         "continuous": ("acceleration_mps2", "steering_rad"),
         "discrete": ("target_speeds_mps",),
+        "grid": ("acceleration_mps2", "steering_rad", "grid_throttle", "grid_steering"),
     }[kind]
     found: dict[str, tuple[Any, Any]] = {}
     for key in ("kind", *scales):

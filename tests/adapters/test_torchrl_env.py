@@ -51,7 +51,7 @@ def wild(tensordict: Any) -> Any:
     return tensordict.set((CAR, "action"), actions)
 
 
-@pytest.mark.parametrize("action", ["continuous", "discrete"])
+@pytest.mark.parametrize("action", ["continuous", "discrete", "grid"])
 @pytest.mark.parametrize("kind", ["flat", "dict"])
 @pytest.mark.parametrize("mode", MODES)
 def test_torchrls_own_check_passes(mode: str, kind: str, action: str) -> None:

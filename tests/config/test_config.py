@@ -117,6 +117,8 @@ def test_a_wrong_type_is_named(tmp_path: Path, text: str, expected: str) -> None
         ),
         ("clock: {control_latency_ticks: 99}", r"control_latency_ticks = 99: .*0 to 16"),
         ("sensors: {lidar: {range_m: -1}}", r"sensors\.lidar\.range_m = -1\.0: must be"),
+        ("action: {grid_steering: [-0.1, 0.1]}", r"grid_steering = .*0 among them"),
+        ("action: {grid_throttle: [1, 0]}", r"grid_throttle = .*rising"),
         ("action: {target_speeds_mps: [3, 2]}", r"target_speeds_mps = .*rising speeds"),
         ("terms: {weights: {collision: .nan}}", r"terms\.weights\.collision = nan: must be"),
         ("sensors: {stack: 0}", r"sensors\.stack = 0: must be a whole .* 1 to 64"),

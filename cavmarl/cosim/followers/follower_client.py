@@ -114,7 +114,7 @@ class Follower:
         """Say what the vehicles of the last snapshot do in the next step.
 
         Args:
-            controls: by vehicle: two numbers in [-1, 1], or the number of a meta-action.
+            controls: by vehicle: two numbers in [-1, 1], or the number of a choice.
 
         Raises:
             FollowerLostError: the world is gone.

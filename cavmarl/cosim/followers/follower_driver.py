@@ -25,7 +25,8 @@ class StackDriver:
         stacks: of the vehicles that are driven now, by agent.
 
     Raises:
-        ConfigError: another map, sensors that a stage needs and does not have, or meta-actions.
+        ConfigError: another map, sensors that a stage needs and does not have, or no
+            continuous actions.
     """
 
     def __init__(
@@ -37,7 +38,9 @@ class StackDriver:
                 "the environment or the map file that the world was made from"
             )
         if welcome.action != "continuous":
-            raise ConfigError("action.kind = discrete: the stack needs continuous controls")
+            raise ConfigError(
+                f"action.kind = {welcome.action}: the stack needs continuous controls"
+            )
         self._edges = {name: row for row, name in enumerate(network.edge_ids)}
         sensors = [sensor_of(view.name, view.settings) for view in welcome.sensors]
         step_s = welcome.dt_s * welcome.ticks_per_step

@@ -97,7 +97,7 @@ class Welcome:
     ticks_per_step: StrictInt  # ticks from one snapshot to the next
     # that controls wait in the vehicle, after the step that they are for has begun
     control_latency_ticks: StrictInt
-    action: StrictStr  # `continuous` or `discrete`
+    action: StrictStr  # `continuous`, `discrete` or `grid`
     acceleration_mps2: StrictFloat  # what 1 means as the first number of a control
     steering_rad: StrictFloat  # what 1 means as the second
     # of every vehicle; none: a snapshot has the `observation` of the environment

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.numba import kernel
-from cavmarl.core.records.codes import ACTION_IDLE, ACTION_SLOWER
 
 
 @kernel
@@ -45,19 +44,16 @@ def decode_pairs(
 def decode_choices(
     actions: NDArray[Any],  # (W, A) whole numbers
     mask: NDArray[np.bool_],  # (W, A) whose are read; others stay idle
+    idle: int,  # the choice that changes nothing
+    choices: int,  # how many there are
     last: NDArray[np.int64],  # (W, A) is written
-    meta_actions: NDArray[np.int64],  # (W, A) is written, too
-) -> bool:  # whether all are ACTION_* codes
-    """Take over meta-actions; nothing if one is none."""
+) -> bool:  # whether all are choices
+    """Take over choices; nothing if one is none."""
     for w in range(mask.shape[0]):
         for agent in range(mask.shape[1]):
-            if mask[w, agent] and not 0 <= actions[w, agent] <= ACTION_SLOWER:
+            if mask[w, agent] and not 0 <= actions[w, agent] < choices:
                 return False
     for w in range(mask.shape[0]):
         for agent in range(mask.shape[1]):
-            chosen = ACTION_IDLE
-            if mask[w, agent]:
-                chosen = actions[w, agent]
-            last[w, agent] = chosen
-            meta_actions[w, agent] = chosen
+            last[w, agent] = actions[w, agent] if mask[w, agent] else idle
     return True

@@ -1,0 +1,146 @@
+"""`WorldFrame`: one world between two steps, as viewers and recordings need it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.records.codes import (
+    EVENT_ARRIVED,
+    EVENT_COLLIDED,
+    EVENT_OFF_ROAD,
+    EVENT_RED_LIGHT,
+    EVENT_WRONG_WAY,
+)
+from cavmarl.engine.kernels.seen_rows import write_seen
+from cavmarl.engine.world_views import WorldViews
+from cavmarl.handoff.zone_view import TransferInFlight
+
+# One vehicle as it is seen. Units and frames as in `driving.vehicles.VEHICLE`.
+SEEN = np.dtype(
+    [
+        ("id", "<i8"),
+        ("x", "<f8"),
+        ("y", "<f8"),
+        ("z", "<f8"),
+        ("heading", "<f8"),
+        ("pitch", "<f8"),
+        ("speed", "<f8"),
+        ("accel", "<f8"),
+        ("steering", "<f8"),
+        ("distance_m", "<f8"),
+        ("to_go", "<f8"),
+        ("length", "<f4"),
+        ("width", "<f4"),
+        ("height", "<f4"),
+        ("lane", "<i4"),
+        ("agent", "<i4"),
+        ("events", "<i4"),
+        ("vclass", "<i2"),
+        ("zone", "<i2"),  # its owner
+        ("target_zone", "<i2"),  # of the transfer in flight; -1: none
+        ("driver", "i1"),
+        ("blinker", "i1"),
+        ("transfer", "i1"),
+    ]
+)
+# An agent whose vehicle ended in the step before the frame, and by which EVENT_* bits.
+ENDED = np.dtype([("agent", "<i4"), ("events", "<i4")])
+_NONE_ENDED = np.zeros(0, dtype=ENDED)
+
+_KINDS = {
+    EVENT_COLLIDED: "collision",
+    EVENT_OFF_ROAD: "off_road",
+    EVENT_WRONG_WAY: "wrong_way",
+    EVENT_RED_LIGHT: "red_light",
+    EVENT_ARRIVED: "arrived",
+}
+
+
+class WorldFrame(NamedTuple):
+    """One world between two steps; the arrays are its own."""
+
+    world: int
+    tick: int  # since the reset
+    time_s: float
+    vehicles: NDArray[np.void]  # SEEN (n,), by id
+    signals: NDArray[np.int32]  # (num_signals,) PHASE rows that are on
+    transfers: tuple[TransferInFlight, ...] = ()
+    ghosts: tuple[NDArray[np.int64], ...] = ()  # of each zone, the ids that it sees of others
+    ended: NDArray[np.void] = _NONE_ENDED  # ENDED (m,): they are not among `vehicles`
+
+
+class FrameEvent(NamedTuple):
+    """What happened between two frames."""
+
+    tick: int  # of the later frame
+    # departed, left, arrived, collision, off_road, wrong_way, red_light, transferred or signal
+    kind: str
+    vehicle: int  # id; -1: of no vehicle
+    agent: int  # index; -1: no agent's
+    detail: str
+
+
+def frame_of(
+    simulation: WorldViews,
+    world: int = 0,
+    ghosts: bool = False,
+    ended: NDArray[np.void] = _NONE_ENDED,
+) -> WorldFrame:
+    """The present moment of one world.
+
+    Args:
+        simulation: the worlds.
+        world: which of them.
+        ghosts: whether to tell what each zone sees of the others' vehicles.
+        ended: ENDED, of the last step.
+    """
+    rows = simulation.vehicles(world)
+    seen = np.empty(len(rows), dtype=SEEN)
+    write_seen(rows, np.argsort(rows["id"]), simulation.types, seen)
+    view = simulation.zone_view(world) if simulation.partition.count > 1 else None
+    tick = int(simulation.ticks()[world])
+    return WorldFrame(
+        world,
+        tick,
+        tick * simulation.config.clock.sim_dt_s,
+        seen,
+        simulation.signal_phases(world).copy(),
+        () if view is None else view.transfers,
+        view.ghosts if view is not None and ghosts else (),
+        ended,
+    )
+
+
+def events_between(before: WorldFrame, after: WorldFrame) -> Iterator[FrameEvent]:
+    """What happened from one frame to the next of the same episode, in the order of vehicles."""
+    ids, were = after.vehicles["id"], before.vehicles["id"]
+    both = ids
+    old: Any = slice(None)
+    new: Any = slice(None)
+    if not np.array_equal(ids, were):
+        for row in after.vehicles[~np.isin(ids, were)]:
+            yield FrameEvent(after.tick, "departed", int(row["id"]), int(row["agent"]), "")
+        bits_of = {int(end["agent"]): int(end["events"]) for end in after.ended}
+        for row in before.vehicles[~np.isin(were, ids)]:
+            bits = bits_of.get(int(row["agent"]), 0)
+            kinds = [kind for bit, kind in _KINDS.items() if bits & bit] or ["left"]
+            for kind in kinds:
+                yield FrameEvent(after.tick, kind, int(row["id"]), int(row["agent"]), "")
+        both, old, new = np.intersect1d(were, ids, assume_unique=True, return_indices=True)
+    rows, zones = after.vehicles[new], before.vehicles["zone"][old]
+    told = rows["events"]
+    moved = zones != rows["zone"]
+    for k in np.flatnonzero(moved | (told != 0)):
+        row, agent = rows[k], int(rows["agent"][k])
+        for bit, kind in _KINDS.items():
+            if told[k] & bit:
+                yield FrameEvent(after.tick, kind, int(both[k]), agent, "")
+        if moved[k]:
+            way = f"{zones[k]} to {row['zone']}"
+            yield FrameEvent(after.tick, "transferred", int(both[k]), agent, way)
+    for signal in np.flatnonzero(before.signals != after.signals):
+        yield FrameEvent(after.tick, "signal", -1, -1, f"{signal}: phase {after.signals[signal]}")

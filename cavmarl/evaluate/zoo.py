@@ -1,0 +1,213 @@
+"""The zoo: trained drivers that carry their results, and can be verified by driving again.
+
+An entry is the folder of a trained driver with a folder `result/` in it: a closed evaluation by
+`cavmarl evaluate`. To verify an entry is to drive the same episodes and to compare bytes.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Unpack
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config.registry import agent_entries
+from cavmarl.config.world_spec import WorldKeys, WorldSpec
+from cavmarl.core.errors import ConfigError, ManifestError, PolicyError
+from cavmarl.engine.world_description import describe_world
+from cavmarl.engine.world_setup import load_world
+from cavmarl.evaluate.episodes import Progress
+from cavmarl.evaluate.evaluation import (
+    EPISODES_FILE,
+    TRACKS_FILE,
+    TRIPS_FILE,
+    evaluate,
+    load_tables,
+)
+from cavmarl.evaluate.provenance.manifest import hash_of_file, read_closed
+from cavmarl.policies.policy import TOGETHER, policy_files
+
+RESULT_FOLDER = "result"
+TABLES = (TRIPS_FILE, EPISODES_FILE, TRACKS_FILE)  # the same each time they are made
+SHARES = ("success", "collision", "off_road", "red_light")
+
+
+@dataclass(frozen=True)
+class ZooEntry:
+    """A trained driver and what its result says."""
+
+    name: str
+    folder: Path
+    weights_bytes: int
+    environment: str  # with its version, as `merge-v1`; empty: no result
+    trips: int  # of the result
+    shares: Mapping[str, float]  # of trips, by a name of `SHARES`
+
+
+@dataclass(frozen=True)
+class Verification:
+    """An entry's result beside that of driving the same episodes again."""
+
+    name: str
+    expected: Mapping[str, str]  # SHA-256 by file
+    found: Mapping[str, str]
+
+    @property
+    def differing(self) -> list[str]:
+        """Files that are others."""
+        return [file for file, digest in self.expected.items() if self.found[file] != digest]
+
+
+@dataclass(frozen=True)
+class Cross:
+    """Drivers among each other: `tables[a][b]` are the TRIP rows of a's vehicles among b's."""
+
+    drivers: tuple[str, ...]
+    tables: Mapping[str, Mapping[str, NDArray[np.void]]]
+
+    def share(self, driver: str, others: str, column: str) -> float | None:
+        """The share of a driver's counted trips among others; None: it had none."""
+        trips = self.tables[driver][others]
+        return float(trips[column].mean()) if len(trips) else None
+
+
+def zoo_entries() -> list[ZooEntry]:
+    """The trained drivers that a name can mean, by name."""
+    return [_entry(name, path) for name, path in sorted(agent_entries().items()) if path.is_dir()]
+
+
+def verify_entry(policy: str | Path, progress: Progress | None = None) -> Verification:
+    """Drive an entry's episodes again.
+
+    Args:
+        policy: name of a trained driver, or its folder.
+        progress: as in `evaluate`.
+
+    Raises:
+        PolicyError: nothing of that name, or a driver that is not trained.
+        ManifestError: there is no result, or weights or world are not those it was made with.
+    """
+    weights = policy_files(policy)
+    folder = weights[0].parent
+    if len(weights) < 2:
+        raise PolicyError(f"{policy}: is a script; the zoo has trained drivers only")
+    name = folder.name
+    document = read_closed(folder / RESULT_FOLDER)
+    job = _job_of(document, folder)
+    _check_weights(document, name, weights)
+    spec = WorldSpec.of(job["env"], **{key: job[key] for key in _KEYS})
+    _check_world(document, name, spec)
+    with TemporaryDirectory() as room:
+        out = Path(room) / "again"
+        evaluate(
+            spec,
+            {name: folder},
+            episodes=job["episodes"],
+            repeats=len(document["seeds"]),
+            out=out,
+            progress=progress,
+        )
+        known = document["results_sha256"]
+        expected = {file: known[file] for file in TABLES if file in known}
+        return Verification(name, expected, {file: hash_of_file(out / file) for file in expected})
+
+
+def cross(
+    env: str | Path | WorldSpec,
+    policies: Sequence[str],
+    *,
+    episodes: int = 8,
+    progress: Progress | None = None,
+    **keys: Unpack[WorldKeys],
+) -> Cross:
+    """Let each driver drive every other agent among each other driver's vehicles.
+
+    All pairs meet the same episodes. Agents with even numbers are the driver's, odd ones the
+    others'.
+
+    Raises:
+        ConfigError: an environment with fewer than two agents.
+        PolicyError: a driver cannot be loaded or does not fit, or is named twice.
+    """
+    if len(set(policies)) < len(policies):
+        raise PolicyError(f"drivers {', '.join(policies)}: one stands there twice")
+    spec = WorldSpec.of(env, **keys)
+    if load_world(spec.env, **spec.keywords).config.population.num_ids < 2:
+        raise ConfigError(f"{spec.env}: has one agent; a matrix of drivers needs two or more")
+    pairs = {(a, b): a if a == b else f"{a}{TOGETHER}{b}" for a in policies for b in policies}
+    with TemporaryDirectory() as room:
+        out = Path(room) / "cross"
+        named = {f"{a} among {b}": pair for (a, b), pair in pairs.items()}
+        evaluate(spec, named, episodes=episodes, out=out, progress=progress)
+        found = load_tables(out)
+    tables: dict[str, dict[str, NDArray[np.void]]] = {a: {} for a in policies}
+    for a, b in pairs:
+        trips, _ = found[f"{a} among {b}"]
+        tables[a][b] = trips[trips["counted"] & (trips["agent"] % 2 == 0)]
+    return Cross(tuple(policies), tables)
+
+
+_WORLD_KEYS = ("environment", "map_content_sha256", "demand_content_sha256")
+_KEYS = ("agents", "background", "max_cycles", "seed", "overrides")
+
+
+def _entry(name: str, folder: Path) -> ZooEntry:
+    weights_bytes = policy_files(folder)[0].stat().st_size
+    result = folder / RESULT_FOLDER
+    if not result.is_dir():
+        return ZooEntry(name, folder, weights_bytes, "", 0, {})
+    document = read_closed(result)
+    trips, _ = load_tables(result)[next(iter(document["policies"]))]
+    counted = trips[trips["counted"]]
+    shares = {key: float(counted[key].mean()) for key in SHARES} if len(counted) else {}
+    environment = document["world"]["environment"]
+    return ZooEntry(name, folder, weights_bytes, environment, len(counted), shares)
+
+
+def _job_of(document: Mapping[str, Any], folder: Path) -> Mapping[str, Any]:
+    """What is to be done again."""
+    job = document.get("job")
+    if not isinstance(job, dict) or not {"env", "episodes", *_KEYS} <= job.keys():
+        raise ManifestError(
+            f"{folder / RESULT_FOLDER}: its manifest does not say what was driven; make the result "
+            f"again: `cavmarl evaluate ENV --policy {folder} --out {folder / RESULT_FOLDER}`"
+        )
+    return job
+
+
+def _check_weights(document: Mapping[str, Any], name: str, files: Sequence[Path]) -> None:
+    (described,) = list(document["policies"].values())[:1]
+    for file in files:
+        if described["sha256"].get(file.name) != hash_of_file(file):
+            raise ManifestError(
+                f"{file}: is not the file that the result of {name} was made with; restore it, or "
+                "evaluate the driver again"
+            )
+
+
+def _check_world(document: Mapping[str, Any], name: str, spec: WorldSpec) -> None:
+    """Refuse a world that is not the result's; keys that this version has added do not count."""
+    here = json.loads(json.dumps(describe_world(*load_world(spec.env, **spec.keywords))))
+    there = document["world"]
+    others = [key for key in _WORLD_KEYS if here[key] != there[key]]
+    others += _differing("config", there["config"], here["config"])
+    if others:
+        raise ManifestError(
+            f"{name}: its result is of {there['environment']}, but {others[0]} is another in this "
+            f"version ({here['environment']}); figures of different worlds are not compared: "
+            "evaluate the driver again"
+        )
+
+
+def _differing(key: str, there: Any, here: Any) -> Iterator[str]:
+    """Keys of a config that have another value, or none, in the config of today."""
+    if isinstance(there, dict) and isinstance(here, dict):
+        for name, value in there.items():
+            yield from _differing(f"{key}.{name}", value, here.get(name))
+    elif there != here:
+        yield key

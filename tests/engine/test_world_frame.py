@@ -1,0 +1,131 @@
+"""Frames: what is seen of a world is the same however it is divided and wherever it runs."""
+
+from __future__ import annotations
+
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+from cavmarl import make_vec, parallel_env
+from cavmarl.core.errors import ConfigError, EpisodeError
+from cavmarl.core.records.codes import EVENT_ARRIVED, EVENT_COLLIDED
+from cavmarl.engine.world_frame import ENDED, SEEN, WorldFrame, events_between
+
+_PLACED = ("zone", "target_zone", "transfer")
+_WHAT = [name for name in SEEN.names or () if name not in _PLACED]
+
+
+def _frames(zones: int, workers: int, steps: int = 25) -> list[WorldFrame]:
+    with closing(make_vec("grid4x4", num_envs=1, zones=zones, workers=workers)) as vec:
+        vec.reset(seed=3)
+        actions = np.zeros(vec.action_space.shape, dtype=np.float32)
+        frames = []
+        for _ in range(steps):
+            vec.step(actions)
+            frames += vec.world_frames()
+    return frames
+
+
+@pytest.mark.parametrize(("zones", "workers"), [(4, 0), (4, 2), (1, 1)])
+def test_frames_are_those_of_the_undivided_world(zones: int, workers: int) -> None:
+    for whole, divided in zip(_frames(1, 0), _frames(zones, workers), strict=True):
+        assert (whole.tick, whole.time_s) == (divided.tick, divided.time_s)
+        np.testing.assert_array_equal(whole.vehicles[_WHAT], divided.vehicles[_WHAT])
+        np.testing.assert_array_equal(whole.signals, divided.signals)
+        np.testing.assert_array_equal(whole.ended, divided.ended)
+        if zones > 1:
+            assert len(set(divided.vehicles["zone"])) > 1
+
+
+def test_a_frame_holds_what_the_world_holds_and_stays() -> None:
+    world = parallel_env("grid4x4", zones=4)
+    world.reset(seed=1)
+    for _ in range(10):
+        world.step({agent: world.action_space(agent).sample() for agent in world.agents})
+    (frame,) = world.world_frames(ghosts=True)
+    simulation = world.worlds.simulation
+    rows = np.sort(simulation.vehicles(), order="id")
+    for name in SEEN.names or ():
+        held = {"zone": rows["owner"], "vclass": simulation.types["vclass"][rows["vtype"]]}
+        there = held[name] if name in held else rows[name]
+        np.testing.assert_array_equal(frame.vehicles[name], there.astype(SEEN[name]))
+    assert len(frame.ghosts) == 4
+    assert any(len(ids) for ids in frame.ghosts)
+    kept = frame.vehicles.copy()
+    world.step({agent: world.action_space(agent).sample() for agent in world.agents})
+    np.testing.assert_array_equal(frame.vehicles, kept)
+
+
+def test_events_tell_how_agents_end() -> None:
+    world = parallel_env("ring")
+    world.reset(seed=1)
+    (before,) = world.world_frames()
+    told: list[tuple[str, int]] = []
+    ended: list[tuple[str, int]] = []
+    rng = np.random.default_rng(0)
+    for _ in range(150):
+        if not world.agents:
+            break
+        low, high = -1.0, 1.0
+        actions = {agent: rng.uniform(low, high, 2).astype("f4") for agent in world.agents}
+        _, _, terminations, _, infos = world.step(actions)
+        (after,) = world.world_frames()
+        told += [
+            (event.kind, event.agent)
+            for event in events_between(before, after)
+            if event.agent >= 0 and event.kind in ("collision", "off_road", "arrived")
+        ]
+        for agent in (name for name, over in terminations.items() if over):
+            terms = infos[agent]
+            ended += [
+                (kind, world.possible_agents.index(agent))
+                for kind, term in (
+                    ("collision", "collision"),
+                    ("off_road", "off_road"),
+                    ("arrived", "arrival"),
+                )
+                if terms[term]
+            ]
+        before = after
+    assert sorted(told) == sorted(ended)
+    assert told
+
+
+def _frame(
+    tick: int, rows: list[dict[str, int]], ended: list[tuple[int, int]], **named: int
+) -> WorldFrame:
+    vehicles = np.zeros(len(rows), dtype=SEEN)
+    vehicles["agent"] = -1
+    for row, values in zip(vehicles, rows, strict=True):
+        for name, value in values.items():
+            row[name] = value
+    signals = np.array([named.get("phase", 0)], dtype=np.int32)
+    return WorldFrame(0, tick, tick * 0.1, vehicles, signals, ended=np.array(ended, dtype=ENDED))
+
+
+def test_events_between_two_frames() -> None:
+    before = _frame(4, [{"id": 1}, {"id": 2, "agent": 0}, {"id": 3}, {"id": 4, "zone": 1}], [])
+    after = _frame(
+        5,
+        [{"id": 1, "events": EVENT_COLLIDED}, {"id": 4, "zone": 2}, {"id": 9}],
+        [(0, EVENT_ARRIVED)],
+        phase=3,
+    )
+    assert [tuple(event) for event in events_between(before, after)] == [
+        (5, "departed", 9, -1, ""),
+        (5, "arrived", 2, 0, ""),
+        (5, "left", 3, -1, ""),
+        (5, "collision", 1, -1, ""),
+        (5, "transferred", 4, -1, "1 to 2"),
+        (5, "signal", -1, -1, "0: phase 3"),
+    ]
+
+
+def test_frames_that_cannot_be_had() -> None:
+    world = parallel_env("ring")
+    with pytest.raises(EpisodeError, match="reset"):
+        world.world_frames()
+    world.reset(seed=0)
+    with pytest.raises(ConfigError, match="worlds 0 to 0"):
+        world.world_frames([1])

@@ -1,0 +1,115 @@
+"""The zoo: an entry is verified by driving again; what was changed is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cavmarl import make_vec
+from cavmarl.config.registry import agent_entries
+from cavmarl.core.errors import ConfigError, ManifestError, PolicyError
+from cavmarl.evaluate.zoo import TABLES, cross, verify_entry, zoo_entries
+from cavmarl.policies.policy import load_policy, policy_files
+
+pytest.importorskip("torch")
+
+pytestmark = pytest.mark.integration  # a manifest asks git for the commit
+
+
+@pytest.fixture
+def entry(tmp_path: Path) -> Path:
+    return Path(shutil.copytree(agent_entries()["merge_ippo"], tmp_path / "merge_ippo"))
+
+
+@pytest.mark.parametrize("found", zoo_entries(), ids=lambda entry: entry.name)
+def test_each_entry_is_what_its_result_says(found) -> None:  # type: ignore[no-untyped-def]
+    assert found.weights_bytes <= 1_000_000
+    assert found.trips >= 50
+    assert 0.5 < found.shares["success"] <= 1.0
+    again = verify_entry(found.name)
+    assert list(again.expected) == list(TABLES)
+    assert not again.differing
+
+
+def test_what_was_changed_by_a_byte_is_refused(entry: Path) -> None:
+    weights = entry / "model.safetensors"
+    whole = bytearray(weights.read_bytes())
+    whole[-1] ^= 1
+    weights.write_bytes(whole)
+    with pytest.raises(ManifestError, match=r"model\.safetensors: is not the file"):
+        verify_entry(entry)
+
+
+def test_results_that_were_changed_are_refused(entry: Path) -> None:
+    trips = entry / "result" / "trips.csv"
+    trips.write_text(trips.read_text().replace("True", "False", 1))
+    with pytest.raises(ManifestError, match=r"trips\.csv: is not the file"):
+        verify_entry(entry)
+
+
+def test_another_world_is_not_compared(entry: Path) -> None:
+    path = entry / "result" / "manifest.json"
+    document = json.loads(path.read_text())
+    document["world"]["config"]["clock"]["sim_dt_s"] = 0.1
+    path.write_text(json.dumps(document))
+    with pytest.raises(ManifestError, match=r"config\.clock\.sim_dt_s is another in this version"):
+        verify_entry(entry)
+
+
+def test_a_difference_is_found(entry: Path) -> None:
+    path = entry / "result" / "manifest.json"
+    document = json.loads(path.read_text())
+    document["job"] |= {"episodes": 1, "seed": 3}
+    path.write_text(json.dumps(document))
+    assert set(verify_entry(entry).differing) == set(TABLES)
+
+
+def test_what_is_no_entry(entry: Path, tmp_path: Path) -> None:
+    with pytest.raises(PolicyError, match="is a script"):
+        verify_entry("idm")
+    shutil.rmtree(entry / "result")
+    with pytest.raises(ManifestError, match="origin of these results is unknown"):
+        verify_entry(entry)
+
+
+def test_drivers_among_each_other() -> None:
+    found = cross("merge", ["idm", "random_actions"], episodes=1, seed=2)
+    assert found.drivers == ("idm", "random_actions")
+    for driver in found.drivers:
+        for others in found.drivers:
+            trips = found.tables[driver][others]
+            assert len(trips)
+            assert not (trips["agent"] % 2).any()
+    calm = found.share("idm", "idm", "success")
+    wild = found.share("random_actions", "idm", "success")
+    assert calm is not None
+    assert wild == 0.0 < calm
+
+
+def test_a_matrix_needs_several_agents_and_different_drivers() -> None:
+    with pytest.raises(ConfigError, match="has one agent"):
+        cross("merge", ["idm"], agents=1)
+    with pytest.raises(PolicyError, match="stands there twice"):
+        cross("merge", ["idm", "idm"])
+
+
+def test_drivers_share_the_agents_by_turns() -> None:
+    vec = make_vec("ring", num_envs=2)
+    observations, infos = vec.reset(seed=1)
+    together = load_policy("idm+random_actions", vec)
+    alone = [load_policy(name, vec) for name in ("idm", "random_actions")]
+    for driver in (together, *alone):
+        driver.reset(5)
+    mask = infos["mask"]
+    found = together.act_batch(observations, mask)
+    even = np.arange(mask.shape[1]) % 2 == 0
+    idm = alone[0].act_batch(observations, mask & even)
+    other = alone[1].act_batch(observations, mask & ~even)
+    np.testing.assert_array_equal(found[:, even], idm[:, even])
+    np.testing.assert_array_equal(found[:, ~even], other[:, ~even])
+    assert len(policy_files("idm+random_actions")) == 2
+    vec.close()
