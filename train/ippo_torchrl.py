@@ -4,7 +4,7 @@
 
 TorchRL's collector, advantages and clipped loss, on `cavmarl.adapters.torchrl_env`; the network is
 ours. The run's folder holds it as `model.safetensors` and `config.json`, which
-`cavmarl evaluate --policy FOLDER` takes, `progress.csv` with the columns of `ippo_torch.py`,
+`cavmarl evaluate --policy FOLDER` takes, `progress.csv` with the columns of `ppo.py`,
 `manifest.json`, which says what it was trained with, and `checkpoint.pt`. `--resume FOLDER` goes on
 from that, in new episodes: TorchRL's collector keeps the state of its worlds to itself.
 """

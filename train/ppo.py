@@ -312,15 +312,15 @@ class Learner:
                     loss = loss + self.imitation_weight(left) * distance.mean()
                 self.optimizer.zero_grad()
                 loss.backward()  # type: ignore[no-untyped-call]
-                for group in network.parts:
-                    nn.utils.clip_grad_norm_(group, args.max_gradient_norm)
+                for part in network.parts:
+                    nn.utils.clip_grad_norm_(part, args.max_gradient_norm)
                 self.optimizer.step()
                 with torch.no_grad():
                     kl = (ratio - 1.0 - change).mean()
                     clipped = ((ratio - 1.0).abs() > args.clip).float().mean()
                 found.append(torch.stack([policy_loss, value_loss, entropy.mean(), kl, clipped]))
         self.scales.add(of(batch.observations, acted))
-        means = torch.stack(found).detach().mean(0) if found else torch.zeros(len(NUMBERS))
+        means = torch.stack(found or [torch.zeros(len(NUMBERS))]).detach().mean(0)
         return dict(zip(NUMBERS, means.tolist(), strict=True))
 
     def _filtered(self, advantages: Tensor, acted: Tensor, all_of_them: bool) -> Tensor:
@@ -431,8 +431,7 @@ def train(args: Args, console: Console) -> Path:
     with opened(args) as run, progress_bar(console) as bar:
         if run.vec.plans:
             console.print(run.vec.plan_text(), highlight=False)
-        task = bar.add_task("", total=1.0)
-        done = run.done() if run.updates else 0.0
+        task, done = bar.add_task("", total=1.0), run.done() if run.updates else 0.0
         while done < 1.0:
             row = run.update()
             done = run.done()

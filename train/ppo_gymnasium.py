@@ -5,7 +5,7 @@
 Every agent is a row of `gymnasium.make_vec`; rows begin anew in the next step, so that what follows
 a row's last step is its last observation. The run's folder holds the driver (`model.safetensors`
 and `config.json`, which `cavmarl evaluate --policy FOLDER` takes), `progress.csv` with the columns
-of `ippo_torch.py`, `manifest.json`, which says what it was trained with, and `checkpoint.pt`, from
+of `ppo.py`, `manifest.json`, which says what it was trained with, and `checkpoint.pt`, from
 which `--resume FOLDER` goes on bit for bit.
 """
 

@@ -4,7 +4,7 @@
 
 RLlib's algorithm, env runners and learner, on `cavmarl.adapters.rllib_env`; the network is ours, as
 an `RLModule`. The run's folder holds it as `model.safetensors` and `config.json`, which
-`cavmarl evaluate --policy FOLDER` takes, `progress.csv` with the columns of `ippo_torch.py`, and
+`cavmarl evaluate --policy FOLDER` takes, `progress.csv` with the columns of `ppo.py`, and
 `manifest.json`, which says what it was trained with.
 """
 

@@ -4,7 +4,7 @@
 
 The library's own PPO, learning rate, batches and network; what is ours is the view of the worlds
 (`cavmarl.adapters.sb3_vec_env`). The run's folder holds stable-baselines3's `model.zip`,
-`progress.csv` with the columns of `ippo_torch.py`, and the same network as `model.safetensors` and
+`progress.csv` with the columns of `ppo.py`, and the same network as `model.safetensors` and
 `config.json`, which `cavmarl evaluate --policy FOLDER` takes; `manifest.json` says what it was
 trained with. From `checkpoint.pt`, `--resume FOLDER` goes on bit for bit.
 """
@@ -73,7 +73,7 @@ class Args:
 class Curve(BaseCallback):
     """Writes a line for every update, and checkpoints, and stops the run when its time is over.
 
-    Trips that the horizon cut count neither here nor in `ippo_torch.py`.
+    Trips that the horizon cut count neither here nor in `ppo.py`.
     """
 
     def __init__(self, folder: RunFolder, minutes: float) -> None:
