@@ -29,6 +29,7 @@ EXTRAS = (
     "render",
     "report",
     "service",
+    "viewer",
     "torch",
     "sb3",
     "torchrl",
