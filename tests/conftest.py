@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from tests.support.cpu_time import CpuTimes, known_costs, rare_variants
+from tests.support.cpu_time import CpuTimes, argued, known_costs, rare_tests
 from tests.support.tiers import ProcessWatch, mark, skip_if_late
 
 
@@ -25,7 +25,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark each test with its tier."""
-    rare = rare_variants((item.nodeid for item in items), known_costs())
+    rare = rare_tests((item.nodeid for item in items), known_costs(), argued())
     for item in items:
         mark(item)
         if item.nodeid in rare:

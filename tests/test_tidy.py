@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.cpu_time import known_costs, rare_variants
+from tests.support.cpu_time import ARGUED_S, argued, known_costs, rare_tests
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("cavmarl", "tests", "train", "agents", "fuzz", "docs", "examples", "benchmarks")
@@ -126,10 +126,15 @@ def test_things_are_not_called_persons(folder: str) -> None:
     assert found <= PERSONS_AT_MOST[folder], "say vehicle, zone, worker, message"
 
 
-def test_of_dear_variants_the_first_ones_are_in_every_run() -> None:
-    costs = {"a[1]": 2.0, "a[2]": 0.9, "a[3]": 0.2, "b[1]": 9.0, "b[2]": 0.0, "c": 9.0}
-    assert rare_variants(costs, costs) == {"a[3]"}
-    assert rare_variants([*costs, "b[3]"], costs | {"b[3]": 0.5}) == {"a[3]", "b[3]"}
+def test_dear_tests_are_slow_but_for_those_that_are_argued_for() -> None:
+    costs = {"a[1]": 2.0, "a[2]": 0.9, "a[3]": 0.2, "b[1]": 2.9, "b[2]": 0.0, "c": 9.0}
+    assert rare_tests(costs, costs) == {"a[3]", "c"}
+    assert rare_tests(costs, costs, frozenset({"c"})) == {"a[3]"}
+    assert rare_tests([*costs, "b[3]"], costs | {"b[3]": 0.5}) == {"a[3]", "b[3]", "c"}
+
+
+def test_tests_that_are_argued_for_are_dear() -> None:
+    assert [name for name in argued() if known_costs().get(name, 0.0) <= ARGUED_S] == []
 
 
 def test_the_file_of_costs_names_tests_that_are_there() -> None:

@@ -21,7 +21,9 @@ from cavmarl.roads.network import SIGNAL_STATES, VEHICLE_CLASSES, RoadNetwork
 _CAR = 1 << VEHICLE_CLASSES.index("passenger")
 # Slower than a walk or faster than any car: likelier a wrong unit than a speed limit.
 _SPEED_RANGE_MPS = (1.0, 70.0)
-_STEEP = 0.25
+_STEEP = 0.15
+_ROUNDING = 0.005  # of grades, by places that are written to the centimetre
+_STUB_M = 1.0  # lanes that are shorter say nothing of a grade
 _WELL_CONNECTED = 0.9
 _GREEN = [SIGNAL_STATES.index(letter) for letter in "gGosOY"]
 
@@ -57,6 +59,7 @@ class MapReport:
     # and limits of single links
     programs_simplified: tuple[str, ...]
     self_loops: tuple[str, ...]  # edges that end where they begin
+    steep_lanes: tuple[str, ...]  # lanes that climb more than 15 %, the steepest first
     speed_outliers: tuple[str, ...]  # lanes with a speed limit below 1 or above 70 m/s
     problems: tuple[str, ...]  # why the map cannot be driven; empty if it can
     notes: tuple[str, ...]  # what else to know
@@ -76,6 +79,7 @@ def check_map(source: str | Path | RoadNetwork) -> MapReport:
     """
     network = source if isinstance(source, RoadNetwork) else load_network(source)
     cars = _Cars(network)
+    grades = _grades(network)
     findings = {
         "dead_ends": cars.dead_ends(),
         "lanes_without_successor": cars.lanes_without_successor(),
@@ -86,12 +90,13 @@ def check_map(source: str | Path | RoadNetwork) -> MapReport:
         "lanes_never_green": _lanes_never_green(network),
         "programs_simplified": _simplified_programs(network),
         "self_loops": cars.self_loops(),
+        "steep_lanes": _steep_lanes(network, grades),
         "speed_outliers": cars.speed_outliers(),
     }
     connected = cars.largest_component()
     share = connected / len(cars.edges) if len(cars.edges) else 0.0
     heights = (float(network.points["z"].min()), float(network.points["z"].max()))
-    grade = float(np.abs(network.points["slope"]).max())
+    grade = float(grades.max(initial=0.0))
     return MapReport(
         name=network.name,
         source_hash=network.source_hash,
@@ -188,6 +193,19 @@ def _junctions_by_type(network: RoadNetwork) -> dict[str, int]:
     return {kind: int(count) for kind, count in zip(network.junction_kinds, counts, strict=True)}
 
 
+def _grades(network: RoadNetwork) -> NDArray[np.float64]:
+    """The steepest slope of each lane, as a ratio."""
+    slopes = np.abs(network.points["slope"])
+    steepest = np.maximum.reduceat(slopes, network.lanes["first_point"])
+    return np.where(network.lanes["length_m"] >= _STUB_M, steepest, 0.0)
+
+
+def _steep_lanes(network: RoadNetwork, grades: NDArray[np.float64]) -> tuple[str, ...]:
+    ranked = np.argsort(-grades, kind="stable")
+    steep = ranked[grades[ranked] > _STEEP + _ROUNDING]
+    return tuple(f"{network.lane_ids[row]} {grades[row]:.0%}" for row in steep)
+
+
 def _idle_signals(network: RoadNetwork) -> tuple[str, ...]:
     rows = np.setdiff1d(np.arange(len(network.signals)), network.links["signal"])
     return tuple(network.signal_ids[row] for row in rows)
@@ -223,6 +241,6 @@ def _notes(findings: dict[str, tuple[str, ...]], share: float, grade: float) -> 
         if ids:
             shown = ", ".join(ids[:5]) + (", …" if len(ids) > 5 else "")
             notes.append(f"{len(ids)} {name.replace('_', ' ')}: {shown}")
-    if grade > _STEEP:
-        notes.append(f"the steepest lane climbs {grade:.0%}: check the elevation data")
+    if grade > _STEEP + _ROUNDING:
+        notes.append(f"the steepest lane climbs {grade:.0%}: check the heights")
     return notes

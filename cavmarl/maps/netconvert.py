@@ -2,110 +2,44 @@
 
 The same source and options give the same bytes: netconvert's comment with the date is dropped.
 
-The kind of a map file is told by its content and not by its name.
+Each says inside where it comes from (`maps.provenance`); heights are laid under it here.
 """
 
 from __future__ import annotations
 
 import gzip
 import hashlib
+import math
 import os
 import re
 import shutil
-import subprocess
 import tempfile
 import time
-from collections import Counter
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal
-from xml.sax import SAXParseException
-from xml.sax.handler import ContentHandler
+from typing import Any
 
 from cavmarl.core.cache_folder import cache_dir
 from cavmarl.core.errors import ConfigError, MapError, require
-from cavmarl.core.processes import dying_with_parent
-from cavmarl.roads.sumo_net.reader import map_name, read_network, source_hash
-from cavmarl.roads.sumo_net.xml_source import read_bytes, read_xml
-
-MapKind = Literal["sumo", "osm", "opendrive"]
-
-MAP_ENDINGS = (".net.xml", ".net.xml.gz", ".osm", ".osm.gz", ".osm.xml", ".osm.xml.gz", ".xodr")
-
-_KINDS = (
-    "give a SUMO network (<net>, .net.xml), an OpenStreetMap extract (<osm>, .osm or .osm.xml) or "
-    "an OpenDRIVE file (<OpenDRIVE>, .xodr); the first two also gzipped (.gz)"
+from cavmarl.maps.heights.draping import HeightOptions, HeightReport, drape
+from cavmarl.maps.map_kinds import MapKind, map_kind
+from cavmarl.maps.net_document import NetDocument
+from cavmarl.maps.netconvert_process import BuildLog, Cures, quoted, run_netconvert, sumo_home
+from cavmarl.maps.osm_roads import OsmRoads
+from cavmarl.maps.provenance import (
+    NOT_STATED,
+    OSM_ATTRIBUTION,
+    OSM_LICENCE,
+    RoadDefaults,
+    defaults_text,
+    head_of,
+    read_provenance,
+    road_defaults,
 )
-_ROOTS: dict[str, MapKind] = {"net": "sumo", "osm": "osm", "OpenDRIVE": "opendrive"}
-
-
-class _Root(ContentHandler):
-    """Remembers the root element; the parser around it finds what is broken or hostile."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.name = ""
-
-    def startElement(self, name: str, attrs: Any) -> None:
-        self.name = self.name or name
-
-
-def map_kind(path: Path) -> MapKind:
-    """Read a map file to its end and tell its kind by its root element.
-
-    Raises MapError: the file cannot be read, is broken or hostile XML, or is no map.
-    """
-    root = _Root()
-    try:
-        read_xml(path, root)
-    except MapError as error:
-        no_xml = isinstance(error.__cause__, SAXParseException) and not root.name
-        if no_xml and not path.name.endswith(MAP_ENDINGS):
-            raise MapError(f"{path}: is no map: {_KINDS}") from error
-        raise
-    if root.name not in _ROOTS:
-        raise MapError(f"{path}: <{root.name}> is the root of no map: {_KINDS}")
-    return _ROOTS[root.name]
-
-
-_QUOTED = re.compile(r"'[^']*'")
-_NUMBERED = re.compile(r"\S*\d\S*")
-_CORRECTION = re.compile(r"^(Joined|Guessed|Removed) |^[1-9]\d* .*(removed|computed|split|added)$")
-
-
-class BuildLog:
-    """The output of one run with `--verbose` and without aggregated warnings."""
-
-    def __init__(self, stdout: str = "", stderr: str = "") -> None:
-        self._said = stdout.splitlines()
-        self._complained = stderr.splitlines()
-
-    def errors(self) -> tuple[str, ...]:
-        return self._after("Error: ")
-
-    def warnings(self) -> dict[str, int]:
-        """How often each warning came, by its text with `%` for names and numbers."""
-        kinds = Counter(
-            _NUMBERED.sub("%", _QUOTED.sub("'%'", line)) for line in self._after("Warning: ")
-        )
-        return dict(kinds.most_common())
-
-    def corrections(self) -> tuple[str, ...]:
-        """What netconvert changed on its own account, in its words."""
-        lines = (line.strip().rstrip(".") for line in self._said if line.startswith(" "))
-        return tuple(line for line in lines if _CORRECTION.search(line))
-
-    def complaint(self) -> tuple[str, ...]:
-        """The errors or, if it died without one, all that it complained about."""
-        return self.errors() or tuple(self._complained) or ("no message",)
-
-    def _after(self, prefix: str) -> tuple[str, ...]:
-        return tuple(
-            line.removeprefix(prefix) for line in self._complained if line.startswith(prefix)
-        )
-
+from cavmarl.roads.sumo_net.reader import map_name, read_network, source_hash
+from cavmarl.roads.sumo_net.xml_source import read_bytes
 
 Box = tuple[float, float, float, float]
 
@@ -118,6 +52,7 @@ OSM_OPTIONS = (
     "--tls.join",
     "--keep-edges.by-vclass=passenger",
     "--remove-edges.isolated",
+    "--output.original-names",  # of the ways of each lane: bridges, names, defaults
 )
 OPENDRIVE_OPTIONS = ("--opendrive.import-all-lanes=false",)
 
@@ -126,8 +61,17 @@ _TYPE_MAP = {"osm": "osmNetconvert.typ.xml", "opendrive": "opendriveNetconvert.t
 _OPTIONS = {"sumo": (), "osm": OSM_OPTIONS, "opendrive": OPENDRIVE_OPTIONS}
 
 _COMMENT = re.compile(rb"<!-- generated on .*?-->\s*", re.DOTALL)
-_SHOWN_LINES = 10
 _LEFT_S = 86_400.0  # a build that is older than this was killed
+_FAR_M = 100_000.0  # from the origin: the projection is no longer true to scale
+
+Origin = tuple[float, float]  # latitude and longitude, degrees
+Told = Callable[[str], None]
+
+STAGES = ("netconvert", "what the source says", "heights", "reading it back")
+
+
+def _silent(stage: str) -> None:
+    pass
 
 
 @dataclass(frozen=True)
@@ -144,6 +88,9 @@ class BuildResult:
     corrections: tuple[str, ...]
     # with `tolerant`, the errors that netconvert ignored: what they name was left out
     dropped: tuple[str, ...]
+    provenance: dict[str, str]  # what the file says of its own origin
+    defaults: tuple[RoadDefaults, ...] = ()  # what OSM does not say and the type map gave
+    heights: HeightReport | None = None
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self) | {"path": str(self.path), "source": str(self.source)}
@@ -155,8 +102,12 @@ def build_network(
     *,
     options: Sequence[str] = (),
     bbox: Box | None = None,
+    origin: Origin | None = None,
+    heights: HeightOptions | None = None,
+    licences: tuple[str, str] = ("", ""),
     tolerant: bool = False,
     timeout_s: float = 600.0,
+    told: Told = _silent,
 ) -> BuildResult:
     """Make a SUMO network of a map file and prove that it can be read.
 
@@ -168,41 +119,47 @@ def build_network(
         options: more options for netconvert.
         bbox: keep the roads within (min, min, max, max): longitude and latitude in degrees for
             OSM, else metres in the source's own frame.
+        origin: latitude and longitude of the map's x = y = 0, OSM only; by default the corner of
+            the roads, in UTM.
+        heights: models of the ground, laid under the roads; nothing moves in the plane.
+        licences: of the source and of the models of heights, where the map is to say others.
         tolerant: let netconvert leave out what it cannot use instead of giving up.
         timeout_s: how long netconvert may take.
+        told: called with each of `STAGES` as it begins.
 
     Raises:
-        ConfigError: an empty `bbox`.
+        ConfigError: an empty `bbox`, or an origin that is on no earth or of another map.
         MapError: the source is broken, hostile or no map, netconvert refuses it (its own lines are
-            in the message), nothing in the result can be driven, or the target cannot be written.
-        MissingExtraError: netconvert is needed and not installed.
+            in the message), nothing in the result can be driven, the heights cannot be laid under
+            it, or the target cannot be written.
+        MissingExtraError: netconvert, or what heights need, is not installed.
     """
     source = Path(source)
     kind = map_kind(source)
-    chosen = (*_OPTIONS[kind], *_crop(kind, bbox), *options)
+    chosen = (*_OPTIONS[kind], *_crop(kind, bbox), *_centred(source, kind, origin), *options)
     if tolerant and chosen:
         chosen += ("--ignore-errors",)
-    log = BuildLog()
-    if target is None and not chosen:
+    if target is None and not chosen and heights is None:
         read_network(source)
-        place = source
-    else:
-        place = _cache_entry(source, chosen) if target is None else Path(target)
-        try:
-            log = _build(kind, source, place, chosen, timeout_s)
-        except OSError as error:
-            cure = "name another target" if target else "set CAVMARL_CACHE_DIR to another folder"
-            raise MapError(
-                f"{place}: cannot be written ({error.strerror or error}); {cure}"
-            ) from error
+        return BuildResult(source, source, kind, (), {}, (), (), read_provenance(source))
+    place = Path(target) if target else _cache_entry(source, chosen, heights)
+    made = _Build(source, kind, place, chosen, origin, heights, licences, timeout_s, told)
+    try:
+        made.run()
+    except OSError as error:
+        cure = "name another target" if target else "set CAVMARL_CACHE_DIR to another folder"
+        raise MapError(f"{place}: cannot be written ({error.strerror or error}); {cure}") from error
     return BuildResult(
         path=place,
         source=source,
         kind=kind,
         options=chosen,
-        warnings=log.warnings(),
-        corrections=log.corrections(),
-        dropped=log.errors(),
+        warnings=made.log.warnings(),
+        corrections=made.log.corrections(),
+        dropped=made.log.errors(),
+        provenance=read_provenance(place),
+        defaults=made.defaults,
+        heights=made.report,
     )
 
 
@@ -221,10 +178,14 @@ def map_file(path: str | Path) -> Path:
     return entry if entry.exists() else build_network(path).path
 
 
-def _cache_entry(source: Path, options: Sequence[str]) -> Path:
+def _cache_entry(
+    source: Path, options: Sequence[str], heights: HeightOptions | None = None
+) -> Path:
     require("sumo", "sumo")
-    release = version("eclipse-sumo")
-    digest = hashlib.sha256("\0".join([source_hash(source), release, *options]).encode())
+    words = [source_hash(source), version("eclipse-sumo"), *options]
+    if heights is not None:
+        words += [*map(source_hash, heights.models), repr(heights)]
+    digest = hashlib.sha256("\0".join(words).encode())
     return cache_dir() / "maps" / digest.hexdigest()[:32] / f"{map_name(source)}.net.xml"
 
 
@@ -237,69 +198,129 @@ def _crop(kind: MapKind, bbox: Box | None) -> tuple[str, ...]:
     return (f"{option}={','.join(map(repr, bbox))}",)
 
 
-def _build(
-    kind: MapKind, source: Path, place: Path, options: Sequence[str], timeout_s: float
-) -> BuildLog:
-    if place.exists() and place.samefile(source):
-        raise MapError(f"{place}: the target is the source: give another target")
-    place.parent.mkdir(parents=True, exist_ok=True)
-    for left in place.parent.glob(".build-*"):  # by a process that was killed
-        if time.time() - left.stat().st_mtime > _LEFT_S:
-            shutil.rmtree(left, ignore_errors=True)
-    with tempfile.TemporaryDirectory(dir=place.parent, prefix=".build-") as folder:
-        draft = Path(folder) / f"{map_name(place)}.net.xml"
-        log = BuildLog()
-        if options:
-            log = _run(kind, source, draft, options, timeout_s)
-            content = _COMMENT.sub(b"", draft.read_bytes(), count=1)
-        else:
-            content = read_bytes(source)
-        draft.write_bytes(gzip.compress(content, mtime=0) if place.suffix == ".gz" else content)
-        _check_readable(source, draft, log)
-        os.replace(draft, place)
-    return log
+def _centred(source: Path, kind: MapKind, origin: Origin | None) -> tuple[str, ...]:
+    if origin is None:
+        return ()
+    latitude, longitude = origin
+    if kind != "osm":
+        raise ConfigError(
+            f"--origin: {source} states its own frame: an origin is for OpenStreetMap"
+        )
+    if not (abs(latitude) < 90.0 and abs(longitude) <= 180.0):
+        raise ConfigError(
+            f"--origin {latitude:g},{longitude:g}: is no latitude and longitude: give LAT,LON in "
+            "degrees"
+        )
+    projection = f"+proj=tmerc +lat_0={latitude!r} +lon_0={longitude!r} +k=1 +x_0=0 +y_0=0"
+    projection += " +datum=WGS84 +units=m +no_defs"
+    return ("--proj", projection, "--offset.disable-normalization")
 
 
-def _run(
+@dataclass
+class _Build:
+    source: Path
+    kind: MapKind
+    place: Path
+    options: tuple[str, ...]
+    origin: Origin | None
+    heights: HeightOptions | None
+    licences: tuple[str, str]
+    timeout_s: float
+    told: Told
+    log: BuildLog = field(default_factory=BuildLog)
+    defaults: tuple[RoadDefaults, ...] = ()
+    report: HeightReport | None = None
+
+    def run(self) -> None:
+        """Make the network beside its place, and put it there when it is whole."""
+        place = self.place
+        if place.exists() and place.samefile(self.source):
+            raise MapError(f"{place}: the target is the source: give another target")
+        place.parent.mkdir(parents=True, exist_ok=True)
+        for left in place.parent.glob(".build-*"):  # by a process that was killed
+            if time.time() - left.stat().st_mtime > _LEFT_S:
+                shutil.rmtree(left, ignore_errors=True)
+        with tempfile.TemporaryDirectory(dir=place.parent, prefix=".build-") as folder:
+            draft = Path(folder) / f"{map_name(place)}.net.xml"
+            self.told(STAGES[0])
+            if self.options:
+                self.log = _convert(self.kind, self.source, draft, self.options, self.timeout_s)
+            else:
+                draft.write_bytes(read_bytes(self.source))
+            content = self._finished(draft)
+            draft.write_bytes(gzip.compress(content, mtime=0) if place.suffix == ".gz" else content)
+            self.told(STAGES[3])
+            _check_readable(self.source, draft, self.log)
+            os.replace(draft, place)
+
+    def _finished(self, draft: Path) -> bytes:
+        """The network with what netconvert does not do: heights, and where it is from."""
+        if not self.options and self.heights is None:
+            return draft.read_bytes()
+        self.told(STAGES[1])
+        roads = OsmRoads(self.source) if self.kind == "osm" else None
+        document = NetDocument(draft)
+        _check_near(self.source, document, self.origin)
+        if roads is not None:
+            self.defaults = road_defaults(document, roads)
+        if self.heights is not None:
+            self.told(STAGES[2])
+            self.report = drape(document, self.heights, roads, self.source)
+            return document.content(head_of(self._facts(document)))
+        facts = head_of(self._facts(document))
+        content = _COMMENT.sub(b"", draft.read_bytes(), count=1)
+        return content.replace(b"<net ", facts + b"<net ", 1)
+
+    def _facts(self, document: NetDocument) -> dict[str, str]:
+        """What the map says of its own origin."""
+        facts = read_provenance(self.source) if self.kind == "sumo" else {}
+        if not facts:
+            facts = {"source": self.source.name, "source sha256": source_hash(self.source)}
+            facts["licence"] = self.licences[0] or (
+                OSM_LICENCE if self.kind == "osm" else NOT_STATED
+            )
+            if self.kind == "osm":
+                facts["attribution"] = OSM_ATTRIBUTION
+        if document.geo is not None:
+            offset = f"{document.geo.offset_x_m:.2f},{document.geo.offset_y_m:.2f} m"
+            facts |= {"projection": document.geo.projection, "offset": offset}
+        if self.origin is not None:
+            facts["origin"] = f"latitude {self.origin[0]!r}, longitude {self.origin[1]!r}"
+        if self.defaults:
+            facts["defaults"] = defaults_text(self.defaults)
+        if self.heights is not None and self.report is not None:
+            sums = [f"{path.name} (sha256 {source_hash(path)})" for path in self.heights.models]
+            facts["heights"] = ", ".join(sums)
+            facts["heights licence"] = self.licences[1] or NOT_STATED
+            facts["heights filled"] = f"{self.report.filled_places} of {self.report.places} places"
+        return facts
+
+
+def _check_near(source: Path, document: NetDocument, origin: Origin | None) -> None:
+    location = document.root.find("location")
+    if origin is None or location is None:
+        return
+    corners = [float(word) for word in location.get("convBoundary", "0").split(",")]
+    if max(map(abs, corners)) > _FAR_M or not all(map(math.isfinite, corners)):
+        raise ConfigError(
+            f"--origin {origin[0]:g},{origin[1]:g}: {source} lies more than {_FAR_M / 1e3:g} km "
+            "away: give LAT,LON in this order, near the roads"
+        )
+
+
+def _convert(
     kind: MapKind, source: Path, draft: Path, options: Sequence[str], timeout_s: float
 ) -> BuildLog:
-    """Run netconvert.
-
-    Raises MapError: it fails or takes too long.
-    """
-    home = Path(require("sumo", "sumo").SUMO_HOME)
-    command = [str(home / "bin" / "netconvert"), _INPUT[kind], str(source), "-o", str(draft)]
+    arguments = [_INPUT[kind], str(source), "-o", str(draft), *options]
     if kind in _TYPE_MAP:
-        command += ["-t", str(home / "data" / "typemap" / _TYPE_MAP[kind])]
-    command += [*options, "--verbose", "--aggregate-warnings=1000000", "--xml-validation=never"]
-    projections = str(home / "data" / "proj")
-    own = {"SUMO_HOME": str(home), "PROJ_DATA": projections, "PROJ_LIB": projections}
-    try:
-        done = subprocess.run(
-            dying_with_parent(command),
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=timeout_s,
-            env=os.environ | own,
-            check=False,
-        )
-    except subprocess.TimeoutExpired as error:
-        raise MapError(
-            f"{source}: netconvert took longer than {timeout_s:g} s: crop the map "
-            f"(cavmarl map build {source} --bbox …) or allow more time (--timeout-s)"
-        ) from error
-    log = BuildLog(done.stdout, done.stderr)
-    if done.returncode != 0 or not draft.exists():
-        tolerant = "--ignore-errors" in options
-        cure = "mend the source"
-        if not tolerant:
-            cure += f", or leave out what is broken: cavmarl map build {source} --tolerant"
-        raise MapError(
-            f"{source}: netconvert gave up (exit code {done.returncode}):\n"
-            f"{_quote(log.complaint())}\nCure: {cure}"
-        )
-    return log
+        arguments += ["-t", str(sumo_home() / "data" / "typemap" / _TYPE_MAP[kind])]
+    cures = Cures(
+        f"crop the map (cavmarl map build {source} --bbox …) or allow more time (--timeout-s)",
+        "mend the source"
+        if "--ignore-errors" in options
+        else f"mend the source, or leave out what is broken: cavmarl map build {source} --tolerant",
+    )
+    return run_netconvert(arguments, source, timeout_s, cures)
 
 
 def _check_readable(source: Path, draft: Path, log: BuildLog) -> None:
@@ -309,12 +330,5 @@ def _check_readable(source: Path, draft: Path, log: BuildLog) -> None:
         message = f"{source}: {str(error).removeprefix(f'{draft}: ')}"
         said = (*log.errors(), *log.warnings())
         if said:
-            message += f"\nnetconvert said:\n{_quote(said)}"
+            message += f"\nnetconvert said:\n{quoted(said)}"
         raise MapError(message) from error
-
-
-def _quote(lines: Sequence[str]) -> str:
-    shown = [f"  {line}" for line in lines[:_SHOWN_LINES]]
-    if len(lines) > _SHOWN_LINES:
-        shown.append(f"  … and {len(lines) - _SHOWN_LINES} more")
-    return "\n".join(shown)

@@ -31,3 +31,13 @@ def project(source: Path | str, degrees: Places, geo: GeoReference) -> Places:
             "projected as the map is: export the file again for this map"
         )
     return placed
+
+
+def unproject(places: Places, geo: GeoReference) -> Places:
+    """Longitudes and latitudes (n, 2) of x and y in m (n, 2).
+
+    Raises MissingExtraError: pyproj is not installed.
+    """
+    pyproj: Any = require("pyproj", "maps")
+    east, north = places[:, 0] - geo.offset_x_m, places[:, 1] - geo.offset_y_m
+    return np.stack(pyproj.Proj(projparams=geo.projection)(east, north, inverse=True), axis=1)

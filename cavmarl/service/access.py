@@ -114,13 +114,13 @@ class Access:
             keys.append({**found, "kid": number, "alg": ALGORITHM, "use": "sig"})
         return {"keys": keys}
 
-    def exchange(self, secret: str | None, refresh_token: str | None) -> dict[str, Any]:
-        """Tokens for a secret, or for a refresh token that was not used yet."""
-        if (secret is None) == (refresh_token is None):
-            raise problem("bad-body", "give one of secret and refresh_token")
-        if secret is not None:
-            return self._tokens(self._by_secret(secret))
-        claims = self._verify(refresh_token or "", "refresh")
+    def exchange(self, secret: str) -> dict[str, Any]:
+        """Tokens for a secret."""
+        return self._tokens(self._by_secret(secret))
+
+    def refresh(self, refresh_token: str) -> dict[str, Any]:
+        """Tokens for a refresh token that was not used yet."""
+        claims = self._verify(refresh_token, "refresh")
         identity = self._identity(claims["sub"])
         if claims["jti"] in identity.used:  # it was stolen, or its answer was
             self._log.record("identity.withdrawn", identity.id)

@@ -18,7 +18,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from cavmarl.core.errors import ServiceError
 from cavmarl.service.guards import Service, rule_of
-from cavmarl.service.problems import add_handlers, answer
+from cavmarl.service.problems import answer, serve_routes
 from cavmarl.service.routes import ROUTERS
 from cavmarl.service.service_metrics import ServiceMetrics
 
@@ -65,8 +65,7 @@ def make_app(service: Service, sweep_s: float = 0.5) -> ASGIApp:
     app.state.metrics = ServiceMetrics(service.broker)
     for router in ROUTERS:
         _check_rules(router)
-        app.include_router(router)
-    add_handlers(app)
+    serve_routes(app, ROUTERS)
     return GuardedRequests(app)
 
 

@@ -14,7 +14,12 @@ Host = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9:][A-Za-z0-9:.-]{0,
 Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
 Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 Port = Annotated[int, Field(ge=1, le=65535)]
+Whole = Annotated[int, Field(ge=0, lt=1 << 53)]  # JSON has these exactly
 Words = Annotated[list[Word], Field(max_length=64)]
+
+
+NO_OTHERS: Any = {"additionalProperties": False}  # keys than those of the pattern
+MAX_WAIT_S = 7 * 86_400.0  # of a job
 
 
 class _Body(BaseModel):
@@ -30,7 +35,7 @@ class NodeBody(_Body):
     simulator_port: Port
     slots: Annotated[int, Field(ge=1, le=10_000)] = 4
     capabilities: Words = []
-    versions: Annotated[dict[Word, Word], Field(max_length=32)] = {}
+    versions: Annotated[dict[Word, Word], Field(max_length=32, json_schema_extra=NO_OTHERS)] = {}
     allowed: Words = []
 
 
@@ -44,7 +49,8 @@ class BeatBody(_Body):
     gpu: Share = 0.0
     sent_s: Annotated[float, Field(allow_inf_nan=False)]
     counters: Annotated[
-        dict[Word, Annotated[float, Field(allow_inf_nan=False)]], Field(max_length=32)
+        dict[Word, Annotated[float, Field(allow_inf_nan=False)]],
+        Field(max_length=32, json_schema_extra=NO_OTHERS),
     ] = {}
 
 
@@ -59,7 +65,7 @@ class ConfigurationBody(_Body):
     zones: Annotated[int, Field(ge=1, le=1024)] | None = None
     nodes: Annotated[int, Field(ge=1, le=64)] | None = None  # that host the zones; None: one
     num_envs: Annotated[int, Field(ge=1, le=1024)] = 1
-    seed: Annotated[int, Field(ge=0, lt=1 << 63)] = 0
+    seed: Whole = 0
     overrides: Annotated[dict[str, Any], Field(max_length=256)] = {}
 
 
@@ -77,9 +83,6 @@ class ResolveBody(_Body):
 
     unreachable: Annotated[list[Name], Field(max_length=16)] = []
     wait_s: Annotated[float, Field(ge=0.0, le=60.0)] = 0.0
-
-
-Whole = Annotated[int, Field(ge=0, lt=1 << 63)]
 
 
 class TransfersBody(_Body):
@@ -113,6 +116,8 @@ class JobBody(_Body):
     repeats: Annotated[int, Field(ge=1, le=1000)] = 1
     node: Name | None = None
     needs: Words = []
+    # so long it may wait for its first node; none: as long as it takes
+    wait_s: Annotated[float, Field(ge=0.0, le=MAX_WAIT_S)] | None = None
 
 
 class OutcomeBody(_Body):
@@ -129,8 +134,13 @@ class IdentityBody(_Body):
     role: Role
 
 
-class TokenBody(_Body):
-    """A secret, or a refresh token, in exchange for an access token."""
+class SecretBody(_Body):
+    """A secret, in exchange for tokens."""
 
-    secret: Annotated[str, StringConstraints(max_length=256)] | None = None
-    refresh_token: Annotated[str, StringConstraints(max_length=4096)] | None = None
+    secret: Annotated[str, StringConstraints(max_length=256)]
+
+
+class RefreshBody(_Body):
+    """A refresh token, in exchange for new ones."""
+
+    refresh_token: Annotated[str, StringConstraints(max_length=4096)]

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 from fastapi import Depends, Request, Response
+from fastapi.openapi.models import HTTPBearer
 from fastapi.routing import APIRoute
+from fastapi.security.base import SecurityBase
 
 from cavmarl.core.errors import ServiceError
 from cavmarl.service.access import Access, RateLimit
@@ -43,8 +45,20 @@ async def _given(request: Request) -> Service:
 TheService = Annotated[Service, Depends(_given)]  # what is not async would go through a thread
 
 
-class may:
+class Rule:
     """Lets the identities of some roles use a route; it gives the route the identity."""
+
+    roles: frozenset[str]
+
+    async def __call__(self, request: Request) -> IdentityRecord:
+        raise NotImplementedError
+
+
+class may(Rule, SecurityBase):
+    """A route for identities of some roles, which send a token."""
+
+    model = HTTPBearer(bearerFormat="JWT", description="An access token of POST /v1/token")
+    scheme_name = "token"
 
     def __init__(self, *roles: str) -> None:
         assert set(roles) <= set(ROLES)
@@ -70,18 +84,34 @@ class may:
         return identity
 
 
-class open_to_all(may):
+class open_to_all(Rule):
     """A route without a token: counted by address."""
 
-    def __init__(self) -> None:
-        super().__init__(*ROLES)
+    roles = frozenset(ROLES)
 
     async def __call__(self, request: Request) -> IdentityRecord:
         service_of(request).by_address.take(_address(request))
         return IdentityRecord("nobody", "nobody", "viewer", "")
 
 
-class DurableRoute(APIRoute):
+class StrictRoute(APIRoute):
+    """A route that refuses parameters which it does not know: a typo is not ignored."""
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        handle = super().get_route_handler()
+        known = {one.alias for one in self.dependant.query_params}
+
+        async def check_and_handle(request: Request) -> Response:
+            for name in request.query_params if request.scope["query_string"] else ():
+                if name not in known:
+                    there = ", ".join(sorted(known)) or "none"
+                    raise problem("bad-body", f"query.{name[:64]}: unknown; there are: {there}")
+            return await handle(request)
+
+        return check_and_handle
+
+
+class DurableRoute(StrictRoute):
     """A route that answers when what it tells of is on disk."""
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
@@ -101,10 +131,10 @@ class DurableRoute(APIRoute):
         return handle_and_settle
 
 
-def rule_of(route: APIRoute) -> may | None:
+def rule_of(route: APIRoute) -> Rule | None:
     """The dependency that says which roles may use a route."""
     for one in route.dependant.dependencies:
-        if isinstance(one.call, may):
+        if isinstance(one.call, Rule):
             return one.call
     return None
 

@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 ROLES = ("viewer", "client", "operator", "admin", "node")
 Role = Literal["viewer", "client", "operator", "admin", "node"]
 
+SessionState = Literal["queued", "active", "closed", "done", "failed"]
 SESSION_OVER = ("closed", "done", "failed")
 KEPT_OWNERS = 10_000  # of a world
 
@@ -60,7 +61,9 @@ class SessionRecord:
     job: dict[str, Any] | None  # policy, episodes, repeats; None: a client steps the world
     needs: list[str]  # capabilities
     preferred: str | None  # name of a node
-    state: str = "queued"  # queued, active, closed, done, failed
+    opened_s: float = 0.0  # by the wall clock
+    wait_s: float | None = None  # so long a job waits for its first node; None: as long as it takes
+    state: SessionState = "queued"
     node: str | None = None
     incarnation: int = 0  # of that node
     placements: int = 0
@@ -169,12 +172,12 @@ class Infrastructure:
     def _apply_session(self, word: str, event: LogEvent) -> None:
         if word == "opened":
             self.sessions[event.subject] = SessionRecord(
-                id=event.subject, owner=event.owner, **event.data
+                id=event.subject, owner=event.owner, opened_s=event.time_s, **event.data
             )
             if event.data["job"] is not None:
                 self.waiting.add(event.subject)
             return
-        if word == "refused":  # it was never opened
+        if word in ("refused", "timeout"):  # what comes of it is told beside it
             return
         if word == "forgotten":
             del self.sessions[event.subject]

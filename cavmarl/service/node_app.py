@@ -21,14 +21,16 @@ from cavmarl.client.world_flows import SAVED_HEADER
 from cavmarl.core.errors import ServiceError, WorkerError
 from cavmarl.service.access import ALGORITHM, ISSUER
 from cavmarl.service.app import NO_TELEMETRY, GuardedRequests
+from cavmarl.service.bodies import Whole
+from cavmarl.service.guards import StrictRoute
 from cavmarl.service.node_link import NodeLink
-from cavmarl.service.problems import add_handlers
+from cavmarl.service.problems import serve_routes
 from cavmarl.service.refusals import problem
 from cavmarl.service.session_worlds import SAVED_EVERY, SessionWorlds
 
 MAX_ACTIONS_BYTES = 16 * 1024 * 1024
 
-router = APIRouter(prefix="/v1/worlds/{session}")
+router = APIRouter(prefix="/v1/worlds/{session}", route_class=StrictRoute)
 
 
 def _link(request: Request) -> NodeLink:
@@ -73,8 +75,7 @@ def make_node_app(link: NodeLink, worlds: SessionWorlds) -> ASGIApp:
         telemetry=NO_TELEMETRY,
     )
     app.state.link, app.state.worlds = link, worlds
-    app.include_router(router)
-    add_handlers(app)
+    serve_routes(app, [router])
     return GuardedRequests(app, body_bytes=MAX_ACTIONS_BYTES)
 
 
@@ -110,7 +111,7 @@ async def command(
     word: str,
     _: Opened,
     number: Annotated[int, Query(ge=1)],
-    seed: Annotated[int | None, Query(ge=0, lt=1 << 63)] = None,
+    seed: Annotated[Whole | None, Query()] = None,
     quiet: bool = False,
 ) -> Response:
     """`reset`, or `step` with the actions as little-endian numbers; the answer is an .npz."""

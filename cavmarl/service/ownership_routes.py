@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from cavmarl.service import bodies
+from cavmarl.service import answers, bodies
 from cavmarl.service.guards import TheService
 from cavmarl.service.route_parts import Nodes, Readers, SessionId, make_router
 
@@ -14,22 +12,23 @@ ownership = make_router("/v1/sessions/{number}", "ownership")
 @ownership.get("/transfers")
 async def get_transfers(
     identity: Readers, service: TheService, number: SessionId
-) -> dict[str, Any]:
+) -> answers.Ownership:
     """Owners of vehicles that have changed their zone, and vehicles that another has PREPARED."""
     session = service.broker.session(identity, number)
-    return {
-        "number": session.told_number,
-        "owners": [
-            {"world": int(world), "episode": table.episode, "vehicle": vehicle, "zone": zone,
-             "epoch": epoch}
-            for world, table in session.owners.items()
-            for vehicle, (zone, epoch) in table.zones.items()
-        ],
-        "in_flight": [
-            dict(zip(("world", "vehicle", "source", "target"), row, strict=True), state="PREPARED")
-            for row in service.broker.prepared.get(number, ())
-        ],
-    }  # fmt: skip
+    owners = [
+        answers.OwnerOfVehicle(
+            world=int(world), episode=table.episode, vehicle=vehicle, zone=zone, epoch=epoch
+        )
+        for world, table in session.owners.items()
+        for vehicle, (zone, epoch) in table.zones.items()
+    ]
+    in_flight = [
+        answers.InFlight(
+            world=world, vehicle=vehicle, source=source, target=target, state="PREPARED"
+        )
+        for world, vehicle, source, target in service.broker.prepared.get(number, ())
+    ]
+    return answers.Ownership(number=session.told_number, owners=owners, in_flight=in_flight)
 
 
 @ownership.put("/transfers", status_code=204)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from typing import Any
 
-from fastapi import FastAPI, Request
+from fastapi import APIRouter, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
@@ -41,8 +42,11 @@ def answer(
     return JSONResponse(body, status or known, headers, media_type=PROBLEM_TYPE)
 
 
-def add_handlers(app: FastAPI) -> None:
-    """Let each error of an application be answered as a problem."""
+def serve_routes(app: FastAPI, routers: Sequence[APIRouter]) -> None:
+    """Add routes to an application, each of whose errors is answered as a problem."""
+    app.state.routes = [one for router in routers for one in router.routes]
+    for router in routers:
+        app.include_router(router)
     app.add_exception_handler(CavmarlError, _on_error)
     app.add_exception_handler(RequestValidationError, _on_validation)
     app.add_exception_handler(HTTPException, _on_http)
@@ -83,11 +87,22 @@ def _percent(found: dict[str, Any]) -> str:
     return ""
 
 
-async def _on_http(_: Request, error: Exception) -> JSONResponse:
+async def _on_http(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, HTTPException)
     name = _BY_STATUS.get(error.status_code, "bad-body")
     headers = dict(error.headers or {})
+    if error.status_code == 405:
+        headers["Allow"] = ", ".join(sorted(_methods_of(request)))
     return answer(name, str(error.detail), status=error.status_code, headers=headers)
+
+
+def _methods_of(request: Request) -> set[str]:
+    """All methods of a path: the router itself names those of the first route alone."""
+    methods: set[str] = set()
+    for route in request.app.state.routes:
+        if route.path_regex.fullmatch(request.scope["path"]):
+            methods |= route.methods
+    return methods
 
 
 async def _on_fault(_: Request, error: Exception) -> JSONResponse:

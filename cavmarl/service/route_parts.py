@@ -21,6 +21,12 @@ BYTES: dict[int | str, dict[str, Any]] = {
         "content": {"application/octet-stream": {"schema": {"type": "string"}}},
     }
 }
+CONTENT = {  # of a request whose body is no document
+    "requestBody": {
+        "required": True,
+        "content": {"application/octet-stream": {"schema": {"type": "string"}}},
+    }
+}
 
 
 def make_router(prefix: str, tag: str) -> APIRouter:

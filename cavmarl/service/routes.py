@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-import asyncio
-import json
-import time
-from collections.abc import AsyncIterator, Callable
-from dataclasses import asdict
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import Header, Path, Query, Request, Response
 from fastapi.responses import JSONResponse, PlainTextResponse, StreamingResponse
 
-from cavmarl.service import bodies, configurations
-from cavmarl.service.guards import Service, TheService
-from cavmarl.service.infrastructure import (
-    IdentityRecord,
-    LogEvent,
-    NodeRecord,
-    SessionRecord,
-)
-from cavmarl.service.node_selection import NoNodeError, score_of
+from cavmarl.service import answers, bodies, configurations
+from cavmarl.service.guards import TheService
+from cavmarl.service.infrastructure import SessionRecord
 from cavmarl.service.ownership_routes import ownership
 from cavmarl.service.refusals import problem
+from cavmarl.service.route_answers import (
+    assigned,
+    event_answer,
+    event_stream,
+    node_answer,
+    session_answer,
+)
 from cavmarl.service.route_parts import (
     BYTES,
+    CONTENT,
     Admins,
     Anybody,
     Clients,
@@ -50,26 +47,28 @@ PAGE = 1000
 IdempotencyKey = Annotated[
     str, Header(alias="Idempotency-Key", pattern=r"^[A-Za-z0-9-]{0,64}$")
 ]  # the same request with the same key is carried out once
-TLS = "tls"  # the capability of nodes whose clients' port has it
-KEEP_ALIVE_S = 15.0
 
 
 @open_routes.get("/health")
-async def health(_: Anybody, service: TheService) -> dict[str, Any]:
+async def health(_: Anybody, service: TheService) -> answers.Health:
     """Whether the service is there, and how many events it has."""
-    return {"status": "ok", "events": service.broker.log.sequence}
+    return answers.Health(status="ok", events=service.broker.log.sequence)
 
 
 @open_routes.get("/keys")
-async def keys(_: Anybody, service: TheService) -> dict[str, Any]:
+async def keys(_: Anybody, service: TheService) -> answers.PublicKeys:
     """The public keys that verify tokens: a JSON Web Key Set."""
-    return service.access.public_keys()
+    return answers.PublicKeys(**service.access.public_keys())
 
 
 @open_routes.post("/token")
-async def token(_: Anybody, service: TheService, body: bodies.TokenBody) -> dict[str, Any]:
+async def token(
+    _: Anybody, service: TheService, body: bodies.SecretBody | bodies.RefreshBody
+) -> answers.Tokens:
     """An access token and a refresh token for a secret, or for a refresh token."""
-    return service.access.exchange(body.secret, body.refresh_token)
+    if isinstance(body, bodies.SecretBody):
+        return answers.Tokens(**service.access.exchange(body.secret))
+    return answers.Tokens(**service.access.refresh(body.refresh_token))
 
 
 @open_routes.delete("/token", status_code=204)
@@ -78,7 +77,7 @@ async def withdraw(identity: Everyone, service: TheService) -> None:
     service.access.withdraw(identity)
 
 
-@nodes.post("/{name}/beat")
+@nodes.post("/{name}/beat", response_model=answers.Duties)  # not checked again: it is often
 async def beat(
     identity: Nodes, service: TheService, name: NodeName, body: bodies.BeatBody
 ) -> JSONResponse:
@@ -90,55 +89,59 @@ async def beat(
 
 
 @nodes.get("")
-async def list_nodes(_: Readers, service: TheService) -> dict[str, Any]:
+async def list_nodes(_: Readers, service: TheService) -> answers.NodeList:
     """All nodes, with what their last beats said."""
-    return {"nodes": [_node(service, one) for one in service.broker.log.state.nodes.values()]}
+    known = service.broker.log.state.nodes.values()
+    return answers.NodeList(nodes=[node_answer(service, one) for one in known])
 
 
 @nodes.post("", status_code=201)
-async def register(identity: Nodes, service: TheService, body: bodies.NodeBody) -> dict[str, Any]:
+async def register(
+    identity: Nodes, service: TheService, body: bodies.NodeBody
+) -> answers.NodeStatus:
     """Register a node, or register it anew after it has left, died or begun again."""
-    return _node(service, service.broker.register(identity, body))
+    return node_answer(service, service.broker.register(identity, body))
 
 
 @nodes.post("/{name}/drain")
-async def drain(identity: Drainers, service: TheService, name: NodeName) -> dict[str, Any]:
+async def drain(identity: Drainers, service: TheService, name: NodeName) -> answers.NodeStatus:
     """Give a node nothing more, and move what it has."""
-    return _node(service, service.broker.drain(identity, name))
+    return node_answer(service, service.broker.drain(identity, name))
 
 
 @nodes.post("/{name}/resume")
-async def resume(identity: Operators, service: TheService, name: NodeName) -> dict[str, Any]:
+async def resume(identity: Operators, service: TheService, name: NodeName) -> answers.NodeStatus:
     """Let a drained node take sessions again."""
-    return _node(service, service.broker.drain(identity, name, is_on=False))
+    return node_answer(service, service.broker.drain(identity, name, is_on=False))
 
 
 @nodes.delete("/{name}")
-async def leave(identity: Drainers, service: TheService, name: NodeName) -> dict[str, Any]:
+async def leave(identity: Drainers, service: TheService, name: NodeName) -> answers.NodeStatus:
     """A node ends."""
-    return _node(service, service.broker.leave(identity, name))
+    return node_answer(service, service.broker.leave(identity, name))
 
 
 @worlds.post("/configurations", status_code=201)
 async def add_configuration(
     identity: Clients, service: TheService, body: bodies.ConfigurationBody
-) -> dict[str, Any]:
+) -> answers.Configuration:
     """Check and keep a configuration; another content is another version."""
-    return configurations.add_configuration(service.broker.log, identity, body)
+    found = configurations.add_configuration(service.broker.log, identity, body)
+    return answers.Configuration(**found)
 
 
 @worlds.get("/configurations/{sha256}")
 async def get_configuration(
     _: Everyone, service: TheService, sha256: Annotated[bodies.Sha256, Path()]
-) -> dict[str, Any]:
+) -> bodies.ConfigurationBody:
     """A configuration by its hash."""
-    return configurations.read_configuration(service.broker.log, sha256)
+    return bodies.ConfigurationBody(**configurations.read_configuration(service.broker.log, sha256))
 
 
 @worlds.post("/sessions", status_code=201)
 async def open_session(
     identity: Clients, service: TheService, body: bodies.SessionBody, key: IdempotencyKey = ""
-) -> dict[str, Any]:
+) -> answers.Assignment:
     """Open a session on the node that eq. (1) and (2) choose, or on a preferred one."""
     found = configurations.read_configuration(service.broker.log, body.configuration)
 
@@ -152,41 +155,41 @@ async def open_session(
             key=key,
         )
 
-    return await _assigned(service, identity, body.configuration, opened, body.wait_s)
+    return await assigned(service, identity, body.configuration, opened, body.wait_s)
 
 
 @worlds.post("/sessions/{number}/resolve")
 async def resolve(
     identity: Clients, service: TheService, number: SessionId, body: bodies.ResolveBody
-) -> dict[str, Any]:
+) -> answers.Assignment:
     """Where a session is now, and a new lease of it."""
 
     def resolved() -> SessionRecord:
         return service.broker.resolve(identity, number, body.unreachable)
 
-    return await _assigned(service, identity, number, resolved, body.wait_s)
+    return await assigned(service, identity, number, resolved, body.wait_s)
 
 
 @worlds.get("/sessions")
-async def list_sessions(identity: Readers, service: TheService) -> dict[str, Any]:
+async def list_sessions(identity: Readers, service: TheService) -> answers.SessionList:
     """Sessions and jobs: a client's own, or all."""
     found = service.broker.log.state.sessions.values()
-    is_all = identity.role != "client"
-    return {"sessions": [_session(one) for one in found if is_all or one.owner == identity.id]}
+    own = [one for one in found if identity.role != "client" or one.owner == identity.id]
+    return answers.SessionList(sessions=list(map(session_answer, own)))
 
 
 @worlds.get("/sessions/{number}")
-async def get_session(identity: Readers, service: TheService, number: SessionId) -> dict[str, Any]:
+async def get_session(identity: Readers, service: TheService, number: SessionId) -> answers.Session:
     """A session or a job."""
-    return _session(service.broker.session(identity, number))
+    return session_answer(service.broker.session(identity, number))
 
 
 @worlds.delete("/sessions/{number}")
 async def close_session(
     identity: Clients, service: TheService, number: SessionId
-) -> dict[str, Any]:
+) -> answers.Session:
     """End a session or a job."""
-    return _session(service.broker.close(identity, number))
+    return session_answer(service.broker.close(identity, number))
 
 
 @worlds.get(
@@ -204,13 +207,13 @@ async def get_state(identity: Nodes, service: TheService, number: SessionId) -> 
     return Response(content, headers=headers, media_type="application/octet-stream")
 
 
-@worlds.put("/sessions/{number}/state", status_code=204)
+@worlds.put("/sessions/{number}/state", status_code=204, openapi_extra=CONTENT)
 async def put_state(
     identity: Nodes,
     service: TheService,
     request: Request,
     number: SessionId,
-    at: Annotated[int, Query(ge=0)],
+    at: Annotated[bodies.Whole, Query()],
 ) -> None:
     """Save the state of a session after so many commands."""
     content = await request.body()
@@ -220,13 +223,13 @@ async def put_state(
 @worlds.post("/jobs", status_code=201)
 async def submit(
     identity: Clients, service: TheService, body: bodies.JobBody, key: IdempotencyKey = ""
-) -> dict[str, Any]:
+) -> answers.Session:
     """Have a node evaluate drivers; where none can, the job waits for one."""
     if configurations.read_configuration(service.broker.log, body.configuration).get("nodes"):
         raise problem("refused", "nodes: an evaluation runs on one node; leave it out")
     configurations.check_policies(body.policies)
     job = body.model_dump(include={"policies", "episodes", "repeats"})
-    return _session(
+    return session_answer(
         service.broker.open(
             identity, body.configuration, preferred=body.node, needs=body.needs, job=job, key=key
         )
@@ -236,14 +239,14 @@ async def submit(
 @worlds.post("/jobs/{number}/outcome")
 async def finish(
     identity: Nodes, service: TheService, number: SessionId, body: bodies.OutcomeBody
-) -> dict[str, Any]:
+) -> answers.Session:
     """A node has ended a job."""
     session = service.broker.hosted(identity, number)
     service.broker.finish(session, body.status, body.message)
-    return _session(session)
+    return session_answer(session)
 
 
-@worlds.put("/jobs/{number}/results/{name}", status_code=204)
+@worlds.put("/jobs/{number}/results/{name}", status_code=204, openapi_extra=CONTENT)
 async def put_result(
     identity: Nodes, service: TheService, request: Request, number: SessionId, name: FileName
 ) -> None:
@@ -268,13 +271,14 @@ async def get_result(
 async def events(
     identity: Readers,
     service: TheService,
-    after: Annotated[int, Query(ge=0)] = 0,
+    after: Annotated[bodies.Whole, Query()] = 0,
     limit: Annotated[int, Query(ge=1, le=PAGE)] = 100,
-) -> dict[str, Any]:
+) -> answers.EventList:
     """Events after a sequence number: a client's own, or all."""
     owner = identity.id if identity.role == "client" else None
     await service.broker.log.settle()
-    return {"events": [_event(one) for one in service.broker.log.read(after, limit, owner)]}
+    found = service.broker.log.read(after, limit, owner)
+    return answers.EventList(events=list(map(event_answer, found)))
 
 
 @records.get("/events/stream", response_class=StreamingResponse)
@@ -282,12 +286,12 @@ async def stream(
     identity: Readers,
     service: TheService,
     request: Request,
-    after: Annotated[int, Query(ge=0)] = 0,
+    after: Annotated[bodies.Whole, Query()] = 0,
 ) -> StreamingResponse:
     """Events as they come, as server-sent events; `Last-Event-ID` goes on where one ended."""
     last = request.headers.get("last-event-id", "")
     after = int(last) if last.isascii() and last.isdigit() and len(last) < 19 else after
-    lines = _stream(service, identity, after)
+    lines = event_stream(service, identity, after)
     return StreamingResponse(lines, media_type="text/event-stream")
 
 
@@ -300,18 +304,21 @@ async def metrics(_: Viewers, request: Request) -> PlainTextResponse:
 @records.post("/identities", status_code=201)
 async def add_identity(
     identity: Admins, service: TheService, body: bodies.IdentityBody
-) -> dict[str, Any]:
+) -> answers.NewIdentity:
     """A new identity, and its secret, which is shown this once."""
     found, secret = service.access.add_identity(body.name, body.role, identity.id)
-    return {"identity": found.id, "name": found.name, "role": found.role, "secret": secret}
+    return answers.NewIdentity(identity=found.id, name=found.name, role=found.role, secret=secret)
 
 
 @records.get("/identities")
-async def list_identities(_: Admins, service: TheService) -> dict[str, Any]:
+async def list_identities(_: Admins, service: TheService) -> answers.IdentityList:
     """All identities."""
     known = service.broker.log.state.identities.values()
-    names = ("id", "name", "role", "revoked")
-    return {"identities": [{name: getattr(one, name) for name in names} for one in known]}
+    shown = [
+        answers.Identity(id=one.id, name=one.name, role=one.role, revoked=one.revoked)
+        for one in known
+    ]
+    return answers.IdentityList(identities=shown)
 
 
 @records.delete("/identities/{number}", status_code=204)
@@ -325,96 +332,6 @@ async def revoke(
 
 
 @records.post("/keys", status_code=201)
-async def rotate(identity: Admins, service: TheService) -> dict[str, Any]:
+async def rotate(identity: Admins, service: TheService) -> answers.NewKey:
     """Sign tokens with a new key; those of the key before stay valid."""
-    return {"key": service.access.rotate_key(identity.id)}
-
-
-async def _assigned(
-    service: Service,
-    identity: IdentityRecord,
-    subject: str,  # of the event, if there is no node
-    take: Callable[[], SessionRecord],
-    wait_s: float,
-) -> dict[str, Any]:
-    """What a client needs to reach its world; it waits for a node until a deadline."""
-    broker = service.broker
-    until_s = time.monotonic() + wait_s
-    while True:
-        try:
-            session = take()
-            break
-        except NoNodeError as error:
-            left_s = until_s - time.monotonic()
-            if left_s <= 0.0:
-                broker.refuse(identity, subject, error)
-                raise
-            await broker.log.settle()
-            broker.waiting += 1
-            try:
-                async with asyncio.timeout(left_s), broker.log.changed:
-                    await broker.log.changed.wait()
-            except TimeoutError:
-                continue
-            finally:
-                broker.waiting -= 1
-    node = broker.log.state.nodes[session.node or ""]
-    lease_s = broker.rules.lease_s
-    return {
-        "session": session.id,
-        "requested": session.preferred,
-        "assigned": node.name,
-        "redirected": session.preferred not in (None, node.name),
-        "reason": session.reason,
-        "score": session.score,
-        "scheme": "https" if TLS in node.capabilities else "http",
-        "address": node.address,
-        "client_port": node.client_port,
-        "simulator_port": node.simulator_port,
-        "configuration": session.configuration,
-        "lease_s": lease_s,
-        "expires_s": broker.log.wall_s() + lease_s,
-        "token": service.access.session_token(session, lease_s),
-    }
-
-
-def _node(service: Service, node: NodeRecord) -> dict[str, Any]:
-    live = service.broker.live[node.name]
-    return {
-        **asdict(node),
-        "load": live.use and asdict(live.use),
-        "score": score_of(node, live),
-        "sessions": len(live.hosted),
-        "age_s": round(service.broker.age_s(node.name), 3),
-    }
-
-
-def _session(session: SessionRecord) -> dict[str, Any]:
-    found = asdict(session)
-    del found["saved_blob"], found["owners"]
-    return found
-
-
-def _event(line: LogEvent) -> dict[str, Any]:
-    found = line._asdict()
-    del found["private"]
-    return found
-
-
-async def _stream(service: Service, identity: IdentityRecord, after: int) -> AsyncIterator[str]:
-    log = service.broker.log
-    owner = identity.id if identity.role == "client" else None
-    generation = identity.generation
-    while identity.generation == generation:  # its tokens are void: it hears no more
-        last = log.durable
-        for line in log.read(after, last - after, owner) if last > after else ():
-            text = json.dumps(_event(line), separators=(",", ":"))
-            yield f"id: {line.sequence}\nevent: {line.kind}\ndata: {text}\n\n"
-        after = max(after, last)
-        if log.durable > after:
-            continue
-        try:
-            async with asyncio.timeout(KEEP_ALIVE_S), log.changed:
-                await log.changed.wait()
-        except TimeoutError:
-            yield ": still here\n\n"
+    return answers.NewKey(key=service.access.rotate_key(identity.id))

@@ -24,7 +24,7 @@ MAX_REQUESTS = 1000  # that wait for the world
 
 
 @dataclass(eq=False)
-class Watcher:
+class PageWatcher:
     """One page that is open; of the server's thread."""
 
     number: int
@@ -82,7 +82,7 @@ class Audience:
     def __init__(self) -> None:
         self.wishes = Wishes()
         self.dropped = 0
-        self._watchers: dict[int, Watcher] = {}
+        self._watchers: dict[int, PageWatcher] = {}
         self._numbers = 0
         self._requests: queue.Queue[tuple[int, PageRequest]] = queue.Queue(MAX_REQUESTS)
         self._asked = threading.Event()
@@ -129,9 +129,9 @@ class Audience:
         """Say on which loop the watchers are served."""
         self._loop = loop
 
-    def join(self) -> Watcher:
+    def join(self) -> PageWatcher:
         self._numbers += 1
-        watcher = Watcher(self._numbers)
+        watcher = PageWatcher(self._numbers)
         self._watchers[watcher.number] = watcher
         if self._last is not None:
             watcher.offer(self._last)
@@ -141,12 +141,12 @@ class Audience:
         self._asked.set()
         return watcher
 
-    def leave(self, watcher: Watcher) -> None:
+    def leave(self, watcher: PageWatcher) -> None:
         self._watchers.pop(watcher.number, None)
         self._update()
         self.ask(watcher, PageRequest("seat"))  # nobody sits in its seat any more
 
-    def ask(self, watcher: Watcher, request: PageRequest) -> None:
+    def ask(self, watcher: PageWatcher, request: PageRequest) -> None:
         """Take a request of a page; beyond MAX_REQUESTS they are not kept."""
         if request.kind in ("watch", "ghosts"):
             number = None if request.number is None else int(request.number)

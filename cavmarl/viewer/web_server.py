@@ -22,7 +22,7 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 
 from cavmarl.core.errors import MessageError, ServiceError
 from cavmarl.core.listening import is_loopback, listen, shown_host
-from cavmarl.viewer.audience import Audience, Watcher
+from cavmarl.viewer.audience import Audience, PageWatcher
 from cavmarl.viewer.page_requests import CONTROLS, MAX_TEXT, read_object, read_request
 from cavmarl.viewer.web_options import WebOptions
 
@@ -226,7 +226,7 @@ class _LiveSocket:
                 return False
         return True
 
-    async def _watch(self, watcher: Watcher) -> None:
+    async def _watch(self, watcher: PageWatcher) -> None:
         """Send and listen until either ends."""
         tasks = {
             asyncio.create_task(self._send_news(watcher)),
@@ -241,7 +241,7 @@ class _LiveSocket:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
 
-    async def _send_news(self, watcher: Watcher) -> None:
+    async def _send_news(self, watcher: PageWatcher) -> None:
         while not watcher.is_lost:
             await watcher.news.wait()
             try:
@@ -258,7 +258,7 @@ class _LiveSocket:
             else:
                 await self._socket.send_bytes(message)
 
-    async def _listen(self, watcher: Watcher) -> None:
+    async def _listen(self, watcher: PageWatcher) -> None:
         while True:
             try:
                 request = read_request(await self._socket.receive_text())

@@ -12,7 +12,7 @@ import pytest
 
 from cavmarl.config.registry import find_entry
 from cavmarl.core.errors import ConfigError, MapError
-from cavmarl.maps import netconvert
+from cavmarl.maps import netconvert_process
 from cavmarl.maps.netconvert import OSM_OPTIONS, build_network, map_file
 from cavmarl.roads.sumo_net.reader import read_network
 
@@ -210,7 +210,7 @@ def test_without_sumo_the_extra_is_named(
     def missing(module: str, extra: str) -> None:
         raise MapError(f"no {module}, install {extra}")
 
-    monkeypatch.setattr(netconvert, "require", missing)
+    monkeypatch.setattr(netconvert_process, "require", missing)
     with pytest.raises(MapError, match="no sumo, install sumo"):
         build_network(town, tmp_path / "out.net.xml")
 
@@ -225,8 +225,8 @@ def test_netconvert_ends_with_the_process_that_runs_it(tmp_path: Path, how: sign
     source.write_text("<osm/>")
     program = (
         "import sys; from pathlib import Path; from types import SimpleNamespace; "
-        "from cavmarl.maps import netconvert; "
-        f"netconvert.require = lambda *_: SimpleNamespace(SUMO_HOME={str(tmp_path)!r}); "
+        "from cavmarl.maps import netconvert, netconvert_process; "
+        f"netconvert_process.require = lambda *_: SimpleNamespace(SUMO_HOME={str(tmp_path)!r}); "
         f"netconvert.build_network({str(source)!r}, {str(tmp_path / 'a.net.xml')!r})"
     )
     with subprocess.Popen([sys.executable, "-c", program]) as caller:

@@ -17,14 +17,16 @@ from typing import Any
 
 import pytest
 
-__all__ = ["CpuTimes", "known_costs", "rare_variants"]
+__all__ = ["CpuTimes", "argued", "known_costs", "rare_tests"]
 
-ARGUED_S = 2.0  # a test that costs more is marked `slow`, or listed at the end of a run
+LISTED_AT_END_S = 2.0  # a test that costs more is listed at the end of a run
+ARGUED_S = 3.0  # one that costs more is slow, but for those of the file of argued tests
 LISTED_S = 0.5  # a test that costs less is not in the file of costs
 OFTEN_S = (
     3.0  # of the variants of a test, so many seconds are in every run, and one of them at least
 )
 COSTS = Path(__file__).resolve().parents[1] / "costs.txt"
+ARGUED = COSTS.with_name("argued.txt")
 
 
 @cache
@@ -34,18 +36,29 @@ def known_costs() -> dict[str, float]:
     return {name: float(cost_s) for cost_s, name in (line.split(" ", 1) for line in lines)}
 
 
-def rare_variants(names: Iterable[str], costs: Mapping[str, float]) -> set[str]:
-    """Which tests are variants of others, and too dear to be in every run.
+@cache
+def argued() -> frozenset[str]:
+    """Dear tests that are in every run."""
+    lines = ARGUED.read_text(encoding="utf-8").splitlines()
+    return frozenset(line for line in lines if line and not line.startswith("#"))
+
+
+def rare_tests(
+    names: Iterable[str], costs: Mapping[str, float], kept: frozenset[str] = frozenset()
+) -> set[str]:
+    """Which tests are too dear to be in every run.
 
     Args:
         names: of all tests, in their order; variants of one test differ behind the bracket.
         costs: seconds of processor by name, of those that are known.
+        kept: of dear ones, those that are in every run.
     """
     spent: dict[str, float] = {}
     rare = set()
     for name in names:
         test, cost_s = name.split("[", 1)[0], costs.get(name, 0.0)
-        if test in spent and spent[test] + cost_s > OFTEN_S and cost_s:
+        another = test in spent and spent[test] + cost_s > OFTEN_S and cost_s > 0.0
+        if name not in kept and (cost_s > ARGUED_S or another):
             rare.add(name)
         else:
             spent[test] = spent.get(test, 0.0) + cost_s
@@ -83,11 +96,13 @@ class CpuTimes:
             listed = sorted((name, s) for name, s in self.seconds.items() if s >= LISTED_S)
             lines = [f"{cost_s:.1f} {name}\n" for name, cost_s in listed]
             Path(path).write_text("".join(lines), encoding="utf-8")
-        dear = sorted(((s, name) for name, s in self.seconds.items() if s > ARGUED_S), reverse=True)
+        dear = sorted(
+            ((s, name) for name, s in self.seconds.items() if s > LISTED_AT_END_S), reverse=True
+        )
         total_s = sum(self.seconds.values())
         terminalreporter.write_line(
             f"{len(self.seconds)} tests cost {total_s:.0f} s of processor;"
-            f" {len(dear)} of them more than {ARGUED_S:g} s each"
+            f" {len(dear)} of them more than {LISTED_AT_END_S:g} s each"
         )
         for cost_s, name in dear[:10]:
             terminalreporter.write_line(f"  {cost_s:6.1f} s  {name}")

@@ -24,12 +24,17 @@ class Fleet:
         self.log = EventLog(EventStore(where), lambda: self.now_s)
         self.access = Access(self.log, lambda: self.now_s)
         self.broker = Broker(self.log, BrokerRules(**rules), lambda: self.now_s)
+        self.secrets: dict[str, str] = {}  # by names of identities
         self.nodes = self.identity("nodes", "node")
         self.client = self.identity("ada", "client")
         self._beats = itertools.count()
 
     def identity(self, name: str, role: Role) -> IdentityRecord:
-        return self.access.add_identity(name, role)[0]
+        found, self.secrets[name] = self.access.add_identity(name, role)
+        return found
+
+    def token(self, name: str) -> str:
+        return str(self.access.exchange(self.secrets[name])["access_token"])
 
     def register(self, name: str, **given: Any) -> int:
         body = {"name": name, "address": "127.0.0.1", "client_port": 1, "simulator_port": 2}

@@ -1,9 +1,9 @@
 """Which tests are dear: those that start processes, or read SUMO or real maps.
 
 A test is `integration` where its file says so by what it imports or calls, or where a fixture of
-it makes a map; it is `slow` where it is marked so, or is a dear variant of a test of which others
-are in every run (`cpu_time.py`); the rest are unit tests. A test is `alone` where it measures time,
-memory or cores, or kills: nothing may run beside it.
+it makes a map; it is `slow` where it is marked so, or is dear (`cpu_time.py`); the rest are unit
+tests. A test is `alone` where it measures time, memory or cores, or kills: nothing may run beside
+it.
 """
 
 from __future__ import annotations

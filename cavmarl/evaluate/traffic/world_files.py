@@ -15,7 +15,8 @@ import numpy as np
 from cavmarl.core.errors import ConfigError, MapError, require
 from cavmarl.core.processes import dying_with_parent
 from cavmarl.evaluate.traffic.world_draw import DemandDraw, WorldDraw
-from cavmarl.maps.netconvert import MAP_ENDINGS, build_network, map_file
+from cavmarl.maps.map_kinds import MAP_ENDINGS
+from cavmarl.maps.netconvert import build_network, map_file
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
 

@@ -1,0 +1,254 @@
+"""Heights laid under a network that lies flat; nothing moves in the plane.
+
+On the ground a lane is where the model is. Bridges and tunnels go straight from abutment to
+abutment; where they cross another road, they keep `CLEARANCE_M` from it, with ramps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import MapError
+from cavmarl.maps.heights.height_model import HeightModel
+from cavmarl.maps.heights.levels import Levels, crossings, levels_of
+from cavmarl.maps.heights.stations import Stations, kept_rows, stations_of
+from cavmarl.maps.net_document import HEIGHT_DIGITS, NetDocument, shape_text
+from cavmarl.maps.osm_roads import OsmRoads
+from cavmarl.maps.projection import unproject
+
+CLEARANCE_M = 5.0  # from road to road, where one crosses above another
+RAMP_GRADE = 0.08
+STEEP_GRADE = 0.15  # is told
+MOST_GRADE = 0.25  # is refused
+_LIST = 8
+
+Heights = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class HeightReport:
+    """What was done to lay heights under a map."""
+
+    models: tuple[str, ...]
+    cell_m: float  # of the finest model
+    heights_m: tuple[float, float]  # lowest and highest of all lanes
+    places: int  # at which the model was asked
+    filled_places: int  # in voids of the model, filled from around
+    void_cells: int  # of the models around the map
+    raised_edges: tuple[str, ...]  # on bridges and in tunnels, all or in part
+    crossings: int  # of lanes on two levels
+    ramp_places: int  # on the ground, moved off the model so that a crossing keeps its clearance
+    smoothed_places: int  # moved off the model by the limit of grade
+    most_smoothed_m: float
+    max_grade: float  # of what was built
+    steep: tuple[str, ...]  # roads above `STEEP_GRADE`, with their grades
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class HeightOptions:
+    """Heights that a build is asked for."""
+
+    models: tuple[Path, ...]
+    limit_grade: float | None = None  # roads are made no steeper than that; None: as the model is
+    max_grade: float = MOST_GRADE  # roads that are steeper are refused
+
+
+def drape(
+    document: NetDocument, options: HeightOptions, roads: OsmRoads | None, source: Path
+) -> HeightReport:
+    """Give each lane and junction of a document its heights.
+
+    Args:
+        document: a network without heights, which is changed.
+        options: the models, and what is done with steep roads.
+        roads: where bridges and tunnels are; None: all roads are on the ground.
+        source: where the map is from, for messages.
+
+    Raises:
+        MapError: the map is not projected or has heights, the model cannot be used or does not
+            cover it, or a road is too steep.
+        MissingExtraError: pyproj or Pillow is not installed.
+    """
+    if document.geo is None:
+        raise MapError(
+            f"{source}: the map does not say where it lies on the earth (no projection): heights "
+            "need an OpenStreetMap extract, or a network with projParameter in its <location>"
+        )
+    stations = stations_of(document)
+    model = HeightModel(options.models)
+    places = np.concatenate([stations.plane_m, stations.hubs_m])
+    used = len(stations.plane_m)
+    ground = np.zeros(len(places))
+    degrees = unproject(places, document.geo)
+    ground[:used], coverage = model.at(degrees[:used])
+    ground[used:] = _at_hubs(stations, ground)
+    levels = np.zeros(len(places), np.int64)
+    if roads is not None:
+        levels = levels_of(stations, roads, document.geo, source)
+    spanned = stations.graph.spanned(ground, levels != 0)
+    crossed = crossings(stations, levels)
+    ramped = _cleared(stations, spanned, levels, crossed)
+    heights = ramped
+    if options.limit_grade is not None:
+        heights = stations.graph.limited(ramped, options.limit_grade)
+    _write(document, stations, heights)
+    grades = _grades(stations, heights)
+    steep = _steep(grades, roads, stations)
+    highest = max(grades.values(), default=0.0)
+    if highest > options.max_grade + 1e-3:
+        raise MapError(
+            f"{source}: roads would climb up to {highest:.0%}, more than {options.max_grade:.0%}:\n"
+            f"{_listed(steep)}\nCure: flatten them (--limit-grade {STEEP_GRADE:g}), allow it "
+            "(--max-grade), or give a model of the bare ground, in metres"
+        )
+    moved = np.abs(heights - ramped)[:used]
+    on_ground = levels[:used] == 0
+    return HeightReport(
+        models=tuple(tile.name for tile in model.tiles),
+        cell_m=model.cell_m,
+        heights_m=(float(heights[:used].min()), float(heights[:used].max())),
+        places=coverage.places,
+        filled_places=coverage.filled_places,
+        void_cells=coverage.void_cells,
+        raised_edges=_raised(stations, levels),
+        crossings=len(crossed),
+        ramp_places=int((on_ground & (np.abs(ramped - spanned)[:used] > 0.01)).sum()),
+        smoothed_places=int((moved > 0.01).sum()),
+        most_smoothed_m=float(moved.max()),
+        max_grade=highest,
+        steep=tuple(steep),
+    )
+
+
+def _at_hubs(stations: Stations, ground: Heights) -> Heights:
+    """A junction lies where the lanes that meet there do, in the mean."""
+    base = int(stations.first[-1])
+    links = stations.graph.links[stations.graph.links[:, 1] >= base]
+    number = len(stations.hubs_m)
+    count = np.bincount(links[:, 1] - base, minlength=number)
+    total = np.bincount(links[:, 1] - base, ground[links[:, 0]], number)
+    mean: Heights = np.where(count > 0, total / np.maximum(count, 1), ground[:base].mean())
+    return mean
+
+
+def _cleared(
+    stations: Stations, heights: Heights, levels: Levels, crossed: NDArray[np.int64]
+) -> Heights:
+    """Lift bridges over what they cross, from the lowest up; lower tunnels, from the highest."""
+    upper, lower = levels[crossed[:, 0]], levels[crossed[:, 1]]
+    for level in sorted({*upper[upper > 0].tolist()}):
+        pairs = crossed[upper == level]
+        floors = np.full(len(heights), -np.inf)
+        np.maximum.at(floors, pairs[:, 0], heights[pairs[:, 1]] + CLEARANCE_M)
+        floors[floors <= heights] = -np.inf
+        heights = stations.graph.lifted(heights, floors, RAMP_GRADE)
+    for level in sorted({*lower[(lower < 0) & (upper <= 0)].tolist()}, reverse=True):
+        pairs = crossed[(lower == level) & (upper <= 0)]
+        caps = np.full(len(heights), np.inf)
+        np.minimum.at(caps, pairs[:, 1], heights[pairs[:, 0]] - CLEARANCE_M)
+        caps[caps >= heights] = np.inf
+        heights = stations.graph.capped(heights, caps, RAMP_GRADE)
+    return heights
+
+
+def _write(document: NetDocument, stations: Stations, heights: Heights) -> None:
+    for row, lane in enumerate(stations.lanes):
+        rows = stations.rows(row)
+        own, z_m = stations.written[rows], heights[rows]
+        kept = kept_rows(stations.s_m[rows], z_m, own)
+        written = iter(_plane_words(lane.element.get("shape", "")))
+        plane = [
+            next(written) if own[place] else "{:.2f},{:.2f}".format(*stations.plane_m[rows][place])
+            for place in kept.tolist()
+        ]
+        lane.element.set("shape", shape_text(plane, z_m[kept]))
+    hub_of = dict(zip(stations.junction_ids, range(len(stations.hubs_m)), strict=True))
+    ends = _lane_ends(stations)
+    base = int(stations.first[-1])
+    for junction in document.junctions():
+        hub = hub_of.get(junction.get("id", ""))
+        if hub is None:
+            continue
+        height = float(heights[base + hub])
+        junction.set("z", f"{height:.{HEIGHT_DIGITS}f}")
+        plane = _plane_words(junction.get("shape", ""))
+        if plane:
+            rim = np.array([list(map(float, word.split(","))) for word in plane])
+            near = ends.get(hub)
+            z_m = np.full(len(rim), height)
+            if near is not None:
+                apart = rim[:, None] - stations.plane_m[near][None]
+                z_m = heights[near][np.hypot(apart[..., 0], apart[..., 1]).argmin(axis=1)]
+            junction.set("shape", shape_text(plane, z_m))
+    for edge in document.root.iter("edge"):
+        if "shape" in edge.attrib:
+            del edge.attrib["shape"]  # the flat middle of a road; its lanes say where it is
+
+
+def _plane_words(shape: str) -> list[str]:
+    return [",".join(word.split(",")[:2]) for word in shape.split()]
+
+
+def _lane_ends(stations: Stations) -> dict[int, NDArray[np.int64]]:
+    base = int(stations.first[-1])
+    ends: dict[int, list[int]] = {}
+    for place, hub in stations.graph.links.tolist():
+        if hub >= base:
+            ends.setdefault(hub - base, []).append(place)
+    return {hub: np.array(rows) for hub, rows in ends.items()}
+
+
+def _grades(stations: Stations, heights: Heights) -> dict[int, float]:
+    """The steepest grade of each lane, by its row."""
+    step = np.diff(stations.s_m)
+    rise = np.abs(np.diff(heights[: len(stations.s_m)]))
+    grade = np.where(step > 1e-3, rise / np.maximum(step, 0.1), 0.0)
+    grade[stations.first[1:-1] - 1] = 0.0
+    return {
+        row: float(grade[stations.first[row] : stations.first[row + 1] - 1].max(initial=0.0))
+        for row in range(len(stations.lanes))
+    }
+
+
+def _steep(grades: dict[int, float], roads: OsmRoads | None, stations: Stations) -> list[str]:
+    """Roads and junctions above `STEEP_GRADE`, the steepest first."""
+    worst: dict[str, float] = {}
+    for row, grade in grades.items():
+        if grade > STEEP_GRADE + 1e-3:
+            name = _named(row, roads, stations)
+            worst[name] = max(grade, worst.get(name, 0.0))
+    ranked = sorted(worst.items(), key=lambda item: (-item[1], item[0]))
+    return [f"{name}: {grade:.1%}" for name, grade in ranked]
+
+
+def _named(row: int, roads: OsmRoads | None, stations: Stations) -> str:
+    lane = stations.lanes[row]
+    edge = lane.edge.get("id", "")
+    if lane.internal:
+        return f"junction {edge[1:].rsplit('_', 1)[0]}"
+    for way in lane.ways if roads is not None else ():
+        if roads is not None and way in roads.ways and roads.ways[way].name:
+            return f"{edge} ({roads.ways[way].name})"
+    return edge
+
+
+def _raised(stations: Stations, levels: Levels) -> tuple[str, ...]:
+    rows = np.unique(stations.lane_of[np.flatnonzero(levels[: len(stations.s_m)])])
+    lanes = [stations.lanes[row] for row in rows.tolist()]
+    return tuple(sorted({lane.edge.get("id", "") for lane in lanes if not lane.internal}))
+
+
+def _listed(lines: Sequence[str]) -> str:
+    shown = [f"  {line}" for line in lines[:_LIST]]
+    if len(lines) > _LIST:
+        shown.append(f"  … and {len(lines) - _LIST} more")
+    return "\n".join(shown)

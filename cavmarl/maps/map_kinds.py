@@ -1,0 +1,50 @@
+"""The kind of a map file, told by its content and not by its name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+from xml.sax import SAXParseException
+from xml.sax.handler import ContentHandler
+
+from cavmarl.core.errors import MapError
+from cavmarl.roads.sumo_net.xml_source import read_xml
+
+MapKind = Literal["sumo", "osm", "opendrive"]
+
+MAP_ENDINGS = (".net.xml", ".net.xml.gz", ".osm", ".osm.gz", ".osm.xml", ".osm.xml.gz", ".xodr")
+
+_KINDS = (
+    "give a SUMO network (<net>, .net.xml), an OpenStreetMap extract (<osm>, .osm or .osm.xml) or "
+    "an OpenDRIVE file (<OpenDRIVE>, .xodr); the first two also gzipped (.gz)"
+)
+_ROOTS: dict[str, MapKind] = {"net": "sumo", "osm": "osm", "OpenDRIVE": "opendrive"}
+
+
+class _Root(ContentHandler):
+    """Remembers the root element; the parser around it finds what is broken or hostile."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.name = ""
+
+    def startElement(self, name: str, attrs: Any) -> None:
+        self.name = self.name or name
+
+
+def map_kind(path: Path) -> MapKind:
+    """Read a map file to its end and tell its kind by its root element.
+
+    Raises MapError: the file cannot be read, is broken or hostile XML, or is no map.
+    """
+    root = _Root()
+    try:
+        read_xml(path, root)
+    except MapError as error:
+        no_xml = isinstance(error.__cause__, SAXParseException) and not root.name
+        if no_xml and not path.name.endswith(MAP_ENDINGS):
+            raise MapError(f"{path}: is no map: {_KINDS}") from error
+        raise
+    if root.name not in _ROOTS:
+        raise MapError(f"{path}: <{root.name}> is the root of no map: {_KINDS}")
+    return _ROOTS[root.name]

@@ -1,0 +1,108 @@
+"""A SUMO network file as a tree: what may be changed in it without netconvert."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from xml.etree.ElementTree import Element, ParseError, tostring
+
+import defusedxml.ElementTree
+import numpy as np
+from defusedxml.common import DefusedXmlException
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import MapError
+from cavmarl.roads.network import GeoReference
+from cavmarl.roads.sumo_net.xml_source import read_bytes
+
+Points = NDArray[np.float64]
+
+_WAY = re.compile(r"-?(\d+)")
+HEIGHT_DIGITS = 3
+
+
+@dataclass(frozen=True)
+class DocumentLane:
+    """One lane of a network file."""
+
+    edge: Element
+    element: Element
+
+    @property
+    def id(self) -> str:
+        return self.element.get("id", "")
+
+    @property
+    def internal(self) -> bool:
+        return self.edge.get("function", "") != ""
+
+    @cached_property
+    def points(self) -> Points:
+        """(n, 2) or (n, 3), as the file says them."""
+        return points_of(self.element)
+
+    @property
+    def ways(self) -> list[str]:
+        """Ids of the ways of OSM that it was made of."""
+        for param in self.element.iter("param"):
+            if param.get("key") == "origId":
+                return param.get("value", "").split()
+        named = _WAY.match(self.edge.get("id", ""))
+        return [named[1]] if named else []
+
+
+class NetDocument:
+    """The elements of a network file."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises MapError: the file is no network or is broken."""
+        self.path = path
+        try:
+            root: Element = defusedxml.ElementTree.fromstring(read_bytes(path), forbid_dtd=True)
+        except (ParseError, DefusedXmlException, ValueError, OSError) as error:
+            raise MapError(f"{path}: cannot be read ({error}): build it again") from error
+        if root.tag != "net":
+            raise MapError(f"{path}: <{root.tag}> is no SUMO network")
+        self.root = root
+        self.lanes = [
+            DocumentLane(edge, lane) for edge in root.iter("edge") for lane in edge.iter("lane")
+        ]
+
+    @cached_property
+    def geo(self) -> GeoReference | None:
+        location = self.root.find("location")
+        if location is None or location.get("projParameter", "!") in ("!", "-", "."):
+            return None
+        x, y = map(float, location.get("netOffset", "0,0").split(","))
+        return GeoReference(location.get("projParameter", ""), x, y)
+
+    def junctions(self) -> Iterator[Element]:
+        return self.root.iter("junction")
+
+    def content(self, head: bytes = b"") -> bytes:
+        """The file's bytes; `head`: a comment that goes before the root."""
+        text: bytes = tostring(self.root, "utf-8")
+        return b'<?xml version="1.0" encoding="UTF-8"?>\n' + head + text + b"\n"
+
+
+def points_of(element: Element) -> Points:
+    """The `shape` of an element; (0, 2) where it has none."""
+    words = [word.split(",") for word in element.get("shape", "").split()]
+    if not words:
+        return np.zeros((0, 2))
+    size = min(map(len, words))
+    try:
+        return np.array([word[:size] for word in words], dtype=np.float64)
+    except ValueError as error:
+        raise MapError(f"{element.get('id')}: shape='{element.get('shape')}': {error}") from error
+
+
+def shape_text(plane: list[str], heights_m: Points) -> str:
+    """A `shape` of places as they were written, and heights."""
+    return " ".join(
+        f"{place},{height:.{HEIGHT_DIGITS}f}"
+        for place, height in zip(plane, heights_m.tolist(), strict=True)
+    )

@@ -1,0 +1,110 @@
+"""One run of netconvert as a process, and what it says."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from cavmarl.core.errors import MapError, require
+from cavmarl.core.processes import dying_with_parent
+
+_SHOWN_LINES = 10
+_QUOTED = re.compile(r"'[^']*'")
+_NUMBERED = re.compile(r"\S*\d\S*")
+_CORRECTION = re.compile(r"^(Joined|Guessed|Removed) |^[1-9]\d* .*(removed|computed|split|added)$")
+
+
+class BuildLog:
+    """The output of one run with `--verbose` and without aggregated warnings."""
+
+    def __init__(self, stdout: str = "", stderr: str = "") -> None:
+        self._said = stdout.splitlines()
+        self._complained = stderr.splitlines()
+
+    def errors(self) -> tuple[str, ...]:
+        return self._after("Error: ")
+
+    def warnings(self) -> dict[str, int]:
+        """How often each warning came, by its text with `%` for names and numbers."""
+        kinds = Counter(
+            _NUMBERED.sub("%", _QUOTED.sub("'%'", line)) for line in self._after("Warning: ")
+        )
+        return dict(kinds.most_common())
+
+    def corrections(self) -> tuple[str, ...]:
+        """What netconvert changed on its own account, in its words."""
+        lines = (line.strip().rstrip(".") for line in self._said if line.startswith(" "))
+        return tuple(line for line in lines if _CORRECTION.search(line))
+
+    def complaint(self) -> tuple[str, ...]:
+        """The errors or, if it died without one, all that it complained about."""
+        return self.errors() or tuple(self._complained) or ("no message",)
+
+    def _after(self, prefix: str) -> tuple[str, ...]:
+        return tuple(
+            line.removeprefix(prefix) for line in self._complained if line.startswith(prefix)
+        )
+
+
+@dataclass(frozen=True)
+class Cures:
+    """What a message advises."""
+
+    too_long: str = "allow more time (--timeout-s)"
+    refused: str = "mend the source"
+
+
+def run_netconvert(
+    arguments: Sequence[str], source: Path, timeout_s: float, cures: Cures = Cures()
+) -> BuildLog:
+    """Run netconvert of the `eclipse-sumo` wheel.
+
+    `source`: the file that messages name. `cures`: what they advise.
+
+    Raises:
+        MapError: it fails or takes too long.
+        MissingExtraError: it is not installed.
+    """
+    home = sumo_home()
+    command = [str(home / "bin" / "netconvert"), *arguments]
+    command += ["--verbose", "--aggregate-warnings=1000000", "--xml-validation=never"]
+    projections = str(home / "data" / "proj")
+    own = {"SUMO_HOME": str(home), "PROJ_DATA": projections, "PROJ_LIB": projections}
+    try:
+        done = subprocess.run(
+            dying_with_parent(command),
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=timeout_s,
+            env=os.environ | own,
+            check=False,
+        )
+    except subprocess.TimeoutExpired as error:
+        raise MapError(
+            f"{source}: netconvert took longer than {timeout_s:g} s: {cures.too_long}"
+        ) from error
+    log = BuildLog(done.stdout, done.stderr)
+    if done.returncode != 0:
+        raise MapError(
+            f"{source}: netconvert gave up (exit code {done.returncode}):\n"
+            f"{quoted(log.complaint())}\nCure: {cures.refused}"
+        )
+    return log
+
+
+def sumo_home() -> Path:
+    """Raises MissingExtraError: SUMO is not installed."""
+    return Path(require("sumo", "sumo").SUMO_HOME)
+
+
+def quoted(lines: Sequence[str]) -> str:
+    shown = [f"  {line}" for line in lines[:_SHOWN_LINES]]
+    if len(lines) > _SHOWN_LINES:
+        shown.append(f"  … and {len(lines) - _SHOWN_LINES} more")
+    return "\n".join(shown)

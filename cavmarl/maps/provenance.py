@@ -1,0 +1,96 @@
+"""Where a map comes from, kept inside its file: a comment before the root, `key: value` a line."""
+
+from __future__ import annotations
+
+import gzip
+import re
+import zlib
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from cavmarl.maps.net_document import NetDocument
+from cavmarl.maps.osm_roads import OsmRoads
+
+OSM_LICENCE = (
+    "Open Data Commons Open Database License (ODbL) 1.0, "
+    "https://opendatacommons.org/licenses/odbl/1-0/"
+)
+OSM_ATTRIBUTION = "© OpenStreetMap contributors, https://www.openstreetmap.org/copyright"
+NOT_STATED = "not stated: see the source"
+
+_TITLE = "map built by cavmarl"
+_HEAD_BYTES = 1 << 16
+_COMMENT = re.compile(rf"<!-- {_TITLE}\n(.*?)-->", re.DOTALL)
+_GUESSED = {"lanes": "numLanes", "maxspeed": "speed", "width": "width"}
+
+
+@dataclass(frozen=True)
+class RoadDefaults:
+    """What netconvert's type map gave the roads of one kind that do not say it."""
+
+    kind: str  # OSM's `highway`, as netconvert names it
+    edges: int
+    guessed: str  # lanes, maxspeed or width
+    value: str  # the commonest; speeds in m/s, widths in m
+    used_for: int  # edges
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def head_of(facts: Mapping[str, str]) -> bytes:
+    """The comment that goes into a map's file."""
+    lines = [f"{key}: {' '.join(value.split())}" for key, value in facts.items()]
+    text = "\n".join(lines).replace("--", "- -")
+    return f"<!-- {_TITLE}\n{text}\n-->\n".encode()
+
+
+def read_provenance(path: Path) -> dict[str, str]:
+    """What the file of a map says of its own origin; empty: nothing."""
+    try:
+        with path.open("rb") as raw:
+            head = raw.read(_HEAD_BYTES)
+        if head[:2] == b"\x1f\x8b":
+            head = zlib.decompressobj(wbits=31).decompress(head, _HEAD_BYTES)
+    except (OSError, zlib.error, gzip.BadGzipFile):
+        return {}
+    found = _COMMENT.search(head.decode("utf-8", errors="replace"))
+    lines = found[1].splitlines() if found else []
+    return dict(line.split(": ", 1) for line in lines if ": " in line)
+
+
+def road_defaults(document: NetDocument, roads: OsmRoads) -> tuple[RoadDefaults, ...]:
+    """Which kinds of road were built with guessed lanes, speeds and widths, and how often."""
+    counts: Counter[str] = Counter()
+    values: dict[tuple[str, str], Counter[str]] = {}
+    seen = set()
+    for lane in document.lanes:
+        name = lane.edge.get("id", "")
+        if lane.internal or name in seen:
+            continue
+        seen.add(name)
+        kind = lane.edge.get("type", "")
+        counts[kind] += 1
+        ways = [roads.ways[way] for way in lane.ways if way in roads.ways]
+        built = {
+            "numLanes": str(sum(1 for _ in lane.edge.iter("lane"))),
+            "speed": lane.element.get("speed", ""),
+            "width": lane.element.get("width", "3.20"),
+        }
+        for tag, field in _GUESSED.items():
+            if not all(tag in way.tags for way in ways) or not ways:
+                values.setdefault((kind, tag), Counter())[built[field]] += 1
+    return tuple(
+        RoadDefaults(kind, counts[kind], tag, found.most_common(1)[0][0], found.total())
+        for (kind, tag), found in sorted(values.items())
+    )
+
+
+def defaults_text(defaults: Iterable[RoadDefaults]) -> str:
+    return "; ".join(
+        f"{row.kind} {row.guessed}={row.value} ({row.used_for} of {row.edges} edges)"
+        for row in defaults
+    )

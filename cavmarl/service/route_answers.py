@@ -1,0 +1,117 @@
+"""How the answers of routes are made of what the broker knows."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import AsyncIterator, Callable
+from dataclasses import asdict
+
+from cavmarl.service import answers
+from cavmarl.service.guards import Service
+from cavmarl.service.infrastructure import (
+    IdentityRecord,
+    LogEvent,
+    NodeRecord,
+    SessionRecord,
+)
+from cavmarl.service.node_selection import NoNodeError, score_of
+
+TLS = "tls"  # the capability of nodes whose clients' port has it
+KEEP_ALIVE_S = 15.0
+
+
+async def assigned(
+    service: Service,
+    identity: IdentityRecord,
+    subject: str,  # of the event, if there is no node
+    take: Callable[[], SessionRecord],
+    wait_s: float,
+) -> answers.Assignment:
+    """What a client needs to reach its world; it waits for a node until a deadline."""
+    broker = service.broker
+    until_s = time.monotonic() + wait_s
+    while True:
+        try:
+            session = take()
+            break
+        except NoNodeError as error:
+            left_s = until_s - time.monotonic()
+            if left_s <= 0.0:
+                broker.refuse(identity, subject, error)
+                raise
+            await broker.log.settle()
+            broker.waiting += 1
+            try:
+                async with asyncio.timeout(left_s), broker.log.changed:
+                    await broker.log.changed.wait()
+            except TimeoutError:
+                continue
+            finally:
+                broker.waiting -= 1
+    node = broker.log.state.nodes[session.node or ""]
+    lease_s = broker.rules.lease_s
+    return answers.Assignment(
+        session=session.id,
+        requested=session.preferred,
+        assigned=node.name,
+        redirected=session.preferred not in (None, node.name),
+        reason=session.reason,
+        score=session.score,
+        scheme="https" if TLS in node.capabilities else "http",
+        address=node.address,
+        client_port=node.client_port,
+        simulator_port=node.simulator_port,
+        configuration=session.configuration,
+        lease_s=lease_s,
+        expires_s=broker.log.wall_s() + lease_s,
+        token=service.access.session_token(session, lease_s),
+    )
+
+
+def node_answer(service: Service, node: NodeRecord) -> answers.NodeStatus:
+    """A node, with what its last beat said."""
+    live = service.broker.live[node.name]
+    return answers.NodeStatus(
+        **asdict(node),
+        load=None if live.use is None else answers.Load(**asdict(live.use)),
+        score=score_of(node, live),
+        sessions=len(live.hosted),
+        age_s=round(service.broker.age_s(node.name), 3),
+    )
+
+
+def session_answer(session: SessionRecord) -> answers.Session:
+    """A session or a job, without what only its node needs."""
+    found = asdict(session)
+    del found["saved_blob"], found["owners"]
+    return answers.Session(**found)
+
+
+def event_answer(line: LogEvent) -> answers.EventLine:
+    """A line of the log, without what is never shown."""
+    found = line._asdict()
+    del found["private"]
+    return answers.EventLine(**found)
+
+
+async def event_stream(
+    service: Service, identity: IdentityRecord, after: int
+) -> AsyncIterator[str]:
+    """Server-sent events: those that there are after a number, and then those that come."""
+    log = service.broker.log
+    owner = identity.id if identity.role == "client" else None
+    generation = identity.generation
+    while identity.generation == generation:  # its tokens are void: it hears no more
+        last = log.durable
+        for line in log.read(after, last - after, owner) if last > after else ():
+            text = event_answer(line).model_dump_json()
+            yield f"id: {line.sequence}\nevent: {line.kind}\ndata: {text}\n\n"
+        after = max(after, last)
+        if log.durable > after:
+            continue
+        try:
+            async with asyncio.timeout(KEEP_ALIVE_S), log.changed:
+                await log.changed.wait()
+        except TimeoutError:
+            yield ": still here\n\n"

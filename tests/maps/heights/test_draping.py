@@ -1,0 +1,224 @@
+"""Heights laid under networks: true to the model, continuous, and nothing moves in the plane."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import ConfigError, MapError
+from cavmarl.maps.check import check_map
+from cavmarl.maps.heights.draping import CLEARANCE_M, HeightOptions, HeightReport
+from cavmarl.maps.heights.height_model import HeightModel
+from cavmarl.maps.netconvert import BuildResult, build_network
+from cavmarl.maps.projection import unproject
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.sumo_net.reader import read_network
+from tests.support.terrain import TOWN, plane, write_geotiff, write_hgt
+
+pytest.importorskip("sumo", reason="needs the extra 'sumo'")
+
+
+@pytest.fixture
+def town(tmp_path: Path) -> Path:
+    path = tmp_path / "town.osm"
+    path.write_text(TOWN)
+    return path
+
+
+def built(source: Path, *models: Path, **more: float) -> BuildResult:
+    heights = HeightOptions(models, **more)
+    return build_network(source, source.with_name("high.net.xml"), heights=heights)
+
+
+def told(result: BuildResult) -> HeightReport:
+    assert result.heights is not None
+    return result.heights
+
+
+def on_the_ground(network: RoadNetwork, raised: tuple[str, ...]) -> NDArray[np.void]:
+    rows = [
+        network.lane_points(lane)
+        for lane in np.flatnonzero(~network.lanes["internal"])
+        if network.edge_ids[network.lanes["edge"][lane]] not in raised
+    ]
+    return np.concatenate(rows)
+
+
+def off_model(network: RoadNetwork, points: NDArray[np.void], model: Path) -> NDArray[np.float64]:
+    assert network.geo is not None
+    places = np.stack([points["x"], points["y"]], axis=1)
+    return np.abs(points["z"] - HeightModel([model]).at(unproject(places, network.geo))[0])
+
+
+def plane_of(path: Path) -> list[str]:
+    """Ids and places of all junctions and shapes, as they are written, without heights."""
+    text = path.read_text()
+    nodes = re.findall(r'<junction id="([^"]*)".*? x="([^"]*)" y="([^"]*)"', text)
+    return ["/".join(node) for node in nodes]
+
+
+def test_heights_are_the_models_and_nothing_moves(town: Path, tmp_path: Path) -> None:
+    rolling = plane(0.02, 0.05)
+    model = write_geotiff(
+        tmp_path / "ground.tif",
+        lambda lon, lat: rolling(lon, lat) + 3.0 * np.sin((lon + lat) * 2e3),
+    )
+    flat = build_network(town, tmp_path / "flat.net.xml")
+    result = built(town, model)
+
+    network = read_network(result.path)
+    assert plane_of(result.path) == plane_of(flat.path)
+    level = read_network(flat.path)
+    for lane, name in enumerate(level.lane_ids):
+        high = network.lane_polyline(network.lane_ids.index(name))
+        for point in level.lane_polyline(lane)[:, :2]:
+            assert np.hypot(*(high[:, :2] - point).T).min() < 1e-9
+    points = on_the_ground(network, told(result).raised_edges)
+    far = np.abs(points["x"] - np.interp(11.00525, [11.0, 11.013], [0, 968])) > 100.0
+    assert off_model(network, points[far], model).max() < 0.05
+    assert told(result).places > 1000
+    assert result.path.read_text().count("heights licence: not stated") == 1
+
+
+def test_the_model_need_not_be_in_degrees(town: Path, tmp_path: Path) -> None:
+    """The same plane in metres of UTM 32 gives the same heights."""
+    import pyproj
+
+    motion = pyproj.Transformer.from_crs("EPSG:32632", "EPSG:4326", always_xy=True)
+    ground = plane(0.0, 0.05)
+    model = write_geotiff(
+        tmp_path / "utm.tif",
+        lambda x, y: ground(*motion.transform(x, y)),
+        (648_500.0, 5_317_500.0, 651_500.0, 5_320_000.0),
+        20.0,
+        keys=(1024, 0, 1, 1, 1025, 0, 1, 2, 3072, 0, 1, 32632),
+    )
+    high = read_network(built(town, model).path)
+
+    assert high.points["z"].min() == pytest.approx(500.0, abs=0.2)
+    assert high.points["z"].max() == pytest.approx(500.0 + 0.05 * 1000.8, abs=0.3)
+
+
+def test_a_bridge_clears_the_road_below_and_is_continuous(town: Path, tmp_path: Path) -> None:
+    result = built(town, write_geotiff(tmp_path / "flat.tif", plane(0.0, 0.0)))
+
+    network, report = read_network(result.path), told(result)
+    assert report.crossings > 0
+    assert report.ramp_places > 0
+    assert report.max_grade <= 0.081
+    below = [n for n, name in enumerate(network.lane_ids) if re.match(r"-?14_", name)]
+    deck = network.points["z"].max()
+    assert max(network.lane_polyline(lane)[:, 2].max() for lane in below) == pytest.approx(500.0)
+    assert deck == pytest.approx(500.0 + CLEARANCE_M, abs=0.1)
+    for link in network.links:
+        before = network.lane_polyline(link["from_lane"])[-1]
+        after = network.lane_polyline(link["next_lane"])[0]
+        assert abs(before[2] - after[2]) < 0.01 + 0.1 * np.hypot(*(before - after)[:2])
+
+
+def test_a_bridge_over_a_valley_goes_straight(town: Path, tmp_path: Path) -> None:
+    def valley(lon: NDArray[np.float64], lat: NDArray[np.float64]) -> NDArray[np.float64]:
+        inside = np.abs(lon - 11.00525) < 0.0002
+        depth = 20.0 * np.clip(1.0 - np.abs(lat - 48.004) / 0.003, 0.0, 1.0)
+        return 500.0 - np.where(inside, depth, 0.0)
+
+    report = told(built(town, write_geotiff(tmp_path / "valley.tif", valley, step=0.00005)))
+    assert report.max_grade < 0.15
+    assert report.heights_m[0] < 481.0  # the road below lies in it
+
+
+def test_voids_are_filled_and_counted(town: Path, tmp_path: Path) -> None:
+    def dig(heights: NDArray[np.float64]) -> None:
+        heights[20:40, 20:40] = np.nan
+
+    model = write_geotiff(tmp_path / "holes.tif", plane(0.0, 0.01), holes=dig)
+    result = built(town, model)
+    assert told(result).void_cells == 400
+    assert 0 < told(result).filled_places < told(result).places / 2
+    assert told(result).heights_m[0] > 499.0
+
+
+@pytest.mark.parametrize(("grade", "steep"), [(0.1, False), (0.2, True)])
+def test_steep_roads_are_named(town: Path, tmp_path: Path, grade: float, steep: bool) -> None:
+    result = built(town, write_geotiff(tmp_path / "steep.tif", plane(0.0, grade)))
+
+    assert any("(Hill Road): 20.0%" in line for line in told(result).steep) is steep
+    assert bool(check_map(result.path).steep_lanes) is steep
+
+
+def test_steeper_roads_are_refused_unless_told(town: Path, tmp_path: Path) -> None:
+    model = write_geotiff(tmp_path / "steep.tif", plane(0.0, 0.3))
+
+    with pytest.raises(MapError, match=r"(?s)30%, more than 25%.*Hill Road.*--limit-grade"):
+        built(town, model)
+    assert not (tmp_path / "high.net.xml").exists()
+    assert told(built(town, model, max_grade=0.4)).max_grade == pytest.approx(0.3, abs=0.01)
+    limited = told(built(town, model, limit_grade=0.15))
+    assert limited.max_grade <= 0.151
+    assert limited.most_smoothed_m > 10.0
+    assert check_map(tmp_path / "high.net.xml").max_grade <= 0.152
+
+
+def test_an_origin_is_kept_and_read_back(town: Path, tmp_path: Path) -> None:
+    result = build_network(town, tmp_path / "o.net.xml", origin=(48.004, 11.0))
+
+    geo = read_network(result.path).geo
+    assert geo is not None
+    assert (geo.offset_x_m, geo.offset_y_m) == (0.0, 0.0)
+    assert unproject(np.zeros((1, 2)), geo) == pytest.approx(np.array([[11.0, 48.004]]))
+    assert result.provenance["origin"] == "latitude 48.004, longitude 11.0"
+    assert "ODbL" in result.provenance["licence"]
+    assert "OpenStreetMap contributors" in result.provenance["attribution"]
+    row = next(row for row in result.defaults if row.guessed == "maxspeed")
+    assert (row.kind, row.value, row.used_for) == ("highway.residential", "13.89", row.edges)
+    for wrong in ((11.0, 48.004), (95.0, 11.0)):
+        with pytest.raises(ConfigError, match="LAT,LON"):
+            build_network(town, tmp_path / "w.net.xml", origin=wrong)
+
+
+def test_heights_go_under_a_network_too(town: Path, tmp_path: Path) -> None:
+    flat = build_network(town, tmp_path / "flat.net.xml").path
+    model = write_hgt(tmp_path / "N48E011.hgt", plane(0.0, 0.05))
+    result = built(flat, model)
+
+    assert told(result).raised_edges == ()
+    assert "ODbL" in result.provenance["licence"]
+    with pytest.raises(MapError, match="has heights already"):
+        build_network(result.path, tmp_path / "x.net.xml", heights=HeightOptions((model,)))
+
+
+def test_a_map_without_a_projection_takes_no_heights(tmp_path: Path) -> None:
+    from cavmarl.config.registry import find_entry
+
+    model = write_geotiff(tmp_path / "g.tif", plane(0.0, 0.0))
+    source = find_entry("ring") / "map" / "map.net.xml"
+    with pytest.raises(MapError, match="no projection"):
+        build_network(source, tmp_path / "r.net.xml", heights=HeightOptions((model,)))
+
+
+@pytest.mark.parametrize(
+    ("name", "model", "low", "high"),
+    [
+        ("monaco.osm.gz", "monaco_srtm3.tif", -5.0, 196.0),
+        ("laufamholz.osm.xml", "laufamholz_srtm3.tif", 312.0, 325.0),
+    ],
+)
+def test_real_maps(
+    shared_maps: Path, tmp_path: Path, name: str, model: str, low: float, high: float
+) -> None:
+    heights = HeightOptions((shared_maps / "dem" / model,), limit_grade=0.15)
+    result = build_network(shared_maps / "osm" / name, tmp_path / "m.net.xml", heights=heights)
+
+    report, found = told(result), check_map(result.path)
+    assert low <= found.elevation_m[0] < found.elevation_m[1] <= high
+    assert report.max_grade <= 0.151
+    network = read_network(result.path)
+    roads = network.lanes["num_points"][~network.lanes["internal"]]
+    first = network.lanes["first_point"][~network.lanes["internal"]]
+    rows = np.concatenate([np.arange(a, a + n) for a, n in zip(first, roads, strict=True)])
+    assert np.abs(network.points["slope"][rows]).max() <= 0.155
+    assert bool(report.raised_edges) is name.startswith("monaco")

@@ -1,0 +1,100 @@
+"""Files of heights that cannot be used are refused by a cause and a cure."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cavmarl.core.errors import MapError
+from cavmarl.maps.heights.height_model import HeightModel
+from cavmarl.maps.heights.tile_files import read_tile
+from tests.support.terrain import plane, write_geotiff, write_hgt
+
+PLACES = np.array([[11.001, 48.001], [11.012, 48.009], [11.0071, 48.0033]])
+GROUND = plane(0.03, 0.05)
+FEET = (1024, 0, 1, 2, 1025, 0, 1, 2, 2048, 0, 1, 4326, 4099, 0, 1, 9002)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.int32, np.uint16])
+def test_geotiffs_say_the_heights_of_the_ground(tmp_path: Path, kind: type) -> None:
+    model = HeightModel([write_geotiff(tmp_path / "g.tif", GROUND, kind=kind)])
+
+    heights, coverage = model.at(PLACES)
+    assert np.abs(heights - GROUND(*PLACES.T)).max() < (0.01 if kind is np.float32 else 1.1)
+    assert coverage.filled_places == 0
+
+
+def test_hgt_plain_and_packed(tmp_path: Path) -> None:
+    plain = write_hgt(tmp_path / "N48E011.hgt", GROUND)
+    packed = tmp_path / "N48E011.hgt.zip"
+    with zipfile.ZipFile(packed, "w") as archive:
+        archive.write(plain, "N48E011.hgt")
+
+    one, other = (HeightModel([path]).at(PLACES)[0] for path in (plain, packed))
+    assert np.abs(one - GROUND(*PLACES.T)).max() < 1.1
+    assert (one == other).all()
+
+
+def test_real_hgt_and_its_crop_agree(shared_maps: Path) -> None:
+    random = np.random.default_rng(0)
+    places = np.column_stack([random.uniform(7.41, 7.44, 500), random.uniform(43.73, 43.75, 500)])
+    one = HeightModel([shared_maps / "dem" / "N43E007.hgt.zip"]).at(places)[0]
+    other = HeightModel([shared_maps / "dem" / "monaco_srtm3.tif"]).at(places)[0]
+    assert np.abs(one - np.maximum(other, -2.0)).max() < 3.0  # the crop has 0 for negative heights
+
+
+def test_tiles_go_on_where_others_end(tmp_path: Path) -> None:
+    west = write_geotiff(tmp_path / "w.tif", GROUND, (10.995, 47.995, 11.006, 48.015))
+    east = write_geotiff(tmp_path / "e.tif", GROUND, (11.006, 47.995, 11.02, 48.015))
+
+    assert np.abs(HeightModel([west, east]).at(PLACES)[0] - GROUND(*PLACES.T)).max() < 0.05
+    with pytest.raises(MapError, match=r"67% of the roads lie off the model.*more tiles"):
+        HeightModel([west]).at(PLACES)
+
+
+def test_swapped_coordinates_are_named(tmp_path: Path) -> None:
+    model = HeightModel([write_geotiff(tmp_path / "g.tif", GROUND)])
+    with pytest.raises(MapError, match="look swapped"):
+        model.at(PLACES[:, ::-1])
+
+
+def test_voids_everywhere_are_refused(tmp_path: Path) -> None:
+    path = write_geotiff(tmp_path / "g.tif", GROUND, holes=lambda heights: heights.fill(np.nan))
+    with pytest.raises(MapError, match="100% of the roads lie in voids"):
+        HeightModel([path]).at(PLACES)
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [((), "no projection"), (FEET, "in feet"), ((1024, 0, 1, 1, 3072, 0, 1, 32767), "no proj")],
+)
+def test_models_without_a_frame_are_refused(
+    tmp_path: Path, keys: tuple[int, ...], message: str
+) -> None:
+    with pytest.raises(MapError, match=message):
+        read_tile(write_geotiff(tmp_path / "g.tif", GROUND, keys=keys))
+
+
+def test_files_cut_short_and_of_other_kinds_are_refused(tmp_path: Path) -> None:
+    whole = write_geotiff(tmp_path / "g.tif", GROUND)
+    content = whole.read_bytes()
+    for size in (8, 200, len(content) // 2, len(content) - 10):
+        whole.write_bytes(content[:size])
+        with pytest.raises(MapError, match=r"g\.tif"):
+            read_tile(whole)
+    hgt = write_hgt(tmp_path / "N48E011.hgt", GROUND)
+    hgt.write_bytes(hgt.read_bytes()[:-7])
+    with pytest.raises(MapError, match="cut short"):
+        read_tile(hgt)
+    with pytest.raises(MapError, match="rename it"):
+        read_tile(write_hgt(tmp_path / "tile.hgt", GROUND))
+    for name, text in (("x.tif", b"no heights"), ("x.zip", b"PK"), ("y.gz", b"\x1f\x8b\x08")):
+        (tmp_path / name).write_bytes(text)
+        with pytest.raises(MapError):
+            read_tile(tmp_path / name)
+    picture = write_geotiff(tmp_path / "p.tif", GROUND, kind=np.uint8)
+    with pytest.raises(MapError, match="picture"):
+        read_tile(picture)

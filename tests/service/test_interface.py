@@ -1,0 +1,148 @@
+"""The document of the interface is true of all kinds of requests, which Schemathesis makes of it.
+
+Answers have the status, the type and the fields that the document shows; what the document does not
+allow is refused; nothing is a fault of the service.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import pytest
+import schemathesis
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+from schemathesis import GenerationMode
+from schemathesis.checks import not_a_server_error
+from schemathesis.specs.openapi.checks import positive_data_acceptance
+
+from cavmarl.service.access import RateLimit
+from cavmarl.service.app import make_app
+from cavmarl.service.bodies import ConfigurationBody
+from cavmarl.service.configurations import add_configuration
+from cavmarl.service.guards import Service, open_to_all, rule_of
+from cavmarl.service.routes import ROUTERS
+from tests.support.fleet import Fleet
+
+ENDLESS = "GET /v1/events/stream"
+RULES = {
+    f"{method} {route.path}": rule_of(route)
+    for router in ROUTERS
+    for route in router.routes
+    for method in route.methods
+}
+OPERATIONS = sorted(RULES.keys() - {ENDLESS})
+
+
+class Served:
+    """A service in this process, with a node, a session and a job, and what its document says."""
+
+    def __init__(self, store: Path) -> None:
+        self.fleet = Fleet(store, max_nodes=50, max_sessions=20)
+        self.fleet.identity("root", "admin")
+        body = ConfigurationBody(environment="merge")
+        found = add_configuration(self.fleet.log, self.fleet.client, body)
+        self.configuration = str(found["hash"])
+        never = RateLimit(1e9, 1e9)
+        app = make_app(Service(self.fleet.broker, self.fleet.access, never, never))
+        document = schemathesis.openapi.from_asgi("/v1/openapi.json", app)
+        self.operations = {one.ok().label: one.ok() for one in document.get_all_operations()}
+
+    def known(self) -> dict[str, str]:
+        """What paths can name; there is always a node and a session again."""
+        fleet = self.fleet
+        fleet.join("a", slots=1000)
+        for one in list(fleet.log.state.sessions.values()):
+            fleet.broker.close(fleet.client, one.id)
+        session = fleet.open(zone_nodes=1)
+        fleet.broker.save(session, 1, b"state")
+        fleet.broker.add_result(session, "table.csv", b"1,2")
+        return {"name": "a", "number": session.id, "sha256": self.configuration}
+
+    def headers(self, name: str) -> dict[str, str]:
+        rule = RULES[name]
+        if isinstance(rule, open_to_all):
+            return {}
+        names = {"node": "nodes", "client": "ada", "admin": "root"}
+        role = next(role for role in names if role in rule.roles)
+        return {"Authorization": f"Bearer {self.fleet.token(names[role])}"}
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    made = Served(tmp_path_factory.mktemp("interface") / "store.sqlite")
+    yield made
+    made.fleet.close()
+
+
+def plain(value: Any) -> Any:
+    """As JSON's whole numbers are written: 3 and not 3.0, which is refused."""
+    if isinstance(value, dict):
+        return {key: plain(one) for key, one in value.items()}
+    if isinstance(value, list):
+        return [plain(one) for one in value]
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+def check(served: Served, name: str, mode: GenerationMode, examples: int) -> None:
+    operation = served.operations[name]
+
+    @given(operation.as_strategy(generation_mode=mode), st.randoms())
+    @settings(
+        max_examples=examples,
+        database=None,
+        phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )
+    def run(case: Any, random: Random) -> None:
+        known = served.known()
+        for part in case.path_parameters or ():
+            is_known = part in known and "identities" not in name and random.random() < 0.5
+            if mode is GenerationMode.POSITIVE and is_known:
+                case.path_parameters[part] = known[part]
+        case.body = plain(case.body)
+        if isinstance(case.body, dict) and mode is GenerationMode.POSITIVE:
+            if "configuration" in case.body:
+                case.body["configuration"] = known["sha256"]
+            if "wait_s" in case.body:
+                case.body["wait_s"] = 0
+        answer = case.call_and_validate(
+            headers=served.headers(name),
+            excluded_checks=[positive_data_acceptance, not_a_server_error],
+        )
+        if answer.status_code >= 400:
+            title = answer.json()["title"]
+            assert answer.status_code < 500 or title == "no-node", answer.text
+            assert mode is not GenerationMode.POSITIVE or title != "bad-body", answer.text
+
+    run()
+
+
+@pytest.mark.parametrize("name", OPERATIONS)
+def test_answers_are_as_the_document_says(served: Served, name: str) -> None:
+    check(served, name, GenerationMode.POSITIVE, 8)
+
+
+def can_be_wrong(name: str) -> bool:
+    """Not where nothing is sent, or content that may be anything."""
+    method, path = name.split()
+    if method == "PUT" and path.endswith(("/state", "/results/{name}")):
+        return False
+    return method != "GET" or "{" in path or path == "/v1/events"
+
+
+@pytest.mark.parametrize("name", list(filter(can_be_wrong, OPERATIONS)))
+def test_what_the_document_does_not_allow_is_refused(served: Served, name: str) -> None:
+    check(served, name, GenerationMode.NEGATIVE, 8)
+
+
+def test_each_answer_has_its_fields_in_the_document(served: Served) -> None:
+    """A client can be written from it alone."""
+    for name, operation in served.operations.items():
+        for status, answer in operation.definition.raw["responses"].items():
+            for kind, content in answer.get("content", {}).items():
+                if status.startswith("2") and kind == "application/json":
+                    assert "$ref" in content["schema"], name
