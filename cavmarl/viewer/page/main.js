@@ -20,7 +20,7 @@ const page = {
   looksBack: false, chosen: null, wanted: null, following: false, told: null,
   coloring: "agent", theme: "light", ghosts: null,
   arrived: 0, between: 100, dirty: true, socket: null, over: false,
-  times: [], firstPicture: 0, calls: 0, stillDrawn: 0,
+  times: [], takes: [], firstPicture: 0, calls: 0, stillDrawn: 0,
 };
 window.viewer = page; // for tests and measurements
 
@@ -84,7 +84,12 @@ function takeBytes(buffer) {
   const kind = kindOf(buffer);
   if (kind === MAP) takeMap(decodeMap(buffer));
   else if (kind === ROSTER) page.roster = page.roster.after(buffer);
-  else if (kind === FRAME) takeFrame(decodeFrame(buffer, page.roster));
+  else if (kind === FRAME) {
+    const begun = performance.now();
+    takeFrame(decodeFrame(buffer, page.roster));
+    page.takes.push(performance.now() - begun);
+    if (page.takes.length > COUNTED) page.takes.shift();
+  }
 }
 
 function takeMap(map) {
