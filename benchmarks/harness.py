@@ -31,7 +31,7 @@ from cavmarl.bench.harness import (
 )
 from cavmarl.cli.output import JsonPath, about, print_error, write_json
 from cavmarl.core.errors import CavmarlError
-from cavmarl.evaluate.provenance.machine import describe_hardware
+from cavmarl.core.machine import describe_hardware
 
 __all__ = [
     "Env",

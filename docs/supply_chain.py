@@ -19,13 +19,16 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[1]
-LOCKED = "sumo,maps,followers,nodes,render,report,service"  # torch's wheels differ by processor
+# torch's wheels differ by processor.
+LOCKED = "sumo,maps,followers,nodes,recordings,render,report,service"
 EXTRAS = (
     "",
     "sumo",
     "maps",
     "followers",
     "nodes",
+    "recordings",
+    "mcap",
     "render",
     "report",
     "service",

@@ -37,6 +37,8 @@ LATE = (
     "torchrl",
     "tensordict",
     "benchmarl",
+    "pyarrow",
+    "mcap",
 )
 
 PROBE = """

@@ -30,7 +30,7 @@ from cavmarl.bench.highway_worlds import (
 )
 from cavmarl.config.registry import shadow
 from cavmarl.core.errors import ConfigError, require
-from cavmarl.evaluate.provenance.machine import describe_hardware
+from cavmarl.core.machine import describe_hardware
 
 if TYPE_CHECKING:
     from cavmarl.bench.highway_rows import HighwayRows

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 from cavmarl.bench.harness import Result, Say, paired_ratio, silent
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError, WorkerError
+from cavmarl.core.machine import describe_hardware
 from cavmarl.env.vector import CavVectorEnv, make_vec
-from cavmarl.evaluate.provenance.machine import describe_hardware
 from cavmarl.parallel.pooled_worlds import PooledWorlds
 from cavmarl.parallel.processes.worker_pool import Pool
 

@@ -21,6 +21,7 @@ from cavmarl.cli import (
     map,
     node,
     plan,
+    replay,
     scenario,
     service,
     suite,
@@ -53,6 +54,7 @@ app.command()(lead.lead)
 app.command()(follow.follow)
 app.command()(node.node)
 app.command()(view.view)
+app.command()(replay.replay)
 app.command()(demo.demo)
 app.command(context_settings={"ignore_unknown_options": True, "allow_interspersed_args": False})(
     train.train

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from cavmarl.cli.evaluate import evaluate_showing, report_table
 from cavmarl.cli.output import JsonPath, Seed, about, make_folder, write_json
-from cavmarl.cli.view import record
+from cavmarl.cli.view import drive
 from cavmarl.config.registry import find_settings, programs
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError, require
@@ -56,7 +56,7 @@ def demo(
     for env, policy in videos.items():
         made = parallel_env(env, render_mode="rgb_array")
         video = out / f"{env}.mp4"
-        stats[env] = record(made, policy, seconds, EVALUATION_SEED, video, console)
+        stats[env] = drive(made, policy, seconds, EVALUATION_SEED, video, console)
         console.print(f"{Path(policy).name} in {env}: {_traffic(stats[env])}")
     console.print("[bold]made:[/]")
     for path in (trained, *(out / f"{env}.mp4" for env in videos)):

@@ -17,6 +17,7 @@ from rich.table import Table
 
 from cavmarl.cli.output import (
     JsonPath,
+    RecordPath,
     about,
     about_file,
     grid,
@@ -58,6 +59,10 @@ def evaluate(
     out: Annotated[
         Path | None, about("Folder of manifest and raw results; default: a new one in runs/.")
     ] = None,
+    record: RecordPath = None,
+    failures: Annotated[
+        int, about("Write failures.html with so many of the worst trips, each with a replay.")
+    ] = 0,
     html: HtmlPath = None,
     json_path: JsonPath = None,
 ) -> None:
@@ -65,8 +70,10 @@ def evaluate(
     _check_page(html)
     console = Console()
     folder = out or _new_folder(world.env)
-    counts = {"episodes": episodes, "repeats": repeats}
-    found = evaluate_showing(console, world, policy or ["idm"], out=folder, **counts)
+    more = {"episodes": episodes, "repeats": repeats, "record": record, "failures": failures}
+    found = evaluate_showing(console, world, policy or ["idm"], out=folder, **more)
+    if failures:
+        console.print(f"failed trips: {folder / 'failures.html'}", markup=False)
     _show(console, found, folder, html, json_path)
 
 

@@ -83,6 +83,9 @@ Settings = Annotated[
     list[str] | None, about("Any key of env.yaml; may be repeated.", "--set", metavar="KEY=VALUE")
 ]
 JsonPath = Annotated[Path | None, about_file("Write the result here as JSON.", "--json")]
+RecordPath = Annotated[
+    Path | None, about("Record into this new folder, for `cavmarl replay`.", "--record")
+]
 AtLeast = Annotated[
     float | None, about("Exit with 1 if it is not so many times as fast.", callback=check_bound)
 ]

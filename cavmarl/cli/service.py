@@ -82,6 +82,9 @@ def submit(
     ] = None,
     episodes: Annotated[int, about("Episodes of each run.", "--episodes", "-n")] = 32,
     repeats: Annotated[int, about("Independent runs.", "--repeats", "-r")] = 1,
+    wait_s: Annotated[
+        float | None, about("Fail if no node has taken it after so many seconds.", min=0.0)
+    ] = None,
     out: Annotated[Path | None, about("Folder of the results; default: runs/submit/JOB.")] = None,
     service: Url = DEFAULT_URL,
     secret_file: SecretFile = None,
@@ -97,12 +100,15 @@ def submit(
     del keys["max_cycles"]
     with connect(service, secret_file, authority) as client:
         job = client.submit(
-            world.env, policies=policy or ["idm"], episodes=episodes, repeats=repeats, **keys
-        )
+            world.env, policies=policy or ["idm"], episodes=episodes, repeats=repeats,
+            wait_s=wait_s, **keys,
+        )  # fmt: skip
         folder = out or Path("runs/submit") / job
         make_folder(folder)
         with console.status(f"job {job}"):
             client.wait(job, folder)
+        told = "".join(json.dumps(event) + "\n" for event in client.events(job))
+        (folder / "service_events.jsonl").write_text(told, encoding="utf-8")
     found = load_report(folder)
     console.print(report_table(found))
     write_json(json_path, found.to_dict())
@@ -157,6 +163,9 @@ def sessions(
 def events(
     after: Annotated[int, about("Those after this number.", min=0)] = 0,
     follow: Annotated[bool, about("Go on as they come.", "--follow", "-f")] = False,
+    subject: Annotated[
+        str | None, about("Only those of this session, job, node or configuration.")
+    ] = None,
     service: Url = DEFAULT_URL,
     secret_file: SecretFile = None,
     authority: Authority = None,
@@ -165,9 +174,11 @@ def events(
     with connect(service, secret_file, authority) as client:
         if follow:
             for event in client.follow(after):
-                _tell(json.dumps(event))
+                if subject in (None, event["subject"]):
+                    _tell(json.dumps(event))
             return
-        while lines := client.get("/events", after=after, limit=1000)["events"]:
+        params = {"limit": 1000} | ({} if subject is None else {"subject": subject})
+        while lines := client.get("/events", after=after, **params)["events"]:
             for event in lines:
                 _tell(json.dumps(event))
             after = lines[-1]["sequence"]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 from rich.console import Console
 
 from cavmarl.cli.evaluate import progress_bar
-from cavmarl.cli.output import JsonPath, PolicyName, about, with_world, write_json
+from cavmarl.cli.output import JsonPath, PolicyName, RecordPath, about, with_world, write_json
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
 from cavmarl.viewer.web_options import DEFAULT_PORT, WebOptions
@@ -43,6 +43,7 @@ def view(
     ),
     token: Annotated[str, about("Token that a page has to give.", envvar=TOKEN_VARIABLE)] = "",
     watch_only: Annotated[bool, about("Pages may not pause, step or drive.")] = False,
+    record: RecordPath = None,
     json_path: JsonPath = None,
 ) -> None:
     """Drive one world and show it from above."""
@@ -53,7 +54,9 @@ def view(
 
         _check_web(seconds, video, ghosts_of)
         options = WebOptions(host, port, token, control=not watch_only)
-        made = parallel_env(world.env, zones=zones, workers=workers, **world.keywords)
+        made = parallel_env(
+            world.env, zones=zones, workers=workers, record=record, **world.keywords
+        )
         show = partial(Console().print, markup=False, highlight=False, soft_wrap=True)
         stats = show_world(made, policy, world.seed, options, show, seconds)
         write_json(json_path, {"video": None, "traffic": stats})
@@ -62,12 +65,14 @@ def view(
     if not 0.0 < seconds <= 3600.0:
         raise ConfigError(f"--seconds {seconds:g}: must be above 0 and at most 3600")
     if video is None:
-        _check_display()
+        check_display()
     mode = "human" if video is None else "rgb_array"
-    made = parallel_env(world.env, zones=zones, workers=workers, render_mode=mode, **world.keywords)
+    made = parallel_env(
+        world.env, zones=zones, workers=workers, render_mode=mode, record=record, **world.keywords
+    )
     made.ghosts_of = ghosts_of
     console = Console()
-    stats = record(made, policy, seconds, world.seed, video, console)
+    stats = drive(made, policy, seconds, world.seed, video, console)
     if video is not None:
         console.print(f"video: {video}", markup=False)
     write_json(json_path, {"video": str(video) if video else None, "traffic": stats})
@@ -83,14 +88,14 @@ def _check_web(seconds: float | None, video: Path | None, ghosts_of: int | None)
         raise ConfigError("--web and --ghosts-of: the page has a choice of zones; leave it out")
 
 
-def _check_display() -> None:
+def check_display() -> None:
     """Refuse a window where SDL would draw it nowhere and say nothing: Linux without a display."""
     shows = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
     if sys.platform == "linux" and not any(os.environ.get(name) for name in shows):
         raise ConfigError("there is no display for a window: use --video FILE")
 
 
-def record(
+def drive(
     world: CavEnv, policy: str, seconds: float, seed: int, video: Path | None, console: Console
 ) -> dict[str, float]:
     """Drive `world` for some seconds, and film it where `video` is a path.

@@ -24,8 +24,16 @@ def _wanted(node: str | None, needs: Sequence[str], wait_s: float) -> dict[str, 
     return {"node": node, "needs": list(needs), "wait_s": wait_s}
 
 
-def _job(policies: Sequence[str], episodes: int, repeats: int, node: str | None) -> dict[str, Any]:
-    return {"policies": list(policies), "episodes": episodes, "repeats": repeats, "node": node}
+def _job(
+    policies: Sequence[str], episodes: int, repeats: int, node: str | None, wait_s: float | None
+) -> dict[str, Any]:
+    return {
+        "policies": list(policies),
+        "episodes": episodes,
+        "repeats": repeats,
+        "node": node,
+        "wait_s": wait_s,
+    }
 
 
 def _write(files: dict[str, bytes], folder: str | Path) -> Path:
@@ -112,10 +120,14 @@ class Client:
         episodes: int = 32,
         repeats: int = 1,
         node: str | None = None,
+        wait_s: float | None = None,
         **keys: Any,
     ) -> str:
-        """The id of a new job: an evaluation, as `cavmarl.evaluate.evaluate` makes it."""
-        job = _job(policies, episodes, repeats, node)
+        """The id of a new job: an evaluation, as `cavmarl.evaluate.evaluate` makes it.
+
+        Where no node can take it now it waits, at most `wait_s`; then it has failed.
+        """
+        job = _job(policies, episodes, repeats, node, wait_s)
         return self.run(self.flows.submit(environment, keys, job))
 
     def wait(
@@ -126,6 +138,10 @@ class Client:
         if folder is not None:
             _write(self.run(self.flows.results(job)), folder)
         return found
+
+    def events(self, subject: str) -> list[dict[str, Any]]:
+        """What the log has of a session, a job or a node."""
+        return self.run(self.flows.events(subject))
 
     def get(self, path: str, **params: Any) -> Any:
         """A document of the service: `/nodes`, `/sessions`, `/events`."""
@@ -259,10 +275,11 @@ class AsyncClient:
         episodes: int = 32,
         repeats: int = 1,
         node: str | None = None,
+        wait_s: float | None = None,
         **keys: Any,
     ) -> str:
         """As `Client.submit`."""
-        job = _job(policies, episodes, repeats, node)
+        job = _job(policies, episodes, repeats, node, wait_s)
         return await self.run(self.flows.submit(environment, keys, job))
 
     async def wait(
@@ -273,6 +290,10 @@ class AsyncClient:
         if folder is not None:
             _write(await self.run(self.flows.results(job)), folder)
         return found
+
+    async def events(self, subject: str) -> list[dict[str, Any]]:
+        """As `Client.events`."""
+        return await self.run(self.flows.events(subject))
 
     async def get(self, path: str, **params: Any) -> Any:
         """As `Client.get`."""

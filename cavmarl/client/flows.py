@@ -18,6 +18,7 @@ from cavmarl.core.errors import ServiceError
 T = TypeVar("T")
 RENEW_BEFORE_S = 60.0  # a token ends
 AGAIN_S = 0.2  # between two attempts
+PAGE = 1000  # events in one answer
 RETRIED_S = 10.0  # for so long is asked again for an answer that was lost
 
 
@@ -142,6 +143,17 @@ class ServiceFlows:
             answer = yield from self.ask("GET", f"/jobs/{job}/results/{name}")
             files[name] = answer.content
         return files
+
+    def events(self, subject: str) -> Flow[list[dict[str, Any]]]:
+        """What the log has of a session, a job or a node."""
+        found: list[dict[str, Any]] = []
+        after = 0
+        while True:
+            page = yield from self.get("/events", after=after, limit=PAGE, subject=subject)
+            if not page["events"]:
+                return found
+            found += page["events"]
+            after = found[-1]["sequence"]
 
     def _renew(self) -> Flow[None]:
         answer = yield Ask("POST", f"{self.url}/v1/token", {"secret": self._secret})

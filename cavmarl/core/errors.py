@@ -107,6 +107,13 @@ class ManifestError(EvaluationError):
     """Results without a manifest, with one that was never closed, or with one of other results."""
 
 
+class RecordingError(CavmarlError):
+    """A recording that cannot be written, or one that is cut short, damaged or of another version.
+
+    The message names the file and what to do.
+    """
+
+
 class TrainingError(CavmarlError):
     """A run of training that cannot begin, go on or be written.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from cavmarl.core.records.codes import (
     EVENT_RED_LIGHT,
     EVENT_WRONG_WAY,
 )
+from cavmarl.engine.kernels.seen_rows import write_seen
 from cavmarl.engine.world_views import WorldViews
 from cavmarl.handoff.zone_view import TransferInFlight
 
@@ -46,9 +47,6 @@ SEEN = np.dtype(
         ("transfer", "i1"),
     ]
 )
-# What is copied as it is; `vclass` is that of the type, `zone` the owner.
-_COPIED = tuple(name for name in SEEN.names or () if name not in ("vclass", "zone"))
-
 # An agent whose vehicle ended in the step before the frame, and by which EVENT_* bits.
 ENDED = np.dtype([("agent", "<i4"), ("events", "<i4")])
 _NONE_ENDED = np.zeros(0, dtype=ENDED)
@@ -101,12 +99,8 @@ def frame_of(
         ended: ENDED, of the last step.
     """
     rows = simulation.vehicles(world)
-    rows = rows[np.argsort(rows["id"])]
     seen = np.empty(len(rows), dtype=SEEN)
-    for name in _COPIED:
-        seen[name] = rows[name]
-    seen["zone"] = rows["owner"]
-    seen["vclass"] = simulation.types["vclass"][rows["vtype"]]
+    write_seen(rows, np.argsort(rows["id"]), simulation.types, seen)
     view = simulation.zone_view(world) if simulation.partition.count > 1 else None
     tick = int(simulation.ticks()[world])
     return WorldFrame(
@@ -124,24 +118,29 @@ def frame_of(
 def events_between(before: WorldFrame, after: WorldFrame) -> Iterator[FrameEvent]:
     """What happened from one frame to the next of the same episode, in the order of vehicles."""
     ids, were = after.vehicles["id"], before.vehicles["id"]
-    for row in after.vehicles[~np.isin(ids, were)]:
-        yield FrameEvent(after.tick, "departed", int(row["id"]), int(row["agent"]), "")
-    bits_of = {int(end["agent"]): int(end["events"]) for end in after.ended}
-    for row in before.vehicles[~np.isin(were, ids)]:
-        bits = bits_of.get(int(row["agent"]), 0)
-        kinds = [kind for bit, kind in _KINDS.items() if bits & bit] or ["left"]
-        for kind in kinds:
-            yield FrameEvent(after.tick, kind, int(row["id"]), int(row["agent"]), "")
-    both, old, new = np.intersect1d(were, ids, assume_unique=True, return_indices=True)
-    told = after.vehicles["events"][new]
-    moved = before.vehicles["zone"][old] != after.vehicles["zone"][new]
+    both = ids
+    old: Any = slice(None)
+    new: Any = slice(None)
+    if not np.array_equal(ids, were):
+        for row in after.vehicles[~np.isin(ids, were)]:
+            yield FrameEvent(after.tick, "departed", int(row["id"]), int(row["agent"]), "")
+        bits_of = {int(end["agent"]): int(end["events"]) for end in after.ended}
+        for row in before.vehicles[~np.isin(were, ids)]:
+            bits = bits_of.get(int(row["agent"]), 0)
+            kinds = [kind for bit, kind in _KINDS.items() if bits & bit] or ["left"]
+            for kind in kinds:
+                yield FrameEvent(after.tick, kind, int(row["id"]), int(row["agent"]), "")
+        both, old, new = np.intersect1d(were, ids, assume_unique=True, return_indices=True)
+    rows, zones = after.vehicles[new], before.vehicles["zone"][old]
+    told = rows["events"]
+    moved = zones != rows["zone"]
     for k in np.flatnonzero(moved | (told != 0)):
-        row, agent = after.vehicles[new[k]], int(after.vehicles["agent"][new[k]])
+        row, agent = rows[k], int(rows["agent"][k])
         for bit, kind in _KINDS.items():
             if told[k] & bit:
                 yield FrameEvent(after.tick, kind, int(both[k]), agent, "")
         if moved[k]:
-            zones = f"{before.vehicles['zone'][old[k]]} to {row['zone']}"
-            yield FrameEvent(after.tick, "transferred", int(both[k]), agent, zones)
+            way = f"{zones[k]} to {row['zone']}"
+            yield FrameEvent(after.tick, "transferred", int(both[k]), agent, way)
     for signal in np.flatnonzero(before.signals != after.signals):
         yield FrameEvent(after.tick, "signal", -1, -1, f"{signal}: phase {after.signals[signal]}")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
@@ -41,3 +43,10 @@ def refuse_over(over: NDArray[np.bool_]) -> None:
             f"world {int(over.argmax())} is over, and autoreset_mode is 'Disabled': call "
             "reset(options={'reset_mask': …}) before the next step()"
         )
+
+
+def with_rows(array: NDArray[Any], others: NDArray[Any], chosen: NDArray[np.bool_]) -> NDArray[Any]:
+    """A copy of an array (W, …) with the chosen rows (W,) of another one."""
+    found = array.copy()
+    found[chosen] = others[chosen]
+    return found

@@ -1,8 +1,9 @@
-"""What can be seen of the worlds that an environment steps: pictures, a window, frames of data."""
+"""What can be seen of the worlds that an environment steps: pictures, frames, recordings."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,10 +21,12 @@ from cavmarl.core.records.codes import (
 )
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_frame import ENDED, WorldFrame, frame_of
+from cavmarl.env.recorded_worlds import recording_of
 from cavmarl.parallel.backends import shows_state
 from cavmarl.parallel.journaled_worlds import unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds, kept_elsewhere
 from cavmarl.parallel.step_arrays import SteppedWorlds
+from cavmarl.recordings.recording_writer import RecordingWriter
 from cavmarl.render.topdown import WorldView
 
 RENDER_MODES = ("human", "rgb_array")
@@ -80,6 +83,7 @@ class DrawnWorlds:
     _ready: bool = False  # whether `reset` has been called
     _view: WorldView | None
     _copied: LocalWorlds | None = None  # of worlds that other processes have
+    _writer: RecordingWriter | None = None
 
     def _frame(self, world: int = 0, ghosts_of: int | None = None) -> NDArray[np.uint8] | None:
         """A world as it is now; None and a warning without a render_mode, as Gymnasium has it."""
@@ -135,18 +139,51 @@ class DrawnWorlds:
             ended["events"][arrays.terms[world, agents, term] > 0.0] |= bit
         return ended
 
-    def _shown(self) -> Simulation:
-        """The worlds, or a copy of them as they are now where they live in other processes."""
+    def record(self, path: str | Path | None) -> None:
+        """Record all worlds from the next reset or step on, until `close`; see docs/recordings.md.
+
+        Args:
+            path: a new folder; None: record nothing.
+
+        Raises:
+            EpisodeError: a recording has begun already.
+            RecordingError: there is something at `path`, or it cannot be written.
+            MissingExtraError: pyarrow is not installed.
+        """
+        if path is None:
+            return
+        if self._writer is not None:
+            raise EpisodeError(f"record({str(path)!r}): {self._writer.path} is recorded already")
+        self._writer = recording_of(path, self.worlds.world, self._standing())
+
+    def _record_frames(self, chosen: NDArray[np.bool_] | None = None) -> None:
+        """Add the present moment of the chosen worlds (W,), or of all, to what is recorded."""
+        if self._writer is not None:
+            every = range(len(self.worlds.arrays.mask))
+            some = every if chosen is None else np.flatnonzero(chosen).tolist()
+            self._writer.add(self.world_frames(some, ghosts=True))
+
+    def _standing(self) -> Simulation:
+        """The worlds, or a copy of them as they have been at some time."""
         worlds = self.worlds
         if isinstance(worlds, LocalWorlds):
             return worlds.simulation
         if self._copied is None:
             self._copied = LocalWorlds(unwatched(worlds.world), len(worlds.arrays.mask))
-        self._copied.load_worlds(worlds.save_worlds())
         return self._copied.simulation
 
+    def _shown(self) -> Simulation:
+        """The worlds, or a copy of them as they are now where they live in other processes."""
+        simulation = self._standing()
+        if self._copied is not None:
+            self._copied.load_worlds(self.worlds.save_worlds())
+        return simulation
+
     def _close_view(self) -> None:
-        """Close the window, if there is one."""
+        """Close the window and the recording, if there are any."""
+        if self._writer is not None:
+            writer, self._writer = self._writer, None
+            writer.close()
         if self._view is not None:
             self._view.close()
             self._view = None

@@ -29,6 +29,7 @@ from cavmarl.engine.world_setup import check_agents, make_world
 from cavmarl.env.actions import LENIENT, ActionDecoder
 from cavmarl.env.declared_events import DeclaredEvents
 from cavmarl.env.drawn_worlds import RENDER_MODES, DrawnWorlds, check_rendering
+from cavmarl.env.recorded_worlds import check_recording
 from cavmarl.env.world_copies import CopiedWithWorlds
 from cavmarl.parallel.backends import check_hosts, make_worlds, places_of
 from cavmarl.parallel.step_arrays import SteppedWorlds
@@ -38,6 +39,13 @@ from cavmarl.sensors.mounted.frames import SensorFrames
 _OF_VEHICLE = ("active", "vehicle_done", "vehicle_id")
 
 Observation = NDArray[np.float32] | dict[str, NDArray[Any]]
+Stepped = tuple[
+    dict[str, Observation],
+    dict[str, float],
+    dict[str, bool],
+    dict[str, bool],
+    dict[str, dict[str, float]],
+]
 
 
 def parallel_env(
@@ -53,6 +61,7 @@ def parallel_env(
     seed: int | None = None,
     max_cycles: int | None = None,
     render_mode: str | None = None,
+    record: str | Path | None = None,
     lenient: bool = False,
     overrides: Mapping[str, Any] | None = None,
 ) -> CavEnv:
@@ -74,6 +83,7 @@ def parallel_env(
         seed: of the first reset, if that is given none.
         max_cycles: steps until truncation; shadows horizon_s.
         render_mode: `human`, `rgb_array` or None.
+        record: a new folder to record into (docs/recordings.md); None: nothing.
         lenient: for libraries that act for absent agents, or beyond the bounds: values are clipped,
             actions of agents that have left ignored, and missing ones are the last, or 0. Sets
             action.out_of_range, .missing_action and .late_actions; traffic_stats() counts each.
@@ -83,7 +93,8 @@ def parallel_env(
         ConfigError: a key, value or combination that cannot work.
         MapError: the map cannot be read or driven.
         WorkerError: worker processes cannot be started, or have no memory.
-        MissingExtraError: hosts on Ray without Ray.
+        MissingExtraError: hosts on Ray without Ray, or `record` without pyarrow.
+        RecordingError: `record` cannot be written.
     """
     workers, hosts = places_of(workers, hosts, nodes)
     check_hosts(workers, hosts)
@@ -101,9 +112,12 @@ def parallel_env(
     )
     check_agents(config)
     check_rendering(config, render_mode, 1, workers, hosts)
+    check_recording(config, record, 1, workers, hosts)
     world = make_world(config, base_dir)
     worlds = make_worlds(world, base_dir, 1, workers, hosts, in_next_step=True)
-    return CavEnv(worlds, seed=first_seed, render_mode=render_mode)
+    made = CavEnv(worlds, seed=first_seed, render_mode=render_mode)
+    made.record(record)
+    return made
 
 
 def _flags(agents: list[str], flags: NDArray[np.bool_]) -> dict[str, bool]:
@@ -120,8 +134,7 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
     hold every term by its name, and `active` (it has a vehicle), `vehicle_done` (that vehicle's
     trip ended in this step) and `vehicle_id`; all are plain numbers.
 
-    The world runs in this process, or its zones are shared out over worker processes
-    (docs/workers.md): what comes out is the same bit for bit.
+    It runs here, or its zones over worker processes (docs/workers.md): the same bit for bit.
 
     Args:
         worlds: the one world; it begins anew in the next step, which never comes: a reset does.
@@ -231,20 +244,13 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
         self._decoder.forget(arrays.chosen)
         self._steps = 0
         self._ready = True
+        self._record_frames()
         self._list(np.flatnonzero(arrays.mask[0] | self._seats))
         if not self.agents:
             self._wait_for_agents()
         return self._observations(), self._infos()
 
-    def step(
-        self, actions: Mapping[str, Any]
-    ) -> tuple[
-        dict[str, Observation],
-        dict[str, float],
-        dict[str, bool],
-        dict[str, bool],
-        dict[str, dict[str, float]],
-    ]:
+    def step(self, actions: Mapping[str, Any]) -> Stepped:
         """Let every agent act and the world go on for `step_s` seconds.
 
         Agents that enter during the step are in the results, with reward 0. When all agents have
@@ -265,17 +271,10 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
         commands = self._decoder.from_dict(actions, self.agents, needed)
         self.worlds.step(self._events.add_to(commands))
         self._steps += 1
+        self._record_frames()
         return self._report()
 
-    def _report(
-        self,
-    ) -> tuple[
-        dict[str, Observation],
-        dict[str, float],
-        dict[str, bool],
-        dict[str, bool],
-        dict[str, dict[str, float]],
-    ]:
+    def _report(self) -> Stepped:
         """What the agents get after a step; decides which stay."""
         arrays = self.worlds.arrays
         truncated = self._steps >= self.max_cycles
@@ -319,6 +318,7 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
         while not arrays.episode_over[0] and self._steps < self._max_cycles:
             self.worlds.step(self._decoder.idle())
             self._steps += 1
+            self._record_frames()
             if arrays.mask.any():
                 self._list(np.flatnonzero(arrays.mask[0]))
                 break
@@ -442,7 +442,7 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
         return self._frame(ghosts_of=self.ghosts_of)
 
     def close(self) -> None:
-        """Close the window and end the worker processes, if there are any.
+        """Close window and recording and end the worker processes, if there are any.
 
         Without workers the environment can be used on.
         """

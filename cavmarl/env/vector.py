@@ -26,9 +26,10 @@ from cavmarl.engine.spaces import (
 )
 from cavmarl.engine.world_setup import check_agents, make_world
 from cavmarl.env.actions import ActionDecoder
-from cavmarl.env.autoreset import known_mode, present_mode, refuse_over
+from cavmarl.env.autoreset import known_mode, present_mode, refuse_over, with_rows
 from cavmarl.env.declared_events import DeclaredEvents
 from cavmarl.env.drawn_worlds import DrawnWorlds, check_rendering
+from cavmarl.env.recorded_worlds import check_recording
 from cavmarl.env.saved_state import SavedState
 from cavmarl.env.world_copies import CopiedWithWorlds
 from cavmarl.parallel.backends import check_hosts, make_worlds, places_of
@@ -62,6 +63,7 @@ def make_vec(
     autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
     copy: bool = True,
     render_mode: str | None = None,
+    record: str | Path | None = None,
     overrides: Mapping[str, Any] | None = None,
 ) -> CavVectorEnv:
     """Make `num_envs` worlds of one environment that are stepped together.
@@ -80,22 +82,21 @@ def make_vec(
         background: shadows population.background.
         seed: of the first reset, if that is given none.
         max_cycles: steps until truncation; shadows horizon_s.
-        autoreset_mode: when a world that is over begins anew: in the `SameStep`, in the `NextStep`,
-            or when `reset` says so (`Disabled`); see `CavVectorEnv`.
-        copy: False returns observations without a copy; see `CavVectorEnv`.
+        autoreset_mode: when a world that is over begins anew; see `CavVectorEnv`.
+        copy: False returns observations without a copy.
         render_mode: `rgb_array` or None.
+        record: a new folder to record into, a subfolder a world (docs/recordings.md).
         overrides: values for any other key.
 
     Raises:
         ConfigError: a key, value or combination that cannot work.
         MapError: the map cannot be read or driven.
         WorkerError: worker processes cannot be started, or have no memory.
-        MissingExtraError: hosts on Ray without Ray.
+        MissingExtraError, RecordingError: `hosts` or `record` without its extra; a taken path.
     """
-    num_envs = _checked(num_envs)
+    num_envs, mode = _checked(num_envs), known_mode(autoreset_mode)
     workers, hosts = places_of(workers, hosts, nodes)
     check_hosts(workers, hosts)
-    mode = known_mode(autoreset_mode)
     first_seed = None if seed is None else check_seed(seed)
     config, base_dir = load_config(
         env,
@@ -108,11 +109,14 @@ def make_vec(
     )
     check_agents(config)
     check_rendering(config, render_mode, num_envs, workers, hosts, ("rgb_array",))
+    check_recording(config, record, num_envs, workers, hosts)
     world = make_world(config, base_dir)
     in_next_step = mode is not AutoresetMode.SAME_STEP
     worlds = make_worlds(world, base_dir, num_envs, workers, hosts, in_next_step)
-    forms: dict[str, Any] = {"copy": copy, "render_mode": render_mode}
-    return CavVectorEnv(worlds, seed=first_seed, disabled=mode is AutoresetMode.DISABLED, **forms)
+    forms: dict[str, Any] = {"copy": copy, "render_mode": render_mode, "seed": first_seed}
+    made = CavVectorEnv(worlds, disabled=mode is AutoresetMode.DISABLED, **forms)
+    made.record(record)
+    return made
 
 
 def _checked(num_envs: int) -> int:
@@ -271,6 +275,7 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
         self._mask = self.worlds.arrays.mask.copy()
         self._over = self._over & ~chosen
         self._ready = True
+        self._record_frames(chosen)
         return self._observations(), {"mask": self._mask.copy()}
 
     def _chosen(self, reset_mask: Any, seed: int | None) -> NDArray[np.bool_]:
@@ -301,10 +306,9 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
         Returns:
             observations (W, A, D), rewards (W, A), terminations (W, A): the agent's vehicle ended;
             truncations (W, A): the episode was cut at the horizon; and infos: `mask` (W, A) agents
-                that
-            act next; `acted` (W, A) agents that acted in this step, so their rewards count; `terms`
-            (W, A, T) in the order of `config.TERMS`; `arrivals` (W,) vehicles that reached their
-            goal since the reset, agents included; `episode_over` (W,) which worlds are over;
+            that act next; `acted` (W, A) agents that acted in this step, so their rewards count;
+            `terms` (W, A, T) in the order of `config.TERMS`; `arrivals` (W,) vehicles that reached
+            their goal since the reset, agents included; `episode_over` (W,) which worlds are over;
             `final_observations` (W, A, D) before a reset and with the last ones of agents that
             left: the same array as the observations in a step where none did.
 
@@ -321,6 +325,7 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
         began = time.perf_counter()
         self.worlds.step(self._events.add_to(commands))
         self.simulated_s += time.perf_counter() - began
+        self._record_frames()
         arrays = self.worlds.arrays
         over = self._over = arrays.episode_over.copy()
         terminations = arrays.terminations.copy()
@@ -379,10 +384,10 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
         """The observations, and of the worlds (W,) where something ended those before that."""
         arrays = self.worlds.arrays
         if not self._senses:
-            return _with_rows(arrays.observations, arrays.final_observations, ended)
+            return with_rows(arrays.observations, arrays.final_observations, ended)
         last = sensed_observation(arrays.final_frames)
         return {
-            name: _with_rows(data, last[name], ended)
+            name: with_rows(data, last[name], ended)
             for name, data in sensed_observation(arrays.frames).items()
         }
 
@@ -436,15 +441,6 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
         return tuple(frame for frame in frames if frame is not None) or None
 
     def close(self) -> None:
-        """End the worker processes, if there are any; arrays that were returned stay."""
+        """End recording and worker processes, if there are any; arrays that were returned stay."""
         self._close_view()
         self.worlds.close()
-
-
-def _with_rows(
-    array: NDArray[Any], others: NDArray[Any], chosen: NDArray[np.bool_]
-) -> NDArray[Any]:
-    """A copy of an array (W, …) with the chosen rows (W,) of another one."""
-    found = array.copy()
-    found[chosen] = others[chosen]
-    return found

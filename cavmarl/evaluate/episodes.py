@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,9 @@ from cavmarl.engine.shard_clock import ShardClock
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.evaluate.encounters import EncounterWatch, MessageRecord
+from cavmarl.evaluate.failure_clips import Failure
 from cavmarl.evaluate.recorder import Recorder
+from cavmarl.evaluate.run_watch import RunWatch, recording_path
 from cavmarl.evaluate.tables import EPISODE, TRACK, TRANSFER, TRIP
 from cavmarl.evaluate.transfer_rows import TransferRecorder
 from cavmarl.parallel.local_worlds import LocalWorlds
@@ -38,6 +40,9 @@ class EpisodeJob(WorldSpec):
     policies: Mapping[str, str]  # as in `load_policy`, by the name that results have
     episodes: int  # how many; episode e is the first one of world e of the seed
     run: int = 0  # its number
+    runs: int = 1  # how many there are
+    record: str = ""  # folder of recordings; empty: nothing is recorded
+    failures: int = 0  # how many failed trips are kept of each policy
 
 
 @dataclass(frozen=True)
@@ -64,6 +69,7 @@ class RunData:
     # TRANSFER records of the changes of owner; none in undivided worlds
     transfers: NDArray[np.void]
     transfer_counts: Mapping[str, int]  # of a `TransferLog`, summed over the episodes
+    failures: Sequence[Failure] = ()  # trips that were no success, as far as they are kept
 
 
 def worlds_at_once(episodes: int, vehicles: int) -> int:
@@ -87,6 +93,8 @@ def _drive(
     parts: list[_Part] = []
     clock = _zone_clock(vec)
     count = math.ceil(job.episodes / vec.num_envs)
+    path = recording_path(job.record, name, job.run, len(job.policies) == job.runs == 1)
+    watch = RunWatch(vec, name, job.run, job.seed, path, job.failures)
     for k in range(count):
         first = k * vec.num_envs
 
@@ -94,9 +102,10 @@ def _drive(
             if progress is not None:
                 progress(name, before * most + steps, count * most)
 
-        part = _Part(vec, min(vec.num_envs, job.episodes - first), tracked=k == 0)
+        part = _Part(vec, watch, min(vec.num_envs, job.episodes - first), tracked=k == 0)
         part.drive(driver, job.seed, first, derived_seed(job.seed, k), step_done)
         parts.append(part)
+    watch.close()
     trips, episodes, transfers = (
         np.concatenate([getattr(part, table) for part in parts])
         for table in ("trips", "episodes", "transfers")
@@ -107,7 +116,8 @@ def _drive(
     for table in (trips, episodes, transfers):
         table["run"] = job.run
     speed = _speed(parts, vec.num_envs, clock)
-    return RunData(trips, episodes, parts[0].tracks, speed, transfers, dict(counts))
+    tracks = parts[0].tracks
+    return RunData(trips, episodes, tracks, speed, transfers, dict(counts), list(watch.failures))
 
 
 def derived_seed(seed: int, number: int) -> int:
@@ -120,8 +130,9 @@ def derived_seed(seed: int, number: int) -> int:
 class _Part:
     """The episodes of the worlds that are stepped together; the first `count` of them count."""
 
-    def __init__(self, vec: CavVectorEnv, count: int, *, tracked: bool) -> None:
+    def __init__(self, vec: CavVectorEnv, seen: RunWatch, count: int, *, tracked: bool) -> None:
         self._vec = vec
+        self._seen = seen
         self._count = count
         self._recorder = Recorder(
             vec.num_envs,
@@ -160,6 +171,7 @@ class _Part:
         imbalance, messages = _Imbalance(vec), MessageRecord(vec)
         running = np.arange(vec.num_envs) < self._count
         every = max(1, round(TRACK_S / vec.step_s))
+        self._seen.begin(first, running)
         steps = 0
         while running.any():
             self._watch.locate()
@@ -180,7 +192,9 @@ class _Part:
             acted = infos["acted"] & running[:, None]
             over = infos["episode_over"] & running
             done = infos["vehicle_done"] & acted
-            self._recorder.add(steps, acted, rewards, infos["terms"], done, over, infos["arrivals"])
+            arrivals = infos["arrivals"]
+            ended = self._recorder.add(steps, acted, rewards, infos["terms"], done, over, arrivals)
+            self._seen.step(running, over, ended)
             handed_over.collect(np.flatnonzero(running).tolist(), over)
             running &= ~over
             steps += 1

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from cavmarl.config.checks import check_count
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
-from cavmarl.core.errors import ConfigError, JournalError, PolicyError
+from cavmarl.core.errors import ConfigError, JournalError, PolicyError, RecordingError, require
+from cavmarl.engine.world_description import describe_world
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.evaluate.episodes import (
@@ -27,11 +28,11 @@ from cavmarl.evaluate.episodes import (
     drive_run,
     worlds_at_once,
 )
+from cavmarl.evaluate.failure_page import write_failures
 from cavmarl.evaluate.fresh import call_in_fresh_process
 from cavmarl.evaluate.provenance.manifest import (
     close_manifest,
     describe_policies,
-    describe_world,
     open_manifest,
     read_closed,
     write_text,
@@ -57,12 +58,14 @@ Policies = str | Path | Sequence[str | Path] | Mapping[str, str | Path]
 
 MAX_EPISODES = 100_000
 MAX_REPEATS = 1000
+MAX_FAILURES = 1000
 
 TRIPS_FILE = "trips.csv"
 EPISODES_FILE = "episodes.csv"
 TRACKS_FILE = "tracks.csv"
 MAP_FILE = "map.json"
 SPEED_FILE = "speed.json"
+FAILURES_FILE = "failures.html"
 TRANSFERS_FILE = "transfers.csv"
 TRANSFER_COUNTS_FILE = "transfer_counts.json"
 RESULT_FILES = [TRIPS_FILE, EPISODES_FILE, TRACKS_FILE, MAP_FILE, SPEED_FILE]
@@ -76,6 +79,8 @@ def evaluate(
     episodes: int = 32,
     repeats: int = 1,
     out: Path | None = None,
+    record: str | Path | None = None,
+    failures: int = 0,
     progress: Progress | None = None,
     **keys: Unpack[WorldKeys],
 ) -> EvaluationReport:
@@ -90,6 +95,9 @@ def evaluate(
         episodes: of each run.
         repeats: independent runs.
         out: folder for manifest and raw results; None keeps nothing but the report.
+        record: a new folder for recordings, whose worlds are episodes; with several policies or
+            runs, in subfolders POLICY/run-N (docs/recordings.md).
+        failures: how many failed trips the page `failures.html` in `out` shows; 0: there is none.
         progress: called after every step of a run with the policy's name, the steps that it has
             done in this run, and the most there can be.
         keys: of the world; the seed is that of the first run, from which the others' follow.
@@ -99,16 +107,39 @@ def evaluate(
         PolicyError: a policy cannot be loaded or does not fit, or two have one name.
         ManifestError: `out` holds results already.
         JournalError: a journal is there already.
+        RecordingError: `record` cannot be written.
+        MissingExtraError: `record` without pyarrow, `failures` without Jinja2.
     """
     check_count("episodes", episodes, MAX_EPISODES)
     check_count("repeats", repeats, MAX_REPEATS)
     spec = WorldSpec.of(env, **keys)
-    job = EpisodeJob(**vars(spec), policies=_named(policies), episodes=episodes)
+    if failures:
+        check_count("failures", failures, MAX_FAILURES)
+        require("jinja2", "report")
+    folders = "" if record is None else str(Path(record).absolute())
+    job = EpisodeJob(
+        **vars(spec),
+        policies=_named(policies),
+        episodes=episodes,
+        runs=repeats,
+        record=folders,
+        failures=failures,
+    )
+    _check_record(folders)
     with TemporaryDirectory() as room:
         folder = Path(room) if out is None else out
         jobs, is_divided = _prepare(folder, job, repeats)
         _drive_all(folder, jobs, progress, is_divided)
         return load_report(folder)
+
+
+def _check_record(folder: str) -> None:
+    """Refuse early what no recording can be made in."""
+    if folder:
+        require("pyarrow", "recordings")
+        path = Path(folder)
+        if path.exists() and not (path.is_dir() and not any(path.iterdir())):
+            raise RecordingError(f"{path}: there is something already; give a new folder")
 
 
 def load_report(folder: Path) -> EvaluationReport:
@@ -246,7 +277,19 @@ def _drive_all(
     if is_divided:
         _write_transfers(folder, names, runs)
         files += TRANSFER_FILES
+    if jobs[0].failures:
+        _write_failures(folder, jobs[0], [data for run in runs for data in run.values()])
+        files.append(FAILURES_FILE)
     close_manifest(folder, files)
+
+
+def _write_failures(folder: Path, job: EpisodeJob, results: list[RunData]) -> None:
+    world = load_world(job.env, **job.keywords)
+    name = f"{world.config.name}-v{world.config.version}"
+    kept = [failure for data in results for failure in data.failures]
+    found = sum(int((data.trips["counted"] & ~data.trips["success"]).sum()) for data in results)
+    path = folder / FAILURES_FILE
+    write_failures(path, kept, job.failures, found, world.network, name)
 
 
 def _deaf(policy: str, steps: int, most: int) -> None:

@@ -64,8 +64,8 @@ class Recorder:
         done: NDArray[np.bool_],
         over: NDArray[np.bool_],
         arrivals: NDArray[np.int64],
-    ) -> None:
-        """Take in one step.
+    ) -> NDArray[np.void]:
+        """Take in one step; the TRIP records of the trips that ended in it.
 
         Args:
             step: its number in the episode, from 0.
@@ -91,8 +91,11 @@ class Recorder:
         agents_arrived = self._world_terms[:, _TERM["arrival"]].astype(np.int64)
         self._background_arrivals[over] = arrivals[over] - agents_arrived[over]
         ended = (self._steps > 0) & (done | over[:, None])
-        if ended.any():
-            self._trips.append(self._close(ended))
+        if not ended.any():
+            return np.zeros(0, dtype=TRIP)
+        rows = self._close(ended)
+        self._trips.append(rows)
+        return rows
 
     def _close(self, ended: NDArray[np.bool_]) -> NDArray[np.void]:
         """TRIP records of the trips that have ended, whose seats are free again."""

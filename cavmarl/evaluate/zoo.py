@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from cavmarl.config.registry import agent_entries
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError, ManifestError, PolicyError
+from cavmarl.engine.world_description import describe_world
 from cavmarl.engine.world_setup import load_world
 from cavmarl.evaluate.episodes import Progress
 from cavmarl.evaluate.evaluation import (
@@ -28,7 +29,7 @@ from cavmarl.evaluate.evaluation import (
     evaluate,
     load_tables,
 )
-from cavmarl.evaluate.provenance.manifest import describe_world, hash_of_file, read_closed
+from cavmarl.evaluate.provenance.manifest import hash_of_file, read_closed
 from cavmarl.policies.policy import TOGETHER, policy_files
 
 RESULT_FOLDER = "result"

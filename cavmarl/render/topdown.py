@@ -198,6 +198,11 @@ class TopDownRenderer:
             self._window = Window(title, fps)
         self._window.show(surface)
 
+    @property
+    def closed_by_person(self) -> bool:
+        """Whether there was a window and a person has closed it."""
+        return self._window is not None and self._window.closed_by_person
+
     def close(self) -> None:
         """Close the window and let go of all pictures; drawing again makes them anew."""
         if self._window is not None:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.cache_folder import cache_dir, tell_unwritable
+from cavmarl.roads.kernels.backdrop_pieces import WALL
 from cavmarl.roads.network import (
     CONFLICT,
     DETECTOR,
@@ -54,6 +55,9 @@ _DTYPES = {
     "switches": SWITCH,
     "detectors": DETECTOR,
     "phase_detectors": np.dtype(np.int32),
+    "walls": WALL,
+    "roofs": np.dtype(np.float64),
+    "roof_height": np.dtype(np.float64),
 }
 _IDS = ("lane_ids", "edge_ids", "junction_ids", "signal_ids", "program_ids", "junction_kinds")
 
@@ -76,30 +80,14 @@ def load_network(path: str | Path) -> RoadNetwork:
     return network
 
 
-def _entry(digest: str) -> Path:
-    layout = hashlib.sha256(repr((FORMAT, [dtype.descr for dtype in _DTYPES.values()])).encode())
-    return cache_dir() / "maps" / f"{digest}-{layout.hexdigest()[:12]}.network"
+def network_layout() -> str:
+    """Short hash of the records of a packed network: another layout cannot be read."""
+    columns = [dtype.descr for dtype in _DTYPES.values()]
+    return hashlib.sha256(repr((FORMAT, columns)).encode()).hexdigest()[:12]
 
 
-def _restore(entry: Path, name: str, digest: str) -> RoadNetwork | None:
-    """The network of a cache entry, or None if there is no whole one."""
-    try:
-        content = entry.read_bytes()
-    except OSError:
-        return None
-    if hashlib.sha256(content[_DIGEST_BYTES:]).digest() != content[:_DIGEST_BYTES]:
-        return None
-    with np.load(io.BytesIO(content[_DIGEST_BYTES:]), allow_pickle=False) as stored:
-        values: dict[str, Any] = {key: _thaw(stored[key], kind) for key, kind in _DTYPES.items()}
-        values |= {key: tuple(json.loads(stored[key].tobytes())) for key in _IDS}
-        geo = json.loads(stored["geo"].tobytes())
-        values["geo"] = None if geo is None else GeoReference(**geo)
-        values["left_hand"] = bool(json.loads(stored["left_hand"].tobytes()))
-    return RoadNetwork(name=name, source_hash=digest, **values)
-
-
-def _store(entry: Path, network: RoadNetwork) -> None:
-    """Write an entry whole or not at all: other processes may read it at any time."""
+def pack_network(network: RoadNetwork) -> bytes:
+    """All of a network but its name and the hash of its source, for `unpack_network`."""
     stored: dict[str, NDArray[np.uint8]] = {}
     for field in fields(network):
         value = getattr(network, field.name)
@@ -112,9 +100,48 @@ def _store(entry: Path, network: RoadNetwork) -> None:
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **stored)
     content = buffer.getvalue()
+    return hashlib.sha256(content).digest() + content
+
+
+def unpack_network(content: bytes, name: str, digest: str) -> RoadNetwork | None:
+    """The network that `pack_network` of the same layout has packed, or None if it is damaged.
+
+    Args:
+        content: what was packed.
+        name: of the network.
+        digest: SHA-256 of its source, hex.
+    """
+    if hashlib.sha256(content[_DIGEST_BYTES:]).digest() != content[:_DIGEST_BYTES]:
+        return None
+    with np.load(io.BytesIO(content[_DIGEST_BYTES:]), allow_pickle=False) as stored:
+        values: dict[str, Any] = {key: _thaw(stored[key], kind) for key, kind in _DTYPES.items()}
+        values |= {key: tuple(json.loads(stored[key].tobytes())) for key in _IDS}
+        values["roofs"] = values["roofs"].reshape(-1, 4, 2)
+        geo = json.loads(stored["geo"].tobytes())
+        values["geo"] = None if geo is None else GeoReference(**geo)
+        values["left_hand"] = bool(json.loads(stored["left_hand"].tobytes()))
+    return RoadNetwork(name=name, source_hash=digest, **values)
+
+
+def _entry(digest: str) -> Path:
+    return cache_dir() / "maps" / f"{digest}-{network_layout()}.network"
+
+
+def _restore(entry: Path, name: str, digest: str) -> RoadNetwork | None:
+    """The network of a cache entry, or None if there is no whole one."""
+    try:
+        content = entry.read_bytes()
+    except OSError:
+        return None
+    return unpack_network(content, name, digest)
+
+
+def _store(entry: Path, network: RoadNetwork) -> None:
+    """Write an entry whole or not at all: other processes may read it at any time."""
+    content = pack_network(network)
     entry.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.NamedTemporaryFile(dir=entry.parent, suffix=".tmp", delete=False) as target:
-        target.write(hashlib.sha256(content).digest() + content)
+        target.write(content)
     os.replace(target.name, entry)
 
 

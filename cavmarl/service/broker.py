@@ -60,6 +60,7 @@ class Broker:
         self._clock_s = clock_s
         self._touched: dict[str, float] = {}  # session → when it was asked for last
         self._skewed: set[str] = set()
+        self._ahead_s = log.wall_s() - clock_s()  # the wall clock, of the other
         # sessions → world, vehicle, source and target of what is about to change its zone
         self.prepared: dict[str, list[list[int]]] = {}
         now_s = clock_s()
@@ -167,7 +168,10 @@ class Broker:
                 if idle_s > self.rules.keep_s:
                     self._forget(session)
             elif session.job is None and idle_s > self.rules.idle_s:
+                self._tell(session, "timeout", {"of": "idle session", "after_s": idle_s})
                 self._end(session, "closed", "service", f"nobody asked for {idle_s:.0f} s")
+        self._end_waits()
+        self._watch_own_clock()
         self.zone_nodes.sweep()
         self.assign_jobs()
 
@@ -182,9 +186,10 @@ class Broker:
         needs: Sequence[str] = (),
         job: dict[str, Any] | None = None,
         zone_nodes: int = 0,
+        wait_s: float | None = None,
         key: str = "",
     ) -> SessionRecord:
-        """A session, assigned to a node; a job waits for one if there is none.
+        """A session, assigned to a node; a job waits for one, `wait_s` at most, if there is none.
 
         With the `key` of a request that was carried out, it is the session of that request.
 
@@ -203,6 +208,7 @@ class Broker:
             "needs": list(needs),
             "preferred": preferred,
             "zone_nodes": zone_nodes,
+            "wait_s": wait_s,
             "key": key,
         }
         if key and (known := self._of_key(identity, data)) is not None:
@@ -244,9 +250,14 @@ class Broker:
         self._assign(number, chosen)
         return session
 
-    def refuse(self, identity: IdentityRecord, subject: str, error: NoNodeError) -> None:
-        """Put on record that no node could take what `identity` wants."""
+    def refuse(
+        self, identity: IdentityRecord, subject: str, error: NoNodeError, waited_s: float = 0.0
+    ) -> None:
+        """Put on record that no node could take what `identity` wants, after it has waited."""
         self.refusals += 1
+        if waited_s > 0.0:
+            told = {"of": "request for a node", "after_s": waited_s}
+            self.log.record("session.timeout", subject, told, actor=identity.id, owner=identity.id)
         shown = [one._asdict() for one in error.exclusions[:SHOWN_EXCLUSIONS]]
         data = {"excluded": shown, "excluded_count": len(error.exclusions)}
         self.log.record("session.refused", subject, data, actor=identity.id, owner=identity.id)
@@ -399,6 +410,23 @@ class Broker:
     def _job_of(self, number: str) -> dict[str, Any]:
         session = self.log.state.sessions[number]
         return {"id": number, "configuration": session.configuration, **(session.job or {})}
+
+    def _end_waits(self) -> None:
+        """Jobs that no node has taken within their time have failed."""
+        for number in sorted(self.log.state.waiting):
+            session = self.log.state.sessions[number]
+            waited_s = self.log.wall_s() - session.opened_s
+            if session.wait_s is None or session.placements or waited_s <= session.wait_s:
+                continue
+            self._tell(session, "timeout", {"of": "job in the queue", "after_s": waited_s})
+            self._end(session, "failed", "service", f"no node took it within {session.wait_s:g} s")
+
+    def _watch_own_clock(self) -> None:
+        """Tell of a wall clock that was set: tokens and leases go by it."""
+        ahead_s = self.log.wall_s() - self._clock_s()
+        if abs(jump_s := ahead_s - self._ahead_s) > self.rules.max_skew_s:
+            self._ahead_s = ahead_s
+            self.log.record("clock.anomaly", "service", {"jump_s": round(jump_s, 3)})
 
     def _watch_clock(self, name: str, sent_s: float) -> None:
         """Tell once of a node whose clock is off, and once when it is right again."""

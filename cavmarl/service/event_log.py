@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 from cavmarl.core.errors import ServiceError
@@ -118,9 +118,3 @@ class EventLog:
         """Wake what waits for a change."""
         async with self.changed:
             self.changed.notify_all()
-
-    def read(self, after: int, limit: int, owner: str | None) -> Iterable[LogEvent]:
-        """Lines that are on disk, of one owner or of all."""
-        for line in self.store.read(after, limit):
-            if owner is None or owner in (line.owner, line.actor):
-                yield line

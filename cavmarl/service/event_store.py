@@ -135,12 +135,27 @@ class EventStore:
                 "of it was: make room, and start the service again"
             ) from error
 
-    def read(self, after: int = 0, limit: int | None = None) -> Iterator[LogEvent]:
-        """The lines after a sequence number."""
+    def read(
+        self,
+        after: int = 0,
+        limit: int | None = None,
+        *,
+        until: int | None = None,  # the last sequence number
+        owner: str | None = None,  # who owns what they are about, or has caused them
+        subject: str | None = None,
+    ) -> Iterator[LogEvent]:
+        """The lines after a sequence number, of all or of some."""
+        wanted = []
+        if until is not None:
+            wanted.append(_EVENTS.c.sequence <= until)
+        if owner is not None:
+            wanted.append((_EVENTS.c.owner == owner) | (_EVENTS.c.actor == owner))
+        if subject is not None:
+            wanted.append(_EVENTS.c.subject == subject)
         left = limit
         while left is None or left > 0:
             size = _PAGE if left is None else min(left, _PAGE)
-            query = select(_EVENTS).where(_EVENTS.c.sequence > after)
+            query = select(_EVENTS).where(_EVENTS.c.sequence > after, *wanted)
             ordered = query.order_by(_EVENTS.c.sequence).limit(size)
             with self._guard, self._connection.begin():
                 rows = list(self._connection.execute(ordered))

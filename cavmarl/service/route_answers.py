@@ -38,7 +38,7 @@ async def assigned(
         except NoNodeError as error:
             left_s = until_s - time.monotonic()
             if left_s <= 0.0:
-                broker.refuse(identity, subject, error)
+                broker.refuse(identity, subject, error, wait_s)
                 raise
             await broker.log.settle()
             broker.waiting += 1
@@ -104,7 +104,7 @@ async def event_stream(
     generation = identity.generation
     while identity.generation == generation:  # its tokens are void: it hears no more
         last = log.durable
-        for line in log.read(after, last - after, owner) if last > after else ():
+        for line in log.store.read(after, until=last, owner=owner) if last > after else ():
             text = event_answer(line).model_dump_json()
             yield f"id: {line.sequence}\nevent: {line.kind}\ndata: {text}\n\n"
         after = max(after, last)

@@ -228,12 +228,16 @@ async def submit(
     if configurations.read_configuration(service.broker.log, body.configuration).get("nodes"):
         raise problem("refused", "nodes: an evaluation runs on one node; leave it out")
     configurations.check_policies(body.policies)
-    job = body.model_dump(include={"policies", "episodes", "repeats"})
-    return session_answer(
-        service.broker.open(
-            identity, body.configuration, preferred=body.node, needs=body.needs, job=job, key=key
-        )
+    session = service.broker.open(
+        identity,
+        body.configuration,
+        preferred=body.node,
+        needs=body.needs,
+        job=body.model_dump(include={"policies", "episodes", "repeats"}),
+        wait_s=body.wait_s,
+        key=key,
     )
+    return session_answer(session)
 
 
 @worlds.post("/jobs/{number}/outcome")
@@ -273,11 +277,12 @@ async def events(
     service: TheService,
     after: Annotated[bodies.Whole, Query()] = 0,
     limit: Annotated[int, Query(ge=1, le=PAGE)] = 100,
+    subject: Annotated[str | None, Query(max_length=128)] = None,
 ) -> answers.EventList:
-    """Events after a sequence number: a client's own, or all."""
+    """Events after a sequence number, of one subject or of all: a client's own, or everybody's."""
     owner = identity.id if identity.role == "client" else None
     await service.broker.log.settle()
-    found = service.broker.log.read(after, limit, owner)
+    found = service.broker.log.store.read(after, limit, owner=owner, subject=subject)
     return answers.EventList(events=list(map(event_answer, found)))
 
 

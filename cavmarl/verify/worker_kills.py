@@ -16,8 +16,8 @@ from typing import Any, Literal, Unpack
 
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError, EvaluationError
+from cavmarl.core.machine import describe_hardware
 from cavmarl.env.vector import CavVectorEnv, make_vec
-from cavmarl.evaluate.provenance.machine import describe_hardware
 from cavmarl.parallel.hosts.host_pool import HostPool
 from cavmarl.parallel.hosts.remote_worlds import RemoteWorlds
 from cavmarl.parallel.pooled_worlds import PooledWorlds

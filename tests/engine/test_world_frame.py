@@ -44,9 +44,12 @@ def test_a_frame_holds_what_the_world_holds_and_stays() -> None:
     for _ in range(10):
         world.step({agent: world.action_space(agent).sample() for agent in world.agents})
     (frame,) = world.world_frames(ghosts=True)
-    rows = np.sort(world.worlds.simulation.vehicles(), order="id")
-    for name in ("id", "x", "heading", "speed", "lane", "agent"):
-        np.testing.assert_array_equal(frame.vehicles[name], rows[name])
+    simulation = world.worlds.simulation
+    rows = np.sort(simulation.vehicles(), order="id")
+    for name in SEEN.names or ():
+        held = {"zone": rows["owner"], "vclass": simulation.types["vclass"][rows["vtype"]]}
+        there = held[name] if name in held else rows[name]
+        np.testing.assert_array_equal(frame.vehicles[name], there.astype(SEEN[name]))
     assert len(frame.ghosts) == 4
     assert any(len(ids) for ids in frame.ghosts)
     kept = frame.vehicles.copy()

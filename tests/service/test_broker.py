@@ -10,6 +10,7 @@ import pytest
 from pydantic import ValidationError
 
 from cavmarl.core.errors import ServiceError
+from cavmarl.service.access import RateLimit
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.event_store import EventStore
 from cavmarl.service.node_selection import NoNodeError
@@ -231,3 +232,67 @@ def test_a_replay_of_the_log_gives_the_same(fleet: Fleet, tmp_path: Path) -> Non
     assert again.content(sessions[0].saved_blob or "") == b"content"
     assert again.store.check_chain() == again.sequence
     fleet.log.store = again.store
+
+
+def test_what_has_taken_too_long_is_a_timeout_on_record(fleet: Fleet) -> None:
+    job = fleet.open(job={"policies": ["idm"], "episodes": 1, "repeats": 1}, wait_s=30.0)
+    fleet.now_s += 29.0
+    fleet.broker.sweep()
+    assert job.state == "queued"
+    fleet.now_s += 2.0
+    fleet.broker.sweep()
+    assert (job.state, job.message) == ("failed", "no node took it within 30 s")
+    fleet.join("a")
+    assert fleet.beat("a")["jobs"] == []
+    session = fleet.open()
+    fleet.now_s += 601.0
+    fleet.broker.sweep()
+    assert session.state == "closed"
+    fleet.log.flush()
+    told = [line.data for line in fleet.log.store.read() if line.kind == "session.timeout"]
+    assert told == [
+        {"of": "job in the queue", "after_s": 31.0},
+        {"of": "idle session", "after_s": 601.0},
+    ]
+
+
+def test_a_job_that_a_node_had_waits_on_when_that_is_lost(fleet: Fleet) -> None:
+    fleet.join("a")
+    job = fleet.open(job={"policies": ["idm"], "episodes": 1, "repeats": 1}, wait_s=5.0)
+    fleet.now_s += 60.0
+    fleet.broker.sweep()
+    assert (job.state, job.placements) == ("queued", 1)
+
+
+def test_a_wall_clock_that_is_set_is_told_once(fleet: Fleet) -> None:
+    fleet.log.wall_s = lambda: fleet.now_s - 3600.0
+    fleet.broker.sweep()
+    fleet.broker.sweep()
+    fleet.log.flush()
+    told = [line for line in fleet.log.store.read() if line.kind == "clock.anomaly"]
+    assert [(line.subject, line.data) for line in told] == [("service", {"jump_s": -3600.0})]
+
+
+def test_expired_tokens_are_refused(fleet: Fleet) -> None:
+    tokens = fleet.access.exchange(fleet.secrets["ada"])
+    fleet.now_s += 899.0
+    assert fleet.access.authenticate(tokens["access_token"]).name == "ada"
+    fleet.now_s += 2.0
+    with pytest.raises(ServiceError, match="expired") as refused:
+        fleet.access.authenticate(tokens["access_token"])
+    assert refused.value.problem == "bad-token"
+    fleet.now_s += 8 * 3600.0
+    with pytest.raises(ServiceError, match="expired"):
+        fleet.access.refresh(tokens["refresh_token"])
+
+
+def test_requests_of_one_caller_have_a_rate(fleet: Fleet) -> None:
+    limit = RateLimit(2.0, 3.0, lambda: fleet.now_s)
+    for _ in range(3):
+        limit.take("ada")
+    with pytest.raises(ServiceError, match="2 requests a second") as refused:
+        limit.take("ada")
+    assert (refused.value.problem, refused.value.retry_s) == ("too-many", 0.5)
+    limit.take("bob")
+    fleet.now_s += 0.5
+    limit.take("ada")

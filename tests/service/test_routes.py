@@ -224,6 +224,10 @@ def test_no_node_is_503_with_a_time_to_try_again(
     body["wait_s"] = 0.5
     assert ask(service, tokens["client"], "POST", "/sessions", json=body).status_code == 503
     assert time.monotonic() - began_s > 0.4
+    params = {"subject": body["configuration"], "limit": 2}
+    told = ask(service, tokens["client"], "GET", "/events", params=params).json()["events"]
+    assert [one["kind"] for one in told] == ["session.refused", "session.timeout"]
+    assert told[1]["data"] == {"of": "request for a node", "after_s": 0.5}
 
 
 def test_a_percentage_is_refused_with_the_share(
@@ -367,6 +371,32 @@ def test_events_are_streamed_and_go_on_where_one_ended(service: RunningService) 
         service.grant("seen", "viewer")
         found = next(following)
         assert (found["kind"], found["data"]["name"]) == ("identity.added", "seen")
+
+
+def test_a_client_s_page_of_events_is_full_of_its_own(service: RunningService) -> None:
+    secret = service.grant("quiet", "client")
+    with service.client() as admin, service.client(secret) as quiet:
+        after = admin.get("/health")["events"]
+        for k in range(5):
+            admin.post("/identities", {"name": f"loud-{k}", "role": "viewer"})
+        quiet.post("/configurations", {"environment": "merge", "agents": 9, "name": "quiet"})
+        (found,) = quiet.get("/events", after=after, limit=2)["events"]
+        assert (found["kind"], found["subject"]) == ("configuration.added", "quiet")
+
+
+def test_a_parameter_that_there_is_not_is_refused(
+    service: RunningService, secrets: dict[str, str]
+) -> None:
+    viewer = token_of(service, secrets["viewer"]).json()
+    answer = ask(service, viewer, "GET", "/events?afer=3")
+    assert problem_of(answer) == "bad-body"
+    assert "after, limit, subject" in answer.json()["detail"]
+
+
+def test_a_wrong_method_is_told_all_that_there_are(service: RunningService) -> None:
+    answer = httpx.put(f"{service.url}/v1/nodes/a")
+    assert (answer.status_code, answer.headers["allow"]) == (405, "DELETE")
+    assert httpx.put(f"{service.url}/v1/nodes").headers["allow"] == "GET, POST"
 
 
 def test_metrics_are_as_prometheus_reads_them(

@@ -58,6 +58,8 @@ def test_the_page_s_session_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert {"node.registered", "session.done"} <= set(kinds)
     assert "merge" in said["manifest"]
     assert Path("runs/there/trips.csv").is_file()
+    told = Path("runs/there/service_events.jsonl").read_text().splitlines()
+    assert [json.loads(line)["kind"] for line in told][:2] == ["session.opened", "session.assigned"]
 
 
 @pytest.mark.slow  # test_sessions.py says the same of smaller worlds

@@ -22,8 +22,8 @@ from cavmarl.core.errors import (
     DemandError,
     SumoError,
 )
+from cavmarl.engine.world_description import describe_world
 from cavmarl.engine.world_setup import load_world, make_world
-from cavmarl.evaluate.provenance.manifest import describe_world
 from cavmarl.parallel.hosts.hosted_worlds_job import HostedWorlds
 from cavmarl.parallel.recipe import fingerprint
 from cavmarl.parallel.worlds_job import Task

@@ -12,54 +12,20 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from datetime import UTC, datetime
 from os.path import isfile
 from pathlib import Path
 from typing import Any
 
-from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ManifestError
-from cavmarl.core.numba import kernel_cache_dir
+from cavmarl.core.machine import describe_machine
 from cavmarl.core.whole_file import write_whole
-from cavmarl.evaluate.provenance.machine import describe_machine
 from cavmarl.policies.policy import policy_files
-from cavmarl.roads.network import RoadNetwork
-from cavmarl.traffic.demand import DemandFile
-from cavmarl.traffic.sumo.sumo_demand import SumoDemand
-from cavmarl.zones.partition.zone_partition import ZonePartition
 
 MANIFEST_FILE = "manifest.json"
 SCHEMA = 2
 
 Document = dict[str, Any]
-
-
-def describe_world(
-    config: EnvConfig,
-    network: RoadNetwork,
-    demand: DemandFile | SumoDemand | None,
-    partition: ZonePartition,
-) -> Document:
-    """The environment whole; its roads, its demand, its zones and the kernels by their hashes."""
-    resolved = asdict(config)
-    text = json.dumps(resolved, sort_keys=True)
-    return {
-        "environment": f"{config.name}-v{config.version}",
-        "config": resolved,
-        "config_sha256": hashlib.sha256(text.encode()).hexdigest(),
-        "map": network.name,
-        "map_source_sha256": network.source_hash,
-        "map_content_sha256": network.content_hash,
-        "demand_content_sha256": None if demand is None else demand.content_hash,
-        "sumo": demand.version if isinstance(demand, SumoDemand) else None,
-        "kernels": kernel_cache_dir().name,
-        "zones": partition.count,
-        "zones_content_sha256": partition.content_hash,
-        "channel": asdict(config.v2x.channel)
-        if config.v2x.enabled
-        else "none: there are no messages between vehicles",
-    }
 
 
 def describe_policies(policies: Mapping[str, str]) -> Document:

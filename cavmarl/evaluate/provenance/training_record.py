@@ -14,11 +14,11 @@ from cavmarl.balance.balance_plan import Plan
 from cavmarl.balance.plan_file import PLACEMENT, PLACEMENT_AT_END
 from cavmarl.core.errors import ManifestError
 from cavmarl.engine.simulation import Simulation
+from cavmarl.engine.world_description import describe_world
 from cavmarl.engine.world_setup import World
 from cavmarl.evaluate.provenance.manifest import (
     MANIFEST_FILE,
     close_manifest,
-    describe_world,
     open_manifest,
     read_closed,
 )

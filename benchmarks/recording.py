@@ -1,0 +1,88 @@
+"""What recording costs a step: the same worlds with and without, turn about."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+from time import perf_counter
+from typing import Annotated
+
+from benchmarks.harness import (
+    Env,
+    Report,
+    Say,
+    about,
+    check_positive,
+    paired_ratio,
+    run,
+    silent,
+    take_turns,
+)
+from cavmarl.cli.output import Seed
+from cavmarl.core.errors import ConfigError
+from cavmarl.env.vector import CavVectorEnv, make_vec
+
+
+def measure(
+    env: Env = "town",
+    vehicles: Annotated[int, about("Vehicles of the world, one in ten of them an agent.")] = 1000,
+    steps: Annotated[int, about("Steps of a turn.")] = 100,
+    turns: Annotated[int, about("Turns of each side.")] = 7,
+    seed: Seed = 0,
+    at_most: Annotated[
+        float | None, about("Exit with 1 if a recorded step takes more times as long.")
+    ] = None,
+    say: Say = silent,
+) -> Report:
+    """Milliseconds a step with and without a recording; both drive the same episodes."""
+    check_positive("--at-most", at_most)
+    if not (vehicles >= 10 and steps >= 1 and turns >= 1):
+        raise ConfigError(
+            f"vehicles = {vehicles}, steps = {steps}, turns = {turns}: must be at least 10, 1, 1"
+        )
+    agents = vehicles // 10
+
+    def made(record: Path | None) -> CavVectorEnv:
+        background = vehicles - agents
+        return make_vec(env, seed=seed, agents=agents, background=background, record=record)
+
+    with TemporaryDirectory() as room:
+        say("making the worlds")
+        path = Path(room) / "recording"
+        sides = {"not recorded": made(None), "recorded": made(path)}
+        for vec in sides.values():
+            vec.reset()
+            _steps_s(vec, steps)
+        timed = {name: partial(_steps_s, vec, steps) for name, vec in sides.items()}
+        found = take_turns(timed, turns, say)
+        for vec in sides.values():
+            vec.close()
+        size = sum(file.stat().st_size for file in path.rglob("*.parquet"))
+    ratio = paired_ratio(found["recorded"], found["not recorded"])
+    frames = steps * (turns + 1) + 1
+    rows = [{"side": name, "ms": 1e3 * median(taken) / steps} for name, taken in found.items()]
+    return Report(
+        f"A step of {env}, {vehicles} vehicles",
+        {"": "side", "ms a step": "ms:.3f"},
+        rows,
+        [f"recorded: {ratio:.3f} times as long, {size / frames / 1e3:.1f} kB a frame"],
+        {"ratio": ratio, "bytes_per_frame": size / frames},
+        holds=at_most is None or ratio <= at_most,
+    )
+
+
+def _steps_s(vec: CavVectorEnv, steps: int) -> float:
+    """Seconds of some steps of built-in drivers, without what chooses their actions."""
+    took = 0.0
+    for _ in range(steps):
+        actions = vec.suggest_actions()
+        began = perf_counter()
+        vec.step(actions)
+        took += perf_counter() - began
+    return took
+
+
+if __name__ == "__main__":
+    run(measure)

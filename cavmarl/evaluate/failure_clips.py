@@ -1,0 +1,153 @@
+"""Failed trips of an evaluation: why they failed, and the last ten seconds of what was around."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.engine.world_frame import WorldFrame
+
+CLIP_S = 10.0
+REACH_M = 70.0  # from where the trip ended: what a clip shows
+STILL_M = 5.0  # a vehicle that has driven less in a clip is blocked
+
+# Worst first.
+CAUSES = ("collision", "off_road", "red_light", "wrong_way", "blocked", "out_of_time", "slow")
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A trip that was no success."""
+
+    cause: str  # of `CAUSES`
+    severity: float  # the more the worse, among those of its cause: m/s, or s of delay
+    trip: Mapping[str, Any]  # policy, run, seed, episode, agent, when and where it ended
+    clip: Mapping[str, Any]  # `vehicles` and `frames`, as `clip_of` makes them
+
+
+class FailureClips:
+    """Keeps the last seconds of worlds, and the worst failures of each cause.
+
+    Args:
+        most: how many failures are kept.
+        step_s: seconds a step.
+        about: what stands in each trip: policy, run, seed.
+    """
+
+    def __init__(self, most: int, step_s: float, about: Mapping[str, Any]) -> None:
+        self._most = most
+        self._about = dict(about)
+        self._step_s = step_s
+        self._length = max(2, math.ceil(CLIP_S / step_s) + 1)
+        self._recent: dict[int, deque[WorldFrame]] = {}
+        self.failures: list[Failure] = []
+
+    def begin(self) -> None:
+        """Forget what was seen: the worlds begin other episodes."""
+        self._recent.clear()
+
+    def add(self, frames: Iterable[WorldFrame]) -> None:
+        """Take the present moment of worlds."""
+        for frame in frames:
+            kept = self._recent.setdefault(frame.world, deque(maxlen=self._length))
+            kept.append(frame)
+
+    def take(self, trips: NDArray[np.void], first: int) -> None:
+        """Look at trips that have ended in the step after the last frames.
+
+        Args:
+            trips: TRIP (n,), `episode` is their world.
+            first: the episode of world 0.
+        """
+        for trip in trips[trips["counted"] & ~trips["success"]]:
+            recent = list(self._recent.get(int(trip["episode"]), ()))
+            if recent:
+                self.failures.append(self._failure(trip, recent, first))
+        if len(self.failures) > 4 * self._most:
+            self.failures = worst(self.failures, self._most)
+
+    def _failure(self, trip: np.void, recent: Sequence[WorldFrame], first: int) -> Failure:
+        last = recent[-1]
+        mine = last.vehicles[last.vehicles["agent"] == trip["agent"]]
+        row = mine[0] if len(mine) else None
+        driven_m, speed = math.inf, float(trip["mean_speed_mps"])
+        if row is not None:
+            began = recent[0].vehicles
+            began = began[began["id"] == row["id"]]
+            speed = float(row["speed"])
+            if len(began) and len(recent) == self._length:
+                driven_m = float(row["distance_m"]) - float(began["distance_m"][0])
+        cause = cause_of(trip, driven_m)
+        by_delay = cause in ("blocked", "out_of_time", "slow")
+        place = trip if row is None else row
+        names = ("end_x_m", "end_y_m") if row is None else ("x", "y")
+        center = tuple(round(float(place[name]), 2) for name in names)
+        told = {
+            **self._about,
+            "episode": first + int(trip["episode"]),
+            "agent": int(trip["agent"]),
+            "vehicle": -1 if row is None else int(row["id"]),
+            "began_s": round(float(trip["began_s"]), 2),
+            "duration_s": round(float(trip["duration_s"]), 2),
+            "speed_mps": round(speed, 2),
+            "delay_s": round(float(trip["delay_s"]), 2),
+            "center_m": center,
+            "step_s": self._step_s,
+        }
+        severity = float(trip["delay_s"]) if by_delay else abs(speed)
+        return Failure(cause, severity, told, clip_of(recent, (center[0], center[1])))
+
+
+def cause_of(trip: np.void, driven_m: float) -> str:
+    """Why a trip is no success, of `CAUSES`; `driven_m` in its last ten seconds."""
+    for cause in ("collision", "off_road", "red_light", "wrong_way"):
+        if trip[cause]:
+            return cause
+    if trip["unfinished"]:
+        return "blocked" if driven_m < STILL_M else "out_of_time"
+    return "slow"
+
+
+def worst(failures: Iterable[Failure], most: int) -> list[Failure]:
+    """The worst of each cause in turn, until there are `most`; by cause, worst first."""
+    every = sorted(failures, key=lambda failure: -failure.severity)
+    by_cause = {cause: [one for one in every if one.cause == cause] for cause in CAUSES}
+    chosen: dict[str, int] = dict.fromkeys(CAUSES, 0)
+    left = most
+    while left > 0 and any(chosen[cause] < len(by_cause[cause]) for cause in CAUSES):
+        for cause in CAUSES:
+            if left > 0 and chosen[cause] < len(by_cause[cause]):
+                chosen[cause] += 1
+                left -= 1
+    return [failure for cause in CAUSES for failure in by_cause[cause][: chosen[cause]]]
+
+
+def clip_of(frames: Sequence[WorldFrame], center: tuple[float, float]) -> dict[str, Any]:
+    """What frames show near a place, as numbers for a page.
+
+    Returns:
+        `vehicles`: by id [length, width, agent]; `frames`: of each the tick and
+        [id, x, y, heading, speed, lights] of each vehicle; lights: 1 brakes, 2 left, 4 right.
+    """
+    vehicles: dict[str, list[float]] = {}
+    shown = []
+    for frame in frames:
+        rows = frame.vehicles
+        near = (np.abs(rows["x"] - center[0]) < REACH_M) & (np.abs(rows["y"] - center[1]) < REACH_M)
+        listed = []
+        for row in rows[near]:
+            size = [round(float(row["length"]), 2), round(float(row["width"]), 2)]
+            vehicles[str(row["id"])] = [*size, int(row["agent"])]
+            lights = int(row["accel"] < -1.0) + 2 * int(row["blinker"] > 0)
+            lights += 4 * int(row["blinker"] < 0)
+            moved = [round(float(row[name]), 2) for name in ("x", "y")]
+            heading, speed = round(float(row["heading"]), 3), round(float(row["speed"]), 1)
+            listed.append([int(row["id"]), *moved, heading, speed, lights])
+        shown.append([frame.tick, listed])
+    return {"vehicles": vehicles, "frames": shown}

@@ -1,0 +1,92 @@
+"""What is kept of a run besides its results: a recording, clips of failed trips."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.env.recorded_worlds import recording_of
+from cavmarl.env.vector import CavVectorEnv
+from cavmarl.evaluate.failure_clips import Failure, FailureClips
+
+
+class RunWatch:
+    """Looks at the worlds of one policy in one run, part by part.
+
+    Args:
+        vec: the worlds.
+        policy: its name in the results.
+        run: its number.
+        seed: of the run.
+        record: folder of the recording; None: none is made.
+        failures: how many failed trips are kept.
+    """
+
+    def __init__(
+        self,
+        vec: CavVectorEnv,
+        policy: str,
+        run: int,
+        seed: int,
+        record: Path | None,
+        failures: int,
+    ) -> None:
+        self._vec = vec
+        self._first = 0
+        about = {"policy": policy, "run": run, "seed": seed}
+        self._writer = None
+        if record is not None:
+            self._writer = recording_of(record, vec.worlds.world, vec.simulation, **about)
+        self._clips = FailureClips(failures, vec.step_s, about) if failures else None
+
+    @property
+    def failures(self) -> Sequence[Failure]:
+        return () if self._clips is None else self._clips.failures
+
+    def begin(self, first: int, running: NDArray[np.bool_]) -> None:
+        """After the reset of worlds; the first of them is in this episode."""
+        self._first = first
+        if self._clips is not None:
+            self._clips.begin()
+        self._look(running)
+
+    def step(
+        self, running: NDArray[np.bool_], over: NDArray[np.bool_], trips: NDArray[np.void]
+    ) -> None:
+        """After a step.
+
+        Args:
+            running: (W,) worlds that were in their episode before it.
+            over: (W,) those whose episode ended in it: they show the next one already.
+            trips: TRIP (n,), those that ended in it.
+        """
+        if self._clips is not None:
+            self._clips.take(trips, self._first)
+        self._look(running & ~over)
+
+    def _look(self, chosen: NDArray[np.bool_]) -> None:
+        if self._writer is None and self._clips is None:
+            return
+        frames = self._vec.world_frames(np.flatnonzero(chosen).tolist(), ghosts=True)
+        if self._clips is not None:
+            self._clips.add(frames)
+        if self._writer is not None:  # a world of the recording is an episode of the run
+            self._writer.add(frame._replace(world=self._first + frame.world) for frame in frames)
+
+    def close(self) -> None:
+        """Close the recording, if there is one."""
+        if self._writer is not None:
+            self._writer.close()
+
+
+def recording_path(record: str, policy: str, run: int, is_only: bool) -> Path | None:
+    """Where one policy's run is recorded: `record` itself where there is no other."""
+    if not record:
+        return None
+    if is_only:
+        return Path(record)
+    return Path(record) / re.sub(r"[^\w.-]+", "_", policy).strip("._") / f"run-{run}"

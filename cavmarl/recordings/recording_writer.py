@@ -1,0 +1,255 @@
+"""`RecordingWriter`: frames to disk while a run goes on, in parts that are there whole or not."""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+import time
+import weakref
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cavmarl.core.errors import RecordingError
+from cavmarl.core.whole_file import write_whole
+from cavmarl.engine.world_frame import FrameEvent, WorldFrame, events_between
+from cavmarl.recordings.recording_format import (
+    HEAD_FILE,
+    NETWORK_FILE,
+    TABLES,
+    RecordedEvent,
+    RecordedFrame,
+    RecordingHead,
+    arrow,
+    event_table,
+    frame_table,
+    vehicle_table,
+    write_table,
+)
+from cavmarl.roads.cache import network_layout, pack_network
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.zones.partition.zone_partition import ZonePartition
+
+COMMIT_S = 0.8  # of wall time from part to part, so that each is on disk within a second
+MOST_WAITING_BYTES = 256 << 20  # of frames that are not written yet; then `add` waits
+
+
+class RecordingWriter:
+    """Takes frames and writes them beside the run, in a thread.
+
+    About once a second what has come is committed as a part. A process that is killed, or a machine
+    without power, leaves all parts that were committed. Without `close` the rest is written when
+    the process ends.
+
+    Args:
+        path: a folder that is made; if it is there, it is empty.
+        environment: name and version.
+        network: the map, of which a copy is kept.
+        partition: the zones.
+        halo_m: how far they see over their borders.
+        sim_dt_s: seconds a tick.
+        step_s: seconds a step.
+        manifest: of the run, with the key `world`; numbers, text, lists and dicts.
+
+    Raises:
+        RecordingError: there is something at `path`, or it cannot be written.
+        MissingExtraError: pyarrow is not installed.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        environment: str,
+        network: RoadNetwork,
+        partition: ZonePartition,
+        halo_m: float,
+        sim_dt_s: float,
+        step_s: float,
+        manifest: Mapping[str, Any],
+    ) -> None:
+        arrow()
+        self.path = Path(path)
+        packed = pack_network(network)
+        head = RecordingHead(
+            environment=environment,
+            sim_dt_s=sim_dt_s,
+            step_s=step_s,
+            network={
+                "name": network.name,
+                "source_sha256": network.source_hash,
+                "layout": network_layout(),
+                "sha256": hashlib.sha256(packed).hexdigest(),
+            },
+            bounds=list(partition.bounds),
+            rects=partition.rects.tolist(),
+            halo_m=halo_m,
+            manifest=manifest,
+        )
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            if any(self.path.iterdir()):
+                raise RecordingError(f"{path}: there is something already; give a new folder")
+            write_whole(self.path / NETWORK_FILE, packed)
+            write_whole(self.path / HEAD_FILE, head.to_bytes())
+        except OSError as error:
+            raise _unwritable(self.path, error) from error
+        self._sink = _Sink(self.path, head)
+        self._finish = weakref.finalize(self, self._sink.close)  # at the end of the process, too
+
+    def add(self, frames: Iterable[WorldFrame]) -> None:
+        """Take frames, one a world; a tick that is not after the last one begins an episode.
+
+        Raises:
+            RecordingError: an earlier part could not be written.
+        """
+        self._sink.add(list(frames))
+
+    def close(self) -> None:
+        """Write what is left and mark the recording as whole.
+
+        Raises:
+            RecordingError: a part could not be written.
+        """
+        if self._finish.alive:
+            self._finish.detach()
+            self._sink.close()
+            self._sink.check()
+
+
+class _Sink:
+    """What the thread works on; it does not know the writer, so that one can go unseen."""
+
+    def __init__(self, path: Path, head: RecordingHead) -> None:
+        self._path = path
+        self._head = head
+        self._waiting: list[WorldFrame] = []
+        self._waiting_bytes = 0
+        self._changed = threading.Condition()
+        self._closing = False
+        self._error: Exception | None = None
+        self._worlds: dict[int, _WorldParts] = {}
+        self._thread: threading.Thread | None = None
+
+    def add(self, frames: list[WorldFrame]) -> None:
+        self.check()
+        size = sum(frame.vehicles.nbytes for frame in frames)
+        with self._changed:
+            self._waiting += frames
+            self._waiting_bytes += size
+            if self._thread is None:  # not before: a process may fork until its worlds are made
+                self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
+                self._thread.start()
+            if self._waiting_bytes > MOST_WAITING_BYTES:
+                self._changed.notify_all()
+                self._changed.wait_for(lambda: not self._waiting or self._error is not None)
+
+    def check(self) -> None:
+        if self._error is not None:
+            raise _unwritable(self._path, self._error) from self._error
+
+    def close(self) -> None:
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        if self._thread is not None:
+            self._thread.join()
+        if self._error is None:
+            try:
+                write_whole(self._path / HEAD_FILE, self._head.closed().to_bytes())
+            except OSError as error:
+                self._error = error
+
+    def _run(self) -> None:
+        due = time.monotonic() + COMMIT_S
+        while True:
+            with self._changed:
+                self._changed.wait_for(self._is_due, timeout=max(0.0, due - time.monotonic()))
+                frames, self._waiting, self._waiting_bytes = self._waiting, [], 0
+                last = self._closing
+                self._changed.notify_all()
+            due = time.monotonic() + COMMIT_S
+            try:
+                self._commit(frames)
+            except Exception as error:  # it is raised where frames are added
+                with self._changed:
+                    self._error = error
+                    self._changed.notify_all()
+                return
+            if last:
+                return
+
+    def _is_due(self) -> bool:
+        return self._closing or self._waiting_bytes > MOST_WAITING_BYTES
+
+    def _commit(self, frames: list[WorldFrame]) -> None:
+        for frame in frames:
+            if frame.world not in self._worlds:
+                folder = self._path / f"world-{frame.world}"
+                self._worlds[frame.world] = _WorldParts(folder, self._head)
+            self._worlds[frame.world].take(frame)
+        for parts in self._worlds.values():
+            parts.commit()
+
+
+class _WorldParts:
+    """The parts of one world."""
+
+    def __init__(self, folder: Path, head: RecordingHead) -> None:
+        self._folder = folder
+        self._step_ticks = max(1, round(head.step_s / head.sim_dt_s))
+        self._count = 0
+        self._last: RecordedFrame | None = None
+        self._frames: list[RecordedFrame] = []
+        self._events: list[RecordedEvent] = []
+        for table in TABLES:
+            (folder / table).mkdir(parents=True)
+
+    def take(self, frame: WorldFrame) -> None:
+        last = self._last
+        episode = 0 if last is None else last.episode
+        if last is not None and frame.tick <= last.frame.tick:
+            self._events += (
+                RecordedEvent(episode, event) for event in self._at_the_end(last.frame, frame)
+            )
+            episode += 1
+        elif last is not None:
+            found = events_between(last.frame, frame)
+            self._events += (RecordedEvent(episode, event) for event in found)
+        self._last = RecordedFrame(episode, frame)
+        self._frames.append(self._last)
+
+    def _at_the_end(self, last: WorldFrame, first: WorldFrame) -> Iterator[FrameEvent]:
+        """What happened in the step that ended an episode; its last frame is not to be had."""
+        ended = first.ended["agent"]
+        stay = last.vehicles[~np.isin(last.vehicles["agent"], ended) | (last.vehicles["agent"] < 0)]
+        stay = stay.copy()
+        stay["events"] = 0
+        over = last._replace(
+            tick=last.tick + self._step_ticks, vehicles=stay, ended=first.ended, transfers=()
+        )
+        return events_between(last, over)
+
+    def commit(self) -> None:
+        """Write a part, if there is anything in it; the frames are last and commit it."""
+        if not self._frames:
+            return
+        tables = (
+            vehicle_table(self._frames),
+            event_table(self._events),
+            frame_table(self._frames),
+        )
+        for name, table in zip(TABLES, tables, strict=True):
+            write_whole(self._folder / name / f"{self._count:06d}.parquet", write_table(table))
+        self._count += 1
+        self._frames, self._events = [], []
+
+
+def _unwritable(path: Path, error: Exception) -> RecordingError:
+    reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+    return RecordingError(
+        f"{path}: cannot be recorded there ({reason}); what was committed can be read; make room, "
+        "or record into another folder"
+    )

@@ -1,0 +1,167 @@
+"""Failed trips: causes, which are the worst, the clip of each, and the page in a browser."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cavmarl import RecordingError
+from cavmarl.config.registry import find_entry
+from cavmarl.evaluate import evaluate
+from cavmarl.evaluate.evaluation import load_tables
+from cavmarl.evaluate.failure_clips import CAUSES, REACH_M, Failure, cause_of, worst
+from cavmarl.evaluate.failure_page import write_failures
+from cavmarl.evaluate.tables import TRIP
+from cavmarl.recordings.recording import Recording
+from cavmarl.roads.cache import load_network
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    room = tmp_path_factory.mktemp("failures")
+    record = room / "recordings"
+    evaluate(
+        "merge",
+        ["random_actions", "idm"],
+        episodes=2,
+        out=room / "out",
+        record=record,
+        failures=6,
+    )
+    return room
+
+
+def told(page: Path) -> Any:
+    text = page.read_text(encoding="utf-8")
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.DOTALL)
+    assert found is not None
+    return json.loads(found[1])
+
+
+def test_the_page_has_the_worst_trips_with_clips_of_ten_seconds(folder: Path) -> None:
+    data = told(folder / "out" / "failures.html")
+    tables = load_tables(folder / "out")
+    assert len(data["failures"]) == 6
+    for failure in data["failures"]:
+        trips, _ = tables[failure["policy"]]
+        failed = trips[trips["counted"] & ~trips["success"]]
+        (trip,) = failed[
+            (failed["episode"] == failure["episode"])
+            & (failed["agent"] == failure["agent"])
+            & (np.abs(failed["began_s"] - failure["began_s"]) < 0.01)
+        ]
+        by_time = ("blocked", "out_of_time", "slow")
+        assert failure["cause"] in by_time or trip[failure["cause"]]
+        frames = failure["clip"]["frames"]
+        assert 1 < len(frames) <= round(10.0 / failure["step_s"]) + 1
+        ticks = [tick for tick, _ in frames]
+        assert ticks == sorted(set(ticks))
+        (mine,) = [row for row in frames[-1][1] if row[0] == failure["vehicle"]]
+        assert mine[1:3] == failure["center_m"]
+        for _, rows in frames:
+            for vehicle, x, y, *_ in rows:
+                assert str(vehicle) in failure["clip"]["vehicles"]
+                assert abs(x - failure["center_m"][0]) < REACH_M + 0.01
+                assert abs(y - failure["center_m"][1]) < REACH_M + 0.01
+
+
+def test_a_clip_shows_what_the_recording_has(folder: Path) -> None:
+    failure = told(folder / "out" / "failures.html")["failures"][0]
+    path = folder / "recordings" / failure["policy"] / "run-0"
+    recording = Recording.open(path)
+    assert recording.manifest["policy"] == failure["policy"]
+    for tick, rows in failure["clip"]["frames"]:
+        frame = recording.at(tick, failure["episode"])
+        assert frame.tick == tick
+        by_id = {int(row["id"]): row for row in frame.vehicles}
+        for vehicle, x, y, *_ in rows:
+            assert (x, y) == (round(by_id[vehicle]["x"], 2), round(by_id[vehicle]["y"], 2))
+
+
+def test_the_page_asks_nothing_of_other_hosts(folder: Path) -> None:
+    text = (folder / "out" / "failures.html").read_text(encoding="utf-8")
+    assert "http" not in text.replace("http-equiv", "")
+    assert "default-src 'none'" in text
+    assert "unsafe" not in text
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium")
+def test_a_browser_shows_the_page(folder: Path) -> None:
+    page = folder / "out" / "failures.html"
+    assert CHROMIUM is not None
+    words = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=2000"]
+    done = subprocess.run(
+        [*words, "--dump-dom", page.as_uri()], capture_output=True, text=True, timeout=120
+    )
+    assert 'data-ready="yes"' in done.stdout
+    body = done.stdout[done.stdout.index('<tbody id="rows">') : done.stdout.index("</tbody>")]
+    assert body.count("<tr ") == len(told(page)["failures"])
+    shown = re.search(r'<canvas[^>]*data-tick="(\d+)" data-shown="(\d+)"', done.stdout)
+    assert shown is not None
+    assert int(shown[2]) > 0
+
+
+def test_names_of_files_cannot_end_the_script(tmp_path: Path) -> None:
+    name = "</script><script>alert(1)</script>"
+    trip = {"policy": name, "center_m": (0.0, 0.0), "agent": 0, "run": 0, "episode": 0}
+    failure = Failure("collision", 1.0, trip, {"vehicles": {}, "frames": [[0, []]]})
+    network = load_network(find_entry("ring") / "map" / "map.net.xml")
+    write_failures(tmp_path / "page.html", [failure], 5, 1, network, name)
+    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "alert(1)</script>" not in text
+    assert told(tmp_path / "page.html")["failures"][0]["policy"] == name
+
+
+def test_each_cause_has_its_share_of_the_worst() -> None:
+    failures = [
+        Failure(cause, float(k), {}, {}) for cause in ("collision", "slow") for k in range(10)
+    ]
+    failures.append(Failure("red_light", 3.0, {}, {}))
+    chosen = worst(failures, 7)
+    assert [(one.cause, one.severity) for one in chosen] == [
+        ("collision", 9.0),
+        ("collision", 8.0),
+        ("collision", 7.0),
+        ("red_light", 3.0),
+        ("slow", 9.0),
+        ("slow", 8.0),
+        ("slow", 7.0),
+    ]
+    assert len(worst(failures, 100)) == 21
+
+
+@pytest.mark.parametrize(
+    ("marks", "driven_m", "cause"),
+    [
+        (["collision", "red_light"], 50.0, "collision"),
+        (["off_road"], 50.0, "off_road"),
+        (["red_light", "arrived"], 50.0, "red_light"),
+        (["wrong_way"], 50.0, "wrong_way"),
+        (["unfinished"], 1.0, "blocked"),
+        (["unfinished"], 50.0, "out_of_time"),
+        (["arrived"], 50.0, "slow"),
+    ],
+)
+def test_causes(marks: list[str], driven_m: float, cause: str) -> None:
+    trip = np.zeros(1, dtype=TRIP)
+    for mark in marks:
+        trip[mark] = True
+    assert cause_of(trip[0], driven_m) == cause
+    assert cause in CAUSES
+
+
+def test_a_recording_that_is_there_is_refused_before_anything_runs(tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there" / "file").write_text("kept")
+    with pytest.raises(RecordingError, match="give a new folder"):
+        evaluate("ring", "idm", episodes=1, out=tmp_path / "out", record=tmp_path / "there")
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,151 @@
+"""Recordings: what is read is what was recorded, field by field, wherever the world runs."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cavmarl import CavEnv, RecordingError, make_vec, parallel_env
+from cavmarl.engine.world_frame import WorldFrame
+from cavmarl.recordings.recording import Recording
+
+
+def drive(env: CavEnv, steps: int) -> list[WorldFrame]:
+    """Frames of a seeded episode with its reset, as the environment shows them."""
+    env.reset(seed=5)
+    found = env.world_frames(ghosts=True)
+    for _ in range(steps):
+        env.step(env.suggest_actions())
+        found += env.world_frames(ghosts=True)
+    return found
+
+
+def assert_same(one: WorldFrame, other: WorldFrame) -> None:
+    assert one._fields == other._fields
+    for name in one._fields:
+        a, b = getattr(one, name), getattr(other, name)
+        arrays = a if name == "ghosts" else (a,)
+        others = b if name == "ghosts" else (b,)
+        assert len(arrays) == len(others)
+        for x, y in zip(arrays, others, strict=True):
+            if isinstance(x, np.ndarray):
+                assert x.dtype == y.dtype
+                assert x.tobytes() == y.tobytes(), name
+            else:
+                assert x == y, name
+
+
+@pytest.mark.parametrize(("zones", "workers"), [(1, 0), (4, 0), (1, 1), (4, 2)])
+def test_replayed_frames_equal_the_recorded_ones(tmp_path: Path, zones: int, workers: int) -> None:
+    path = tmp_path / "run"
+    env = parallel_env("grid4x4", zones=zones, workers=workers, record=path)
+    with closing(env):
+        shown = drive(env, 25)
+    recording = Recording.open(path)
+    replayed = list(recording.frames())
+    assert len(replayed) == len(shown) == 26
+    for one, other in zip(replayed, shown, strict=True):
+        assert_same(one, other)
+    assert recording.is_whole
+    assert recording.worlds == [0]
+    assert recording.episodes() == [0]
+    assert recording.network.content_hash == env.network.content_hash
+    assert recording.partition.count == zones
+    assert recording.manifest["world"]["map_content_sha256"] == env.network.content_hash
+    assert recording.manifest["software"]["packages"]["cavmarl"]
+
+
+def test_worlds_of_a_vector_have_folders_of_their_own_and_episodes_are_counted(
+    tmp_path: Path,
+) -> None:
+    with closing(make_vec("ring", num_envs=2, record=tmp_path / "run", max_cycles=5)) as vec:
+        vec.reset(seed=1)
+        for _ in range(12):
+            vec.step(vec.suggest_actions())
+    recording = Recording.open(tmp_path / "run")
+    assert recording.worlds == [0, 1]
+    for world in recording.worlds:
+        assert recording.episodes(world) == [0, 1, 2]
+        assert [frame.world for frame in recording.frames(world)] == [world] * 13
+        ticks = recording.ticks(world, 1)
+        assert ticks[0] == 0
+        assert ticks == sorted(set(ticks))
+        between = recording.at(ticks[2] + 1 if ticks[3] > ticks[2] + 1 else ticks[2], world, 1)
+        assert between.tick == ticks[2]
+    with pytest.raises(RecordingError, match="no frame at tick -1"):
+        recording.at(-1)
+    with pytest.raises(RecordingError, match="no world 7; there are 0, 1"):
+        next(recording.frames(7))
+
+
+def test_an_end_in_the_step_that_begins_the_world_anew_is_an_event(tmp_path: Path) -> None:
+    """Of autoreset's last step there is no frame; what ended in it is told all the same."""
+    arguments: dict[str, Any] = {"agents": 2, "background": 0, "max_cycles": 40}
+    with closing(make_vec("ring", record=tmp_path / "run", **arguments)) as vec:
+        vec.reset(seed=1)
+        actions = np.ones(vec.action_space.shape, dtype=np.float32)
+        for _ in range(40):
+            vec.step(actions)
+    kinds = {found.event.kind for found in Recording.open(tmp_path / "run").events()}
+    assert kinds & {"off_road", "collision", "wrong_way"}
+
+
+def test_copies_do_not_record(tmp_path: Path) -> None:
+    from copy import deepcopy
+
+    with closing(parallel_env("ring", record=tmp_path / "run")) as env:
+        env.reset(seed=1)
+        copied = deepcopy(env)
+        copied.step(copied.suggest_actions())
+    assert len(list(Recording.open(tmp_path / "run").frames())) == 1
+
+
+PROGRAM = """
+import sys
+from cavmarl import parallel_env
+env = parallel_env("ring", record=sys.argv[1])
+env.reset(seed=5)
+print("begun", flush=True)
+while True:
+    env.step(env.suggest_actions())
+    if not env.agents:
+        env.reset()
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="kills with SIGKILL")
+def test_a_killed_run_leaves_all_that_was_committed(tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    with subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, str(path)], stdout=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"begun\n"
+        until = time.monotonic() + 30.0
+        while len(list(path.glob("world-0/frames/0*.parquet"))) < 3 and time.monotonic() < until:
+            time.sleep(0.02)
+        process.send_signal(signal.SIGKILL)
+    recording = Recording.open(path)
+    assert not recording.is_whole
+    replayed = list(recording.frames())
+    assert len(replayed) > 3
+    with closing(parallel_env("ring")) as env:
+        for one, other in zip(replayed, drive(env, 20), strict=False):
+            assert_same(one, other)
+
+
+def test_a_process_that_ends_without_close_leaves_the_whole_run(tmp_path: Path) -> None:
+    program = PROGRAM.replace("while True", "for _ in range(9)")
+    subprocess.run([sys.executable, "-c", program, str(tmp_path / "run")], check=True)
+    recording = Recording.open(tmp_path / "run")
+    assert recording.is_whole
+    assert len(list(recording.frames())) == 10
