@@ -83,11 +83,16 @@ libraries: $(LIBRARIES)/.ready ## what needs RLlib or BenchMARL, in an environme
 
 # Without the comment that netconvert and netgenerate begin with (date, version, options), the same
 # options give the same bytes.
-maps: $(READY) ## make the maps of ring, merge and grid4x4 anew from the options beside them
+maps: $(READY) ## make the maps of ring, merge, grid4x4 and cities anew from the options beside them
 	cd envs/ring/map && ../../../$(BIN)/netconvert --configuration-file map.netccfg
 	cd envs/merge/map && ../../../$(BIN)/netconvert --configuration-file map.netccfg
 	cd envs/grid4x4/map && ../../../$(BIN)/netgenerate --configuration-file map.netgcfg
 	sed --in-place '2,/^-->$$/d' $(MAPS)
+	cd envs/cities/map && for options in *.net?cfg; do \
+	    case $$options in *.netgcfg) make=netgenerate;; *) make=netconvert;; esac; \
+	    net=$${options%.net?cfg}.net.xml; \
+	    ../../../$(BIN)/$$make --configuration-file $$options --output-file $$net && \
+	    sed --in-place '2,/^-->$$/d' $$net && gzip --force --best --no-name $$net || exit 1; done
 
 lock: $(READY) ## write constraints-hashes.txt: each file of an installation with its hash
 	$(BIN)/python -m docs.supply_chain lock

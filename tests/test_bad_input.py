@@ -472,7 +472,7 @@ def test_a_map_in_two_parts_is_driven_and_nobody_goes_across(write: Write) -> No
     network = env.network
     for _ in range(30):
         for vehicle in env.simulation.vehicles():
-            goal = network.edge_ids[env.simulation.goal_edges[vehicle["goal"]]]
+            goal = network.edge_ids[env.simulation.goal_edges[0, vehicle["goal"]]]
             assert goal == network.edge_ids[network.lanes[vehicle["lane"]]["edge"]]
         if env.agents:
             env.step(env.suggest_actions())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import importlib.metadata
 import re
 import subprocess
@@ -11,14 +12,14 @@ from pathlib import Path
 import pytest
 
 from cavmarl.config.env import EnvConfig
-from cavmarl.config.registry import load_config, resolve_map
+from cavmarl.config.registry import load_config, resolve_maps
 from cavmarl.core.errors import MissingExtraError
 from cavmarl.maps.check import check_map
 from tests.support.generated import check_block, table
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = sorted(path for path in (ROOT / "envs").iterdir() if path.is_dir())
-RECIPES = sorted((ROOT / "envs").glob("*/map/map.net*cfg"))
+RECIPES = sorted((ROOT / "envs").glob("*/map/*.net*cfg"))
 
 each_folder = pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
 
@@ -33,9 +34,9 @@ def test_the_folder_has_the_name_of_its_environment(folder: Path) -> None:
 @each_folder
 def test_the_map_can_be_driven_and_has_the_edges_that_are_named(folder: Path) -> None:
     config, base_dir = load_config(folder.name)
-    map_path = map_or_skip(config, base_dir)
-    assert check_map(map_path).drivable
-    text = map_path.read_text(encoding="utf-8")
+    map_paths = maps_or_skip(config, base_dir)
+    assert all(check_map(path).drivable for path in map_paths)
+    text = read(map_paths[0])
     for edge in (*config.traffic.origins, *config.traffic.destinations):
         assert f'<edge id="{edge}"' in text
 
@@ -44,7 +45,7 @@ def test_the_map_can_be_driven_and_has_the_edges_that_are_named(folder: Path) ->
 def test_the_card_says_what_the_configuration_says(folder: Path) -> None:
     config, base_dir = load_config(folder.name)
     card = folder / "README.md"
-    check_block(card, "facts", facts(config, map_or_skip(config, base_dir)))
+    check_block(card, "facts", facts(config, maps_or_skip(config, base_dir)))
     text = card.read_text(encoding="utf-8")
     assert f'cavmarl.parallel_env("{config.name}")' in text
     assert re.search(rf"## Versions\n\n- {config.version}: ", text), (
@@ -52,7 +53,7 @@ def test_the_card_says_what_the_configuration_says(folder: Path) -> None:
     )
 
 
-@pytest.mark.parametrize("recipe", RECIPES, ids=lambda recipe: recipe.parts[-3])
+@pytest.mark.parametrize("recipe", RECIPES, ids=lambda recipe: "/".join(recipe.parts[-3::2]))
 def test_a_generated_map_is_what_its_options_make(recipe: Path, tmp_path: Path) -> None:
     pinned = re.search(
         r"^eclipse-sumo==(.*)$", (ROOT / "constraints.txt").read_text(), re.MULTILINE
@@ -77,29 +78,38 @@ def test_a_generated_map_is_what_its_options_make(recipe: Path, tmp_path: Path) 
     text = re.sub(
         r"\n<!-- generated on .*?\n-->\n", "", built.read_text(), count=1, flags=re.DOTALL
     )
-    assert text == (recipe.parent / "map.net.xml").read_text()
+    (made,) = recipe.parent.glob(f"{recipe.stem}.net.xml*")
+    assert text == read(made)
 
 
-def map_or_skip(config: EnvConfig, base_dir: Path) -> Path:
+def read(path: Path) -> str:
+    data = path.read_bytes()
+    return (gzip.decompress(data) if path.suffix == ".gz" else data).decode()
+
+
+def maps_or_skip(config: EnvConfig, base_dir: Path) -> list[Path]:
     try:
-        return resolve_map(config, base_dir)
+        return resolve_maps(config, base_dir)
     except MissingExtraError as error:
         pytest.skip(str(error))
 
 
-def facts(config: EnvConfig, map_path: Path) -> str:
+def facts(config: EnvConfig, map_paths: list[Path]) -> str:
     """The table of facts of a card."""
-    report, people, clock = check_map(map_path), config.population, config.clock
+    reports = [check_map(path) for path in map_paths]
+    people, clock = config.population, config.clock
     budget = f", {people.num_ids} in an episode" if people.mode == "open" else ""
     trip = f"from {config.traffic.min_trip_m:g} m"
     if config.traffic.max_trip_m:
         trip += f" to {config.traffic.max_trip_m:g} m"
     weights = (f"`{name}` {weight:g}" for name, weight in config.terms.weights.items())
     rows = (
-        ("map", f"`{config.map.source}`"),
+        ("map", ", ".join(f"`{source}`" for source in config.map.sources)),
         (
             "roads",
-            f"{report.road_km:.2f} km, {report.lanes} lanes, {report.signals} traffic lights",
+            f"{sum(report.road_km for report in reports):.2f} km, "
+            f"{sum(report.lanes for report in reports)} lanes, "
+            f"{sum(report.signals for report in reports)} traffic lights",
         ),
         ("population", f"`{people.mode}`: {people.agents} agents{budget}"),
         ("background", f"{people.background} vehicles"),

@@ -50,7 +50,8 @@ class MapConfig(Section, key="map"):
 
     Attributes:
         source: a map file: relative to the entry's folder, absolute, or `sumo:PATH` for a file of
-            the eclipse-sumo wheel.
+            the eclipse-sumo wheel. A list of them, or a folder of map files: each episode of each
+            world is on one that is drawn by the seed.
         programs: additional files with more signal programs, named as the source is; of several
             programs of a signal the last is on.
         program: the program of each signal named here, whatever was loaded; `off` is one, too.
@@ -58,14 +59,19 @@ class MapConfig(Section, key="map"):
             (OpenStreetMap or SUMO's polygons), named as the source is; empty: none.
     """
 
-    source: str
+    source: str | tuple[str, ...]
     programs: tuple[str, ...] = ()
     program: dict[str, str] = field(default_factory=dict)
     buildings: str = ""
 
     def __post_init__(self) -> None:
-        self.need("source", bool(self.source), "must name a map file")
+        self.need("source", bool(self.source) and all(self.sources), "must name a map file")
         self.need("programs", all(self.programs), "must name files")
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """What `source` names, one or several."""
+        return (self.source,) if isinstance(self.source, str) else self.source
 
 
 @dataclass(frozen=True)

@@ -231,9 +231,43 @@ def _find_rig(name: str, base_dir: Path) -> Path:
     return rigs[name]
 
 
+def resolve_maps(config: EnvConfig, base_dir: Path) -> list[Path]:
+    """The files that `map.source` means; those of a folder in the order of their names.
+
+    Raises MapError: what is missing, all of it; a folder without a map file.
+    """
+    found: list[Path] = []
+    refused: list[str] = []
+    for source in config.map.sources:
+        try:
+            found += _maps_of(source, base_dir)
+        except MapError as error:
+            refused.append(str(error))
+    if refused:
+        raise MapError("\n".join(refused))
+    return found
+
+
 def resolve_map(config: EnvConfig, base_dir: Path) -> Path:
-    """The file that `map.source` means."""
-    return _resolve("map.source", config.map.source, base_dir, MapError)
+    """The file that `map.source` means, where it is to be one.
+
+    Raises MapError: as of `resolve_maps`, or there are several.
+    """
+    found = resolve_maps(config, base_dir)
+    if len(found) > 1:
+        names = ", ".join(path.name for path in found)
+        raise MapError(f"map.source has {len(found)} maps: {names}; name the one that is meant")
+    return found[0]
+
+
+def _maps_of(source: str, base_dir: Path) -> list[Path]:
+    if source.startswith(_SUMO_PREFIX) or not isdir(base_dir / source):
+        return [_resolve("map.source", source, base_dir, MapError)]
+    names = sorted(path.name for path in (base_dir / source).iterdir())
+    maps = [base_dir / source / name for name in names if name.endswith(MAP_SUFFIXES)]
+    if not maps:
+        raise MapError(f"map.source = {source!r}: no map file in {base_dir / source}")
+    return maps
 
 
 def resolve_demand(config: EnvConfig, base_dir: Path) -> list[Path]:

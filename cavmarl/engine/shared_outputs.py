@@ -46,6 +46,7 @@ class SharedOutputs:
         if self._roads.signals.size > 0:
             self._switch_signals(
                 self._roads,
+                worlds.keys,
                 worlds.ticks,
                 worlds.detected_s,
                 self._sim_dt_s,

@@ -2,28 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from cavmarl.config.env import BY_MAP, EnvConfig
+from cavmarl.config.env import BY_MAP, ZONE_LAYOUTS, EnvConfig
 from cavmarl.config.registry import (
     entries,
     load_config,
     resolve_buildings,
     resolve_demand,
     resolve_map,
+    resolve_maps,
     resolve_programs,
     resolve_zones,
 )
-from cavmarl.core.errors import ConfigError
+from cavmarl.core.errors import ConfigError, MapError
 from cavmarl.maps.buildings import with_buildings
 from cavmarl.maps.netconvert import map_file
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.horizon import horizon_of
+from cavmarl.roads.joined_maps import join
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.signal_plans import with_outages, with_programs
 from cavmarl.traffic.demand import DemandFile, read_demand
@@ -112,11 +114,49 @@ def load_roads(config: EnvConfig, base_dir: Path) -> RoadNetwork:
     Raises:
         MapError: the map or a file of buildings or programs cannot be read, or they do not fit.
     """
-    network = load_network(map_file(resolve_map(config, base_dir)))
+    network = join(_each_map(resolve_maps(config, base_dir)))
+    if len(network.maps) > 1:
+        _refuse_of_one_map(config)
     buildings = resolve_buildings(config, base_dir)
     if buildings is not None:
         network = with_buildings(network, buildings)
     return with_programs(network, resolve_programs(config, base_dir), config.map.program)
+
+
+def _each_map(paths: Sequence[Path]) -> list[RoadNetwork]:
+    """The networks of map files.
+
+    Raises MapError: what is wrong with any of them, all together.
+    """
+    found: list[RoadNetwork] = []
+    refused: list[str] = []
+    for path in paths:
+        try:
+            found.append(load_network(map_file(path)))
+        except MapError as error:
+            refused.append(str(error))
+    if refused:
+        raise MapError("\n".join(refused))
+    return found
+
+
+def _refuse_of_one_map(config: EnvConfig) -> None:
+    """Refuse keys that name things of one map where there are several."""
+    named = {
+        "map.programs": config.map.programs,
+        "map.program": config.map.program,
+        "map.buildings": config.map.buildings,
+        "traffic.demand": config.traffic.demand,
+        "traffic.origins": config.traffic.origins,
+        "traffic.destinations": config.traffic.destinations,
+        "scenario.name": config.scenario.name,
+        "zones.layout": config.zones.layout not in ZONE_LAYOUTS and config.zones.layout,
+    }
+    for key, value in named.items():
+        if value:
+            raise ConfigError(
+                f"{key} = {value!r}: is of one map, and map.source names several; leave one out"
+            )
 
 
 def load_zones(config: EnvConfig, base_dir: Path, network: RoadNetwork) -> ZonePartition:

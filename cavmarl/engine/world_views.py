@@ -86,7 +86,7 @@ class WorldViews:
 
     @property
     def goal_edges(self) -> NDArray[np.int32]:
-        """EDGE rows of the goals, by `VEHICLE["goal"]`."""
+        """EDGE rows (M, G) of the goals, by MAP row and `VEHICLE["goal"]`."""
         return self._tick.traffic.goal_edges
 
     @property

@@ -208,7 +208,7 @@ class LocalWorlds:
             simulation.types["vclass"][rows["vtype"]],
             rows["length"].astype(np.float64),
             rows["width"].astype(np.float64),
-            simulation.goal_edges[rows["goal"]],
+            simulation.goal_edges[simulation.network.lanes["map"][rows["lane"]], rows["goal"]],
             rows["speed"].astype(np.float64),
         )
         return [Driven(*row) for row in zip(*(column.tolist() for column in columns), strict=True)]

@@ -86,8 +86,9 @@ class TopDownRenderer:
     """Draws the vehicles and signals of one map, off screen.
 
     `size`: width and height of the picture in pixels; by default what suits the map's shape.
-    `focus`: (min_x, min_y, max_x, max_y) in metres to show; all roads by default. `goal_edges`:
-    EDGE rows by `VEHICLE["goal"]`; given, each agent's destination is marked.
+    `focus`: (min_x, min_y, max_x, max_y) in metres to show; all roads by default, of
+    several maps those of the vehicles' map. `goal_edges`: EDGE rows (M, G) by MAP row and
+    `VEHICLE["goal"]`; given, each agent's destination is marked.
 
     Raises MissingExtraError: pygame-ce is not installed.
     """
@@ -101,7 +102,8 @@ class TopDownRenderer:
     ) -> None:
         load_pygame()
         self.network = network
-        bounds = focus or network.extent_m
+        bounds = focus or network.extent_of(0)
+        self._moves_home = focus is None and len(network.maps) > 1
         self.size = size or suitable_size(bounds)
         self._home = Viewport.fit(bounds, self.size, MARGIN_PX)
         self._camera = self._home
@@ -167,8 +169,9 @@ class TopDownRenderer:
         seen = in_view(vehicles, camera)
         if self._goals is not None:
             agents = vehicles[vehicles["agent"] >= 0]
+            maps = self.network.lanes["map"][agents["lane"]]
             self._overlay.destinations(
-                surface, agents["agent"], self._goals[agents["goal"]], camera
+                surface, agents["agent"], self._goals[maps, agents["goal"]], camera
             )
         draw_cars(surface, seen, camera)
         self._overlay.agents(surface, seen, camera)
@@ -217,6 +220,9 @@ class TopDownRenderer:
         follow: Sequence[int] | None,
         center: tuple[float, float] | None,
     ) -> None:
+        if self._moves_home and len(vehicles):
+            number = int(self.network.lanes["map"][vehicles["lane"][0]])
+            self._home = Viewport.fit(self.network.extent_of(number), self.size, MARGIN_PX)
         if follow is None and center is None:
             self._camera, self._following = self._home, False
             return
@@ -255,9 +261,9 @@ class TopDownRenderer:
 
 
 def _edge_ends(network: RoadNetwork, edges: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Where edges end, (n, 2) m: the middle of their last points."""
-    ends = np.zeros((len(edges), 2))
-    for row, edge in enumerate(network.edges[edges]):
+    """Where edges (…) end, (…, 2) m: the middle of their last points."""
+    ends = np.zeros((*edges.shape, 2))
+    for row, edge in np.ndenumerate(network.edges[edges]):
         first = edge["first_lane"]
         lanes = range(first, first + edge["num_lanes"])
         ends[row] = np.mean([network.lane_polyline(lane)[-1, :2] for lane in lanes], axis=0)

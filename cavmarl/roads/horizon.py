@@ -14,10 +14,16 @@ _CAR = 1 << VEHICLE_CLASSES.index("passenger")
 def horizon_of(network: RoadNetwork) -> float:
     """Seconds for three trips across a map at its limits: its width and then its height.
 
-    The speed is that of a car that drives over each lane once. Whole tens from 60 to 900.
+    The speed is that of a car that drives over each lane once. Whole tens from 60 to 900. Of
+    several maps it is that of the longest.
     """
-    min_x, min_y, max_x, max_y = (float(bound) for bound in network.extent_m)
-    lanes = network.lanes[(network.lanes["permissions"] & _CAR != 0) & ~network.lanes["internal"]]
+    return max(_horizon_on(network, number) for number in range(len(network.maps)))
+
+
+def _horizon_on(network: RoadNetwork, number: int) -> float:
+    min_x, min_y, max_x, max_y = network.extent_of(number)
+    lanes = network.lanes[network.lanes["map"] == number]
+    lanes = lanes[(lanes["permissions"] & _CAR != 0) & ~lanes["internal"]]
     if not len(lanes):
         return LEAST_S
     s_per_m = float(np.sum(lanes["length_m"] / lanes["speed_mps"]) / np.sum(lanes["length_m"]))

@@ -89,6 +89,7 @@ LANE = record(
     ("min_y", np.float64),
     ("max_x", np.float64),
     ("max_y", np.float64),
+    ("map", np.int32),  # MAP row
 )
 
 EDGE = record(
@@ -200,6 +201,16 @@ PLACE = record(
     ("s_m", np.float64),  # of the detector in the lane's s; beyond its ends on lanes beside it
 )
 
+# Rows of one map lie together; of several maps in one network a world drives on one.
+MAP = record(
+    ("first_lane", np.int32),  # LANE rows [first_lane, first_lane + num_lanes)
+    ("num_lanes", np.int32),
+    ("first_signal", np.int32),  # SIGNAL rows
+    ("num_signals", np.int32),
+    ("first_program", np.int32),  # PROGRAM rows
+    ("num_programs", np.int32),
+)
+
 
 @dataclass(frozen=True)
 class GeoReference:
@@ -242,6 +253,8 @@ class RoadNetwork:
     junction_kinds: tuple[str, ...]  # SUMO's types that occur, by `JUNCTION["kind"]`
     geo: GeoReference | None = None  # where it lies on the earth; None: the map does not say
     left_hand: bool = False  # whether one drives on the left
+    joined: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, MAP))  # MAP of several
+    map_names: tuple[str, ...] = ()  # of several
     # WALL (num_walls,) of the buildings, if they were asked for; see `maps.buildings`
     walls: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, WALL))
     # (num_roofs, 4, 2) corners in m of the convex parts of their footprints
@@ -273,8 +286,38 @@ class RoadNetwork:
             self.detectors,
             self.phase_detectors,
             *self._places,
+            self.maps,
         )
         return RoadArrays(*map(huge_copy, own))
+
+    @cached_property
+    def maps(self) -> NDArray[np.void]:
+        """MAP (M,): the maps that lie in it, one or, as `joined_maps.join` makes it, several."""
+        if len(self.joined):
+            return self.joined
+        rows = np.zeros(1, MAP)
+        rows["num_lanes"] = len(self.lanes)
+        rows["num_signals"] = len(self.signals)
+        rows["num_programs"] = len(self.programs)
+        return rows
+
+    def name_of(self, number: int) -> str:
+        """What a map of it, by its MAP row, is called."""
+        return self.map_names[number] if self.map_names else self.name
+
+    def extent_of(self, number: int) -> tuple[float, float, float, float]:
+        """`extent_m` of one of its maps."""
+        row = self.maps[number]
+        return _extent(self.lanes[row["first_lane"] : row["first_lane"] + row["num_lanes"]])
+
+    @cached_property
+    def room_m(self) -> tuple[float, float, float, float]:
+        """(min_x, min_y, max_x, max_y) that any one of its maps fits in, moved if need be."""
+        if len(self.maps) == 1:
+            return self.extent_m
+        extents = np.array([self.extent_of(number) for number in range(len(self.maps))])
+        width, height = (extents[:, 2:] - extents[:, :2]).max(axis=0).tolist()
+        return 0.0, 0.0, width, height
 
     @property
     def num_controllers(self) -> int:
@@ -314,13 +357,7 @@ class RoadNetwork:
     @cached_property
     def extent_m(self) -> tuple[float, float, float, float]:
         """(min_x, min_y, max_x, max_y) over all lanes: roads, not stray nodes."""
-        lanes = self.lanes
-        return (
-            float(lanes["min_x"].min()),
-            float(lanes["min_y"].min()),
-            float(lanes["max_x"].max()),
-            float(lanes["max_y"].max()),
-        )
+        return _extent(self.lanes)
 
     def lane_polyline(self, lane: int) -> NDArray[np.float64]:
         """The centre line of a lane as (num_points, 3) x, y, z in metres."""
@@ -357,6 +394,15 @@ class RoadNetwork:
             elif value is True:
                 digest.update(item.name.encode())
         return digest.hexdigest()
+
+
+def _extent(lanes: NDArray[np.void]) -> tuple[float, float, float, float]:
+    return (
+        float(lanes["min_x"].min()),
+        float(lanes["min_y"].min()),
+        float(lanes["max_x"].max()),
+        float(lanes["max_y"].max()),
+    )
 
 
 def content_of(array: NDArray[Any]) -> bytes:

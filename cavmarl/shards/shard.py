@@ -111,7 +111,8 @@ class Shard:
         self._further = optional_arrays(config.sensors, network, plans)
         self._registered = RegisteredOutputs(config, network)
         num_worlds, capacity = zoned.rows.shape[2:]
-        self._extent_m = network.extent_m
+        self._floating = len(network.maps) > 1
+        self._extent_m = network.room_m
         self.cut(zones, halo)
         # One after the other works in it: what the last one has left is still near in memory.
         self.scratch: Scratch = (
@@ -147,8 +148,10 @@ class Shard:
         """Say where its zone and the others are; a group has to be made anew after it."""
         self.zones = zones
         self.halo = halo
-        seen = _seen(self._extent_m, zones, self.zone, halo.halo_m)
-        self.grid = make_grid(seen, CELL_M, self.zoned.rows.shape[3])
+        seen = self._extent_m
+        if not self._floating:
+            seen = _seen(seen, zones, self.zone, halo.halo_m)
+        self.grid = make_grid(seen, CELL_M, self.zoned.rows.shape[3], self._floating)
 
     def turn(self) -> None:
         """Let the next rows be on the other side, for a tick that puts rows in order."""

@@ -49,8 +49,11 @@ class ShardGroup:
         self._travel = first.travel
         self._scratch = first.scratch
         grids = [shard.grid for shard in shards]
-        self._room = max(grids, key=lambda grid: grid.newest.size)
-        frames = [tuple(getattr(grid, name) for name in FRAME.names or ()) for grid in grids]
+        largest = max(grids, key=lambda grid: grid.newest.size)
+        self._room = largest._replace(corner=largest.corner.copy())
+        frames = [
+            (*grid.corner.tolist(), grid.cells_per_m, grid.num_x, grid.num_y) for grid in grids
+        ]
         self._members = Members(
             numbers=np.array([shard.zone for shard in shards]),
             frames=np.array(frames, dtype=FRAME),

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import ActionConfig, PopulationConfig, TrafficConfig
-from cavmarl.core.errors import CapacityError, ConfigError, RouteError
+from cavmarl.core.errors import CapacityError
 from cavmarl.core.memory import Zeros
 from cavmarl.core.numba.specialized import specialized
 from cavmarl.core.records.arrays import Demand, Gate, Travel, Worlds
@@ -21,12 +21,13 @@ from cavmarl.driving.driver_models import model_code
 from cavmarl.driving.kernels.drivers import look_ahead_m, see_line_m
 from cavmarl.driving.kernels.lane_index import VIEW_M
 from cavmarl.driving.vehicle_types import generated_types
-from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
-from cavmarl.roads.routing import make_plans
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.routing import PLAN, make_plans
 from cavmarl.traffic.demand import STOP, DemandFile
 from cavmarl.traffic.departure_queue import with_room
 from cavmarl.traffic.kernels.admission import accept, assign_lanes
 from cavmarl.traffic.kernels.demand_generator import call_orders, populate, settle
+from cavmarl.traffic.map_trips import MapTrips, for_each_map, together
 from cavmarl.traffic.rerouting import Rerouting
 from cavmarl.traffic.scenarios.cast import Cast
 from cavmarl.traffic.scenarios.movement_scripts import NO_SCRIPTS
@@ -37,13 +38,8 @@ from cavmarl.traffic.sumo.sumo_demand import SumoDemand
 from cavmarl.traffic.turning_circle import with_tight_turns
 from cavmarl.traffic.way_search import WaySlots, way_slots
 
-PASSENGER = 1 << VEHICLE_CLASSES.index("passenger")
 FAST_FACTOR = 1.5  # a speed over the limit that hardly any driver of the demand wants
-MIN_ORIGIN_M = 15.0  # lanes shorter than this are no place to start
 JAM_GAP_M = 2.5  # between the bumpers of vehicles that stand in a queue
-MIN_GOAL_M = 10.0  # nor to arrive
-DENSITY_M = 25.0  # a lane is drawn at reset once for each such length
-MAX_TRIPS = 200_000  # of a table; longer ones are thinned evenly
 
 
 class _Calls:
@@ -89,27 +85,28 @@ class NativeTraffic:
 
     @cached_property
     def goal_edges(self) -> NDArray[np.int32]:
-        """EDGE rows that trips lead to: named destinations first, then a spread over the map."""
-        named = [self._edge(name, "destinations") for name in self.traffic.destinations]
-        edges = self._drivable_edges(MIN_GOAL_M)
-        leaves = [e for e in edges if self._is_way_out(e)]
-        rest = [e for e in edges if e not in set(leaves)]
-        # Ways out of the map first; the others evenly over the rows, whatever the seed.
-        candidates = leaves + rest
-        if self.scene is not None:
-            named += self.scene.goal_edges
-        wanted = max(self.traffic.goals, len(named))
-        if len(leaves) < wanted and rest:
-            picks = np.linspace(0, len(rest) - 1, min(wanted - len(leaves), len(rest)))
-            candidates = leaves + [rest[round(p)] for p in picks]
-        chosen = list(dict.fromkeys(named + candidates))[:wanted]
-        return np.array(chosen, dtype=np.int32)
+        """EDGE rows (M, G) that trips of each map lead to; maps with fewer have some twice."""
+        acted = [] if self.scene is None else self.scene.goal_edges
+        found = for_each_map(self.network, lambda number: self._trips_of(number).goals(acted))
+        most = max(map(len, found))
+        return np.array([np.resize(goals, most) for goals in found], dtype=np.int32)
 
     @cached_property
     def plans(self) -> NDArray[np.void]:
-        """PLAN (G, L) of the goal edges."""
+        """PLAN (G, L) of the goal edges: on each map's lanes, the ways to its goals."""
         roads = with_tight_turns(self.network, ActionConfig().steering_rad)
-        return make_plans(self.network, self.goal_edges.tolist(), roads=roads)
+        maps = self.network.maps
+        if len(maps) == 1:
+            return make_plans(self.network, self.goal_edges[0].tolist(), roads=roads)
+        plans = np.zeros((self.goal_edges.shape[1], len(self.network.lanes)), dtype=PLAN)
+        for row, goals in zip(maps, self.goal_edges.tolist(), strict=True):
+            own = slice(row["first_lane"], row["first_lane"] + row["num_lanes"])
+            plans[:, own] = make_plans(self.network, goals, roads=roads)[:, own]
+        plans.setflags(write=False)
+        return plans
+
+    def _trips_of(self, number: int) -> MapTrips:
+        return MapTrips(self.network, number, self.traffic)
 
     @cached_property
     def schedule(self) -> Schedule | None:
@@ -123,7 +120,7 @@ class NativeTraffic:
         if self.scene is None:
             return None
         first_type = len(generated_types()) + (0 if self.file is None else len(self.file.types))
-        goals = {edge: goal for goal, edge in enumerate(self.goal_edges.tolist())}
+        goals = {edge: goal for goal, edge in enumerate(self.goal_edges[0].tolist())}
         agents = self.population.agents
         return Cast.of(self.scene, self.network, goals, first_type, self.dt, agents)
 
@@ -234,30 +231,21 @@ class NativeTraffic:
     def demand(self) -> Demand:
         """The tables that departures are drawn from.
 
-        Raises ConfigError: no trip of the wanted length exists on this map.
+        Raises ConfigError: no trip of the wanted length exists on a map.
         """
-        lanes = self.network.lanes
-        edges = set(self._drivable_edges(MIN_ORIGIN_M))
-        named = [self._edge(name, "origins") for name in self.traffic.origins]
-        start = self._lanes_of(named or sorted(edges))
-        entries = [e for e in edges if self._is_way_in(e)]
-        enter = self._lanes_of(sorted(entries)) if entries else self._lanes_of(sorted(edges))
-        anywhere = self._lanes_of(sorted(edges))
-        copies = np.ceil(lanes["length_m"][anywhere] / DENSITY_M).astype(np.int64)
-        goals = np.arange(len(self.goal_edges))
-        targets = goals[: len(self.traffic.destinations)] if self.traffic.destinations else goals
-        closed = self.population.mode == "closed"
-        minimum, maximum = self.traffic.min_trip_m, self.traffic.max_trip_m
-        background = self._trips(np.repeat(anywhere, copies), goals, 0.0, 0.0)
+        num_goals = self.goal_edges.shape[1]
+        parts = for_each_map(
+            self.network, lambda number: self._trips_of(number).drawn(self.plans, num_goals)
+        )
         return Demand(
-            agent_trips=self._trips(start, targets, minimum, maximum),
-            start_trips=background,
-            enter_trips=self._trips(enter, goals, 0.0, 0.0),
-            enter_at_start=bool(entries),
+            agent_trips=together([part.of_agents for part in parts]),
+            start_trips=together([part.at_start for part in parts]),
+            enter_trips=together([part.entering for part in parts]),
+            enter_at_start=np.array([part.has_ways_in for part in parts]),
             num_agents=self.population.agents,
             num_ids=self.population.num_ids,
             num_background=self.population.background,
-            reenter=not closed,
+            reenter=self.population.mode != "closed",
             seats=self.population.mode == "respawn",
             speed_factor_spread=self.traffic.speed_factor_spread,
             blank=self.blank,
@@ -308,93 +296,22 @@ class NativeTraffic:
         return _Calls()
 
     def _check_room(self) -> None:
-        """Refuse a population that cannot stand on the map, bumper to bumper.
+        """Refuse a population that cannot stand on each map, bumper to bumper.
 
         Raises CapacityError: more vehicles than that.
         """
-        lanes = self.network.lanes
-        usable = ~lanes["internal"] & (lanes["permissions"] & PASSENGER != 0)
-        metres = float(lanes["length_m"][usable].sum())
+        for_each_map(self.network, self._check_room_of)
+
+    def _check_room_of(self, number: int) -> None:
+        metres = self._trips_of(number).metres
         room = int(metres / (float(self.blank["length"][0]) + JAM_GAP_M))
         wanted = self.population.agents + self.population.background
         if wanted > room:
             raise CapacityError(
                 f"population.agents + population.background = {wanted}: the map "
-                f"'{self.network.name}' has {metres / 1000.0:.1f} km of lanes, room for {room} "
-                "vehicles bumper to bumper; ask for fewer"
+                f"'{self.network.name_of(number)}' has {metres / 1000.0:.1f} km of lanes, room for "
+                f"{room} vehicles bumper to bumper; ask for fewer"
             )
-
-    def _edge(self, name: str, key: str) -> int:
-        try:
-            return self.network.edge_ids.index(name)
-        except ValueError:
-            some = [n for n in self.network.edge_ids if not n.startswith(":")][:8]
-            raise ConfigError(
-                f"traffic.{key}: the map '{self.network.name}' has no edge '{name}'; "
-                f"it has {', '.join(some)} …"
-            ) from None
-
-    def _drivable_edges(self, least_m: float) -> list[int]:
-        """EDGE rows outside junctions with a lane for cars that is at least `least_m` long."""
-        lanes = self.network.lanes
-        good = (
-            ~lanes["internal"]
-            & (lanes["permissions"] & PASSENGER != 0)
-            & (lanes["length_m"] >= least_m)
-        )
-        found = [int(edge) for edge in np.unique(lanes["edge"][good])]
-        if not found:
-            raise RouteError(
-                f"map '{self.network.name}': no edge for cars is {least_m:g} m long or more"
-            )
-        return found
-
-    def _lanes_of(self, edges: list[int]) -> NDArray[np.int64]:
-        lanes = self.network.lanes
-        on_edge = np.isin(lanes["edge"], edges) & (lanes["permissions"] & PASSENGER != 0)
-        return np.flatnonzero(on_edge & (lanes["length_m"] >= MIN_ORIGIN_M))
-
-    def _is_way_out(self, edge: int) -> bool:
-        row = self.network.edges[edge]
-        lanes = self.network.lanes[row["first_lane"] : row["first_lane"] + row["num_lanes"]]
-        return not bool(lanes["num_links"].any())
-
-    def _is_way_in(self, edge: int) -> bool:
-        row = self.network.edges[edge]
-        lanes = self.network.lanes[row["first_lane"] : row["first_lane"] + row["num_lanes"]]
-        return not bool(lanes["num_into"].any())
-
-    def _trips(
-        self, origins: NDArray[np.int64], goals: NDArray[np.int64], least_m: float, most_m: float
-    ) -> NDArray[np.int32]:
-        """(P, 2) pairs of origin lane and goal whose way has a length from `least_m` to `most_m`.
-
-        Vehicles start on a lane that their way can follow: no trip begins with a lane change. And
-        no trip has a turn for which a car's turning circle is too wide.
-        """
-        pairs = np.ix_(goals, origins)
-        to_go = self.plans["to_go"][pairs]
-        fits = np.isfinite(to_go) & (to_go >= least_m)
-        fits &= (self.plans["change"][pairs] == 0) & (self.plans["turnarounds"][pairs] == 0)
-        if most_m > 0.0:
-            fits &= to_go <= most_m
-        goal, origin = np.nonzero(fits)
-        if not len(goal):
-            reachable = to_go[np.isfinite(to_go)]
-            longest = (
-                f"the longest way is {reachable.max():.0f} m"
-                if reachable.size
-                else "no way leads to a goal"
-            )
-            raise ConfigError(
-                f"traffic.min_trip_m = {least_m:g}, traffic.max_trip_m = {most_m:g}: no trip of "
-                f"that length on the map '{self.network.name}' ({longest}); change the limits, "
-                "traffic.origins or traffic.destinations"
-            )
-        trips = np.stack([origins[origin], goals[goal]], axis=1).astype(np.int32)
-        if len(trips) > MAX_TRIPS:
-            trips = trips[:: -(-len(trips) // MAX_TRIPS)]
-        return np.ascontiguousarray(trips)
 
 
 def capacity_of(

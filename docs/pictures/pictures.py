@@ -62,6 +62,8 @@ PICTURES = {
     "grid4x4": Picture("grid4x4", 16.0),
     "town": Picture("town", 20.0, background=250),
     "rush": Picture("rush", 60.0),
+    "cities": Picture("cities", 20.0, (1000, 800)),
+    "cities_validation": Picture("cities_validation", 20.0, (1000, 800)),
     "ghosts": Picture(
         "rush",
         60.0,

@@ -73,7 +73,7 @@ class Scene:
         network, worlds = self.simulation.network, self.simulation._shard.worlds
         row = network.lane_ids.index(lane)
         s = float(network.lanes[row]["length_m"]) - to_line_m - 2.5
-        goals = [network.edge_ids[edge] for edge in self.simulation.goal_edges]
+        goals = [network.edge_ids[edge] for edge in self.simulation.goal_edges[0]]
         travel = self.simulation._tick.traffic.travel
         car = on_lane(network, row, s, travel, goal=goals.index(goal), **fields)
         plan = self.simulation._tick.traffic.plans[car[0]["goal"], row]

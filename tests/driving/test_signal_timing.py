@@ -37,6 +37,7 @@ def watch(
         worlds.detected_s[random.random(worlds.detected_s.shape) < busy] = tick * DT
         switch_signals(
             roads.arrays,
+            worlds.keys,
             worlds.ticks,
             worlds.detected_s,
             DT,

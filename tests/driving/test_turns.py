@@ -47,7 +47,7 @@ def test_turns_that_are_too_tight_are_sharp_ones_and_no_trip_has_one(tmp_path: P
     assert 0 < tight.size < 0.15 * len(links)
     assert min(_turn_rad(roads, roads.links[link]) for link in tight) > 1.2
     traffic = world._tick.traffic
-    for origin, goal in traffic.demand.agent_trips.tolist():
+    for origin, goal in traffic.demand.agent_trips.pairs.tolist():
         plan, lane = traffic.plans[goal], origin
         while plan[lane]["next"] >= 0:
             assert plan[lane]["link"] not in tight

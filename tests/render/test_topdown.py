@@ -163,8 +163,8 @@ def test_camera_follows_agents_and_waits_for_them(grid: RoadNetwork, car: Car) -
 
 
 def test_destinations_are_marked(grid: RoadNetwork, car: Car) -> None:
-    goals = np.flatnonzero(~grid.edges["internal"])[:1].astype(np.int32)
-    lane = grid.lanes[grid.edges[goals[0]]["first_lane"]]
+    goals = np.flatnonzero(~grid.edges["internal"])[:1].astype(np.int32)[None]
+    lane = grid.lanes[grid.edges[goals[0, 0]]["first_lane"]]
     end = grid.points[lane["first_point"] + lane["num_points"] - 1]
     row = car(agent=4, x=-1e6, goal=0)
     place = (float(end["x"]), float(end["y"]))

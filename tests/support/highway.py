@@ -93,8 +93,8 @@ def vehicles(env: Any) -> NDArray[np.void]:
 
 
 def destinations(env: Any) -> NDArray[np.float64]:
-    """(G, 2) where each vehicle goes."""
-    return np.array([vehicle.destination * (1.0, -1.0) for vehicle in env.road.vehicles])
+    """(1, G, 2) where each vehicle goes."""
+    return np.array([[vehicle.destination * (1.0, -1.0) for vehicle in env.road.vehicles]])
 
 
 def grid_of(rows: NDArray[np.void]) -> Grid:

@@ -5,6 +5,7 @@ small records that lie together in memory, with sine and cosine of the heading t
 cell they lie in row order; readers must not depend on it and break ties by id.
 
 Cells reach to the ends of the plane: what lies outside the grid's area belongs to the border cells.
+Where worlds drive on one of several maps, the area floats: it begins where their vehicles do.
 """
 
 from __future__ import annotations
@@ -56,8 +57,8 @@ SPOT = np.dtype(
 class Grid(NamedTuple):
     """Square cells over a map and the bodies in them; holds nothing between ticks."""
 
-    min_x: float  # m, corner of cell (0, 0)
-    min_y: float
+    corner: NDArray[np.float64]  # (2,) m, of cell (0, 0)
+    floating: bool  # `aim` moves it
     cells_per_m: float
     num_x: int
     num_y: int
@@ -75,14 +76,15 @@ def make_grid(
     bounds: tuple[float, float, float, float],  # min_x, min_y, max_x, max_y of the area in m
     cell_m: float,  # side of a cell in m; about half the usual search distance is fast
     capacity: int,  # most vehicles that it can take
+    floating: bool = False,  # the area begins where the vehicles do
 ) -> Grid:
     """An empty grid."""
     min_x, min_y, max_x, max_y = bounds
     num_x = max(1, math.ceil((max_x - min_x) / cell_m))
     num_y = max(1, math.ceil((max_y - min_y) / cell_m))
     return Grid(
-        min_x=float(min_x),
-        min_y=float(min_y),
+        corner=np.array([min_x, min_y], dtype=np.float64),
+        floating=floating,
         cells_per_m=1.0 / float(cell_m),
         num_x=num_x,
         num_y=num_y,
@@ -106,16 +108,16 @@ def _slot(offset: float, cells_per_m: float, count: int) -> int:
 
 @kernel
 def cell_at(grid: Grid, x: float, y: float) -> int:
-    column = _slot(x - grid.min_x, grid.cells_per_m, grid.num_x)
-    return _slot(y - grid.min_y, grid.cells_per_m, grid.num_y) * grid.num_x + column
+    column = _slot(x - grid.corner[0], grid.cells_per_m, grid.num_x)
+    return _slot(y - grid.corner[1], grid.cells_per_m, grid.num_y) * grid.num_x + column
 
 
 @kernel
 def cell_columns(grid: Grid, x: float, distance_m: float) -> tuple[int, int]:
     """The first and last column of cells that can hold a body within `distance_m` of `x`."""
     return (
-        _slot(x - distance_m - _MARGIN_M - grid.min_x, grid.cells_per_m, grid.num_x),
-        _slot(x + distance_m + _MARGIN_M - grid.min_x, grid.cells_per_m, grid.num_x),
+        _slot(x - distance_m - _MARGIN_M - grid.corner[0], grid.cells_per_m, grid.num_x),
+        _slot(x + distance_m + _MARGIN_M - grid.corner[0], grid.cells_per_m, grid.num_x),
     )
 
 
@@ -123,9 +125,23 @@ def cell_columns(grid: Grid, x: float, distance_m: float) -> tuple[int, int]:
 def cell_rows(grid: Grid, y: float, distance_m: float) -> tuple[int, int]:
     """The first and last row of cells that can hold a body within `distance_m` of `y`."""
     return (
-        _slot(y - distance_m - _MARGIN_M - grid.min_y, grid.cells_per_m, grid.num_y),
-        _slot(y + distance_m + _MARGIN_M - grid.min_y, grid.cells_per_m, grid.num_y),
+        _slot(y - distance_m - _MARGIN_M - grid.corner[1], grid.cells_per_m, grid.num_y),
+        _slot(y + distance_m + _MARGIN_M - grid.corner[1], grid.cells_per_m, grid.num_y),
     )
+
+
+@kernel
+def aim(grid: Grid, rows: NDArray[np.void], num: int) -> None:
+    """Let the area of a floating grid begin where VEHICLE rows[:num] do."""
+    if not grid.floating or num == 0:
+        return
+    min_x = math.inf
+    min_y = math.inf
+    for i in range(num):
+        min_x = min(min_x, rows[i]["x"])
+        min_y = min(min_y, rows[i]["y"])
+    grid.corner[0] = min_x
+    grid.corner[1] = min_y
 
 
 @kernel
@@ -160,6 +176,7 @@ def fill_grid(
     start = grid.start
     cell = grid.cell
     start[:] = 0
+    aim(grid, rows, num)
     for i in range(num):
         c = cell_at(grid, rows[i]["x"], rows[i]["y"])
         cell[i] = c

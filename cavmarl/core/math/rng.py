@@ -40,6 +40,7 @@ STREAM_SENSOR = 10 * DRAWS_PER_STREAM  # noise and dropouts of sensors
 STREAM_V2X = 11 * DRAWS_PER_STREAM  # losses and delays of messages
 STREAM_DEMAND = 12 * DRAWS_PER_STREAM  # times, types and routes of a demand file
 STREAM_REROUTER = 13 * DRAWS_PER_STREAM  # which vehicles follow a rerouter, and where to
+STREAM_MAP = 14 * DRAWS_PER_STREAM  # the map of an episode, where there are several
 
 _MASK_16 = np.uint64(0xFFFF)
 _MASK_32 = np.uint64(0xFFFFFFFF)

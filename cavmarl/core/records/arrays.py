@@ -34,6 +34,7 @@ class RoadArrays(NamedTuple):
     phase_detectors: NDArray[np.int32]  # see PHASE["first_detector"]
     lane_place: NDArray[np.int32]  # (L,) the first PLACE of each lane, or -1
     places: NDArray[np.void]  # PLACE (num_places,) detectors that bodies on a lane can cover
+    maps: NDArray[np.void]  # MAP (M,), see `roads.kernels.map_draw`
 
 
 class LaneGrid(NamedTuple):
@@ -156,13 +157,21 @@ class Gate(NamedTuple):
     spare: NDArray[np.void]  # VEHICLE (1,) room
 
 
+class TripTable(NamedTuple):
+    """Trips to draw from, map by map."""
+
+    pairs: NDArray[np.int32]  # (P, 2) LANE and goal
+    first: NDArray[np.int64]  # (M + 1,) trips of map m: pairs[first[m] : first[m + 1]]
+
+
 class Demand(NamedTuple):
     """What the generator draws departures from; the same for all worlds of an environment."""
 
-    agent_trips: NDArray[np.int32]  # (P, 2) LANE and goal of the trips of agents
-    start_trips: NDArray[np.int32]  # (P, 2) of background vehicles at reset, dense by lane length
-    enter_trips: NDArray[np.int32]  # (P, 2) of background vehicles that enter later
-    enter_at_start: bool  # whether those enter at the start of their lane (a road into the map)
+    agent_trips: TripTable
+    start_trips: TripTable  # of background vehicles at reset, dense by lane length
+    enter_trips: TripTable  # of background vehicles that enter later
+    # (M,) whether those enter at the start of their lane (a road into the map)
+    enter_at_start: NDArray[np.bool_]
     num_agents: int  # agents in the world at any one time
     num_ids: int  # agents that an episode can have
     num_background: int

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.math.geometry import boxes_overlap
-from cavmarl.core.math.neighbors import Grid, cell_at, cell_columns, cell_rows
+from cavmarl.core.math.neighbors import Grid, aim, cell_at, cell_columns, cell_rows
 from cavmarl.core.numba import inlined_kernel, kernel
 
 
@@ -48,6 +48,7 @@ def find_contacts(
     One pass: each vehicle looks at those that are in the cells already and joins them.
     """
     grid.newest[:] = -1
+    aim(grid, rows, num)
     largest = 0.0
     found = False
     for i in range(num):

@@ -79,9 +79,10 @@ class TouchCounter:
     Of several that touch one vehicle at once, only its pair with the lowest id counts.
     """
 
-    def __init__(self, bounds: tuple[float, float, float, float]) -> None:
+    def __init__(self, bounds: tuple[float, float, float, float], floating: bool = False) -> None:
         self.count = 0  # pairs so far; one that parts and touches again counts again
         self._bounds = bounds
+        self._floating = floating
         self._make_room(0)
         self._touching: set[tuple[int, int]] = set()
 
@@ -97,7 +98,7 @@ class TouchCounter:
         self._touching = touching
 
     def _make_room(self, capacity: int) -> None:
-        self._grid = make_grid(self._bounds, CELL_M, capacity)
+        self._grid = make_grid(self._bounds, CELL_M, capacity, self._floating)
         self._hit = np.zeros(capacity, dtype=np.int64)
 
 
@@ -106,7 +107,7 @@ class TrafficMeter:
 
     def __init__(self, network: RoadNetwork) -> None:
         self._network = network
-        self._touches = TouchCounter(network.extent_m)
+        self._touches = TouchCounter(network.room_m, len(network.maps) > 1)
         self._locks = JunctionLocks(network)
         signalled = network.links["from_lane"][network.links["signal"] >= 0]
         self._ends_at_signal = np.zeros(len(network.lanes), dtype=np.bool_)

@@ -14,7 +14,7 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.config.registry import (
     resolve_buildings,
     resolve_demand,
-    resolve_map,
+    resolve_maps,
     resolve_programs,
     resolve_zones,
 )
@@ -70,7 +70,7 @@ def files_of(config: EnvConfig, base_dir: Path) -> list[WorldFile]:
     """Those that a configuration names."""
     buildings = resolve_buildings(config, base_dir) if config.map.buildings != "osm" else None
     paths = [
-        ("map.source", -1, resolve_map(config, base_dir)),
+        *(("map.source", n, path) for n, path in enumerate(resolve_maps(config, base_dir))),
         ("map.buildings", -1, buildings),
         ("zones.layout", -1, resolve_zones(config, base_dir)),
         *(("map.programs", n, path) for n, path in enumerate(resolve_programs(config, base_dir))),
@@ -86,7 +86,11 @@ def files_of(config: EnvConfig, base_dir: Path) -> list[WorldFile]:
 def recipe_with(recipe: Mapping[str, Any], files: Sequence[WorldFile]) -> dict[str, Any]:
     """A recipe whose configuration names the files as they are on this machine."""
     config = dict(recipe["config"])
+    maps = [str(file.found()) for file in files if file.key == "map.source"]
+    config["map"] = {**config["map"], "source": maps[0] if len(maps) == 1 else maps}
     for file in files:
+        if file.key == "map.source":
+            continue
         section, _, field = file.key.partition(".")
         values = dict(config[section])
         path = str(file.found())

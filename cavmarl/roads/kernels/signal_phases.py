@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from cavmarl.core.numba import kernel
 from cavmarl.core.records.arrays import RoadArrays
 from cavmarl.core.records.rows import is_off_lanes
+from cavmarl.roads.kernels.map_draw import map_of
 
 # From a detector to the centre of any vehicle that is over it or has left it in this tick.
 DETECTOR_REACH_M = 30.0
@@ -63,6 +64,7 @@ def detect(
 @kernel
 def switch_signals(
     roads: RoadArrays,
+    keys: NDArray[np.uint64],
     ticks: NDArray[np.int64],
     detected_s: NDArray[np.float64],
     dt: float,
@@ -70,6 +72,8 @@ def switch_signals(
     signal_phase: NDArray[np.int32],
 ) -> None:
     """Bring every signal to the worlds' ticks; once more at the same tick changes nothing.
+
+    Signals of maps that a world is not on show their first phase.
 
     `detected_s`: (W, D) what bodies of all shards did up to these ticks. `controllers`: CONTROLLER
     (W, num_controllers), written. `signal_phase`: (W, num_signals), written.
@@ -79,8 +83,15 @@ def switch_signals(
         if controllers.shape[1] > 0:
             if ticks[w] == 0:
                 _start(roads, controllers[w], dt)
-            _control(roads, ticks[w], detected_s[w], dt, controllers[w])
+            own_map = map_of(keys[w], roads.maps.shape[0])
+            _control(roads, own_map, ticks[w], detected_s[w], dt, controllers[w])
+        own = roads.maps[map_of(keys[w], roads.maps.shape[0])]
+        first_signal = own["first_signal"]
+        end_signal = first_signal + own["num_signals"]
         for k in range(roads.signals.shape[0]):
+            if k < first_signal or k >= end_signal:
+                signal_phase[w, k] = roads.programs[roads.signals[k]["program"]]["first_phase"]
+                continue
             program = program_at(roads, k, time, dt)
             controller = roads.programs[program]["controller"]
             if controller >= 0:
@@ -146,6 +157,7 @@ def _note(
 @kernel
 def _control(
     roads: RoadArrays,
+    own_map: int,
     tick: int,
     detected_s: NDArray[np.float64],
     dt: float,
@@ -154,7 +166,8 @@ def _control(
     """Let every actuated program of a world look, as often as is due before the next tick."""
     now_ms = _milliseconds(tick * dt)
     end_ms = _milliseconds((tick + 1) * dt)
-    for program in range(roads.programs.shape[0]):
+    rows = roads.maps[own_map]
+    for program in range(rows["first_program"], rows["first_program"] + rows["num_programs"]):
         controller = roads.programs[program]["controller"]
         if controller >= 0:
             state = controllers[controller]

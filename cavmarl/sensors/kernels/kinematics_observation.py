@@ -55,8 +55,9 @@ def vehicle_features(
 ) -> None:
     """All features of a vehicle in the world's frame.
 
-    `destinations`: (G, 2) x and y of each goal in m, our frame. `intentions`: whether the direction
-    to the vehicle's goal is shown; else it is 0. `out`: (NUM_VEHICLE_FEATURES,), overwritten.
+    `destinations`: (M, G, 2) x and y of each map's goals in m, our frame. `intentions`: whether the
+    direction to the vehicle's goal is shown; else it is 0. `out`: (NUM_VEHICLE_FEATURES,),
+    overwritten.
     """
     cos = math.cos(row["heading"])
     sin = math.sin(row["heading"])
@@ -71,8 +72,9 @@ def vehicle_features(
     out[FEATURE_COS_D] = 0.0
     out[FEATURE_SIN_D] = 0.0
     if intentions:
-        dx = destinations[row["goal"], 0] - row["x"]
-        dy = destinations[row["goal"], 1] - row["y"]
+        own_map = lanes[row["lane"]]["map"]
+        dx = destinations[own_map, row["goal"], 0] - row["x"]
+        dy = destinations[own_map, row["goal"], 1] - row["y"]
         distance = math.sqrt(dx * dx + dy * dy)
         if distance > 0.0:
             out[FEATURE_COS_D] = dx / distance

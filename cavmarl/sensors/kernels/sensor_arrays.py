@@ -25,7 +25,7 @@ class KinematicsSensor(NamedTuple):
     clip: bool
     see_behind: bool
     observe_intentions: bool
-    destinations: NDArray[np.float64]  # (G, 2) where each goal is, m
+    destinations: NDArray[np.float64]  # (M, G, 2) where each goal of each map is, m
     near_body: NDArray[np.int64]  # (vehicles,) room
     near_key: NDArray[np.float64]
     values: NDArray[np.float64]  # (NUM_VEHICLE_FEATURES,) room
@@ -47,7 +47,7 @@ class OccupancyGrid(NamedTuple):
     aligned: bool
     clip: bool
     as_image: bool
-    destinations: NDArray[np.float64]  # (G, 2) where each goal is, m
+    destinations: NDArray[np.float64]  # (M, G, 2) where each goal of each map is, m
     cell_body: NDArray[np.int64]  # (num_x * num_y,) room
     lane_seen: NDArray[np.int64]  # (L + 1,) room: when each lane was drawn last, and the time
     values: NDArray[np.float64]  # (NUM_VEHICLE_FEATURES,) room

@@ -76,12 +76,14 @@ def codes(features: tuple[str, ...]) -> NDArray[np.int64]:
 
 
 def goal_places(network: RoadNetwork, plans: NDArray[np.void]) -> NDArray[np.float64]:
-    """(G, 2) x and y of each goal in m: the end of the lane at the kerb of its edge."""
-    places = np.zeros((len(plans), 2))
-    for place, plan in zip(places, plans, strict=True):
-        reached = np.isfinite(plan["to_go"]) & (plan["next"] < 0) & (plan["change"] == 0)
-        goal = int(np.flatnonzero(reached)[0])
-        place[:] = network.lane_polyline(goal)[-1, :2]
+    """(M, G, 2) x and y of each goal of each map in m: the end of its edge's lane at the kerb."""
+    places = np.zeros((len(network.maps), len(plans), 2))
+    for own, row in zip(places, network.maps, strict=True):
+        first, end = row["first_lane"], row["first_lane"] + row["num_lanes"]
+        for place, plan in zip(own, plans[:, first:end], strict=True):
+            reached = np.isfinite(plan["to_go"]) & (plan["next"] < 0) & (plan["change"] == 0)
+            goal = first + int(np.flatnonzero(reached)[0])
+            place[:] = network.lane_polyline(goal)[-1, :2]
     return places
 
 

@@ -40,8 +40,8 @@ from cavmarl.zones.kernels.zone_lookup import Halo, ZoneArrays
 
 FRAME = np.dtype(
     [
-        ("min_x", np.float64),  # see `neighbors.Grid`
-        ("min_y", np.float64),
+        ("corner_x", np.float64),  # see `neighbors.Grid`
+        ("corner_y", np.float64),
         ("cells_per_m", np.float64),
         ("num_x", np.int64),
         ("num_y", np.int64),
@@ -93,9 +93,11 @@ def _worlds(members: Members, zone: int, side: int, next_side: int) -> Worlds:
 def _grid(frame: np.void, room: Grid) -> Grid:
     """A zone's spatial index, in the room of the largest one."""
     cells = frame["num_x"] * frame["num_y"]
+    room.corner[0] = frame["corner_x"]
+    room.corner[1] = frame["corner_y"]
     return Grid(
-        min_x=frame["min_x"],
-        min_y=frame["min_y"],
+        corner=room.corner,
+        floating=room.floating,
         cells_per_m=frame["cells_per_m"],
         num_x=frame["num_x"],
         num_y=frame["num_y"],

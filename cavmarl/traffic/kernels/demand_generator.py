@@ -20,7 +20,7 @@ from cavmarl.core.math.rng import (
     uniform,
 )
 from cavmarl.core.numba import kernel
-from cavmarl.core.records.arrays import Demand, Gate, RoadArrays, Travel, Worlds
+from cavmarl.core.records.arrays import Demand, Gate, RoadArrays, Travel, TripTable, Worlds
 from cavmarl.core.records.codes import (
     COUNT_ARRIVED,
     COUNT_DEPARTED,
@@ -38,6 +38,7 @@ from cavmarl.core.records.codes import (
 )
 from cavmarl.driving.kernels.motion import place_on_lane
 from cavmarl.driving.kernels.ways import own_step, way_left
+from cavmarl.roads.kernels.map_draw import map_of
 from cavmarl.traffic.kernels.entering import speed_at
 
 PLACE_TRIES = 24  # places tried for a vehicle at reset before it has to queue
@@ -58,13 +59,14 @@ def _order(
     worlds: Worlds,
     w: int,
     agent: int,
-    trips: NDArray[np.int32],
+    trips: TripTable,
 ) -> None:
     """Number and draw one departure and put it at the end of the queue."""
+    own_map = map_of(worlds.keys[w], roads.maps.shape[0])
     vehicle = gate.next_id[w]
     gate.next_id[w] = vehicle + 1
     key = worlds.keys[w]
-    trip = below(key, vehicle, 0, STREAM_ORIGIN, trips.shape[0])
+    trip = _draw(trips, own_map, key, vehicle, 0)
     departure = gate.queue[w, gate.num_queue[w]]
     gate.num_queue[w] += 1
     departure["id"] = vehicle
@@ -77,15 +79,24 @@ def _order(
     departure["pos_code"] = POS_GIVEN
     departure["speed_code"] = SPEED_MAX
     departure["due"] = worlds.ticks[w]
-    _send(roads, departure, trips[trip, 0], trips[trip, 1])
+    _send(roads, departure, trips.pairs[trip, 0], trips.pairs[trip, 1])
     spread = 2.0 * uniform(key, vehicle, 0, STREAM_SPEED_FACTOR) - 1.0
     departure["speed_factor"] = 1.0 + demand.speed_factor_spread * spread
     length = roads.lanes[departure["lane"]]["length_m"]
     body = demand.blank[0]["length"]
     departure["pos"] = body + 1.0
-    if agent >= 0 or not demand.enter_at_start:
+    if agent >= 0 or not demand.enter_at_start[own_map]:
         free = max(length - body - END_ROOM_M, 0.0)
         departure["pos"] += free * uniform(key, vehicle, 0, STREAM_PLACE)
+
+
+@kernel
+def _draw(trips: TripTable, own_map: int, key: np.uint64, vehicle: int, attempt: int) -> int:
+    """Which of the trips of a map a vehicle makes."""
+    first = trips.first[own_map]
+    count = trips.first[own_map + 1] - first
+    drawn: int = first + np.int64(below(key, vehicle, 0, STREAM_ORIGIN + attempt, count))
+    return drawn
 
 
 @kernel
@@ -177,6 +188,7 @@ def populate(
         gate.counts[w, :] = 0
         gate.sums[w, :] = 0.0
         gate.num_entered[w] = demand.num_agents
+        own_map = map_of(worlds.keys[w], roads.maps.shape[0])
         for n in range(demand.num_agents + demand.num_background):
             agent = n if n < demand.num_agents else -1
             trips = demand.agent_trips if agent >= 0 else demand.start_trips
@@ -185,9 +197,9 @@ def populate(
             vehicle = departure["id"]
             kind = travel.types[departure["vtype"]]
             for attempt in range(PLACE_TRIES):
-                trip = below(worlds.keys[w], vehicle, 0, STREAM_ORIGIN + attempt, trips.shape[0])
-                lane = trips[trip, 0]
-                _send(roads, departure, lane, trips[trip, 1])
+                trip = _draw(trips, own_map, worlds.keys[w], vehicle, attempt)
+                lane = trips.pairs[trip, 0]
+                _send(roads, departure, lane, trips.pairs[trip, 1])
                 length = roads.lanes[lane]["length_m"]
                 share = uniform(worlds.keys[w], vehicle, 0, STREAM_PLACE + attempt)
                 s = half + 1.0 + share * max(length - 2.0 * half - END_ROOM_M, 0.0)

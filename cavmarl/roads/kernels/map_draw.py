@@ -1,0 +1,17 @@
+"""Which map an episode is on, where a network has several."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cavmarl.core.math.rng import STREAM_MAP, below
+from cavmarl.core.numba import kernel
+
+
+@kernel
+def map_of(key: np.uint64, num_maps: int) -> int:
+    """The MAP row of an episode: a function of its key, so of seed, world and episode."""
+    if num_maps == 1:
+        return 0
+    number: int = np.int64(below(key, 0, 0, STREAM_MAP, num_maps))  # type: ignore[assignment]
+    return number

@@ -1,0 +1,197 @@
+"""`MapTrips`: which trips the generator has on a map, one of those of a network."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config.env import TrafficConfig
+from cavmarl.core.errors import CavmarlError, ConfigError, RouteError
+from cavmarl.core.records.arrays import TripTable
+from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+
+PASSENGER = 1 << VEHICLE_CLASSES.index("passenger")
+MIN_ORIGIN_M = 15.0  # lanes shorter than this are no place to start
+MIN_GOAL_M = 10.0  # nor to arrive
+DENSITY_M = 25.0  # a lane is drawn at reset once for each such length
+MAX_TRIPS = 200_000  # of a table; longer ones are thinned evenly
+
+T = TypeVar("T")
+
+
+def for_each_map(network: RoadNetwork, make: Callable[[int], T]) -> list[T]:
+    """What `make` makes of each MAP row.
+
+    Raises:
+        CavmarlError: as `make`, of the kind of the first one, with all messages.
+    """
+    found: list[T] = []
+    refused: list[CavmarlError] = []
+    for number in range(len(network.maps)):
+        try:
+            found.append(make(number))
+        except CavmarlError as error:
+            refused.append(error)
+    if refused:
+        raise type(refused[0])("\n".join(map(str, refused))) from refused[0]
+    return found
+
+
+def together(parts: Sequence[NDArray[np.int32]]) -> TripTable:
+    """The trips of all maps, (P, 2) each."""
+    first = np.cumsum([0, *map(len, parts)], dtype=np.int64)
+    return TripTable(np.ascontiguousarray(np.concatenate(parts)), first)
+
+
+class DrawnTrips(NamedTuple):
+    """Trips of one map, (P, 2) LANE and goal."""
+
+    of_agents: NDArray[np.int32]
+    at_start: NDArray[np.int32]  # of background vehicles at reset
+    entering: NDArray[np.int32]  # of those that enter later
+    has_ways_in: bool  # whether those come on roads that lead into the map
+
+
+@dataclass(frozen=True)
+class MapTrips:
+    """Trips of one map."""
+
+    network: RoadNetwork
+    number: int  # MAP row
+    traffic: TrafficConfig
+
+    @cached_property
+    def metres(self) -> float:
+        """Of lanes for cars outside junctions."""
+        return float(self.network.lanes["length_m"][self._usable].sum())
+
+    def goals(self, acted: Sequence[int]) -> list[int]:
+        """EDGE rows that trips lead to: named destinations first, then a spread over the map.
+
+        `acted`: more of them, those of a scenario.
+        """
+        named = [self._edge(name, "destinations") for name in self.traffic.destinations]
+        edges = self._drivable_edges(MIN_GOAL_M)
+        leaves = [e for e in edges if self._is_way_out(e)]
+        rest = [e for e in edges if e not in set(leaves)]
+        # Ways out of the map first; the others evenly over the rows, whatever the seed.
+        candidates = leaves + rest
+        named += acted
+        wanted = max(self.traffic.goals, len(named))
+        if len(leaves) < wanted and rest:
+            picks = np.linspace(0, len(rest) - 1, min(wanted - len(leaves), len(rest)))
+            candidates = leaves + [rest[round(p)] for p in picks]
+        return list(dict.fromkeys(named + candidates))[:wanted]
+
+    def drawn(self, plans: NDArray[np.void], num_goals: int) -> DrawnTrips:
+        """What departures are drawn from.
+
+        `plans`: PLAN (G, L). `num_goals`: G.
+
+        Raises ConfigError: no trip of the wanted length exists on this map.
+        """
+        lanes = self.network.lanes
+        edges = set(self._drivable_edges(MIN_ORIGIN_M))
+        named = [self._edge(name, "origins") for name in self.traffic.origins]
+        start = self._lanes_of(named or sorted(edges))
+        entries = [e for e in edges if self._is_way_in(e)]
+        enter = self._lanes_of(sorted(entries)) if entries else self._lanes_of(sorted(edges))
+        anywhere = self._lanes_of(sorted(edges))
+        copies = np.ceil(lanes["length_m"][anywhere] / DENSITY_M).astype(np.int64)
+        goals = np.arange(num_goals)
+        targets = goals[: len(self.traffic.destinations)] if self.traffic.destinations else goals
+        minimum, maximum = self.traffic.min_trip_m, self.traffic.max_trip_m
+        return DrawnTrips(
+            at_start=self._trips(plans, np.repeat(anywhere, copies), goals, 0.0, 0.0),
+            of_agents=self._trips(plans, start, targets, minimum, maximum),
+            entering=self._trips(plans, enter, goals, 0.0, 0.0),
+            has_ways_in=bool(entries),
+        )
+
+    @cached_property
+    def _usable(self) -> NDArray[np.bool_]:
+        """(L,) whether a lane of this map is for cars, and outside junctions."""
+        lanes = self.network.lanes
+        usable: NDArray[np.bool_] = (
+            (lanes["map"] == self.number)
+            & ~lanes["internal"]
+            & (lanes["permissions"] & PASSENGER != 0)
+        )
+        return usable
+
+    def _edge(self, name: str, key: str) -> int:
+        try:
+            return self.network.edge_ids.index(name)
+        except ValueError:
+            some = [n for n in self.network.edge_ids if not n.startswith(":")][:8]
+            raise ConfigError(
+                f"traffic.{key}: the map '{self.network.name}' has no edge '{name}'; "
+                f"it has {', '.join(some)} …"
+            ) from None
+
+    def _drivable_edges(self, least_m: float) -> list[int]:
+        """EDGE rows outside junctions with a lane for cars that is at least `least_m` long."""
+        lanes = self.network.lanes
+        good = self._usable & (lanes["length_m"] >= least_m)
+        found = [int(edge) for edge in np.unique(lanes["edge"][good])]
+        if not found:
+            name = self.network.name_of(self.number)
+            raise RouteError(f"map '{name}': no edge for cars is {least_m:g} m long or more")
+        return found
+
+    def _lanes_of(self, edges: list[int]) -> NDArray[np.int64]:
+        lanes = self.network.lanes
+        on_edge = np.isin(lanes["edge"], edges) & (lanes["permissions"] & PASSENGER != 0)
+        return np.flatnonzero(on_edge & (lanes["length_m"] >= MIN_ORIGIN_M))
+
+    def _is_way_out(self, edge: int) -> bool:
+        row = self.network.edges[edge]
+        lanes = self.network.lanes[row["first_lane"] : row["first_lane"] + row["num_lanes"]]
+        return not bool(lanes["num_links"].any())
+
+    def _is_way_in(self, edge: int) -> bool:
+        row = self.network.edges[edge]
+        lanes = self.network.lanes[row["first_lane"] : row["first_lane"] + row["num_lanes"]]
+        return not bool(lanes["num_into"].any())
+
+    def _trips(
+        self,
+        plans: NDArray[np.void],
+        origins: NDArray[np.int64],
+        goals: NDArray[np.int64],
+        least_m: float,
+        most_m: float,
+    ) -> NDArray[np.int32]:
+        """(P, 2) pairs of origin lane and goal whose way has a length from `least_m` to `most_m`.
+
+        Vehicles start on a lane that their way can follow: no trip begins with a lane change. And
+        no trip has a turn for which a car's turning circle is too wide.
+        """
+        pairs = np.ix_(goals, origins)
+        to_go = plans["to_go"][pairs]
+        fits = np.isfinite(to_go) & (to_go >= least_m)
+        fits &= (plans["change"][pairs] == 0) & (plans["turnarounds"][pairs] == 0)
+        if most_m > 0.0:
+            fits &= to_go <= most_m
+        goal, origin = np.nonzero(fits)
+        if not len(goal):
+            reachable = to_go[np.isfinite(to_go)]
+            longest = (
+                f"the longest way is {reachable.max():.0f} m"
+                if reachable.size
+                else "no way leads to a goal"
+            )
+            raise ConfigError(
+                f"traffic.min_trip_m = {least_m:g}, traffic.max_trip_m = {most_m:g}: no trip of "
+                f"that length on the map '{self.network.name_of(self.number)}' ({longest}); change "
+                "the limits, traffic.origins or traffic.destinations"
+            )
+        trips = np.stack([origins[origin], goals[goal]], axis=1).astype(np.int32)
+        if len(trips) > MAX_TRIPS:
+            trips = trips[:: -(-len(trips) // MAX_TRIPS)]
+        return np.ascontiguousarray(trips)
