@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
@@ -159,6 +159,21 @@ def difference_table(found: EvaluationReport) -> Table:
     return grid(_heads(others), rows, title, caption, wraps=True)
 
 
+def place_table(policy: str, rows: Sequence[Mapping[str, Any]]) -> Table:
+    """What a driver does near borders of zones and inside; an effect of borders would show."""
+    events, means = ("collision", "off_road", "red_light"), ("jerk", "ttc_risk")
+    keys = ["agent_hours", *(f"{event}_per_h" for event in events), *means]
+    heads = ["zone", "hours", "collisions/h", "off road/h", "red lights/h", "jerk", "ttc risk"]
+    lines = [
+        [
+            f"{'all' if row['zone'] < 0 else row['zone']}, {row['place']}",
+            *(number(row[key]) for key in keys),
+        ]
+        for row in rows
+    ]
+    return grid(heads, lines, escape(f"{Path(policy).name} near borders and inside"), wraps=True)
+
+
 def _heads(names: Iterable[str]) -> list[str]:
     return ["", *(escape(Path(name).name) for name in names)]
 
@@ -197,6 +212,10 @@ def _show(
     console.print(report_table(found))
     if len(found.policies) > 1:
         console.print(difference_table(found))
+    from cavmarl.evaluate.evaluation import load_places
+
+    for name, rows in load_places(folder).items():
+        console.print(place_table(name, rows))
     write_json(json_path, found.to_dict())
     if html is not None:
         from cavmarl.evaluate.page import write_page

@@ -2,24 +2,76 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
 import typer
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from cavmarl.cli.output import Environment, JsonPath, write_json
+from cavmarl.cli.output import Environment, JsonPath, about, about_file, grid, write_json
+from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import find_map
 from cavmarl.maps.check import MapReport, check_map
+from cavmarl.maps.check_page import write_check_page
+from cavmarl.maps.defects import Defect, find_defects
+from cavmarl.maps.mending import mend
+from cavmarl.roads.cache import load_network
+
+_SHOWN = 12
 
 
-def check(env: Environment, json_path: JsonPath = None) -> None:
+def check(
+    env: Environment,
+    buildings: Annotated[
+        Path | None, about("OSM or SUMO polygons: those on roads are told.", exists=True)
+    ] = None,
+    fix: Annotated[
+        Path | None, about("Write a mended network here (.net.xml), and list what was done.")
+    ] = None,
+    page: Annotated[Path | None, about_file("Write a page with a picture, places marked.")] = None,
+    json_path: JsonPath = None,
+) -> None:
     """Say what a map holds and whether it can be driven; exit code 1 if it cannot."""
+    if fix is not None and not fix.name.endswith(".net.xml"):
+        raise ConfigError(f"--fix {fix}: must end in .net.xml")
     console = Console()
     with console.status(f"checking {env} …"):
-        report = check_map(find_map(env))
+        path = find_map(env)
+        network = load_network(path)
+        report = check_map(network)
+        defects = find_defects(network, path, buildings)
     print_report(console, report)
-    write_json(json_path, report.to_dict())
+    _print_defects(console, defects)
+    document = report.to_dict() | {"defects": [defect.to_dict() for defect in defects]}
+    if page is not None:
+        write_check_page(page, network, defects)
+    if fix is not None:
+        with console.status(f"mending {env} …"):
+            done, left = mend(path, fix, defects)
+        for line in done:
+            console.print(Text(f"mended: {line}"))
+        console.print(Text(f"{fix}: {len(done)} mended, {len(left)} left, to be mended by hand"))
+        document |= {"mended": done, "left": [defect.to_dict() for defect in left]}
+    write_json(json_path, document)
     raise typer.Exit(0 if report.drivable else 1)
+
+
+def _print_defects(console: Console, defects: Sequence[Defect]) -> None:
+    counts = Counter(defect.kind for defect in defects)
+    for kind, count in counts.items():
+        console.print(Text(f"{count} x {kind}", style="yellow"))
+    rows = [
+        [defect.kind, defect.name, f"{defect.x_m:.1f}, {defect.y_m:.1f}", defect.about]
+        for defect in defects[:_SHOWN]
+    ]
+    if rows:
+        console.print(grid(["kind", "name", "x, y (m)", ""], rows, wraps=True))
+    if len(defects) > _SHOWN:
+        console.print(f"… and {len(defects) - _SHOWN} more (--page, --json)", style="dim")
 
 
 def print_report(console: Console, report: MapReport) -> None:

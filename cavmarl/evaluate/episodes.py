@@ -15,6 +15,7 @@ from cavmarl.config.world_spec import WorldSpec
 from cavmarl.engine.shard_clock import ShardClock
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
+from cavmarl.evaluate.border_terms import BorderTerms
 from cavmarl.evaluate.encounters import EncounterWatch, MessageRecord
 from cavmarl.evaluate.failure_clips import Failure
 from cavmarl.evaluate.recorder import Recorder
@@ -70,6 +71,7 @@ class RunData:
     transfers: NDArray[np.void]
     transfer_counts: Mapping[str, int]  # of a `TransferLog`, summed over the episodes
     failures: Sequence[Failure] = ()  # trips that were no success, as far as they are kept
+    borders: Sequence[BorderTerms] = ()  # terms by zone and place
 
 
 def worlds_at_once(episodes: int, vehicles: int) -> int:
@@ -116,8 +118,10 @@ def _drive(
     for table in (trips, episodes, transfers):
         table["run"] = job.run
     speed = _speed(parts, vec.num_envs, clock)
-    tracks = parts[0].tracks
-    return RunData(trips, episodes, tracks, speed, transfers, dict(counts), list(watch.failures))
+    tracks, borders = parts[0].tracks, [part.borders for part in parts]
+    return RunData(
+        trips, episodes, tracks, speed, transfers, dict(counts), list(watch.failures), borders
+    )
 
 
 def derived_seed(seed: int, number: int) -> int:
@@ -143,6 +147,7 @@ class _Part:
         )
         self._watch = EncounterWatch(vec, self._recorder)
         self._tracked = tracked
+        self.borders = BorderTerms(vec.simulation.partition, vec.step_s)
         self._tracks: list[NDArray[np.void]] = [np.zeros(0, TRACK)]
         self.policy_s = self.simulation_s = 0.0
         self.decisions = self.timed_steps = 0
@@ -195,6 +200,7 @@ class _Part:
             arrivals = infos["arrivals"]
             ended = self._recorder.add(steps, acted, rewards, infos["terms"], done, over, arrivals)
             self._seen.step(running, over, ended)
+            self.borders.add(self._recorder.places_m, acted, infos["terms"])
             handed_over.collect(np.flatnonzero(running).tolist(), over)
             running &= ~over
             steps += 1

@@ -19,6 +19,7 @@ from cavmarl.core.errors import ConfigError, JournalError, PolicyError, Recordin
 from cavmarl.engine.world_description import describe_world
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
+from cavmarl.evaluate.border_terms import place_rows
 from cavmarl.evaluate.episodes import (
     EpisodeJob,
     Progress,
@@ -69,7 +70,8 @@ FAILURES_FILE = "failures.html"
 TRANSFERS_FILE = "transfers.csv"
 TRANSFER_COUNTS_FILE = "transfer_counts.json"
 RESULT_FILES = [TRIPS_FILE, EPISODES_FILE, TRACKS_FILE, MAP_FILE, SPEED_FILE]
-TRANSFER_FILES = [TRANSFERS_FILE, TRANSFER_COUNTS_FILE]  # of divided worlds
+PLACES_FILE = "places.json"
+TRANSFER_FILES = [TRANSFERS_FILE, TRANSFER_COUNTS_FILE, PLACES_FILE]  # of divided worlds
 
 
 def evaluate(
@@ -181,6 +183,16 @@ def load_transfers(folder: Path) -> dict[str, TransferSummary]:
         name: TransferSummary.of(transfers_of(rows.get(name, none)), counts[name])
         for name in manifest["policies"]
     }
+
+
+def load_places(folder: Path) -> dict[str, list[dict[str, Any]]]:
+    """What `place_rows` made, by policy; nothing of undivided worlds. Raises as `load_report`."""
+    if PLACES_FILE not in read_closed(folder)["results_sha256"]:
+        return {}
+    rows: dict[str, list[dict[str, Any]]] = json.loads(
+        (folder / PLACES_FILE).read_text(encoding="utf-8")
+    )
+    return rows
 
 
 def load_map(folder: Path) -> dict[str, Any]:
@@ -308,3 +320,7 @@ def _write_transfers(folder: Path, names: list[str], runs: list[dict[str, RunDat
     transfers = {name: _all(runs, name, "transfers") for name in names}
     write_table(folder / TRANSFERS_FILE, transfers, TRANSFER)
     write_text(folder / TRANSFER_COUNTS_FILE, json.dumps(counts, indent=2))
+    places = {
+        name: place_rows(part for run in runs for part in run[name].borders) for name in names
+    }
+    write_text(folder / PLACES_FILE, json.dumps(places, indent=2))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import MapError
 from cavmarl.maps.heights.height_model import HeightModel
 from cavmarl.maps.heights.levels import Levels, crossings, levels_of
-from cavmarl.maps.heights.stations import Stations, kept_rows, stations_of
+from cavmarl.maps.heights.stations import Stations, kept_rows, laid, stations_of
 from cavmarl.maps.net_document import HEIGHT_DIGITS, NetDocument, shape_text
 from cavmarl.maps.osm_roads import OsmRoads
 from cavmarl.maps.projection import unproject
@@ -189,9 +189,37 @@ def _write(document: NetDocument, stations: Stations, heights: Heights) -> None:
                 apart = rim[:, None] - stations.plane_m[near][None]
                 z_m = heights[near][np.hypot(apart[..., 0], apart[..., 1]).argmin(axis=1)]
             junction.set("shape", shape_text(plane, z_m))
-    for edge in document.root.iter("edge"):
-        if "shape" in edge.attrib:
-            del edge.attrib["shape"]  # the flat middle of a road; its lanes say where it is
+    _write_middles(document, stations, heights)
+
+
+def _write_middles(document: NetDocument, stations: Stations, heights: Heights) -> None:
+    """The line that an edge's lanes were made from, as high as its first lane beside it.
+
+    netconvert makes exports from it.
+    """
+    node = {
+        junction.get("id", ""): f"{junction.get('x')},{junction.get('y')}"
+        for junction in document.junctions()
+    }
+    seen = set()
+    for row, lane in enumerate(stations.lanes):
+        edge = lane.edge
+        ends = [node.get(edge.get(end, ""), "") for end in ("from", "to")]
+        if lane.internal or id(edge) in seen or not ("shape" in edge.attrib or all(ends)):
+            continue
+        seen.add(id(edge))
+        plane = _plane_words(edge.get("shape", " ".join(ends)))
+        places, s_m, own = laid(np.array([list(map(float, word.split(","))) for word in plane]))
+        rows = stations.rows(row)
+        apart = places[:, None] - stations.plane_m[rows][None]
+        z_m = heights[rows][np.hypot(apart[..., 0], apart[..., 1]).argmin(axis=1)]
+        kept = kept_rows(s_m, z_m, own)
+        words = iter(plane)
+        written = [
+            next(words) if own[place] else "{:.2f},{:.2f}".format(*places[place])
+            for place in kept.tolist()
+        ]
+        edge.set("shape", shape_text(written, z_m[kept]))
 
 
 def _plane_words(shape: str) -> list[str]:

@@ -55,7 +55,7 @@ def stations_of(document: NetDocument) -> Stations:
                 f"{document.path}: has heights already (lane {lane.id}): leave out --dem, or build "
                 "it again without them"
             )
-        places, s_m, own = _laid(shape[:, :2])
+        places, s_m, own = laid(shape[:, :2])
         parts.append(places)
         s_parts.append(s_m)
         written.append(own)
@@ -70,7 +70,7 @@ def stations_of(document: NetDocument) -> Stations:
     )
 
 
-def _laid(shape: Points) -> tuple[Points, NDArray[np.float64], NDArray[np.bool_]]:
+def laid(shape: Points) -> tuple[Points, NDArray[np.float64], NDArray[np.bool_]]:
     """Places on a polyline, where they are on it, and which of them are its own points."""
     lengths = np.hypot(*np.diff(shape, axis=0).T)
     counts = np.maximum(np.ceil(lengths / STEP_M).astype(np.int64), 1)

@@ -1,0 +1,84 @@
+"""Terms of agents by zone, near borders and inside: an effect of borders would show there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config.env import TERMS
+from cavmarl.zones.partition.zone_partition import ZonePartition
+
+NEAR_M = 25.0  # of another zone: a vehicle is near its border
+PLACES = ("inside", "near border")
+PER_HOUR = ("collision", "off_road", "red_light", "wrong_way", "arrival")  # of driving
+PER_STEP = ("jerk", "ttc_risk", "speeding", "delay")  # means of the terms
+
+
+class BorderTerms:
+    """Sums over the steps of agents, by zone and by how near they are to a border.
+
+    Attributes:
+        step_s: seconds a step.
+        steps: (Z, 2) of agents, inside and near a border.
+        sums: (Z, 2, T) of each term over them.
+    """
+
+    def __init__(self, partition: ZonePartition, step_s: float) -> None:
+        self._partition = partition
+        self.step_s = step_s
+        self.steps = np.zeros((partition.count, len(PLACES)), dtype=np.int64)
+        self.sums = np.zeros((partition.count, len(PLACES), len(TERMS)))
+
+    def add(
+        self,
+        places_m: NDArray[np.float64],
+        acted: NDArray[np.bool_],
+        terms: NDArray[np.float32],
+    ) -> None:
+        """Take in a step.
+
+        Args:
+            places_m: (W, A, 2) of agents before it.
+            acted: (W, A) which count.
+            terms: (W, A, T) of the step, registered ones last.
+        """
+        if self._partition.count == 1 or not acted.any():
+            return
+        xy = places_m[acted]
+        known = np.isfinite(xy).all(axis=1)
+        xy, found = xy[known], terms[acted][known][:, : len(TERMS)]
+        zones = self._partition.zones_of(xy)
+        rects = self._partition.reaching[zones]
+        gap_m = np.minimum(xy - rects[:, :2], rects[:, 2:] - xy).min(axis=1)
+        near = (gap_m < NEAR_M).astype(np.int64)
+        np.add.at(self.steps, (zones, near), 1)
+        np.add.at(self.sums, (zones, near), found)
+
+
+def place_rows(parts: Iterable[BorderTerms]) -> list[dict[str, Any]]:
+    """What the parts of a policy come to: of all zones together (-1) and of each.
+
+    Returns:
+        Rows of `zone`, `place`, `agent_hours`, `<term>_per_h` of events and mean `<term>`s; None
+        where no agent drove.
+    """
+    every = list(parts)
+    if not every or every[0].steps.shape[0] == 1:
+        return []
+    steps = sum((part.steps for part in every), np.zeros_like(every[0].steps))
+    sums = sum((part.sums for part in every), np.zeros_like(every[0].sums))
+    groups = [(-1, steps.sum(axis=0), sums.sum(axis=0))]
+    groups += [(zone, steps[zone], sums[zone]) for zone in range(len(steps))]
+    rows = []
+    for zone, counts, totals in groups:
+        for place, count, total in zip(PLACES, counts.tolist(), totals.tolist(), strict=True):
+            of = dict(zip(TERMS, total, strict=True))
+            hours = count * every[0].step_s / 3600.0
+            row: dict[str, Any] = {"zone": zone, "place": place, "agent_hours": hours}
+            row |= {f"{term}_per_h": of[term] / hours if count else None for term in PER_HOUR}
+            row |= {term: of[term] / count if count else None for term in PER_STEP}
+            rows.append(row)
+    return rows

@@ -1,0 +1,247 @@
+"""Places of a map that look wrong, each with its kind and where it lies."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.maps.buildings import with_buildings
+from cavmarl.maps.net_document import NetDocument, points_of
+from cavmarl.maps.shared_ground import CAR_WIDTH_M, LEVEL_M
+from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+
+_CAR = 1 << VEHICLE_CLASSES.index("passenger")
+STEP_M = 0.1  # of height, between lanes of which one leads into the other
+_DEEP_M = 1.0  # that a stop line may lie inside its junction
+
+Points = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Defect:
+    """One place that looks wrong."""
+
+    kind: str
+    name: str  # of the lane, junction, signal or edge
+    x_m: float
+    y_m: float
+    about: str
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def find_defects(network: RoadNetwork, path: Path, buildings: Path | None = None) -> list[Defect]:
+    """Everything that looks wrong, kind by kind.
+
+    Args:
+        network: the map.
+        path: its file, which has rules and shapes of junctions.
+        buildings: OSM or SUMO polygons; None: they are not asked.
+
+    Raises:
+        MapError: a file cannot be read, or the buildings are of another map.
+        MissingExtraError: buildings have to be projected, and pyproj is not installed.
+    """
+    document = NetDocument(path)
+    found = [
+        *_unruled_crossings(network, document),
+        *_idle_signals(network),
+        *_narrow_lanes(network),
+        *_steps(network),
+        *(
+            Defect("unreachable part", network.edge_ids[edge], *_middle(network, edge), "")
+            for edge in cut_off_edges(network)
+        ),
+        *_stop_lines_inside(network, document),
+    ]
+    if buildings is not None:
+        found += _buildings_on_roads(with_buildings(network, buildings))
+    return found
+
+
+def cut_off_edges(network: RoadNetwork) -> list[int]:
+    """EDGE rows for cars that the largest part of the map neither reaches nor is reached from."""
+    from cavmarl.maps.components import strong_components
+
+    open_lanes = (network.lanes["permissions"] & _CAR != 0) & ~network.lanes["internal"]
+    edges = np.unique(network.lanes["edge"][open_lanes])
+    links = network.links[
+        open_lanes[network.links["from_lane"]] & open_lanes[network.links["to_lane"]]
+    ]
+    of_lane = network.lanes["edge"]
+    arcs = np.stack([of_lane[links["from_lane"]], of_lane[links["to_lane"]]], axis=1)
+    part = strong_components(len(network.edges), arcs)
+    largest = np.bincount(part[edges]).argmax() if len(edges) else -1
+    joined = part == largest
+    for one, other in ((0, 1), (1, 0)):
+        near = part == largest
+        while True:
+            fresh = np.zeros(len(near), bool)
+            fresh[arcs[near[arcs[:, one]], other]] = True
+            if not (fresh & ~near).any():
+                break
+            near |= fresh
+        joined |= near
+    return [int(edge) for edge in edges if not joined[edge]]
+
+
+def _middle(network: RoadNetwork, edge: int) -> tuple[float, float]:
+    shape = network.lane_polyline(int(network.edges["first_lane"][edge]))
+    x, y = shape[len(shape) // 2, :2].tolist()
+    return x, y
+
+
+def _unruled_crossings(network: RoadNetwork, document: NetDocument) -> Iterator[Defect]:
+    """Paths that cross in a junction, and neither has to give way nor is signalled.
+
+    Asked is the file: where it has no rule, the reader takes one.
+    """
+    links = network.links
+    rules = {
+        junction.get("id", ""): {
+            request.get("index", ""): request.get("response", "")[::-1]
+            for request in junction.iter("request")
+        }
+        for junction in document.junctions()
+    }
+    order = np.argsort(links["junction"], kind="stable")
+    bounds = np.searchsorted(links["junction"][order], np.arange(len(network.junctions) + 1))
+    paths: dict[int, Points] = {}
+    for junction, first in enumerate(bounds[:-1].tolist()):
+        rows = order[first : bounds[junction + 1]].tolist()
+        rows = [row for row in rows if links["signal"][row] < 0]
+        rule = rules.get(network.junction_ids[junction], {})
+        for n, one in enumerate(rows):
+            for other in rows[n + 1 :]:
+                if links["from_lane"][one] == links["from_lane"][other]:
+                    continue
+                numbers = links["index"][[one, other]].tolist()
+                if _yields(rule, *numbers) or _yields(rule, *numbers[::-1]):
+                    continue
+                for row in (one, other):
+                    if row not in paths:
+                        paths[row] = _path(network, row)
+                place = crossing_of(paths[one], paths[other])
+                if place is not None:
+                    names = [network.lane_ids[links["from_lane"][row]] for row in (one, other)]
+                    yield Defect(
+                        "crossing without right of way",
+                        network.junction_ids[junction],
+                        *place,
+                        f"from {names[0]} and from {names[1]}",
+                    )
+
+
+def _yields(rule: dict[str, str], one: int, other: int) -> bool:
+    return rule.get(str(one), "")[other : other + 1] == "1"
+
+
+def _path(network: RoadNetwork, link: int) -> Points:
+    parts, lane = [], int(network.links["first_internal"][link])
+    while lane >= 0 and network.lanes["internal"][lane]:
+        parts.append(network.lane_polyline(lane))
+        lane = int(network.lanes["successor"][lane])
+    return np.concatenate(parts) if parts else np.zeros((0, 3))
+
+
+def crossing_of(one: Points, other: Points) -> tuple[float, float] | None:
+    """Where two polylines (n, 3) cross on one level, in the plane; None: nowhere."""
+    if len(one) < 2 or len(other) < 2:
+        return None
+    a, b = one[:-1, None], one[1:, None]
+    c, d = other[None, :-1], other[None, 1:]
+
+    def side(p: Points, q: Points, r: Points) -> Points:
+        along, across = q - p, r - p
+        turn: Points = along[..., 0] * across[..., 1] - along[..., 1] * across[..., 0]
+        return turn
+
+    crossed = (side(a, b, c) * side(a, b, d) < 0.0) & (side(c, d, a) * side(c, d, b) < 0.0)
+    crossed &= np.abs(a[..., 2] - c[..., 2]) < LEVEL_M
+    if not crossed.any():
+        return None
+    row = int(np.argwhere(crossed)[0, 0])
+    x, y = ((one[row] + one[row + 1]) / 2.0)[:2].tolist()
+    return x, y
+
+
+def _idle_signals(network: RoadNetwork) -> Iterator[Defect]:
+    place = {name: row for row, name in enumerate(network.junction_ids)}
+    for row in np.setdiff1d(np.arange(len(network.signals)), network.links["signal"]).tolist():
+        name = network.signal_ids[row]
+        at = network.junctions[place[name]] if name in place else {"x": np.nan, "y": np.nan}
+        yield Defect("signal without lanes", name, float(at["x"]), float(at["y"]), "")
+
+
+def _narrow_lanes(network: RoadNetwork) -> Iterator[Defect]:
+    cars = (network.lanes["permissions"] & _CAR != 0) & ~network.lanes["internal"]
+    for lane in np.flatnonzero(cars & (network.lanes["width_m"] < CAR_WIDTH_M)).tolist():
+        x, y = network.lane_polyline(lane)[0, :2].tolist()
+        width = f"{network.lanes['width_m'][lane]:.2f} m, a car {CAR_WIDTH_M:.2f} m"
+        yield Defect("lane narrower than a car", network.lane_ids[lane], x, y, width)
+
+
+def _steps(network: RoadNetwork) -> Iterator[Defect]:
+    lanes = network.lanes
+    first = network.points[lanes["first_point"]]
+    last = network.points[lanes["first_point"] + lanes["num_points"] - 1]
+    inner = np.flatnonzero(lanes["internal"] & (lanes["successor"] >= 0))
+    before = np.concatenate([network.links["from_lane"], inner])
+    after = np.concatenate([network.links["next_lane"], lanes["successor"][inner]])
+    step = np.abs(last["z"][before] - first["z"][after])
+    for row in np.flatnonzero(step > STEP_M).tolist():
+        at, name = last[before[row]], network.lane_ids[before[row]]
+        words = f"{step[row]:.2f} m to {network.lane_ids[after[row]]}"
+        yield Defect("step in height", name, float(at["x"]), float(at["y"]), words)
+
+
+def _stop_lines_inside(network: RoadNetwork, document: NetDocument) -> Iterator[Defect]:
+    rims = {junction.get("id", ""): points_of(junction) for junction in document.junctions()}
+    for lane in np.flatnonzero(~network.lanes["internal"]).tolist():
+        row = network.lanes[lane]
+        junction = network.junction_ids[network.edges["to_junction"][row["edge"]]]
+        rim = rims.get(junction)
+        if rim is None or len(rim) < 3 or not row["num_links"]:
+            continue
+        end = network.lane_polyline(lane)[-1, :2]
+        if _inside(end, rim[:, :2]) and _to_rim(end, rim[:, :2]) > _DEEP_M:
+            deep = f"{_to_rim(end, rim[:, :2]):.1f} m inside {junction}"
+            x, y = end.tolist()
+            yield Defect("stop line inside a junction", network.lane_ids[lane], x, y, deep)
+
+
+def _inside(place: Points, rim: Points) -> bool:
+    one, other = rim, np.roll(rim, -1, axis=0)
+    spans = (one[:, 1] > place[1]) != (other[:, 1] > place[1])
+    rise = np.where(spans, other[:, 1] - one[:, 1], 1.0)
+    at = one[:, 0] + (place[1] - one[:, 1]) / rise * (other[:, 0] - one[:, 0])
+    return bool((spans & (place[0] < at)).sum() % 2)
+
+
+def _to_rim(place: Points, rim: Points) -> float:
+    along = np.roll(rim, -1, axis=0) - rim
+    square = np.maximum((along**2).sum(axis=1), 1e-12)
+    share = np.clip(((place - rim) * along).sum(axis=1) / square, 0.0, 1.0)
+    return float(np.hypot(*(rim + share[:, None] * along - place).T).min())
+
+
+def _buildings_on_roads(network: RoadNetwork) -> Iterator[Defect]:
+    """Middles of lanes under a roof: a building that was drawn over a road, or its passage."""
+    lane_of = np.repeat(np.arange(len(network.lanes)), network.lanes["num_points"])
+    places = np.stack([network.points["x"], network.points["y"]], axis=1)
+    seen: set[int] = set()
+    for roof in network.roofs:
+        low, high = roof.min(axis=0), roof.max(axis=0)
+        near = np.flatnonzero(((places >= low) & (places <= high)).all(axis=1))
+        for row in near.tolist():
+            lane = int(lane_of[row])
+            if lane not in seen and _inside(places[row], roof):
+                seen.add(lane)
+                x, y = places[row].tolist()
+                yield Defect("building on a road", network.lane_ids[lane], x, y, "")

@@ -1,0 +1,53 @@
+"""What can be mended in a network without its source: netconvert writes it anew."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from cavmarl.core.errors import MapError
+from cavmarl.maps.defects import Defect, cut_off_edges, find_defects
+from cavmarl.maps.net_document import NetDocument
+from cavmarl.maps.netconvert_process import run_netconvert
+from cavmarl.maps.provenance import head_of, read_provenance
+from cavmarl.roads.sumo_net.reader import read_network
+
+_TIMEOUT_S = 600.0
+
+
+def mend(source: Path, target: Path, before: Sequence[Defect]) -> tuple[list[str], list[Defect]]:
+    """Write a network without what is cut off, and with right of way and signals made anew.
+
+    Args:
+        source: a SUMO network.
+        target: where the mended one goes.
+        before: what was found in the source.
+
+    Returns what was done, and what is found in the mended network.
+
+    Raises MapError: netconvert refuses the network, or the target is the source.
+    """
+    if target.exists() and target.samefile(source):
+        raise MapError(f"{target}: the target is the source: give another target")
+    network = read_network(source)
+    cut = [network.edge_ids[edge] for edge in cut_off_edges(network)]
+    arguments = ["--sumo-net-file", str(source)]
+    if cut:
+        arguments += ["--remove-edges.explicit", ",".join(cut)]
+    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".build-") as folder:
+        draft = Path(folder) / "mended.net.xml"
+        run_netconvert([*arguments, "-o", str(draft)], source, _TIMEOUT_S)
+        facts = read_provenance(source) | {"mended": f"{len(cut)} edges removed"}
+        draft.write_bytes(NetDocument(draft).content(head_of(facts)))
+        after = find_defects(read_network(draft), draft)
+        os.replace(draft, target)
+    done = [f"removed edge {name}: cut off from the rest" for name in cut]
+    left = {(defect.kind, defect.name) for defect in after}
+    done += [
+        f"{defect.kind} {defect.name}: made anew"
+        for defect in before
+        if (defect.kind, defect.name) not in left and defect.kind != "unreachable part"
+    ]
+    return done, after

@@ -1,0 +1,133 @@
+"""Exports come back as they went."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from cavmarl.cli.map import app
+from cavmarl.core.errors import ConfigError, MapError
+from cavmarl.maps.exports.geojson import write_geojson
+from cavmarl.maps.exports.lanelet import write_lanelet2
+from cavmarl.maps.exports.left_handed import swap_positions, swap_turns
+from cavmarl.maps.exports.opendrive import write_opendrive
+from cavmarl.maps.heights.draping import HeightOptions
+from cavmarl.maps.netconvert import build_network
+from cavmarl.maps.projection import project
+from cavmarl.roads.sumo_net.reader import read_network
+from tests.support.terrain import TOWN, plane, write_geotiff
+
+pytest.importorskip("sumo", reason="needs the extra 'sumo'")
+
+
+@pytest.fixture
+def town(tmp_path: Path) -> Path:
+    """A town on a slope."""
+    source = tmp_path / "town.osm"
+    source.write_text(TOWN)
+    model = write_geotiff(tmp_path / "ground.tif", plane(0.02, 0.05))
+    target = tmp_path / "town.net.xml"
+    return build_network(source, target, heights=HeightOptions((model,))).path
+
+
+def test_opendrive_comes_back(town: Path, tmp_path: Path) -> None:
+    target = tmp_path / "town.xodr"
+    trip = write_opendrive(town, target)
+
+    assert trip.same
+    assert trip.off < 0.02
+    text = target.read_text()
+    assert text.count("<elevation ") > 12
+    assert "+proj=utm" in text
+    assert "generated on" not in text
+    back = read_network(build_network(target, tmp_path / "back.net.xml").path)
+    heights = read_network(town).points["z"]
+    assert back.points["z"].min() == pytest.approx(heights.min(), abs=0.3)
+    assert back.points["z"].max() == pytest.approx(heights.max(), abs=0.3)
+
+
+@pytest.mark.parametrize(
+    "name", ["net/Town10HD.net.xml", "net/bologna_acosta/acosta_buslanes.net.xml"]
+)
+def test_real_maps_come_back(shared_maps: Path, tmp_path: Path, name: str) -> None:
+    trip = write_opendrive(shared_maps / name, tmp_path / "map.xodr")
+    assert (trip.edges[0], trip.lanes[0]) == (trip.edges[1], trip.lanes[1])
+    assert trip.off < 0.02
+
+
+def test_geojson_has_each_lane_where_it_is(town: Path, tmp_path: Path) -> None:
+    network = read_network(town)
+    target = tmp_path / "town.geojson"
+    count = write_geojson(network, target, town)
+
+    document = json.loads(target.read_text())
+    assert len(document["features"]) == count == int((~network.lanes["internal"]).sum())
+    assert "ODbL" in document["provenance"]["licence"]
+    for feature in document["features"]:
+        line = np.array(feature["geometry"]["coordinates"])
+        shape = network.lane_polyline(network.lane_ids.index(feature["id"]))
+        assert network.geo is not None
+        assert project("it", line[:, :2], network.geo) == pytest.approx(shape[:, :2], abs=0.01)
+        assert line[:, 2] == pytest.approx(shape[:, 2], abs=0.001)
+
+
+def test_lanelets_are_read_back_and_lead_on(town: Path, tmp_path: Path) -> None:
+    lanelet2 = pytest.importorskip("lanelet2", reason="needs the extra 'lanelet2'")
+    network = read_network(town)
+    target = tmp_path / "town_lanelets.osm"
+    counts = write_lanelet2(network, target)
+
+    assert counts == {"lanelets": len(network.lanes), "read back": len(network.lanes)}
+    longitude, latitude = 11.0, 48.0
+    projector = lanelet2.projection.UtmProjector(lanelet2.io.Origin(latitude, longitude))
+    back = lanelet2.io.load(str(target), projector)
+    by_name = {lanelet.attributes["name"]: lanelet for lanelet in back.laneletLayer}
+    for link in network.links[network.links["direction"] == ord("s")]:
+        lanes = (link["from_lane"], link["next_lane"])
+        one, other = (by_name[network.lane_ids[lane]] for lane in lanes)
+        assert lanelet2.geometry.follows(one, other)
+
+
+def test_the_left_handed_frame_mirrors_motion() -> None:
+    """A vehicle on a left-hand curve: positions, headings and rates agree in both frames."""
+    t = np.linspace(0.0, 2.0, 201)
+    heading, rate = 0.3 + 0.5 * t, np.full_like(t, 0.5)
+    speed = 10.0
+    velocity = speed * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    place = np.cumsum(velocity * (t[1] - t[0]), axis=0)
+
+    other, turned = swap_positions(place), swap_turns(heading)
+    moved = np.diff(other, axis=0)
+    assert np.arctan2(moved[:, 1], moved[:, 0]) == pytest.approx(turned[1:], abs=1e-9)
+    assert np.gradient(turned, t) == pytest.approx(swap_turns(rate))
+    assert swap_positions(velocity) == pytest.approx(
+        speed * np.stack([np.cos(turned), np.sin(turned)], axis=1)
+    )
+    assert (swap_positions(other) == place).all()
+    assert (swap_turns(turned) == heading).all()
+    assert swap_positions(np.array([[1.0, 2.0, 3.0]])).tolist() == [[1.0, -2.0, 3.0]]
+
+
+def test_the_command_exports(town: Path, tmp_path: Path) -> None:
+    xodr, lanes = tmp_path / "a.xodr", tmp_path / "a.geojson"
+    words = ["export", str(town), "--opendrive", str(xodr), "--geojson", str(lanes)]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0, result.output
+    assert xodr.exists()
+    assert lanes.exists()
+    refused = CliRunner().invoke(app, ["export", str(town)])
+    assert isinstance(refused.exception, ConfigError)
+
+
+def test_maps_without_a_projection_go_to_no_degrees(tmp_path: Path) -> None:
+    from cavmarl.config.registry import find_entry
+
+    path = find_entry("ring") / "map" / "map.net.xml"
+    with pytest.raises(MapError, match="where it lies"):
+        write_geojson(read_network(path), tmp_path / "r.geojson", path)
+    with pytest.raises(MapError, match="where it lies"):
+        write_lanelet2(read_network(path), tmp_path / "r.osm")
