@@ -32,6 +32,7 @@ EXTRAS = (
     "render",
     "report",
     "service",
+    "viewer",
     "torch",
     "sb3",
     "torchrl",

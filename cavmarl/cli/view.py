@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,6 +15,9 @@ from cavmarl.cli.evaluate import progress_bar
 from cavmarl.cli.output import JsonPath, PolicyName, RecordPath, about, with_world, write_json
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
+from cavmarl.viewer.web_options import DEFAULT_PORT, WebOptions
+
+TOKEN_VARIABLE = "CAVMARL_VIEWER_TOKEN"
 
 if TYPE_CHECKING:
     from cavmarl.env.parallel import CavEnv
@@ -23,29 +27,65 @@ if TYPE_CHECKING:
 def view(
     world: WorldSpec,
     policy: PolicyName = "idm",
-    seconds: Annotated[float, about("Seconds of simulated time.")] = 30.0,
+    seconds: Annotated[
+        float | None, about("Seconds of simulated time; default: 30, on a page without end.")
+    ] = None,
     video: Annotated[Path | None, about("Write an .mp4 here; default: show a window.")] = None,
     ghosts_of: Annotated[
         int | None, about("Outline the ghosts of this zone of a divided world.")
     ] = None,
+    zones: Annotated[int | None, about("Zones that the world is divided into.")] = None,
+    workers: Annotated[int | None, about("Processes that run the zones.")] = None,
+    web: Annotated[bool, about("Show it in a browser, from a page that is served here.")] = False,
+    port: Annotated[int, about("Of the page; 0: any that is free.")] = DEFAULT_PORT,
+    host: Annotated[str, about("Address of the page; others than this machine's need a token.")] = (
+        "127.0.0.1"
+    ),
+    token: Annotated[str, about("Token that a page has to give.", envvar=TOKEN_VARIABLE)] = "",
+    watch_only: Annotated[bool, about("Pages may not pause, step or drive.")] = False,
     record: RecordPath = None,
     json_path: JsonPath = None,
 ) -> None:
     """Drive one world and show it from above."""
     from cavmarl.env.parallel import parallel_env
 
+    if web:
+        from cavmarl.viewer.show_world import show_world
+
+        _check_web(seconds, video, ghosts_of)
+        options = WebOptions(host, port, token, control=not watch_only)
+        made = parallel_env(
+            world.env, zones=zones, workers=workers, record=record, **world.keywords
+        )
+        show = partial(Console().print, markup=False, highlight=False, soft_wrap=True)
+        stats = show_world(made, policy, world.seed, options, show, seconds)
+        write_json(json_path, {"video": None, "traffic": stats})
+        return
+    seconds = 30.0 if seconds is None else seconds
     if not 0.0 < seconds <= 3600.0:
         raise ConfigError(f"--seconds {seconds:g}: must be above 0 and at most 3600")
     if video is None:
         check_display()
     mode = "human" if video is None else "rgb_array"
-    made = parallel_env(world.env, render_mode=mode, record=record, **world.keywords)
+    made = parallel_env(
+        world.env, zones=zones, workers=workers, render_mode=mode, record=record, **world.keywords
+    )
     made.ghosts_of = ghosts_of
     console = Console()
     stats = drive(made, policy, seconds, world.seed, video, console)
     if video is not None:
         console.print(f"video: {video}", markup=False)
     write_json(json_path, {"video": str(video) if video else None, "traffic": stats})
+
+
+def _check_web(seconds: float | None, video: Path | None, ghosts_of: int | None) -> None:
+    """Refuse what a page cannot be told with its options."""
+    if seconds is not None and not 0.0 < seconds < float("inf"):
+        raise ConfigError(f"--seconds {seconds:g}: must be above 0")
+    if video is not None:
+        raise ConfigError(f"--web and --video {video}: give one of them")
+    if ghosts_of is not None:
+        raise ConfigError("--web and --ghosts-of: the page has a choice of zones; leave it out")
 
 
 def check_display() -> None:

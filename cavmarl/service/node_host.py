@@ -15,12 +15,13 @@ from typing import Any
 import uvicorn
 
 from cavmarl.core.errors import CavmarlError, ServiceError
+from cavmarl.core.listening import listen
 from cavmarl.evaluate.evaluation import evaluate
 from cavmarl.evaluate.fresh import call_in_fresh_process
 from cavmarl.service.configurations import world_keywords
 from cavmarl.service.node_app import in_turn, make_node_app
 from cavmarl.service.node_link import NodeLink, is_final
-from cavmarl.service.server import ServerOptions, check_transport, listen, uvicorn_config
+from cavmarl.service.server import ServerOptions, check_transport, uvicorn_config
 from cavmarl.service.session_worlds import SessionWorlds
 from cavmarl.service.zone_processes import ZoneProcesses
 

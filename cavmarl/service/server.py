@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import ipaddress
-import socket
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +11,7 @@ import uvicorn
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from cavmarl.core.errors import ServiceError
+from cavmarl.core.listening import is_loopback, listen, shown_host
 from cavmarl.service.access import Access, RateLimit
 from cavmarl.service.app import make_app
 from cavmarl.service.broker import Broker, BrokerRules
@@ -74,7 +73,7 @@ def serve(options: ServerOptions, tell: Callable[[str], None]) -> None:
         listener = listen(options.host, options.port)
         scheme = "https" if options.certificate else "http"
         port = listener.getsockname()[1]
-        tell(f"service: {scheme}://{_shown(options.host)}:{port}, store {options.store}")
+        tell(f"service: {scheme}://{shown_host(options.host)}:{port}, store {options.store}")
         if admin is not None:
             tell(f"admin secret, shown this once: {admin}")
         server.run(sockets=[listener])
@@ -97,29 +96,6 @@ def check_transport(host: str, certificate: Path | None, key: Path | None) -> No
             f"--host {host}: others can reach it, and without TLS all can read its secrets: give "
             "--certificate and --key, or 127.0.0.1"
         )
-
-
-def is_loopback(host: str) -> bool:
-    """Whether an address is of this machine alone."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
-
-
-def listen(host: str, port: int) -> socket.socket:
-    """A socket that is bound."""
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    # asyncio switches Nagle's delays off where the protocol is named: else 40 ms an answer.
-    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listener.bind((host, port))
-        listener.listen(2048)
-    except OSError as error:
-        listener.close()
-        raise ServiceError(f"{host}:{port}: {error.strerror}; give another --port") from error
-    return listener
 
 
 def uvicorn_config(app: object, options: ServerOptions) -> uvicorn.Config:
@@ -181,7 +157,3 @@ class BoundedHeads(HttpToolsProtocol):
 
     _late: asyncio.TimerHandle | None = None
     _head_bytes = 0
-
-
-def _shown(host: str) -> str:
-    return f"[{host}]" if ":" in host else host

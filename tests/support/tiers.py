@@ -24,6 +24,7 @@ __all__ = ["ALONE_FILES", "ProcessWatch", "mark", "skip_if_late"]
 _OF_PROCESSES = re.compile(
     r"^import (subprocess|multiprocessing|libsumo)\b"
     r"|^from tests\.support\.(sumo_worlds|netgenerate|toy_hosts|toy_job|world_hosts|service) import"
+    r"|^from tests\.support\.chromium import"
     r"|importorskip\(\"(libsumo|ray)\""
     r"|\bworkers=(?!0\b)|\bhosts=|\bnodes=",
     re.MULTILINE,

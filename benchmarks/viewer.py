@@ -1,0 +1,210 @@
+"""What watching costs: bytes of a frame, time to publish it, many clients, the page's JavaScript.
+
+Vehicles are made up, all with new places in each frame, and sent through the viewer's own server.
+With a Chromium and Playwright the page itself is measured, too.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import multiprocessing
+import resource
+import shutil
+from multiprocessing.connection import Connection
+from statistics import median
+from time import perf_counter, process_time, sleep
+from typing import Annotated, Any
+
+import numpy as np
+from websockets.asyncio.client import connect
+
+from benchmarks.harness import Env, Report, Say, about, run, silent
+from cavmarl.cli.output import Seed
+from cavmarl.core.errors import ConfigError
+from cavmarl.engine.world_frame import SEEN, WorldFrame
+from cavmarl.env.parallel import CavEnv, parallel_env
+from cavmarl.viewer.audience import Audience
+from cavmarl.viewer.frame_messages import FrameEncoder
+from cavmarl.viewer.map_geometry import map_message, unpack
+from cavmarl.viewer.vehicle_details import hello_of
+from cavmarl.viewer.web_options import WebOptions
+from cavmarl.viewer.web_server import WebServer
+
+SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+BROWSER_HZ = 10.0
+
+
+def measure(
+    env: Env = "grid4x4",
+    vehicles: Annotated[int, about("Vehicles of a frame.")] = 10_000,
+    clients: Annotated[int, about("Clients that watch at once.")] = 100,
+    rate_hz: Annotated[float, about("Frames a second that they are sent.")] = 10.0,
+    seconds: Annotated[float, about("That clients and the page are watched for.")] = 10.0,
+    seed: Seed = 0,
+    say: Say = silent,
+) -> Report:
+    """Bytes, milliseconds and shares of one core that the viewer costs."""
+    if not (1 <= vehicles <= 100_000 and 0 <= clients <= 200 and rate_hz > 0.0 and seconds > 0.0):
+        raise ConfigError(
+            "vehicles must be 1 to 100000, clients 0 to 200, rate and seconds above 0"
+        )
+    world = parallel_env(env, agents=1, background=0)
+    try:
+        frames = made_up_frames(world, vehicles, seed)
+        say("encoding")
+        rows = [encoding(world, frames)]
+        if clients:
+            say(f"{clients} clients")
+            rows.append(serving(world, frames, clients, rate_hz, seconds))
+        if shutil.which("chromium"):
+            say("the page in Chromium")
+            rows.append(drawing(world, frames, seconds))
+    finally:
+        world.close()
+    columns = {
+        "what": "name",
+        "kB": "kb:.1f",
+        "ms a frame": "ms:.2f",
+        "core": "core:.0%",
+        "frames/s": "fps:.1f",
+        "calls": "calls",
+        "first, ms": "first:.0f",
+    }
+    return Report(f"{vehicles} vehicles on {env}", columns, rows)
+
+
+def made_up_frames(env: CavEnv, count: int, seed: int, number: int = 20) -> list[WorldFrame]:
+    """Frames of vehicles all over the map, of which one in a hundred enters or leaves a frame."""
+    random = np.random.default_rng(seed)
+    min_x, min_y, max_x, max_y = env.network.extent_m
+    signals = np.zeros(len(env.network.signals), np.int32)
+    signals[:] = env.network.programs["first_phase"][env.network.signals["program"]]
+    frames = []
+    for tick in range(number):
+        rows = np.zeros(count, SEEN)
+        rows["id"] = np.arange(count) + tick * (count // 100)
+        rows["x"] = random.uniform(min_x, max_x, count)
+        rows["y"] = random.uniform(min_y, max_y, count)
+        rows["heading"] = random.uniform(-np.pi, np.pi, count)
+        rows["speed"] = random.uniform(0.0, 30.0, count)
+        rows["length"], rows["width"], rows["height"] = 4.6, 1.8, 1.5
+        rows["agent"], rows["target_zone"] = -1, -1
+        frames.append(WorldFrame(0, tick, tick / 10.0, rows, signals))
+    return frames
+
+
+def encoding(env: CavEnv, frames: list[WorldFrame]) -> dict[str, Any]:
+    encoder = FrameEncoder(np.array(unpack(map_message(env.network))[0]["origin"]))
+    spent, sizes = [], []
+    for frame in frames:
+        begun = perf_counter()
+        shown = encoder.publication(frame)
+        spent.append(perf_counter() - begun)
+        sizes.append(len(shown.frame) + len(shown.roster[-1].message))
+    return {"name": "publishing", "kb": median(sizes[1:]) / 1e3, "ms": 1e3 * median(spent)}
+
+
+def serving(
+    env: CavEnv, frames: list[WorldFrame], clients: int, rate_hz: float, seconds: float
+) -> dict[str, Any]:
+    """CPU time of the server's process while clients of another process read all frames."""
+    audience, server, encoder = served(env)
+    ours, theirs = multiprocessing.get_context("spawn").Pipe()
+    reader = multiprocessing.get_context("spawn").Process(
+        target=read_all, args=(server.address, clients, seconds, theirs)
+    )
+    with server:
+        reader.start()
+        while audience.wishes.watchers < clients:
+            sleep(0.05)
+        ours.send("begin")
+        begun, cpu = perf_counter(), process_time()
+        sent = 0
+        while perf_counter() - begun < seconds:
+            audience.publish(encoder.publication(frames[0]._replace(tick=sent)))
+            sent += 1
+            sleep(max(0.0, begun + sent / rate_hz - perf_counter()))
+        took, cpu = perf_counter() - begun, process_time() - cpu
+        received = ours.recv()
+        reader.join()
+    return {
+        "name": f"{clients} clients, {rate_hz:g} Hz",
+        "core": cpu / took,
+        "ms": 1e3 * cpu / sent,
+        "fps": received / clients / took,
+    }
+
+
+def read_all(address: str, clients: int, seconds: float, pipe: Connection) -> None:
+    """Watch with so many clients and tell how many frames came."""
+    resource.setrlimit(
+        resource.RLIMIT_NOFILE, (1024, resource.getrlimit(resource.RLIMIT_NOFILE)[1])
+    )
+    pipe.send(asyncio.run(_read(address, clients, seconds, pipe)))
+
+
+async def _read(address: str, clients: int, seconds: float, pipe: Connection) -> int:
+    counts = [0] * clients
+
+    async def watch(k: int) -> None:
+        url = address.replace("http", "ws") + "live"
+        async with connect(url, max_size=None, compression=None) as client:
+            await client.send("{}")
+            async for message in client:
+                counts[k] += not isinstance(message, str) and message[0] == 3
+
+    tasks = [asyncio.create_task(watch(k)) for k in range(clients)]
+    await asyncio.to_thread(pipe.recv)
+    before = sum(counts)
+    await asyncio.sleep(seconds)
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+    return sum(counts) - before
+
+
+def drawing(env: CavEnv, frames: list[WorldFrame], seconds: float) -> dict[str, Any]:
+    """Main-thread JavaScript of the page, with software GL: only the JavaScript counts."""
+    from playwright.sync_api import sync_playwright
+
+    audience, server, encoder = served(env)
+    audience.publish(encoder.publication(frames[0]))
+    with server, sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=shutil.which("chromium"), args=SOFTWARE_GL
+        )
+        page = browser.new_page(viewport={"width": 1280, "height": 720})
+        page.goto(server.address)
+        begun, sent = perf_counter(), 0
+        while perf_counter() - begun < seconds:
+            audience.publish(encoder.publication(frames[sent % len(frames)]._replace(tick=sent)))
+            sent += 1
+            page.wait_for_timeout(1e3 / BROWSER_HZ)
+        told = json.loads(
+            page.evaluate(
+                "JSON.stringify({draw: viewer.times, take: viewer.takes, calls: viewer.calls, "
+                "first: viewer.firstPicture, n: viewer.frame.count})"
+            )
+        )
+        browser.close()
+    return {
+        "name": "page",
+        "ms": median(told["draw"]) + median(told["take"]),
+        "draw_ms": median(told["draw"]),
+        "take_ms": median(told["take"]),
+        "calls": told["calls"],
+        "first": told["first"],
+    }
+
+
+def served(env: CavEnv) -> tuple[Audience, WebServer, FrameEncoder]:
+    map_bytes = map_message(env.network)
+    origin = np.array(unpack(map_bytes)[0]["origin"])
+    audience = Audience()
+    server = WebServer(WebOptions(port=0), audience, hello_of(env, origin, "none"), map_bytes)
+    return audience, server, FrameEncoder(origin)
+
+
+if __name__ == "__main__":
+    run(measure)

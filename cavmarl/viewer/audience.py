@@ -1,0 +1,203 @@
+"""Between a world and its watchers: the world's thread publishes, the server's thread sends.
+
+The world never waits. Each watcher has room for one frame: a newer one takes its place, so that one
+that reads slowly gets fewer. What it must not miss, changes of the roster and texts, waits for it
+within bounds; a watcher beyond them is dropped.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import queue
+import threading
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+from cavmarl.viewer.frame_messages import Publication
+from cavmarl.viewer.page_requests import PageRequest
+
+MAX_TEXTS = 256  # that wait for one watcher
+MAX_REQUESTS = 1000  # that wait for the world
+
+
+@dataclass(eq=False)
+class PageWatcher:
+    """One page that is open; of the server's thread."""
+
+    number: int
+    has_version: int = 0  # of the roster
+    newest: Publication | None = None  # that it has not been sent
+    texts: deque[str] = field(default_factory=deque)
+    news: asyncio.Event = field(default_factory=asyncio.Event)
+    vehicle: int | None = None  # whose state it is told
+    ghosts_of: int | None = None
+    skipped: int = 0  # frames that it did not get
+    is_lost: bool = False  # it reads too slowly
+
+    def offer(self, publication: Publication) -> None:
+        self.skipped += self.newest is not None
+        self.newest = publication
+        self.news.set()
+
+    def tell(self, text: str) -> None:
+        if len(self.texts) >= MAX_TEXTS:
+            self.is_lost = True
+        else:
+            self.texts.append(text)
+        self.news.set()
+
+    def take(self) -> list[str | bytes]:
+        """All that is to be sent to it now, in its order."""
+        messages: list[str | bytes] = list(self.texts)
+        self.texts.clear()
+        publication, self.newest = self.newest, None
+        if publication is not None:
+            messages += publication.since(self.has_version)
+            messages.append(publication.frame)
+            self.has_version = publication.version
+        self.news.clear()
+        return messages
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """What all watchers together want to be told."""
+
+    watchers: int = 0
+    vehicles: frozenset[int] = frozenset()
+    ghosts_of: tuple[int, ...] = ()
+
+
+class Audience:
+    """The watchers of one world.
+
+    Attributes:
+        wishes: replaced as a whole, so that the world's thread may read it at any time.
+        dropped: watchers that read too slowly.
+    """
+
+    def __init__(self) -> None:
+        self.wishes = Wishes()
+        self.dropped = 0
+        self._watchers: dict[int, PageWatcher] = {}
+        self._numbers = 0
+        self._requests: queue.Queue[tuple[int, PageRequest]] = queue.Queue(MAX_REQUESTS)
+        self._asked = threading.Event()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._last: Publication | None = None
+        self._events: deque[list[Any]] = deque(maxlen=500)
+
+    # The world's thread.
+
+    def publish(self, publication: Publication) -> None:
+        """Give all watchers a frame."""
+        self._call(self._spread, publication)
+
+    def tell_events(self, events: list[list[Any]]) -> None:
+        """Add to the time line: tick, kind, vehicle and what more there is to say of each."""
+        self._call(self._add_events, events)
+
+    def tell_all(self, content: dict[str, Any]) -> None:
+        self._call(self._tell_all, json.dumps(content, allow_nan=False))
+
+    def tell_of_vehicle(self, vehicle: int, content: dict[str, Any]) -> None:
+        """Tell those that watch a vehicle of it."""
+        self._call(self._tell_of, vehicle, json.dumps(content, allow_nan=False))
+
+    def tell(self, number: int, content: dict[str, Any]) -> None:
+        self._call(self._tell_one, number, json.dumps(content, allow_nan=False))
+
+    def requests(self) -> Iterable[tuple[int, PageRequest]]:
+        """What pages have asked for since the last call: the watcher's number and its request."""
+        self._asked.clear()
+        while True:
+            try:
+                yield self._requests.get_nowait()
+            except queue.Empty:
+                return
+
+    def wait(self, seconds: float) -> None:
+        """Wait so long, or until a page asks for something."""
+        self._asked.wait(seconds)
+
+    # The server's thread.
+
+    def begin(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Say on which loop the watchers are served."""
+        self._loop = loop
+
+    def join(self) -> PageWatcher:
+        self._numbers += 1
+        watcher = PageWatcher(self._numbers)
+        self._watchers[watcher.number] = watcher
+        if self._last is not None:
+            watcher.offer(self._last)
+        if self._events:
+            watcher.tell(_events_text(list(self._events)))
+        self._update()
+        self._asked.set()
+        return watcher
+
+    def leave(self, watcher: PageWatcher) -> None:
+        self._watchers.pop(watcher.number, None)
+        self._update()
+        self.ask(watcher, PageRequest("seat"))  # nobody sits in its seat any more
+
+    def ask(self, watcher: PageWatcher, request: PageRequest) -> None:
+        """Take a request of a page; beyond MAX_REQUESTS they are not kept."""
+        if request.kind in ("watch", "ghosts"):
+            number = None if request.number is None else int(request.number)
+            if request.kind == "watch":
+                watcher.vehicle = number
+            else:
+                watcher.ghosts_of = number
+            self._update()
+        try:
+            self._requests.put_nowait((watcher.number, request))
+        except queue.Full:
+            return
+        self._asked.set()
+
+    def _update(self) -> None:
+        watchers = self._watchers.values()
+        vehicles = frozenset(one.vehicle for one in watchers if one.vehicle is not None)
+        zones = {one.ghosts_of for one in watchers if one.ghosts_of is not None}
+        self.wishes = Wishes(len(self._watchers), vehicles, tuple(sorted(zones)))
+
+    def _call(self, function: Any, *arguments: Any) -> None:
+        loop = self._loop
+        if loop is None or loop.is_closed():
+            return
+        try:
+            loop.call_soon_threadsafe(function, *arguments)
+        except RuntimeError:  # closed since
+            return
+
+    def _spread(self, publication: Publication) -> None:
+        self._last = publication
+        for watcher in self._watchers.values():
+            watcher.offer(publication)
+
+    def _add_events(self, events: list[list[Any]]) -> None:
+        self._events.extend(events)
+        self._tell_all(_events_text(events))
+
+    def _tell_all(self, text: str) -> None:
+        for watcher in self._watchers.values():
+            watcher.tell(text)
+
+    def _tell_of(self, vehicle: int, text: str) -> None:
+        for watcher in self._watchers.values():
+            if watcher.vehicle == vehicle:
+                watcher.tell(text)
+
+    def _tell_one(self, number: int, text: str) -> None:
+        if number in self._watchers:
+            self._watchers[number].tell(text)
+
+
+def _events_text(events: list[list[Any]]) -> str:
+    return json.dumps({"kind": "events", "events": events})

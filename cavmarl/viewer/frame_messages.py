@@ -1,0 +1,189 @@
+"""Frames as binary messages: nine bytes a vehicle, and a roster of what seldom changes.
+
+A vehicle's id, size and kind, its zone and where it is handed over are a row of the *roster*. A
+change of the roster is a message of its own with a version; messages of one version after another
+make the whole. A *frame* names the version that it belongs to, and has the vehicles in the order of
+their ids in that roster. So a watcher may miss frames, but no change of the roster.
+
+All is little endian. Places are centimetres from a corner `MARGIN_M` below and left of the map's
+origin; headings have 2048 parts of a turn, speeds are quarters of m/s.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.records.codes import EVENT_COLLIDED
+from cavmarl.engine.world_frame import WorldFrame
+from cavmarl.render.shapes import level_of
+
+ROSTER_MESSAGE = 2
+FRAME_MESSAGE = 3
+
+ROSTER_HEAD = struct.Struct("<BBxxIII")  # message, whole, version, rows, ids that have left
+# message, flags, world, version, time, tick, pace, vehicles, signals, zones whose ghosts follow
+FRAME_HEAD = struct.Struct("<BBHIdIfIII")
+PAUSED = 1  # flag of a frame
+
+ROSTER_ROW = np.dtype(
+    [
+        ("id", "<f8"),
+        ("agent", "<i4"),
+        ("length_cm", "<u2"),
+        ("width_cm", "<u2"),
+        ("height_cm", "<u2"),
+        ("zone", "<i2"),
+        ("target", "<i2"),  # the zone that it is handed over to; -1: to none
+        ("vclass", "u1"),
+        ("driver", "u1"),
+        ("level", "i1"),
+        ("unused", "u1"),
+    ]
+)
+ROW_BYTES = 9
+MARGIN_M = 1000.0
+MOST = 2**24 - 1
+HEADINGS = 2048
+SPEEDS_PER_MPS = 4.0
+BRAKING_MPS2 = -0.8  # from here brake lights are on
+REBASE_ROWS = 1000  # changes beyond twice the vehicles, after which the roster is sent whole
+REBASE_CHANGES = 256
+
+
+class Change(NamedTuple):
+    """One message of the roster."""
+
+    version: int
+    message: bytes
+
+
+@dataclass(frozen=True)
+class Publication:
+    """What watchers get of one moment: a frame, and the changes that its roster is made of."""
+
+    frame: bytes
+    roster: tuple[Change, ...]  # by version; the first one is whole
+
+    def since(self, version: int) -> list[bytes]:
+        """What a watcher lacks that has the roster of a version; 0: it has none."""
+        return [change.message for change in self.roster if change.version > version]
+
+    @property
+    def version(self) -> int:
+        return self.roster[-1].version
+
+
+class FrameEncoder:
+    """Makes publications of the frames of one world, one after the other.
+
+    `origin`: (2,) m, of the map's message.
+    """
+
+    def __init__(self, origin: NDArray[np.float64]) -> None:
+        self._origin = origin
+        self._roster = np.zeros(0, ROSTER_ROW)
+        self._changes: tuple[Change, ...] = ()
+        self._version = 0
+        self._changed_rows = 0
+        self._tick = -1
+
+    def publication(
+        self,
+        frame: WorldFrame,
+        *,
+        paused: bool = False,
+        pace: float = 1.0,
+        ghosts_of: tuple[int, ...] = (),
+    ) -> Publication:
+        """A frame for watchers.
+
+        Args:
+            frame: of the world, not older than the last one unless the world has begun anew.
+            paused: whether the world waits.
+            pace: seconds of the world in one of ours; 0: as fast as it can.
+            ghosts_of: zones whose ghosts are marked.
+        """
+        vehicles = frame.vehicles
+        self._keep_roster(_roster_of(vehicles), begun_anew=frame.tick < self._tick)
+        self._tick = frame.tick
+        ghosts = [(zone, frame.ghosts[zone]) for zone in ghosts_of if zone < len(frame.ghosts)]
+        head = FRAME_HEAD.pack(
+            FRAME_MESSAGE,
+            PAUSED if paused else 0,
+            frame.world,
+            self._version,
+            frame.time_s,
+            frame.tick,
+            pace,
+            len(vehicles),
+            len(frame.signals),
+            len(ghosts),
+        )
+        parts = [head, frame.signals.astype("<u4").tobytes()]
+        for zone, seen in ghosts:
+            rows = np.flatnonzero(np.isin(vehicles["id"], seen)).astype("<u4")
+            parts += [struct.pack("<II", zone, len(rows)), rows.tobytes()]
+        parts.append(self._rows(vehicles))
+        return Publication(b"".join(parts), self._changes)
+
+    def _rows(self, vehicles: NDArray[np.void]) -> bytes:
+        """ROW_BYTES of each vehicle: x and y with three bytes each, and three with the rest."""
+        words = np.zeros((len(vehicles), 3), dtype="<u4")
+        for k, name in enumerate(("x", "y")):
+            place = (vehicles[name] - (self._origin[k] - MARGIN_M)) * 100.0
+            words[:, k] = np.clip(np.rint(place), 0, MOST)
+        turns = np.rint(vehicles["heading"] * (HEADINGS / (2.0 * np.pi))).astype(np.int64)
+        speeds = np.clip(np.rint(np.abs(vehicles["speed"]) * SPEEDS_PER_MPS), 0, 511)
+        bits = turns & (HEADINGS - 1)
+        bits |= speeds.astype(np.int64) << 11
+        bits |= (vehicles["accel"] < BRAKING_MPS2).astype(np.int64) << 20
+        bits |= (vehicles["blinker"] > 0).astype(np.int64) << 21
+        bits |= (vehicles["blinker"] < 0).astype(np.int64) << 22
+        bits |= (vehicles["events"] & EVENT_COLLIDED).astype(bool).astype(np.int64) << 23
+        words[:, 2] = bits
+        return np.ascontiguousarray(words.view(np.uint8).reshape(-1, 3, 4)[:, :, :3]).tobytes()
+
+    def _keep_roster(self, roster: NDArray[np.void], begun_anew: bool) -> None:
+        """Add what has changed since the last frame to the messages that watchers need."""
+        before = self._roster
+        if self._changes and not begun_anew and np.array_equal(before, roster):
+            return
+        self._version += 1
+        self._roster = roster
+        old = np.searchsorted(before["id"], roster["id"])
+        known = old < len(before)
+        known[known] = before["id"][old[known]] == roster["id"][known]
+        fresh = ~known
+        fresh[known] = before[old[known]] != roster[known]
+        left = before["id"][~np.isin(before["id"], roster["id"])]
+        self._changed_rows += int(fresh.sum()) + len(left)
+        too_much = self._changed_rows > 2 * len(roster) + REBASE_ROWS
+        if not self._changes or begun_anew or too_much or len(self._changes) >= REBASE_CHANGES:
+            whole = self._message(True, roster, left[:0])
+            self._changes = (Change(self._version, whole),)
+            self._changed_rows = 0
+        else:
+            change = Change(self._version, self._message(False, roster[fresh], left))
+            self._changes = (*self._changes, change)
+
+    def _message(self, whole: bool, rows: NDArray[np.void], left: NDArray[np.float64]) -> bytes:
+        head = ROSTER_HEAD.pack(ROSTER_MESSAGE, whole, self._version, len(rows), len(left))
+        return head + left.astype("<f8").tobytes() + rows.tobytes()
+
+
+def _roster_of(vehicles: NDArray[np.void]) -> NDArray[np.void]:
+    """SEEN (n,) as ROSTER_ROW."""
+    rows = np.zeros(len(vehicles), ROSTER_ROW)
+    for name in ("id", "agent", "zone", "vclass", "driver"):
+        rows[name] = vehicles[name]
+    for name in ("length", "width", "height"):
+        rows[f"{name}_cm"] = np.clip(np.rint(vehicles[name] * 100.0), 0, 65535)
+    moving = vehicles["transfer"] != 0
+    rows["target"] = np.where(moving, vehicles["target_zone"], -1)
+    rows["level"] = np.clip(level_of(vehicles["z"]), -30, 30)
+    return rows

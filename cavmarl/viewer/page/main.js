@@ -1,0 +1,538 @@
+// The page: takes messages, keeps what it has seen, draws, and asks.
+
+import { Camera, listenToPointers } from "./camera.js";
+import { inks, legend, SELECTION, THEMES } from "./colors.js";
+import { MapLayers } from "./drawing.js";
+import { Seat } from "./driving.js";
+import { $, addEvents, element, notice, showLegend, showScale, showVehicle } from "./panels.js";
+import { decodeFrame, decodeMap, FRAME, kindOf, MAP, Roster, ROSTER } from "./protocol.js";
+import { drawStill } from "./still.js";
+import { VehicleLayer } from "./vehicles.js";
+
+const MOST_FRAMES = 1200; // that are kept to look back
+const MOST_BYTES = 64e6;
+const LABEL_SCALE = 1.6; // pixels a metre from where agents have their names
+const COUNTED = 240;
+
+const page = {
+  hello: null, map: null, camera: null, gl: null, layers: null, vehicles: null,
+  roster: new Roster(0, 0), frame: null, history: [], bytes: 0, events: [],
+  looksBack: false, chosen: null, wanted: null, following: false, told: null,
+  coloring: "agent", theme: "light", ghosts: null,
+  arrived: 0, between: 100, dirty: true, socket: null, over: false,
+  times: [], takes: [], firstPicture: 0, calls: 0, stillDrawn: 0,
+};
+window.viewer = page; // for tests and measurements
+
+const ask = (request) => {
+  if (page.socket?.readyState === WebSocket.OPEN) page.socket.send(JSON.stringify(request));
+};
+const seat = new Seat(ask);
+const dirty = () => { page.dirty = true; };
+
+// ---- messages
+
+function connect(token) {
+  const scheme = location.protocol === "https:" ? "wss" : "ws";
+  const socket = new WebSocket(`${scheme}://${location.host}/live`);
+  socket.binaryType = "arraybuffer";
+  page.socket = socket;
+  socket.addEventListener("open", () => socket.send(JSON.stringify({ kind: "hello", token })));
+  socket.addEventListener("message", ({ data }) => {
+    if (typeof data === "string") take(JSON.parse(data));
+    else takeBytes(data);
+  });
+  socket.addEventListener("close", ({ code, reason }) => closed(code, reason, token));
+}
+
+function closed(code, reason, token) {
+  $("status").textContent = "not connected";
+  seat.leave();
+  if (code === 4401) {
+    if (token) notice(reason);
+    $("token-box").showModal();
+    return;
+  }
+  if (code === 1013 || code === 1003) {
+    notice(reason);
+    return;
+  }
+  notice("The world has ended or cannot be reached; trying again.");
+  setTimeout(() => connect(token), 2000);
+}
+
+function take(told) {
+  if (told.kind === "hello") takeHello(told);
+  else if (told.kind === "vehicle") takeVehicle(told);
+  else if (told.kind === "events") takeEvents(told.events);
+  else if (told.kind === "seat") takeSeat(told);
+}
+
+function takeHello(hello) {
+  page.hello = hello;
+  notice("");
+  $("title").textContent = hello.title;
+  document.title = `${hello.title} – cavmarl`;
+  for (const id of ["play", "step", "pace", "reset"]) $(id).disabled = !hello.control;
+  $("ghosts-label").hidden = !hello.zones.length;
+  $("ghosts").replaceChildren(element("option", "no zone", { value: "" }),
+    ...hello.zones.map((_, k) => element("option", `zone ${k}`, { value: k })));
+  if (hello.zones.length && !page.map) setColoring("zone");
+}
+
+function takeBytes(buffer) {
+  const kind = kindOf(buffer);
+  if (kind === MAP) takeMap(decodeMap(buffer));
+  else if (kind === ROSTER) page.roster = page.roster.after(buffer);
+  else if (kind === FRAME) {
+    const begun = performance.now();
+    takeFrame(decodeFrame(buffer, page.roster));
+    page.takes.push(performance.now() - begun);
+    if (page.takes.length > COUNTED) page.takes.shift();
+  }
+}
+
+function takeMap(map) {
+  const again = page.map !== null;
+  page.map = map;
+  page.roster = new Roster(0, 0);
+  page.history = [];
+  if (!again) page.camera = new Camera($("scene"), map.extent);
+  resize();
+  if (!again) page.camera.home();
+  if (page.gl) {
+    page.layers = new MapLayers(page.gl, map);
+    page.layers.setZones(page.hello.zones, map.zone_colors);
+    page.vehicles = new VehicleLayer(page.gl, [...map.zone_colors, SELECTION]);
+  }
+  if (again) return;
+  listenToPointers($("scene"), page.camera, {
+    click: choose,
+    moved(byHand) {
+      if (byHand) follow(false);
+      dirty();
+    },
+  });
+}
+
+function takeFrame(frame) {
+  const now = performance.now();
+  if (page.arrived) {
+    page.between = Math.min(Math.max(0.8 * page.between + 0.2 * (now - page.arrived), 30), 400);
+  }
+  page.arrived = now;
+  const last = page.history.at(-1);
+  if (last && frame.tick < last.tick) page.history = [];
+  if (!last || frame.tick !== last.tick) {
+    page.history.push(frame);
+    page.bytes += frame.bytes;
+  }
+  while (page.history.length > MOST_FRAMES || page.bytes > MOST_BYTES) {
+    page.bytes -= page.history.shift().bytes;
+  }
+  page.live = frame;
+  showClockControls(frame);
+  if (page.looksBack) {
+    showTimeLine();
+    return;
+  }
+  const smooth = last !== undefined && frame.tick >= last.tick;
+  show(frame, smooth);
+}
+
+function takeVehicle(told) {
+  if (told.id !== page.wanted) return;
+  page.told = told;
+  const row = page.roster.find(told.id);
+  const agent = row >= 0 ? page.roster.agents[row] : -1;
+  const name = agent >= 0 ? `${page.hello.agents[agent]} · vehicle ${told.id}` : `vehicle ${told.id}`;
+  showVehicle(told, name);
+  $("seat").hidden = !page.hello.control || (agent < 0 && seat.agent === null);
+}
+
+function takeSeat(told) {
+  if (told.agent === null && told.reason) {
+    seat.leave();
+    notice(told.reason);
+  }
+  showSeat();
+}
+
+function takeEvents(events) {
+  page.events.push(...events);
+  page.events.splice(0, Math.max(0, page.events.length - 500));
+  addEvents(events, timeText, (tick, vehicle) => {
+    lookBack(tick);
+    if (vehicle >= 0) watch(vehicle);
+  });
+  showTimeLine();
+}
+
+// ---- what is shown
+
+const secondsOf = (tick) => {
+  const frame = page.live;
+  return frame && frame.tick ? (tick * frame.time) / frame.tick : tick * (page.hello?.step_s ?? 0.1);
+};
+const timeText = (tick) => `${secondsOf(tick).toFixed(1)} s`;
+
+function show(frame, smooth) {
+  page.frame = frame;
+  $("clock").textContent = `${frame.time.toFixed(1)} s · ${frame.count} vehicles`;
+  if (page.vehicles) {
+    page.vehicles.take(frame, smooth);
+    page.layers.setPhases(frame.signals);
+    paint();
+  }
+  showTimeLine();
+  if (page.coloring === "type" || !$("legend").children.length) showColors();
+  dirty();
+}
+
+function paint() {
+  if (!page.frame || !page.vehicles) return;
+  const ghosts = page.ghosts === null ? null : page.frame.ghosts.get(page.ghosts);
+  page.inkOf ??= inks(page.coloring, page.map.zone_colors);
+  page.vehicles.paint(page.inkOf, page.chosen, ghosts, (page.ghosts ?? 0) % 7);
+  dirty();
+}
+
+function showColors() {
+  if (page.hello && page.map) {
+    showLegend(legend(page.coloring, page.hello, page.map, page.roster));
+  }
+}
+
+function setColoring(coloring) {
+  page.coloring = coloring;
+  page.inkOf = null;
+  $("coloring").value = coloring;
+  showColors();
+  paint();
+}
+
+function showClockControls(frame) {
+  if (page.wasPaused === frame.paused && page.wasPace === frame.pace) return;
+  [page.wasPaused, page.wasPace] = [frame.paused, frame.pace];
+  $("play").textContent = frame.paused ? "Play" : "Pause";
+  $("status").textContent = frame.paused ? "paused" : "live";
+  $("pace").value = String(frame.pace);
+}
+
+function showTimeLine() {
+  const { history } = page;
+  const range = $("past");
+  range.max = String(Math.max(history.length - 1, 0));
+  if (!page.looksBack) range.value = range.max;
+  const shownFrame = page.frame;
+  if (shownFrame) range.setAttribute("aria-valuetext", timeText(shownFrame.tick));
+  if (performance.now() - (page.markedAt ?? 0) < 250) return;
+  page.markedAt = performance.now();
+  drawMarks(history);
+}
+
+function drawMarks(history) {
+  const canvas = $("marks");
+  canvas.width = canvas.clientWidth;
+  canvas.height = 8;
+  const pen = canvas.getContext("2d");
+  if (history.length < 2) return;
+  const from = history[0].tick;
+  const span = history.at(-1).tick - from || 1;
+  for (const [tick, kind] of page.events) {
+    if (tick < from) continue;
+    const bad = kind === "collision" || kind === "off_road" || kind === "wrong_way";
+    pen.fillStyle = bad ? "#d63030" : kind === "arrived" ? "#2e9e5b" : "#8a94a0";
+    pen.fillRect(8 + ((tick - from) / span) * (canvas.width - 16) - 1, bad ? 0 : 3, 2, 8);
+  }
+}
+
+function lookBack(tick) {
+  const { history } = page;
+  const at = history.findIndex((frame) => frame.tick >= tick);
+  if (at >= 0) lookAt(at);
+}
+
+function lookAt(at) {
+  const frame = page.history[at];
+  if (!frame) return;
+  page.looksBack = at < page.history.length - 1;
+  $("live").disabled = !page.looksBack;
+  $("past").value = String(at);
+  $("status").textContent = page.looksBack ? `looking back to ${timeText(frame.tick)}` : "live";
+  if (!page.looksBack) page.wasPaused = undefined;
+  show(frame, false);
+}
+
+function watch(vehicle) {
+  page.wanted = page.chosen = vehicle;
+  ask({ kind: "watch", number: vehicle });
+  if (vehicle === null) {
+    $("vehicle").hidden = true;
+    follow(false);
+    seat.leave();
+    showSeat();
+  } else {
+    takeVehicle({ id: vehicle, here: true, rows: [] });
+  }
+  paint();
+}
+
+function follow(on) {
+  page.following = on && page.chosen !== null;
+  $("follow").setAttribute("aria-pressed", String(page.following));
+  if (page.following && page.camera.scale < 4) page.camera.scale = 6;
+  dirty();
+}
+
+function choose(px, py) {
+  if (!page.vehicles || !page.frame) return;
+  const [x, y] = page.camera.toMetres(px, py);
+  const row = page.vehicles.nearest(x, y, Math.max(4, 14 / page.camera.scale), share());
+  watch(row < 0 ? null : page.frame.roster.ids[row]);
+}
+
+function showSeat() {
+  const driving = seat.agent !== null;
+  $("seat").setAttribute("aria-pressed", String(driving));
+  $("seat").textContent = driving ? "Leave the seat" : "Drive";
+  $("hint").hidden = !driving;
+  $("hint").textContent = page.hello?.action !== "discrete"
+    ? "Arrow keys or a gamepad: throttle, brake and steering. Escape leaves the seat."
+    : "Arrow keys: faster, slower, lane to the left or right. Escape leaves the seat.";
+}
+
+// ---- drawing
+
+const share = () => {
+  if (page.looksBack) return 1;
+  return Math.min((performance.now() - page.arrived) / page.between, 1);
+};
+
+function resize() {
+  const scene = $("scene");
+  const density = devicePixelRatio || 1;
+  for (const canvas of page.gl ? [scene, $("labels")] : [$("labels")]) {
+    canvas.width = Math.max(1, Math.round(canvas.clientWidth * density));
+    canvas.height = Math.max(1, Math.round(canvas.clientHeight * density));
+  }
+  if (page.camera) page.camera.covered = innerWidth > 700 ? 310 : 0;
+  dirty();
+}
+
+function draw() {
+  requestAnimationFrame(draw);
+  if (!page.map || !page.camera) return;
+  if (!page.gl) {
+    stillPicture();
+    return;
+  }
+  const part = share();
+  if (!page.dirty && (part >= 1 && page.settled)) return;
+  const begun = performance.now();
+  page.settled = part >= 1;
+  page.dirty = false;
+  followChosen(part);
+  const { gl, camera } = page;
+  const theme = THEMES[page.theme];
+  gl.viewport(0, 0, $("scene").width, $("scene").height);
+  gl.clearColor(...theme.land, 1);
+  gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+  page.layers.draw(camera, theme);
+  if (page.coloring === "zone") page.layers.drawZones(camera);
+  const calls = page.frame ? page.vehicles.draw(camera, part, page.coloring === "speed") : 0;
+  page.calls = page.layers.calls + calls;
+  drawLabels(part, theme);
+  showScale(camera.scale);
+  page.times.push(performance.now() - begun);
+  if (page.times.length > COUNTED) page.times.shift();
+  page.firstPicture ||= page.frame ? performance.now() : 0;
+}
+
+function followChosen(part) {
+  if (!page.following || !page.frame) return;
+  const row = page.frame.roster.find(page.chosen);
+  if (row < 0) {
+    seatFollows();
+    return;
+  }
+  const [x, y] = page.vehicles.placeOf(row, part);
+  page.camera.x = x + page.camera.covered / 2 / page.camera.scale;
+  page.camera.y = y;
+}
+
+// An agent whose seat is held gets another vehicle after its trip.
+function seatFollows() {
+  if (seat.agent === null) return;
+  const row = page.frame.roster.agents.indexOf(seat.agent);
+  if (row >= 0) watch(page.frame.roster.ids[row]);
+}
+
+function drawLabels(part, theme) {
+  const canvas = $("labels");
+  const pen = canvas.getContext("2d");
+  const density = devicePixelRatio || 1;
+  pen.setTransform(density, 0, 0, density, 0, 0);
+  pen.clearRect(0, 0, canvas.width, canvas.height);
+  pen.font = "600 12px system-ui, sans-serif";
+  pen.textAlign = "center";
+  pen.lineWidth = 3;
+  pen.strokeStyle = theme.halo;
+  const label = (text, x, y, ink) => {
+    pen.strokeText(text, x, y);
+    pen.fillStyle = ink;
+    pen.fillText(text, x, y);
+  };
+  const { camera, frame } = page;
+  if (page.coloring === "zone") {
+    page.hello.zones.forEach(([ax, ay, bx, by], k) => {
+      label(`zone ${k}`, ...camera.toPixels((ax + bx) / 2, (ay + by) / 2), theme.ink);
+    });
+  }
+  if (!frame || camera.scale < LABEL_SCALE) return;
+  let room = 80;
+  for (let k = 0; k < frame.count && room; k++) {
+    if (frame.roster.agents[k] < 0) continue;
+    const [x, y] = camera.toPixels(...page.vehicles.placeOf(k, part).slice(0, 2));
+    if (x < 0 || y < 0 || x > camera.width || y > camera.height) continue;
+    room -= 1;
+    const away = Math.max(14, frame.roster.sizes[2 * k + 1] * camera.scale * 0.5 + 8);
+    label(page.hello.agents[frame.roster.agents[k]], x, y - away, theme.ink);
+  }
+}
+
+function stillPicture() {
+  const now = performance.now();
+  if (now - page.stillDrawn < 1000 || !page.frame) return;
+  page.stillDrawn = now;
+  page.inkOf ??= inks(page.coloring, page.map.zone_colors);
+  drawStill($("scene"), page.camera, page.map, page.frame, THEMES[page.theme], page.inkOf);
+}
+
+// ---- controls
+
+function setTheme(theme) {
+  page.theme = theme;
+  document.documentElement.dataset.theme = theme;
+  $("theme").setAttribute("aria-pressed", String(theme === "dark"));
+  dirty();
+}
+
+function find(text) {
+  const wanted = text.trim();
+  const agent = page.hello.agents.indexOf(wanted);
+  const row = agent >= 0 ? page.roster.agents.indexOf(agent) : page.roster.find(Number(wanted));
+  if (!wanted || row < 0) {
+    notice(`There is no vehicle ${wanted} now.`);
+    setTimeout(() => notice(""), 3000);
+    return;
+  }
+  watch(page.roster.ids[row]);
+  follow(true);
+}
+
+function toggleSeat() {
+  if (seat.agent !== null) {
+    seat.leave();
+  } else {
+    const row = page.roster.find(page.chosen);
+    if (row >= 0 && page.roster.agents[row] >= 0) {
+      seat.take(page.roster.agents[row]);
+      follow(true);
+      $("scene").focus();
+    }
+  }
+  showSeat();
+}
+
+function toggleClock() {
+  ask({ kind: page.live?.paused ? "play" : "pause" });
+}
+
+const PAN = { ArrowUp: [0, 60], ArrowDown: [0, -60], ArrowLeft: [60, 0], ArrowRight: [-60, 0] };
+const ACTIONS = {
+  " ": toggleClock,
+  ".": () => ask({ kind: "step" }),
+  "+": () => page.camera.zoom(1.25),
+  "=": () => page.camera.zoom(1.25),
+  "-": () => page.camera.zoom(0.8),
+  Home: () => { follow(false); page.camera.home(); },
+  f: () => follow(!page.following),
+  "/": () => $("wanted").focus(),
+  Escape: () => { if (seat.agent !== null) toggleSeat(); else watch(null); },
+};
+
+function onKey(event) {
+  if (event.ctrlKey || event.metaKey || event.altKey) return;
+  const typing = event.target.matches("input, select, dialog *");
+  const pressing = event.target.matches("button, summary") && (event.key === " " || event.key === "Enter");
+  if (typing || pressing || !page.camera) return;
+  if (seat.key(event, true)) {
+    event.preventDefault();
+    return;
+  }
+  if (event.key in PAN) {
+    follow(false);
+    page.camera.pan(...PAN[event.key]);
+  } else if (event.key in ACTIONS) {
+    ACTIONS[event.key]();
+  } else {
+    return;
+  }
+  event.preventDefault();
+  dirty();
+}
+
+function wire() {
+  const on = (id, event, act) => $(id).addEventListener(event, act);
+  on("play", "click", toggleClock);
+  on("step", "click", () => ask({ kind: "step" }));
+  on("reset", "click", () => ask({ kind: "reset" }));
+  on("pace", "change", () => ask({ kind: "pace", number: Number($("pace").value) }));
+  on("past", "input", () => lookAt(Number($("past").value)));
+  on("live", "click", () => lookAt(page.history.length - 1));
+  on("nearer", "click", () => { page.camera?.zoom(1.4); dirty(); });
+  on("farther", "click", () => { page.camera?.zoom(1 / 1.4); dirty(); });
+  on("home", "click", () => { follow(false); page.camera?.home(); dirty(); });
+  on("theme", "click", () => setTheme(page.theme === "dark" ? "light" : "dark"));
+  on("follow", "click", () => follow(!page.following));
+  on("seat", "click", toggleSeat);
+  on("release", "click", () => watch(null));
+  on("coloring", "change", () => setColoring($("coloring").value));
+  on("search", "submit", (event) => { event.preventDefault(); find($("wanted").value); });
+  on("ghosts", "change", () => {
+    page.ghosts = $("ghosts").value === "" ? null : Number($("ghosts").value);
+    ask({ kind: "ghosts", number: page.ghosts });
+    paint();
+  });
+  on("token-box", "close", () => connect($("token").value));
+  addEventListener("keydown", onKey);
+  addEventListener("keyup", (event) => seat.key(event, false));
+  addEventListener("blur", () => seat.held.clear());
+  addEventListener("resize", resize);
+  setInterval(() => {
+    const frame = page.frame;
+    if (!frame) return;
+    const text = `The map of ${page.hello.title} with ${frame.count} vehicles`;
+    $("scene").setAttribute("aria-label", text);
+  }, 5000);
+}
+
+function begin() {
+  page.gl = $("scene").getContext("webgl2", { antialias: true, alpha: false });
+  if (page.gl) {
+    page.gl.enable(page.gl.DEPTH_TEST);
+    page.gl.depthFunc(page.gl.LEQUAL);
+    page.gl.enable(page.gl.BLEND);
+    page.gl.blendFunc(page.gl.ONE, page.gl.ONE_MINUS_SRC_ALPHA);
+    $("scene").addEventListener("webglcontextlost", () => location.reload());
+  } else {
+    notice("This browser has no WebGL2: a still picture is shown, anew every second.", true);
+  }
+  setTheme(matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
+  wire();
+  connect("");
+  requestAnimationFrame(draw);
+}
+
+begin();

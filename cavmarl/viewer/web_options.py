@@ -1,0 +1,18 @@
+"""Where the viewer listens and what its pages may do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+DEFAULT_PORT = 8710
+
+
+@dataclass(frozen=True)
+class WebOptions:
+    """Of one server."""
+
+    host: str = "127.0.0.1"
+    port: int = DEFAULT_PORT  # 0: any that is free
+    token: str = ""  # that a page has to give; the loopback address needs none
+    control: bool = True  # pages may pause, step and drive
+    send_s: float = 5.0  # in which a page has to take a message

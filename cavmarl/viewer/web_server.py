@@ -1,0 +1,269 @@
+"""The viewer's server: the page's files, and a WebSocket that a running world is shown through."""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import json
+import threading
+from collections.abc import Callable
+from importlib.resources import files
+from typing import Any
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.datastructures import Headers
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.websockets import WebSocket, WebSocketDisconnect
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+
+from cavmarl.core.errors import MessageError, ServiceError
+from cavmarl.core.listening import is_loopback, listen, shown_host
+from cavmarl.viewer.audience import Audience, PageWatcher
+from cavmarl.viewer.page_requests import CONTROLS, MAX_TEXT, read_object, read_request
+from cavmarl.viewer.web_options import WebOptions
+
+PAGE = files("cavmarl.viewer") / "page"
+TYPES = {
+    "html": "text/html; charset=utf-8",
+    "css": "text/css; charset=utf-8",
+    "js": "text/javascript; charset=utf-8",
+    "svg": "image/svg+xml",
+}
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+HEADERS = {
+    "content-security-policy": POLICY,
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "cache-control": "no-store",
+}
+MOST_WATCHERS = 250
+FIRST_MESSAGE_S = 5.0
+WRONG_TOKEN_S = 0.5
+TRY_LATER, REFUSED, NOT_UNDERSTOOD = 1013, 4401, 1003
+
+
+class WebServer:
+    """Serves pages from a thread of its own.
+
+    Args:
+        options: where and how.
+        audience: the watchers of the world.
+        hello: what a page is told first, JSON.
+        map_bytes: the map's message.
+
+    Raises:
+        ServiceError: the port is taken, or others could watch without a token.
+    """
+
+    def __init__(
+        self, options: WebOptions, audience: Audience, hello: dict[str, Any], map_bytes: bytes
+    ) -> None:
+        if not is_loopback(options.host) and not options.token:
+            raise ServiceError(f"--host {options.host}: others can reach it; give a --token")
+        self._listener = listen(options.host, options.port)
+        self.port: int = self._listener.getsockname()[1]
+        self.address = f"http://{shown_host(options.host)}:{self.port}/"
+        self._audience = audience
+        app = viewer_app(options, self.port, audience, hello, map_bytes)
+        config = uvicorn.Config(
+            app,
+            log_level="critical",
+            access_log=False,
+            server_header=False,
+            lifespan="off",
+            loop="asyncio",
+            http="httptools",
+            ws=DroppedWhenDone,
+            ws_max_size=4 * MAX_TEXT,
+            ws_per_message_deflate=False,
+            timeout_graceful_shutdown=1,
+            limit_concurrency=2 * MOST_WATCHERS,
+            proxy_headers=False,
+        )
+        self._server = uvicorn.Server(config)
+        self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
+
+    def __enter__(self) -> WebServer:
+        begun = threading.Event()
+        self._begun: Callable[[], None] = begun.set
+        self._thread.start()
+        begun.wait(10.0)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._server.should_exit = True
+        self._thread.join(10.0)
+        self._listener.close()
+
+    def _run(self) -> None:
+        asyncio.run(self._serve())
+
+    async def _serve(self) -> None:
+        self._audience.begin(asyncio.get_running_loop())
+        self._begun()
+        # Not `serve`: signals are the main thread's.
+        await self._server._serve(sockets=[self._listener])
+
+
+class DroppedWhenDone(WebSocketsSansIOProtocol):
+    """Cuts the connection when the application has ended without a close of its own.
+
+    A peer that reads nothing would never take in the close.
+    """
+
+    async def run_asgi(self) -> None:
+        await super().run_asgi()
+        if not self.close_sent and self.transport is not None:
+            self.transport.abort()
+
+
+def viewer_app(
+    options: WebOptions, port: int, audience: Audience, hello: dict[str, Any], map_bytes: bytes
+) -> ASGIApp:
+    """The application of one world; see `WebServer`."""
+    pages = {file.name: file.read_bytes() for file in PAGE.iterdir() if file.is_file()}
+
+    async def page(request: Request) -> Response:
+        name = request.path_params.get("name") or "index.html"
+        content = pages.get(name)
+        if content is None:
+            return PlainTextResponse("there is no such file", 404)
+        return Response(content, media_type=TYPES[name.rpartition(".")[2]])
+
+    async def live(socket: WebSocket) -> None:
+        await _LiveSocket(socket, options, audience).serve(hello, map_bytes)
+
+    routes = [Route("/", page), Route("/{name}", page), WebSocketRoute("/live", live)]
+    return OwnPagesOnly(Starlette(routes=routes), options.host, port)
+
+
+class OwnPagesOnly:
+    """Refuses what comes through another name or from a page of another origin; adds headers.
+
+    On the loopback address the name is checked, too: a foreign name that is made to point here
+    would make a foreign page's origin look like ours.
+    """
+
+    def __init__(self, app: ASGIApp, host: str, port: int) -> None:
+        self._app = app
+        names = {"127.0.0.1", "localhost", "[::1]", shown_host(host)}
+        self._hosts = {f"{name}:{port}" for name in names} if is_loopback(host) else None
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] not in ("http", "websocket"):
+            return
+        headers = Headers(scope=scope)
+        host, origin = headers.get("host", ""), headers.get("origin")
+        foreign = self._hosts is not None and host not in self._hosts
+        foreign |= origin is not None and origin != f"http://{host}"
+        if foreign and scope["type"] == "websocket":
+            await send({"type": "websocket.close", "code": 1008})
+            return
+
+        async def with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                own = [(name.encode(), value.encode()) for name, value in HEADERS.items()]
+                message["headers"] = [*message.get("headers", []), *own]
+            await send(message)
+
+        if foreign:
+            refusal = PlainTextResponse("this address is not the viewer's", 403)
+            await refusal(scope, receive, with_headers)
+        else:
+            await self._app(scope, receive, with_headers)
+
+
+class _LiveSocket:
+    """One page's WebSocket: it says hello with its token, then asks and is told."""
+
+    def __init__(self, socket: WebSocket, options: WebOptions, audience: Audience) -> None:
+        self._socket = socket
+        self._options = options
+        self._audience = audience
+
+    async def serve(self, hello: dict[str, Any], map_bytes: bytes) -> None:
+        await self._socket.accept()
+        try:
+            if not await self._is_welcome():
+                return
+            watcher = self._audience.join()
+            try:
+                await self._send(json.dumps({**hello, "control": self._options.control}))
+                await self._send(map_bytes)
+                await self._watch(watcher)
+            finally:
+                self._audience.leave(watcher)
+        except (WebSocketDisconnect, TimeoutError, RuntimeError):
+            return
+
+    async def _is_welcome(self) -> bool:
+        if self._audience.wishes.watchers >= MOST_WATCHERS:
+            await self._socket.close(TRY_LATER, f"{MOST_WATCHERS} pages watch already")
+            return False
+        try:
+            async with asyncio.timeout(FIRST_MESSAGE_S):
+                first = read_object(await self._socket.receive_text())
+        except (MessageError, KeyError):
+            await self._socket.close(NOT_UNDERSTOOD, "the first message must be a hello")
+            return False
+        token = first.get("token")
+        given = token.encode() if isinstance(token, str) else b""
+        if not hmac.compare_digest(given, self._options.token.encode()):
+            if self._options.token or given:
+                await asyncio.sleep(WRONG_TOKEN_S)
+                await self._socket.close(
+                    REFUSED, "a token is needed" if not given else "wrong token"
+                )
+                return False
+        return True
+
+    async def _watch(self, watcher: PageWatcher) -> None:
+        """Send and listen until either ends."""
+        tasks = {
+            asyncio.create_task(self._send_news(watcher)),
+            asyncio.create_task(self._listen(watcher)),
+        }
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for task in done:
+                task.result()
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _send_news(self, watcher: PageWatcher) -> None:
+        while not watcher.is_lost:
+            await watcher.news.wait()
+            try:
+                for message in watcher.take():
+                    await self._send(message)
+            except TimeoutError:
+                break
+        self._audience.dropped += 1
+
+    async def _send(self, message: str | bytes) -> None:
+        async with asyncio.timeout(self._options.send_s):
+            if isinstance(message, str):
+                await self._socket.send_text(message)
+            else:
+                await self._socket.send_bytes(message)
+
+    async def _listen(self, watcher: PageWatcher) -> None:
+        while True:
+            try:
+                request = read_request(await self._socket.receive_text())
+            except (MessageError, KeyError) as error:
+                await self._socket.close(NOT_UNDERSTOOD, str(error)[:100])
+                return
+            if self._options.control or request.kind not in CONTROLS:
+                self._audience.ask(watcher, request)

@@ -1,0 +1,76 @@
+"""A server with a small divided world behind it, and a browser where there is one."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cavmarl.env.parallel import parallel_env
+from cavmarl.policies.policy import load_policy
+from cavmarl.viewer.audience import Audience
+from cavmarl.viewer.frame_messages import FrameEncoder
+from cavmarl.viewer.map_geometry import map_message, unpack
+from cavmarl.viewer.shown_run import ShownRun
+from cavmarl.viewer.vehicle_details import hello_of
+from cavmarl.viewer.web_options import WebOptions
+from cavmarl.viewer.web_server import WebServer
+
+
+@dataclass
+class Served:
+    """A world that is driven in a thread, and its server."""
+
+    run: ShownRun
+    audience: Audience
+    server: WebServer
+    map_bytes: bytes
+
+
+@contextmanager
+def served(env: Any, options: WebOptions, drives: bool = True) -> Iterator[Served]:
+    """Serve a world; it runs unless `drives` is false, as then turns are the caller's."""
+    with ExitStack() as stack:
+        stack.callback(env.close)
+        map_bytes = map_message(env.network)
+        origin = np.array(unpack(map_bytes)[0]["origin"])
+        audience = Audience()
+        run = ShownRun(env, load_policy("idm", env), audience, FrameEncoder(origin), seed=1)
+        hello = hello_of(env, origin, "idm")
+        server = stack.enter_context(WebServer(options, audience, hello, map_bytes))
+        over = threading.Event()
+        if drives:
+            thread = threading.Thread(target=_drive, args=(run, over))
+            thread.start()
+            stack.callback(thread.join)
+            stack.callback(over.set)
+        yield Served(run, audience, server, map_bytes)
+
+
+def _drive(run: ShownRun, over: threading.Event) -> None:
+    while not over.is_set():
+        run.turn()
+
+
+@pytest.fixture
+def serve() -> Iterator[Callable[..., Served]]:
+    """Serves worlds until the test ends."""
+    with ExitStack() as stack:
+
+        def begin(
+            *,
+            env: str = "grid4x4",
+            zones: int = 4,
+            background: int = 20,
+            options: WebOptions | None = None,
+            drives: bool = True,
+        ) -> Served:
+            made = parallel_env(env, zones=zones, agents=3, background=background)
+            return stack.enter_context(served(made, options or WebOptions(port=0), drives))
+
+        yield begin

@@ -1,0 +1,146 @@
+"""The page in a real browser: it draws, asks, tells no other host, and takes names as text."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from cavmarl.viewer.web_options import WebOptions
+from tests.support.chromium import chromium, until
+from tests.viewer.conftest import Served
+
+Serve = Callable[..., Served]
+WITHOUT_WEBGL2 = """
+const real = HTMLCanvasElement.prototype.getContext;
+HTMLCanvasElement.prototype.getContext = function (kind, ...more) {
+  return kind === "webgl2" ? null : real.call(this, kind, ...more);
+};
+"""
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as found:
+        yield found
+
+
+def opened(browser: Any, served: Served, script: str = "") -> tuple[Any, list[str], set[str]]:
+    """A page that shows a first frame; its complaints, and the hosts that it has asked."""
+    page = browser.new_page(viewport={"width": 1280, "height": 760})
+    problems: list[str] = []
+    hosts: set[str] = set()
+    page.on("pageerror", lambda error: problems.append(str(error)))
+    page.on("console", lambda message: problems.append(message.text))
+    page.on("request", lambda request: hosts.add(request.url.split("/")[2]))
+    if script:
+        page.add_init_script(script)
+    page.goto(served.server.address)
+    until(page, "window.viewer && viewer.frame")
+    return page, problems, hosts
+
+
+def test_the_page_draws_follows_and_asks_no_other_host(browser: Any, serve: Serve) -> None:
+    served = serve()
+    page, problems, hosts = opened(browser, served)
+    until(page, "viewer.firstPicture > 0")
+    assert page.evaluate("viewer.frame.count") >= 3
+    assert page.evaluate("viewer.calls") <= 10  # layers
+    page.fill("#wanted", "car_1")
+    page.press("#wanted", "Enter")
+    until(page, "document.querySelector('#observation').rows.length > 5")
+    assert "car_1" in page.inner_text("#vehicle-name")
+    assert page.get_attribute("#follow", "aria-pressed") == "true"
+    page.focus("#scene")
+    page.keyboard.press("Space")
+    until(page, "viewer.live.paused")
+    tick = page.evaluate("viewer.live.tick")
+    page.keyboard.press(".")
+    until(page, f"viewer.live.tick > {tick}")
+    page.select_option("#ghosts", "1")
+    until(page, "viewer.frame.ghosts.has(1)")
+    page.evaluate("document.querySelector('#past').value = 0")
+    page.dispatch_event("#past", "input")
+    assert "looking back" in page.inner_text("#status")
+    page.click("#live")
+    assert not problems
+    assert hosts == {f"127.0.0.1:{served.server.port}"}
+
+
+def test_a_seat_is_driven_with_the_arrow_keys(browser: Any, serve: Serve) -> None:
+    served = serve()
+    page, problems, _ = opened(browser, served)
+    page.fill("#wanted", "car_0")
+    page.press("#wanted", "Enter")
+    page.click("#seat")
+    page.keyboard.down("ArrowUp")
+    page.keyboard.down("ArrowLeft")
+    page.wait_for_timeout(600)
+    (driven,) = served.run._driving.values()
+    assert served.run._seats.keys() == {0}
+    assert driven[1] == 1.0
+    assert driven[2] > 0.3
+    page.keyboard.up("ArrowUp")
+    page.keyboard.press("Escape")
+    page.wait_for_timeout(400)
+    assert not served.run._seats
+    assert not problems
+
+
+def test_every_control_has_a_name(browser: Any, serve: Serve) -> None:
+    page, _, _ = opened(browser, serve())
+    unnamed = page.evaluate(
+        """[...document.querySelectorAll('button, input, select')].filter((one) =>
+        !one.textContent.trim() && !one.getAttribute('aria-label') && !one.labels?.length)
+        .map((one) => one.id)"""
+    )
+    assert unnamed == []
+    assert page.evaluate("document.documentElement.lang") == "en"
+
+
+def test_names_of_maps_are_text(browser: Any, serve: Serve) -> None:
+    nasty = "<script>alert(1)</script><img src=x onerror=alert(1)>"
+    served = serve()
+    network = served.run._env.network
+    object.__setattr__(network, "lane_ids", (nasty,) * len(network.lane_ids))
+    page, problems, _ = opened(browser, served)
+    page.on("dialog", lambda dialog: problems.append(dialog.message))
+    page.fill("#wanted", "car_0")
+    page.press("#wanted", "Enter")
+    until(page, "document.querySelector('#state').rows.length > 5")
+    assert nasty in page.inner_text("#state")
+    assert page.evaluate("document.querySelectorAll('#state script, #state img').length") == 0
+    assert not problems
+
+
+def test_without_webgl2_there_are_words_and_a_still_picture(browser: Any, serve: Serve) -> None:
+    page, problems, _ = opened(browser, serve(), WITHOUT_WEBGL2)
+    until(page, "viewer.stillDrawn > 0")
+    assert "no WebGL2" in page.inner_text("#notice")
+    colors = page.evaluate(
+        """(() => { const c = document.querySelector('#scene');
+        const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;
+        const seen = new Set(); for (let k = 0; k < d.length; k += 4)
+        seen.add(`${d[k]},${d[k + 1]},${d[k + 2]}`); return seen.size; })()"""
+    )
+    assert colors > 3
+    assert not problems
+
+
+def test_a_token_is_asked_for(browser: Any, serve: Serve) -> None:
+    served = serve(options=WebOptions(port=0, token="open sesame"))
+    page = browser.new_page()
+    page.goto(served.server.address)
+    page.wait_for_selector("#token-box[open]")
+    page.fill("#token", "open sesame")
+    page.press("#token", "Enter")
+    until(page, "viewer.frame")
+    assert "open" not in page.url
+
+
+@pytest.mark.parametrize("width", [360])
+def test_a_small_screen_does_not_scroll_sideways(browser: Any, serve: Serve, width: int) -> None:
+    page, _, _ = opened(browser, serve())
+    page.set_viewport_size({"width": width, "height": 640})
+    assert page.evaluate("document.documentElement.scrollWidth") <= width

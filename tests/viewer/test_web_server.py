@@ -1,0 +1,304 @@
+"""The viewer's server: headers, origins, tokens, slow and rude watchers, a taken port."""
+
+from __future__ import annotations
+
+import json
+import socket
+import struct
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from typing import Any
+
+import httpx
+import pytest
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import ClientConnection, connect
+
+from cavmarl.core.errors import ServiceError
+from cavmarl.env.parallel import parallel_env
+from cavmarl.viewer.audience import Audience
+from cavmarl.viewer.frame_messages import Change, Publication
+from cavmarl.viewer.map_geometry import unpack
+from cavmarl.viewer.show_world import show_world
+from cavmarl.viewer.web_options import WebOptions
+from cavmarl.viewer.web_server import PAGE, POLICY, WebServer
+from tests.viewer.conftest import Served
+
+Serve = Callable[..., Served]
+
+
+HANDSHAKE = "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+
+
+def live(server: WebServer, headers: dict[str, str] | None = None) -> Any:
+    address = server.address.replace("http", "ws") + "live"
+    return connect(address, max_size=2**24, additional_headers=headers)
+
+
+@contextmanager
+def welcome(server: WebServer, token: str = "") -> Iterator[ClientConnection]:
+    with live(server) as client:
+        client.send(json.dumps({"kind": "hello", "token": token}))
+        yield client
+
+
+def first_of(client: ClientConnection, kind: int | str) -> Any:
+    """The next message of a kind, a number or a name."""
+    end = time.monotonic() + 20.0
+    while time.monotonic() < end:
+        message = client.recv(timeout=20.0)
+        if isinstance(message, str):
+            told = json.loads(message)
+            if told["kind"] == kind:
+                return told
+        elif message[0] == kind:
+            return message
+    raise AssertionError(f"no message {kind}")
+
+
+def ended_with(client: ClientConnection) -> tuple[int | None, str]:
+    try:
+        while True:
+            client.recv(timeout=20.0)
+    except ConnectionClosed:
+        return client.close_code, client.close_reason or ""
+
+
+def test_a_page_is_told_the_world_the_map_and_frames(serve: Serve) -> None:
+    served = serve()
+    with welcome(served.server) as client:
+        hello = first_of(client, "hello")
+        assert hello["title"] == "grid4x4"
+        assert len(hello["zones"]) == 4
+        assert first_of(client, 1) == served.map_bytes
+        assert first_of(client, 2)[1] == 1  # a whole roster
+        ticks = [struct.unpack_from("<I", first_of(client, 3), 16)[0] for _ in range(3)]
+        assert ticks == sorted(set(ticks))
+
+
+def test_requests_reach_the_world(serve: Serve) -> None:
+    served = serve()
+    with welcome(served.server) as client:
+        first_of(client, 3)
+        client.send('{"kind": "pause"}')
+        while first_of(client, 3)[1] != 1:
+            pass
+        steps = served.run.steps
+        client.send('{"kind": "step"}')
+        first_of(client, 3)
+        assert served.run.steps == steps + 1
+        client.send('{"kind": "watch", "number": 0}')
+        told = first_of(client, "vehicle")
+        assert told["here"]
+        rows = dict(told["rows"])
+        assert rows["agent"] == "car_0"
+        assert [name for name, _ in told["terms"]] == list(served.run._env.config.terms.names)
+        assert len(told["observation"]) == served.run._env.observation_space("car_0").shape[0]
+        client.send('{"kind": "watch", "number": 99999}')
+        assert first_of(client, "vehicle") == {
+            "kind": "vehicle", "id": 99999, "here": False, "rows": [],
+        }  # fmt: skip
+        client.send('{"kind": "ghosts", "number": 1}')
+        while struct.unpack_from("<I", first_of(client, 3), 32)[0] != 1:
+            pass
+
+
+def test_a_seat_is_driven_by_one_page_and_given_back(serve: Serve) -> None:
+    served = serve(drives=False)
+    run = served.run
+    with welcome(served.server) as one, welcome(served.server) as other:
+        for client, number in ((one, 1), (other, 2)):
+            first_of(client, 1)
+            client.send('{"kind": "seat", "number": 0}')
+            turns_until(served, lambda: bool(run._seats))
+            told = first_of_turning(served, client)
+            assert (told["agent"], bool(told["reason"])) == ((0, False), (None, True))[number - 1]
+        one.send('{"kind": "drive", "throttle": 1.0, "steering": 0.5}')
+        turns_until(served, lambda: bool(run._driving))
+        watcher = run._seats[0]
+        assert run._driving[watcher][1:] == (1.0, 0.5)
+        actions: dict[str, Any] = {"car_0": None, "car_1": None}
+        run._take_seats(actions)
+        assert actions["car_0"].tolist() == [1.0, 0.5]
+        assert actions["car_1"] is None
+    turns_until(served, lambda: not run._seats)
+
+
+def turns_until(served: Served, is_so: Callable[[], bool]) -> None:
+    end = time.monotonic() + 20.0
+    while not is_so() and time.monotonic() < end:
+        served.run.turn()
+    assert is_so()
+
+
+def first_of_turning(served: Served, client: ClientConnection) -> Any:
+    for _ in range(10):
+        served.run.turn()
+    return first_of(client, "seat")
+
+
+@pytest.mark.parametrize("path", ["", "main.js", "viewer.css", "icon.svg", "nothing", "../app.py"])
+def test_all_answers_have_the_headers(serve: Serve, path: str) -> None:
+    served = serve(drives=False)
+    answer = httpx.get(served.server.address + path)
+    assert answer.status_code == (200 if (PAGE / (path or "index.html")).is_file() and
+                                  ".." not in path else 404)  # fmt: skip
+    assert answer.headers["content-security-policy"] == POLICY
+    assert "unsafe" not in POLICY
+    assert answer.headers["x-content-type-options"] == "nosniff"
+    assert answer.headers["referrer-policy"] == "no-referrer"
+    assert answer.headers["cache-control"] == "no-store"
+    assert "server" not in answer.headers
+
+
+def test_the_page_holds_nothing_that_its_policy_forbids() -> None:
+    for file in PAGE.iterdir():
+        text = file.read_text(encoding="utf-8")
+        assert "innerHTML" not in text
+        assert "insertAdjacentHTML" not in text
+        assert "eval(" not in text
+        assert " style=" not in text
+        assert " onclick=" not in text
+        assert "https://" not in text
+        assert text.count("\n") <= 560, f"{file.name}: divide it"
+
+
+def test_foreign_origins_and_names_are_refused(serve: Serve) -> None:
+    served = serve(drives=False)
+    port = served.server.port
+    for headers in (
+        {"Origin": "http://evil.example"},
+        {"Origin": "null"},
+        {"Origin": f"http://localhost:{port}"},  # of this machine, but not the page's
+        {"Host": f"evil.example:{port}", "Origin": f"http://evil.example:{port}"},
+    ):
+        assert status_of_handshake(port, headers) == 403
+    host = {"Host": f"evil.example:{port}"}
+    assert httpx.get(served.server.address, headers=host).status_code == 403
+    own = {"Origin": f"http://127.0.0.1:{port}"}
+    with live(served.server, headers=own) as client:
+        client.send("{}")
+        assert first_of(client, "hello")
+
+
+def status_of_handshake(port: int, headers: dict[str, str]) -> int:
+    fields = {"Host": f"127.0.0.1:{port}", **headers}
+    lines = "".join(f"{name}: {value}\r\n" for name, value in fields.items())
+    with socket.create_connection(("127.0.0.1", port), timeout=10.0) as peer:
+        peer.sendall(
+            f"GET /live HTTP/1.1\r\n{lines}Upgrade: websocket\r\nConnection: Upgrade\r\n"
+            f"{HANDSHAKE}".encode()
+        )
+        status = int(peer.recv(4096).split()[1])
+    return status
+
+
+def test_a_token_is_needed_where_there_is_one(serve: Serve) -> None:
+    served = serve(drives=False, options=WebOptions(port=0, token="a secret"))
+    with welcome(served.server) as client:
+        assert ended_with(client) == (4401, "a token is needed")
+    with welcome(served.server, "another") as client:
+        assert ended_with(client) == (4401, "wrong token")
+    assert served.audience.wishes.watchers == 0
+    with welcome(served.server, "a secret") as client:
+        assert first_of(client, "hello")
+
+
+def test_other_machines_are_only_served_with_a_token() -> None:
+    with pytest.raises(ServiceError, match=r"--host 0\.0\.0\.0: others can reach it; give a --to"):
+        WebServer(WebOptions(host="0.0.0.0", port=0), Audience(), {}, b"")
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("nonsense", "no JSON"),
+        ("[1]", "a list"),
+        ('{"kind": "fly"}', "'fly'"),
+        ('{"kind": "watch", "number": -1}', "whole number"),
+        ('{"kind": "watch", "number": true}', "whole number"),
+        ('{"kind": "pace", "number": 1e9}', "from 0 to 1000"),
+        ('{"kind": "drive", "throttle": 1, "steering": NaN}', "from -1 to 1"),
+        ('{"kind": "drive", "throttle": "full"}', "must be a number"),
+    ],
+)
+def test_what_is_not_understood_ends_the_connection(serve: Serve, text: str, reason: str) -> None:
+    served = serve(drives=False)
+    with welcome(served.server) as client:
+        first_of(client, 1)
+        client.send(text)
+        code, why = ended_with(client)
+        assert code == 1003
+        assert reason in why
+
+
+def test_a_page_that_may_only_watch_changes_nothing(serve: Serve) -> None:
+    served = serve(options=WebOptions(port=0, control=False))
+    with welcome(served.server) as client:
+        assert first_of(client, "hello")["control"] is False
+        for kind in ("pause", "reset", "step"):
+            client.send(json.dumps({"kind": kind}))
+        for _ in range(4):
+            assert first_of(client, 3)[1] == 0
+
+
+def test_a_watcher_that_reads_nothing_is_dropped_and_the_world_goes_on(serve: Serve) -> None:
+    served = serve(options=WebOptions(port=0, send_s=0.5), drives=False)
+    served.run._pace = 0.0
+    large = Publication(b"\x03" + bytes(2**20), (Change(1, b""),))
+    with closing(socket.socket()) as peer:
+        peer.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        peer.connect(("127.0.0.1", served.server.port))
+        peer.sendall(
+            f"GET /live HTTP/1.1\r\nHost: 127.0.0.1:{served.server.port}\r\n"
+            f"Upgrade: websocket\r\nConnection: Upgrade\r\n{HANDSHAKE}".encode()
+        )
+        assert b"101" in peer.recv(512)
+        peer.sendall(b"\x81\x82\x00\x00\x00\x00{}")
+        turns_until(served, lambda: served.audience.wishes.watchers == 1)
+        steps = served.run.steps
+        end = time.monotonic() + 30.0
+        while not served.audience.dropped and time.monotonic() < end:
+            served.audience.publish(large)
+            served.run.turn()
+            time.sleep(0.02)
+        assert served.audience.dropped == 1
+        assert served.run.steps > steps
+        turns_until(served, lambda: served.audience.wishes.watchers == 0)
+
+
+def test_a_world_that_nobody_watches_publishes_nothing(serve: Serve) -> None:
+    served = serve(drives=False)
+    served.run._pace = 0.0
+    for _ in range(30):
+        served.run.turn()
+    assert (served.run.steps, served.run.published) == (30, 0)
+
+
+def test_frames_are_published_no_more_often_than_20_times_a_second(serve: Serve) -> None:
+    served = serve(drives=False)
+    served.run._pace = 0.0
+    with welcome(served.server) as client:
+        first_of(client, 1)
+        begun = time.monotonic()
+        while time.monotonic() - begun < 1.0:
+            served.run.turn()
+        took = time.monotonic() - begun
+    assert 2 <= served.run.published <= 20 * took + 1
+    assert served.run.steps > served.run.published
+
+
+def test_two_servers_on_one_port_are_a_typed_error(serve: Serve) -> None:
+    served = serve(drives=False)
+    env = parallel_env("ring", agents=1, background=0)
+    with pytest.raises(ServiceError, match="Address already in use; give another --port"):
+        show_world(env, "idm", 0, WebOptions(port=served.server.port), lambda _: None, 1.0)
+
+
+def test_the_head_of_a_map_names_its_sections(serve: Serve) -> None:
+    head, sections = unpack(serve(drives=False).map_bytes)
+    assert head["name"]
+    ends = [start for start, _ in head["sections"].values()]
+    assert ends == sorted(ends)
+    assert len(sections) >= ends[-1]
