@@ -152,7 +152,8 @@ def cross(
     return Cross(tuple(policies), tables)
 
 
-_WORLD_KEYS = ("environment", "map_content_sha256", "demand_content_sha256")
+# The map by its file: how it is read may change, and then the driving shows it.
+_WORLD_KEYS = ("environment", "map_source_sha256", "demand_content_sha256")
 _KEYS = ("agents", "background", "max_cycles", "seed", "overrides")
 
 

@@ -88,6 +88,7 @@ def look_and_switch(network: RoadNetwork, worlds: Worlds, step_s: float) -> None
     detect(*places, worlds.rows, worlds.num_owned, worlds.ticks, step_s, worlds.detected_s)
     switch_signals(
         network.arrays,
+        worlds.keys,
         worlds.ticks,
         worlds.detected_s,
         step_s,

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig, ZonesConfig
 from cavmarl.config.registry import load_config
@@ -21,13 +19,6 @@ from cavmarl.roads.horizon import horizon_of
 from cavmarl.zones.partition.zone_file import write_zones
 from cavmarl.zones.partition.zone_layouts import cut_map
 from tests.support.netgenerate import netgenerate
-
-
-class Of(NamedTuple):
-    """What a horizon is taken from."""
-
-    lanes: NDArray[np.void]
-    extent_m: tuple[float, float, float, float]
 
 
 @pytest.fixture(scope="module")
@@ -80,8 +71,13 @@ def test_a_horizon_that_is_stated_wins(grid: Path) -> None:
 
 def test_a_horizon_by_the_map_is_from_one_to_fifteen_minutes(grid: Path) -> None:
     network = load_network(grid)
-    for extent_m, horizon_s in (((0, 0, 50, 50), 60.0), ((0, 0, 9e3, 9e3), 900.0)):
-        assert horizon_of(Of(network.lanes, extent_m)) == horizon_s  # type: ignore[arg-type]
+    for side_m, horizon_s in ((50.0, 60.0), (9e3, 900.0)):
+        lanes = network.lanes.copy()
+        for field in ("min_x", "min_y"):
+            lanes[field] = 0.0
+        for field in ("max_x", "max_y"):
+            lanes[field] = side_m
+        assert horizon_of(replace(network, lanes=lanes)) == horizon_s
 
 
 def test_each_process_and_episode_has_the_horizon_of_the_map(grid: Path) -> None:

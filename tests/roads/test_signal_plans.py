@@ -70,6 +70,7 @@ def states(
         )
         switch_signals(
             network.arrays,
+            worlds.keys,
             worlds.ticks,
             worlds.detected_s,
             dt,

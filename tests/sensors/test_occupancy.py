@@ -96,7 +96,7 @@ def test_near_lanes_draw_what_all_lanes_draw(name: str) -> None:
         rows = on_lane(roads, int(lane), 0.3 * float(roads.lanes["length_m"][lane]))
         drawn = []
         for lane_grid in (routing.lane_grid(roads), highway.everywhere(roads.arrays)):
-            sensor = occupancy_grid.settings(settings, 0, roads, np.zeros((1, 2)))
+            sensor = occupancy_grid.settings(settings, 0, roads, np.zeros((1, 1, 2)))
             out = np.zeros(121, np.float32)
             observe_occupancy(roads.arrays, lane_grid, rows, 0, highway.grid_of(rows), sensor, out)
             drawn.append(out)
