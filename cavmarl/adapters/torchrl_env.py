@@ -124,10 +124,10 @@ class CavTorchRLEnv(OwnWorlds, EnvBase):  # type: ignore[misc] # TorchRL is not 
         else:
             mask = chosen.reshape(-1).cpu().numpy()
             observations, infos = self._vec.reset(options={"reset_mask": mask})
-        nobody = np.zeros_like(infos["mask"])
-        everywhere = np.zeros(len(nobody), dtype=np.bool_)
+        none = np.zeros_like(infos["mask"])
+        everywhere = np.zeros(len(none), dtype=np.bool_)
         return self._tensors(
-            self._agents(observations, infos["mask"], self._no_terms) | _ends(nobody, nobody),
+            self._agents(observations, infos["mask"], self._no_terms) | _ends(none, none),
             _ends(everywhere, everywhere),
         )
 

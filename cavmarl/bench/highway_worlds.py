@@ -1,7 +1,7 @@
 """The same road with the same vehicles on both sides of a comparison: ours and highway-env's.
 
 N controlled vehicles stand on a straight road of four lanes, as densely as highway-env sets them
-out; nobody else is on the road. All keep to the meta-action IDLE, at 20 Hz with 10 decisions a
+out; the road is else empty. All keep to the meta-action IDLE, at 20 Hz with 10 decisions a
 second.
 """
 

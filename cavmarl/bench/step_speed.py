@@ -59,7 +59,7 @@ class Row:
     """One way to step one kind of world."""
 
     sensors: str  # `lidar` (and neighbours) or `kinematics`
-    who: str  # `batched`, `single`, `dicts`, `more`, `highway_env` or `highway_env_raw`
+    side: str  # `batched`, `single`, `dicts`, `more`, `highway_env` or `highway_env_raw`
     agents: int  # controlled vehicles a world
     worlds: int  # stepped together
     low: float  # agent-steps a second, the slowest turn
@@ -94,7 +94,7 @@ def measure_step_speed(
     require("highway_env", "highway")
     with one_core(), tempfile.TemporaryDirectory() as folder:
         progress("making highway-env's worlds")
-        theirs = {(sensors, who): highway_env(agents, seen) for sensors, who, seen in THEIRS}
+        theirs = {(sensors, side): highway_env(agents, seen) for sensors, side, seen in THEIRS}
         road_m = max(map(length_m, theirs.values()))
         progress("making our worlds on that road")
         sides = _our_sides(Path(folder), road_m, agents, worlds)
@@ -102,14 +102,14 @@ def measure_step_speed(
             sides[key] = (agents, 1, partial(_their_rate, env, agents))
         turns = take_turns({key: rate for key, (_, _, rate) in sides.items()}, repeats, progress)
     rows = []
-    for (sensors, who), (count, together, _) in sides.items():
-        rates = spread(turns[sensors, who])
-        rows.append(Row(sensors, who, count, together, rates.low, rates.median, rates.high))
+    for (sensors, side), (count, together, _) in sides.items():
+        rates = spread(turns[sensors, side])
+        rows.append(Row(sensors, side, count, together, rates.low, rates.median, rates.high))
     return _compare(road_m, repeats, rows)
 
 
 def _compare(road_m: float, repeats: int, rows: list[Row]) -> StepSpeed:
-    found = {(row.sensors, row.who): row for row in rows}
+    found = {(row.sensors, row.side): row for row in rows}
 
     def ratio(sensors: str, one: str, other: str) -> float:
         return found[sensors, one].median / found[sensors, other].median
@@ -132,7 +132,7 @@ def _our_sides(
 ) -> dict[tuple[str, str], tuple[int, int, Callable[[], float]]]:
     """Agents, worlds and rate of each of ours, stepped twice before anything is measured."""
     sides: dict[tuple[str, str], tuple[int, int, Callable[[], float]]] = {}
-    for sensors, who, times, is_batched in OURS:
+    for sensors, side, times, is_batched in OURS:
         count, together = times * agents, worlds if is_batched else 1
         vec = make_vec(
             straight_road(folder, road_m * times),
@@ -142,7 +142,7 @@ def _our_sides(
             overrides=overrides(LIDAR if sensors == "lidar" else KINEMATICS, count),
         )
         _batched_rate(vec, 2)
-        sides[sensors, who] = (count, together, partial(_batched_rate, vec))
+        sides[sensors, side] = (count, together, partial(_batched_rate, vec))
     road = straight_road(folder, road_m)
     env = parallel_env(road, agents=agents, background=0, overrides=overrides(KINEMATICS, agents))
     _dicts_rate(env, 2)

@@ -71,7 +71,7 @@ OUR_SENSORS: dict[str, Any] = {
 class TrainingRow:
     """One side."""
 
-    who: str  # `cavmarl` or `stable_baselines3`; `cavmarl_recipe` with what we learn best with
+    name: str  # `cavmarl` or `stable_baselines3`; `cavmarl_recipe` with what we learn best with
     worlds: int  # stepped together
     decisions: int  # of an update
     rates: tuple[float, ...]  # agent-steps a second of each turn: one update, learning among it
@@ -99,7 +99,7 @@ class TrainingSpeed(Result):
     @property
     def recipe_rate(self) -> float:
         """Agent-steps a second of our own recipe; median of the turns."""
-        (row,) = (row for row in self.end_to_end if row.who == "cavmarl_recipe")
+        (row,) = (row for row in self.end_to_end if row.name == "cavmarl_recipe")
         return median(row.rates)
 
     @property
@@ -107,7 +107,7 @@ class TrainingSpeed(Result):
         return self.workers > (self.hardware["usable_cores"] or 1)
 
     def _over(self, one: str, other: str) -> float:
-        rates = {row.who: row.rates for row in self.end_to_end}
+        rates = {row.name: row.rates for row in self.end_to_end}
         return paired_ratio(rates[one], rates[other])
 
     def to_dict(self) -> dict[str, Any]:
@@ -155,7 +155,7 @@ def measure_training(
         stepping = []
         for turn in range(repeats + 1):
             for side in sides:
-                say(f"update {turn} of {repeats}: {side.who}")
+                say(f"update {turn} of {repeats}: {side.name}")
                 side.update(counts=turn > 0)
             stepping.append(_stepping(plain))
         found = tuple(side.row() for side in sides)
@@ -219,8 +219,8 @@ class _Side:
     `update` collects and learns; it returns decisions and seconds by phase.
     """
 
-    def __init__(self, who: str, worlds: int, update: Callable[[], _Update]) -> None:
-        self.who = who
+    def __init__(self, name: str, worlds: int, update: Callable[[], _Update]) -> None:
+        self.name = name
         self._worlds = worlds
         self._update = update
         self._decisions: list[int] = []
@@ -239,10 +239,10 @@ class _Side:
         total_s = sum(self._spent_s.values())
         shares = {phase: seconds / total_s for phase, seconds in self._spent_s.items()}
         decisions = sum(self._decisions) // len(self._decisions)
-        return TrainingRow(self.who, self._worlds, decisions, tuple(self._rates), shares)
+        return TrainingRow(self.name, self._worlds, decisions, tuple(self._rates), shares)
 
 
-def _ours(who: str, run: Any) -> _Side:
+def _ours(name: str, run: Any) -> _Side:
     phases = training_program().PHASES
 
     def update() -> _Update:
@@ -250,7 +250,7 @@ def _ours(who: str, run: Any) -> _Side:
         row = run.update()
         return run.agent_steps - before, {phase: row[f"{phase}_s"] for phase in phases}
 
-    return _Side(who, run.args.num_envs, update)
+    return _Side(name, run.args.num_envs, update)
 
 
 def _theirs(rows: HighwayRows, worlds: int, num_steps: int) -> _Side:

@@ -14,7 +14,7 @@ from cavmarl.cli.output import about
 from cavmarl.cli.service import Authority, Certificate, Key, SecretFile, read_secret
 from cavmarl.core.errors import ConfigError, WorkerError, require
 
-AGAIN_S = 0.5  # between two calls while nobody listens
+AGAIN_S = 0.5  # between two calls while no caller listens
 
 
 def node(

@@ -199,13 +199,12 @@ class WorkersConfig(Section, key="workers"):
             perfect division
             would, nothing moves.
         max_moves: worlds or zones that change their worker in one round.
-        monitor_cpu: see how busy others keep the workers' cores, and give nothing more to workers
-            above
-            a threshold; without it nobody else is supposed to use them.
+        monitor_cpu: see how busy others keep the workers' cores, and give nothing more to
+            workers above a threshold; without it the cores are taken to be free.
         sensors: processes that the sensors of `rig` are shared out over, for each process that
             keeps the state of worlds; 0: it senses itself. Results do not depend on it. See
             docs/sensor_workers.md.
-        sensor_placement: who of them senses what: by what it `cost` of late, or `in_turn`.
+        sensor_placement: which of them senses what: by what it `cost` of late, or `in_turn`.
         join_timeout_s: for so long is waited for zone nodes to join; see docs/nodes.md.
         key_file: with the key that nodes started by hand have to know; relative to the environment.
     """
@@ -225,16 +224,16 @@ class WorkersConfig(Section, key="workers"):
 
 @dataclass(frozen=True)
 class PopulationConfig(Section, key="population"):
-    """Who is in the world.
+    """The vehicles of a world.
 
     Attributes:
-        mode: `closed`: all enter at reset, nobody later. `entering`: agents also enter during the
-            episode, every id once, `budget` in all. `seats`: `agents` fixed ids; when a seat's
-            vehicle ends, the seat gets a new one.
+        mode: `closed`: all agents enter at reset. `open`: agents also enter during the episode,
+            each id once, `budget` in all. `respawn`: `agents` fixed ids; when the vehicle of one
+            ends, the id gets a new vehicle.
         agents: vehicles driven by policies at any one time.
         background: vehicles driven by the built-in drivers. In `closed` worlds they are placed at
             reset; else each arrival orders a new departure, so that their number holds.
-        budget: how many agents may enter in one episode of an `entering` world (default 4 ·
+        budget: how many agents may enter in one episode of an `open` world (default 4 ·
             agents); the other modes do not read it.
     """
 
@@ -265,8 +264,8 @@ class TrafficConfig(Section, key="traffic"):
     """Where departures come from.
 
     Attributes:
-        source: who the demand files are for. `native`: they are read here. `sumo-demand`: SUMO says
-            who departs when and on which route, and what signals show; our drivers drive.
+        source: what reads the demand files. `native`: cavmarl. `sumo-demand`: SUMO says which
+            vehicle departs when and on which route, and what signals show; our drivers drive.
             `sumo-traffic`: SUMO moves its vehicles, too. The generator's drive beside them.
         demand: SUMO files of vehicles, flows, routes and types (`.rou.xml`, `.add.xml`,
             `.sumocfg`): named as `map.source`; their vehicles drive beside the generator's.
@@ -454,7 +453,7 @@ class EnvConfig(Section, key=""):
         object.__setattr__(self, "sensors", self.sensors.without_sight())
 
     def _check_messages(self) -> None:
-        """Refuse to observe messages that nobody keeps."""
+        """Refuse to observe messages that are not kept."""
         kept = {"objects": self.v2x.inbox.objects, "events": self.v2x.inbox.events}
         for name, most in kept.items():
             key, count = f"sensors.messages.{name}", getattr(self.sensors.messages, name)
@@ -501,7 +500,7 @@ class EnvConfig(Section, key=""):
                 not timed,
                 key,
                 True,
-                f"traffic.source = {source}: nobody knows when SUMO's signals change; set it false",
+                f"traffic.source = {source}: when SUMO's signals change is not known; set it false",
             )
         self.need(
             "scenario.name",

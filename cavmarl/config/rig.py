@@ -31,7 +31,7 @@ _NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 
 
 class ByType:
-    """Tells the classes of a union apart by their `type`, for whoever validates with pydantic."""
+    """Tells the classes of a union apart by their `type`, for validation by pydantic."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         from pydantic import Field  # slow to import
@@ -382,7 +382,7 @@ class LaneBoundaryConfig(SampledConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class CollisionConfig(MountedConfig):
-    """What happens to the vehicle, when it happens: EVENT_* bits, and whom it hit (-1: nobody)."""
+    """What happens to the vehicle, and when: EVENT_* bits, and the vehicle hit (-1: none)."""
 
     type: Literal["collision"] = "collision"
     units: ClassVar[tuple[str, ...]] = ("bits", "id")

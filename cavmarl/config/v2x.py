@@ -1,4 +1,4 @@
-"""The keys under `v2x` of `env.yaml`: who tells whom what over the air, and how much of it arrives.
+"""The keys under `v2x` of `env.yaml`: which messages are sent, and how many of them arrive.
 
 Everything is off by default, and the channel is ideal: each of its effects is off at 0.
 """
@@ -104,7 +104,7 @@ class ChannelConfig(Section, key="v2x.channel"):
         building_db: lost where a building stands in the line of sight; 0: they do not matter.
         data_rate_mbps: what the air can carry; 0: any amount.
         packet_bytes: length of a packet.
-        external: a network simulator, connected to the bus, says who receives what.
+        external: a network simulator, connected to the bus, says which receiver gets which message.
     """
 
     range_m: Annotated[float, Within(0.0, 1e6)] = 0.0

@@ -194,7 +194,7 @@ class WorkerDeathError(WorkerError):
     def __init__(self, worker: int, part: str, order: int, what: str, causes: list[str]) -> None:
         super().__init__(
             f"worker {worker} ({part}) could not do its {what} (order {order}): {len(causes)} "
-            f"processes died of it ({', '.join(causes)}). SIGKILL is sent by somebody, or by the "
+            f"processes died of it ({', '.join(causes)}). SIGKILL is sent by a user, or by the "
             "system when memory runs out; what a process prints stands on standard error; "
             "workers=0 runs the same in this process"
         )

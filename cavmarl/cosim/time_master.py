@@ -151,7 +151,7 @@ class ClockEvent(NamedTuple):
     tick: int  # the master's when it was noticed
     # `own_tick`: a follower wanted to tick; `drift`: a world is not where its master left it
     kind: Literal["own_tick", "drift"]
-    who: str  # name of the follower; unknown for a drift
+    follower: str  # its name; unknown for a drift
     ticks: int  # by how many the world has gone on, or would have
 
 

@@ -66,7 +66,7 @@ class WorldViews:
         for part in self._tick.attached:
             if isinstance(part, Messaging):
                 return part.bus
-        raise ConfigError("nobody says anything here: set v2x.enabled to true")
+        raise ConfigError("no messages are sent here: set v2x.enabled to true")
 
     @property
     def gate(self) -> Gate:

@@ -242,15 +242,15 @@ class ActionDecoder:
             return array if array.dtype == np.int64 else None
         return None
 
-    def _as_numbers(self, value: Any, who: str) -> NDArray[Any]:
+    def _as_numbers(self, value: Any, name: str) -> NDArray[Any]:
         """An array of a dtype that loses nothing when it is cast; refuses what is none."""
         kind = "numbers" if self._continuous else "whole numbers"
         try:
             array = np.asarray(value)
         except ValueError as error:
-            raise ActionError(f"{who}: no array of {kind}: {error}") from error
+            raise ActionError(f"{name}: no array of {kind}: {error}") from error
         if array.dtype.kind not in ("fiu" if self._continuous else "iu"):
-            raise ActionError(f"{who}: dtype {array.dtype} given, {kind} needed")
+            raise ActionError(f"{name}: dtype {array.dtype} given, {kind} needed")
         if array.dtype == np.uint64:
             # Cast to int64 the largest ones would wrap around.
             array = np.minimum(array, np.uint64(np.iinfo(np.int64).max)).astype(np.int64)

@@ -33,7 +33,7 @@ class DeclaredEvents:
 
     def declare(self, world: int, agent: int, cause: str) -> None:
         if not self._enabled:
-            raise ConfigError("nobody says anything here: set v2x.enabled to true")
+            raise ConfigError("no messages are sent here: set v2x.enabled to true")
         num_worlds, num_agents = self._causes.shape
         if not (0 <= world < num_worlds and 0 <= agent < num_agents):
             raise ActionError(

@@ -375,7 +375,7 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
 
         Raises:
             ActionError: no such agent, or it has left.
-            ConfigError: no such cause, or nobody says anything in this environment.
+            ConfigError: no such cause, or no messages are sent in this environment.
         """
         if agent not in self.agents:
             raise ActionError(f"declare_event('{agent}', …): it is not in the episode")

@@ -376,7 +376,7 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
 
         Raises:
             ActionError: no such agent.
-            ConfigError: no such cause, or nobody says anything in this environment.
+            ConfigError: no such cause, or no messages are sent in this environment.
         """
         self._events.declare(world, agent, cause)
 

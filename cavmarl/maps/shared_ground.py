@@ -43,7 +43,7 @@ def shared_ground(network: RoadNetwork) -> list[tuple[int, int]]:
 
 
 def stub_lanes(network: RoadNetwork) -> NDArray[np.int64]:
-    """LANE rows of roads of several lanes that are shorter than a car: nobody can change there."""
+    """LANE rows of roads of several lanes that are shorter than a car: too short for changes."""
     edges = network.edges[network.lanes["edge"]]
     stubs = ~network.lanes["internal"] & (edges["num_lanes"] > 1)
     return np.flatnonzero(stubs & (network.lanes["length_m"] < CAR_LENGTH_M))

@@ -119,7 +119,7 @@ class Table:
             moves.append((vehicle, target, epoch, True))
         for vehicle, _ in removed:
             if vehicle not in owners:
-                raise ProtocolError(f"vehicle {vehicle} has left the world, and nobody owned it")
+                raise ProtocolError(f"vehicle {vehicle} has left the world, and no zone owned it")
             zone, epoch = owners.pop(vehicle)
             counts[zone] -= 1
             moves.append((vehicle, zone, epoch, False))

@@ -58,7 +58,7 @@ class RateLimit:
 
 
 class Access:
-    """Who a caller is, as the log says."""
+    """The caller's identity, as the log says."""
 
     def __init__(self, log: EventLog, wall_s: Callable[[], float] = time.time) -> None:
         self._log = log

@@ -35,7 +35,7 @@ class BrokerRules:
     beat_s: float = 1.0  # from beat to beat of a node
     missed_beats: int = 3  # after which a node is down
     lease_s: float = 30.0  # of a session's token; the client asks anew
-    idle_s: float = 600.0  # a session that nobody has asked for ends
+    idle_s: float = 600.0  # an idle session ends
     keep_s: float = 3600.0  # sessions that are over can be read so long
     max_skew_s: float = 5.0  # between the clocks of a node and of the service
     max_nodes: int = 10_000
@@ -155,7 +155,7 @@ class Broker:
         return self._clock_s() - self.live[name].heard_s
 
     def sweep(self) -> None:
-        """Nodes that have missed their beats are down; what nobody asks for ends."""
+        """Nodes that have missed their beats are down; idle sessions end."""
         now_s = self._clock_s()
         for name, node in self.log.state.nodes.items():
             missed = (now_s - self.live[name].heard_s) / self.rules.beat_s
@@ -169,7 +169,7 @@ class Broker:
                     self._forget(session)
             elif session.job is None and idle_s > self.rules.idle_s:
                 self._tell(session, "timeout", {"of": "idle session", "after_s": idle_s})
-                self._end(session, "closed", "service", f"nobody asked for {idle_s:.0f} s")
+                self._end(session, "closed", "service", f"no request for {idle_s:.0f} s")
         self._end_waits()
         self._watch_own_clock()
         self.zone_nodes.sweep()

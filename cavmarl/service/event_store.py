@@ -141,7 +141,7 @@ class EventStore:
         limit: int | None = None,
         *,
         until: int | None = None,  # the last sequence number
-        owner: str | None = None,  # who owns what they are about, or has caused them
+        owner: str | None = None,  # the owner of their subject, or the caller that caused them
         subject: str | None = None,
     ) -> Iterator[LogEvent]:
         """The lines after a sequence number, of all or of some."""

@@ -27,7 +27,7 @@ class NetworkFault(StrEnum):
     DELAY = "delay"  # the next ones come later
     DAMAGE = "damage"  # one bit of the next ones is another
     CUT = "cut"  # the connection ends, maybe in the middle of a frame
-    SILENCE = "silence"  # nothing comes any more, and nobody is told
+    SILENCE = "silence"  # nothing comes any more, without notice
 
 
 class _Connection:

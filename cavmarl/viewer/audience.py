@@ -144,7 +144,7 @@ class Audience:
     def leave(self, watcher: PageWatcher) -> None:
         self._watchers.pop(watcher.number, None)
         self._update()
-        self.ask(watcher, PageRequest("seat"))  # nobody sits in its seat any more
+        self.ask(watcher, PageRequest("seat"))  # its seat is free again
 
     def ask(self, watcher: PageWatcher, request: PageRequest) -> None:
         """Take a request of a page; beyond MAX_REQUESTS they are not kept."""

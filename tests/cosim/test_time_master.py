@@ -98,7 +98,7 @@ def test_followers_come_and_tick_and_go_and_no_trajectory_changes(own_ticks: Own
     assert follower.since_tick == 5
     assert follower.own_ticks == master.own_ticks == 5
     assert master.drift_ticks == 0
-    assert [(event.tick, event.kind, event.who) for event in master.events] == [
+    assert [(event.tick, event.kind, event.follower) for event in master.events] == [
         (tick, "own_tick", "stack") for tick in range(5, 10)
     ]
 

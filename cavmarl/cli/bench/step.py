@@ -55,7 +55,7 @@ def _table(found: StepSpeed) -> Table:
     rows = [
         (
             _SENSORS[row.sensors],
-            _SIDES[row.who],
+            _SIDES[row.side],
             str(row.worlds),
             *(f"{value:,.0f}" for value in (row.agents, row.low, row.median, row.high)),
         )

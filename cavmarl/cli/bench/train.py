@@ -70,4 +70,4 @@ def _table(found: TrainingSpeed) -> Table:
         f"PPO, {found.agents} agents a world, {found.numbers} numbers each, {found.workers} "
         f"workers\n{hardware_line(found.hardware)}"
     )
-    return make_table(title, ("end to end", *(_SIDES[side.who] for side in sides)), rows)
+    return make_table(title, ("end to end", *(_SIDES[side.name] for side in sides)), rows)

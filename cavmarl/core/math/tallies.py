@@ -28,11 +28,11 @@ def occasions(
     num_through: NDArray[np.int64],  # (k, W) vehicles that have arrived in each zone
 ) -> tuple[bool, bool]:
     """Whether a second begins in some world, and whether a vehicle has arrived."""
-    somebody = False
+    has_arrived = False
     for zone in range(num_through.shape[0]):
         for w in range(num_through.shape[1]):
-            somebody |= num_through[zone, w] > 0
-    return begins_second(ticks, ticks_per_s), somebody
+            has_arrived |= num_through[zone, w] > 0
+    return begins_second(ticks, ticks_per_s), has_arrived
 
 
 @kernel

@@ -141,13 +141,13 @@ class FollowedWorld:
         """One cycle; rewards by agent.
 
         Raises:
-            EpisodeError: there is nobody to go on with.
+            EpisodeError: no follower is left to go on with.
             FollowerLostError: a follower has not answered in time; it is let go. The world has gone
                 on by one step, and the next call goes on from there; the same, where a follower has
                 ended.
-            FollowerError: the same, where it has said what nobody understands; the same, where its
-                controls cannot be carried out.
-            ClockError: somebody else has advanced the world.
+            FollowerError: the same, where its words cannot be read, or its controls cannot be
+                carried out.
+            ClockError: another caller has advanced the world.
         """
         if self.is_over:
             raise EpisodeError("the episode is over: call FollowedWorld.reset()")

@@ -49,7 +49,7 @@ from cavmarl.driving.kernels.swept_areas import (
 from cavmarl.driving.kernels.ways import leave, next_step
 
 SEE_LINE_M = 8.0
-SEE_FOES_M = 4.5  # before a line, a driver who has to give way is ready to stop, as SUMO's are
+SEE_FOES_M = 4.5  # before a line, a driver that gives way is ready to stop, as SUMO's are
 NEAR_M = 8.0  # to a leader so near the corner between matters,
 ASKEW_RAD = 0.7  # if it turns by so much,
 ASKEW_M = 2.5  # which takes this off the gap

@@ -241,7 +241,7 @@ def foe_blocks(
     leaves_mps = min(reached, max(limit, speed))
     time_out = _earliest(distance - half, speed, limit, GENTLE_ACCEL)
     time_out += 2.0 * (over + row["length"]) / max(speed + leaves_mps, STANDING_MPS)
-    # With the speed that it has; it is counted on to brake by those who have waited for long.
+    # With the speed that it has; vehicles that have waited for long count on it to brake.
     arrives = (foe["dist"] - foe["half"]) / max(foe["speed"], STANDING_MPS)
     arrives *= 1.0 + min(row["wait_s"] / IMPATIENCE_S, 1.0)
     blocks: bool = arrives < time_out + (MERGE_AHEAD_S if conflict["merging"] else AHEAD_S)

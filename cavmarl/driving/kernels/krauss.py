@@ -40,5 +40,5 @@ def dawdle(
     dt: float,  # seconds of the tick
 ) -> float:
     """The speed that is left of a wanted one by imperfect driving, in m/s."""
-    # Who starts from a stand is slowed in proportion, so that it does start.
+    # A vehicle that starts from a stand is slowed in proportion, so that it does start.
     return max(speed - dt * sigma * min(accel, speed) * share, 0.0)

@@ -1,6 +1,6 @@
 """Swept areas: where a long vehicle in a bend, or one beside it, has to wait for the other.
 
-No right of way says who goes first there. A vehicle that is in the area does; of two before it the
+No right of way says which goes first there. A vehicle in the area does; of two before it the
 one that is further along, unless something else holds it. What it waits for is no reason for others
 to let it pass: a driver that gives way to it goes on.
 """
@@ -24,7 +24,7 @@ EASY_STOP = 2.0  # m/s², of one that needs more to stop before the area it is s
 HARD_STOP = 3.5  # one that needs more goes first
 SOON_M = 3.5  # one that is so near to the area may be in it at once
 LONG_FORK_M = 6.0  # how much further long vehicles need to be clear of one another at a fork
-GIVE_UP_S = 60.0  # who has stood so long goes on, whatever is in the area
+GIVE_UP_S = 60.0  # one that has stood so long goes on, whatever is in the area
 
 
 @inlined_kernel
@@ -129,7 +129,7 @@ def before_swept(
 
 @inlined_kernel
 def before_line_gently(kind: np.void, row: np.void, gap: float, dt: float) -> float:
-    """How a line presses before which nobody has to brake harder than those behind can."""
+    """The constraint of a line before which no vehicle brakes harder than those behind can."""
     press = before_line(kind, row["speed"], gap, dt)
     if kind["model"] == MODEL_KRAUSS:
         return float(min(press, kind["decel"] * dt - row["speed"]))

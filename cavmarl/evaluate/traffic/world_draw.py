@@ -18,7 +18,7 @@ Drawn = TypeVar("Drawn")
 
 # Features that a draw may have; each can be left out by name. Kinds of nets:
 KINDS = {"grid": 0.36, "spider": 0.2, "random": 0.29, "cut": 0.15}
-# types of junctions (SUMO's names; zipper and unregulated order nobody where ways cross),
+# types of junctions (SUMO's names; zipper and unregulated give no order where ways cross),
 JUNCTIONS = {
     "priority": 0.26,
     "right_before_left": 0.16,

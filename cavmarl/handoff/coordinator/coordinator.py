@@ -110,7 +110,7 @@ class Coordinator(ABC):
         Raises:
             ProtocolError: a vehicle was lost or doubled; it cannot be decided, or a zone does not
                 answer.
-            ConfigError: a zone has not seen who enters it.
+            ConfigError: a zone has not seen a vehicle that enters it.
         """
 
     @abstractmethod

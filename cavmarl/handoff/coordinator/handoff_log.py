@@ -51,7 +51,7 @@ class HandoffLog:
         """Let vehicles change their owner, by the committed rows.
 
         Raises:
-            ConfigError: a zone has not seen who enters it.
+            ConfigError: a zone has not seen a vehicle that enters it.
         """
         division, book, w = self._division, self._book, self._world
         changed = 0

@@ -44,8 +44,10 @@ class Crash:
     def __post_init__(self) -> None:
         points = COORDINATOR_POINTS if self.zone is None else ZONE_POINTS
         if self.point not in points:
-            who = "the coordinator" if self.zone is None else "a zone"
-            raise ConfigError(f"{who} cannot die at '{self.point}'; points are {', '.join(points)}")
+            what = "the coordinator" if self.zone is None else "a zone"
+            raise ConfigError(
+                f"{what} cannot die at '{self.point}'; points are {', '.join(points)}"
+            )
         check_whole("the tick of a crash", self.tick, 0)
         check_whole("times of a crash", self.times, 1)
         if self.zone is not None:

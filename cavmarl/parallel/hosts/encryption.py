@@ -1,7 +1,7 @@
-"""Encryption of connections that leave this machine: TLS 1.3 between two who know a secret.
+"""Encryption of connections that leave this machine: TLS 1.3 between two that know a secret.
 
-Both work out the same key and certificate from the secret, show it, and take no other. So nobody
-signs anything, and each connection's own keys are drawn anew.
+Both work out the same key and certificate from the secret, show it, and take no other. No third
+party signs anything, and each connection's own keys are drawn anew.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def _context(secret: bytes, calls: bool) -> ssl.SSLContext:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT if calls else ssl.PROTOCOL_TLS_SERVER)
     context.sslsocket_class = EncryptedSocket
     context.minimum_version = ssl.TLSVersion.TLSv1_3
-    context.check_hostname = False  # who knows the key may be anywhere
+    context.check_hostname = False  # the holder of the key may be anywhere
     context.verify_mode = ssl.CERT_REQUIRED
     context.load_verify_locations(cadata=certificate.decode())
     if not calls:

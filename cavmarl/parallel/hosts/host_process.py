@@ -97,7 +97,7 @@ def serve(
 
     Raises:
         OSError: the caller cannot be reached.
-        EOFError: whoever listens there does not want us.
+        EOFError: the listener refuses this host.
         MessageError: it is not the caller.
     """
     line = _Line(knock(place, secret, number))

@@ -60,7 +60,7 @@ class HostRegistry:
     """Lets hosts in and watches all connections at once.
 
     Raises:
-        WorkerError: nobody can listen, or hosts cannot be started.
+        WorkerError: the port cannot be listened on, or hosts cannot be started.
     """
 
     def __init__(self, launcher: Launcher, code: str) -> None:

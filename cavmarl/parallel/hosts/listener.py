@@ -8,7 +8,7 @@ and no more than a few bytes. What leaves this machine is encrypted before.
     caller → host   random number, proof
     host → caller   proof
 
-Who speaks another version is told which one is spoken here.
+A caller of another version is told which one is spoken here.
 """
 
 from __future__ import annotations
@@ -88,20 +88,20 @@ class PendingConnection:
             self._go_on()
             return None
         if not hmac.compare_digest(said, self._expected):
-            raise MessageError("somebody who does not know the secret has called")
+            raise MessageError("a caller does not know the secret")
         return self._socket
 
     def close(self) -> None:
         self._socket.close()
 
     def _go_on(self) -> None:
-        """It may take as long again: whoever listens may be busy in between."""
+        """It may take as long again: the listener may be busy in between."""
         self.until_s = time.monotonic() + GREETING_S
 
     def _answer(self, hello: bytes) -> None:
         magic, version, self.number, _ = _HELLO.unpack(hello)
         if magic != MAGIC:
-            raise MessageError(f"somebody who says {hello[:4]!r} has called")
+            raise MessageError(f"a caller says {hello[:4]!r}")
         if version != VERSION:
             self._socket.sendall(_SPOKEN.pack(MAGIC, VERSION))
             raise MessageError(
@@ -114,10 +114,10 @@ class PendingConnection:
 
 
 class Listener:
-    """Listens, and lets in who knows the secret; strangers cost little and are shown out.
+    """Listens, and lets in callers that know the secret; strangers cost little and are shown out.
 
     Raises:
-        WorkerError: nobody can listen there.
+        WorkerError: the port cannot be listened on.
         MissingExtraError: others than this machine can call there, and cryptography is missing.
     """
 
@@ -152,10 +152,11 @@ class Listener:
         return self._selector.fileno()
 
     def admit(self) -> list[tuple[int, socket.socket]]:
-        """Hear all who call, without waiting.
+        """Hear all callers, without waiting.
 
         Returns:
-            who has proved that it knows the secret: the number that it says, its connection.
+            callers that have proved that they know the secret: the number that each says, its
+                connection.
         """
         admitted: list[tuple[int, socket.socket]] = []
         for key, _ in self._selector.select(0.0):
@@ -214,7 +215,7 @@ def knock(place: tuple[str, int], secret: bytes, number: int) -> FramedSocket:
     """Call as a host; the caller may be busy for long before it answers.
 
     Raises:
-        OSError: nobody listens there.
+        OSError: no process listens there.
     """
     return FramedSocket(call(place, secret, number))
 
@@ -223,13 +224,13 @@ def call(
     place: tuple[str, int],
     secret: bytes,
     number: int,
-    answer_s: float | None = None,  # for whoever listens there to answer; None: as long as it takes
+    answer_s: float | None = None,  # for the listener to answer; None: as long as it takes
 ) -> socket.socket:
     """A connection to a `Listener` on which both ends have proved that they know the secret.
 
     Raises:
         OSError: nothing listens there.
-        EOFError: whoever listens there wants no more callers.
+        EOFError: the listener wants no more callers.
         MessageError: it does not know the secret, or speaks another version.
     """
     connection = socket.create_connection(place, CALL_S)
@@ -286,5 +287,5 @@ def _foreign(place: tuple[str, int]) -> MessageError:
     )
 
 
-def _proof(secret: bytes, who: bytes, said: bytes) -> bytes:
-    return hmac.digest(secret, who + said, "sha256")
+def _proof(secret: bytes, side: bytes, said: bytes) -> bytes:
+    return hmac.digest(secret, side + said, "sha256")

@@ -298,11 +298,11 @@ class Links:
         return frames.popleft() if frames else None
 
     def has(self, number: int) -> bool:
-        """Whether a frame of one has come, and nobody has taken it."""
+        """Whether a frame of one has come that has not been taken."""
         return number in self._links and bool(self._links[number].frames)
 
     def release(self, number: int) -> Link:
-        """Leave a connection to somebody else."""
+        """Give a connection away."""
         return self._forget(number)
 
     def put_back(self, number: int, frame: NodeFrame) -> None:

@@ -19,7 +19,7 @@ from cavmarl.parallel.nodes.node_files import WorldFile
 
 log = logging.getLogger("cavmarl.nodes")
 
-LOOK_MS = 20.0  # so often it is looked who has called, before the worlds begin
+LOOK_MS = 20.0  # between looks for callers, before the worlds begin
 ANYONE = (1 << 32) - 1  # the number of a node that takes any
 
 
@@ -35,11 +35,11 @@ class Newcomer:
 
 
 class Newcomers:
-    """Tells those who may join what to be, and waits until they are.
+    """Tells processes that may join which node to be, and waits until they are ready.
 
     Attributes:
         place: where they call.
-        ready: who has loaded the world, by numbers of their own.
+        ready: those that have loaded the world, by numbers of their own.
         refused: why others were sent away.
         failures: exceptions while they loaded the world.
     """
@@ -64,7 +64,7 @@ class Newcomers:
         self.failures: list[WorkerFailureError] = []
 
     def look(self, wait_ms: float) -> None:
-        """Hear who calls, and what those say who have called."""
+        """Accept calls, and hear what earlier callers say."""
         for asked, connection in self._listener.admit():
             self._all[self._next] = Newcomer(asked)
             self._links.add(self._next, connection)

@@ -51,7 +51,7 @@ log = logging.getLogger("cavmarl.nodes")
 
 PONG_S = 1.0  # for a living node to answer
 KEEP_S = 0.2  # so much of work may have to be done again
-MISSED_S = 0.1  # to hear who else misses a node
+MISSED_S = 0.1  # to hear which others miss a node
 END_S = 1.0  # for nodes to hear that they are needed no more
 SPARES = 1  # nodes more than are wanted that may wait for another one's end
 
@@ -204,7 +204,7 @@ class NodePool:
         """Let all nodes do a command; what each has found, by rising numbers.
 
         Raises:
-            WorkerDeathError: nodes are lost whose zones nobody has kept, or too many for one step.
+            WorkerDeathError: no node has kept the zones of lost ones, or too many were lost.
         """
         if command.changes and time.monotonic() > self._keep_again_s:
             if not self._replace_lost():

@@ -195,7 +195,7 @@ class NodeProgram:
                 frame = None
 
     def _miss(self, lost: LinkLostError) -> None:
-        """Tell the coordinator of a node that cannot be reached: nobody else may see it."""
+        """Tell the coordinator of a node that cannot be reached: others may not see it."""
         if lost.peer == COORDINATOR:
             raise lost
         self._links.drop(lost.peer)
@@ -357,9 +357,9 @@ def run_node(
         whether it is needed no more, as the caller has said; else the caller is gone.
 
     Raises:
-        OSError: nobody listens there.
+        OSError: no process listens there.
         EOFError: the caller wants no more, or is busy.
-        MessageError: who listens there does not know the secret, or speaks another version.
+        MessageError: what listens there does not know the secret, or speaks another version.
         NodeRefusedError: the caller does not want it.
     """
     connection = call(place, secret, number)

@@ -1,4 +1,4 @@
-"""What starts nodes: this machine, Ray, or somebody by hand on any machine."""
+"""What starts nodes: this machine, Ray, or a command by hand on any machine."""
 
 from __future__ import annotations
 
@@ -112,13 +112,13 @@ class RayNodes:
 
 
 class JoinedNodes:
-    """Nodes that somebody starts by hand: `cavmarl node --join`."""
+    """Nodes that are started by hand: `cavmarl node --join`."""
 
     def trouble(self) -> str | None:
         return None
 
     def replace(self, number: int, is_silent: bool) -> None:
-        """Whoever has started it may start another one."""
+        """Another one may be started by hand."""
 
     def close(self) -> None:
         """They end with the connection."""
@@ -136,7 +136,7 @@ def start_nodes(
     Raises:
         ConfigError: a place or a key file that cannot be.
         MissingExtraError: Ray is not installed.
-        WorkerError: nobody can listen, or nodes cannot be started.
+        WorkerError: the port cannot be listened on, or nodes cannot be started.
     """
     if hosts == "":
         listener = Listener(LOCAL)

@@ -1,4 +1,4 @@
-"""Who hosts which zones after nodes were lost, or others have come."""
+"""Which node hosts which zones after nodes were lost, or others have come."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ class ZoneMoves(NamedTuple):
     """What changes, from a state that nodes have kept."""
 
     zones: Zones  # from now on
-    heirs: dict[int, int]  # lost node → who hosts its zones now
-    donors: list[tuple[int, int]]  # nodes that give zones away, and who gets them
+    heirs: dict[int, int]  # lost node → the one that hosts its zones now
+    donors: list[tuple[int, int]]  # nodes that give zones away, and those that get them
 
 
 def moves_of(

@@ -1,9 +1,9 @@
 """What the `conflicts` sensor writes: the vehicles that come nearest to the own way.
 
-All are taken to go on as they go now: the others straight on along their headings, as nobody knows
-their plans, the own one along its way. At a few moments ahead the gap between the bodies is taken,
-as boxes along the own one; what comes nearest and soonest stands first. Right of way is that of the
-map: by the lane that the other is on, whichever way it takes from there.
+All are taken to go on as they go now: the others straight on along their headings, as their plans
+are not known, the own one along its way. At a few moments ahead the gap between the bodies is
+taken, as boxes along the own one; what comes nearest and soonest stands first. Right of way is that
+of the map: by the lane that the other is on, whichever way it takes from there.
 """
 
 from __future__ import annotations

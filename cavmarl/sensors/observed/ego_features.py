@@ -128,10 +128,10 @@ def lanes(config: SensorsConfig) -> list[Feature]:
     if config.lanes.range_m == 0.0:
         return []
     rows: list[Row] = []
-    for name, who in _GAPS:
+    for name, vehicle in _GAPS:
         rows += [
-            (f"{name}_gap", f"how near {who} is, along the lanes: {_NEARNESS}; 0: none", ""),
-            (f"{name}_speed", f"speed of {who} minus the own one; 0: none", "40 m/s"),
+            (f"{name}_gap", f"how near {vehicle} is, along the lanes: {_NEARNESS}; 0: none", ""),
+            (f"{name}_speed", f"speed of {vehicle} minus the own one; 0: none", "40 m/s"),
         ]
     return _features((*rows, *_CROSSING))
 

@@ -1,7 +1,7 @@
 """What the sensors observe that are made for driving on any map.
 
-The way ahead, who comes near it, and what was done last. The scales are those of the kernels
-`observing_way`, `observing_conflicts` and `observing_history`.
+The way ahead, vehicles that come near it, and what was done last. The scales are those of the
+kernels `observing_way`, `observing_conflicts` and `observing_history`.
 """
 
 from __future__ import annotations

@@ -142,11 +142,11 @@ class SumoSimulation:
 
         Returns names, numbers and LANE rows, and what is to be said of vehicles that have come.
         """
-        vehicle, nobody = self._vehicle, repeat(-1)
+        vehicle, none = self._vehicle, repeat(-1)
         names = vehicle.getIDList()
-        lanes = map(self._lane_row.get, map(self._lane_of, names), nobody)
+        lanes = map(self._lane_row.get, map(self._lane_of, names), none)
         rows = np.fromiter(lanes, np.int32, len(names))
-        known = map(self._number.get, names, nobody)
+        known = map(self._number.get, names, none)
         numbers = np.fromiter(known, np.int32, len(names))
         is_here = (rows >= 0) & (numbers >= 0)
         there = int(is_here.sum())
