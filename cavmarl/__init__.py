@@ -43,7 +43,7 @@ from cavmarl.core.errors import (
     WorkerError,
     WorkerFailureError,
 )
-from cavmarl.driving.agent_view import AgentView
+from cavmarl.driving.agent_view import AgentView, BatchView
 from cavmarl.driving.driver_models import register_driver_model
 from cavmarl.env.parallel import CavEnv, parallel_env
 from cavmarl.env.registration import env, raw_env, register_all
@@ -60,6 +60,7 @@ __all__ = [
     "TERMS",
     "ActionError",
     "AgentView",
+    "BatchView",
     "CapacityError",
     "CavEnv",
     "CavVectorEnv",

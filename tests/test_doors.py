@@ -32,10 +32,10 @@ def examples(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Mod
     sys.path.insert(0, str(folder))
     found = {}
     for section in PAGE.read_text(encoding="utf-8").split("\n## ")[1:]:
-        for code in re.findall(r"```python\n(.*?)```", section, re.DOTALL):
+        if blocks := re.findall(r"```python\n(.*?)```", section, re.DOTALL):
             title = section.splitlines()[0]
             name = "outside_" + title.lower().replace(" ", "_")
-            (folder / f"{name}.py").write_text(code, encoding="utf-8")
+            (folder / f"{name}.py").write_text("\n\n".join(blocks), encoding="utf-8")
             found[title] = importlib.import_module(name)
     assert {"A term", "A sensor", "A driver model", "A backend"} < set(found)
     yield found
@@ -85,6 +85,31 @@ def test_a_term_from_outside(examples: dict[str, ModuleType]) -> None:
     env.reset(seed=0)
     *_, infos = env.step({agent: env.action_space(agent).sample() for agent in env.agents})
     assert all("headway" in info for info in infos.values())
+    env.close()
+
+
+def test_a_batched_term_is_the_one_of_single_agents(examples: dict[str, ModuleType]) -> None:
+    weights = {"headway": -0.5, "headway_of_all": -0.25}
+    terms, _ = same_bytes({"terms.weights": weights})
+    assert terms[-1] == terms[-2] > 0.0
+
+
+def test_a_batched_answer_is_of_each_agent_alone() -> None:
+    def against_the_mean(view: cavmarl.BatchView) -> np.ndarray:
+        return view.own["speed"] - view.own["speed"].mean()
+
+    cavmarl.register_term("relative", against_the_mean, reach_m=300.0, batched=True)
+    env = cavmarl.parallel_env(ENV, agents=4, overrides={"terms.weights": {"relative": 1.0}})
+    with pytest.raises(RegisteredFunctionError, match=r"'relative' depends on .* of the batch"):
+        drive(env)
+    env.close()
+
+
+def test_a_batched_answer_has_a_number_for_each_agent() -> None:
+    cavmarl.register_term("one", lambda view: np.zeros(1), batched=True)
+    env = cavmarl.parallel_env(ENV, agents=4, overrides={"terms.weights": {"one": 1.0}})
+    with pytest.raises(RegisteredFunctionError, match=r"'one' .* must be 1 finite number\(s\) an"):
+        drive(env)
     env.close()
 
 

@@ -17,7 +17,7 @@ from cavmarl.config.env import EnvConfig, SensorsConfig
 from cavmarl.config.rig import MountedConfig, samples_per_step
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.extensions import REGISTERED_SENSORS
-from cavmarl.driving.agent_view import AgentView
+from cavmarl.driving.agent_view import AgentView, BatchView
 from cavmarl.sensors.mounted import cameras, lidar, own_motion
 from cavmarl.sensors.mounted.frames import SensorFrames
 from cavmarl.sensors.mounted.mounted_sensor import MountedSensor, Platform
@@ -68,21 +68,22 @@ def find_sensor(name: str) -> Sensor | MountedType:
 
 def register_sensor(
     name: str,
-    sense: Callable[[AgentView], ArrayLike],
+    sense: Callable[[AgentView], ArrayLike] | Callable[[BatchView], ArrayLike],
     *,
     features: Sequence[Feature],
     reach_m: float = 0.0,
+    batched: bool = False,
 ) -> None:
     """Add a sensor that agents observe, which `sensors.registered` can name.
 
-    It is asked once a step and agent, in Python: slower than a sensor of the package.
-
     Args:
         name: of the sensor.
-        sense: its numbers, of an `AgentView` at the end of the step, one a feature. They must not
-            depend on the order of `view.others`; that is checked when it is first used.
+        sense: its numbers, of an `AgentView` at the end of the step, one a feature; if `batched`,
+            those of all agents (n, number of features), of a `BatchView`. They must not depend on
+            the order of `view.others`; that is checked when it is first used.
         features: what each number is; names are unique.
         reach_m: how far away the centres of `view.others` can be; 0: it looks at none.
+        batched: whether it answers for all agents of a world at once, and not once an agent.
 
     Raises:
         ConfigError: the name is taken, the reach is no distance, or features are missing or of one
@@ -100,7 +101,7 @@ def register_sensor(
     def reach_of(config: SensorsConfig) -> float:
         return float(reach_m)
 
-    sensor = Sensor(name, features_of, reach_of, sense=sense)
+    sensor = Sensor(name, features_of, reach_of, sense=sense, batched=batched)
     REGISTERED_SENSORS.add(name, sensor, sense, (*_OBSERVED, *_MOUNTED))
 
 

@@ -9,7 +9,7 @@ from cavmarl.config.env import TERMS, EnvConfig
 from cavmarl.core.extensions import REGISTERED_SENSORS, REGISTERED_TERMS
 from cavmarl.core.records.arrays import Outputs, Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
-from cavmarl.driving.agent_view import RegisteredFunction, agent_view
+from cavmarl.driving.agent_view import BatchView, RegisteredFunction, batch_view
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.kernels.output_reset import newest_frame
 from cavmarl.sensors.observed import layout
@@ -26,12 +26,14 @@ class RegisteredOutputs:
         self._sensors = []
         for name in config.sensors.registered:
             sensor, place = REGISTERED_SENSORS[name], places[name]
-            call = RegisteredFunction(name, sensor.sense, place.stop - place.start)
+            size = place.stop - place.start
+            call = RegisteredFunction(name, sensor.sense, size, sensor.batched)
             self._sensors.append((call, sensor.reach_m(config.sensors), place))
         self._terms = []
         for column, name in enumerate(config.terms.registered, len(TERMS)):
             term = REGISTERED_TERMS[name]
-            self._terms.append((RegisteredFunction(name, term.function, 1), term.reach_m, column))
+            call = RegisteredFunction(name, term.function, 1, term.batched)
+            self._terms.append((call, term.reach_m, column))
 
     def write(self, worlds: Worlds, chosen: NDArray[np.bool_], outputs: Outputs) -> None:
         """Write those of every owned agent of the chosen worlds (W,), after `sense`."""
@@ -40,17 +42,26 @@ class RegisteredOutputs:
         for w in np.flatnonzero(chosen).tolist():
             rows = worlds.rows[w, : worlds.num_rows[w]]
             owned = rows["driver"][: worlds.num_owned[w]] == DRIVER_AGENT
-            for i in np.flatnonzero(owned).tolist():
-                self._write_agent(rows, i, w, outputs)
+            if owned.any():
+                self._write_agents(rows, np.flatnonzero(owned), w, outputs)
 
-    def _write_agent(self, rows: NDArray[np.void], i: int, w: int, outputs: Outputs) -> None:
-        agent = int(rows["agent"][i])
-        seen = outputs.observations[w, agent]
-        frame = seen[newest_frame(seen, self._stack) :]
+    def _write_agents(
+        self, rows: NDArray[np.void], of_agents: NDArray[np.int64], w: int, outputs: Outputs
+    ) -> None:
+        """Write those of the agents whose vehicles are these rows."""
+        agents = rows["agent"][of_agents]
         for call, reach_m, place in self._sensors:
-            frame[place] = call(agent_view(rows, i, reach_m, self._network, self._step_s))
-        if not outputs.acted[w, agent]:
-            return
-        for call, reach_m, column in self._terms:
-            view = agent_view(rows, i, reach_m, self._network, self._step_s)
-            outputs.terms[w, agent, column] = call(view)[0]
+            numbers = call(self._view(rows, of_agents, reach_m))
+            for agent, own in zip(agents.tolist(), numbers, strict=True):
+                seen = outputs.observations[w, agent]
+                seen[newest_frame(seen, self._stack) :][place] = own
+        acted = outputs.acted[w, agents]
+        if acted.any():
+            for call, reach_m, column in self._terms:
+                numbers = call(self._view(rows, of_agents[acted], reach_m))
+                outputs.terms[w, agents[acted], column] = numbers[:, 0]
+
+    def _view(
+        self, rows: NDArray[np.void], of_agents: NDArray[np.int64], reach_m: float
+    ) -> BatchView:
+        return batch_view(rows, of_agents, reach_m, self._network, self._step_s)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike
+from numpy.typing import DTypeLike
 
 from cavmarl.config.env import SensorsConfig
-from cavmarl.driving.agent_view import AgentView
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,9 @@ class Sensor:
     dtype: Callable[[SensorsConfig], DTypeLike] = _float32  # of that part
     # whether it looks that far for any part of a body, and not for its centre
     sees_bodies: bool = False
-    # of a sensor from outside of the package: its numbers, of an agent's view
-    sense: Callable[[AgentView], ArrayLike] | None = None
+    # of a sensor from outside of the package: its numbers, of a view of one agent, or of several
+    sense: Callable[[Any], Any] | None = None
+    batched: bool = False
 
     def reach_of_centres_m(self, config: SensorsConfig, largest_radius_m: float) -> float:
         """How far away the centre of a vehicle can be that the sensor can tell, in m."""
