@@ -6,10 +6,17 @@
     vec = cavmarl.make_vec("merge", num_envs=16)                            # batched arrays
     policy = cavmarl.load_policy("idm", env)
 
-Importing it registers the entries of `envs/` with Gymnasium and PettingZoo.
+Importing it registers the entries of `envs/` with Gymnasium and PettingZoo; the simulator is loaded
+when one of its names is used.
 """
 
+import sys
+from importlib import import_module
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
 from cavmarl.config.env import TERMS, EnvConfig
+from cavmarl.config.library_names import register_all
 from cavmarl.config.registry import entries
 from cavmarl.core.errors import (
     ActionError,
@@ -43,16 +50,18 @@ from cavmarl.core.errors import (
     WorkerError,
     WorkerFailureError,
 )
-from cavmarl.driving.agent_view import AgentView, BatchView
-from cavmarl.driving.driver_models import register_driver_model
-from cavmarl.env.parallel import CavEnv, parallel_env
-from cavmarl.env.registration import env, raw_env, register_all
-from cavmarl.env.vector import CavVectorEnv, make_vec
-from cavmarl.parallel.backends import register_backend
-from cavmarl.policies.policy import Policy, load_policy
-from cavmarl.rewards.registered_terms import register_term
-from cavmarl.sensors.observed.feature import Feature
-from cavmarl.sensors.registry import register_sensor
+
+if TYPE_CHECKING:
+    from cavmarl.driving.agent_view import AgentView, BatchView
+    from cavmarl.driving.driver_models import register_driver_model
+    from cavmarl.env.parallel import CavEnv, parallel_env
+    from cavmarl.env.registration import env, raw_env
+    from cavmarl.env.vector import CavVectorEnv, make_vec
+    from cavmarl.parallel.backends import register_backend
+    from cavmarl.policies.policy import Policy, load_policy
+    from cavmarl.rewards.registered_terms import register_term
+    from cavmarl.sensors.observed.feature import Feature
+    from cavmarl.sensors.registry import register_sensor
 
 __version__ = "0.1.0"
 
@@ -107,5 +116,53 @@ __all__ = [
     "register_term",
 ]
 
+_LATE = {
+    "AgentView": "driving.agent_view",
+    "BatchView": "driving.agent_view",
+    "CavEnv": "env.parallel",
+    "CavVectorEnv": "env.vector",
+    "Feature": "sensors.observed.feature",
+    "Policy": "policies.policy",
+    "env": "env.registration",
+    "load_policy": "policies.policy",
+    "make_vec": "env.vector",
+    "parallel_env": "env.parallel",
+    "raw_env": "env.registration",
+    "register_backend": "parallel.backends",
+    "register_driver_model": "driving.driver_models",
+    "register_sensor": "sensors.registry",
+    "register_term": "rewards.registered_terms",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LATE:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = getattr(import_module(f"{__name__}.{_LATE[name]}"), name)
+    if name != "env":
+        globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return __all__
+
+
+class _Package(ModuleType):
+    """`cavmarl.env` is the function, though a folder of that name is imported, too."""
+
+    @property
+    def env(self) -> Any:
+        return __getattr__("env")
+
+    @env.setter
+    def env(self, folder: ModuleType) -> None:
+        """Importing the folder does not hide the function."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return import_module, (self.__name__,)
+
+
+sys.modules[__name__].__class__ = _Package
 register_all()
 del register_all

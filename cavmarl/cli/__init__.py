@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from importlib.metadata import version
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from cavmarl.cli import (
     bench,
@@ -18,7 +20,6 @@ from cavmarl.cli import (
     journal,
     lead,
     listing,
-    map,
     node,
     plan,
     replay,
@@ -37,7 +38,23 @@ from cavmarl.core.tracebacks import print_traceback
 
 __all__ = ["app", "main"]
 
+
+class _Group(TyperGroup):
+    """Loads `map` when it is asked for: what it stands on takes longer than other commands do."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return [*super().list_commands(ctx), "map"]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        if cmd_name != "map":
+            return super().get_command(ctx, cmd_name)
+        found = typer.main.get_group(import_module("cavmarl.cli.map").app)
+        found.name = "map"
+        return found
+
+
 app = typer.Typer(
+    cls=_Group,
     help="Multi-agent reinforcement learning for automated vehicles on real road networks.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -67,7 +84,6 @@ app.command()(service.sessions)
 app.command()(service.events)
 app.command()(service.manifest)
 app.command("list")(listing.list_entries)
-app.add_typer(map.app, name="map")
 app.add_typer(demand.app, name="demand")
 app.add_typer(bench.app, name="bench")
 app.add_typer(scenario.app, name="scenario")

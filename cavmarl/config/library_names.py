@@ -1,0 +1,61 @@
+"""The names under which other libraries find the environments.
+
+PettingZoo: the module functions `parallel_env`, `env` and `raw_env`, and, from 1.27 on, ids such
+as `cavmarl/merge-v1` in both its registries. Gymnasium: `cavmarl/merge-v1`, one vehicle of the
+world as a single-agent environment, and `cavmarl/mergeAgents-v1` for `gymnasium.make_vec`, all
+agents as rows; `cavmarl/mergeDiscrete-v1` and `cavmarl/mergeDiscreteAgents-v1` are the same with
+meta-actions.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import gymnasium
+import pettingzoo
+
+from cavmarl.config.registry import entries
+
+_ID = re.compile(r"[A-Za-z0-9][\w.-]*", re.ASCII)
+
+
+def register_all() -> None:
+    """Register every entry with Gymnasium and, where it has a registry, with PettingZoo.
+
+    Entries whose name cannot be an id (letters, digits, `_`, `-` and `.`) have none.
+    """
+    for name, folder in entries().items():
+        if not _ID.fullmatch(name):
+            continue
+        version = _version(folder)
+        one = f"cavmarl/{name}-v{version}"
+        for word, kind in {"": {}, "Discrete": {"action_kind": "discrete"}}.items():
+            gymnasium.register(
+                f"cavmarl/{name}{word}-v{version}",
+                entry_point="cavmarl.adapters.gymnasium_env:CavEgoEnv",
+                kwargs={"env": name, **kind},
+                disable_env_checker=True,
+            )
+            gymnasium.register(
+                f"cavmarl/{name}{word}Agents-v{version}",
+                vector_entry_point="cavmarl.adapters.gymnasium_rows:CavAgentRows",
+                kwargs={"env": name, **kind},
+                disable_env_checker=True,
+            )
+        if hasattr(pettingzoo, "register"):
+            of_entry = {"env": name}
+            pettingzoo.register(
+                "parallel", one, "cavmarl.env.parallel:parallel_env", kwargs=of_entry
+            )
+            pettingzoo.register("aec", one, "cavmarl.env.registration:env", kwargs=of_entry)
+
+
+def _version(folder: Path) -> int:
+    """The entry's version, read without the parsers that would make the import slow."""
+    try:
+        text = (folder / "env.yaml").read_bytes()
+    except OSError:
+        return 0  # what is wrong with it is said when it is used
+    found = re.search(rb"^version: *(\d{1,9})", text, re.MULTILINE)
+    return int(found[1]) if found else 0
