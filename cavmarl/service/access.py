@@ -12,7 +12,6 @@ import hmac
 import json
 import secrets
 import time
-from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any
 
@@ -31,30 +30,7 @@ ALGORITHM = "EdDSA"
 ACCESS_S = 900.0
 REFRESH_S = 8 * 3600.0
 KEYS_KEPT = 2  # whose tokens are taken: the present one and the one before
-MOST_BUCKETS = MOST_VERIFIED = 10_000
-
-
-class RateLimit:
-    """So many requests a second for each caller, after a burst."""
-
-    def __init__(
-        self, rate_hz: float, burst: float, clock_s: Callable[[], float] = time.monotonic
-    ) -> None:
-        self.rate_hz, self.burst = rate_hz, burst
-        self._clock_s = clock_s
-        self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
-
-    def take(self, caller: str) -> None:
-        """Count a request of `caller`; raises the problem `too-many`."""
-        now_s = self._clock_s()
-        left, then_s = self._buckets.pop(caller, (self.burst, now_s))
-        left = min(self.burst, left + (now_s - then_s) * self.rate_hz)
-        self._buckets[caller] = (max(left - 1.0, 0.0), now_s)
-        while len(self._buckets) > MOST_BUCKETS:
-            self._buckets.popitem(last=False)
-        if left < 1.0:
-            wait_s = (1.0 - left) / self.rate_hz
-            raise problem("too-many", f"more than {self.rate_hz:g} requests a second: wait", wait_s)
+MOST_VERIFIED = 10_000
 
 
 class Access:

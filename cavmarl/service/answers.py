@@ -76,7 +76,17 @@ class NodeStatus(_Answer):
     load: Load | None  # null: no beat yet
     score: float | None
     sessions: int
+    zones_of: list[str]  # sessions whose zones it hosts, one for each part
     age_s: float  # since it was heard of
+
+
+class Excluded(_Answer):
+    """A node that was not chosen, and why."""
+
+    node: str
+    reason: str
+    value: float | None = None
+    threshold: float | None = None
 
 
 class NodeList(_Answer):
@@ -132,6 +142,8 @@ class Assignment(_Answer):
     redirected: bool
     reason: str
     score: float
+    excluded: list[Excluded]  # the first of those that were left out
+    excluded_count: int
     scheme: Literal["http", "https"]
     address: str
     client_port: int
@@ -168,6 +180,8 @@ class Session(_Answer):
     placements: int
     reason: str
     score: float
+    excluded: list[Excluded]
+    excluded_count: int
     saved_number: int
     results: dict[str, str]  # files, with their hashes
     message: str

@@ -7,6 +7,7 @@ start.
 from __future__ import annotations
 
 import asyncio
+import re
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 
@@ -24,6 +25,7 @@ from cavmarl.service.service_metrics import ServiceMetrics
 
 MAX_BODY_BYTES = 256 * 1024
 MAX_CONTENT_BYTES = 64 * 1024 * 1024  # of a world's state, or a file of results
+_CONTENT = re.compile(r"/v1/(sessions/[^/]+/state|jobs/[^/]+/results/[^/]+)")
 MAX_PATH_BYTES = 1024
 NO_TELEMETRY: TelemetryConfig = {  # whatever the surroundings have set up: nothing is exported
     "tracing": False,
@@ -62,10 +64,11 @@ def make_app(service: Service, sweep_s: float = 0.5) -> ASGIApp:
         lifespan=lifespan,
     )
     app.state.service = service
-    app.state.metrics = ServiceMetrics(service.broker)
     for router in ROUTERS:
         _check_rules(router)
     serve_routes(app, ROUTERS)
+    app.state.metrics = ServiceMetrics(service.broker, app.state.rejected)
+    app.state.on_misreport = service.broker.misreported
     return GuardedRequests(app)
 
 
@@ -92,7 +95,7 @@ class GuardedRequests:
 
     Args:
         app: what it guards.
-        content_bytes: the most that a PUT has.
+        content_bytes: the most of a state or a result, which is read after its sender is known.
         body_bytes: the most that any other body has.
     """
 
@@ -110,7 +113,8 @@ class GuardedRequests:
             await self._app(scope, receive, send)
             return
         until_s = asyncio.get_running_loop().time() + BODY_S
-        left = self._content_bytes if scope["method"] == "PUT" else self._body_bytes
+        is_content = scope["method"] == "PUT" and _CONTENT.fullmatch(scope["path"])
+        left = self._content_bytes if is_content else self._body_bytes
         is_read = False
 
         async def receive_in_time() -> Message:

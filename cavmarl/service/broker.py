@@ -6,6 +6,7 @@ other. Time comes from an injected clock.
 
 from __future__ import annotations
 
+import itertools
 import secrets
 import time
 from collections.abc import Callable, Sequence
@@ -21,6 +22,8 @@ from cavmarl.service.infrastructure import (
     NodeRecord,
     SessionRecord,
 )
+from cavmarl.service.job_queue import JobQueue
+from cavmarl.service.node_reports import NodeReports
 from cavmarl.service.node_selection import Chosen, LiveNode, NoNodeError, choose, overloads
 from cavmarl.service.refusals import problem
 from cavmarl.service.zone_nodes import ZoneNodes
@@ -37,6 +40,8 @@ class BrokerRules:
     lease_s: float = 30.0  # of a session's token; the client asks anew
     idle_s: float = 600.0  # an idle session ends
     keep_s: float = 3600.0  # sessions that are over can be read so long
+    keep_nodes_s: float = 86_400.0  # nodes that are down or have left are known so long
+    max_placements: int = 10  # of a job: so many nodes it may lose
     max_skew_s: float = 5.0  # between the clocks of a node and of the service
     max_nodes: int = 10_000
     max_sessions: int = 1000  # of one identity, that are not over
@@ -59,18 +64,19 @@ class Broker:
         self.took_s: Callable[[float], None] = lambda _: None  # told how long a selection took
         self._clock_s = clock_s
         self._touched: dict[str, float] = {}  # session → when it was asked for last
-        self._skewed: set[str] = set()
-        self._ahead_s = log.wall_s() - clock_s()  # the wall clock, of the other
         # sessions → world, vehicle, source and target of what is about to change its zone
         self.prepared: dict[str, list[list[int]]] = {}
         now_s = clock_s()
-        for number, name in enumerate(log.state.nodes):
-            self.live[name] = LiveNode(number, now_s)
+        self._reports = NodeReports(log, now_s, self.rules.max_skew_s)
+        self._numbers = itertools.count()  # of nodes, in the order of their coming
+        for name in log.state.nodes:
+            self.live[name] = LiveNode(next(self._numbers), now_s)
         for session in log.state.sessions.values():
             self._touched[session.id] = now_s
             if session.node is not None:
                 self.live[session.node].hosted.add(session.id)
         self.zone_nodes = ZoneNodes(log, self.live, self._choose)
+        self.jobs = JobQueue(log, self._choose, self._assign, self._fail, clock_s)
 
     # Nodes
 
@@ -86,7 +92,7 @@ class Broker:
         data = body.model_dump(exclude={"name"})
         data |= {"identity": identity.id, "incarnation": incarnation}
         self.log.record("node.registered", body.name, data, actor=identity.id)
-        number = self.live[body.name].number if known else len(self.live)
+        number = self.live[body.name].number if known else next(self._numbers)
         self.live[body.name] = LiveNode(number, self._clock_s())
         return self.log.state.nodes[body.name]
 
@@ -113,8 +119,8 @@ class Broker:
         if resources != node.excluded:
             kind = "node.overloaded" if resources else "node.admissible"
             self.log.record(kind, name, {"resources": resources, **asdict(live.use)})
-        self._watch_clock(name, body.sent_s)
-        self.assign_jobs()
+        self._reports.accept(name, body.sent_s)
+        self.jobs.place()
         return {
             "draining": node.draining,
             "beat_s": self.rules.beat_s,
@@ -124,6 +130,12 @@ class Broker:
             "jobs": [self._job_of(one) for one in sorted(live.hosted)
                      if self.log.state.sessions[one].job is not None],
         }  # fmt: skip
+
+    def misreported(self, identity: IdentityRecord, name: str, detail: str) -> None:
+        """Put on record that a node tells what cannot be, such as 85 for 0.85."""
+        node = self.log.state.nodes.get(name)
+        if node is not None and node.identity == identity.id:
+            self._reports.refuse(name, detail)
 
     def own_node(self, identity: IdentityRecord, name: str) -> NodeRecord:
         """A node that this identity may speak for."""
@@ -157,11 +169,16 @@ class Broker:
     def sweep(self) -> None:
         """Nodes that have missed their beats are down; idle sessions end."""
         now_s = self._clock_s()
-        for name, node in self.log.state.nodes.items():
-            missed = (now_s - self.live[name].heard_s) / self.rules.beat_s
+        for name, node in list(self.log.state.nodes.items()):
+            age_s = now_s - self.live[name].heard_s
+            missed = age_s / self.rules.beat_s
             if node.state == "up" and missed > self.rules.missed_beats:
                 self.log.record("node.down", name, {"missed_beats": int(missed)})
                 self._empty(name)
+            elif node.state != "up" and age_s > self.rules.keep_nodes_s:
+                self.log.record("node.forgotten", name)
+                del self.live[name]
+                self._reports.forget(name)
         for session in list(self.log.state.sessions.values()):
             idle_s = now_s - self._touched[session.id]
             if session.state in SESSION_OVER:
@@ -170,10 +187,10 @@ class Broker:
             elif session.job is None and idle_s > self.rules.idle_s:
                 self._tell(session, "timeout", {"of": "idle session", "after_s": idle_s})
                 self._end(session, "closed", "service", f"no request for {idle_s:.0f} s")
-        self._end_waits()
-        self._watch_own_clock()
+        self.jobs.end_hopeless(self.rules.max_placements)
+        self._reports.watch_own_clock(now_s)
         self.zone_nodes.sweep()
-        self.assign_jobs()
+        self.jobs.place()
 
     # Sessions and jobs
 
@@ -315,14 +332,6 @@ class Broker:
         """A job is done, or has failed."""
         self._end(session, status, session.node or "service", message)
 
-    def assign_jobs(self) -> None:
-        """Give jobs that wait to nodes that can take them."""
-        for number in sorted(self.log.state.waiting):
-            try:
-                self._assign(number, self._choose(self.log.state.sessions[number], ()))
-            except NoNodeError:
-                continue  # another may need less
-
     # Within
 
     def _of_key(self, identity: IdentityRecord, data: dict[str, Any]) -> SessionRecord | None:
@@ -381,6 +390,9 @@ class Broker:
         self._touched[session.id] = self._clock_s()
         self._drop(blob)
 
+    def _fail(self, session: SessionRecord, message: str) -> None:
+        self._end(session, "failed", "service", message)
+
     def _forget(self, session: SessionRecord) -> None:
         self._tell(session, "forgotten", {})
         del self._touched[session.id]
@@ -410,29 +422,3 @@ class Broker:
     def _job_of(self, number: str) -> dict[str, Any]:
         session = self.log.state.sessions[number]
         return {"id": number, "configuration": session.configuration, **(session.job or {})}
-
-    def _end_waits(self) -> None:
-        """Jobs that no node has taken within their time have failed."""
-        for number in sorted(self.log.state.waiting):
-            session = self.log.state.sessions[number]
-            waited_s = self.log.wall_s() - session.opened_s
-            if session.wait_s is None or session.placements or waited_s <= session.wait_s:
-                continue
-            self._tell(session, "timeout", {"of": "job in the queue", "after_s": waited_s})
-            self._end(session, "failed", "service", f"no node took it within {session.wait_s:g} s")
-
-    def _watch_own_clock(self) -> None:
-        """Tell of a wall clock that was set: tokens and leases go by it."""
-        ahead_s = self.log.wall_s() - self._clock_s()
-        if abs(jump_s := ahead_s - self._ahead_s) > self.rules.max_skew_s:
-            self._ahead_s = ahead_s
-            self.log.record("clock.anomaly", "service", {"jump_s": round(jump_s, 3)})
-
-    def _watch_clock(self, name: str, sent_s: float) -> None:
-        """Tell once of a node whose clock is off, and once when it is right again."""
-        skew_s = sent_s - self.log.wall_s()
-        is_off = abs(skew_s) > self.rules.max_skew_s
-        if is_off != (name in self._skewed):
-            self._skewed ^= {name}
-            kind = "clock.anomaly" if is_off else "clock.right"
-            self.log.record(kind, name, {"skew_s": round(skew_s, 3)})

@@ -19,6 +19,8 @@ from cavmarl.service.event_log import EventLog
 from cavmarl.service.infrastructure import IdentityRecord
 from cavmarl.service.refusals import problem
 
+MOST_CONFIGURATIONS = 10_000  # of one identity
+MOST_VEHICLES = 200_000  # in all worlds of a session: more may take more memory than a node has
 _PLAIN = re.compile(r"[A-Za-z0-9_+:#,() -]{0,64}")
 _OF_FILES = (
     "map.source",
@@ -42,6 +44,9 @@ def add_configuration(
     found = hashlib.sha256(content).hexdigest()
     versions = log.state.configurations.get(name, [])
     if found not in versions:
+        if log.state.configurations_of.get(identity.id, 0) >= MOST_CONFIGURATIONS:
+            detail = f"{MOST_CONFIGURATIONS} configurations of yours are kept: use those"
+            raise problem("too-many", detail)
         log.keep(content)
         data = {"hash": found, "version": len(versions) + 1}
         log.record("configuration.added", name, data, actor=identity.id, owner=identity.id)
@@ -87,9 +92,17 @@ def _check(document: dict[str, Any]) -> None:
             )
     try:
         own = asdict(load_config(environment)[0])
-        wanted = asdict(load_config(environment, **world_keywords(document))[0])
+        config = load_config(environment, **world_keywords(document))[0]
     except (CavmarlError, RecursionError) as error:
         raise problem("refused", str(error)) from error
+    population = config.population
+    vehicles = document["num_envs"] * (population.num_ids + population.background)
+    if vehicles > MOST_VEHICLES:
+        raise problem(
+            "refused", f"{vehicles} vehicles in {document['num_envs']} worlds: at most "
+            f"{MOST_VEHICLES}; ask for less agents, background or num_envs"
+        )  # fmt: skip
+    wanted = asdict(config)
     for key in _OF_FILES:
         if _value(own, key) != _value(wanted, key):
             raise problem("refused", f"{key}: names files, which stay as they are here")

@@ -87,8 +87,15 @@ class EventLog:
 
     def flush(self) -> None:
         """Write all that has happened."""
-        lines, blobs, gone = self._lines, self._blobs, self._gone
-        self._lines, self._blobs, self._gone, self._in_flight = [], {}, [], blobs
+        self._write(*self._take())
+
+    def _take(self) -> tuple[list[LogEvent], dict[str, bytes], list[str]]:
+        """What is to be written; in the thread in which it happens."""
+        taken = self._lines, self._blobs, self._gone
+        self._lines, self._blobs, self._gone, self._in_flight = [], {}, [], taken[1]
+        return taken
+
+    def _write(self, lines: list[LogEvent], blobs: dict[str, bytes], gone: list[str]) -> None:
         if not (lines or blobs or gone):
             return
         try:
@@ -111,7 +118,7 @@ class EventLog:
             if self.is_broken:
                 raise ServiceError(f"store {self.store.where}: cannot be written")
             if self._lines or self._blobs:
-                await asyncio.to_thread(self.flush)
+                await asyncio.to_thread(self._write, *self._take())
         await self.stir()
 
     async def stir(self) -> None:

@@ -19,6 +19,7 @@ from sqlalchemy import (
     BigInteger,
     Column,
     Float,
+    Index,
     LargeBinary,
     MetaData,
     String,
@@ -57,6 +58,10 @@ _EVENTS = Table(
     Column("private", Text, nullable=False),
     Column("digest", String(64), nullable=False),
 )
+_INDICES = [
+    Index(f"events_of_{name}", _EVENTS.c[name], _EVENTS.c.sequence)
+    for name in ("owner", "actor", "subject")
+]
 _BLOBS = Table(
     "blobs",
     _METADATA,
@@ -204,6 +209,8 @@ class EventStore:
             if "about" not in there and there & {"events", "blobs"}:
                 raise _foreign(self.where, "none")
             _METADATA.create_all(connection)
+            for index in _INDICES:
+                index.create(connection, checkfirst=True)
             found = connection.execute(select(_ABOUT.c.schema)).scalar()
             if found is None:
                 connection.execute(insert(_ABOUT), {"schema": SCHEMA})

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Coroutine
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 from fastapi import Depends, Request, Response
@@ -12,10 +14,13 @@ from fastapi.routing import APIRoute
 from fastapi.security.base import SecurityBase
 
 from cavmarl.core.errors import ServiceError
-from cavmarl.service.access import Access, RateLimit
+from cavmarl.service.access import Access
 from cavmarl.service.broker import Broker
 from cavmarl.service.infrastructure import ROLES, IdentityRecord
+from cavmarl.service.rate_limit import RateLimit
 from cavmarl.service.refusals import problem
+
+MOST_HELD = 64
 
 
 @dataclass
@@ -24,6 +29,8 @@ class Service:
 
     Attributes:
         on_broken: called when the store cannot be written: the process has to end.
+        held: requests of each identity that are not answered at once: streams, and waits for a
+            node.
     """
 
     broker: Broker
@@ -31,6 +38,19 @@ class Service:
     by_identity: RateLimit
     by_address: RateLimit  # where there is no identity yet
     on_broken: Callable[[], None] = lambda: None
+    held: Counter[str] = field(default_factory=Counter)
+
+    @contextmanager
+    def holding(self, identity: IdentityRecord) -> Iterator[None]:
+        """Count a request that is not answered at once; raises the problem `too-many`."""
+        if self.held[identity.id] >= MOST_HELD:
+            detail = f"{MOST_HELD} requests of yours wait or follow events: end some"
+            raise problem("too-many", detail, 5.0)
+        self.held[identity.id] += 1
+        try:
+            yield
+        finally:
+            self.held[identity.id] -= 1
 
 
 def service_of(request: Request) -> Service:
@@ -76,6 +96,7 @@ class may(Rule, SecurityBase):
             service.by_address.take(_address(request))
             raise
         service.by_identity.take(identity.id)
+        request.state.identity = identity
         if identity.role not in self.roles:
             raise problem(
                 "forbidden",

@@ -69,6 +69,8 @@ class SessionRecord:
     placements: int = 0
     reason: str = ""  # why it is that node
     score: float = 0.0  # of that node, then
+    excluded: list[dict[str, Any]] = field(default_factory=list)  # some of the others, and why
+    excluded_count: int = 0
     saved_number: int = 0  # commands that the saved state includes
     saved_blob: str | None = None
     results: dict[str, str] = field(default_factory=dict)  # name → hash
@@ -111,7 +113,9 @@ class Infrastructure:
     identities: dict[str, IdentityRecord] = field(default_factory=dict)
     keys: dict[str, str] = field(default_factory=dict)  # id → private key, in order of making
     configurations: dict[str, list[str]] = field(default_factory=dict)  # name → hashes, by version
-    waiting: set[str] = field(default_factory=set)  # jobs that no node has
+    # identities → how many configurations they have added
+    configurations_of: dict[str, int] = field(default_factory=dict)
+    waiting: dict[str, None] = field(default_factory=dict)  # jobs that no node has, in their order
 
     def apply(self, event: LogEvent) -> None:
         """Change as `event` says; it has been checked before it was written."""
@@ -138,6 +142,7 @@ class Infrastructure:
 
     def _apply_configuration(self, word: str, event: LogEvent) -> None:
         self.configurations.setdefault(event.subject, []).append(event.data["hash"])
+        self.configurations_of[event.owner] = self.configurations_of.get(event.owner, 0) + 1
 
     def _apply_clock(self, word: str, event: LogEvent) -> None:
         """A clock's anomaly changes nothing."""
@@ -146,6 +151,11 @@ class Infrastructure:
         if word == "registered":
             self._lose(event.subject)  # what an earlier process of it had is gone
             self.nodes[event.subject] = NodeRecord(event.subject, **event.data)
+            return
+        if word == "forgotten":
+            del self.nodes[event.subject]
+            for session in self.sessions.values():
+                session.members = [one for one in session.members if one != event.subject]
             return
         node = self.nodes[event.subject]
         match word:
@@ -167,7 +177,7 @@ class Infrastructure:
             if session.node == name and session.state == "active":
                 session.node, session.state = None, "queued"
                 if session.job is not None:
-                    self.waiting.add(session.id)
+                    self.waiting[session.id] = None
 
     def _apply_session(self, word: str, event: LogEvent) -> None:
         if word == "opened":
@@ -175,7 +185,7 @@ class Infrastructure:
                 id=event.subject, owner=event.owner, opened_s=event.time_s, **event.data
             )
             if event.data["job"] is not None:
-                self.waiting.add(event.subject)
+                self.waiting[event.subject] = None
             return
         if word in ("refused", "timeout"):  # what comes of it is told beside it
             return
@@ -187,8 +197,10 @@ class Infrastructure:
             case "assigned" | "redirected":
                 session.node, session.incarnation = event.data["node"], event.data["incarnation"]
                 session.reason, session.score = event.data["reason"], event.data["score"]
+                session.excluded = event.data["excluded"]
+                session.excluded_count = event.data["excluded_count"]
                 session.state = "active"
-                self.waiting.discard(event.subject)
+                self.waiting.pop(event.subject, None)
                 session.placements += 1
             case "saved":
                 session.saved_number = event.data["number"]
@@ -203,7 +215,7 @@ class Infrastructure:
                 session.results[event.data["name"]] = event.data["sha256"]
             case "closed" | "done" | "failed":
                 session.state, session.node = word, None
-                self.waiting.discard(event.subject)
+                self.waiting.pop(event.subject, None)
                 session.saved_blob, session.message = None, event.data.get("message", "")
 
 

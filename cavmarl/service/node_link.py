@@ -23,7 +23,7 @@ from cavmarl.service.configurations import world_keywords
 NEW_S = 5.0  # for so long a session may be here before a beat's answer names it
 GPU_EVERY = 5  # beats
 JOIN_S = 60.0  # in which the nodes of a session's zones have to come
-MOST_ROWS = 2000  # in one body
+MOST_ROWS = 1000  # in one body, which has 256 KiB at most
 
 
 class NodeLink:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from cavmarl.service import answers, bodies
 from cavmarl.service.guards import TheService
+from cavmarl.service.refusals import problem
 from cavmarl.service.route_parts import Nodes, Readers, SessionId, make_router
 
 ownership = make_router("/v1/sessions/{number}", "ownership")
@@ -45,4 +46,7 @@ async def put_door(
 ) -> None:
     """Where the node of a session awaits those that host zones of it."""
     session = service.broker.hosted(identity, number)
+    node = service.broker.log.state.nodes[session.node or ""]
+    if body.host != node.address:  # others are sent there: nowhere but to the node itself
+        raise problem("refused", f"host: is '{body.host}', the node's address '{node.address}'")
     service.broker.zone_nodes.open_door(session, body)

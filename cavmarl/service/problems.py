@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import re
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,6 +20,7 @@ from cavmarl.service.refusals import PROBLEM_TYPE, PROBLEMS
 MOST_EXCLUSIONS = 100  # that an answer names
 
 _BY_STATUS = {404: "not-found", 405: "wrong-method", 408: "slow-body", 413: "too-large"}
+_BEAT = re.compile(r"/v1/nodes/([^/]+)/beat")
 _LOGGER = logging.getLogger("cavmarl.service")
 
 
@@ -44,6 +47,8 @@ def answer(
 
 def serve_routes(app: FastAPI, routers: Sequence[APIRouter]) -> None:
     """Add routes to an application, each of whose errors is answered as a problem."""
+    app.state.rejected = Counter()
+    app.state.on_misreport = None  # told of beats that say what cannot be
     app.state.routes = [one for router in routers for one in router.routes]
     for router in routers:
         app.include_router(router)
@@ -53,30 +58,40 @@ def serve_routes(app: FastAPI, routers: Sequence[APIRouter]) -> None:
     app.add_exception_handler(Exception, _on_fault)
 
 
-async def _on_error(_: Request, error: Exception) -> JSONResponse:
+def _refuse(request: Request, name: str, detail: str, **given: Any) -> JSONResponse:
+    request.app.state.rejected[name] += 1
+    return answer(name, detail, **given)
+
+
+async def _on_error(request: Request, error: Exception) -> JSONResponse:
     if isinstance(error, NoNodeError):
         shown = [one._asdict() for one in error.exclusions[:MOST_EXCLUSIONS]]
         more = {"excluded": shown, "excluded_count": len(error.exclusions)}
-        return answer("no-node", str(error), headers={"Retry-After": "1"}, more=more)
+        return _refuse(request, "no-node", str(error), headers={"Retry-After": "1"}, more=more)
     if isinstance(error, ServiceError) and error.problem:
         headers: dict[str, str] = {}
         if error.status == 401:
             headers["WWW-Authenticate"] = "Bearer"
         if error.retry_s is not None:
             headers["Retry-After"] = str(max(1, round(error.retry_s)))
-        return answer(error.problem, str(error), headers=headers)
+        return _refuse(request, error.problem, str(error), headers=headers)
     if isinstance(error, ServiceError):
-        return await _on_fault(_, error)
-    return answer("refused", str(error))
+        return await _on_fault(request, error)
+    return _refuse(request, "refused", str(error))
 
 
-async def _on_validation(_: Request, error: Exception) -> JSONResponse:
+async def _on_validation(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
     places = [
         f"{'.'.join(map(str, one['loc']))}: {one['msg']}{_percent(one)}"
         for one in error.errors()[:8]
     ]
-    return answer("bad-body", "; ".join(places))
+    detail = "; ".join(places)
+    beat = _BEAT.fullmatch(request.scope["path"])
+    identity = getattr(request.state, "identity", None)  # none: it is no JSON
+    if beat and identity and request.app.state.on_misreport:
+        request.app.state.on_misreport(identity, beat[1], detail)
+    return _refuse(request, "bad-body", detail)
 
 
 def _percent(found: dict[str, Any]) -> str:
@@ -93,7 +108,7 @@ async def _on_http(request: Request, error: Exception) -> JSONResponse:
     headers = dict(error.headers or {})
     if error.status_code == 405:
         headers["Allow"] = ", ".join(sorted(_methods_of(request)))
-    return answer(name, str(error.detail), status=error.status_code, headers=headers)
+    return _refuse(request, name, str(error.detail), status=error.status_code, headers=headers)
 
 
 def _methods_of(request: Request) -> set[str]:
@@ -105,6 +120,6 @@ def _methods_of(request: Request) -> set[str]:
     return methods
 
 
-async def _on_fault(_: Request, error: Exception) -> JSONResponse:
+async def _on_fault(request: Request, error: Exception) -> JSONResponse:
     _LOGGER.error("%s: %s", type(error).__name__, error, exc_info=error)
-    return answer("broken", "the service could not do this; nothing of it was kept")
+    return _refuse(request, "broken", "the service could not do this; nothing of it was kept")

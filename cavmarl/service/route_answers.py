@@ -5,9 +5,11 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import AsyncIterator, Callable
+from contextlib import suppress
 from dataclasses import asdict
 
 from cavmarl.service import answers
+from cavmarl.service.broker import Broker
 from cavmarl.service.guards import Service
 from cavmarl.service.infrastructure import (
     IdentityRecord,
@@ -30,25 +32,14 @@ async def assigned(
 ) -> answers.Assignment:
     """What a client needs to reach its world; it waits for a node until a deadline."""
     broker = service.broker
-    until_s = time.monotonic() + wait_s
-    while True:
-        try:
-            session = take()
-            break
-        except NoNodeError as error:
-            left_s = until_s - time.monotonic()
-            if left_s <= 0.0:
-                broker.refuse(identity, subject, error, wait_s)
-                raise
-            await broker.log.settle()
-            broker.waiting += 1
-            try:
-                async with asyncio.timeout(left_s), broker.log.changed:
-                    await broker.log.changed.wait()
-            except TimeoutError:
-                continue
-            finally:
-                broker.waiting -= 1
+    try:
+        session = take()
+    except NoNodeError as error:
+        if wait_s <= 0.0:
+            broker.refuse(identity, subject, error)
+            raise
+        with service.holding(identity):
+            session = await _awaited(broker, identity, subject, take, wait_s)
     node = broker.log.state.nodes[session.node or ""]
     lease_s = broker.rules.lease_s
     return answers.Assignment(
@@ -58,6 +49,8 @@ async def assigned(
         redirected=session.preferred not in (None, node.name),
         reason=session.reason,
         score=session.score,
+        excluded=[answers.Excluded(**one) for one in session.excluded],
+        excluded_count=session.excluded_count,
         scheme="https" if TLS in node.capabilities else "http",
         address=node.address,
         client_port=node.client_port,
@@ -69,6 +62,37 @@ async def assigned(
     )
 
 
+async def _awaited(
+    broker: Broker,
+    identity: IdentityRecord,
+    subject: str,
+    take: Callable[[], SessionRecord],
+    wait_s: float,
+) -> SessionRecord:
+    """A session, when a node can take it; raises NoNodeError at the deadline."""
+    until_s = time.monotonic() + wait_s
+    await broker.log.settle()
+    broker.waiting += 1
+    try:
+        while True:
+            left_s = until_s - time.monotonic()
+            with suppress(TimeoutError):
+                async with asyncio.timeout(max(left_s, 0.0)), broker.log.changed:
+                    await broker.log.changed.wait()
+            is_late = time.monotonic() >= until_s
+            if not is_late and not broker.jobs.may_try():
+                continue
+            try:
+                return take()
+            except NoNodeError as error:
+                broker.jobs.has_failed()
+                if is_late:
+                    broker.refuse(identity, subject, error, wait_s)
+                    raise
+    finally:
+        broker.waiting -= 1
+
+
 def node_answer(service: Service, node: NodeRecord) -> answers.NodeStatus:
     """A node, with what its last beat said."""
     live = service.broker.live[node.name]
@@ -77,6 +101,7 @@ def node_answer(service: Service, node: NodeRecord) -> answers.NodeStatus:
         load=None if live.use is None else answers.Load(**asdict(live.use)),
         score=score_of(node, live),
         sessions=len(live.hosted),
+        zones_of=list(live.zones_of),
         age_s=round(service.broker.age_s(node.name), 3),
     )
 
@@ -102,16 +127,17 @@ async def event_stream(
     log = service.broker.log
     owner = identity.id if identity.role == "client" else None
     generation = identity.generation
-    while identity.generation == generation:  # its tokens are void: it hears no more
-        last = log.durable
-        for line in log.store.read(after, until=last, owner=owner) if last > after else ():
-            text = event_answer(line).model_dump_json()
-            yield f"id: {line.sequence}\nevent: {line.kind}\ndata: {text}\n\n"
-        after = max(after, last)
-        if log.durable > after:
-            continue
-        try:
-            async with asyncio.timeout(KEEP_ALIVE_S), log.changed:
-                await log.changed.wait()
-        except TimeoutError:
-            yield ": still here\n\n"
+    with service.holding(identity):
+        while identity.generation == generation:  # its tokens are void: it hears no more
+            last = log.durable
+            for line in log.store.read(after, until=last, owner=owner) if last > after else ():
+                text = event_answer(line).model_dump_json()
+                yield f"id: {line.sequence}\nevent: {line.kind}\ndata: {text}\n\n"
+            after = max(after, last)
+            if log.durable > after:
+                continue
+            try:
+                async with asyncio.timeout(KEEP_ALIVE_S), log.changed:
+                    await log.changed.wait()
+            except TimeoutError:
+                yield ": still here\n\n"

@@ -296,7 +296,8 @@ async def stream(
     """Events as they come, as server-sent events; `Last-Event-ID` goes on where one ended."""
     last = request.headers.get("last-event-id", "")
     after = int(last) if last.isascii() and last.isdigit() and len(last) < 19 else after
-    lines = event_stream(service, identity, after)
+    with service.holding(identity):  # refused here, where it can be told
+        lines = event_stream(service, identity, after)
     return StreamingResponse(lines, media_type="text/event-stream")
 
 

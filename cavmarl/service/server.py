@@ -12,12 +12,13 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from cavmarl.core.errors import ServiceError
 from cavmarl.core.listening import is_loopback, listen, shown_host
-from cavmarl.service.access import Access, RateLimit
+from cavmarl.service.access import Access
 from cavmarl.service.app import make_app
 from cavmarl.service.broker import Broker, BrokerRules
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.event_store import EventStore
 from cavmarl.service.guards import Service
+from cavmarl.service.rate_limit import RateLimit
 
 DEFAULT_STORE = Path("runs/service.sqlite")
 DEFAULT_PORT = 8700
@@ -56,9 +57,7 @@ def serve(options: ServerOptions, tell: Callable[[str], None]) -> None:
     try:
         log = EventLog(store)
         access = Access(log)
-        admin = None
-        if not any(one.role == "admin" for one in log.state.identities.values()):
-            admin = access.add_identity("admin", "admin")[1]
+        admin = first_admin(log, access)
         log.flush()
         broker = Broker(log, options.rules)
         limits = RateLimit(options.rate_hz, 2.0 * options.rate_hz), RateLimit(20.0, 100.0)
@@ -82,6 +81,13 @@ def serve(options: ServerOptions, tell: Callable[[str], None]) -> None:
         log.flush()
     finally:
         store.close()
+
+
+def first_admin(log: EventLog, access: Access) -> str | None:
+    """The secret of a first admin; None: there is one."""
+    if any(one.role == "admin" for one in log.state.identities.values()):
+        return None
+    return access.add_identity("admin", "admin")[1]
 
 
 def check_transport(host: str, certificate: Path | None, key: Path | None) -> None:

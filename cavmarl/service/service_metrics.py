@@ -22,10 +22,10 @@ _TOLD = {  # by nodes, with their beats
 
 
 class ServiceMetrics(PrometheusCollector):
-    """Figures of a broker."""
+    """Figures of a broker, and of requests that were `rejected`, by their problems."""
 
-    def __init__(self, broker: Broker) -> None:
-        self._broker = broker
+    def __init__(self, broker: Broker, rejected: Mapping[str, int]) -> None:
+        self._broker, self._rejected = broker, rejected
         self._registry = CollectorRegistry()
         name, text = "cavmarl_selection_seconds", "Time to choose a node."
         histogram = Histogram(name, text, buckets=BUCKETS_S, registry=self._registry)
@@ -65,6 +65,12 @@ class ServiceMetrics(PrometheusCollector):
                     family.add_metric([name], one.counters[counter])
             yield family
         yield CounterMetricFamily("cavmarl_refusals", "No node was free.", broker.refusals)
+        family = CounterMetricFamily(
+            "cavmarl_rejections", "Requests that were refused.", labels=["problem"]
+        )
+        for problem, count in self._rejected.items():
+            family.add_metric([problem], count)
+        yield family
         yield GaugeMetricFamily("cavmarl_waiting", "Requests that wait.", broker.waiting)
         yield CounterMetricFamily("cavmarl_events", "Events in the log.", broker.log.sequence)
 

@@ -10,10 +10,10 @@ import pytest
 from pydantic import ValidationError
 
 from cavmarl.core.errors import ServiceError
-from cavmarl.service.access import RateLimit
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.event_store import EventStore
 from cavmarl.service.node_selection import NoNodeError
+from cavmarl.service.rate_limit import RateLimit
 from tests.support.fleet import Fleet
 
 
@@ -284,6 +284,72 @@ def test_expired_tokens_are_refused(fleet: Fleet) -> None:
     fleet.now_s += 8 * 3600.0
     with pytest.raises(ServiceError, match="expired"):
         fleet.access.refresh(tokens["refresh_token"])
+
+
+def test_jobs_that_no_node_can_take_cost_little_and_keep_none_waiting(fleet: Fleet) -> None:
+    asked = 0
+
+    def count(_: float) -> None:
+        nonlocal asked
+        asked += 1
+
+    fleet.broker.took_s = count
+    job = {"policies": ["idm"], "episodes": 1, "repeats": 1}
+    for k in range(80):
+        fleet.open(job=job, needs=[f"none-{k % 60}"])
+    possible = fleet.open(job=job)
+    asked = 0
+    fleet.join("a")  # one pass: each kind once, but no more than may fail at once
+    for _ in range(100):
+        fleet.beat("a")
+    assert asked <= 52
+    for _ in range(20):
+        fleet.now_s += 0.5
+        fleet.beat("a")
+    assert possible.node == "a"
+    assert asked <= 1100  # a hundred a second
+
+
+def test_jobs_are_placed_in_their_order(fleet: Fleet) -> None:
+    job = {"policies": ["idm"], "episodes": 1, "repeats": 1}
+    jobs = [fleet.open(job=job) for _ in range(12)]
+    fleet.join("a", slots=8)
+    assert [one.node for one in jobs] == ["a"] * 8 + [None] * 4
+
+
+def test_a_job_that_nodes_do_not_survive_fails(fleet: Fleet) -> None:
+    job = fleet.open(job={"policies": ["idm"], "episodes": 1, "repeats": 1})
+    for k in range(10):
+        fleet.join(f"n{k}")
+        fleet.broker.leave(fleet.nodes, f"n{k}")
+    fleet.broker.sweep()
+    assert (job.state, job.message) == ("failed", "10 nodes were lost with it")
+
+
+def test_nodes_that_are_gone_for_a_day_are_forgotten(fleet: Fleet) -> None:
+    fleet.join("a", "b")
+    session = fleet.open(zone_nodes=2)
+    fleet.broker.leave(fleet.nodes, "b")
+    fleet.now_s += 86_399.0
+    fleet.beat("a")
+    fleet.broker.sweep()
+    assert [*fleet.log.state.nodes] == ["a", "b"]
+    fleet.now_s += 2.0
+    fleet.beat("a")
+    fleet.broker.sweep()
+    assert [*fleet.log.state.nodes] == [*fleet.broker.live] == ["a"]
+    assert "b" not in session.members
+    fleet.join("b", "c")  # ties are broken by the order of coming
+    numbers = [live.number for live in fleet.broker.live.values()]
+    assert numbers == sorted(set(numbers))
+
+
+def test_the_answer_and_the_log_have_the_reasons_against_others(fleet: Fleet) -> None:
+    fleet.join("a", "b")
+    fleet.beat("a", cpu=0.9)
+    session = fleet.open()
+    reasons = [{"node": "a", "reason": "cpu", "value": 0.9, "threshold": 0.85}]
+    assert (session.excluded, session.excluded_count) == (reasons, 1)
 
 
 def test_requests_of_one_caller_have_a_rate(fleet: Fleet) -> None:

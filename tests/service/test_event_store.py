@@ -5,46 +5,41 @@ A real service is killed in each run: no cheaper test shows what outlives that.
 
 from __future__ import annotations
 
-import os
-import shutil
-import socket
-import subprocess
-import tempfile
+import itertools
+import time
+import uuid
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
+from threading import Thread
 
 import pytest
-from sqlalchemy import create_engine, text
+from sqlalchemy import create_engine, inspect, text
 
 from cavmarl.core.errors import ServiceError
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.event_store import EventStore
+from cavmarl.service.server import first_admin
 from tests.support.fleet import Fleet
+from tests.support.postgresql import running_postgresql
 from tests.support.service import running_service
 
 
 @pytest.fixture(scope="module")
 def postgresql() -> Iterator[str]:
-    """URL of a real server that is started for these tests."""
-    if shutil.which("initdb") is None or shutil.which("postgres") is None:
-        pytest.skip("no PostgreSQL on this machine: initdb and postgres are not in the path")
-    folder = Path(tempfile.mkdtemp(prefix="cavmarl-pg-"))  # where every user may go
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    user = ["setpriv", "--reuid=65534", "--regid=65534", "--clear-groups"]
-    prefix = user if os.geteuid() == 0 else []  # it does not run for root
-    if prefix:
-        os.chown(folder, 65534, 65534)
-    data = folder / "data"
-    words = ["initdb", "-D", str(data), "-U", "postgres", "-A", "trust", "--no-sync"]
-    subprocess.run([*prefix, *words], check=True, capture_output=True)
-    options = f"-p {port} -k {folder} -c listen_addresses=127.0.0.1"
-    server = [*prefix, "pg_ctl", "-D", str(data), "-w", "-l", str(folder / "log")]
-    subprocess.run([*server, "-o", options, "start"], check=True, capture_output=True)
-    yield f"postgresql://postgres@127.0.0.1:{port}/postgres"
-    subprocess.run([*server, "-m", "immediate", "stop"], check=False, capture_output=True)
-    shutil.rmtree(folder, ignore_errors=True)
+    with running_postgresql() as url:
+        yield url
+
+
+@pytest.fixture
+def empty_postgresql(postgresql: str) -> str:
+    """The same server, and a database of this test alone."""
+    name = f"d{uuid.uuid4().hex}"
+    engine = create_engine(postgresql.replace("postgresql:", "postgresql+psycopg:"))
+    with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
+        connection.execute(text(f"CREATE DATABASE {name}"))
+    engine.dispose()
+    return f"{postgresql.rpartition('/')[0]}/{name}"
 
 
 def history(where: str | Path) -> tuple[list[str], EventLog]:
@@ -69,10 +64,10 @@ def history(where: str | Path) -> tuple[list[str], EventLog]:
     return kinds, again
 
 
-def test_postgresql_keeps_what_sqlite_keeps(postgresql: str, tmp_path: Path) -> None:
-    kinds, log = history(postgresql)
+def test_postgresql_keeps_what_sqlite_keeps(empty_postgresql: str, tmp_path: Path) -> None:
+    kinds, log = history(empty_postgresql)
     with pytest.raises(ServiceError, match="another service has it"):
-        EventStore(postgresql)
+        EventStore(empty_postgresql)
     log.store.close()
     expected, other = history(tmp_path / "store.sqlite")
     other.store.close()
@@ -138,20 +133,53 @@ def test_the_store_s_file_is_its_owner_s_alone(tmp_path: Path) -> None:
     assert (tmp_path / "store.sqlite").stat().st_mode & 0o077 == 0
 
 
-def test_what_was_acknowledged_outlives_a_kill(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
+def test_what_was_acknowledged_outlives_a_kill(
+    kind: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    where: str | Path = tmp_path / "store.sqlite"
+    if kind == "postgresql":
+        where = request.getfixturevalue("empty_postgresql")
+    acknowledged: list[str] = []
+    with running_service(where) as service:
+
+        def ask_until_killed(asker: int) -> None:
+            with service.client() as client, suppress(ServiceError):
+                for k in itertools.count():
+                    body = {"name": f"guest-{asker}-{k}", "role": "viewer"}
+                    acknowledged.append(client.post("/identities", body)["identity"])
+
+        askers = [Thread(target=ask_until_killed, args=(k,)) for k in range(3)]
+        for one in askers:
+            one.start()
+        while len(acknowledged) < 20 and any(one.is_alive() for one in askers):
+            time.sleep(0.001)
+        service.kill()  # with requests under way
+        for one in askers:
+            one.join()
+        service.start_again()  # which shows no secret: there is an admin
+        with service.client() as client:
+            known = {one["id"] for one in client.get("/identities")["identities"]}
+    assert len(acknowledged) >= 20
+    assert known >= set(acknowledged)
+
+
+def test_a_secret_is_shown_once(tmp_path: Path) -> None:
+    for is_new in (True, False):
+        fleet = Fleet(tmp_path / "store.sqlite", identities=is_new)
+        assert (first_admin(fleet.log, fleet.access) is not None) == is_new
+        fleet.close()
+
+
+def test_a_store_from_before_the_indices_gets_them(tmp_path: Path) -> None:
     path = tmp_path / "store.sqlite"
-    acknowledged = []
-    with running_service(path) as service, service.client() as client:
-        for k in range(20):
-            body = {"name": f"guest-{k}", "role": "viewer"}
-            acknowledged.append(client.post("/identities", body)["identity"])
-        secret = service.secret
-        service.kill()
-    with running_service(path) as service:
-        assert service.secret == ""  # it is shown once
-        with service.client(secret) as client:
-            known = [one["id"] for one in client.get("/identities")["identities"]]
-            assert known[1:] == acknowledged
+    EventStore(path).close()
+    damage(path, "DROP INDEX events_of_owner")
+    EventStore(path).close()
+    engine = create_engine(f"sqlite:///{path}")
+    names = {one["name"] for one in inspect(engine).get_indexes("events")}
+    engine.dispose()
+    assert names == {"events_of_owner", "events_of_actor", "events_of_subject"}
 
 
 def test_nothing_is_acknowledged_that_could_not_be_written(tmp_path: Path) -> None:

@@ -19,14 +19,15 @@ CONFIGURATION = "0" * 64
 class Fleet:
     """A broker, and nodes and clients of it that do as a test says."""
 
-    def __init__(self, where: str | Path, **rules: Any) -> None:
+    def __init__(self, where: str | Path, *, identities: bool = True, **rules: Any) -> None:
         self.now_s = 1000.0
         self.log = EventLog(EventStore(where), lambda: self.now_s)
         self.access = Access(self.log, lambda: self.now_s)
         self.broker = Broker(self.log, BrokerRules(**rules), lambda: self.now_s)
         self.secrets: dict[str, str] = {}  # by names of identities
-        self.nodes = self.identity("nodes", "node")
-        self.client = self.identity("ada", "client")
+        if identities:
+            self.nodes = self.identity("nodes", "node")
+            self.client = self.identity("ada", "client")
         self._beats = itertools.count()
 
     def identity(self, name: str, role: Role) -> IdentityRecord:

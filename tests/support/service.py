@@ -23,8 +23,8 @@ class RunningService:
 
     process: subprocess.Popen[str]
     url: str
-    secret: str  # of the admin; nothing, if there was one before
-    store: Path
+    secret: str  # of the admin
+    store: str | Path
 
     def client(self, secret: str = "", **options: Any) -> Client:
         return Client(self.url, secret or self.secret, **options)
@@ -48,16 +48,15 @@ class RunningService:
 
 
 @contextmanager
-def running_service(store: Path, *options: str) -> Iterator[RunningService]:
-    """A service on a socket; it ends with the block."""
-    has_admin = store.exists()
+def running_service(store: str | Path, *options: str) -> Iterator[RunningService]:
+    """A service on a socket, with a new store; it ends with the block."""
     words = [sys.executable, "-m", "cavmarl", "serve", "--port", "0", "--store", str(store)]
     process = subprocess.Popen([*words, *options], stdout=subprocess.PIPE, text=True)
     running = RunningService(process, "", "", store)
     try:
         assert process.stdout is not None
         running.url = process.stdout.readline().split()[1].rstrip(",")
-        running.secret = "" if has_admin else process.stdout.readline().split()[-1]
+        running.secret = process.stdout.readline().split()[-1]
         yield running
     finally:
         if running.process.poll() is None:
