@@ -112,7 +112,7 @@ class open_to_all(Rule):
 
     async def __call__(self, request: Request) -> IdentityRecord:
         service_of(request).by_address.take(_address(request))
-        return IdentityRecord("nobody", "nobody", "viewer", "")
+        return IdentityRecord("unknown", "unknown", "viewer", "")
 
 
 class StrictRoute(APIRoute):
