@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import zlib
 
 import pytest
 
@@ -38,9 +39,16 @@ def frame(kind: FrameKind, data: bytes) -> bytes:
     return said
 
 
+def head(kind: int, size: int) -> bytes:
+    """The head of a first frame."""
+    found = b"cavN\x03\x00" + kind.to_bytes(2, "little") + bytes(8) + size.to_bytes(8, "little")
+    found += bytes(4)
+    return found + zlib.crc32(found, 1).to_bytes(4, "little")
+
+
 def test_the_bytes_of_a_frame() -> None:
     assert frame(FrameKind.PING, b"abc").hex() == (
-        "6361764e02000d000700000000000000" + "f52be634" + "0300000000000000" + b"abc".hex()
+        "6361764e03000d0007000000000000000300000000000000c2412435" + "0a522abc" + b"abc".hex()
     )
 
 
@@ -48,9 +56,9 @@ def test_the_bytes_of_a_frame() -> None:
     ("said", "words"),
     [
         (b"GET / HTTP/1.1\r\n" * 9, "begins no frame"),
-        (frame(FrameKind.PING, b"abc")[:20] + (MAX_FRAME + 1).to_bytes(8, "little"), "is none"),
-        (b"cavN\x09\x00" + bytes(22), "version 9"),
-        (b"cavN\x02\x00\xff\x00" + bytes(20), "kind 255"),
+        (head(FrameKind.PING, MAX_FRAME + 1), "is none"),
+        (b"cavN\x09\x00" + bytes(26), "version 9"),
+        (head(255, 0), "kind 255"),
         (frame(FrameKind.PING, b"abc")[:-1] + b"d", "not what was sent"),
         (2 * frame(FrameKind.SYNC, b"abc"), "not the next one"),
         (frame(FrameKind.SYNC, b"abc")[:-1], "has ended"),
@@ -87,6 +95,19 @@ def test_a_node_speaks_for_its_own_zones() -> None:
         with pytest.raises(LinkLostError, match="speaks for zone 2"):
             links.pump(1000.0)
     others.close()
+
+
+def test_each_bit_of_a_frame_is_guarded() -> None:
+    """None of them makes another frame of it, or lets the receiver wait for more."""
+    sent = frame(FrameKind.SYNC, b"abc")
+    for bit in range(8 * len(sent)):
+        changed = bytearray(sent)
+        changed[bit // 8] ^= 1 << bit % 8
+        links, far = pair()
+        far.sendall(changed)
+        with pytest.raises(LinkLostError, match="frame"):
+            links.take([0], WAIT_S)
+        far.close()
 
 
 @pytest.mark.parametrize("said", [b"no JSON", b"{}", b"\xff"])

@@ -3,10 +3,11 @@
 A frame is a head of fixed size and bytes. Frames of a connection arrive in their order, or the
 connection has ended. Nothing in a frame is ever run.
 
-    head    magic, version, kind, number, checksum of what follows, bytes of what follows
+    head    magic, version, kind, number, bytes of what follows, checksum of what follows,
+            checksum of the head
 
-A checksum begins with how many frames went before on that connection, so that one that comes twice
-or out of turn is no frame.
+The head's checksum begins with how many frames went before on that connection, so that one that
+comes twice or out of turn is no frame. It is compared before anything else of the frame is awaited.
 """
 
 from __future__ import annotations
@@ -15,7 +16,6 @@ import json
 import select
 import socket
 import struct
-import time
 import zlib
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -24,12 +24,15 @@ from enum import IntEnum
 from typing import Any, NamedTuple, TypeAlias
 
 from cavmarl.core.errors import MessageError, NodeRefusedError
+from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 
 MAGIC = b"cavN"
-VERSION = 2
+VERSION = 3
 MAX_FRAME = 1 << 32
 _ALL = (1 << 32) - 1
-_HEAD = struct.Struct("<4sHHQIQ")
+_HEAD = struct.Struct("<4sHHQQI")
+_SUM = struct.Struct("<I")
+HEAD_BYTES = _HEAD.size + _SUM.size
 
 # A machine that vanishes says nothing: after so many seconds it is asked, and again, so often.
 _ALIVE = [(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)] + [
@@ -129,7 +132,7 @@ class Link:
         self.socket = connection
         self.waiting: deque[memoryview] = deque()
         self.frames: deque[NodeFrame] = deque()
-        self._head = bytearray(_HEAD.size)
+        self._head = bytearray(HEAD_BYTES)
         self._into = memoryview(self._head)
         self._opened: tuple[FrameKind, int, int, bytearray] | None = None
         self._num_sent = self._num_heard = 0  # frames
@@ -137,12 +140,14 @@ class Link:
     def send(self, kind: FrameKind, number: int, pieces: Sequence[Bytes]) -> None:
         """Send what the system takes at once; the rest is kept, as a copy."""
         views = [memoryview(piece).cast("B") for piece in pieces if len(piece)]
-        checksum = self._num_sent = self._num_sent + 1 & _ALL
+        self._num_sent = self._num_sent + 1 & _ALL
+        checksum = 0
         for view in views:
             checksum = zlib.crc32(view, checksum)
         size = sum(map(len, views))
-        head = _HEAD.pack(MAGIC, VERSION, kind, number, checksum, size)
-        rest = [memoryview(head), *views]
+        head = _HEAD.pack(MAGIC, VERSION, kind, number, size, checksum)
+        start = head + _SUM.pack(zlib.crc32(head, self._num_sent))
+        rest = [memoryview(start), *views]
         if not self.waiting:
             rest = self._sent(rest)
         self.waiting.extend(memoryview(bytes(view)) for view in rest)
@@ -196,7 +201,7 @@ class Link:
                     self.frames.append(frame)
 
     def _open(self) -> None:
-        magic, version, kind, number, checksum, size = _HEAD.unpack(self._head)
+        magic, version, kind, number, size, checksum = _HEAD.unpack_from(self._head)
         if magic != MAGIC:
             raise MessageError(f"{bytes(magic)!r} begins no frame of a node")
         if version != VERSION:
@@ -204,6 +209,10 @@ class Link:
                 f"a frame of version {version}, this is {VERSION}: install the same cavmarl "
                 "everywhere"
             )
+        self._num_heard = self._num_heard + 1 & _ALL
+        found = zlib.crc32(memoryview(self._head)[: _HEAD.size], self._num_heard)
+        if _SUM.unpack_from(self._head, _HEAD.size) != (found,):
+            raise MessageError("a frame's head is not what was sent, or not the next one")
         if size > MAX_FRAME or kind not in FrameKind.__members__.values():
             raise MessageError(f"a frame of kind {kind} with {size} bytes is none")
         room = bytearray(size)
@@ -213,9 +222,8 @@ class Link:
     def _close(self) -> NodeFrame:
         assert self._opened is not None
         kind, number, checksum, room = self._opened
-        self._num_heard = self._num_heard + 1 & _ALL
-        if zlib.crc32(room, self._num_heard) != checksum:
-            raise MessageError("a frame is not what was sent, or not the next one")
+        if zlib.crc32(room) != checksum:
+            raise MessageError("a frame is not what was sent")
         self._opened, self._into = None, memoryview(self._head)
         return NodeFrame(kind, number, memoryview(room))
 
@@ -223,10 +231,11 @@ class Link:
 class Links:
     """Connections by the number of the process at the other end."""
 
-    def __init__(self, urgent: Urgent) -> None:
+    def __init__(self, urgent: Urgent, system: NodeSystem = MACHINE) -> None:
         self.urgent = urgent
+        self.now_s = system.now_s
         self._links: dict[int, Link] = {}
-        self._poll = select.poll()
+        self._poll = system.poll()
         self._by_socket: dict[int, int] = {}
         self.awaited: set[int] = set()  # whose frames `take` waits for
         self.waited_s = 0.0
@@ -253,7 +262,7 @@ class Links:
         if link is None:
             raise LinkLostError(to)
         self.sent_frames += 1
-        self.sent_bytes += _HEAD.size + sum(memoryview(piece).nbytes for piece in pieces)
+        self.sent_bytes += HEAD_BYTES + sum(memoryview(piece).nbytes for piece in pieces)
         try:
             link.send(kind, number, pieces)
         except OSError as error:
@@ -274,22 +283,19 @@ class Links:
             MessageError: what came is no frame.
             SilenceError: nothing has come in time.
         """
-        self.awaited = missing = set(wanted)
-        found: dict[int, NodeFrame] = {}
-        until_s = None if timeout_s is None else time.monotonic() + timeout_s
+        numbers = list(wanted)
+        until_s = None if timeout_s is None else self.now_s() + timeout_s
         while True:
-            for number in tuple(missing):
-                link = self._links.get(number)
-                if link is None:
+            for number in numbers:
+                if number not in self._links:
                     raise LinkLostError(number)
-                if link.frames:
-                    found[number] = link.frames.popleft()
-                    missing.remove(number)
-            if not missing:
-                return found
-            left_ms = None if until_s is None else 1e3 * max(until_s - time.monotonic(), 0.0)
+            self.awaited = {number for number in numbers if not self._links[number].frames}
+            if not self.awaited:
+                return {number: self._links[number].frames.popleft() for number in numbers}
+            left_ms = None if until_s is None else 1e3 * max(until_s - self.now_s(), 0.0)
             if left_ms == 0.0:
-                raise SilenceError(f"nodes {sorted(missing)} do not answer within {timeout_s:g} s")
+                missing = sorted(self.awaited)
+                raise SilenceError(f"nodes {missing} do not answer within {timeout_s:g} s")
             self.pump(left_ms)
 
     def arrived(self, number: int) -> NodeFrame | None:
@@ -311,9 +317,9 @@ class Links:
 
     def pump(self, timeout_ms: float | None) -> None:
         """Send and receive what can be; wait so long for the first that can."""
-        began_s = time.perf_counter()
+        began_s = self.now_s()
         ready = self._poll.poll(timeout_ms)
-        self.waited_s += time.perf_counter() - began_s
+        self.waited_s += self.now_s() - began_s
         for socket_number, _ in ready:
             number = self._by_socket[socket_number]
             link = self._links[number]
@@ -349,10 +355,10 @@ class Links:
             with suppress(LinkLostError):
                 self.send(number, FrameKind.END, 0)
         self.urgent = _unheard
-        until_s = time.monotonic() + timeout_s
-        while self._links and time.monotonic() < until_s:
+        until_s = self.now_s() + timeout_s
+        while self._links and self.now_s() < until_s:
             with suppress(LinkLostError):
-                self.pump(1e3 * max(until_s - time.monotonic(), 0.0))
+                self.pump(1e3 * max(until_s - self.now_s(), 0.0))
         self.close()
 
     def close(self) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,9 +12,9 @@ from typing import Any
 from cavmarl.core.errors import WorkerError, WorkerFailureError
 from cavmarl.parallel.commanded_worlds import own_error
 from cavmarl.parallel.hosts.host_process import code_stamp
-from cavmarl.parallel.hosts.listener import Listener
 from cavmarl.parallel.nodes.links import FrameKind, Link, LinkLostError, Links, NodeFrame
 from cavmarl.parallel.nodes.node_files import WorldFile
+from cavmarl.parallel.nodes.node_system import MACHINE, NodeListener, NodeSystem
 
 log = logging.getLogger("cavmarl.nodes")
 
@@ -46,16 +45,17 @@ class Newcomers:
 
     def __init__(
         self,
-        listener: Listener,
+        listener: NodeListener,
         job: Any,  # what they are told, as JSON knows it
         files: Sequence[WorldFile],  # that the world is made of
         room: Callable[[], int],  # how many more would be of use
+        system: NodeSystem = MACHINE,
     ) -> None:
         self._listener = listener
         self._job = json.dumps({**job, "files": files}).encode()
         self._files = files
         self._room = room
-        self._links = Links(lambda number, frame: self._hear(number, self._all[number], frame))
+        self._links = Links(self._hear, system)
         self.place = "{}:{}".format(*listener.place)
         self._all: dict[int, Newcomer] = {}
         self._next = 0
@@ -74,7 +74,7 @@ class Newcomers:
             for number in list(self._all):
                 frame = self._links.arrived(number)
                 if frame is not None:
-                    self._hear(number, self._all[number], frame)
+                    self._hear(number, frame)
         except LinkLostError as lost:
             self._forget(lost.peer)
 
@@ -90,14 +90,14 @@ class Newcomers:
             CavmarlError: what one of them has raised.
             WorkerError: they have not come in time.
         """
-        until_s = time.monotonic() + timeout_s
+        until_s = self._links.now_s() + timeout_s
         log.info("waiting for %d nodes at %s", num, self.place)
         while len(self.ready) < num:
             self.look(LOOK_MS)
             for failure in self.failures:
                 raise own_error(failure) from failure
             why = trouble()
-            if why is None and time.monotonic() > until_s:
+            if why is None and self._links.now_s() > until_s:
                 why = "; refused ".join(
                     (
                         f"{len(self.ready)} of {num} nodes have joined at {self.place} within "
@@ -113,7 +113,8 @@ class Newcomers:
         self.ready.remove(number)
         return self._all.pop(number), self._links.release(number)
 
-    def _hear(self, number: int, newcomer: Newcomer, frame: NodeFrame) -> None:
+    def _hear(self, number: int, frame: NodeFrame) -> None:
+        newcomer = self._all[number]
         try:
             match frame.kind:
                 case FrameKind.JOIN:

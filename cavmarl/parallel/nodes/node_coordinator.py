@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 
@@ -161,9 +160,9 @@ class NodeCoordinator:
         Raises:
             SilenceError: an offer is not answered in time.
         """
-        until_s = time.monotonic() + timeout_s
+        until_s = self._links.now_s() + timeout_s
         while any(not set(world.movers) <= world.answered for world in self._worlds):
-            if time.monotonic() > until_s:
+            if self._links.now_s() > until_s:
                 raise SilenceError(f"offers are not answered within {timeout_s:g} s")
             self._links.pump(1e3 * timeout_s)
         messages = []

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import struct
-import time
-from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -39,7 +39,9 @@ from cavmarl.parallel.nodes.links import (
 from cavmarl.parallel.nodes.newcomers import Newcomer, Newcomers
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
 from cavmarl.parallel.nodes.node_files import files_of
-from cavmarl.parallel.nodes.node_starters import Route, start_nodes, straight
+from cavmarl.parallel.nodes.node_starters import Route, Start, start_nodes, straight
+from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
+from cavmarl.parallel.nodes.node_watch import NodeWatch, SilentNodeError
 from cavmarl.parallel.nodes.zone_hosts import read_report
 from cavmarl.parallel.nodes.zone_moves import ZoneMoves, moves_of, name_of
 from cavmarl.parallel.recipe import recipe_of
@@ -49,9 +51,7 @@ from cavmarl.parallel.work_shares import parts_of
 
 log = logging.getLogger("cavmarl.nodes")
 
-PONG_S = 1.0  # for a living node to answer
 KEEP_S = 0.2  # so much of work may have to be done again
-MISSED_S = 0.1  # to hear which others miss a node
 END_S = 1.0  # for nodes to hear that they are needed no more
 SPARES = 1  # nodes more than are wanted that may wait for another one's end
 
@@ -96,6 +96,8 @@ class NodePool:
         in_next_step: bool = False,  # when worlds begin anew; see `SteppedWorlds`
         hosts: str = "",  # what starts the nodes; see `start_nodes`
         route: Route = straight,  # where to call in order to reach a place
+        system: NodeSystem = MACHINE,  # that the nodes are on
+        start: Start = start_nodes,  # starts them
     ) -> None:
         self.world, self._route = world, route
         self.in_next_step = in_next_step
@@ -110,18 +112,15 @@ class NodePool:
         self._state = _State(1, self.zones, 0)  # that all nodes can go back to
         self._opened: _State | None = None  # that they keep before the next command
         self._next_state = 2
-        self._keep_again_s = 0.0  # by `time.monotonic`
+        self._keep_again_s = -math.inf  # by the clock of `_links`
         self._log: list[NodeCommand] = []  # since that state
         self._lost: list[int] = []
-        self._missed: list[int] = []  # the two ends of connections that nodes have lost
         self._is_torn = False
         self.losses = self.recoveries = self.replacements = 0
         self._timeout_s = config.workers.timeout_s
-        # nodes that answered the last PING, and whose frames each waits for
-        self._answered: dict[int, list[int]] = {}
-        self._pings = 0
         self._ticks_per_step = config.clock.ticks_per_step
-        self._links = Links(_nothing)
+        self._links = Links(_nothing, system)
+        self._watch = NodeWatch(self._links)
         self._nodes: dict[int, Newcomer] = {}  # what is known of each that lives
         self._new: dict[int, tuple[str, int]] = {}  # where the others can call those of them
         runs = prepare_runs(config.zones, num_worlds)
@@ -143,8 +142,8 @@ class NodePool:
             "in_next_step": in_next_step,
         }
         files = files_of(config, base_dir)
-        self._starter, listener = start_nodes(hosts, nodes, config.workers, base_dir, route)
-        self._newcomers = Newcomers(listener, job, files, self._room)
+        self._starter, listener = start(hosts, nodes, config.workers, base_dir, route)
+        self._newcomers = Newcomers(listener, job, files, self._room, system)
         try:
             self._newcomers.await_ready(nodes, config.workers.join_timeout_s, self._starter.trouble)
             self._seat()
@@ -178,7 +177,7 @@ class NodePool:
             if number in self._lost:
                 self._lost.remove(number)
 
-    def _take(self, kind: FrameKind, timeout_s: float | None = None) -> dict[int, NodeFrame]:
+    def _take(self, kind: FrameKind) -> dict[int, NodeFrame]:
         """The next frame of all living nodes, by rising numbers.
 
         Raises:
@@ -186,7 +185,8 @@ class NodePool:
         """
         found: dict[int, NodeFrame] = {}
         while missing := [number for number in self._living if number not in found]:
-            for number, frame in self._links.take(missing, timeout_s or self._timeout_s).items():
+            wait = partial(self._links.take, missing, self._timeout_s)
+            for number, frame in self._watch.wait(self._living, wait).items():
                 if frame.number == self._generation:
                     found[number] = frame
         for number, frame in found.items():
@@ -206,7 +206,7 @@ class NodePool:
         Raises:
             WorkerDeathError: no node has kept the zones of lost ones, or too many were lost.
         """
-        if command.changes and time.monotonic() > self._keep_again_s:
+        if command.changes and self._links.now_s() > self._keep_again_s:
             if not self._replace_lost():
                 self._begin_state()
         if command.changes:
@@ -221,7 +221,7 @@ class NodePool:
         if command.changes and self._opened is not None:
             self._state, self._opened = self._opened, None
             self._log = self._log[-1:]
-            self._keep_again_s = time.monotonic() + KEEP_S
+            self._keep_again_s = self._links.now_s() + KEEP_S
         return results
 
     def _insist(self, command: NodeCommand | None) -> list[memoryview]:
@@ -234,10 +234,10 @@ class NodePool:
                     for one in self._log[: -1 if changes else None]:
                         self._perform(one)
                 return [] if command is None else self._perform(command)
+            except SilentNodeError as silent:
+                self._lose(silent, is_silent=True)
             except LinkLostError as lost:
-                self._lose(self._most_missed(lost))
-            except SilenceError as silence:
-                self._lose(LinkLostError(self._silent(silence)), is_silent=True)
+                self._lose(self._watch.most_missed(lost))
 
     def _replace_lost(self) -> bool:  # whether the worlds go back for that
         """Let nodes that have joined meanwhile host what lost ones had.
@@ -271,7 +271,7 @@ class NodePool:
             return [frame.data for frame in self._take(FrameKind.RESULT).values()]
         results: list[memoryview] = []
         for _ in range(command.ticks):
-            self._coordinator.begin(self._timeout_s)
+            self._watch.wait(self._living, partial(self._coordinator.begin, self._timeout_s))
             results = self._commit()
         return results if command.ticks else self._commit()
 
@@ -280,58 +280,21 @@ class NodePool:
         if frame.kind is FrameKind.MISSED:
             peer = int.from_bytes(frame.data, "little")
             if frame.number == self._generation and peer in self._nodes:
-                self._missed += (number, peer)
-                raise LinkLostError(peer)
+                self._watch.hear_missed(number, peer)
         elif frame.kind is FrameKind.FAILED:
             name, text, trace = said_by(frame)
             failure = WorkerFailureError(number, name_of(self._homes[number]), name, text, trace)
             raise own_error(failure) from failure
-        elif frame.kind is not FrameKind.PONG:
+        elif frame.kind is FrameKind.PONG:
+            self._watch.hear_pong(number, frame)
+        else:
             self._coordinator.hear(number, frame)
-        elif frame.number == self._pings:
-            self._answered[number] = list(said_by(frame))
-
-    def _silent(self, silence: SilenceError) -> int:
-        """A node that answers nothing, for it has stopped; or that another one waits for in vain.
-
-        Raises:
-            WorkerError: all answer, and yet nothing comes of the command.
-        """
-        self._pings += 1
-        self._answered.clear()
-        until_s = time.monotonic() + PONG_S
-        try:
-            for number in self._living:
-                self._links.send(number, FrameKind.PING, self._pings)
-            while time.monotonic() < until_s and len(self._answered) < len(self._living):
-                self._links.pump(1e3 * PONG_S)
-        except LinkLostError as lost:
-            return lost.peer
-        mute = [number for number in self._living if number not in self._answered]
-        missed = Counter(peer for peers in self._answered.values() for peer in peers)
-        mute += [number for number, _ in missed.most_common() if number in self._nodes]
-        if not mute:
-            raise WorkerError(f"{silence}, though they live") from silence
-        return mute[0]
-
-    def _most_missed(self, lost: LinkLostError) -> LinkLostError:
-        """The node that has ended, or else the one that cannot be reached by most others."""
-        until_s = time.monotonic() + MISSED_S
-        while lost.peer in self._links.numbers and time.monotonic() < until_s:
-            try:
-                self._links.pump(1e3 * (until_s - time.monotonic()))
-            except LinkLostError as more:
-                lost = more
-        if lost.peer not in self._links.numbers:
-            return lost
-        worst = max(self._missed, key=lambda number: (self._missed.count(number), number))
-        return LinkLostError(worst, MessageError("other nodes do not reach it"))
 
     def _lose(self, lost: LinkLostError, is_silent: bool = False) -> None:
         """A node is gone: nothing of it counts any more."""
         number = lost.peer
         self._is_torn = True
-        self._missed.clear()
+        self._watch.forget_missed()
         self._links.drop(number)
         node = self._nodes.pop(number, None)
         self._new.pop(number, None)
@@ -367,7 +330,7 @@ class NodePool:
         self._commit()
         self._new.clear()
         self._is_torn = False
-        self._keep_again_s = 0.0
+        self._keep_again_s = -math.inf
         self.recoveries += bool(moves.heirs)
 
     def _tell_zones(

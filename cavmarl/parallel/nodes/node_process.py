@@ -18,7 +18,6 @@ from cavmarl.handoff.shard_setup import limits_of
 from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.ownership.reactions import Hosting
 from cavmarl.parallel.hosts.host_process import code_stamp
-from cavmarl.parallel.hosts.listener import Listener, call
 from cavmarl.parallel.journaled_worlds import unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.nodes.kept_states import KeptStates
@@ -36,8 +35,8 @@ from cavmarl.parallel.nodes.node_files import WorldFile, recipe_with
 from cavmarl.parallel.nodes.node_frames import cases_of, command_of, results_of, told_cases
 from cavmarl.parallel.nodes.node_loads import totals
 from cavmarl.parallel.nodes.node_peers import NodePeers
+from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.nodes.zone_hosts import ZoneHosts
-from cavmarl.parallel.recipe import world_of
 from cavmarl.parallel.worlds_job import Task, commands_of
 from cavmarl.shards.executor import Executor, SerialExecutor
 from cavmarl.shards.shard import Shard
@@ -70,9 +69,9 @@ class NodeProgram:
         zones: that it hosts.
     """
 
-    def __init__(self, links: Links, address: str, secret: bytes) -> None:
+    def __init__(self, system: NodeSystem, links: Links, address: str, secret: bytes) -> None:
         self.zones: tuple[int, ...] = ()
-        self._links = links
+        self._system, self._links = system, links
         self._address = address  # of this machine, as the caller reaches it
         self._secret = secret
         self._number = -1  # until the caller has said it
@@ -90,13 +89,13 @@ class NodeProgram:
         job = json.loads(bytes(self._take(FrameKind.JOB)))
         files = [WorldFile(*told) for told in job["files"]]
         self._fetch(files)
-        world = unwatched(world_of(recipe_with(job["recipe"], files), DIFFERENT))
+        world = unwatched(self._system.world_of(recipe_with(job["recipe"], files), DIFFERENT))
         self._worlds = worlds = LocalWorlds(
             world, job["num_worlds"], warm=True, in_next_step=job["in_next_step"]
         )
         self._commands = commands_of(worlds.arrays)
         worlds.keep_logs()
-        self._listener = Listener(self._address, self._secret)
+        self._listener = self._system.listen(self._address, self._secret)
         said = json.dumps(self._listener.place).encode()
         links.send(COORDINATOR, FrameKind.READY, 0, [said])
 
@@ -249,10 +248,10 @@ class NodeProgram:
         for other in others:
             if other in places and (not is_new or other < number):
                 host, port = places[other]
-                links.add(other, call_node((host, port), self._secret, number, other))
+                links.add(other, call_node(self._system, (host, port), self._secret, number, other))
         if is_new:
             callers = [node for node in others if node not in places or node > number]
-            found = calls_of(self._listener, callers, MEETING_S, self._check)
+            found = calls_of(self._system, self._listener, callers, MEETING_S, self._check)
             for other, connection in found.items():
                 links.add(other, connection)
 
@@ -350,6 +349,7 @@ def run_node(
     secret: bytes,
     number: int,  # that it would have; ANYONE: any
     note: Callable[[str], None] = lambda text: None,  # what is told of its life
+    system: NodeSystem = MACHINE,
 ) -> bool:
     """The whole life of a node.
 
@@ -362,11 +362,11 @@ def run_node(
         MessageError: what listens there does not know the secret, or speaks another version.
         NodeRefusedError: the caller does not want it.
     """
-    connection = call(place, secret, number)
+    connection = system.call(place, secret, number, None)
     address = str(connection.getsockname()[0])
-    links = Links(_ignore)
+    links = Links(_ignore, system)
     links.add(COORDINATOR, connection)
-    node = NodeProgram(links, address, secret)
+    node = NodeProgram(system, links, address, secret)
     note(f"has joined {place[0]}:{place[1]}")
     try:
         node.join()

@@ -16,6 +16,7 @@ from cavmarl.parallel.hosts.host_registry import Launcher
 from cavmarl.parallel.hosts.listener import Listener
 from cavmarl.parallel.hosts.ray_actors import RayActors
 from cavmarl.parallel.nodes.node_process import run_on_ray
+from cavmarl.parallel.nodes.node_system import NodeListener
 
 NODE = "cavmarl.parallel.nodes.local_node"  # the program of a node
 LOCAL = "127.0.0.1"  # where nodes of this machine meet
@@ -124,13 +125,19 @@ class JoinedNodes:
         """They end with the connection."""
 
 
+Start: TypeAlias = Callable[
+    [str, int, WorkersConfig, Path, Route], tuple[NodeStarter, NodeListener]
+]
+"""Begins to start nodes; arguments as of `start_nodes`."""
+
+
 def start_nodes(
     hosts: str,  # "": this machine; "ray"; else HOST:PORT, for nodes that are started by hand
     nodes: int,
     settings: WorkersConfig,
     base_dir: Path,  # the folder that a relative key file starts from
     route: Route,  # for nodes of this machine
-) -> tuple[NodeStarter, Listener]:
+) -> tuple[NodeStarter, NodeListener]:
     """Begin to start nodes; they call the listener.
 
     Raises:

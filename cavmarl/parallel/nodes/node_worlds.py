@@ -27,7 +27,8 @@ from cavmarl.parallel.nodes.node_frames import (
 )
 from cavmarl.parallel.nodes.node_loads import NodeLoad, since
 from cavmarl.parallel.nodes.node_pool import NodeCommand, NodePool
-from cavmarl.parallel.nodes.node_starters import Route, straight
+from cavmarl.parallel.nodes.node_starters import Route, Start, start_nodes, straight
+from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.step_arrays import Driven
 from cavmarl.parallel.worlds_job import Task
 from cavmarl.shards.shard import Commands
@@ -53,9 +54,13 @@ class NodeWorlds(NodePool):
         in_next_step: bool = False,  # when worlds begin anew; see `SteppedWorlds`
         hosts: str = "",  # what starts the nodes; see `start_nodes`
         route: Route = straight,  # where nodes of this machine call in order to reach a place
+        system: NodeSystem = MACHINE,  # that the nodes are on
+        start: Start = start_nodes,  # starts them
     ) -> None:
         check_nodes(world, nodes)
-        super().__init__(world, base_dir, num_worlds, nodes, in_next_step, hosts, route)
+        super().__init__(
+            world, base_dir, num_worlds, nodes, in_next_step, hosts, route, system, start
+        )
         count, every = world.partition.count, world.config.workers.balance_steps
         self._spent_s = np.zeros((1, count))
         self._ticks_done = self._ticks_told = 0

@@ -1,0 +1,82 @@
+"""What a caller or a node needs of the system: a clock, connections, and the world of a recipe."""
+
+from __future__ import annotations
+
+import select
+import socket
+import time
+from collections.abc import Mapping
+from typing import Any, Protocol, TypeAlias
+
+from cavmarl.engine.world_setup import World
+from cavmarl.parallel.hosts.listener import Listener, call
+from cavmarl.parallel.recipe import world_of
+
+Place: TypeAlias = tuple[str, int]
+
+
+class Poll(Protocol):
+    """As `select.poll` makes it."""
+
+    def register(self, one: Any, events: int) -> None: ...
+
+    def modify(self, one: Any, events: int) -> None: ...
+
+    def unregister(self, one: Any) -> None: ...
+
+    def poll(self, timeout_ms: float | None) -> list[tuple[int, int]]: ...
+
+
+class NodeListener(Protocol):
+    """As `Listener`."""
+
+    @property
+    def place(self) -> Place: ...
+
+    def fileno(self) -> int: ...
+
+    def admit(self) -> list[tuple[int, socket.socket]]: ...
+
+    def close(self) -> None: ...
+
+
+class NodeSystem(Protocol):
+    """`cavmarl.verify` has one beside this machine's, in which all processes are threads of one."""
+
+    def now_s(self) -> float:
+        """A clock that never goes back; of this process alone."""
+        ...
+
+    def poll(self) -> Poll: ...
+
+    def listen(self, address: str, secret: bytes) -> NodeListener: ...
+
+    def call(
+        self, place: Place, secret: bytes, number: int, answer_s: float | None
+    ) -> socket.socket: ...
+
+    def world_of(self, recipe: Mapping[str, Any], trouble: str) -> World: ...
+
+
+class Machine:
+    """This machine's."""
+
+    def now_s(self) -> float:
+        return time.monotonic()
+
+    def poll(self) -> Poll:
+        return select.poll()
+
+    def listen(self, address: str, secret: bytes) -> NodeListener:
+        return Listener(address, secret)
+
+    def call(
+        self, place: Place, secret: bytes, number: int, answer_s: float | None
+    ) -> socket.socket:
+        return call(place, secret, number, answer_s)
+
+    def world_of(self, recipe: Mapping[str, Any], trouble: str) -> World:
+        return world_of(recipe, trouble)
+
+
+MACHINE = Machine()

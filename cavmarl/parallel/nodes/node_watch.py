@@ -1,0 +1,99 @@
+"""`NodeWatch`: finds out which node is lost, when one is silent or others cannot reach it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+from cavmarl.core.errors import MessageError, WorkerError
+from cavmarl.parallel.nodes.links import (
+    FrameKind,
+    LinkLostError,
+    Links,
+    NodeFrame,
+    SilenceError,
+    said_by,
+)
+
+PONG_S = 1.0  # for a living node to answer
+MISSED_S = 0.1  # to hear which others miss a node
+VAIN = 5  # times that all nodes answer and yet nothing comes of a command
+
+Found = TypeVar("Found")
+
+
+class SilentNodeError(LinkLostError):
+    """A node says nothing, or another one waits for it in vain; its process may still run."""
+
+
+class NodeWatch:
+    """Of the nodes at the other ends of some connections."""
+
+    def __init__(self, links: Links) -> None:
+        self._links = links
+        self._missed: list[int] = []  # the two ends of connections that nodes have lost
+        # nodes that answered the last PING, and whose frames each waits for
+        self._answered: dict[int, list[int]] = {}
+        self._pings = 0
+
+    def hear_missed(self, number: int, peer: int) -> None:
+        """A node says that its connection to another one has ended. Raises LinkLostError."""
+        self._missed += (number, peer)
+        raise LinkLostError(peer)
+
+    def hear_pong(self, number: int, frame: NodeFrame) -> None:
+        if frame.number == self._pings:
+            self._answered[number] = list(said_by(frame))
+
+    def wait(self, living: Sequence[int], wait: Callable[[], Found]) -> Found:
+        """What comes of waiting, again and again as long as all nodes answer meanwhile.
+
+        Raises:
+            SilentNodeError: one does not, or another one waits for it in vain.
+            WorkerError: all answer, and nothing comes of it.
+        """
+        silence: SilenceError | None = None
+        for _ in range(VAIN):
+            try:
+                return wait()
+            except SilenceError as error:
+                silence = error
+                self._ask(living)
+        raise WorkerError(f"{silence}, though they live") from silence
+
+    def _ask(self, living: Sequence[int]) -> None:
+        """Ask all whether they live, and for whom they wait."""
+        links = self._links
+        self._pings += 1
+        self._answered.clear()
+        for number in living:
+            links.send(number, FrameKind.PING, self._pings)
+        until_s = links.now_s() + PONG_S
+        while len(self._answered) < len(living) and (left_s := until_s - links.now_s()) > 0:
+            links.pump(1e3 * left_s)
+        for number in living:
+            if number not in self._answered:
+                raise SilentNodeError(number, MessageError("it says nothing"))
+        awaited = Counter(peer for peers in self._answered.values() for peer in peers)
+        for number, _ in awaited.most_common():
+            if number in living:
+                raise SilentNodeError(number, MessageError("others wait for it"))
+
+    def most_missed(self, lost: LinkLostError) -> LinkLostError:
+        """The node that has ended, or else the one that cannot be reached by most others."""
+        links = self._links
+        until_s = links.now_s() + MISSED_S
+        while lost.peer in links.numbers and (left_s := until_s - links.now_s()) > 0:
+            try:
+                links.pump(1e3 * left_s)
+            except LinkLostError as more:
+                lost = more
+        if lost.peer not in links.numbers:
+            return lost
+        worst = max(self._missed, key=lambda number: (self._missed.count(number), number))
+        return LinkLostError(worst, MessageError("other nodes do not reach it"))
+
+    def forget_missed(self) -> None:
+        """A node is given up: what was missed because of it does not count any more."""
+        self._missed.clear()
