@@ -21,7 +21,7 @@ KILL, STOP, ANY = "kill", "stop", "any of these"
 SIGNALS = {KILL: signal.SIGKILL, STOP: signal.SIGSTOP}
 FAULTS = (*map(str, NetworkFault), KILL, STOP)
 HARMLESS = 10  # faults of a run that end no connection
-GRAVE = 2  # faults of a run that a node may be lost of; at most all nodes but one
+GRAVE = 2  # faults of a run that a node may be lost of; at most all nodes but one, or the only one
 APART = 8  # steps between two of those
 TIMEOUT_S = 1.0  # of silence, until a node is asked whether it lives
 
@@ -89,8 +89,8 @@ def verify_node_faults(
     """
     given = WorldSpec.of(env, **keys)
     check_count("steps", steps, MAX_STEPS)
-    if not nodes or min(nodes) < 2:
-        raise ConfigError(f"nodes = {list(nodes)}: a campaign of faults needs 2 nodes or more")
+    if not nodes or min(nodes) < 1:
+        raise ConfigError(f"nodes = {list(nodes)}: name at least one number from 1 on")
     if unknown := [fault for fault in faults if fault not in (*FAULTS, ANY)]:
         raise ConfigError(f"faults = {unknown}: must be among {', '.join((*FAULTS, ANY))}")
     if steps < FIRST_STEPS + APART * GRAVE:
@@ -138,5 +138,5 @@ def _planned(line: FaultLine, steps: int, drawn: random.Random) -> Iterator[tupl
         yield from ((step, fault) for step in drawn.sample(range(FIRST_STEPS, steps), HARMLESS))
         return
     first = drawn.randrange(FIRST_STEPS, steps - APART * (GRAVE - 1))
-    for n in range(min(GRAVE, line.nodes - 1)):
+    for n in range(min(GRAVE, max(1, line.nodes - 1))):
         yield first + APART * n, drawn.choice(FAULTS) if fault == ANY else fault

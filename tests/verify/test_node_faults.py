@@ -126,8 +126,8 @@ def test_the_command(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("nodes", "keys", "words"),
     [
-        ([1], {}, "needs 2 nodes or more"),
-        ([], {}, "needs 2 nodes or more"),
+        ([0], {}, "name at least one number from 1 on"),
+        ([], {}, "name at least one number from 1 on"),
         ([2], {"steps": 10}, "steps = 10"),
         ([2], {"faults": ["flood"]}, "must be among delay"),
     ],

@@ -24,7 +24,12 @@ from cavmarl.cli.output import (
 )
 from cavmarl.cli.verify.faults import check_campaign, print_figures, verify_campaign
 from cavmarl.cli.verify.kills import verify_with_kills
-from cavmarl.cli.verify.nodes import verify_node_campaign, verify_over_nodes
+from cavmarl.cli.verify.nodes import (
+    CAMPAIGN,
+    SIMULATED,
+    verify_node_campaign,
+    verify_over_nodes,
+)
 from cavmarl.config.env import ZONE_LAYOUTS
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError, LostTickError
@@ -87,7 +92,8 @@ def verify(
         str | None,
         about(
             "Numbers of nodes, processes that share nothing; with --kill N of them are killed, "
-            "with --faults campaign connections and nodes fail.",
+            "with --faults campaign connections and nodes fail, simulated ones and processes; "
+            "with --faults simulated only the former.",
             metavar="N,N,…",
         ),
     ] = None,
@@ -130,7 +136,8 @@ def verify(
     checked = {"zones.check_invariants": True} if check else {}
     strict = replace(world, overrides={**world.overrides, **checked})
     if kill is not None or nodes is not None:
-        plan = None if nodes is not None and kill is None and faults == "campaign" else faults
+        known = nodes is not None and kill is None and faults in (CAMPAIGN, SIMULATED)
+        plan = None if known else faults
         others = {"--faults": plan, "--layout": layout, "--journal": journal}
         _refuse_with_kill("--kill" if nodes is None else "--nodes", env, counts, others)
     if nodes is not None and faults is not None:
@@ -141,8 +148,9 @@ def verify(
             strict,
             _counts(nodes),
             json_path,
+            faults=faults,
             zones=None if counts is None else counts[0],
-            steps=40 if steps is None else steps,
+            steps=steps,
             seeds=seeds,
             policy=policy,
         )
@@ -174,7 +182,7 @@ def verify(
             zones=None if counts is None else counts[0],
         )
         return
-    if faults == "campaign":
+    if faults == CAMPAIGN:
         check_campaign(layout, 1 if worlds is None else worlds, journal)
         runs = {
             "zones": counts,

@@ -24,6 +24,7 @@ from enum import IntEnum
 from typing import Any, NamedTuple, TypeAlias
 
 from cavmarl.core.errors import MessageError, NodeRefusedError
+from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 
 MAGIC = b"cavN"
@@ -282,10 +283,13 @@ class Links:
             LinkLostError: one of them has gone.
             MessageError: what came is no frame.
             SilenceError: nothing has come in time.
+            RecoveryOrderedError: the coordinator has one that is not awaited.
         """
         numbers = list(wanted)
         until_s = None if timeout_s is None else self.now_s() + timeout_s
         while True:
+            if COORDINATOR not in numbers:
+                self.heed()
             for number in numbers:
                 if number not in self._links:
                     raise LinkLostError(number)
@@ -297,6 +301,15 @@ class Links:
                 missing = sorted(self.awaited)
                 raise SilenceError(f"nodes {missing} do not answer within {timeout_s:g} s")
             self.pump(left_ms)
+
+    def heed(self) -> None:
+        """Raises RecoveryOrderedError: the coordinator's order to go back has come.
+
+        What is awaited then may never come: its sender may be lost without anyone noticing here.
+        """
+        link = self._links.get(COORDINATOR)
+        if link is not None and any(frame.kind is FrameKind.RECOVER for frame in link.frames):
+            raise RecoveryOrderedError(None)
 
     def arrived(self, number: int) -> NodeFrame | None:
         """The next frame of one, if it has come."""

@@ -18,7 +18,6 @@ from cavmarl.handoff.shard_setup import limits_of
 from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.ownership.reactions import Hosting
 from cavmarl.parallel.hosts.host_process import code_stamp
-from cavmarl.parallel.journaled_worlds import unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.nodes.kept_states import KeptStates
 from cavmarl.parallel.nodes.links import (
@@ -89,9 +88,9 @@ class NodeProgram:
         job = json.loads(bytes(self._take(FrameKind.JOB)))
         files = [WorldFile(*told) for told in job["files"]]
         self._fetch(files)
-        world = unwatched(self._system.world_of(recipe_with(job["recipe"], files), DIFFERENT))
-        self._worlds = worlds = LocalWorlds(
-            world, job["num_worlds"], warm=True, in_next_step=job["in_next_step"]
+        recipe = recipe_with(job["recipe"], files)
+        self._worlds = worlds = self._system.worlds_of(
+            recipe, DIFFERENT, job["num_worlds"], job["in_next_step"]
         )
         self._commands = commands_of(worlds.arrays)
         worlds.keep_logs()

@@ -1,4 +1,4 @@
-"""What a caller or a node needs of the system: a clock, connections, and the world of a recipe."""
+"""What a caller or a node needs of the system: a clock, connections, and the worlds of a recipe."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import time
 from collections.abc import Mapping
 from typing import Any, Protocol, TypeAlias
 
-from cavmarl.engine.world_setup import World
 from cavmarl.parallel.hosts.listener import Listener, call
+from cavmarl.parallel.journaled_worlds import unwatched
+from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.recipe import world_of
 
 Place: TypeAlias = tuple[str, int]
@@ -55,7 +56,13 @@ class NodeSystem(Protocol):
         self, place: Place, secret: bytes, number: int, answer_s: float | None
     ) -> socket.socket: ...
 
-    def world_of(self, recipe: Mapping[str, Any], trouble: str) -> World: ...
+    def worlds_of(
+        self,
+        recipe: Mapping[str, Any],
+        trouble: str,  # what it means if its files differ
+        num_worlds: int,
+        in_next_step: bool,  # when worlds begin anew
+    ) -> LocalWorlds: ...
 
 
 class Machine:
@@ -75,8 +82,11 @@ class Machine:
     ) -> socket.socket:
         return call(place, secret, number, answer_s)
 
-    def world_of(self, recipe: Mapping[str, Any], trouble: str) -> World:
-        return world_of(recipe, trouble)
+    def worlds_of(
+        self, recipe: Mapping[str, Any], trouble: str, num_worlds: int, in_next_step: bool
+    ) -> LocalWorlds:
+        world = unwatched(world_of(recipe, trouble))
+        return LocalWorlds(world, num_worlds, warm=True, in_next_step=in_next_step)
 
 
 MACHINE = Machine()

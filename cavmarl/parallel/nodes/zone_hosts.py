@@ -259,6 +259,7 @@ class ZoneHosts:
         if agent < 0:
             return
         while (w, vehicle) not in self._come:
+            self._links.heed()
             self._links.pump(None)
         data, at = self._come.pop((w, vehicle)), 0
         for array in self._carried:

@@ -1,0 +1,379 @@
+"""`SimulatedMachine`: processes as threads of one, of which one runs at a time, and their network.
+
+All that happens is a function of a seed: which process runs next, how late bytes come, and what a
+plan does to them. Time is a number that goes on when all processes wait. A process can be ended or
+stopped wherever it sends, waits or looks at its clock.
+"""
+
+from __future__ import annotations
+
+import heapq
+import random
+import select
+import socket
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping
+from itertools import count
+from typing import Any, cast
+
+from cavmarl.core.errors import MessageError
+from cavmarl.engine.world_setup import World
+from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.nodes.node_system import NodeListener, NodeSystem, Place, Poll
+
+ADDRESS = "node"
+ALIVE_S = 25.0  # until a system ends a connection over which no answer comes
+LATEST_S = 0.002  # that bytes are on their way
+JOIN_S = 5.0  # for a thread to end
+MAX_MOVES = 2_000_000  # of all processes in a run
+
+
+class ProcessEndedError(BaseException):
+    """Unwinds the thread of a process that has been ended from outside."""
+
+
+class SimulatedProcess:
+    """One of them.
+
+    Attributes:
+        slowness_s: what it takes longer at most each time that it waits.
+        clock: what its clock shows at the beginning, and how fast it goes.
+    """
+
+    def __init__(self, machine: SimulatedMachine, name: str) -> None:
+        self.name = name
+        self.slowness_s = 0.0
+        self.clock = (0.0, 1.0)
+        self.is_ended = self.is_done = False
+        self.stopped_until_s = 0.0
+        self.ready: Callable[[], bool] = lambda: True
+        self.until_s: float | None = None
+        self.not_before_s = 0.0
+        self.baton = threading.Semaphore(0)
+        self.sockets: list[SimulatedSocket | SimulatedListener] = []
+        self.on_send: Callable[[bytes], int | None] = lambda data: None
+        self.failure: BaseException | None = None
+        self._machine = machine
+
+    def runs_at_s(self, now_s: float) -> float | None:
+        """When it goes on; None: not by itself."""
+        first_s = max(self.stopped_until_s, self.not_before_s, now_s)
+        if self.is_ended or self.ready():
+            return now_s if self.is_ended else first_s
+        return None if self.until_s is None else max(self.until_s, first_s)
+
+
+class SimulatedMachine:
+    """Some processes, and what time it is.
+
+    Attributes:
+        caller: the process of the thread that made this.
+        now_s: the time.
+        stuck: why the processes cannot go on; empty: they can.
+    """
+
+    def __init__(self, seed: int, world: World) -> None:
+        self.random = random.Random(seed)
+        self.now_s = 0.0
+        self.world = world
+        self.listeners: dict[Place, SimulatedListener] = {}
+        self.processes: list[SimulatedProcess] = []
+        self.numbers = count(100)  # of sockets
+        self.connections: list[tuple[SimulatedSocket, SimulatedSocket]] = []
+        self._events: list[tuple[float, int, Callable[[], None]]] = []
+        self._moves = count()
+        self._threads: list[threading.Thread] = []
+        self.stuck = ""
+        self.caller = self.running = self._new("caller")  # the thread that made this
+
+    def _new(self, name: str) -> SimulatedProcess:
+        process = SimulatedProcess(self, name)
+        self.processes.append(process)
+        return process
+
+    def system(self, process: SimulatedProcess) -> NodeSystem:
+        return _System(self, process)
+
+    def start(self, name: str, run: Callable[[NodeSystem], None]) -> SimulatedProcess:
+        """Begin a process; it runs when others wait."""
+        process = self._new(name)
+
+        def whole() -> None:
+            process.baton.acquire()
+            try:
+                if not process.is_ended:
+                    run(self.system(process))
+            except ProcessEndedError:
+                pass
+            except BaseException as error:
+                process.failure = error
+            finally:
+                self._finish(process)
+
+        thread = threading.Thread(target=whole, daemon=True)
+        self._threads.append(thread)
+        thread.start()
+        return process
+
+    def _finish(self, process: SimulatedProcess) -> None:
+        for one in process.sockets:
+            one.close()
+        process.is_done = True
+        self.processes.remove(process)
+        following = self._next()
+        self.running = following
+        following.baton.release()
+
+    def at(self, delay_s: float, act: Callable[[], None]) -> None:
+        """Let something happen later."""
+        heapq.heappush(self._events, (self.now_s + delay_s, next(self._moves), act))
+
+    def end(self, process: SimulatedProcess) -> None:
+        """As SIGKILL: it does nothing more, and its connections end."""
+        if not process.is_done:
+            process.is_ended = True
+            for one in process.sockets:
+                one.close()
+
+    def wait(
+        self, process: SimulatedProcess, ready: Callable[[], bool], until_s: float | None
+    ) -> None:
+        """Let others run until something is so, or until a time."""
+        if process.is_ended:
+            raise ProcessEndedError
+        process.ready, process.until_s = ready, until_s
+        process.not_before_s = self.now_s + process.slowness_s * self.random.random()
+        following = self._next()
+        if following is not process:
+            self.running = following
+            following.baton.release()
+            process.baton.acquire()
+        if self.stuck and process is self.caller:
+            raise AssertionError(self.stuck)
+        if process.is_ended:
+            raise ProcessEndedError
+
+    def _next(self) -> SimulatedProcess:
+        """The process that runs next, when its time has come; the caller, if none ever will."""
+        while True:
+            if next(self._moves) > MAX_MOVES:
+                self.stuck = "the processes do not come to an end"
+                return self.caller
+            times = [(one.runs_at_s(self.now_s), one) for one in self.processes]
+            due = [one for at_s, one in times if at_s is not None and at_s <= self.now_s]
+            if due:
+                return due[0] if len(due) == 1 else self.random.choice(due)
+            coming = [at_s for at_s, _ in times if at_s is not None]
+            if self._events:
+                coming.append(self._events[0][0])
+            if not coming:
+                self.stuck = "all processes wait for ever"
+                return self.caller
+            self.now_s = max(self.now_s, min(coming))
+            while self._events and self._events[0][0] <= self.now_s:
+                heapq.heappop(self._events)[2]()
+
+    def outlived(self, patience_s: float) -> list[str]:
+        """The processes that have not ended by themselves so long after the caller, by name."""
+        caller, until_s = self.caller, self.now_s + patience_s
+        caller.is_ended = False
+        for one in caller.sockets:
+            one.close()
+        self.wait(caller, lambda: len(self.processes) == 1, until_s)
+        return [process.name for process in self.processes if process is not caller]
+
+    def close(self) -> None:
+        """End all processes but the caller."""
+        self.stuck = ""
+        for process in list(self.processes):
+            if process is not self.caller:
+                self.end(process)
+        self.wait(self.caller, lambda: len(self.processes) == 1, None)
+        for thread in self._threads:
+            thread.join(JOIN_S)
+            if thread.is_alive():
+                raise AssertionError("a process does not end")
+
+
+class SimulatedSocket:
+    """One end of a connection, with as much of `socket.socket` as `Link` needs.
+
+    Attributes:
+        due: what is done to the next bytes that are sent; None: nothing.
+        is_mute: whether nothing that is sent comes, and the sender does not notice.
+    """
+
+    family = socket.AF_UNIX  # it has none of TCP's options
+
+    def __init__(self, machine: SimulatedMachine, owner: SimulatedProcess) -> None:
+        self._machine, self.owner = machine, owner
+        self._number = next(machine.numbers)
+        self.other: SimulatedSocket | None = None
+        self.come: deque[bytes] = deque()
+        self.has_ended = self.is_closed = self.is_mute = False
+        self.due: Callable[[bytes], list[bytes]] | None = None
+        self.held_until_s = 0.0
+        self._last_s = 0.0
+        owner.sockets.append(self)
+
+    def fileno(self) -> int:
+        return self._number
+
+    def getsockname(self) -> Place:
+        return ADDRESS, self._number
+
+    def setblocking(self, flag: bool) -> None:
+        """It never blocks."""
+
+    def sendmsg(self, pieces: list[memoryview]) -> int:
+        machine, data = self._machine, b"".join(map(bytes, pieces))
+        if self.owner.is_ended:
+            raise ProcessEndedError
+        sent = self.owner.on_send(data)
+        if self.is_closed or self.has_ended:
+            raise BrokenPipeError
+        change, self.due = self.due, None
+        chunks = [data if sent is None else data[:sent]]
+        if change is not None:
+            chunks = change(chunks[0])
+        for chunk in [] if self.is_mute else chunks:
+            self._deliver(chunk)
+        if sent is not None:
+            machine.end(self.owner)
+            raise ProcessEndedError
+        return len(data)
+
+    def fall_silent(self) -> None:
+        """Nothing that is sent from here on comes; the system ends the connection for that."""
+        assert self.other is not None
+        self.is_mute = True
+        for end in (self, self.other):
+            self._machine.at(ALIVE_S, end.break_off)
+
+    def break_off(self) -> None:
+        self.has_ended = True
+
+    def _deliver(self, chunk: bytes | None) -> None:
+        """Let bytes come later, after those before them; None: the end."""
+        machine, other = self._machine, self.other
+        assert other is not None
+        at_s = max(machine.now_s, self.held_until_s) + machine.random.uniform(0.0, LATEST_S)
+        self._last_s = max(self._last_s, at_s)
+
+        def come() -> None:
+            if chunk is None:
+                other.has_ended = True
+            elif chunk:
+                other.come.append(chunk)
+
+        machine.at(self._last_s - machine.now_s, come)
+
+    def recv_into(self, room: memoryview) -> int:
+        if not self.come:
+            if self.has_ended:
+                return 0
+            raise BlockingIOError
+        chunk = self.come.popleft()
+        size = min(len(room), len(chunk))
+        room[:size] = chunk[:size]
+        if size < len(chunk):
+            self.come.appendleft(chunk[size:])
+        return size
+
+    def is_readable(self) -> bool:
+        return bool(self.come) or self.has_ended
+
+    def close(self) -> None:
+        if not self.is_closed:
+            self.is_closed = True
+            if not self.is_mute:
+                self._deliver(None)
+
+
+class SimulatedListener:
+    """As `Listener`, for callers that have proved that they know the secret."""
+
+    def __init__(self, machine: SimulatedMachine, owner: SimulatedProcess) -> None:
+        self.place: Place = (ADDRESS, next(machine.numbers))
+        self.secret = bytes(32)
+        self._machine, self.owner = machine, owner
+        self.callers: list[tuple[int, SimulatedSocket]] = []
+        machine.listeners[self.place] = self
+        owner.sockets.append(self)
+
+    def fileno(self) -> int:
+        return self.place[1]
+
+    def is_readable(self) -> bool:
+        return bool(self.callers)
+
+    def admit(self) -> list[tuple[int, socket.socket]]:
+        found, self.callers = self.callers, []
+        return [(number, cast("socket.socket", one)) for number, one in found]
+
+    def close(self) -> None:
+        self._machine.listeners.pop(self.place, None)
+        for _, one in self.callers:
+            one.close()
+
+
+class _Poll:
+    """As `select.poll`; what is sent never has to wait."""
+
+    def __init__(self, machine: SimulatedMachine, process: SimulatedProcess) -> None:
+        self._machine, self._process = machine, process
+        self._ones: dict[int, SimulatedSocket | SimulatedListener] = {}
+
+    def register(self, one: Any, events: int) -> None:
+        self._ones[one.fileno()] = one
+
+    def modify(self, one: Any, events: int) -> None:
+        self._ones[one.fileno()] = one
+
+    def unregister(self, one: Any) -> None:
+        del self._ones[one.fileno()]
+
+    def _ready(self) -> list[tuple[int, int]]:
+        return [(n, select.POLLIN) for n, one in self._ones.items() if one.is_readable()]
+
+    def poll(self, timeout_ms: float | None) -> list[tuple[int, int]]:
+        machine, (_, rate) = self._machine, self._process.clock
+        until_s = None if timeout_ms is None else machine.now_s + 1e-3 * timeout_ms / rate
+        machine.wait(self._process, lambda: bool(self._ready()), until_s)
+        return self._ready()
+
+
+class _System:
+    """What a process of the machine sees of it; a `NodeSystem`."""
+
+    def __init__(self, machine: SimulatedMachine, process: SimulatedProcess) -> None:
+        self._machine, self._process = machine, process
+
+    def now_s(self) -> float:
+        first_s, rate = self._process.clock
+        return first_s + rate * self._machine.now_s
+
+    def poll(self) -> Poll:
+        return _Poll(self._machine, self._process)
+
+    def listen(self, address: str, secret: bytes) -> NodeListener:
+        return SimulatedListener(self._machine, self._process)
+
+    def call(self, place: Place, secret: bytes, number: int, answer_s: float | None) -> Any:
+        machine = self._machine
+        listener = machine.listeners.get((str(place[0]), int(place[1])))
+        if listener is None or listener.owner.is_ended:
+            raise ConnectionRefusedError(f"nothing listens at {place}")
+        if secret != listener.secret:
+            raise MessageError(f"what listens at {place} does not know the secret")
+        here, there = (SimulatedSocket(machine, each) for each in (self._process, listener.owner))
+        here.other, there.other = there, here
+        machine.connections.append((here, there))
+        listener.callers.append((number, there))
+        return here
+
+    def worlds_of(
+        self, recipe: Mapping[str, Any], trouble: str, num_worlds: int, in_next_step: bool
+    ) -> LocalWorlds:
+        return LocalWorlds(self._machine.world, num_worlds, in_next_step=in_next_step)

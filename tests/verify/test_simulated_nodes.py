@@ -1,0 +1,132 @@
+"""Worlds over simulated nodes: a run is a function of its seed, and goes through what happens."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from cavmarl.cli import app
+from cavmarl.config.registry import load_config
+from cavmarl.core.errors import ConfigError
+from cavmarl.engine.world_setup import World, make_world
+from cavmarl.ownership.messages import COORDINATOR
+from cavmarl.parallel.nodes import links as links_module
+from cavmarl.parallel.nodes.links import FrameKind, Links
+from cavmarl.parallel.nodes.node_system import NodeSystem
+from cavmarl.verify.simulated_machine import SimulatedListener, SimulatedMachine, SimulatedSocket
+from cavmarl.verify.simulated_nodes import MIXES, SimulatedLine, verify_simulated_nodes
+
+SMALL: dict[str, Any] = {"agents": 3, "background": 12, "zones": 3, "steps": 8}
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    config, base_dir = load_config("merge", agents=1, background=0)
+    return make_world(config, base_dir)
+
+
+def exchange(
+    world: World, seed: int, change: Callable[[SimulatedSocket], None] = lambda end: None
+) -> tuple[list[str], float]:
+    """What two processes say to each other, and how long that takes."""
+    machine = SimulatedMachine(seed, world)
+    listener = SimulatedListener(machine, machine.caller)
+    heard: list[str] = []
+
+    def node(system: NodeSystem) -> None:
+        links = Links(lambda number, frame: None, system)
+        links.add(COORDINATOR, system.call(listener.place, bytes(32), 0, None))
+        for n in range(5):
+            links.send(COORDINATOR, FrameKind.SHARE, n)
+            links.take([COORDINATOR])
+        heard.append(f"node at {machine.now_s:.9f}")
+        links.close()
+
+    machine.start("node", node)
+    system = machine.system(machine.caller)
+    machine.wait(machine.caller, listener.is_readable, None)
+    ((number, connection),) = listener.admit()
+    change(machine.connections[0][0])
+    links = Links(lambda number, frame: None, system)
+    links.add(number, connection)
+    for n in range(5):
+        links.take([number])
+        links.send(number, FrameKind.SYNC, n)
+    assert machine.outlived(60.0) == []
+    machine.close()
+    return heard, machine.now_s
+
+
+def test_what_happens_is_a_function_of_the_seed(world: World) -> None:
+    heard, took_s = exchange(world, 3)
+    assert (heard, took_s) == exchange(world, 3)
+    assert 0.0 < took_s < 0.05
+    assert exchange(world, 4) != (heard, took_s)
+
+
+def test_bytes_that_change_on_the_way_are_noticed(world: World) -> None:
+    def double(end: SimulatedSocket) -> None:
+        end.due = lambda data: [data, data]
+
+    with pytest.raises(links_module.LinkLostError, match="not the next one"):
+        exchange(world, 3, double)
+
+
+def test_a_connection_without_answers_ends(world: World) -> None:
+    with pytest.raises(links_module.LinkLostError):
+        exchange(world, 3, SimulatedSocket.fall_silent)
+
+
+def test_processes_that_wait_for_each_other_are_noticed(world: World) -> None:
+    machine = SimulatedMachine(0, world)
+    with pytest.raises(AssertionError, match="wait for ever"):
+        machine.wait(machine.caller, lambda: False, None)
+
+
+@pytest.mark.parametrize("mix", ["none", "kill", "stop", "damage", "part", "end_caller_at_point"])
+def test_worlds_go_through_it(mix: str) -> None:
+    found = verify_simulated_nodes("merge", [3], mixes=[mix], seeds=1, **SMALL)
+    (line,) = found.lines
+    assert found.holds, line.wrong
+    loses = 0 if mix in ("none", "end_caller_at_point") else 1
+    assert line == SimulatedLine(3, mix, runs=1, lost=loses, back=loses)
+    assert found == verify_simulated_nodes("merge", [3], mixes=[mix], seeds=1, **SMALL)
+
+
+def test_nodes_that_do_not_heed_an_order_to_go_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The campaign finds it: they wait for ever for a node that only the caller misses."""
+    monkeypatch.setattr(Links, "heed", lambda self: None)
+    found = verify_simulated_nodes("merge", [3], mixes=["part"], seeds=3, **SMALL)
+    assert not found.holds
+
+
+def test_frames_whose_head_is_not_guarded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The campaign finds it: a damaged frame is taken for another one."""
+    monkeypatch.setattr("cavmarl.parallel.nodes.links.zlib.crc32", lambda data, first=0: 0)
+    found = verify_simulated_nodes("merge", [3], mixes=["damage"], seeds=3, **SMALL)
+    assert not found.holds
+
+
+@pytest.mark.slow
+def test_many_runs(tmp_path: Path) -> None:
+    words = ("verify", "merge", "--nodes", "1,2,4", "--faults", "simulated", "--seeds", "2")
+    result = CliRunner().invoke(app, [*words, "--json", str(tmp_path / "found.json")])
+    assert result.exit_code == 0, result.output
+    assert result.output.count("equal") == 3 * len(MIXES)
+
+
+@pytest.mark.parametrize(
+    ("nodes", "keys", "words"),
+    [
+        ([0], {}, "name at least one number"),
+        ([2], {"steps": 3}, "steps = 3: a run needs 4 or more"),
+        ([2], {"mixes": ["flood"]}, "must be among none, kill"),
+    ],
+)
+def test_bad_input(nodes: list[int], keys: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        verify_simulated_nodes("merge", nodes, **keys)
