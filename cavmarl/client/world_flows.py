@@ -17,7 +17,7 @@ import httpx
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.client.flows import Ask, Flow, Rest, ServiceFlows, check
+from cavmarl.client.flows import AGAIN_S, RETRIED_S, Ask, Flow, Rest, ServiceFlows, check
 from cavmarl.core.errors import ActionError, ServiceError
 
 RECOVERY_S = 60.0
@@ -110,8 +110,16 @@ class WorldFlows:
         return unpack(answer.content)
 
     def close(self) -> Flow[None]:
-        """End the session."""
-        yield from self._service.delete(f"/sessions/{self.session}")
+        """End the session; while the service is away, that is asked for again."""
+        until_s = time.monotonic() + RETRIED_S
+        while True:
+            try:
+                yield from self._service.delete(f"/sessions/{self.session}")
+                break
+            except httpx.TransportError:
+                if time.monotonic() > until_s:
+                    raise
+                yield Rest(AGAIN_S)
         try:
             yield Ask("DELETE", self._url, token=self.assignment["token"])
         except httpx.TransportError:

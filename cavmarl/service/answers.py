@@ -272,3 +272,35 @@ class NewKey(_Answer):
     """The key that signs from now on."""
 
     key: str
+
+
+class ArrayForm(_Answer):
+    """Of an array: `dtype` as numpy writes it, such as `<f4`."""
+
+    shape: list[int]
+    dtype: str
+
+
+class WorldDescription(_Answer):
+    """The worlds of a session, on their node."""
+
+    number: int  # commands up to now: the next one has the number after it
+    saved: int  # those that the saved state includes
+    agents: list[str]
+    num_envs: int
+    max_cycles: int
+    step_s: float
+    action: ArrayForm
+    observation: ArrayForm
+
+
+class WorldHashes(_Answer):
+    """Digests of the worlds of a session."""
+
+    hashes: list[str]
+
+
+class WorldTransfers(_Answer):
+    """Changes of owner in divided worlds."""
+
+    transfers: list[dict[str, Any]]

@@ -14,11 +14,13 @@ from typing import Annotated, Any
 
 import jwt
 from fastapi import APIRouter, Depends, FastAPI, Query, Request, Response
-from fastapi.responses import JSONResponse
+from fastapi.openapi.models import HTTPBearer
+from fastapi.security.base import SecurityBase
 from starlette.types import ASGIApp
 
 from cavmarl.client.world_flows import SAVED_HEADER
 from cavmarl.core.errors import ServiceError, WorkerError
+from cavmarl.service import answers
 from cavmarl.service.access import ALGORITHM, ISSUER
 from cavmarl.service.app import NO_TELEMETRY, GuardedRequests
 from cavmarl.service.bodies import Whole
@@ -26,11 +28,43 @@ from cavmarl.service.guards import StrictRoute
 from cavmarl.service.node_link import NodeLink
 from cavmarl.service.problems import serve_routes
 from cavmarl.service.refusals import problem
+from cavmarl.service.route_parts import OCTETS, PROBLEM
 from cavmarl.service.session_worlds import SAVED_EVERY, SessionWorlds
 
 MAX_ACTIONS_BYTES = 16 * 1024 * 1024
 
-router = APIRouter(prefix="/v1/worlds/{session}", route_class=StrictRoute)
+router = APIRouter(
+    prefix="/v1/worlds/{session}", route_class=StrictRoute, responses=PROBLEM, tags=["worlds"]
+)
+
+ARRAYS = "An .npz of numpy, without compression: {}"
+OF_STEPS = (
+    "observations, rewards, terminations, truncations, infos/…; of spaces of parts, each part"
+)
+ANSWER: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": ARRAYS.format(OF_STEPS),
+        "content": {OCTETS: {"schema": {"type": "string", "format": "binary"}}},
+        "headers": {
+            "Cavmarl-Saved": {
+                "description": "Commands that the saved state includes: keep those after it",
+                "schema": {"type": "integer"},
+            }
+        },
+    }
+}
+ACTIONS = {
+    "requestBody": {
+        "required": True,
+        "description": "The actions: `action.shape` numbers of `action.dtype`, little-endian, in C "
+        "order",
+        "content": {OCTETS: {"schema": {"type": "string", "format": "binary"}}},
+    }
+}
+Number = Annotated[
+    int, Query(ge=1, description="Of this command, from 1; a repeated one is answered again")
+]
+Quiet = Annotated[bool, Query(description="Answer nothing: it was answered elsewhere before")]
 
 
 def _link(request: Request) -> NodeLink:
@@ -38,29 +72,34 @@ def _link(request: Request) -> NodeLink:
     return found
 
 
-async def _opened(request: Request, session: str) -> str:
-    """The configuration of the session that the caller's token opens."""
-    link = _link(request)
-    kind, _, token = request.headers.get("authorization", "").partition(" ")
-    try:
-        number = str(jwt.get_unverified_header(token).get("kid"))
-        key = await link.public_key(number)
-        claims = jwt.decode(
-            token, key, [ALGORITHM], audience=f"node:{link.name}", issuer=ISSUER,
-            options={"require": ["exp", "iat", "sub"], "verify_iat": False},
-        )  # fmt: skip
-    except (jwt.InvalidTokenError, KeyError):
-        raise problem(
-            "bad-token", "no token of a lease on this node: resolve the session"
-        ) from None
-    if kind.lower() != "bearer" or claims.get("use") != "session" or claims["sub"] != session:
-        raise problem("bad-token", "the token is not of this session")
-    if claims["inc"] != link.incarnation:
-        raise problem("lost", "the token is of an earlier process of this node: resolve again")
-    return str(claims["cfg"])
+class Lease(SecurityBase):
+    """Lets in what has the token of a session's lease; it gives the session's configuration."""
+
+    model = HTTPBearer(bearerFormat="JWT", description="The `token` of an Assignment")
+    scheme_name = "lease"
+
+    async def __call__(self, request: Request, session: str) -> str:
+        link = _link(request)
+        kind, _, token = request.headers.get("authorization", "").partition(" ")
+        try:
+            number = str(jwt.get_unverified_header(token).get("kid"))
+            key = await link.public_key(number)
+            claims = jwt.decode(
+                token, key, [ALGORITHM], audience=f"node:{link.name}", issuer=ISSUER,
+                options={"require": ["exp", "iat", "sub"], "verify_iat": False},
+            )  # fmt: skip
+        except (jwt.InvalidTokenError, KeyError):
+            raise problem(
+                "bad-token", "no token of a lease on this node: resolve the session"
+            ) from None
+        if kind.lower() != "bearer" or claims.get("use") != "session" or claims["sub"] != session:
+            raise problem("bad-token", "the token is not of this session")
+        if claims["inc"] != link.incarnation:
+            raise problem("lost", "the token is of an earlier process of this node: resolve again")
+        return str(claims["cfg"])
 
 
-Opened = Annotated[str, Depends(_opened)]
+Opened = Annotated[str, Depends(Lease())]
 
 
 def make_node_app(link: NodeLink, worlds: SessionWorlds) -> ASGIApp:
@@ -86,8 +125,11 @@ def _worlds(request: Request) -> SessionWorlds:
 
 @router.post("")
 async def open_worlds(
-    request: Request, session: str, configuration: Opened, save: bool = False
-) -> dict[str, Any]:
+    request: Request,
+    session: str,
+    configuration: Opened,
+    save: Annotated[bool, Query(description="Leave their state with the service first")] = False,
+) -> answers.WorldDescription:
     """Make the worlds of a session, or find them here; they go on from their saved state."""
     link, worlds = _link(request), _worlds(request)
     if session not in worlds:
@@ -101,22 +143,33 @@ async def open_worlds(
         link.expect(session)
     elif save:
         await _save(link, worlds, session)
-    return worlds[session].describe()
+    return answers.WorldDescription(**worlds[session].describe())
 
 
-@router.post("/{word}")
-async def command(
+@router.post("/reset", response_class=Response, responses=ANSWER)
+async def reset(
     request: Request,
     session: str,
-    word: str,
     _: Opened,
-    number: Annotated[int, Query(ge=1)],
-    seed: Annotated[Whole | None, Query()] = None,
-    quiet: bool = False,
+    number: Number,
+    seed: Annotated[Whole | None, Query(description="None: the next episodes")] = None,
+    quiet: Quiet = False,
 ) -> Response:
-    """`reset`, or `step` with the actions as little-endian numbers; the answer is an .npz."""
-    if word not in ("reset", "step"):
-        raise problem("not-found", f"no command '{word}': there are reset and step")
+    """Begin an episode in every world."""
+    return await _command(request, session, "reset", number, seed=seed, is_quiet=quiet)
+
+
+@router.post("/step", response_class=Response, responses=ANSWER, openapi_extra=ACTIONS)
+async def step(
+    request: Request, session: str, _: Opened, number: Number, quiet: Quiet = False
+) -> Response:
+    """Let every agent act."""
+    return await _command(request, session, "step", number, seed=None, is_quiet=quiet)
+
+
+async def _command(
+    request: Request, session: str, word: str, number: int, *, seed: int | None, is_quiet: bool
+) -> Response:
     link, worlds = _link(request), _worlds(request)
     content = await request.body()
     world = worlds[session]
@@ -128,34 +181,37 @@ async def command(
             raise problem("lost", "this node is being drained: resolve the session again")
 
     def act() -> bytes:
-        return world.command(word, number, seed, content, quiet)
+        return world.command(word, number, seed, content, is_quiet)
 
     try:
         answer = await in_turn(worlds, act)
-    except (
-        WorkerError
-    ) as error:  # the nodes of its zones are gone: it begins anew from what is saved
+    except WorkerError as error:  # the nodes of its zones are gone: it begins from what is saved
         await asyncio.to_thread(worlds.close, session)
         raise problem("lost", f"its zones have no nodes: {error}") from error
     worlds.ended(session, word)
     headers = {SAVED_HEADER: str(world.saved)}
-    return Response(answer, headers=headers, media_type="application/octet-stream")
+    return Response(answer, headers=headers, media_type=OCTETS)
 
 
-@router.get("/{word}")
-async def look(request: Request, session: str, word: str, _: Opened) -> Response:
-    """`hash`, `suggestion` or `transfers`."""
+@router.get("/hash")
+async def get_hashes(request: Request, session: str, _: Opened) -> answers.WorldHashes:
+    """Digests of the worlds."""
     worlds = _worlds(request)
-    world = worlds[session]
-    match word:
-        case "hash":
-            return JSONResponse({"hashes": await in_turn(worlds, world.hashes)})
-        case "transfers":
-            return JSONResponse({"transfers": await in_turn(worlds, world.transfers)})
-        case "suggestion":
-            content = await in_turn(worlds, world.suggestion)
-            return Response(content, media_type="application/octet-stream")
-    raise problem("not-found", f"no question '{word}': there are hash, suggestion and transfers")
+    return answers.WorldHashes(hashes=await in_turn(worlds, worlds[session].hashes))
+
+
+@router.get("/suggestion", response_class=Response, responses=ANSWER)
+async def get_suggestion(request: Request, session: str, _: Opened) -> Response:
+    """What the built-in driver would do in each agent's place: an .npz with `actions`."""
+    worlds = _worlds(request)
+    return Response(await in_turn(worlds, worlds[session].suggestion), media_type=OCTETS)
+
+
+@router.get("/transfers")
+async def get_transfers(request: Request, session: str, _: Opened) -> answers.WorldTransfers:
+    """The newest changes of owner in divided worlds."""
+    worlds = _worlds(request)
+    return answers.WorldTransfers(transfers=await in_turn(worlds, worlds[session].transfers))
 
 
 @router.delete("", status_code=204)

@@ -11,6 +11,7 @@ from cavmarl.service.guards import DurableRoute, may, open_to_all
 from cavmarl.service.infrastructure import IdentityRecord
 from cavmarl.service.refusals import PROBLEM_SCHEMA, PROBLEM_TYPE
 
+OCTETS = "application/octet-stream"
 PROBLEM: dict[int | str, dict[str, Any]] = {
     status: {"description": "A problem", "content": {PROBLEM_TYPE: {"schema": PROBLEM_SCHEMA}}}
     for status in ("default", 422)
@@ -18,13 +19,13 @@ PROBLEM: dict[int | str, dict[str, Any]] = {
 BYTES: dict[int | str, dict[str, Any]] = {
     200: {
         "description": "Content",
-        "content": {"application/octet-stream": {"schema": {"type": "string"}}},
+        "content": {OCTETS: {"schema": {"type": "string"}}},
     }
 }
 CONTENT = {  # of a request whose body is no document
     "requestBody": {
         "required": True,
-        "content": {"application/octet-stream": {"schema": {"type": "string"}}},
+        "content": {OCTETS: {"schema": {"type": "string"}}},
     }
 }
 
