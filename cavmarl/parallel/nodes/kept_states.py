@@ -2,8 +2,8 @@
 
 Now and then, between two steps, each node keeps what it needs to go on from there, and sends it to
 the next node that lives. When a node is lost, the next one hosts its zones, and all go back to the
-newest state that all nodes have. What was done since is done again, which gives the same bytes. Zones
-that change their node, as to a new one, do it in the same way.
+newest state that all nodes have. What was done since is done again, which gives the same bytes.
+Zones that change their node, as to a new one, do it in the same way.
 """
 
 from __future__ import annotations
