@@ -26,7 +26,8 @@ from cavmarl.engine.world_frame import SEEN, WorldFrame
 from cavmarl.env.parallel import CavEnv, parallel_env
 from cavmarl.viewer.audience import Audience
 from cavmarl.viewer.frame_messages import FrameEncoder
-from cavmarl.viewer.map_geometry import map_message, unpack
+from cavmarl.viewer.map_geometry import map_origin
+from cavmarl.viewer.stage import first_stage
 from cavmarl.viewer.vehicle_details import hello_of
 from cavmarl.viewer.web_options import WebOptions
 from cavmarl.viewer.web_server import WebServer
@@ -95,7 +96,7 @@ def made_up_frames(env: CavEnv, count: int, seed: int, number: int = 20) -> list
 
 
 def encoding(env: CavEnv, frames: list[WorldFrame]) -> dict[str, Any]:
-    encoder = FrameEncoder(np.array(unpack(map_message(env.network))[0]["origin"]))
+    encoder = FrameEncoder(map_origin(env.network))
     spent, sizes = [], []
     for frame in frames:
         begun = perf_counter()
@@ -199,11 +200,8 @@ def drawing(env: CavEnv, frames: list[WorldFrame], seconds: float) -> dict[str, 
 
 
 def served(env: CavEnv) -> tuple[Audience, WebServer, FrameEncoder]:
-    map_bytes = map_message(env.network)
-    origin = np.array(unpack(map_bytes)[0]["origin"])
-    audience = Audience()
-    server = WebServer(WebOptions(port=0), audience, hello_of(env, origin, "none"), map_bytes)
-    return audience, server, FrameEncoder(origin)
+    stage = first_stage("world 0", env.network, hello_of(env, "none"))
+    return stage.audience, WebServer(WebOptions(port=0), [stage]), stage.encoder
 
 
 if __name__ == "__main__":

@@ -62,6 +62,7 @@ if TYPE_CHECKING:
     from cavmarl.rewards.registered_terms import register_term
     from cavmarl.sensors.observed.feature import Feature
     from cavmarl.sensors.registry import register_sensor
+    from cavmarl.viewer.shown_env import show
 
 __version__ = "0.1.0"
 
@@ -114,6 +115,7 @@ __all__ = [
     "register_driver_model",
     "register_sensor",
     "register_term",
+    "show",
 ]
 
 _LATE = {
@@ -132,6 +134,7 @@ _LATE = {
     "register_driver_model": "driving.driver_models",
     "register_sensor": "sensors.registry",
     "register_term": "rewards.registered_terms",
+    "show": "viewer.shown_env",
 }
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -26,10 +27,13 @@ from cavmarl.cli.output import (
     with_world,
     write_json,
 )
+from cavmarl.cli.web import WebPort, say
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import require
+from cavmarl.viewer.web_options import DEFAULT_PORT, WebOptions
 
 if TYPE_CHECKING:
+    from cavmarl.env.vector import CavVectorEnv
     from cavmarl.evaluate import EvaluationReport
     from cavmarl.evaluate.metrics import Metric
     from cavmarl.evaluate.report import Found, PairedDifference, PolicyReport
@@ -64,17 +68,39 @@ def evaluate(
         int, about("Write failures.html with so many of the worst trips, each with a replay.")
     ] = 0,
     html: HtmlPath = None,
+    page: Annotated[
+        bool,
+        about("Show the episodes in a browser while they are driven, from a page served here."),
+    ] = False,
+    port: WebPort = DEFAULT_PORT,
     json_path: JsonPath = None,
 ) -> None:
     """Drive seeded episodes and show success, safety, comfort, delay, throughput and fairness."""
     _check_page(html)
     console = Console()
     folder = out or _new_folder(world.env)
-    more = {"episodes": episodes, "repeats": repeats, "record": record, "failures": failures}
-    found = evaluate_showing(console, world, policy or ["idm"], out=folder, **more)
+    more: dict[str, Any] = {
+        "episodes": episodes,
+        "repeats": repeats,
+        "record": record,
+        "failures": failures,
+    }
+    with ExitStack() as stack:
+        if page:
+            more["watcher"] = partial(_watched, stack, WebOptions(port=port, control=False))
+        found = evaluate_showing(console, world, policy or ["idm"], out=folder, **more)
     if failures:
         console.print(f"failed trips: {folder / 'failures.html'}", markup=False)
     _show(console, found, folder, html, json_path)
+
+
+def _watched(stack: ExitStack, options: WebOptions, vec: CavVectorEnv) -> Callable[[], None]:
+    """Serve a page that shows the worlds of an evaluation until `stack` ends."""
+    from cavmarl.viewer.shown_env import ShownEnv
+
+    shown = ShownEnv(vec, options, title="evaluation", looks_itself=False, tell=say)
+    stack.callback(shown.close)
+    return shown.look
 
 
 def report(

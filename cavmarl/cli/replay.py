@@ -12,6 +12,8 @@ from rich.console import Console
 from cavmarl.cli.evaluate import progress_bar
 from cavmarl.cli.output import JsonPath, about, about_file, write_json
 from cavmarl.cli.view import check_display
+from cavmarl.cli.web import WebHost, WebPort, WebToken, say
+from cavmarl.viewer.web_options import DEFAULT_PORT, WebOptions
 
 if TYPE_CHECKING:
     from cavmarl.recordings.recording import Recording
@@ -28,13 +30,20 @@ def replay(
     fcd: Annotated[Path | None, about_file("Write SUMO's floating car data here.")] = None,
     csv: Annotated[Path | None, about_file("Write a line a vehicle and frame here.")] = None,
     mcap: Annotated[Path | None, about_file("Write MCAP for Foxglove here.")] = None,
+    web: Annotated[bool, about("Show all of it in a browser, from a page served here.")] = False,
+    port: WebPort = DEFAULT_PORT,
+    host: WebHost = "127.0.0.1",
+    token: WebToken = "",
+    watch_only: Annotated[bool, about("Pages may not pause it or go to another moment.")] = False,
     json_path: JsonPath = None,
 ) -> None:
     """Show a recording from above, or export it; see docs/recordings.md."""
-    from cavmarl.core.errors import RecordingError
+    from cavmarl.core.errors import ConfigError, RecordingError
     from cavmarl.recordings.recording import Recording
     from cavmarl.recordings.recording_exports import EXPORTS
 
+    if web and video is not None:
+        raise ConfigError(f"--web and --video {video}: give one of them")
     recording = Recording.open(path)
     ticks = recording.ticks(world, episode)
     if not ticks:
@@ -49,7 +58,11 @@ def replay(
     for name, file in wanted.items():
         frames = EXPORTS[name](recording, file, world, episode)
         console.print(f"{name}: {file}, {frames} frames", markup=False)
-    if video is not None or not wanted:
+    if web:
+        from cavmarl.viewer.show_world import show_recording
+
+        show_recording(recording, WebOptions(host, port, token, control=not watch_only), say)
+    elif video is not None or not wanted:
         _show(recording, world, episode, len(ticks), video, ghosts_of, console)
     document = {
         "environment": recording.head.environment,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import sys
 from contextlib import ExitStack
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,11 +12,13 @@ from rich.console import Console
 
 from cavmarl.cli.evaluate import progress_bar
 from cavmarl.cli.output import JsonPath, PolicyName, RecordPath, about, with_world, write_json
+from cavmarl.cli.web import WebHost, WebPort, WebToken, say
+from cavmarl.config.checks import check_count
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
 from cavmarl.viewer.web_options import DEFAULT_PORT, WebOptions
 
-TOKEN_VARIABLE = "CAVMARL_VIEWER_TOKEN"
+MOST_WORLDS = 16  # of a page
 
 if TYPE_CHECKING:
     from cavmarl.env.parallel import CavEnv
@@ -37,12 +38,11 @@ def view(
     zones: Annotated[int | None, about("Zones that the world is divided into.")] = None,
     workers: Annotated[int | None, about("Processes that run the zones.")] = None,
     web: Annotated[bool, about("Show it in a browser, from a page that is served here.")] = False,
-    port: Annotated[int, about("Of the page; 0: any that is free.")] = DEFAULT_PORT,
-    host: Annotated[str, about("Address of the page; others than this machine's need a token.")] = (
-        "127.0.0.1"
-    ),
-    token: Annotated[str, about("Token that a page has to give.", envvar=TOKEN_VARIABLE)] = "",
+    port: WebPort = DEFAULT_PORT,
+    host: WebHost = "127.0.0.1",
+    token: WebToken = "",
     watch_only: Annotated[bool, about("Pages may not pause, step or drive.")] = False,
+    worlds: Annotated[int, about("Worlds that the page can choose among.")] = 1,
     record: RecordPath = None,
     json_path: JsonPath = None,
 ) -> None:
@@ -50,17 +50,19 @@ def view(
     from cavmarl.env.parallel import parallel_env
 
     if web:
-        from cavmarl.viewer.show_world import show_world
+        from cavmarl.viewer.show_world import show_worlds
 
-        _check_web(seconds, video, ghosts_of)
+        _check_web(seconds, video, ghosts_of, worlds, record)
         options = WebOptions(host, port, token, control=not watch_only)
-        made = parallel_env(
-            world.env, zones=zones, workers=workers, record=record, **world.keywords
-        )
-        show = partial(Console().print, markup=False, highlight=False, soft_wrap=True)
-        stats = show_world(made, policy, world.seed, options, show, seconds)
+        many = [
+            parallel_env(world.env, zones=zones, workers=workers, record=record, **world.keywords)
+            for _ in range(worlds)
+        ]
+        stats = show_worlds(many, policy, world.seed, options, say, seconds)
         write_json(json_path, {"video": None, "traffic": stats})
         return
+    if worlds != 1:
+        raise ConfigError(f"--worlds {worlds}: only a page shows several; add --web")
     seconds = 30.0 if seconds is None else seconds
     if not 0.0 < seconds <= 3600.0:
         raise ConfigError(f"--seconds {seconds:g}: must be above 0 and at most 3600")
@@ -78,8 +80,17 @@ def view(
     write_json(json_path, {"video": str(video) if video else None, "traffic": stats})
 
 
-def _check_web(seconds: float | None, video: Path | None, ghosts_of: int | None) -> None:
+def _check_web(
+    seconds: float | None,
+    video: Path | None,
+    ghosts_of: int | None,
+    worlds: int,
+    record: Path | None,
+) -> None:
     """Refuse what a page cannot be told with its options."""
+    check_count("--worlds", worlds, MOST_WORLDS)
+    if worlds > 1 and record is not None:
+        raise ConfigError(f"--worlds {worlds} and --record {record}: only one world is recorded")
     if seconds is not None and not 0.0 < seconds < float("inf"):
         raise ConfigError(f"--seconds {seconds:g}: must be above 0")
     if video is not None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ConfigError
-from cavmarl.core.records.arrays import Gate, Outputs, Worlds
+from cavmarl.core.records.arrays import Gate, Outputs, Travel, Worlds
 from cavmarl.engine.component import Attached
 from cavmarl.engine.rig_component import MountedSensors
 from cavmarl.engine.tick import Tick
@@ -93,6 +93,11 @@ class WorldViews:
     def types(self) -> NDArray[np.void]:
         """VTYPE (num_types,), by `VEHICLE["vtype"]`."""
         return self._shard.travel.types
+
+    @property
+    def travel(self) -> Travel:
+        """Types and ways of all vehicles."""
+        return self._shard.travel
 
     @property
     def scene(self) -> Scene | None:

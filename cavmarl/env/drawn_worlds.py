@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from cavmarl.core.records.codes import (
     EVENT_WRONG_WAY,
 )
 from cavmarl.engine.simulation import Simulation
+from cavmarl.engine.vehicle_way import way_ahead
 from cavmarl.engine.world_frame import ENDED, WorldFrame, frame_of
 from cavmarl.env.recorded_worlds import recording_of
 from cavmarl.parallel.backends import shows_state
@@ -84,6 +85,7 @@ class DrawnWorlds:
     _view: WorldView | None
     _copied: LocalWorlds | None = None  # of worlds that other processes have
     _writer: RecordingWriter | None = None
+    _watchers: tuple[Callable[[], None], ...] = ()
 
     def _frame(self, world: int = 0, ghosts_of: int | None = None) -> NDArray[np.uint8] | None:
         """A world as it is now; None and a warning without a render_mode, as Gymnasium has it."""
@@ -129,6 +131,30 @@ class DrawnWorlds:
         simulation = self._shown()
         return [frame_of(simulation, world, ghosts, self._ended(world)) for world in chosen]
 
+    @property
+    def is_ready(self) -> bool:
+        """Whether there is a present moment: `reset` has been called."""
+        return self._ready
+
+    def way_ahead(self, vehicle: int, world: int = 0) -> NDArray[np.float64]:
+        """Points (n, 2) in m of the way of a vehicle, as of the last `world_frames`.
+
+        Raises:
+            EpisodeError: before the first reset.
+        """
+        if not self._ready:
+            raise EpisodeError("way_ahead() before reset(): call reset(seed=…) first")
+        return way_ahead(self._standing(), vehicle, world)
+
+    def watch(self, look: Callable[[], None]) -> Callable[[], None]:
+        """Have a function called after each reset and step; returns what ends that."""
+        self._watchers = (*self._watchers, look)
+
+        def end() -> None:
+            self._watchers = tuple(one for one in self._watchers if one is not look)
+
+        return end
+
     def _ended(self, world: int) -> NDArray[np.void]:
         """ENDED of the last step."""
         arrays = self.worlds.arrays
@@ -157,11 +183,13 @@ class DrawnWorlds:
         self._writer = recording_of(path, self.worlds.world, self._standing())
 
     def _record_frames(self, chosen: NDArray[np.bool_] | None = None) -> None:
-        """Add the present moment of the chosen worlds (W,), or of all, to what is recorded."""
+        """Show the present moment of the chosen worlds (W,), or of all, and record it."""
         if self._writer is not None:
             every = range(len(self.worlds.arrays.mask))
             some = every if chosen is None else np.flatnonzero(chosen).tolist()
             self._writer.add(self.world_frames(some, ghosts=True))
+        for look in self._watchers:
+            look()
 
     def _standing(self) -> Simulation:
         """The worlds, or a copy of them as they have been at some time."""

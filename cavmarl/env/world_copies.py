@@ -28,8 +28,11 @@ class CopiedWithWorlds(OwnWorlds):
 
     # What `__init__` makes of the worlds, and is therefore not copied.
     _MADE_OF_WORLDS: ClassVar = frozenset(
-        {"worlds", "config", "network", "_view", "_read_only", "_decoder", "_writer"}
-    )
+        (
+            "worlds", "config", "network", "_view", "_read_only", "_decoder", "_writer",
+            "_watchers",
+        )
+    )  # fmt: skip
 
     worlds: SteppedWorlds
     _decoder: ActionDecoder

@@ -32,6 +32,8 @@ TRACK_S = 0.5  # between the points of a track
 TIMED_TICKS = 16  # of so many ticks one is timed, zone by zone
 
 Progress = Callable[[str, int, int], None]  # policy, steps done, most steps there can be
+Watcher = Callable[[CavVectorEnv], Callable[[], None]]
+"""Is given the worlds of a run; what it returns is called after each reset and step of them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,23 +82,33 @@ def worlds_at_once(episodes: int, vehicles: int) -> int:
     return math.ceil(episodes / math.ceil(episodes / most))
 
 
-def drive_run(job: EpisodeJob, progress: Progress | None = None) -> dict[str, RunData]:
+def drive_run(
+    job: EpisodeJob, progress: Progress | None = None, watcher: Watcher | None = None
+) -> dict[str, RunData]:
     world = load_world(job.env, **job.keywords)
     population = world.config.population
     num_envs = worlds_at_once(job.episodes, population.agents + population.background)
     vec = CavVectorEnv(LocalWorlds(world, num_envs))
     drivers = {name: load_policy(policy, vec) for name, policy in job.policies.items()}
-    return {name: _drive(vec, driver, name, job, progress) for name, driver in drivers.items()}
+    look = None if watcher is None else watcher(vec)
+    return {
+        name: _drive(vec, driver, name, job, progress, look) for name, driver in drivers.items()
+    }
 
 
 def _drive(
-    vec: CavVectorEnv, driver: Policy, name: str, job: EpisodeJob, progress: Progress | None
+    vec: CavVectorEnv,
+    driver: Policy,
+    name: str,
+    job: EpisodeJob,
+    progress: Progress | None,
+    look: Callable[[], None] | None,
 ) -> RunData:
     parts: list[_Part] = []
     clock = _zone_clock(vec)
     count = math.ceil(job.episodes / vec.num_envs)
     path = recording_path(job.record, name, job.run, len(job.policies) == job.runs == 1)
-    watch = RunWatch(vec, name, job.run, job.seed, path, job.failures)
+    watch = RunWatch(vec, name, job.run, job.seed, path, job.failures, look)
     for k in range(count):
         first = k * vec.num_envs
 

@@ -25,6 +25,7 @@ from cavmarl.evaluate.episodes import (
     Progress,
     RunData,
     Speed,
+    Watcher,
     derived_seed,
     drive_run,
     worlds_at_once,
@@ -84,6 +85,7 @@ def evaluate(
     record: str | Path | None = None,
     failures: int = 0,
     progress: Progress | None = None,
+    watcher: Watcher | None = None,
     **keys: Unpack[WorldKeys],
 ) -> EvaluationReport:
     """Let policies drive `repeats` runs of `episodes` seeded episodes, each counted once.
@@ -102,6 +104,8 @@ def evaluate(
         failures: how many failed trips the page `failures.html` in `out` shows; 0: there is none.
         progress: called after every step of a run with the policy's name, the steps that it has
             done in this run, and the most there can be.
+        watcher: given the worlds, which are stepped together; what it returns is called after each
+            reset and step, and does not count as time of the worlds. Of one run only.
         keys: of the world; the seed is that of the first run, from which the others' follow.
 
     Raises:
@@ -114,6 +118,11 @@ def evaluate(
     """
     check_count("episodes", episodes, MAX_EPISODES)
     check_count("repeats", repeats, MAX_REPEATS)
+    if watcher is not None and repeats > 1:
+        raise ConfigError(
+            f"repeats = {repeats} with a watcher: runs are driven in fresh processes; watch one "
+            "run, or record them"
+        )
     spec = WorldSpec.of(env, **keys)
     if failures:
         check_count("failures", failures, MAX_FAILURES)
@@ -131,7 +140,7 @@ def evaluate(
     with TemporaryDirectory() as room:
         folder = Path(room) if out is None else out
         jobs, is_divided = _prepare(folder, job, repeats)
-        _drive_all(folder, jobs, progress, is_divided)
+        _drive_all(folder, jobs, progress, is_divided, watcher)
         return load_report(folder)
 
 
@@ -270,12 +279,16 @@ def _runs(job: EpisodeJob, seeds: list[int], journal: str, worlds: int) -> list[
 
 
 def _drive_all(
-    folder: Path, jobs: list[EpisodeJob], progress: Progress | None, is_divided: bool
+    folder: Path,
+    jobs: list[EpisodeJob],
+    progress: Progress | None,
+    is_divided: bool,
+    watcher: Watcher | None,
 ) -> None:
     runs: list[dict[str, RunData]] = []
     for job in jobs:
         if len(jobs) == 1:
-            runs.append(drive_run(job, progress))
+            runs.append(drive_run(job, progress, watcher))
         else:
             what = f"run {job.run} (seed {job.seed})"
             runs.append(call_in_fresh_process(what, drive_run, job, hear=progress or _deaf))

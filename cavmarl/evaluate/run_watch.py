@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +24,7 @@ class RunWatch:
         seed: of the run.
         record: folder of the recording; None: none is made.
         failures: how many failed trips are kept.
+        look: called at each moment of the worlds.
     """
 
     def __init__(
@@ -34,8 +35,10 @@ class RunWatch:
         seed: int,
         record: Path | None,
         failures: int,
+        look: Callable[[], None] | None = None,
     ) -> None:
         self._vec = vec
+        self._show = look
         self._first = 0
         about = {"policy": policy, "run": run, "seed": seed}
         self._writer = None
@@ -69,6 +72,8 @@ class RunWatch:
         self._look(running & ~over)
 
     def _look(self, chosen: NDArray[np.bool_]) -> None:
+        if self._show is not None:
+            self._show()
         if self._writer is None and self._clips is None:
             return
         frames = self._vec.world_frames(np.flatnonzero(chosen).tolist(), ghosts=True)

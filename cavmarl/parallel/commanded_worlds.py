@@ -42,6 +42,11 @@ class OrderedWorlds(ABC):
         return self.placement.plans
 
     @property
+    def worker_pids(self) -> dict[int, int]:
+        """Process of each worker on this machine."""
+        return {worker: pid for worker, pid in self._pids().items() if pid}
+
+    @property
     def deaths(self) -> list[Death]:
         return self.pool.deaths
 

@@ -301,6 +301,11 @@ class LocalWorlds:
         """None: there are no workers."""
         return ()
 
+    @property
+    def worker_pids(self) -> dict[int, int]:
+        """None, likewise."""
+        return {}
+
     def hire(self, farm: SensorWorkers) -> None:
         """From now on let others sense for the rigs; what they write is in `arrays`."""
         mounted = self.simulation.mounted

@@ -119,6 +119,11 @@ class SteppedWorlds(Protocol):
         """Which worker hosts what, one plan of all worlds, or one a world; none without workers."""
         ...
 
+    @property
+    def worker_pids(self) -> Mapping[int, int]:
+        """Process of each worker or node by its number, as far as they are on this machine."""
+        ...
+
     def reset(
         self,
         seed: int | None,  # root of all random numbers; None goes on with those of the last seed

@@ -33,6 +33,7 @@ class PageWatcher:
     texts: deque[str] = field(default_factory=deque)
     news: asyncio.Event = field(default_factory=asyncio.Event)
     vehicle: int | None = None  # whose state it is told
+    sensors: bool = False  # and what its sensors see
     ghosts_of: int | None = None
     skipped: int = 0  # frames that it did not get
     is_lost: bool = False  # it reads too slowly
@@ -68,24 +69,29 @@ class Wishes:
 
     watchers: int = 0
     vehicles: frozenset[int] = frozenset()
+    sensed: frozenset[int] = frozenset()  # those of which also sensors are told
     ghosts_of: tuple[int, ...] = ()
 
 
 class Audience:
     """The watchers of one world.
 
+    Args:
+        beside: of another world that the same thread runs: `wait` of either ends with a request to
+            any of them.
+
     Attributes:
         wishes: replaced as a whole, so that the world's thread may read it at any time.
         dropped: watchers that read too slowly.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, beside: Audience | None = None) -> None:
         self.wishes = Wishes()
         self.dropped = 0
         self._watchers: dict[int, PageWatcher] = {}
         self._numbers = 0
         self._requests: queue.Queue[tuple[int, PageRequest]] = queue.Queue(MAX_REQUESTS)
-        self._asked = threading.Event()
+        self._asked: threading.Event = threading.Event() if beside is None else beside._asked
         self._loop: asyncio.AbstractEventLoop | None = None
         self._last: Publication | None = None
         self._events: deque[list[Any]] = deque(maxlen=500)
@@ -112,7 +118,6 @@ class Audience:
 
     def requests(self) -> Iterable[tuple[int, PageRequest]]:
         """What pages have asked for since the last call: the watcher's number and its request."""
-        self._asked.clear()
         while True:
             try:
                 yield self._requests.get_nowait()
@@ -122,6 +127,7 @@ class Audience:
     def wait(self, seconds: float) -> None:
         """Wait so long, or until a page asks for something."""
         self._asked.wait(seconds)
+        self._asked.clear()
 
     # The server's thread.
 
@@ -151,7 +157,7 @@ class Audience:
         if request.kind in ("watch", "ghosts"):
             number = None if request.number is None else int(request.number)
             if request.kind == "watch":
-                watcher.vehicle = number
+                watcher.vehicle, watcher.sensors = number, request.sensors
             else:
                 watcher.ghosts_of = number
             self._update()
@@ -163,9 +169,11 @@ class Audience:
 
     def _update(self) -> None:
         watchers = self._watchers.values()
-        vehicles = frozenset(one.vehicle for one in watchers if one.vehicle is not None)
+        told = [(one.vehicle, one.sensors) for one in watchers if one.vehicle is not None]
+        vehicles = frozenset(vehicle for vehicle, _ in told)
+        sensed = frozenset(vehicle for vehicle, sensors in told if sensors)
         zones = {one.ghosts_of for one in watchers if one.ghosts_of is not None}
-        self.wishes = Wishes(len(self._watchers), vehicles, tuple(sorted(zones)))
+        self.wishes = Wishes(len(self._watchers), vehicles, sensed, tuple(sorted(zones)))
 
     def _call(self, function: Any, *arguments: Any) -> None:
         loop = self._loop

@@ -54,6 +54,12 @@ STOP_LINE = np.dtype(
 )
 
 
+def map_origin(network: RoadNetwork) -> NDArray[np.float64]:
+    """(2,) m: where the places of all messages about a map start from."""
+    origin: NDArray[np.float64] = np.floor(np.array(network.extent_m[:2]))
+    return origin
+
+
 def map_message(network: RoadNetwork) -> bytes:
     """The map as the page takes it.
 
@@ -62,7 +68,7 @@ def map_message(network: RoadNetwork) -> bytes:
     `phase_first` (uint32): what a signal shows is `phase_states[phase_first[phase] + letter]`.
     """
     shapes = road_shapes(network)
-    origin = np.floor(np.array(network.extent_m[:2]))
+    origin = map_origin(network)
     marks, surfaces = _surfaces(network, shapes, origin)
     sections = {
         "roads": np.concatenate([_roads(shapes, origin), _outlines(shapes, origin)]),

@@ -12,7 +12,7 @@ from cavmarl.core.errors import MessageError
 MAX_TEXT = 4096
 MAX_PACE = 1000.0
 # Kinds that change the world or its clock; the others only change what the page itself is told.
-CONTROLS = frozenset({"pause", "play", "step", "pace", "reset", "seat", "drive"})
+CONTROLS = frozenset({"pause", "play", "step", "pace", "reset", "seat", "drive", "seek"})
 
 
 @dataclass(frozen=True)
@@ -21,9 +21,10 @@ class PageRequest:
 
     Attributes:
         kind: `watch` a vehicle, mark the `ghosts` of a zone; of `CONTROLS`: `pause`, `play`,
-            `step`, `pace`, `reset`, take a `seat` and `drive` in it.
-        number: the vehicle, zone or agent, None for none; seconds of the world in one of ours as
-            `pace`, 0 for as fast as it can.
+            `step`, `pace`, `reset`, take a `seat` and `drive` in it, `seek` a tick of a recording.
+        number: the vehicle, zone, agent or tick, None for none; seconds of the world in one of ours
+            as `pace`, 0 for as fast as it can.
+        sensors: whether to tell what the sensors of a vehicle see that is watched.
         throttle: within [-1, 1].
         steering: within [-1, 1], positive to the left.
     """
@@ -32,6 +33,7 @@ class PageRequest:
     number: float | None = None
     throttle: float = 0.0
     steering: float = 0.0
+    sensors: bool = False
 
 
 def read_object(text: str) -> dict[str, Any]:
@@ -61,7 +63,10 @@ def read_request(text: str) -> PageRequest:
         return PageRequest(kind)
     if kind in ("watch", "ghosts", "seat"):
         number = found.get("number")
-        return PageRequest(kind, None if number is None else _whole(kind, number))
+        whole = None if number is None else _whole(kind, number)
+        return PageRequest(kind, whole, sensors=found.get("sensors") is True)
+    if kind == "seek":
+        return PageRequest(kind, _whole(kind, found.get("number")))
     if kind == "pace":
         return PageRequest(kind, _within(kind, found.get("number"), 0.0, MAX_PACE))
     if kind == "drive":

@@ -1,69 +1,132 @@
-"""Shows a world to pages until it is interrupted: server, watchers and run together."""
+"""Shows worlds and recordings to pages until it is interrupted: server and runs together."""
 
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
-
-import numpy as np
+from typing import Protocol
 
 from cavmarl.core.errors import require
 from cavmarl.core.listening import is_loopback
 from cavmarl.env.parallel import CavEnv
 from cavmarl.policies.policy import load_policy
-from cavmarl.viewer.audience import Audience
-from cavmarl.viewer.frame_messages import FrameEncoder
-from cavmarl.viewer.map_geometry import map_message, unpack
+from cavmarl.recordings.recording import Recording
+from cavmarl.viewer.run_loads import RunLoads
+from cavmarl.viewer.shown_recording import ShownRecording, recording_stages
 from cavmarl.viewer.shown_run import ShownRun
+from cavmarl.viewer.stage import Stage, first_stage
 from cavmarl.viewer.vehicle_details import hello_of
 from cavmarl.viewer.web_options import WebOptions
 
+Tell = Callable[[str], None]
 
-def show_world(
-    env: CavEnv,
+
+class Shown(Protocol):
+    """What is shown on one stage."""
+
+    def turn(self) -> float:
+        """Do what is due; how long to wait then, in s."""
+        ...
+
+
+def show_worlds(
+    envs: Sequence[CavEnv],
     policy: str,
     seed: int,
     options: WebOptions,
-    tell: Callable[[str], None],
+    tell: Tell,
     seconds: float | None = None,
 ) -> dict[str, float]:
-    """Drive `env`, which is closed at the end, and serve pages that watch it.
+    """Drive worlds, which are closed at the end, and serve pages that watch them.
 
     Args:
-        env: one world.
-        policy: name or path of what drives its agents.
-        seed: of the first episode.
+        envs: one world each, of the same environment.
+        policy: name or path of what drives their agents.
+        seed: of the first episode of the first; those after it have the next numbers.
         options: where pages are served; off the loopback address a token is made if it has none.
         tell: told the address, and a token that was made.
-        seconds: of the world; None: until it is interrupted.
+        seconds: of the first world; None: until it is interrupted.
 
     Returns:
-        the traffic of the last episode.
+        the traffic of the first world's last episode.
 
     Raises:
         ServiceError: the port is taken.
         MissingExtraError: starlette, uvicorn or websockets are not installed.
     """
+    with ExitStack() as stack:
+        for env in envs:
+            stack.callback(env.close)
+        check_extra()
+        first = first_stage("world 0", envs[0].network, hello_of(envs[0], policy))
+        stages = [first, *(first.named(f"world {k}") for k in range(1, len(envs)))]
+        serve_stages(stack, stages, options, tell)
+        stack.enter_context(RunLoads(envs[0].worlds, first.audience))
+        runs = [
+            ShownRun(env, load_policy(policy, env), stage, seed + k)
+            for k, (env, stage) in enumerate(zip(envs, stages, strict=True))
+        ]
+        most = None if seconds is None else max(1, round(seconds / runs[0].step_s))
+        _go_on(runs, first, tell, lambda: most is None or runs[0].steps < most)
+        return envs[0].traffic_stats()
+
+
+def show_recording(
+    recording: Recording, options: WebOptions, tell: Tell, seconds: float | None = None
+) -> None:
+    """Serve pages that watch a recording.
+
+    Args:
+        recording: that is shown.
+        options: as of `show_worlds`, like `tell`.
+        tell: is told the address.
+        seconds: of ours; None: until it is interrupted.
+
+    Raises:
+        RecordingError: it cannot be read, or is without its map.
+        ServiceError: the port is taken.
+        MissingExtraError: starlette, uvicorn or websockets are not installed.
+    """
+    check_extra()
+    found = recording_stages(recording)
+    with ExitStack() as stack:
+        stages = [stage for _, _, stage in found]
+        serve_stages(stack, stages, options, tell)
+        # Each reads for itself: a reader keeps the part of the recording that it is in.
+        shown = [ShownRecording(Recording(recording.path), *one) for one in found]
+        end = None if seconds is None else time.monotonic() + seconds
+        _go_on(shown, stages[0], tell, lambda: end is None or time.monotonic() < end)
+
+
+def check_extra() -> None:
+    """Raises MissingExtraError: what serves pages is not installed."""
     for module in ("starlette", "uvicorn", "httptools", "websockets"):
         require(module, "viewer")
+
+
+def serve_stages(stack: ExitStack, stages: Sequence[Stage], options: WebOptions, tell: Tell) -> str:
+    """Serve pages of some stages until `stack` ends; their address.
+
+    Raises ServiceError: the port is taken.
+    """
     from cavmarl.viewer.web_server import WebServer
 
+    if not options.token and not is_loopback(options.host):
+        options = replace(options, token=secrets.token_urlsafe(18))
+        tell(f"token: {options.token}")
+    server = stack.enter_context(WebServer(options, stages))
+    tell(f"viewer: {server.address}")
+    return server.address
+
+
+def _go_on(shown: Sequence[Shown], first: Stage, tell: Tell, goes_on: Callable[[], bool]) -> None:
     try:
-        if not options.token and not is_loopback(options.host):
-            options = replace(options, token=secrets.token_urlsafe(18))
-            tell(f"token: {options.token}")
-        driver = load_policy(policy, env)
-        map_bytes = map_message(env.network)
-        origin = np.array(unpack(map_bytes)[0]["origin"])
-        audience = Audience()
-        with WebServer(options, audience, hello_of(env, origin, policy), map_bytes) as server:
-            run = ShownRun(env, driver, audience, FrameEncoder(origin), seed)
-            tell(f"viewer: {server.address}")
-            try:
-                run.run(seconds)
-            except KeyboardInterrupt:
-                tell("viewer: ended")
-        return env.traffic_stats()
-    finally:
-        env.close()
+        while goes_on():
+            wait_s = min([one.turn() for one in shown])
+            if wait_s:
+                first.audience.wait(wait_s)
+    except KeyboardInterrupt:
+        tell("viewer: ended")

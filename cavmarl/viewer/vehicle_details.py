@@ -1,24 +1,28 @@
-"""What a page is told of the world, and of the vehicle that it watches."""
+"""What a page is told of a world, and of the vehicle that it watches."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cavmarl.config.env import EnvConfig
 from cavmarl.core.records.codes import (
     DRIVER_AGENT,
     DRIVER_BACKGROUND,
     DRIVER_SCRIPTED,
     DRIVER_SUMO,
 )
+from cavmarl.engine.spaces import sensed_observation
 from cavmarl.engine.world_frame import WorldFrame
-from cavmarl.env.parallel import CavEnv, Observation
-from cavmarl.roads.network import VEHICLE_CLASSES
+from cavmarl.env.parallel import CavEnv
+from cavmarl.env.vector import CavVectorEnv
+from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.sensors.observed import layout, sensors_of
+from cavmarl.viewer.map_geometry import map_origin
+from cavmarl.viewer.sensed_shapes import sensed_shapes
+from cavmarl.zones.partition.zone_partition import ZonePartition
 
 DRIVERS = {
     DRIVER_BACKGROUND: "traffic",
@@ -27,53 +31,68 @@ DRIVERS = {
     DRIVER_SUMO: "SUMO",
 }
 MOST_NUMBERS = 400  # of an observation that are shown
+ZONE_MARGIN_M = 50.0  # of the map, to which zones are drawn
+
+Shown = CavEnv | CavVectorEnv
 
 
-def hello_of(env: CavEnv, origin: NDArray[np.float64], policy: str) -> dict[str, Any]:
-    """What a page is told first: JSON about the world, places in metres from `origin`."""
-    config = env.config
-    min_x, min_y, max_x, max_y = env.network.extent_m
+def hello_of_map(
+    title: str, network: RoadNetwork, partition: ZonePartition, step_s: float
+) -> dict[str, Any]:
+    """What a page is told first of any world: JSON, places in metres from the map's origin."""
+    origin = map_origin(network)
+    min_x, min_y, max_x, max_y = network.extent_m
     zones: list[list[float]] = []
-    partition = env.worlds.world.partition
     if partition.count > 1:
-        low = np.array([min_x - 50.0, min_y - 50.0] * 2)
-        high = np.array([max_x + 50.0, max_y + 50.0] * 2)
+        low = np.array([min_x - ZONE_MARGIN_M, min_y - ZONE_MARGIN_M] * 2)
+        high = np.array([max_x + ZONE_MARGIN_M, max_y + ZONE_MARGIN_M] * 2)
         zones = (np.clip(partition.reaching, low, high) - np.tile(origin, 2)).tolist()
     return {
         "kind": "hello",
-        "title": f"{config.name}",
-        "policy": policy,
-        "step_s": env.step_s,
-        "agents": list(env.possible_agents),
-        "action": config.action.kind,
+        "title": title,
+        "policy": "",
+        "step_s": step_s,
+        "agents": [],
+        "action": "",
+        "may": ["pause", "step", "pace"],
         "zones": zones,
         "drivers": DRIVERS,
         "classes": [*VEHICLE_CLASSES, "pedestrian"],
     }
 
 
-def vehicle_details(
-    env: CavEnv,
-    frame: WorldFrame,
-    vehicle: int,
-    observations: Mapping[str, Observation],
-    infos: Mapping[str, Mapping[str, float]],
-) -> dict[str, Any]:
-    """The state of a vehicle; of an agent's also what it observes and is paid.
+def hello_of(env: Shown, policy: str, *, is_driven_here: bool = True) -> dict[str, Any]:
+    """The same of an environment's world.
 
-    Its `rows` are pairs of a name and what the page shows beside it.
+    Args:
+        env: whose worlds are shown.
+        policy: what drives it, in words.
+        is_driven_here: whether pages may begin episodes and take seats.
     """
+    config = env.config
+    partition = env.worlds.world.partition
+    own = {"policy": policy, "agents": list(env.possible_agents), "action": config.action.kind}
+    hello = hello_of_map(f"{config.name}", env.network, partition, env.step_s) | own
+    if is_driven_here:
+        hello["may"] = [*hello["may"], "reset", "seat"]
+    return hello
+
+
+def vehicle_state(
+    network: RoadNetwork, agents: list[str], frame: WorldFrame, vehicle: int
+) -> dict[str, Any]:
+    """The state of a vehicle; its `rows` are pairs of a name and what the page shows beside it."""
     place = int(np.searchsorted(frame.vehicles["id"], vehicle))
     if place == len(frame.vehicles) or frame.vehicles["id"][place] != vehicle:
         return {"kind": "vehicle", "id": vehicle, "here": False, "rows": []}
     row = frame.vehicles[place]
-    lane = int(row["lane"])
-    agent = env.possible_agents[row["agent"]] if row["agent"] >= 0 else None
+    lane, number = int(row["lane"]), int(row["agent"])
+    agent = None if number < 0 else agents[number] if number < len(agents) else f"car_{number}"
     rows = [
         ["speed", f"{row['speed']:.2f} m/s ({3.6 * row['speed']:.0f} km/h)"],
         ["acceleration", f"{row['accel']:.2f} m/s²"],
         ["steering", f"{math.degrees(row['steering']):.1f}°"],
-        ["lane", env.network.lane_ids[lane] if lane >= 0 else "none"],
+        ["lane", network.lane_ids[lane] if 0 <= lane < len(network.lane_ids) else "none"],
         ["driver", DRIVERS.get(int(row["driver"]), str(row["driver"]))],
         ["agent", agent or "none"],
         ["zone", str(row["zone"])],
@@ -85,37 +104,62 @@ def vehicle_details(
         rows.insert(8, ["to go", f"{row['to_go']:.0f} m"])
     if row["transfer"]:
         rows.insert(7, ["handed over to zone", str(row["target_zone"])])
-    found: dict[str, Any] = {"kind": "vehicle", "id": vehicle, "here": True, "rows": rows}
-    if agent is not None and agent in infos:
-        told = infos[agent]
-        names = env.config.terms.names
-        found["terms"] = [[name, round(float(told.get(name, 0.0)), 4)] for name in names]
-    if agent is not None and agent in observations:
-        found["observation"] = _observed(env, observations[agent])
+    return {"kind": "vehicle", "id": vehicle, "here": True, "agent": number, "rows": rows}
+
+
+def vehicle_details(
+    env: Shown, world: int, frame: WorldFrame, vehicle: int, sensors: bool = False
+) -> dict[str, Any]:
+    """The state and the way of a vehicle; of an agent's also what it observes and is paid.
+
+    With `sensors` also what its sensors see; see `sensed_shapes`.
+    """
+    found = vehicle_state(env.network, env.possible_agents, frame, vehicle)
+    if not found["here"]:
+        return found
+    way = env.way_ahead(vehicle, world) - map_origin(env.network)
+    found["way"] = np.round(way, 1).ravel().tolist()
+    agent = found["agent"]
+    arrays = env.worlds.arrays
+    if agent < 0 or arrays.vehicle_ids[world, agent] != vehicle:
+        return found
+    terms = arrays.terms[world, agent].tolist()
+    found["terms"] = [
+        [name, round(value, 4)] for name, value in zip(env.config.terms.names, terms, strict=True)
+    ]
+    found["observation"] = _observed(env, world, agent)
+    if sensors:
+        found["shapes"] = sensed_shapes(env.config, arrays, world, agent)
     return found
 
 
-def _observed(env: CavEnv, observation: Observation) -> list[list[Any]]:
+def _observed(env: Shown, world: int, agent: int) -> list[list[Any]]:
     """Sensor, feature and number of each of the features; of a stack the newest frame."""
-    config = env.config
-    if config.observation.mode == "sensors" or isinstance(observation, Mapping):
-        named = observation if isinstance(observation, Mapping) else {"rig": observation}
+    config, arrays = env.config, env.worlds.arrays
+    if config.observation.mode == "sensors":
+        sensed = sensed_observation(arrays.frames)
         return [
             [name, str(k), _number(value)]
-            for name, numbers in named.items()
-            for k, value in enumerate(np.asarray(numbers).ravel()[: MOST_NUMBERS // len(named)])
+            for name, numbers in sensed.items()
+            for k, value in enumerate(numbers[world, agent].ravel()[: MOST_NUMBERS // len(sensed)])
         ]
-    size = len(observation) // config.sensors.stack
-    newest = np.asarray(observation)[-size:]
+    return _named_features(config, newest_frame(config, arrays.observations[world, agent]))
+
+
+def newest_frame(config: EnvConfig, observation: Any) -> Any:
+    """The last frame of a stack."""
+    return observation[-(len(observation) // config.sensors.stack) :]
+
+
+def _named_features(config: EnvConfig, numbers: Any) -> list[list[Any]]:
     places = layout(config.sensors)
-    rows = []
+    rows: list[list[Any]] = []
     for sensor in sensors_of(config.sensors):
         if sensor.name in places:
-            values = newest[places[sensor.name]]
             features = sensor.features(config.sensors)
             rows += [
                 [sensor.name, feature.name, _number(value)]
-                for feature, value in zip(features, values, strict=True)
+                for feature, value in zip(features, numbers[places[sensor.name]], strict=True)
             ]
     return rows[:MOST_NUMBERS]
 

@@ -15,4 +15,5 @@ class WebOptions:
     port: int = DEFAULT_PORT  # 0: any that is free
     token: str = ""  # that a page has to give; the loopback address needs none
     control: bool = True  # pages may pause, step and drive
+    framed: bool = False  # notebooks of this machine may show the page within theirs
     send_s: float = 5.0  # in which a page has to take a message

@@ -6,9 +6,8 @@ import asyncio
 import hmac
 import json
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.resources import files
-from typing import Any
 
 import uvicorn
 from starlette.applications import Starlette
@@ -22,8 +21,9 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 
 from cavmarl.core.errors import MessageError, ServiceError
 from cavmarl.core.listening import is_loopback, listen, shown_host
-from cavmarl.viewer.audience import Audience, PageWatcher
+from cavmarl.viewer.audience import PageWatcher
 from cavmarl.viewer.page_requests import CONTROLS, MAX_TEXT, read_object, read_request
+from cavmarl.viewer.stage import Stage, welcome_of
 from cavmarl.viewer.web_options import WebOptions
 
 PAGE = files("cavmarl.viewer") / "page"
@@ -37,6 +37,9 @@ POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
+# Of Jupyter on this machine, and of the notebooks of VS Code.
+NOTEBOOKS = "http://127.0.0.1:* http://localhost:* vscode-webview:"
+FRAMED_POLICY = POLICY.replace("frame-ancestors 'none'", f"frame-ancestors {NOTEBOOKS}")
 HEADERS = {
     "content-security-policy": POLICY,
     "x-content-type-options": "nosniff",
@@ -56,24 +59,20 @@ class WebServer:
 
     Args:
         options: where and how.
-        audience: the watchers of the world.
-        hello: what a page is told first, JSON.
-        map_bytes: the map's message.
+        stages: the worlds that a page can choose among; one at least.
 
     Raises:
         ServiceError: the port is taken, or others could watch without a token.
     """
 
-    def __init__(
-        self, options: WebOptions, audience: Audience, hello: dict[str, Any], map_bytes: bytes
-    ) -> None:
+    def __init__(self, options: WebOptions, stages: Sequence[Stage]) -> None:
         if not is_loopback(options.host) and not options.token:
             raise ServiceError(f"--host {options.host}: others can reach it; give a --token")
         self._listener = listen(options.host, options.port)
         self.port: int = self._listener.getsockname()[1]
         self.address = f"http://{shown_host(options.host)}:{self.port}/"
-        self._audience = audience
-        app = viewer_app(options, self.port, audience, hello, map_bytes)
+        self._stages = stages
+        app = viewer_app(options, self.port, stages)
         config = uvicorn.Config(
             app,
             log_level="critical",
@@ -108,7 +107,8 @@ class WebServer:
         asyncio.run(self._serve())
 
     async def _serve(self) -> None:
-        self._audience.begin(asyncio.get_running_loop())
+        for stage in self._stages:
+            stage.audience.begin(asyncio.get_running_loop())
         self._begun()
         # Not `serve`: signals are the main thread's.
         await self._server._serve(sockets=[self._listener])
@@ -126,10 +126,8 @@ class DroppedWhenDone(WebSocketsSansIOProtocol):
             self.transport.abort()
 
 
-def viewer_app(
-    options: WebOptions, port: int, audience: Audience, hello: dict[str, Any], map_bytes: bytes
-) -> ASGIApp:
-    """The application of one world; see `WebServer`."""
+def viewer_app(options: WebOptions, port: int, stages: Sequence[Stage]) -> ASGIApp:
+    """The application of a server; see `WebServer`."""
     pages = {file.name: file.read_bytes() for file in PAGE.iterdir() if file.is_file()}
 
     async def page(request: Request) -> Response:
@@ -140,10 +138,11 @@ def viewer_app(
         return Response(content, media_type=TYPES[name.rpartition(".")[2]])
 
     async def live(socket: WebSocket) -> None:
-        await _LiveSocket(socket, options, audience).serve(hello, map_bytes)
+        await _LiveSocket(socket, options, stages).serve()
 
     routes = [Route("/", page), Route("/{name}", page), WebSocketRoute("/live", live)]
-    return OwnPagesOnly(Starlette(routes=routes), options.host, port)
+    policy = FRAMED_POLICY if options.framed else POLICY
+    return OwnPagesOnly(Starlette(routes=routes), options.host, port, policy)
 
 
 class OwnPagesOnly:
@@ -153,8 +152,10 @@ class OwnPagesOnly:
     would make a foreign page's origin look like ours.
     """
 
-    def __init__(self, app: ASGIApp, host: str, port: int) -> None:
+    def __init__(self, app: ASGIApp, host: str, port: int, policy: str = POLICY) -> None:
         self._app = app
+        headers = {**HEADERS, "content-security-policy": policy}
+        self._headers = [(name.encode(), value.encode()) for name, value in headers.items()]
         names = {"127.0.0.1", "localhost", "[::1]", shown_host(host)}
         self._hosts = {f"{name}:{port}" for name in names} if is_loopback(host) else None
 
@@ -171,8 +172,7 @@ class OwnPagesOnly:
 
         async def with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
-                own = [(name.encode(), value.encode()) for name, value in HEADERS.items()]
-                message["headers"] = [*message.get("headers", []), *own]
+                message["headers"] = [*message.get("headers", []), *self._headers]
             await send(message)
 
         if foreign:
@@ -183,38 +183,44 @@ class OwnPagesOnly:
 
 
 class _LiveSocket:
-    """One page's WebSocket: it says hello with its token, then asks and is told."""
+    """One page's WebSocket: it says hello with token and world, then asks and is told."""
 
-    def __init__(self, socket: WebSocket, options: WebOptions, audience: Audience) -> None:
+    def __init__(self, socket: WebSocket, options: WebOptions, stages: Sequence[Stage]) -> None:
         self._socket = socket
         self._options = options
-        self._audience = audience
+        self._stages = stages
+        self._audience = stages[0].audience
 
-    async def serve(self, hello: dict[str, Any], map_bytes: bytes) -> None:
+    async def serve(self) -> None:
         await self._socket.accept()
         try:
-            if not await self._is_welcome():
+            number = await self._chosen()
+            if number is None:
                 return
+            stage = self._stages[number]
+            self._audience = stage.audience
             watcher = self._audience.join()
             try:
-                await self._send(json.dumps({**hello, "control": self._options.control}))
-                await self._send(map_bytes)
+                welcome = welcome_of(self._stages, number, self._options.control)
+                await self._send(json.dumps(welcome))
+                await self._send(stage.map_bytes)
                 await self._watch(watcher)
             finally:
                 self._audience.leave(watcher)
         except (WebSocketDisconnect, TimeoutError, RuntimeError):
             return
 
-    async def _is_welcome(self) -> bool:
-        if self._audience.wishes.watchers >= MOST_WATCHERS:
+    async def _chosen(self) -> int | None:
+        """The number of the world that the page asks for; None: it is turned away."""
+        if sum(stage.audience.wishes.watchers for stage in self._stages) >= MOST_WATCHERS:
             await self._socket.close(TRY_LATER, f"{MOST_WATCHERS} pages watch already")
-            return False
+            return None
         try:
             async with asyncio.timeout(FIRST_MESSAGE_S):
                 first = read_object(await self._socket.receive_text())
         except (MessageError, KeyError):
             await self._socket.close(NOT_UNDERSTOOD, "the first message must be a hello")
-            return False
+            return None
         token = first.get("token")
         given = token.encode() if isinstance(token, str) else b""
         if not hmac.compare_digest(given, self._options.token.encode()):
@@ -223,8 +229,12 @@ class _LiveSocket:
                 await self._socket.close(
                     REFUSED, "a token is needed" if not given else "wrong token"
                 )
-                return False
-        return True
+                return None
+        number, last = first.get("world", 0), len(self._stages) - 1
+        if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number <= last:
+            await self._socket.close(NOT_UNDERSTOOD, f"no such world: there are 0 to {last}")
+            return None
+        return number
 
     async def _watch(self, watcher: PageWatcher) -> None:
         """Send and listen until either ends."""

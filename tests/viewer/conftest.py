@@ -8,15 +8,13 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import pytest
 
 from cavmarl.env.parallel import parallel_env
 from cavmarl.policies.policy import load_policy
 from cavmarl.viewer.audience import Audience
-from cavmarl.viewer.frame_messages import FrameEncoder
-from cavmarl.viewer.map_geometry import map_message, unpack
 from cavmarl.viewer.shown_run import ShownRun
+from cavmarl.viewer.stage import first_stage
 from cavmarl.viewer.vehicle_details import hello_of
 from cavmarl.viewer.web_options import WebOptions
 from cavmarl.viewer.web_server import WebServer
@@ -37,24 +35,21 @@ def served(env: Any, options: WebOptions, drives: bool = True) -> Iterator[Serve
     """Serve a world; it runs unless `drives` is false, as then turns are the caller's."""
     with ExitStack() as stack:
         stack.callback(env.close)
-        map_bytes = map_message(env.network)
-        origin = np.array(unpack(map_bytes)[0]["origin"])
-        audience = Audience()
-        run = ShownRun(env, load_policy("idm", env), audience, FrameEncoder(origin), seed=1)
-        hello = hello_of(env, origin, "idm")
-        server = stack.enter_context(WebServer(options, audience, hello, map_bytes))
+        stage = first_stage("world 0", env.network, hello_of(env, "idm"))
+        run = ShownRun(env, load_policy("idm", env), stage, seed=1)
+        server = stack.enter_context(WebServer(options, [stage]))
         over = threading.Event()
         if drives:
             thread = threading.Thread(target=_drive, args=(run, over))
             thread.start()
             stack.callback(thread.join)
             stack.callback(over.set)
-        yield Served(run, audience, server, map_bytes)
+        yield Served(run, stage.audience, server, stage.map_bytes)
 
 
 def _drive(run: ShownRun, over: threading.Event) -> None:
     while not over.is_set():
-        run.turn()
+        over.wait(min(run.turn(), 0.02))
 
 
 @pytest.fixture
@@ -69,8 +64,10 @@ def serve() -> Iterator[Callable[..., Served]]:
             background: int = 20,
             options: WebOptions | None = None,
             drives: bool = True,
+            rig: dict[str, Any] | None = None,
         ) -> Served:
-            made = parallel_env(env, zones=zones, agents=3, background=background)
+            more = {"rig": rig or {}}
+            made = parallel_env(env, zones=zones, agents=3, background=background, overrides=more)
             return stack.enter_context(served(made, options or WebOptions(port=0), drives))
 
         yield begin

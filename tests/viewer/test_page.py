@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from cavmarl.env.vector import make_vec
+from cavmarl.recordings.recording import Recording
+from cavmarl.viewer.show_world import serve_stages
+from cavmarl.viewer.shown_recording import ShownRecording, recording_stages
 from cavmarl.viewer.web_options import WebOptions
 from tests.support.chromium import chromium, until
 from tests.viewer.conftest import Served
 
 Serve = Callable[..., Served]
+CAMERA = {"front": {"type": "rgb_camera", "rate_hz": 10, "z_m": 1.2, "width": 64, "height": 36}}
 WITHOUT_WEBGL2 = """
 const real = HTMLCanvasElement.prototype.getContext;
 HTMLCanvasElement.prototype.getContext = function (kind, ...more) {
@@ -126,6 +134,69 @@ def test_without_webgl2_there_are_words_and_a_still_picture(browser: Any, serve:
     )
     assert colors > 3
     assert not problems
+
+
+def test_the_sensors_and_the_way_of_a_vehicle_are_drawn(browser: Any, serve: Serve) -> None:
+    page, problems, _ = opened(browser, serve(env="merge", zones=1, rig=CAMERA))
+    page.fill("#wanted", "car_0")
+    page.press("#wanted", "Enter")
+    until(page, "document.querySelectorAll('#pictures canvas').length === 1")
+    until(page, "viewer.shapes.way.length > 4 && viewer.shapes.all.length > 2")
+    drawn = """(() => { const c = document.querySelector('#labels');
+        const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;
+        let n = 0; for (let k = 3; k < d.length; k += 4) n += d[k] > 0; return n; })()"""
+    until(page, f"{drawn} > 20000")  # the cone of the camera alone is more
+    page.uncheck("#sensors")
+    until(page, "viewer.shapes && viewer.shapes.all.length === 0")
+    until(page, f"{drawn} < 20000 && {drawn} > 0")
+    assert not [one for one in problems if "getImageData" not in one]  # that is the test's own
+
+
+def test_a_recording_is_searched_and_its_worlds_are_chosen(browser: Any, tmp_path: Path) -> None:
+    with ExitStack() as stack:
+        address, span = replayed(stack, tmp_path / "run")
+        page = browser.new_page()
+        problems: list[str] = []
+        page.on("pageerror", lambda error: problems.append(str(error)))
+        page.goto(f"{address}#world=1")
+        until(page, "window.viewer && viewer.frame && viewer.firstPicture")
+        assert page.input_value("#world") == "1"
+        page.click("#play")
+        wanted = Recording(tmp_path / "run").ticks(1, 0)[7]
+        page.evaluate(
+            f"(() => {{ const past = document.querySelector('#past'); past.value = '{wanted}';"
+            "past.dispatchEvent(new Event('input')); })()"
+        )
+        until(page, f"viewer.frame.tick === {wanted}")
+        assert page.get_attribute("#past", "max") == str(span[1])
+        assert page.is_hidden("#reset")
+        page.select_option("#world", "0")
+        until(page, "viewer.hello.world === 0 && viewer.frame")
+        assert not problems
+
+
+def replayed(stack: ExitStack, path: Path) -> tuple[str, list[int]]:
+    """A recording of two worlds that is served; its address, and the span of its time line."""
+    vec = make_vec("ring", num_envs=2, agents=1, background=2, record=path)
+    vec.reset(seed=0)
+    for _ in range(30):
+        vec.step(vec.suggest_actions())
+    vec.close()
+    found = recording_stages(Recording(path))
+    shown = [ShownRecording(Recording(path), *one) for one in found]
+    stages = [stage for *_, stage in found]
+    address = serve_stages(stack, stages, WebOptions(port=0), lambda _: None)
+    over = threading.Event()
+
+    def drive() -> None:
+        while not over.is_set():
+            over.wait(min(0.02, *(one.turn() for one in shown)))
+
+    thread = threading.Thread(target=drive)
+    thread.start()
+    stack.callback(thread.join)
+    stack.callback(over.set)
+    return address, stages[0].hello["span"]
 
 
 def test_a_token_is_asked_for(browser: Any, serve: Serve) -> None:

@@ -194,6 +194,11 @@ class NodeWorlds(NodePool):
         return self._placement.plans
 
     @property
+    def worker_pids(self) -> dict[int, int]:
+        """None: nodes measure themselves, see `node_loads`."""
+        return {}
+
+    @property
     def transfers(self) -> tuple[TransferLog, ...]:
         """What became of each change of owner, by worlds."""
         return self._coordinator.transfers

@@ -4,20 +4,21 @@ import { Camera, listenToPointers } from "./camera.js";
 import { inks, legend, SELECTION, THEMES } from "./colors.js";
 import { MapLayers } from "./drawing.js";
 import { Seat } from "./driving.js";
-import { $, addEvents, element, notice, showLegend, showScale, showVehicle } from "./panels.js";
+import { drawLabels, drawSensed } from "./overlay.js";
+import { $, addEvents, element, notice, showLegend, showLoads, showScale, showVehicle } from "./panels.js";
+import { showPictures, Shapes } from "./shapes.js";
 import { decodeFrame, decodeMap, FRAME, kindOf, MAP, Roster, ROSTER } from "./protocol.js";
 import { drawStill } from "./still.js";
+import { TimeLine } from "./timeline.js";
 import { VehicleLayer } from "./vehicles.js";
 
-const MOST_FRAMES = 1200; // that are kept to look back
-const MOST_BYTES = 64e6;
-const LABEL_SCALE = 1.6; // pixels a metre from where agents have their names
 const COUNTED = 240;
+const SMOOTH_S = 1.5; // of the world, from frame to frame; beyond that vehicles jump
 
 const page = {
   hello: null, map: null, camera: null, gl: null, layers: null, vehicles: null,
-  roster: new Roster(0, 0), frame: null, history: [], bytes: 0, events: [],
-  looksBack: false, chosen: null, wanted: null, following: false, told: null,
+  roster: new Roster(0, 0), frame: null, live: null, line: new TimeLine(), world: 0,
+  looksBack: false, chosen: null, wanted: null, following: false, told: null, shapes: null,
   coloring: "agent", theme: "light", ghosts: null,
   arrived: 0, between: 100, dirty: true, socket: null, over: false,
   times: [], takes: [], firstPicture: 0, calls: 0, stillDrawn: 0,
@@ -37,12 +38,17 @@ function connect(token) {
   const socket = new WebSocket(`${scheme}://${location.host}/live`);
   socket.binaryType = "arraybuffer";
   page.socket = socket;
-  socket.addEventListener("open", () => socket.send(JSON.stringify({ kind: "hello", token })));
+  page.token = token;
+  const hello = { kind: "hello", token, world: page.world };
+  socket.addEventListener("open", () => socket.send(JSON.stringify(hello)));
   socket.addEventListener("message", ({ data }) => {
+    if (socket !== page.socket) return;
     if (typeof data === "string") take(JSON.parse(data));
     else takeBytes(data);
   });
-  socket.addEventListener("close", ({ code, reason }) => closed(code, reason, token));
+  socket.addEventListener("close", ({ code, reason }) => {
+    if (socket === page.socket) closed(code, reason, token);
+  });
 }
 
 function closed(code, reason, token) {
@@ -61,19 +67,43 @@ function closed(code, reason, token) {
   setTimeout(() => connect(token), 2000);
 }
 
+// Another world of the same server.
+function goTo(world) {
+  watch(null);
+  page.world = world;
+  page.line = new TimeLine();
+  page.looksBack = false;
+  page.live = page.frame = null;
+  $("events").replaceChildren();
+  const before = page.socket;
+  connect(page.token);
+  before.close();
+}
+
 function take(told) {
   if (told.kind === "hello") takeHello(told);
   else if (told.kind === "vehicle") takeVehicle(told);
   else if (told.kind === "events") takeEvents(told.events);
   else if (told.kind === "seat") takeSeat(told);
+  else if (told.kind === "loads") showLoads(told.rows);
 }
+
+const may = (what) => page.hello.control && page.hello.may.includes(what);
 
 function takeHello(hello) {
   page.hello = hello;
   notice("");
   $("title").textContent = hello.title;
   document.title = `${hello.title} – cavmarl`;
-  for (const id of ["play", "step", "pace", "reset"]) $(id).disabled = !hello.control;
+  for (const id of ["play", "step", "pace"]) $(id).disabled = !may(id === "play" ? "pause" : id);
+  $("reset").hidden = !hello.may.includes("reset");
+  $("reset").disabled = !may("reset");
+  $("live").hidden = Boolean(hello.span);
+  $("past").disabled = Boolean(hello.span) && !may("seek");
+  page.line.span = hello.span ?? null;
+  $("world-label").hidden = hello.worlds.length < 2;
+  $("world").replaceChildren(...hello.worlds.map((name, k) => element("option", name, { value: k })));
+  $("world").value = String(hello.world);
   $("ghosts-label").hidden = !hello.zones.length;
   $("ghosts").replaceChildren(element("option", "no zone", { value: "" }),
     ...hello.zones.map((_, k) => element("option", `zone ${k}`, { value: k })));
@@ -96,7 +126,7 @@ function takeMap(map) {
   const again = page.map !== null;
   page.map = map;
   page.roster = new Roster(0, 0);
-  page.history = [];
+  page.line.forget();
   if (!again) page.camera = new Camera($("scene"), map.extent);
   resize();
   if (!again) page.camera.home();
@@ -121,23 +151,16 @@ function takeFrame(frame) {
     page.between = Math.min(Math.max(0.8 * page.between + 0.2 * (now - page.arrived), 30), 400);
   }
   page.arrived = now;
-  const last = page.history.at(-1);
-  if (last && frame.tick < last.tick) page.history = [];
-  if (!last || frame.tick !== last.tick) {
-    page.history.push(frame);
-    page.bytes += frame.bytes;
-  }
-  while (page.history.length > MOST_FRAMES || page.bytes > MOST_BYTES) {
-    page.bytes -= page.history.shift().bytes;
-  }
+  const last = page.live;
   page.live = frame;
+  page.line.add(frame);
   showClockControls(frame);
   if (page.looksBack) {
     showTimeLine();
     return;
   }
-  const smooth = last !== undefined && frame.tick >= last.tick;
-  show(frame, smooth);
+  const passed = last ? frame.time - last.time : -1;
+  show(frame, passed >= 0 && passed < SMOOTH_S * Math.max(frame.pace, 1));
 }
 
 function takeVehicle(told) {
@@ -147,7 +170,11 @@ function takeVehicle(told) {
   const agent = row >= 0 ? page.roster.agents[row] : -1;
   const name = agent >= 0 ? `${page.hello.agents[agent]} · vehicle ${told.id}` : `vehicle ${told.id}`;
   showVehicle(told, name);
-  $("seat").hidden = !page.hello.control || (agent < 0 && seat.agent === null);
+  page.shapes = new Shapes(told);
+  showPictures(page.shapes.pictures);
+  $("sensors-label").hidden = !told.observation;
+  $("seat").hidden = !may("seat") || (agent < 0 && seat.agent === null);
+  dirty();
 }
 
 function takeSeat(told) {
@@ -159,8 +186,7 @@ function takeSeat(told) {
 }
 
 function takeEvents(events) {
-  page.events.push(...events);
-  page.events.splice(0, Math.max(0, page.events.length - 500));
+  page.line.addEvents(events);
   addEvents(events, timeText, (tick, vehicle) => {
     lookBack(tick);
     if (vehicle >= 0) watch(vehicle);
@@ -172,6 +198,7 @@ function takeEvents(events) {
 
 const secondsOf = (tick) => {
   const frame = page.live;
+  if (page.hello?.tick_s) return tick * page.hello.tick_s;
   return frame && frame.tick ? (tick * frame.time) / frame.tick : tick * (page.hello?.step_s ?? 0.1);
 };
 const timeText = (tick) => `${secondsOf(tick).toFixed(1)} s`;
@@ -215,48 +242,29 @@ function showClockControls(frame) {
   if (page.wasPaused === frame.paused && page.wasPace === frame.pace) return;
   [page.wasPaused, page.wasPace] = [frame.paused, frame.pace];
   $("play").textContent = frame.paused ? "Play" : "Pause";
-  $("status").textContent = frame.paused ? "paused" : "live";
+  const going = page.line.span ? "playing" : "live";
+  $("status").textContent = frame.paused ? "paused" : going;
   $("pace").value = String(frame.pace);
 }
 
 function showTimeLine() {
-  const { history } = page;
-  const range = $("past");
-  range.max = String(Math.max(history.length - 1, 0));
-  if (!page.looksBack) range.value = range.max;
-  const shownFrame = page.frame;
-  if (shownFrame) range.setAttribute("aria-valuetext", timeText(shownFrame.tick));
-  if (performance.now() - (page.markedAt ?? 0) < 250) return;
-  page.markedAt = performance.now();
-  drawMarks(history);
-}
-
-function drawMarks(history) {
-  const canvas = $("marks");
-  canvas.width = canvas.clientWidth;
-  canvas.height = 8;
-  const pen = canvas.getContext("2d");
-  if (history.length < 2) return;
-  const from = history[0].tick;
-  const span = history.at(-1).tick - from || 1;
-  for (const [tick, kind] of page.events) {
-    if (tick < from) continue;
-    const bad = kind === "collision" || kind === "off_road" || kind === "wrong_way";
-    pen.fillStyle = bad ? "#d63030" : kind === "arrived" ? "#2e9e5b" : "#8a94a0";
-    pen.fillRect(8 + ((tick - from) / span) * (canvas.width - 16) - 1, bad ? 0 : 3, 2, 8);
-  }
+  page.line.show($("past"), $("marks"), page.frame, page.looksBack, timeText);
 }
 
 function lookBack(tick) {
-  const { history } = page;
-  const at = history.findIndex((frame) => frame.tick >= tick);
-  if (at >= 0) lookAt(at);
+  if (page.line.span) ask({ kind: "seek", number: tick });
+  else lookAt(page.line.placeOf(tick));
 }
 
+// Where the time line was set: of a recording a tick, else one of the frames that were kept.
 function lookAt(at) {
-  const frame = page.history[at];
+  if (page.line.span) {
+    ask({ kind: "seek", number: at });
+    return;
+  }
+  const frame = page.line.frames[at];
   if (!frame) return;
-  page.looksBack = at < page.history.length - 1;
+  page.looksBack = at < page.line.frames.length - 1;
   $("live").disabled = !page.looksBack;
   $("past").value = String(at);
   $("status").textContent = page.looksBack ? `looking back to ${timeText(frame.tick)}` : "live";
@@ -266,7 +274,8 @@ function lookAt(at) {
 
 function watch(vehicle) {
   page.wanted = page.chosen = vehicle;
-  ask({ kind: "watch", number: vehicle });
+  page.shapes = null;
+  askToWatch();
   if (vehicle === null) {
     $("vehicle").hidden = true;
     follow(false);
@@ -277,6 +286,9 @@ function watch(vehicle) {
   }
   paint();
 }
+
+const askToWatch = () =>
+  ask({ kind: "watch", number: page.wanted, sensors: $("sensors").checked });
 
 function follow(on) {
   page.following = on && page.chosen !== null;
@@ -342,11 +354,24 @@ function draw() {
   if (page.coloring === "zone") page.layers.drawZones(camera);
   const calls = page.frame ? page.vehicles.draw(camera, part, page.coloring === "speed") : 0;
   page.calls = page.layers.calls + calls;
-  drawLabels(part, theme);
+  drawOver(part, theme);
   showScale(camera.scale);
   page.times.push(performance.now() - begun);
   if (page.times.length > COUNTED) page.times.shift();
   page.firstPicture ||= page.frame ? performance.now() : 0;
+}
+
+function drawOver(part, theme) {
+  const pen = $("labels").getContext("2d");
+  const density = devicePixelRatio || 1;
+  pen.setTransform(density, 0, 0, density, 0, 0);
+  pen.clearRect(0, 0, page.camera.width, page.camera.height);
+  if (!page.frame) return;
+  const row = page.chosen === null ? -1 : page.frame.roster.find(page.chosen);
+  if (row >= 0 && page.shapes && !page.looksBack) {
+    drawSensed(pen, page.camera, page.shapes, page.vehicles.poseOf(row, part), $("sensors").checked);
+  }
+  drawLabels(pen, page, part, theme);
 }
 
 function followChosen(part) {
@@ -366,39 +391,6 @@ function seatFollows() {
   if (seat.agent === null) return;
   const row = page.frame.roster.agents.indexOf(seat.agent);
   if (row >= 0) watch(page.frame.roster.ids[row]);
-}
-
-function drawLabels(part, theme) {
-  const canvas = $("labels");
-  const pen = canvas.getContext("2d");
-  const density = devicePixelRatio || 1;
-  pen.setTransform(density, 0, 0, density, 0, 0);
-  pen.clearRect(0, 0, canvas.width, canvas.height);
-  pen.font = "600 12px system-ui, sans-serif";
-  pen.textAlign = "center";
-  pen.lineWidth = 3;
-  pen.strokeStyle = theme.halo;
-  const label = (text, x, y, ink) => {
-    pen.strokeText(text, x, y);
-    pen.fillStyle = ink;
-    pen.fillText(text, x, y);
-  };
-  const { camera, frame } = page;
-  if (page.coloring === "zone") {
-    page.hello.zones.forEach(([ax, ay, bx, by], k) => {
-      label(`zone ${k}`, ...camera.toPixels((ax + bx) / 2, (ay + by) / 2), theme.ink);
-    });
-  }
-  if (!frame || camera.scale < LABEL_SCALE) return;
-  let room = 80;
-  for (let k = 0; k < frame.count && room; k++) {
-    if (frame.roster.agents[k] < 0) continue;
-    const [x, y] = camera.toPixels(...page.vehicles.placeOf(k, part).slice(0, 2));
-    if (x < 0 || y < 0 || x > camera.width || y > camera.height) continue;
-    room -= 1;
-    const away = Math.max(14, frame.roster.sizes[2 * k + 1] * camera.scale * 0.5 + 8);
-    label(page.hello.agents[frame.roster.agents[k]], x, y - away, theme.ink);
-  }
 }
 
 function stillPicture() {
@@ -490,7 +482,9 @@ function wire() {
   on("reset", "click", () => ask({ kind: "reset" }));
   on("pace", "change", () => ask({ kind: "pace", number: Number($("pace").value) }));
   on("past", "input", () => lookAt(Number($("past").value)));
-  on("live", "click", () => lookAt(page.history.length - 1));
+  on("live", "click", () => lookAt(page.line.frames.length - 1));
+  on("sensors", "change", askToWatch);
+  on("world", "change", () => goTo(Number($("world").value)));
   on("nearer", "click", () => { page.camera?.zoom(1.4); dirty(); });
   on("farther", "click", () => { page.camera?.zoom(1 / 1.4); dirty(); });
   on("home", "click", () => { follow(false); page.camera?.home(); dirty(); });
@@ -531,6 +525,8 @@ function begin() {
   }
   setTheme(matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
   wire();
+  const named = /^#world=(\d+)$/.exec(location.hash);
+  if (named) page.world = Number(named[1]);
   connect("");
   requestAnimationFrame(draw);
 }

@@ -48,6 +48,18 @@ export function showVehicle(told, name) {
   fillTable($("observation"), rows);
 }
 
+// What runs the world: each node, what it runs, and its LoadScore.
+export function showLoads(rows) {
+  $("loads-box").hidden = !rows.length;
+  const body = $("loads");
+  body.replaceChildren(...rows.map(({ name, zones, score, note }) => {
+    const row = element("tr");
+    const shown = score === null ? note : score.toFixed(2);
+    row.append(element("th", name, { scope: "row" }), element("td", zones), element("td", shown));
+    return row;
+  }));
+}
+
 export function showLegend(entries) {
   const list = $("legend");
   list.replaceChildren(...entries.map(([name, color]) => {

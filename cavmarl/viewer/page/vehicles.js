@@ -228,6 +228,14 @@ export class VehicleLayer {
       .concat([b[at + 2], b[at + 3]]);
   }
 
+  // The same with the heading between the two.
+  poseOf(row, share) {
+    const [x, y] = this.placeOf(row, share);
+    const [from, to] = [this.before[4 * row + 2], this.now[4 * row + 2]];
+    const turn = ((to - from + 3 * Math.PI) % (2 * Math.PI)) - Math.PI;
+    return [x, y, from + turn * share];
+  }
+
   // The row nearest to a place, within a distance in metres; -1 if there is none.
   nearest(x, y, within, share) {
     let best = within * within;

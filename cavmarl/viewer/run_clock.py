@@ -1,0 +1,58 @@
+"""`RunClock`: when a world that pages watch takes its next step."""
+
+from __future__ import annotations
+
+import time
+
+from cavmarl.viewer.page_requests import PageRequest
+
+IDLE_S = 0.25  # the longest wait before requests are looked at again
+LATE_S = 0.5  # a clock that is later does not catch up
+MOST_STEPS = 10  # that wait while the world is paused
+
+
+class RunClock:
+    """Paused or not, and how fast.
+
+    Attributes:
+        pace: seconds of the world in one of ours; 0: as fast as it can.
+        is_paused: steps are only taken one by one, when a page asks for one.
+    """
+
+    def __init__(self, pace: float = 1.0) -> None:
+        self.pace = pace
+        self.is_paused = False
+        self._steps_wanted = 0
+        self._due_s = time.monotonic()
+
+    def heed(self, request: PageRequest) -> bool:
+        """Take a request; whether it was one for the clock."""
+        match request.kind:
+            case "pause":
+                self.is_paused = True
+            case "play":
+                self.is_paused = False
+            case "step":
+                self.is_paused = True
+                self._steps_wanted = min(self._steps_wanted + 1, MOST_STEPS)
+            case "pace" if request.number is not None:
+                self.pace = request.number
+            case _:
+                return False
+        self._due_s = time.monotonic()
+        return True
+
+    def wait_s(self, now_s: float) -> float:
+        """For how long no step is due, at most `IDLE_S`; 0: one is."""
+        if self._steps_wanted:
+            return 0.0
+        if self.is_paused:
+            self._due_s = now_s
+            return IDLE_S
+        return min(max(0.0, self._due_s - now_s), IDLE_S) if self.pace else 0.0
+
+    def tick(self, now_s: float, step_s: float) -> None:
+        """A step of so many seconds is taken now."""
+        self._steps_wanted = max(0, self._steps_wanted - 1)
+        if self.pace:
+            self._due_s = max(self._due_s, now_s - LATE_S) + step_s / self.pace

@@ -1,0 +1,232 @@
+"""What the sensors of an agent see, as shapes that a page draws.
+
+A shape is a JSON object with `name` (of the sensor), `kind` and `axes`: `vehicle` (x ahead, y to
+the left, from its centre) or `map` (the same place, x east and y north). Places are in metres.
+
+| kind | what there is |
+|---|---|
+| `rays` | `from` [x, y], `ends` [x, y, x, y, …], `hits` 1 where a ray ends at something |
+| `points` | `points` [x, y, …] |
+| `links` | the same, drawn from the vehicle |
+| `picture` | `width`, `height`, `rgba` (base64); `cone` [x, y, yaw_rad, opening_rad, range_m] |
+| `grid` | a picture that lies on the ground: `corners` of its first row's ends and of its last's |
+| `numbers` | `rows` of a unit and a number |
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config.env import EnvConfig
+from cavmarl.config.rig import BevGridConfig, CameraConfig, LidarRigConfig, MountedConfig
+from cavmarl.config.sensors import OccupancyGridConfig
+from cavmarl.parallel.step_arrays import StepArrays
+from cavmarl.sensors.kernels.camera_picture import colours
+from cavmarl.sensors.kernels.panorama import LANE_LINE
+from cavmarl.sensors.mounted.frames import SensorFrames
+from cavmarl.sensors.mounted.lidar import azimuths
+from cavmarl.sensors.mounted.mount_transforms import mount_of, sensor_to_vehicle
+from cavmarl.sensors.observed import layout
+
+MOST_RAYS = 360
+MOST_POINTS = 2000
+MOST_PIXELS = 64_000
+FARTHEST = 1.0 - 1e-6  # a ray of this share of the range has met nothing
+
+Shape = dict[str, Any]
+Floats = NDArray[np.float64]
+
+
+def sensed_shapes(config: EnvConfig, arrays: StepArrays, world: int, agent: int) -> list[Shape]:
+    """Those of an agent's observation, then those of its rig."""
+    shapes: list[Shape] = []
+    if config.observation.mode != "sensors":
+        frame = arrays.observations[world, agent]
+        frame = frame[-(len(frame) // config.sensors.stack) :].astype(np.float64)
+        shapes += _observed(config, {n: frame[p] for n, p in layout(config.sensors).items()})
+    for name, settings in config.rig.items():
+        shapes += _mounted(name, settings, arrays.frames[name], world, agent)
+    return shapes
+
+
+def _observed(config: EnvConfig, parts: dict[str, Floats]) -> list[Shape]:
+    sensors = config.sensors
+    shapes = []
+    if "lidar" in parts:
+        distances = parts["lidar"][: sensors.lidar.rays]
+        angles = 2.0 * np.pi * np.arange(len(distances)) / len(distances)
+        shapes.append(_rays("lidar", distances, angles, sensors.lidar.range_m))
+    if "lidar_observation" in parts:
+        settings = sensors.lidar_observation
+        distances = parts["lidar_observation"].reshape(-1, 2)[:, 0]
+        distances = distances if settings.normalize else distances / settings.maximum_range_m
+        angles = -2.0 * np.pi * np.arange(len(distances)) / len(distances)
+        reach = settings.maximum_range_m
+        shapes.append(_rays("lidar_observation", distances, angles, reach, axes="map"))
+    if "neighbors" in parts:
+        rows = parts["neighbors"].reshape(-1, 7)
+        seen = rows[rows[:, 0] > 0.5, 1:3] * sensors.neighbors.range_m
+        shapes.append(_places("neighbors", "links", seen))
+    if "route" in parts:
+        scale = sensors.route.points * sensors.route.spacing_m
+        shapes.append(_places("route", "points", parts["route"].reshape(-1, 2) * scale))
+    if "roadgraph" in parts:
+        rows = parts["roadgraph"].reshape(sensors.roadgraph.points, -1)
+        seen = rows[rows[:, 0] > 0.5, 1:3] * sensors.roadgraph.range_m
+        shapes.append(_places("roadgraph", "points", seen))
+    if "occupancy_grid" in parts:
+        shapes.append(_occupancy(sensors.occupancy_grid, parts["occupancy_grid"]))
+    return shapes
+
+
+def _rays(
+    name: str, shares: Floats, angles: Floats, range_m: float, axes: str = "vehicle"
+) -> Shape:
+    """Rays from the vehicle's centre, of shares of the range."""
+    reach = np.clip(shares, 0.0, 1.0) * range_m
+    ends = np.stack([np.cos(angles) * reach, np.sin(angles) * reach], axis=1)
+    return _ray_shape(name, np.zeros(2), ends, shares < FARTHEST, axes)
+
+
+def _ray_shape(
+    name: str, start: Floats, ends: Floats, hits: NDArray[np.bool_], axes: str = "vehicle"
+) -> Shape:
+    some = slice(None, None, max(1, -(-len(ends) // MOST_RAYS)))
+    return {
+        "name": name,
+        "kind": "rays",
+        "axes": axes,
+        "from": _flat(start),
+        "ends": _flat(ends[some]),
+        "hits": hits[some].astype(int).tolist(),
+    }
+
+
+def _places(name: str, kind: str, places: Floats) -> Shape:
+    some = places[:: max(1, -(-len(places) // MOST_POINTS))]
+    return {"name": name, "kind": kind, "axes": "vehicle", "points": _flat(some)}
+
+
+def _flat(places: Floats) -> list[float]:
+    """Finite numbers only: JSON has no others."""
+    numbers: list[float] = np.nan_to_num(np.round(places, 2)).ravel().tolist()
+    return numbers
+
+
+def _occupancy(settings: OccupancyGridConfig, numbers: Floats) -> Shape:
+    """The layers together: vehicles orange, roads grey, else the largest number as a shade."""
+    columns, rows = settings.shape
+    layers = numbers.reshape(len(settings.features), columns, rows)
+    shades = np.abs(layers / 255.0 - 0.5 if settings.as_image else layers)
+    shades *= 2.0 if settings.as_image else 1.0
+    rgba = np.zeros((rows, columns, 4), np.uint8)
+    for feature, layer in zip(settings.features, np.clip(shades, 0.0, 1.0), strict=True):
+        filled = layer.T > 1e-3
+        color = (255, 140, 40) if feature == "presence" else (120, 130, 145)
+        if feature in ("presence", "on_road"):
+            fresh = filled if feature == "presence" else filled & (rgba[..., 3] == 0)
+            rgba[fresh] = (*color, 150)
+    (low_x, _), (low_y, _) = settings.grid_size_m
+    step_x, step_y = settings.grid_step_m
+    # highway-env's y points to the right of its x.
+    left, right, top, bottom = low_x, low_x + columns * step_x, -low_y, -(low_y + rows * step_y)
+    corners = np.array([[left, top], [right, top], [left, bottom]])
+    axes = "vehicle" if settings.align_to_vehicle_axes else "map"
+    return _grid("occupancy_grid", rgba, corners, axes)
+
+
+def _grid(name: str, rgba: NDArray[np.uint8], corners: Floats, axes: str = "vehicle") -> Shape:
+    return {
+        "name": name,
+        "kind": "grid",
+        "axes": axes,
+        "corners": _flat(corners),
+        **_pixels(rgba),
+    }
+
+
+def _mounted(
+    name: str, settings: MountedConfig, frames: SensorFrames, world: int, agent: int
+) -> list[Shape]:
+    """What a sensor of the rig has got last; nothing of a sample that was lost."""
+    if frames.lost[world, agent, -1]:
+        return []
+    data = np.asarray(frames.data[world, agent, -1])
+    if isinstance(settings, LidarRigConfig):
+        return [_lidar(name, settings, data.astype(np.float64))]
+    if settings.type == "radar":  # type: ignore[attr-defined]
+        rows = data[data[:, 0] > 0.0].astype(np.float64)
+        flat = np.stack([np.cos(rows[:, 1]), np.sin(rows[:, 1])], axis=1) * rows[:, :1]
+        return [_places(name, "points", _in_vehicle(settings, flat))]
+    if isinstance(settings, CameraConfig):
+        mount = mount_of(settings)
+        yaw = math.atan2(mount.turn[1, 0], mount.turn[0, 0])
+        cone = [*mount.place[:2].tolist(), yaw, math.radians(settings.fov_deg), settings.range_m]
+        shown = _pixels(_colored(settings, data))
+        return [{"name": name, "kind": "picture", "axes": "vehicle", "cone": cone, **shown}]
+    if isinstance(settings, BevGridConfig):
+        ahead, behind = settings.ahead_m, settings.behind_m
+        aside = settings.aside_m
+        corners = np.array([[ahead, aside], [ahead, -aside], [-behind, aside]])
+        rgba = _colored(settings, data)
+        rgba[..., 3] = np.where(data > 0, 150, 0)
+        return [_grid(name, rgba, _in_vehicle(settings, corners))]
+    numbers = np.nan_to_num(data.astype(np.float64)).ravel()
+    units = getattr(settings, "units", ())
+    told = [[unit, round(float(value), 4)] for unit, value in zip(units, numbers, strict=False)]
+    return [{"name": name, "kind": "numbers", "rows": told}]
+
+
+def _lidar(name: str, settings: LidarRigConfig, distances: Floats) -> Shape:
+    """Of one layer rays, of several the points that they meet."""
+    first, step, count = azimuths(settings.fov_deg, settings.rays)
+    turns = first + step * np.arange(count)
+    rises = np.radians(np.linspace(settings.lower_deg, settings.upper_deg, settings.layers))
+    rises = rises if settings.layers > 1 else np.zeros(1)
+    ways = np.stack(
+        [
+            np.cos(rises)[:, None] * np.cos(turns),
+            np.cos(rises)[:, None] * np.sin(turns),
+            np.broadcast_to(np.sin(rises)[:, None], (len(rises), count)),
+        ],
+        axis=2,
+    )
+    mount = mount_of(settings)
+    ends = sensor_to_vehicle(mount, (ways * distances[..., None]).reshape(-1, 3))[:, :2]
+    hits = distances.ravel() < settings.range_m * FARTHEST
+    if settings.layers == 1:
+        return _ray_shape(name, mount.place[:2], ends, hits)
+    return _places(name, "points", ends[hits])
+
+
+def _in_vehicle(settings: MountedConfig, places: Floats) -> Floats:
+    """Points (n, 2) of the sensor's plane in the vehicle's."""
+    flat = np.concatenate([places, np.zeros((len(places), 1))], axis=1)
+    return sensor_to_vehicle(mount_of(settings), flat)[:, :2]
+
+
+def _colored(settings: MountedConfig, data: NDArray[Any]) -> NDArray[np.uint8]:
+    """(height, width, 4): colours as they are, classes in their colours, depth as a shade."""
+    every = max(1, math.ceil(math.sqrt(data.shape[0] * data.shape[1] / MOST_PIXELS)))
+    data = data[::every, ::every]
+    rgba = np.full((*data.shape[:2], 4), 255, np.uint8)
+    if data.ndim == 3:
+        rgba[..., :3] = data
+    elif isinstance(settings, CameraConfig) and settings.units == ("m",):
+        near = 1.0 - np.clip(data.astype(np.float64) / settings.range_m, 0.0, 1.0)
+        rgba[..., :3] = (255.0 * near**2)[..., None]
+    else:
+        shades = colours()
+        shades[LANE_LINE] = 230.0
+        rgba[..., :3] = shades[data]
+    return rgba
+
+
+def _pixels(rgba: NDArray[np.uint8]) -> dict[str, Any]:
+    height, width = rgba.shape[:2]
+    return {"width": width, "height": height, "rgba": base64.b64encode(rgba.tobytes()).decode()}

@@ -1,0 +1,140 @@
+"""`show`: a page for an environment that a program steps, as in a notebook or in training."""
+
+from __future__ import annotations
+
+import html
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import partial
+from typing import Any
+
+from cavmarl.engine.world_frame import WorldFrame
+from cavmarl.viewer.frame_publisher import FramePublisher
+from cavmarl.viewer.run_clock import RunClock
+from cavmarl.viewer.run_loads import RunLoads
+from cavmarl.viewer.show_world import check_extra, serve_stages
+from cavmarl.viewer.stage import first_stage
+from cavmarl.viewer.vehicle_details import Shown, hello_of, vehicle_details
+from cavmarl.viewer.web_options import DEFAULT_PORT, WebOptions
+
+FRAME_HEIGHT_PX = 560  # in a notebook
+
+
+class ShownEnv:
+    """Serves pages that watch the worlds of an environment; a context manager.
+
+    In a notebook it is shown as the page itself.
+
+    Args:
+        env: which a program steps.
+        options: of the server. Where pages may control it, a step waits while they have paused.
+        title: what drives the worlds, in words.
+        looks_itself: whether it is called after each reset and step of `env`; else by `look`.
+        tell: told the address, and a token that was made.
+
+    Attributes:
+        address: of the page.
+    """
+
+    def __init__(
+        self,
+        env: Shown,
+        options: WebOptions,
+        *,
+        title: str = "",
+        looks_itself: bool = True,
+        tell: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        check_extra()
+        self._env = env
+        self._controlled = options.control
+        self._clock = RunClock(pace=0.0)
+        count = len(env.worlds.arrays.mask)
+        first = first_stage("world 0", env.network, hello_of(env, title, is_driven_here=False))
+        stages = [first, *(first.named(f"world {k}") for k in range(1, count))]
+        self._audiences = [stage.audience for stage in stages]
+        self._publishers = [FramePublisher(stage.audience, stage.encoder) for stage in stages]
+        with ExitStack() as stack:
+            self.address = serve_stages(stack, stages, options, tell)
+            stack.enter_context(RunLoads(env.worlds, first.audience))
+            if looks_itself:
+                stack.callback(env.watch(self.look))
+            self._stack = stack.pop_all()
+
+    def look(self) -> None:
+        """Show the present moment to pages; while they have paused it, wait."""
+        for publisher in self._publishers:
+            publisher.is_new = True
+        while True:
+            self._heed()
+            wait_s = self._clock.wait_s(time.monotonic()) if self._controlled else 0.0
+            self._publish()
+            if not wait_s:
+                break
+            self._audiences[0].wait(wait_s)
+        self._clock.tick(time.monotonic(), self._env.step_s)
+
+    def _heed(self) -> None:
+        for audience in self._audiences:
+            for _, request in audience.requests():
+                self._clock.heed(request)
+
+    def _publish(self) -> None:
+        for world, publisher in enumerate(self._publishers):
+            see, tell = partial(self._see, world), partial(self._tell, world)
+            publisher.publish(time.monotonic(), self._clock, see, tell)
+
+    def _see(self, world: int, ghosts: bool) -> WorldFrame:
+        return self._env.world_frames([world], ghosts)[0]
+
+    def _tell(self, world: int, frame: WorldFrame, vehicle: int, sensors: bool) -> dict[str, Any]:
+        return vehicle_details(self._env, world, frame, vehicle, sensors)
+
+    def refresh(self) -> None:
+        """Show the present moment to pages that are open or will be, however lately one was."""
+        for world, publisher in enumerate(self._publishers):
+            publisher.keep(self._see(world, ghosts=False), self._clock)
+
+    def _repr_html_(self) -> str:
+        if self._env.is_ready:
+            self.refresh()
+        source = html.escape(self.address, quote=True)
+        return f'<iframe src="{source}" width="100%" height="{FRAME_HEIGHT_PX}"></iframe>'
+
+    def close(self) -> None:
+        """End the server; the environment goes on."""
+        self._stack.close()
+
+    def __enter__(self) -> ShownEnv:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def show(
+    env: Shown,
+    *,
+    port: int = DEFAULT_PORT,
+    host: str = "127.0.0.1",
+    token: str = "",
+    control: bool = False,
+    title: str = "",
+) -> ShownEnv:
+    """Serve a page that shows an environment while a program steps it (docs/viewer.md).
+
+    Args:
+        env: of `parallel_env` or `make_vec`.
+        port: of the page; 0: any that is free.
+        host: address; one that is not this machine's own needs a token.
+        token: that a page has to give; off this machine one is made and printed without it.
+        control: pages may pause, step and slow the program: its `step` waits for them.
+        title: what drives the worlds, in words.
+
+    Raises:
+        ServiceError: the port is taken.
+        MissingExtraError: starlette, uvicorn or websockets are not installed.
+    """
+    options = WebOptions(host, port, token, control=control, framed=True)
+    return ShownEnv(env, options, title=title, tell=print)
