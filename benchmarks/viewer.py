@@ -11,6 +11,8 @@ import json
 import multiprocessing
 import resource
 import shutil
+import threading
+from collections import deque
 from multiprocessing.connection import Connection
 from statistics import median
 from time import perf_counter, process_time, sleep
@@ -18,15 +20,18 @@ from typing import Annotated, Any
 
 import numpy as np
 from websockets.asyncio.client import connect
+from websockets.sync.client import connect as connect_now
 
-from benchmarks.harness import Env, Report, Say, about, run, silent
+from benchmarks.harness import Env, Report, Say, about, paired_ratio, run, silent, take_turns
 from cavmarl.cli.output import Seed
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_frame import SEEN, WorldFrame
 from cavmarl.env.parallel import CavEnv, parallel_env
+from cavmarl.env.vector import make_vec
 from cavmarl.viewer.audience import Audience
 from cavmarl.viewer.frame_messages import FrameEncoder
 from cavmarl.viewer.map_geometry import map_origin
+from cavmarl.viewer.shown_env import ShownEnv
 from cavmarl.viewer.stage import first_stage
 from cavmarl.viewer.vehicle_details import hello_of
 from cavmarl.viewer.web_options import WebOptions
@@ -34,6 +39,7 @@ from cavmarl.viewer.web_server import WebServer
 
 SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 BROWSER_HZ = 10.0
+WATCHED_STEPS, WATCHED_TURNS = 200, 5
 
 
 def measure(
@@ -41,11 +47,14 @@ def measure(
     vehicles: Annotated[int, about("Vehicles of a frame.")] = 10_000,
     clients: Annotated[int, about("Clients that watch at once.")] = 100,
     rate_hz: Annotated[float, about("Frames a second that they are sent.")] = 10.0,
+    moving: Annotated[int, about("Vehicles of the town that is stepped, watched and not.")] = 1000,
     seconds: Annotated[float, about("That clients and the page are watched for.")] = 10.0,
     seed: Seed = 0,
     say: Say = silent,
 ) -> Report:
     """Bytes, milliseconds and shares of one core that the viewer costs."""
+    if moving < 10:
+        raise ConfigError(f"moving = {moving}: must be at least 10")
     if not (1 <= vehicles <= 100_000 and 0 <= clients <= 200 and rate_hz > 0.0 and seconds > 0.0):
         raise ConfigError(
             "vehicles must be 1 to 100000, clients 0 to 200, rate and seconds above 0"
@@ -58,6 +67,8 @@ def measure(
         if clients:
             say(f"{clients} clients")
             rows.append(serving(world, frames, clients, rate_hz, seconds))
+        say("watching a world")
+        rows.append(watching(moving, seed, say))
         if shutil.which("chromium"):
             say("the page in Chromium")
             rows.append(drawing(world, frames, seconds))
@@ -71,6 +82,7 @@ def measure(
         "frames/s": "fps:.1f",
         "calls": "calls",
         "first, ms": "first:.0f",
+        "times as long": "ratio:.3f",
     }
     return Report(f"{vehicles} vehicles on {env}", columns, rows)
 
@@ -134,6 +146,51 @@ def serving(
         "core": cpu / took,
         "ms": 1e3 * cpu / sent,
         "fps": received / clients / took,
+    }
+
+
+def watching(vehicles: int, seed: int, say: Say) -> dict[str, Any]:
+    """A step of a town that a client watches over one that none watches, turn about.
+
+    Processor time of this process, in which server and client are, too.
+    """
+    agents = vehicles // 10
+    vec = make_vec("town", seed=seed, agents=agents, background=vehicles - agents)
+    shown = ShownEnv(vec, WebOptions(port=0, control=False))
+    try:
+        vec.reset()
+        url = shown.address.replace("http", "ws") + "live"
+
+        def steps_s() -> float:
+            took = 0.0
+            for _ in range(WATCHED_STEPS):
+                actions = vec.suggest_actions()
+                begun = process_time()
+                vec.step(actions)
+                took += process_time() - begun
+            return took
+
+        def watched_s() -> float:
+            with connect_now(url, max_size=None, compression=None) as client:
+                client.send("{}")
+                for _ in range(2):  # hello and map
+                    client.recv()
+                reader = threading.Thread(target=lambda: deque(client, maxlen=0), daemon=True)
+                reader.start()
+                took = steps_s()
+            reader.join()
+            return took
+
+        steps_s()
+        found = take_turns({"alone": steps_s, "watched": watched_s}, WATCHED_TURNS, say)
+    finally:
+        shown.close()
+        vec.close()
+    ratio = paired_ratio(found["watched"], found["alone"])
+    return {
+        "name": f"watched step of {vehicles}",
+        "ms": 1e3 * median(found["watched"]) / WATCHED_STEPS,
+        "ratio": ratio,
     }
 
 
