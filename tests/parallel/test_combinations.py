@@ -97,7 +97,6 @@ REFUSED = {
     ("planned faults", "zones over workers"): OF_ONE_WORLD,
     ("repartitions", "zones over workers"): "needs zones that stay",
     ("sensor workers", "nodes"): NOT_OVER_NODES,
-    ("invariant checks", "nodes"): NOT_OVER_NODES,
     ("repartitions", "nodes"): NOT_OVER_NODES,
     ("planned faults", "nodes"): NOT_OVER_NODES,
 }

@@ -13,6 +13,7 @@ from cavmarl.cli import app
 from cavmarl.config.registry import load_config
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import World, make_world
+from cavmarl.handoff.division import Division
 from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.parallel.nodes import links as links_module
 from cavmarl.parallel.nodes.links import FrameKind, Links
@@ -20,6 +21,7 @@ from cavmarl.parallel.nodes.node_system import NodeSystem
 from cavmarl.verify.simulated_machine import SimulatedListener, SimulatedMachine, SimulatedSocket
 from cavmarl.verify.simulated_nodes import MIXES, SimulatedLine, verify_simulated_nodes
 
+CHECKED = "zones.check_invariants"
 SMALL: dict[str, Any] = {"agents": 3, "background": 12, "zones": 3, "steps": 8}
 
 
@@ -109,6 +111,22 @@ def test_frames_whose_head_is_not_guarded(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr("cavmarl.parallel.nodes.links.zlib.crc32", lambda data, first=0: 0)
     found = verify_simulated_nodes("merge", [3], mixes=["damage"], seeds=3, **SMALL)
     assert not found.holds
+
+
+def test_owners_are_checked_over_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An epoch that no record has is noticed, though the vehicles move as they should."""
+    checked: dict[str, Any] = {**SMALL, "steps": 30, "overrides": {CHECKED: True}}
+    assert verify_simulated_nodes("merge", [3], mixes=["kill"], seeds=1, **checked).holds
+    take_over = Division.take_over
+
+    def later(self: Division, w: int, zone: int, vehicle: int, epoch: int, state: bytes) -> None:
+        take_over(self, w, zone, vehicle, epoch + 1, state)
+
+    monkeypatch.setattr(Division, "take_over", later)
+    found = verify_simulated_nodes("merge", [3], mixes=["none"], seeds=1, **checked)
+    assert "on record are" in found.lines[0].wrong[0]
+    unchecked = {**checked, "overrides": {}}
+    assert verify_simulated_nodes("merge", [3], mixes=["none"], seeds=1, **unchecked).holds
 
 
 @pytest.mark.slow

@@ -121,6 +121,18 @@ def owner_hash(vehicle: int, epoch: int) -> np.uint64:
 
 
 @kernel
+def owned_sum(
+    rows: NDArray[np.void],  # of a zone
+    num: int,  # how many it owns; they come first
+) -> np.uint64:
+    """The sum of `owner_hash` of the vehicles that a zone owns, as its rows say."""
+    total = np.uint64(0)
+    for row in range(num):
+        total += owner_hash(rows[row]["id"], rows[row]["epoch"])
+    return total
+
+
+@kernel
 def _place(table: NDArray[np.void], vehicle: int) -> int:
     """Where a vehicle stands, or the first blank behind its hash."""
     last = table.shape[0] - 1

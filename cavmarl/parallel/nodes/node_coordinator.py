@@ -6,6 +6,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 
 from cavmarl.core.errors import MessageError, ProtocolError
+from cavmarl.handoff.coordinator.invariant_monitor import OwnersOnRecord
 from cavmarl.handoff.coordinator.journal import AnyJournal
 from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.directory import Directory
@@ -36,7 +37,14 @@ class CrossingDigests:
 class _World:
     """The decisions of one world."""
 
-    def __init__(self, run: bytes, zones: int, limits: Limits, journal: AnyJournal | None) -> None:
+    def __init__(
+        self,
+        run: bytes,
+        zones: int,
+        limits: Limits,
+        journal: AnyJournal | None,
+        is_checked: bool,
+    ) -> None:
         self.states = CrossingDigests()
         self.directory = Directory(run, range(zones), self.states, limits)
         self.journal = journal
@@ -44,12 +52,35 @@ class _World:
         self.movers: list[tuple[int, int]] = []
         self.births: list[Birth] = []
         self.answered: set[tuple[int, int]] = set()
+        self.on_record = OwnersOnRecord(zones, limits, is_direct=True) if is_checked else None
+
+    def check_owned(self, w: int, reports: Sequence[Report]) -> None:
+        """Compare the vehicles that zones own by their rows with the records.
+
+        Raises:
+            ProtocolError: they are others, or of another epoch.
+        """
+        if self.on_record is None:
+            return
+        sums = self.on_record.sums(self.births).tolist()
+        due = dict(self.directory.table.counts)
+        for birth in self.births:
+            due[birth.zone] += 1
+        for zone, num, total in (owned for report in reports for owned in report.owned):
+            if (num, total) != (due[zone], sums[zone]):
+                raise ProtocolError(
+                    f"world {w}, tick {self.directory.table.tick}: zone {zone} has {num} vehicles, "
+                    f"on record are {due[zone]}, or others or of another epoch; "
+                    "zones.journal shows the records"
+                )
 
     def write(self, output: Output) -> int:
         """Write records down; how many vehicles change their owner by them."""
         if self.journal is not None and output.records:
             self.journal.append(output.records)
         self.log.logged(output.records)
+        if self.on_record is not None:
+            self.on_record.logged(output.records)
         return sum(len(r.switches) for r in output.records if isinstance(r, Begin))
 
 
@@ -67,9 +98,10 @@ class NodeCoordinator:
         limits: Limits,
         links: Links,  # to all nodes
         journals: Sequence[AnyJournal | None],  # of each world
+        is_checked: bool = False,  # whether it is checked what zones own
     ) -> None:
         self._worlds = [
-            _World(run, len(node_of), limits, journal)
+            _World(run, len(node_of), limits, journal, is_checked)
             for run, journal in zip(runs, journals, strict=True)
         ]
         self._node_of = node_of
@@ -153,6 +185,7 @@ class NodeCoordinator:
             world.movers = [(vehicle, target) for vehicle, target, _ in movers]
             world.states.digests = {v: bytes.fromhex(digest) for v, _, digest in movers}
             world.births += [Birth(v, zone, b"") for report in said for v, zone in report.births]
+            world.check_owned(w, said)
 
     def begin(self, timeout_s: float) -> None:
         """Decide the way to the next tick, once all offers are answered, and lease it.

@@ -131,6 +131,7 @@ class NodePool:
             limits_of(config.zones),
             self._links,
             journals,
+            config.zones.check_invariants,
         )
         self._links.urgent = self._hear
         self._runs = [run.run.hex() for run in runs]

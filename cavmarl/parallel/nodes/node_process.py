@@ -135,8 +135,9 @@ class NodeProgram:
         mounted = simulation.mounted
         carried = [] if mounted is None else [*mounted.arrays()]
         self._hosts = ZoneHosts(
-            simulation.division, mine, node_of, told, limits, self._links, carried, generation
-        )
+            simulation.division, mine, node_of, told, limits, self._links, carried, generation,
+            simulation.config.zones.check_invariants,
+        )  # fmt: skip
         shards = simulation.shards
         own = [shards[zone] for zone in mine]
         foreign = [shard for shard in shards if shard.zone not in mine]

@@ -228,7 +228,6 @@ def check_nodes(world: World, nodes: int) -> None:
         "v2x.channel.external": config.v2x.enabled and config.v2x.channel.external,
         "zones.faults": config.zones.faults,
         "zones.reproducers": config.zones.reproducers,
-        "zones.check_invariants": config.zones.check_invariants,
         "zones.repartition_steps": config.zones.repartition_steps,
         "workers.sensors": config.workers.sensors,
         "workers.monitor_cpu": config.workers.monitor_cpu,

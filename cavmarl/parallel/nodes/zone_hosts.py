@@ -16,9 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import MessageError, ProtocolError
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.core.records.arrays import Gate
 from cavmarl.handoff.coordinator.coordinator import Coordinator
 from cavmarl.handoff.division import Division
+from cavmarl.handoff.kernels.invariant_checks import owned_sum
 from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.codec import decode, encode
 from cavmarl.ownership.endpoint import Endpoint
@@ -40,6 +42,8 @@ class Report(NamedTuple):
     movers: list[tuple[int, int, str]]  # vehicle, zone that it is in, digest of its state as hex
     births: list[tuple[int, int]]  # vehicle, zone that owns it first
     began: bool  # the world has begun anew after the tick
+    # zone, vehicles that its rows say it owns, the sum of their `owner_hash`; where it is checked
+    owned: list[tuple[int, int, int]]
 
 
 class ZoneHosts:
@@ -57,8 +61,10 @@ class ZoneHosts:
         links: Links,  # to the coordinator and to all other nodes
         carried: Sequence[NDArray[Any]],  # (W, A, …) kept of agents beside their vehicles' states
         generation: int = 0,  # how often nodes have been lost
+        is_checked: bool = False,  # whether the caller checks what zones own
     ) -> None:
-        self._generation = generation
+        self._generation, self._is_checked = generation, is_checked
+        self._owned_sum = specialized(owned_sum)
         self._carried = carried
         self._come: dict[tuple[int, int], memoryview] = {}  # world, vehicle → what is to be kept
         self._division = division
@@ -141,12 +147,13 @@ class ZoneHosts:
     def report(self, more: Sequence[Bytes] = ()) -> None:
         """End the leases: DONE of all zones, and offers of vehicles that have crossed a border."""
         messages: list[tuple[int, Message]] = []
-        reports = []
+        reports, checked = [], self._is_checked
         for w in range(len(self._endpoints)):
             began, self._began[w] = self._began[w], False
             messages += [(w, done) for done in self._complete(w)]
             movers = [] if began else self._offer(w)
-            reports.append(Report(movers, self._births[w], began))
+            owned = [self._owned(w, zone) for zone in self._endpoints[w]] if checked else []
+            reports.append(Report(movers, self._births[w], began, owned))
             self._births[w] = []
         said = json.dumps(reports).encode()
         packed_messages = packed(messages)
@@ -155,6 +162,10 @@ class ZoneHosts:
             COORDINATOR, FrameKind.REPORT, self._generation, [head, packed_messages, said, *more]
         )
         self._is_open = False
+
+    def _owned(self, w: int, zone: int) -> tuple[int, int, int]:
+        rows = self._division.owned(w, zone)
+        return zone, len(rows), int(self._owned_sum(rows, len(rows)))
 
     def _complete(self, w: int) -> Iterable[Message]:
         gone, self._gone[w] = self._gone[w], {}
