@@ -52,6 +52,7 @@ class _World:
         self.movers: list[tuple[int, int]] = []
         self.births: list[Birth] = []
         self.answered: set[tuple[int, int]] = set()
+        self.has_begun = False  # before the first reset nodes have rows of no episode
         self.on_record = OwnersOnRecord(zones, limits, is_direct=True) if is_checked else None
 
     def check_owned(self, w: int, reports: Sequence[Report]) -> None:
@@ -60,7 +61,8 @@ class _World:
         Raises:
             ProtocolError: they are others, or of another epoch.
         """
-        if self.on_record is None:
+        self.has_begun |= any(report.began for report in reports)
+        if self.on_record is None or not self.has_begun:
             return
         sums = self.on_record.sums(self.births).tolist()
         due = dict(self.directory.table.counts)
