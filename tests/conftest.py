@@ -37,7 +37,7 @@ def _let_start(patch: pytest.MonkeyPatch, start: Callable[..., object]) -> None:
     from cavmarl.parallel.processes import fork_server
 
     for module in (fork_server, node_starters):
-        patch.setattr(module, "start_dying_with_process", start)
+        patch.setattr(module, "start_python", start)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -53,9 +53,9 @@ def forked_processes() -> Iterator[None]:
 @pytest.fixture
 def fresh_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let pools start Pythons of their own, as they do outside of the tests."""
-    from cavmarl.core.processes import start_dying_with_process
+    from cavmarl.core.processes import start_python
 
-    _let_start(monkeypatch, start_dying_with_process)
+    _let_start(monkeypatch, start_python)
 
 
 def pytest_runtest_setup() -> None:

@@ -16,6 +16,7 @@ import pytest
 from cavmarl.config.env import TERMS, EnvConfig
 from cavmarl.config.io import dotted_keys
 from cavmarl.config.rig import CollisionConfig, SampledConfig
+from cavmarl.core.errors import missing
 from cavmarl.sensors.registry import TYPES
 from tests.support.generated import check_block, table
 
@@ -81,6 +82,13 @@ def test_the_readme_is_one_page_and_its_first_example_runs() -> None:
     names: dict[str, Any] = {}
     exec(example[1], names)
     assert not names["env"].agents
+
+
+def test_installing_is_from_a_checkout_as_long_as_no_index_has_cavmarl() -> None:
+    by_name = re.compile(r"pip install[^`\n]*\bcavmarl\[")
+    texts = [*PAGES, *ROOT.glob("cavmarl/**/*.py"), *ROOT.glob("train/*.py")]
+    assert [path.name for path in texts if by_name.search(path.read_text(encoding="utf-8"))] == []
+    assert "checkout" in str(missing("torch", "torch"))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

@@ -17,7 +17,7 @@ try:
     from benchmarl.environments.common import Task, TaskClass
     from torchrl.data import Composite
 except ModuleNotFoundError as error:
-    raise missing(error, "benchmarl") from error
+    raise missing(error.name, "benchmarl") from error
 
 DECIDED = ("num_envs", "device", "action.kind")
 

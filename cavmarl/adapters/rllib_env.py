@@ -15,7 +15,7 @@ from cavmarl.env.world_copies import OwnWorlds
 try:
     from ray.rllib.env.multi_agent_env import MultiAgentEnv
 except ModuleNotFoundError as error:
-    raise missing(error, "rllib") from error
+    raise missing(error.name, "rllib") from error
 
 Step = tuple[
     dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, float]]

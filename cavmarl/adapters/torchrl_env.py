@@ -28,7 +28,7 @@ try:
     from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
     from torchrl.envs import EnvBase
 except ModuleNotFoundError as error:
-    raise missing(error, "torchrl") from error
+    raise missing(error.name, "torchrl") from error
 
 GROUP = "car"
 DECIDED = ("autoreset_mode", "copy")  # TorchRL resets worlds itself and keeps what it is given

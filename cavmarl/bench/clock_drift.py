@@ -10,7 +10,6 @@ import csv
 import json
 import math
 import subprocess
-import sys
 from dataclasses import asdict, dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -20,7 +19,7 @@ from typing import Any, ClassVar, Unpack
 from cavmarl.bench.harness import Result, check_range
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import EvaluationError
-from cavmarl.core.processes import start_dying_with_process
+from cavmarl.core.processes import start_python
 from cavmarl.cosim.followers.followed_world import FollowedWorld
 from cavmarl.cosim.time_master import OwnTicks, Pacer, RealTime, Unpaced
 from cavmarl.env.parallel import parallel_env
@@ -145,8 +144,8 @@ def _followed(
     world: FollowedWorld, pacer: _FromJoining, steps: int, rogue: float
 ) -> tuple[list[int], dict[str, Any]]:
     """The master's ticks after each step since the follower has joined, and what that has read."""
-    command = [sys.executable, "-m", PROGRAM, str(world.address), str(rogue)]
-    with start_dying_with_process(command, stdout=subprocess.PIPE, text=True) as process:
+    words = ["-m", PROGRAM, str(world.address), str(rogue)]
+    with start_python(words, stdout=subprocess.PIPE, text=True) as process:
         try:
             world.wait_for(1, JOINS_S)
             joined, pacer.has_joined = world.master.tick, True

@@ -60,7 +60,9 @@ def build(
         str | None,
         about("Keep roads within min,min,max,max: degrees lon,lat for OSM, else metres."),
     ] = None,
-    timeout_s: Annotated[float, about("Seconds that netconvert may take.", min=1.0)] = 600.0,
+    timeout_s: Annotated[
+        float | None, about("Seconds that netconvert may take; 600 by default.", min=1.0)
+    ] = None,
     json_path: JsonPath = None,
 ) -> None:
     """Make a SUMO network of a map file; its statistics go beside it, to NAME.stats.json."""

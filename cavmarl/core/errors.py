@@ -288,9 +288,11 @@ class RegisteredFunctionError(CavmarlError):
     """A function that was registered from outside answers what it must not."""
 
 
-def missing(error: ModuleNotFoundError, extra: str) -> MissingExtraError:
-    """What to raise in the place of an import `error`: it says which `extra` brings the module."""
-    return MissingExtraError(f"'{error.name}' is not installed: pip install 'cavmarl[{extra}]'")
+def missing(module: str | None, extra: str) -> MissingExtraError:
+    """What to raise where a `module` cannot be imported: it says which `extra` brings that."""
+    return MissingExtraError(
+        f"'{module}' is not installed: pip install '.[{extra}]' in a checkout of cavmarl"
+    )
 
 
 def require(module: str, extra: str) -> ModuleType:
@@ -304,4 +306,4 @@ def require(module: str, extra: str) -> ModuleType:
     except ModuleNotFoundError as error:
         if error.name is not None and module.split(".")[0] != error.name.split(".")[0]:
             raise
-        raise missing(error, extra) from error
+        raise missing(error.name, extra) from error

@@ -11,13 +11,35 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from pathlib import Path
 from typing import Any
+
+from cavmarl.core.errors import WorkerError
 
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
+
+
+def is_fork(pid: int) -> bool:
+    """Whether this process is a fork of the one that has made something, `pid`."""
+    return os.getpid() != pid
+
+
+def refuse_fork(pid: int, things: str) -> None:
+    """See that this process may use `things`, which process `pid` has made.
+
+    Raises:
+        WorkerError: it is a fork of that one: both would speak to the same process, or write the
+            same file.
+    """
+    if is_fork(pid):
+        raise WorkerError(
+            f"{things} are those of process {pid}, and this is a fork of it: make the environment "
+            "here, after the fork"
+        )
 
 
 def die_with_parent() -> None:
@@ -56,6 +78,25 @@ def start_dying_with_process(command: Sequence[str], **options: Any) -> subproce
     if threading.current_thread() is threading.main_thread():
         return start()
     return _staying_thread(os.getpid()).submit(start).result()
+
+
+def start_python(
+    words: Sequence[str], env: Mapping[str, str] | None = None, **options: Any
+) -> subprocess.Popen[Any]:
+    """Start a Python that ends with this process and finds the modules that this one finds.
+
+    A module in the working directory is not found there, unless this process finds it.
+
+    `words`: `-m` and a module, or `-c` and a program, and arguments. `env`: variables of the
+    environment beside those of this process.
+    """
+    here = str(Path(__file__).resolve().parents[2])
+    path = os.pathsep.join([here, *(place for place in sys.path if place)])
+    return start_dying_with_process(
+        [sys.executable, "-P", *words],
+        env={**os.environ, **(env or {}), "PYTHONPATH": path},
+        **options,
+    )
 
 
 @cache

@@ -14,7 +14,7 @@ from functools import partial
 from typing import Any, BinaryIO, TypeVar
 
 from cavmarl.core import errors
-from cavmarl.core.processes import start_dying_with_process
+from cavmarl.core.processes import start_python
 from cavmarl.core.tracebacks import print_traceback
 
 Found = TypeVar("Found")
@@ -36,9 +36,7 @@ def call_in_fresh_process(
     the process dies, an `EvaluationError` says `what` that was. `began` is given the process, for
     another thread to end it.
     """
-    program = start_dying_with_process(
-        [sys.executable, "-c", PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    )
+    program = start_python(["-c", PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     assert program.stdin is not None
     assert program.stdout is not None
     if began is not None:

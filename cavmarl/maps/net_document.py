@@ -9,14 +9,13 @@ from functools import cached_property
 from pathlib import Path
 from xml.etree.ElementTree import Element, ParseError, tostring
 
-import defusedxml.ElementTree
 import numpy as np
 from defusedxml.common import DefusedXmlException
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import MapError
 from cavmarl.roads.network import GeoReference
-from cavmarl.roads.sumo_net.xml_source import read_bytes
+from cavmarl.roads.sumo_net.xml_source import read_tree
 
 Points = NDArray[np.float64]
 
@@ -61,7 +60,7 @@ class NetDocument:
         """Raises MapError: the file is no network or is broken."""
         self.path = path
         try:
-            root: Element = defusedxml.ElementTree.fromstring(read_bytes(path), forbid_dtd=True)
+            root = read_tree(path)
         except (ParseError, DefusedXmlException, ValueError, OSError) as error:
             raise MapError(f"{path}: cannot be read ({error}): build it again") from error
         if root.tag != "net":

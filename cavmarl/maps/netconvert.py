@@ -26,7 +26,14 @@ from cavmarl.core.errors import ConfigError, MapError, require
 from cavmarl.maps.heights.draping import HeightOptions, HeightReport, drape
 from cavmarl.maps.map_kinds import MapKind, map_kind
 from cavmarl.maps.net_document import NetDocument
-from cavmarl.maps.netconvert_process import BuildLog, Cures, quoted, run_netconvert, sumo_home
+from cavmarl.maps.netconvert_process import (
+    TIME_LIMIT,
+    BuildLog,
+    Cures,
+    quoted,
+    run_netconvert,
+    sumo_home,
+)
 from cavmarl.maps.osm_roads import OsmRoads
 from cavmarl.maps.provenance import (
     NOT_STATED,
@@ -106,7 +113,7 @@ def build_network(
     heights: HeightOptions | None = None,
     licences: tuple[str, str] = ("", ""),
     tolerant: bool = False,
-    timeout_s: float = 600.0,
+    timeout_s: float | None = None,
     told: Told = _silent,
 ) -> BuildResult:
     """Make a SUMO network of a map file and prove that it can be read.
@@ -124,7 +131,7 @@ def build_network(
         heights: models of the ground, laid under the roads; nothing moves in the plane.
         licences: of the source and of the models of heights, where the map is to say others.
         tolerant: let netconvert leave out what it cannot use instead of giving up.
-        timeout_s: how long netconvert may take.
+        timeout_s: how long netconvert may take; None: `CAVMARL_MAX_NETCONVERT_S`, or 600 s.
         told: called with each of `STAGES` as it begins.
 
     Raises:
@@ -225,7 +232,7 @@ class _Build:
     origin: Origin | None
     heights: HeightOptions | None
     licences: tuple[str, str]
-    timeout_s: float
+    timeout_s: float | None
     told: Told
     log: BuildLog = field(default_factory=BuildLog)
     defaults: tuple[RoadDefaults, ...] = ()
@@ -309,13 +316,14 @@ def _check_near(source: Path, document: NetDocument, origin: Origin | None) -> N
 
 
 def _convert(
-    kind: MapKind, source: Path, draft: Path, options: Sequence[str], timeout_s: float
+    kind: MapKind, source: Path, draft: Path, options: Sequence[str], timeout_s: float | None
 ) -> BuildLog:
     arguments = [_INPUT[kind], str(source), "-o", str(draft), *options]
     if kind in _TYPE_MAP:
         arguments += ["-t", str(sumo_home() / "data" / "typemap" / _TYPE_MAP[kind])]
     cures = Cures(
-        f"crop the map (cavmarl map build {source} --bbox …) or allow more time (--timeout-s)",
+        f"crop the map (cavmarl map build {source} --bbox …) or allow more time (--timeout-s, or "
+        f"{TIME_LIMIT})",
         "mend the source"
         if "--ignore-errors" in options
         else f"mend the source, or leave out what is broken: cavmarl map build {source} --tolerant",

@@ -12,7 +12,10 @@ from pathlib import Path
 
 from cavmarl.core.errors import MapError, require
 from cavmarl.core.processes import dying_with_parent
+from cavmarl.roads.sumo_net.xml_source import limit
 
+MAX_NETCONVERT_S = 600
+TIME_LIMIT = "CAVMARL_MAX_NETCONVERT_S"  # the environment's variable with another limit
 _SHOWN_LINES = 10
 _QUOTED = re.compile(r"'[^']*'")
 _NUMBERED = re.compile(r"\S*\d\S*")
@@ -55,21 +58,24 @@ class BuildLog:
 class Cures:
     """What a message advises."""
 
-    too_long: str = "allow more time (--timeout-s)"
+    too_long: str = f"allow more time ({TIME_LIMIT})"
     refused: str = "mend the source"
 
 
 def run_netconvert(
-    arguments: Sequence[str], source: Path, timeout_s: float, cures: Cures = Cures()
+    arguments: Sequence[str], source: Path, timeout_s: float | None, cures: Cures = Cures()
 ) -> BuildLog:
     """Run netconvert of the `eclipse-sumo` wheel.
 
-    `source`: the file that messages name. `cures`: what they advise.
+    `source`: the file that messages name. `timeout_s`: None: `CAVMARL_MAX_NETCONVERT_S`, or 600 s.
+    `cures`: what they advise.
 
     Raises:
+        ConfigError: that variable is no whole number above 0.
         MapError: it fails or takes too long.
         MissingExtraError: it is not installed.
     """
+    timeout_s = limit(TIME_LIMIT, MAX_NETCONVERT_S) if timeout_s is None else timeout_s
     home = sumo_home()
     command = [str(home / "bin" / "netconvert"), *arguments]
     command += ["--verbose", "--aggregate-warnings=1000000", "--xml-validation=never"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import threading
 import time
 import weakref
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from cavmarl.core.errors import RecordingError
+from cavmarl.core.processes import is_fork, refuse_fork
 from cavmarl.core.whole_file import write_whole
 from cavmarl.engine.world_frame import FrameEvent, WorldFrame, events_between
 from cavmarl.recordings.recording_format import (
@@ -125,6 +127,7 @@ class _Sink:
     def __init__(self, path: Path, head: RecordingHead) -> None:
         self._path = path
         self._head = head
+        self._pid = os.getpid()  # forks have no such thread
         self._waiting: list[WorldFrame] = []
         self._waiting_bytes = 0
         self._changed = threading.Condition()
@@ -134,6 +137,7 @@ class _Sink:
         self._thread: threading.Thread | None = None
 
     def add(self, frames: list[WorldFrame]) -> None:
+        refuse_fork(self._pid, f"the frames of {self._path}")
         self.check()
         size = sum(frame.vehicles.nbytes for frame in frames)
         with self._changed:
@@ -151,6 +155,8 @@ class _Sink:
             raise _unwritable(self._path, self._error) from self._error
 
     def close(self) -> None:
+        if is_fork(self._pid):
+            return
         with self._changed:
             self._closing = True
             self._changed.notify_all()

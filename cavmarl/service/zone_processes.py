@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
-from cavmarl.core.processes import start_dying_with_process
+from cavmarl.core.processes import start_python
 from cavmarl.parallel.nodes.newcomers import ANYONE
 from cavmarl.parallel.nodes.node_starters import NODE
 
@@ -45,8 +44,8 @@ class ZoneProcesses:
 
 def _start(door: Door) -> subprocess.Popen[Any]:
     host, port, key = door
-    words = [sys.executable, "-m", NODE, host, str(port), str(ANYONE)]
-    process = start_dying_with_process(words, stdin=subprocess.PIPE, text=True)
+    words = ["-m", NODE, host, str(port), str(ANYONE)]
+    process = start_python(words, stdin=subprocess.PIPE, text=True)
     assert process.stdin is not None
     with suppress(BrokenPipeError), process.stdin as pipe:
         pipe.write(f"{key}\n")

@@ -9,7 +9,6 @@ found too.
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -24,7 +23,7 @@ import numpy as np
 from cavmarl.config.checks import check_count
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import EvaluationError
-from cavmarl.core.processes import start_dying_with_process
+from cavmarl.core.processes import start_dying_with_process, start_python
 from cavmarl.evaluate.fresh import told_error
 from cavmarl.verify.differences import Arrays, Difference, find_difference
 
@@ -105,12 +104,12 @@ class _Program:
     def __init__(self, job: dict[str, Any], hash_seed: str) -> None:
         self._hash_seed = hash_seed
         self._line = ""
-        self._process = start_dying_with_process(
-            [sys.executable, "-m", "cavmarl.verify.lockstep"],
+        self._process = start_python(
+            ["-m", "cavmarl.verify.lockstep"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
-            env={**os.environ, "PYTHONHASHSEED": hash_seed},
+            env={"PYTHONHASHSEED": hash_seed},
         )
         self.write(json.dumps(job))
 

@@ -26,7 +26,7 @@ def test_each_library_steps_the_same_agents() -> None:
 def test_a_library_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "supersuit", None)
     found = measure(agents=2, workers=2, repeats=1)
-    assert "cavmarl[supersuit]" in found.facts["missing"]["supersuit"]
+    assert "'.[supersuit]'" in found.facts["missing"]["supersuit"]
     assert "ratio" not in found.rows[-1]
 
 

@@ -7,8 +7,12 @@ import select
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
-from cavmarl.core.processes import start_dying_with_process
+import pytest
+
+from cavmarl.core.processes import start_dying_with_process, start_python
+from cavmarl.evaluate.fresh import call_in_fresh_process
 
 READY = "print('ready', flush=True); input(); print('heard nothing', flush=True)"
 
@@ -24,6 +28,18 @@ def test_an_interrupt_is_left_to_the_caller() -> None:
         process.stdin.flush()
         assert process.stdout.readline() == "heard nothing\n"
     assert process.returncode == 0
+
+
+def test_code_of_the_working_directory_is_not_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("cavmarl", "numba", "json"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('it was run')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("PYTHONPATH", raising=False)
+    for words in (["-c", "import json, cavmarl"], ["-m", "json.tool", "--help"]):
+        assert start_python(words, stdout=subprocess.DEVNULL).wait() == 0
+    assert call_in_fresh_process("a length", len, [1, 2]) == 2
 
 
 def test_a_process_ends_with_its_caller_while_it_still_starts() -> None:

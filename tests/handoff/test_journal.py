@@ -30,6 +30,7 @@ from cavmarl.ownership.log_records import KINDS, lines_of, replay
 from cavmarl.ownership.messages import Begin, Record
 from tests.ownership.bench import Bench
 from tests.ownership.test_simulator import campaign
+from tests.support.forks import said_in_fork
 from tests.support.generated import check_block, table
 
 PAGE = Path(__file__).resolve().parents[2] / "docs/ownership.md"
@@ -110,6 +111,16 @@ def test_a_journal_goes_on_behind_what_is_there(tmp_path: Path) -> None:
         with Journal(path, resume=at > 0) as journal:
             assert (journal.sequence, journal.dropped) == (at, "")
             journal.append(log[at : at + 3])
+    assert list(JournalReader(path)) == log
+
+
+def test_a_fork_does_not_write_its_mothers_journal(tmp_path: Path) -> None:
+    log, path = eventful().log, tmp_path / "run.journal"
+    with Journal(path) as journal:
+        journal.append(log[:3])
+        said = said_in_fork(lambda: journal.append(log[3:]), journal.close)
+        assert f"the lines of {path} are those of process" in said
+        journal.append(log[3:])
     assert list(JournalReader(path)) == log
 
 

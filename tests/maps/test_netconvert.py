@@ -180,6 +180,18 @@ def test_netconvert_has_limited_time(town: Path, tmp_path: Path) -> None:
         build_network(town, tmp_path / "out.net.xml", timeout_s=0.0001)
 
 
+def test_the_environment_limits_the_time_of_a_map_that_is_driven(
+    town: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CAVMARL_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr("cavmarl.maps.netconvert_process.MAX_NETCONVERT_S", 0.0001)
+    with pytest.raises(MapError, match=r"longer than 0\.0001 s.*CAVMARL_MAX_NETCONVERT_S"):
+        map_file(town)
+    monkeypatch.setenv("CAVMARL_MAX_NETCONVERT_S", "soon")
+    with pytest.raises(ConfigError, match="CAVMARL_MAX_NETCONVERT_S = 'soon'"):
+        map_file(town)
+
+
 def test_map_file_builds_once(town: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CAVMARL_CACHE_DIR", str(tmp_path / "cache"))
 

@@ -20,6 +20,7 @@ from cavmarl.core.errors import WorkerDeathError, WorkerError, WorkerFailureErro
 from cavmarl.parallel.hosts.host_commands import HostProgram
 from cavmarl.parallel.hosts.host_pool import HostPool
 from cavmarl.parallel.hosts.listener import MAX_GUESTS
+from tests.support.forks import said_in_fork
 from tests.support.toy_hosts import ADD, DOZE, FAIL, FALL, TASKS, TOIL, TOTAL, WRITE, Processes
 
 SIZES = (3, 2)
@@ -78,6 +79,14 @@ def test_hosts_add_up(make: Make) -> None:
     for step in range(25):
         adder.run(WRITE if step % 10 == 0 else ADD)
     adder.pool.ping()
+    assert adder.pool.deaths == []
+
+
+def test_a_fork_neither_orders_nor_ends_the_hosts(make: Make) -> None:
+    adder = make()
+    adder.run(WRITE)
+    assert "the hosts are those of process" in said_in_fork(adder.pool.ping, adder.pool.close)
+    adder.run()
     assert adder.pool.deaths == []
 
 

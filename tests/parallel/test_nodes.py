@@ -19,6 +19,7 @@ from cavmarl.env.vector import CavVectorEnv
 from cavmarl.handoff.coordinator.journal import JournalReader
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from tests.support.actuated import actuated_grid
+from tests.support.forks import said_in_fork
 from tests.support.vec_runs import Make, drive, same
 
 WANTED: dict[str, Any] = {"agents": 8, "background": 30, "max_cycles": 8}
@@ -48,6 +49,13 @@ def test_nobody_can_tell(make: Make, arguments: dict[str, Any], nodes: int) -> N
     assert same(drive(vec), whole)
     assert same(drive(vec), whole)
     assert len(over_nodes(vec).pids) == nodes
+    assert over_nodes(vec).recoveries == 0
+
+
+def test_a_fork_neither_steps_nor_ends_the_nodes(make: Make) -> None:
+    vec, whole = make(zones=4, nodes=2, env="grid4x4", **WANTED), make(env="grid4x4", **WANTED)
+    assert "the nodes are those of process" in said_in_fork(lambda: drive(vec), vec.close)
+    assert same(drive(vec), drive(whole))
     assert over_nodes(vec).recoveries == 0
 
 

@@ -58,5 +58,5 @@ def test_settings_that_cannot_be(arguments: dict[str, object], words: str) -> No
 
 def test_ray_is_asked_for_where_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "ray", None)
-    with pytest.raises(MissingExtraError, match=r"'ray'.*pip install 'cavmarl\[ray\]'"):
+    with pytest.raises(MissingExtraError, match=r"'ray'.*pip install '\.\[ray\]'"):
         make_vec("ring", workers="ray")

@@ -26,6 +26,7 @@ from cavmarl.core.errors import (
 )
 from cavmarl.parallel.processes.shared_memory import Segment
 from cavmarl.parallel.processes.worker_pool import Pool, Program
+from tests.support.forks import said_in_fork
 from tests.support.toiling import toiling
 from tests.support.toy_job import ADD, DIE, DOZE, FAIL, FALL, POINTS, RUN_OUT, TASKS, TOIL, TOTAL
 
@@ -477,20 +478,7 @@ def test_a_fork_of_the_pools_process_leaves_the_workers_alone(make: Make) -> Non
 
 def test_a_fork_of_the_pools_process_cannot_order_its_workers(make: Make) -> None:
     pool = make(workers=1)
-    reading, writing = os.pipe()
-    child = os.fork()
-    if child == 0:
-        try:
-            pool.run(ADD)
-            said = b"it was let"
-        except WorkerError as error:
-            said = str(error).encode()
-        os.write(writing, said)
-        os._exit(0)
-    os.waitpid(child, 0)
-    said = os.read(reading, 1000).decode()
-    os.close(reading)
-    os.close(writing)
+    said = said_in_fork(lambda: pool.run(ADD))
     assert f"process {os.getpid()}" in said
     assert "make the environment here" in said
     pool.run(ADD)

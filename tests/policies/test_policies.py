@@ -261,7 +261,7 @@ def test_without_torch_a_network_says_what_to_install(
         raise ModuleNotFoundError(name=module)
 
     monkeypatch.setattr("cavmarl.core.errors.importlib.import_module", absent)
-    with pytest.raises(MissingExtraError, match=r"pip install 'cavmarl\[torch\]'"):
+    with pytest.raises(MissingExtraError, match=r"pip install '\.\[torch\]'"):
         load_policy(checkpoint, small_vec())
 
 

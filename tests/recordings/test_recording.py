@@ -17,6 +17,7 @@ import pytest
 from cavmarl import CavEnv, RecordingError, make_vec, parallel_env
 from cavmarl.engine.world_frame import WorldFrame
 from cavmarl.recordings.recording import Recording
+from tests.support.forks import said_in_fork
 
 
 def drive(env: CavEnv, steps: int) -> list[WorldFrame]:
@@ -42,6 +43,20 @@ def assert_same(one: WorldFrame, other: WorldFrame) -> None:
                 assert x.tobytes() == y.tobytes(), name
             else:
                 assert x == y, name
+
+
+def test_a_fork_adds_nothing_to_a_recording(tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    env = parallel_env("merge", agents=3, background=0, record=path)
+    with closing(env):
+        drive(env, 3)
+        said = said_in_fork(lambda: env.step(env.suggest_actions()), env.close)
+        assert f"the frames of {path} are those of process" in said
+        assert not Recording.open(path).is_whole
+        env.step(env.suggest_actions())
+    recording = Recording.open(path)
+    assert recording.is_whole
+    assert len(list(recording.frames())) == 5
 
 
 @pytest.mark.parametrize(("zones", "workers"), [(1, 0), (4, 0), (1, 1), (4, 2)])

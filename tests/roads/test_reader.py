@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from cavmarl.core.errors import ConfigError, MapError
+from cavmarl.maps.map_kinds import map_kind
 from cavmarl.roads.network import SIGNAL_STATES, VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network
 
@@ -287,6 +288,31 @@ def test_size_is_limited(crossing: Crossing, monkeypatch: pytest.MonkeyPatch) ->
 
     with pytest.raises(MapError, match="larger than 100 bytes"):
         read_network(crossing())
+
+
+def test_a_text_packed_a_hundred_fold_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    packed = tmp_path / "bomb.net.xml.gz"
+    packed.write_bytes(gzip.compress(b'<net version="1.20">' + b" " * 20_000_000 + b"</net>"))
+
+    with pytest.raises(MapError, match=r"larger than 16777216 bytes.*set CAVMARL_MAX_XML_RATIO"):
+        read_network(packed)
+    monkeypatch.setenv("CAVMARL_MAX_XML_RATIO", "2000")
+    with pytest.raises(MapError, match="no lane"):
+        read_network(packed)
+
+
+def test_elements_deep_in_one_another_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for kind, name in (("net", "deep.net.xml"), ("osm", "deep.osm")):
+        deep = tmp_path / name
+        deep.write_text(f"<{kind}>{'<a>' * 120}{'</a>' * 120}</{kind}>")
+        with pytest.raises(MapError, match=r"over 100 deep .*set CAVMARL_MAX_XML_DEPTH"):
+            map_kind(deep)
+    monkeypatch.setenv("CAVMARL_MAX_XML_DEPTH", "121")
+    assert map_kind(deep) == "osm"
 
 
 def test_points_of_a_lane_are_limited(crossing: Crossing, monkeypatch: pytest.MonkeyPatch) -> None:

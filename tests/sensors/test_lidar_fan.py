@@ -63,6 +63,19 @@ def test_every_ray_that_can_meet_a_body_is_tried(
     assert np.all(out["distance"] <= np.array([d for d, _ in twin]) + 1e-9)
 
 
+def test_rays_that_pass_a_corner_meet_nothing() -> None:
+    """A fine fan over turned bodies near and far: each edge of each is passed on both sides."""
+    for k in range(8):
+        place = (7.0 * math.cos(0.8 * k), 7.0 * math.sin(0.8 * k), 0.35 * k)
+        rows = vehicles([(0.0, 0.0, 0.3), place], length=8.0)
+        out = scan(rows, 0, 720)
+        nearer, further = (naive.lidar(rows, 0, 720, 60.0, margin) for margin in (1e-6, -1e-6))
+        sure = [a[0] - b[0] < 1e-3 for a, b in zip(further, nearer, strict=True)]
+        assert sum(sure) > 700
+        for ray in np.flatnonzero(sure):
+            assert out[ray]["distance"] == pytest.approx(nearer[ray][0], abs=1e-3)
+
+
 def test_rays_go_counter_clockwise_from_ahead() -> None:
     heading = 1.0
     ahead = (20.0 * math.cos(heading), 20.0 * math.sin(heading), heading)

@@ -65,6 +65,15 @@ def test_targets_equal_twin(
     assert ranges == sorted(ranges)
 
 
+def test_targets_are_listed_nearest_first_whatever_ray_met_them() -> None:
+    places = [(0.0, 0.0, 0.0), (40.0, -12.0, 0.0), (20.0, 0.0, 0.0), (30.0, 9.0, 0.0)]
+    for order in ([0, 1, 2, 3], [0, 3, 1, 2], [0, 2, 3, 1]):
+        rows = vehicles([places[k] for k in order])
+        ranges = [target["range"] for target in echoes(rows, mount((0.0, 0.0, 0.5)))]
+        assert len(ranges) == 3
+        assert ranges == sorted(ranges)
+
+
 def test_a_wall_at_ten_metres_is_one_target() -> None:
     walls = np.array([(10.0, -20.0, 10.0, 0.0, 8.0, 7), (10.0, 0.0, 10.0, 20.0, 8.0, 7)], WALL)
     (target,) = echoes(vehicles([(0.0, 0.0, 0.0)], speed=3.0), mount((0.0, 0.0, 0.5)), walls)

@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from multiprocessing.reduction import DupFd
 from typing import IO, Any
 
-from cavmarl.core.processes import start_dying_with_process
+from cavmarl.core.processes import start_python
 from tests.support.world_hosts import FORKS
 
 __all__ = ["ForkedProcess", "start_forked"]
@@ -71,16 +71,15 @@ class ForkedProcess:
         self._process.kill()
 
 
-def start_forked(command: Sequence[str], **options: Any) -> Any:
-    """In the place of `start_dying_with_process`; commands that run no module of ours go there."""
-    words = [word for word in command[1:] if word != "-P"]
-    if command[0] != sys.executable or words[0] != "-m" or not words[1].startswith("cavmarl."):
-        return start_dying_with_process(command, **options)
+def start_forked(words: Sequence[str], **options: Any) -> Any:
+    """In the place of `start_python`; words that run no module of ours go there."""
+    if words[0] != "-m" or not words[1].startswith("cavmarl."):
+        return start_python(words, **options)
     return ForkedProcess(
         words[1],
         words[2:],
         options.get("pass_fds", ()),
-        options.get("env", os.environ),
+        {**os.environ, **(options.get("env") or {})},
         options.get("stdin") == subprocess.PIPE,
     )
 

@@ -12,7 +12,7 @@ import pytest
 from cavmarl.config.registry import find_entry
 from cavmarl.core.errors import ConfigError, MapError
 from cavmarl.roads.sumo_net.reader import read_network
-from cavmarl.traffic.sumo.sumo_input import command_words, read_input
+from cavmarl.traffic.sumo.sumo_input import command_words, read_input, without_outputs
 
 sumo = pytest.importorskip("sumo", reason="needs the extra 'sumo'")
 
@@ -140,6 +140,13 @@ def test_a_file_that_includes_another_is_refused(tmp_path: Path, trip: str) -> N
     (tmp_path / "r.rou.xml").write_text(f'<routes><include href="x"/>{trip}</routes>')
     with pytest.raises(ConfigError, match="<include> is not followed"):
         run(tmp_path, "r.rou.xml")
+
+
+def test_demand_deep_in_itself_is_refused_and_not_copied(tmp_path: Path) -> None:
+    deep = tmp_path / "r.rou.xml"
+    deep.write_text(f'<routes>{"<param>" * 50_000}<a file="x"/>{"</param>" * 50_000}</routes>')
+    with pytest.raises(ConfigError, match=r"over 100 deep .*CAVMARL_MAX_XML_DEPTH"):
+        without_outputs(deep, tmp_path)
 
 
 def test_a_small_file_with_a_large_text_is_refused(

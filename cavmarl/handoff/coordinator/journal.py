@@ -17,6 +17,7 @@ from types import TracebackType
 from typing import Literal, Self, TypeAlias, get_args
 
 from cavmarl.core.errors import ConfigError, JournalError
+from cavmarl.core.processes import refuse_fork
 from cavmarl.ownership.log_records import LogChain
 from cavmarl.ownership.messages import Record
 
@@ -118,6 +119,7 @@ class Journal:
             raise self._unwritable(error) from error
         # Worlds are not closed: their journal is, when it is not referenced any more.
         weakref.finalize(self, self._file.close)
+        self._pid = os.getpid()
         try:
             self._lock()
             if resume:
@@ -135,6 +137,7 @@ class Journal:
 
     def append(self, records: Iterable[Record]) -> None:
         """Write records down; when it returns, messages may be sent."""
+        refuse_fork(self._pid, f"the lines of {self.path}")
         lines = [self._chain.write(record) for record in records]
         if not lines:
             return

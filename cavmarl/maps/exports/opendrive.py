@@ -48,7 +48,7 @@ class RoundTrip:
         return asdict(self) | {"off": self.off, "same": self.same}
 
 
-def write_opendrive(source: Path, target: Path, timeout_s: float = 600.0) -> RoundTrip:
+def write_opendrive(source: Path, target: Path, timeout_s: float | None = None) -> RoundTrip:
     """Write a SUMO network as OpenDRIVE, and read that back.
 
     The target is written where what came back differs, too: the result says so.

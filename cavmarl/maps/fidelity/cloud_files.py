@@ -20,6 +20,7 @@ Points = NDArray[np.float64]
 
 CLOUD_ENDINGS = (".csv", ".txt", ".xyz", ".ply", ".pcd", ".las", ".laz")
 MOST_POINTS = 50_000_000  # 1.2 GB as they are read, several times that while they are compared
+_MOST_DIGITS = 18  # of a number of points
 _PLY_TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
     "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
@@ -142,10 +143,16 @@ def _read_ply(path: Path, stream: BinaryIO) -> Points:
     order, number, properties = _ply_head(path, stream)
     _check_number(path, number)
     names = [name for name, _ in properties]
+    if number == 0:
+        return np.zeros((0, 3))
+    if len(set(names)) < len(names):
+        raise MapError(f"{path}: a value of its vertices is named twice: export it again")
     if not {"x", "y", "z"} <= set(names):
         raise MapError(f"{path}: its vertices have no x, y and z: export it again")
     if order == "=":
         lines = [stream.readline() for _ in range(number)]
+        if not any(line.strip() for line in lines):
+            raise _cut_short(path, number, 0)
         try:
             table = np.loadtxt(lines, ndmin=2, usecols=[names.index(axis) for axis in "xyz"])
         except ValueError as error:
@@ -174,7 +181,7 @@ def _ply_head(path: Path, stream: BinaryIO) -> tuple[str, int, list[tuple[str, s
                 break
             case ["format", form, _] if form in _PLY_ORDERS:
                 order = _PLY_ORDERS[form]
-            case ["element", element, text] if text.isdigit():
+            case ["element", element, text] if text.isdigit() and len(text) <= _MOST_DIGITS:
                 if element != "vertex" and number < 0 and int(text):
                     raise MapError(f"{path}: '{element}' stands before its vertices: export again")
                 number = int(text) if element == "vertex" else number
@@ -196,7 +203,7 @@ def _cut_short(path: Path, number: int, found: int) -> MapError:
 def _read_pcd(path: Path, head: bytes) -> Points:
     pypcd4: Any = require("pypcd4", "clouds")
     said = re.search(rb"^POINTS\s+(\d+)", head, re.MULTILINE)
-    number = int(said[1]) if said else -1
+    number = int(said[1][:_MOST_DIGITS]) if said else -1
     _check_number(path, number)
     try:
         read = pypcd4.PointCloud.from_path(path)

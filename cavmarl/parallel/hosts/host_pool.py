@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from cavmarl.core.errors import MessageError, WorkerDeathError, WorkerError, WorkerFailureError
+from cavmarl.core.processes import is_fork, refuse_fork
 from cavmarl.parallel.hosts.framed_socket import Frame, Kind
 from cavmarl.parallel.hosts.host_commands import Arrays, CommittedState, HostProgram, OpenOrder, Say
 from cavmarl.parallel.hosts.host_process import Order
@@ -61,7 +62,8 @@ class HostPool:
         self._number = 0
         self._open: OpenOrder | None = None
         self._company = HostRegistry(launcher, program.code)
-        self._finalizer = weakref.finalize(self, self._company.close)
+        self._pid = os.getpid()
+        self._finalizer = weakref.finalize(self, _close, self._company, self._pid)
         try:
             self._await_first()
         except BaseException:
@@ -155,6 +157,7 @@ class HostPool:
     ) -> list[Any]:
         if not self._finalizer.alive:
             raise WorkerError("the hosts are closed: make the environment anew")
+        refuse_fork(self._pid, "the hosts")
         if self._open is not None:
             self._settle(self._open)
         is_full = len(self._truths[0].since) == IMAGE_EVERY
@@ -320,6 +323,12 @@ class HostPool:
         if trouble is not None:
             self.close()
             raise WorkerError(f"no host ({where}): {trouble}")
+
+
+def _close(company: HostRegistry, pid: int) -> None:
+    """End the hosts; a fork of the pool's process has no right to."""
+    if not is_fork(pid):
+        company.close()
 
 
 def _said(letters: Sequence[Any], inputs: Sequence[Arrays]) -> Say:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+import os
 import struct
 from collections.abc import Sequence
 from functools import partial
@@ -19,6 +20,7 @@ from cavmarl.core.errors import (
     WorkerError,
     WorkerFailureError,
 )
+from cavmarl.core.processes import is_fork, refuse_fork
 from cavmarl.engine.compilation import compiled_before
 from cavmarl.engine.world_setup import World
 from cavmarl.handoff.coordinator.coordinator_setup import prepare_runs
@@ -118,6 +120,7 @@ class NodePool:
         self._is_torn = False
         self.losses = self.recoveries = self.replacements = 0
         self._timeout_s = config.workers.timeout_s
+        self._pid = os.getpid()
         self._ticks_per_step = config.clock.ticks_per_step
         self._links = Links(_nothing, system)
         self._watch = NodeWatch(self._links)
@@ -207,6 +210,7 @@ class NodePool:
         Raises:
             WorkerDeathError: no node has kept the zones of lost ones, or too many were lost.
         """
+        refuse_fork(self._pid, "the nodes")
         if command.changes and self._links.now_s() > self._keep_again_s:
             if not self._replace_lost():
                 self._begin_state()
@@ -390,7 +394,9 @@ class NodePool:
         return found
 
     def close(self) -> None:
-        """End the nodes."""
+        """End the nodes; a fork of the pool's process has no right to."""
+        if is_fork(self._pid):
+            return
         self._links.end(END_S)
         self._newcomers.close()
         self._coordinator.close()

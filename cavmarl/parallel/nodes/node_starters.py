@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any, Protocol, TypeAlias
 
 from cavmarl.config.env import WorkersConfig
 from cavmarl.core.errors import ConfigError
-from cavmarl.core.processes import start_dying_with_process
+from cavmarl.core.processes import start_python
 from cavmarl.parallel.hosts.host_registry import Launcher
 from cavmarl.parallel.hosts.listener import Listener
 from cavmarl.parallel.hosts.ray_actors import RayActors
@@ -61,9 +60,7 @@ class LocalNodes:
 
     def _start(self, number: int) -> subprocess.Popen[Any]:
         told = map(str, (*self._place, number))
-        process = start_dying_with_process(
-            [sys.executable, "-m", NODE, *told], stdin=subprocess.PIPE, text=True
-        )
+        process = start_python(["-m", NODE, *told], stdin=subprocess.PIPE, text=True)
         assert process.stdin is not None
         with suppress(BrokenPipeError), process.stdin as pipe:
             pipe.write(f"{self._listener.secret.hex()}\n")

@@ -12,11 +12,10 @@ import sys
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from cavmarl.core.errors import WorkerError, WorkerFailureError
-from cavmarl.core.processes import start_dying_with_process
+from cavmarl.core.processes import start_python
 from cavmarl.parallel.processes.process_barrier import WAKE
 from cavmarl.parallel.processes.worker_loop import MAIL, MAX_MESSAGE
 
@@ -104,11 +103,11 @@ class ForkServer:
         }
         self._wire = ours
         try:
-            self._process = start_dying_with_process(
-                [sys.executable, "-P", "-m", program, json.dumps(told)],
+            self._process = start_python(
+                ["-m", program, json.dumps(told)],
                 stdin=subprocess.DEVNULL,
                 pass_fds=(theirs.fileno(), *descriptors),
-                env={**os.environ, **_ONE_THREAD, "PYTHONPATH": _python_path()},
+                env=_ONE_THREAD,
             )
         except OSError as error:
             ours.close()
@@ -194,9 +193,3 @@ def _wires() -> tuple[socket.socket, socket.socket]:
         return socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     except OSError as error:
         raise WorkerError(f"no socket: {error}") from error
-
-
-def _python_path() -> str:
-    """Where the process finds this package, whatever has been done to `sys.path`."""
-    here = str(Path(__file__).resolve().parents[3])
-    return os.pathsep.join([here, *(path for path in sys.path if path)])

@@ -18,6 +18,7 @@ from math import isnan, nan
 from typing import Any
 
 from cavmarl.core.errors import WorkerDeathError, WorkerError, WorkerFailureError
+from cavmarl.core.processes import refuse_fork
 from cavmarl.parallel.processes.process_barrier import LONG_WORK_S
 from cavmarl.parallel.processes.watchdog import CHECK_S, Watchdog, processor_s
 from cavmarl.parallel.processes.worker_loop import FAILED, MAIL, MAX_MESSAGE, NOTHING, TASK
@@ -115,11 +116,7 @@ class Pool:
     ) -> list[Any]:
         if not self._finalizer.alive:
             raise WorkerError("the workers are closed: make the environment anew")
-        if os.getpid() != self._pid:
-            raise WorkerError(
-                f"the workers are those of process {self._pid}, and this is a fork of it: make the "
-                "environment here, after the fork"
-            )
+        refuse_fork(self._pid, "the workers")
         if self._open:
             self._settle()
         mail = None if letter is None else MAIL + json.dumps(letter).encode()

@@ -19,7 +19,7 @@ import defusedxml.ElementTree
 from defusedxml.common import DefusedXmlException
 
 from cavmarl.core.errors import ConfigError, SumoError, require
-from cavmarl.roads.sumo_net.xml_source import declared_encoding, read_bytes
+from cavmarl.roads.sumo_net.xml_source import declared_encoding, read_bytes, read_tree
 
 _INPUTS = {
     "net-file": "net-file",
@@ -170,8 +170,7 @@ def _read_config(path: Path) -> SumoInput:
 
 def _root(path: Path) -> Element:
     with _readable(path):
-        root: Element = defusedxml.ElementTree.fromstring(read_bytes(path), forbid_dtd=True)
-    return root
+        return read_tree(path)
 
 
 def _root_tag(path: Path) -> str:

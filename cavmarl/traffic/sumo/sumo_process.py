@@ -19,7 +19,8 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import ConfigError, MissingExtraError, SumoError
+from cavmarl.core.errors import ConfigError, SumoError, missing
+from cavmarl.core.processes import is_fork, refuse_fork
 from cavmarl.traffic.sumo import sumo_child as child
 from cavmarl.traffic.sumo.sumo_history import MOVED, SEEN
 
@@ -47,7 +48,7 @@ def choose_interface(wanted: str) -> str:
     for name in choices:
         if find_spec(name) is not None:
             return name
-    raise MissingExtraError(f"'{choices[0]}' is not installed: pip install 'cavmarl[sumo]'")
+    raise missing(choices[0], "sumo")
 
 
 class SumoProcess:
@@ -83,7 +84,8 @@ class SumoProcess:
         ours.settimeout(ANSWER_S)
         self.pid = process.pid
         self._wire, self._said, self._process = ours, said, process
-        self._finalizer = weakref.finalize(self, _end, process, ours, said)
+        self._owner = os.getpid()
+        self._finalizer = weakref.finalize(self, _end, self._owner, process, ours, said)
         self._send(child.START, {**told, "seen": SEEN.descr, "moved": MOVED.descr})
 
     @property
@@ -122,6 +124,7 @@ class SumoProcess:
         self._finalizer()
 
     def _send(self, kind: int, line: Mapping[str, Any], records: bytes = b"") -> None:
+        refuse_fork(self._owner, "SUMO and its vehicles")
         text = json.dumps(line).encode() if line else b""
         head = np.array([(kind, len(records), 0, len(text))], dtype=child.HEAD)
         try:
@@ -176,7 +179,11 @@ def _tunables() -> list[str]:
     return [own] if own else []
 
 
-def _end(process: subprocess.Popen[bytes], wire: socket.socket, said: IO[bytes]) -> None:
+def _end(
+    owner: int, process: subprocess.Popen[bytes], wire: socket.socket, said: IO[bytes]
+) -> None:
+    if is_fork(owner):  # it has no right to
+        return
     wire.close()
     with suppress(subprocess.TimeoutExpired):
         process.wait(END_S)

@@ -12,6 +12,8 @@ from cavmarl.maps.fidelity import cloud_files
 from cavmarl.maps.fidelity.cloud_files import read_cloud
 
 POINTS = np.array([(1.0, 2.0, 3.0), (-4.5, 5.25, 6.0), (7.0, -8.0, 0.125)])
+PLY = "ply\nformat ascii 1.0\nelement vertex"
+XYZ = "property float x\nproperty float y\nproperty float z\nend_header\n"
 
 
 def ply(path: Path, order: str = "<") -> None:
@@ -94,6 +96,10 @@ def test_what_is_no_place_is_left_out_and_counted(tmp_path: Path) -> None:
         ("a.csv", "x,y,z\n1,2,three\n", "needs three numbers"),
         ("a.ply", "x,y,z\n1,2,3\n", "not what '.ply' says"),
         ("a.ply", "ply\nformat ascii 1.0\nend_header\n", "no number of vertices"),
+        ("a.ply", f"{PLY} {'9' * 5000}\n{XYZ}", "no number of vertices"),
+        ("a.ply", f"{PLY} 1\nproperty float x\n{XYZ}", "named twice"),
+        ("a.ply", f"{PLY} 0\n{XYZ}", "has no points"),
+        ("a.ply", f"{PLY} 3\n{XYZ}\n\n\n", "0 points of 3"),
         ("a.las", "LASF", "no whole las"),
         ("a.laz", "<html>", "not what '.laz' says"),
         ("a.pcd", "# .PCD v0.7\nVERSION 0.7\nPOINTS 9\n", "no whole pcd"),
