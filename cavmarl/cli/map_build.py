@@ -60,9 +60,7 @@ def build(
         str | None,
         about("Keep roads within min,min,max,max: degrees lon,lat for OSM, else metres."),
     ] = None,
-    timeout_s: Annotated[
-        float | None, about("Seconds that netconvert may take; 600 by default.", min=1.0)
-    ] = None,
+    timeout_s: Annotated[float | None, about("Seconds of netconvert; default 600.", min=1)] = None,
     json_path: JsonPath = None,
 ) -> None:
     """Make a SUMO network of a map file; its statistics go beside it, to NAME.stats.json."""
