@@ -21,7 +21,6 @@ TWO := -n 2 --dist loadfile
 FUZZ_SECONDS ?= 60
 FUZZ_TARGETS ?= network programs buildings map cached zones demand sumocfg entry overrides driver manifest \
     plan message log follower
-MAPS := envs/ring/map/map.net.xml envs/merge/map/map.net.xml envs/grid4x4/map/map.net.xml
 
 # Tests start many processes: none is to parse the sources anew.
 export PYTHONDONTWRITEBYTECODE :=
@@ -83,16 +82,13 @@ libraries: $(LIBRARIES)/.ready ## what needs RLlib or BenchMARL, in an environme
 
 # Without the comment that netconvert and netgenerate begin with (date, version, options), the same
 # options give the same bytes.
-maps: $(READY) ## make the maps of ring, merge, grid4x4 and cities anew from the options beside them
-	cd envs/ring/map && ../../../$(BIN)/netconvert --configuration-file map.netccfg
-	cd envs/merge/map && ../../../$(BIN)/netconvert --configuration-file map.netccfg
-	cd envs/grid4x4/map && ../../../$(BIN)/netgenerate --configuration-file map.netgcfg
-	sed --in-place '2,/^-->$$/d' $(MAPS)
-	cd envs/cities/map && for options in *.net?cfg; do \
+maps: $(READY) ## make the maps of all entries anew from the options beside them
+	for options in envs/*/map/*.net?cfg; do \
 	    case $$options in *.netgcfg) make=netgenerate;; *) make=netconvert;; esac; \
-	    net=$${options%.net?cfg}.net.xml; \
-	    ../../../$(BIN)/$$make --configuration-file $$options --output-file $$net && \
-	    sed --in-place '2,/^-->$$/d' $$net && gzip --force --best --no-name $$net || exit 1; done
+	    name=$$(basename $${options%.net?cfg}).net.xml; folder=$$(dirname $$options); \
+	    (cd $$folder && ../../../$(BIN)/$$make --configuration-file $${options##*/} --output-file $$name && \
+	    sed --in-place '2,/^-->$$/d' $$name && \
+	    { test $$folder != envs/cities/map || gzip --force --best --no-name $$name; }) || exit 1; done
 
 lock: $(READY) ## write constraints-hashes.txt: each file of an installation with its hash
 	$(BIN)/python -m docs.supply_chain lock

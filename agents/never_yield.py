@@ -51,7 +51,13 @@ class NeverYieldPolicy(Policy):
         rows = simulation.vehicles(world)
         found = {}
         for row in rows[rows["agent"] >= 0]:
-            angle = steer_to_lane(self.env.network.arrays, simulation.plans, row, int(row["lane"]))
+            angle = steer_to_lane(
+                self.env.network.arrays,
+                simulation.plans,
+                row,
+                int(row["lane"]),
+                float(simulation.types["wheelbase"][row["vtype"]]),
+            )
             found[int(row["agent"])] = min(max(angle / limit, -1.0), 1.0)
         return found
 

@@ -235,15 +235,19 @@ class PopulationConfig(Section, key="population"):
             reset; else each arrival orders a new departure, so that their number holds.
         budget: how many agents may enter in one episode of an `open` world (default 4 ·
             agents); the other modes do not read it.
+        types: vehicles of the agents in turn, of `car`, `truck` and `bus`: agent k has the one
+            at place k, counted round.
     """
 
     mode: Literal["closed", "open", "respawn"] = "closed"
     agents: Annotated[int, Whole(0, 100_000, "; 0: a world to watch")] = 4
     background: Annotated[int, Whole(0, 1_000_000)] = 20
     budget: int | None = None
+    types: tuple[Literal["car", "truck", "bus"], ...] = ("car",)
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        self.need("types", bool(self.types), "must name at least one of car, truck, bus")
         if self.budget is not None and self.mode == "open":
             self.need(
                 "budget",
@@ -276,6 +280,8 @@ class TrafficConfig(Section, key="traffic"):
         destinations: edges that agents drive to, by id; empty: the generator's goals.
         min_trip_m: shortest way of an agent between origin and destination.
         max_trip_m: longest way of an agent; 0: no limit.
+        endless: agents drive on to another goal before they reach theirs, as the background of a
+            `closed` world does: 150 m before it, to one that is farther than that.
         speed_factor_spread: half width of the drivers' uniform spread of desired speed over limit.
         model: how the generator's vehicles follow their leader: `IDM`, `Krauss`, `ACC`, or a model
             that is registered (docs/extending.md). Those of `demand` drive as their type says.
@@ -289,6 +295,7 @@ class TrafficConfig(Section, key="traffic"):
     destinations: tuple[str, ...] = ()
     min_trip_m: Annotated[float, Within(0.0, 1e6)] = 100.0
     max_trip_m: Annotated[float, Within(0.0, 1e6)] = 0.0
+    endless: bool = False
     speed_factor_spread: Annotated[float, Within(0.0, 0.5)] = 0.1
     model: str = "IDM"
 
@@ -502,6 +509,11 @@ class EnvConfig(Section, key=""):
                 True,
                 f"traffic.source = {source}: when SUMO's signals change is not known; set it false",
             )
+        self.need(
+            "population.types",
+            set(self.population.types) == {"car"},
+            f"traffic.source = {source}: SUMO knows our car alone; leave it out",
+        )
         self.need(
             "scenario.name",
             not self.scenario.name,

@@ -4,7 +4,7 @@ PettingZoo: the module functions `parallel_env`, `env` and `raw_env`, and, from 
 as `cavmarl/merge-v1` in both its registries. Gymnasium: `cavmarl/merge-v1`, one vehicle of the
 world as a single-agent environment, and `cavmarl/mergeAgents-v1` for `gymnasium.make_vec`, all
 agents as rows; `cavmarl/mergeDiscrete-v1` and `cavmarl/mergeDiscreteAgents-v1` are the same with
-meta-actions.
+meta-actions. highway-env's tasks have its names: `cavmarl-highway/merge-v0` for `merge-v0`.
 """
 
 from __future__ import annotations
@@ -20,8 +20,16 @@ from cavmarl.config.registry import entries
 _ID = re.compile(r"[A-Za-z0-9][\w.-]*", re.ASCII)
 
 
+# The keys of `adapters/highway_tasks.py`, which lies above and takes time to import.
+HIGHWAY_TASKS = (
+    "highway", "highway-fast", "merge", "roundabout", "intersection", "exit", "two-way", "u-turn",
+)  # fmt: skip
+
+
 def register_all() -> None:
     """Register every entry with Gymnasium and, where it has a registry, with PettingZoo.
+
+    highway-env's tasks are registered with Gymnasium.
 
     Entries whose name cannot be an id (letters, digits, `_`, `-` and `.`) have none.
     """
@@ -49,6 +57,13 @@ def register_all() -> None:
                 "parallel", one, "cavmarl.env.parallel:parallel_env", kwargs=of_entry
             )
             pettingzoo.register("aec", one, "cavmarl.env.registration:env", kwargs=of_entry)
+    for task in HIGHWAY_TASKS:
+        gymnasium.register(
+            f"cavmarl-highway/{task}-v0",
+            entry_point="cavmarl.adapters.highway_env:HighwayEnv",
+            kwargs={"task": task},
+            disable_env_checker=True,
+        )
 
 
 def _version(folder: Path) -> int:

@@ -46,9 +46,11 @@ class EgoConfig:
 
     Attributes:
         enabled: false switches the sensor off.
+        size: adds what its type can do: size, wheelbase, steering, acceleration, braking, speed.
     """
 
     enabled: bool = True
+    size: bool = False
 
 
 @dataclass(frozen=True)
@@ -71,10 +73,12 @@ class NeighborsConfig(Section, key="sensors.neighbors"):
     Attributes:
         count: how many at most; 0 switches the sensor off.
         range_m: distance up to which a vehicle is seen.
+        through_walls: false hides vehicles whose centre lies behind a wall of `map.buildings`.
     """
 
     count: Annotated[int, Whole(0, 64)] = 8
     range_m: Annotated[float, Within(1.0, 300.0)] = 60.0
+    through_walls: bool = True
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from a running SUMO in the tests.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -50,6 +51,11 @@ VTYPE = np.dtype(
             np.float64,
         ),  # chance that such a vehicle looks for its way itself; -1: not said
         ("reroute_period_ms", np.int64),  # how often; 0: once, -1: not said
+        # of types that agents can have, else 0
+        ("wheelbase", np.float64),  # m, twice the way from the centre to each axle
+        ("most_steering", np.float64),  # rad, of the front wheels
+        ("most_accel", np.float64),  # m/s², that a policy can ask for
+        ("most_decel", np.float64),  # m/s², likewise, positive
     ],
     align=True,
 )
@@ -137,6 +143,50 @@ DEFAULT_TYPES = {
 }
 
 
+class AgentType(NamedTuple):
+    """What sets a type of agents' vehicles apart from the car, named and measured as in `VTYPE`."""
+
+    vclass: str
+    length: float
+    width: float
+    height: float
+    accel: float
+    decel: float
+    emergency_decel: float
+    min_gap: float
+    max_speed: float
+    wheelbase: float
+    most_steering: float
+
+
+# A truck of two axles with a limiter at 90 km/h, and a city bus with one at 100 km/h.
+AGENT_TYPES = {
+    "truck": AgentType("truck", 8.0, 2.5, 3.6, 1.5, 4.0, 6.0, 3.0, 25.0, 4.8, 0.7),
+    "bus": AgentType("bus", 12.0, 2.55, 3.2, 1.2, 3.5, 5.5, 3.0, 27.8, 6.0, 0.75),
+}
+CAR_WHEELBASE_M = 5.0  # highway-env's car has its axles at its bumpers
+NO_LIMIT = 1e9  # of what a policy asks of a car, beyond `action`
+
+
+def agent_types(names: Iterable[str], model: int = MODEL_IDM) -> NDArray[np.void]:
+    """VTYPE (n,) of types of agents' vehicles by name, `car` and those of `AGENT_TYPES`."""
+    chosen = list(names)
+    types = generated_types(model).repeat(len(chosen))
+    for record, name in zip(types, chosen, strict=True):
+        if name == "car":
+            continue
+        kind = AGENT_TYPES[name]
+        for field, value in kind._asdict().items():
+            if field != "vclass":
+                record[field] = value
+        record["vclass"] = VEHICLE_CLASSES.index(kind.vclass)
+        record["permissions"] |= 1 << int(record["vclass"])  # and what is for cars
+        record["desired_max_speed"] = kind.max_speed
+        record["most_accel"], record["most_decel"] = kind.accel, kind.emergency_decel
+    types.setflags(write=False)
+    return types
+
+
 def generated_types(model: int = MODEL_IDM) -> NDArray[np.void]:
     """VTYPE (1,): the passenger car of the generator and of agents.
 
@@ -155,5 +205,7 @@ def generated_types(model: int = MODEL_IDM) -> NDArray[np.void]:
     car["min_gap"] = JAM_DISTANCE_M - car["length"]
     car["max_speed"] = car["desired_max_speed"] = MAX_SPEED_MPS
     car["speed_factor"] = 1.0
+    car["wheelbase"] = CAR_WHEELBASE_M
+    car["most_steering"] = car["most_accel"] = car["most_decel"] = NO_LIMIT
     types.setflags(write=False)
     return types

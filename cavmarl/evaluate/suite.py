@@ -15,18 +15,23 @@ from cavmarl.evaluate.report import EvaluationReport
 
 @dataclass(frozen=True)
 class Suite:
-    """What a suite drives: every map with every number of agents."""
+    """What a suite drives: every map with every number of agents.
+
+    What is left out is as each environment says.
+    """
 
     maps: tuple[str, ...]  # names of environments, or map files below the folder of maps
-    agents: tuple[int, ...]  # numbers of agents
-    background: int = 100  # background vehicles of every world
-    horizon_s: float = 300.0  # of every episode
+    agents: tuple[int, ...] = ()  # numbers of agents
+    background: int | None = None  # background vehicles of every world
+    horizon_s: float | None = None  # of every episode
 
     def __post_init__(self) -> None:
+        if not self.maps:
+            raise ConfigError("maps = []: must be at least one")
         for name in ("maps", "agents"):
             values = getattr(self, name)
-            if not values or len(set(values)) < len(values):
-                raise ConfigError(f"{name} = {values!r}: must be at least one, and each once")
+            if len(set(values)) < len(values):
+                raise ConfigError(f"{name} = {values!r}: must have each once")
 
 
 @dataclass(frozen=True)
@@ -35,7 +40,7 @@ class SuiteWorld:
 
     label: str  # its name in results, and its folder
     env: str  # as in `make_vec`
-    agents: int  # how many
+    agents: int | None  # how many; None: as the environment says
 
 
 def load_suite(path: Path) -> Suite:
@@ -46,6 +51,8 @@ def worlds_of(suite: Suite, maps: Path) -> list[SuiteWorld]:
     found = {Path(name).name.split(".")[0]: env for name, env in _found(suite, maps)}
     if len(found) < len(suite.maps):
         raise ConfigError(f"maps = {suite.maps!r}: two have one name; rename a file")
+    if not suite.agents:
+        return [SuiteWorld(name, env, None) for name, env in found.items()]
     return [
         SuiteWorld(f"{name}-{agents}", env, agents)
         for name, env in found.items()
@@ -80,10 +87,14 @@ def run_suite(
 ) -> dict[str, EvaluationReport]:
     """Evaluate the policies in every world, each into its own folder of `out`.
 
-    Agents enter as long as the episode lasts (respawn), so that their number holds. `began` is
-    called before each world; policies, episodes, repeats and seed are as in `evaluate`.
+    Where the suite says how many agents there are, they enter as long as the episode lasts
+    (respawn), so that their number holds. `began` is called before each world; policies, episodes,
+    repeats and seed are as in `evaluate`.
     """
     reports = {}
+    keys: dict[str, object] = {"population.mode": "respawn"} if suite.agents else {}
+    if suite.horizon_s is not None:
+        keys["horizon_s"] = suite.horizon_s
     for world in worlds:
         began(world)
         reports[world.label] = evaluate(
@@ -95,6 +106,6 @@ def run_suite(
             out=out / world.label,
             agents=world.agents,
             background=suite.background,
-            overrides={"population.mode": "respawn", "horizon_s": suite.horizon_s},
+            overrides=keys,
         )
     return reports

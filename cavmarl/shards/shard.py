@@ -107,7 +107,7 @@ class Shard:
         self.plans = plans
         self.travel = travel
         self.lane_grid: LaneGrid = lane_grid(network)
-        self.sensors = sensor_arrays(config.sensors)
+        self.sensors = sensor_arrays(config.sensors, network)
         self._further = optional_arrays(config.sensors, network, plans)
         self._registered = RegisteredOutputs(config, network)
         num_worlds, capacity = zoned.rows.shape[2:]

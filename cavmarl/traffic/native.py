@@ -20,7 +20,7 @@ from cavmarl.core.records.codes import MODEL_KRAUSS
 from cavmarl.driving.driver_models import model_code
 from cavmarl.driving.kernels.drivers import look_ahead_m, see_line_m
 from cavmarl.driving.kernels.lane_index import VIEW_M
-from cavmarl.driving.vehicle_types import generated_types
+from cavmarl.driving.vehicle_types import agent_types, generated_types
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN, make_plans
 from cavmarl.traffic.demand import STOP, DemandFile
@@ -35,7 +35,7 @@ from cavmarl.traffic.scenarios.scene import Scene
 from cavmarl.traffic.schedule import Schedule
 from cavmarl.traffic.sumo.route_book import RouteBook, StopBook
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
-from cavmarl.traffic.turning_circle import with_tight_turns
+from cavmarl.traffic.turning_circle import Body, with_tight_turns
 from cavmarl.traffic.way_search import WaySlots, way_slots
 
 FAST_FACTOR = 1.5  # a speed over the limit that hardly any driver of the demand wants
@@ -78,7 +78,12 @@ class NativeTraffic:
         """The same for another number of worlds, with the tables that all worlds share."""
         other = copy(self)
         object.__setattr__(other, "num_worlds", num_worlds)
-        for name in ("travel", "_slots", "rerouting"):  # each world has its part of them
+        for name in (
+            "travel",
+            "_travel_of_others",
+            "_slots",
+            "rerouting",
+        ):  # each world has its part of them
             vars(other).pop(name, None)
         other._check_room()
         return other
@@ -94,7 +99,11 @@ class NativeTraffic:
     @cached_property
     def plans(self) -> NDArray[np.void]:
         """PLAN (G, L) of the goal edges: on each map's lanes, the ways to its goals."""
-        roads = with_tight_turns(self.network, ActionConfig().steering_rad)
+        names = dict.fromkeys(self.population.types)
+        bodies = tuple(
+            Body(*(float(kind[name]) for name in Body._fields)) for kind in agent_types(names)
+        )
+        roads = with_tight_turns(self.network, ActionConfig().steering_rad, bodies)
         maps = self.network.maps
         if len(maps) == 1:
             return make_plans(self.network, self.goal_edges[0].tolist(), roads=roads)
@@ -126,7 +135,28 @@ class NativeTraffic:
 
     @cached_property
     def travel(self) -> Travel:
-        """Types and ways of all vehicles: the generator's, the demand file's, then the actors'."""
+        """Types and ways of all vehicles: the generator's, the demand file's, the actors', agents'.
+
+        The car, which most agents have, is the generator's.
+        """
+        more = agent_types(self._other_types, model_code(self.traffic.model))
+        found = self._travel_of_others
+        return found._replace(types=np.concatenate([found.types, more])) if len(more) else found
+
+    @property
+    def _other_types(self) -> list[str]:
+        """Names of the types of agents' vehicles but the car."""
+        return [name for name in dict.fromkeys(self.population.types) if name != "car"]
+
+    @cached_property
+    def _agent_type_rows(self) -> NDArray[np.int32]:
+        """VTYPE rows of the agents' types, in turn."""
+        first = len(self.travel.types) - len(self._other_types)
+        names = {"car": 0} | {name: first + k for k, name in enumerate(self._other_types)}
+        return np.array([names[name] for name in self.population.types], dtype=np.int32)
+
+    @cached_property
+    def _travel_of_others(self) -> Travel:
         types = generated_types(model_code(self.traffic.model))
         steps = self.plans.reshape(-1)
         if self.sumo is not None:
@@ -246,9 +276,11 @@ class NativeTraffic:
             num_ids=self.population.num_ids,
             num_background=self.population.background,
             reenter=self.population.mode != "closed",
+            endless=self.traffic.endless,
             seats=self.population.mode == "respawn",
             speed_factor_spread=self.traffic.speed_factor_spread,
             blank=self.blank,
+            agent_types=self._agent_type_rows,
         )
 
     def draw_orders(self, gate: Gate, worlds: Worlds, chosen: NDArray[np.bool_]) -> Gate:
@@ -277,7 +309,7 @@ class NativeTraffic:
 
     def settle(self, gate: Gate, worlds: Worlds) -> None:
         """Count vehicles that have left, and order those that follow."""
-        self._calls.settle(self.demand, self.network.arrays, gate, worlds, self.dt)
+        self._calls.settle(self.demand, self.network.arrays, self.travel, gate, worlds, self.dt)
 
     def assign_lanes(self, gate: Gate, worlds: Worlds) -> None:
         """Assign vehicles of the queue the lanes on which they try to enter."""

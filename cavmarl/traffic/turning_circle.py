@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,32 +25,47 @@ TURN_RAD = 0.9  # ways that turn less within `NEAR_M` are tight for no car
 NEAR_M = 12.0
 
 
+class Body(NamedTuple):
+    """What a turn asks of a vehicle, named and measured as in `VTYPE`."""
+
+    length: float
+    width: float
+    wheelbase: float
+    most_steering: float
+
+
+CAR_BODY = Body(5.0, 2.0, 5.0, np.inf)
+
+
 @lru_cache(maxsize=1)
-def with_tight_turns(network: RoadNetwork, steering_rad: float) -> RoadArrays:
-    """The map with turns that no car can take marked as U-turns, which plans avoid.
+def with_tight_turns(
+    network: RoadNetwork, steering_rad: float, bodies: tuple[Body, ...] = (CAR_BODY,)
+) -> RoadArrays:
+    """The map with turns that one of some vehicles cannot take marked as U-turns; plans avoid them.
 
     `steering_rad`: the most that front wheels turn. A lane that turns too tightly itself makes all
     links that lead there, and from there, such turns.
     """
-    trial = _Trial(network, steering_rad)
+    trials = [_Trial(network, steering_rad, body) for body in bodies]
     for_cars = network.lanes["permissions"] & CAR != 0
     links = network.arrays.links.copy()
     normal = np.flatnonzero(for_cars & ~network.lanes["internal"])
-    tight = [lane for lane in normal.tolist() if trial.is_tight_lane(lane)]
+    tight = [lane for lane in normal.tolist() if any(trial.is_tight_lane(lane) for trial in trials)]
     at_tight = np.isin(links["to_lane"], tight) | np.isin(links["from_lane"], tight)
     usable = for_cars[links["from_lane"]] & for_cars[links["to_lane"]]
     for link in np.flatnonzero(usable & (links["first_internal"] >= 0)).tolist():
-        if at_tight[link] or trial.is_tight_link(link):
+        if at_tight[link] or any(trial.is_tight_link(link) for trial in trials):
             links["direction"][link] = TURNAROUND
     return network.arrays._replace(links=links)
 
 
 class _Trial:
-    """A car that is driven over single turns."""
+    """A vehicle that is driven over single turns."""
 
-    def __init__(self, network: RoadNetwork, steering_rad: float) -> None:
+    def __init__(self, network: RoadNetwork, steering_rad: float, body: Body) -> None:
+        self._body = body
         self._network = network
-        self._steering_rad = steering_rad
+        self._steering_rad = min(steering_rad, body.most_steering)
         self._grid = lane_grid(network)
         self._plan = np.zeros((1, len(network.lanes)), dtype=PLAN)
         self._plan["next"] = network.lanes["successor"]
@@ -86,12 +102,14 @@ class _Trial:
 
     def _drives(self, lane: int, begin_m: float, last_lane: int, end_m: float) -> bool:
         row = blank_vehicle()[0]
+        row["length"], row["width"] = self._body.length, self._body.width
         return bool(
             stays_on_road(
                 self._network.arrays,
                 self._plan,
                 self._grid,
                 row,
+                self._body.wheelbase,
                 lane,
                 begin_m,
                 last_lane,

@@ -56,13 +56,16 @@ def test_in_the_middle_of_a_straight_lane_the_wheels_are_straight() -> None:
     roads = network("merge")
     lane = roads.lane_ids.index("main_in_0")
     row = on_lane(roads, lane, 50.0, speed=10.0)
-    assert steer_to_lane(roads.arrays, plans("merge"), row[0], lane) == pytest.approx(0.0, abs=1e-9)
+    assert steer_to_lane(roads.arrays, plans("merge"), row[0], lane, 5.0) == pytest.approx(
+        0.0, abs=1e-9
+    )
     for d, sign in ((0.5, -1.0), (-0.5, 1.0)):
         aside = on_lane(roads, lane, 50.0, speed=10.0, d=d)
         assert (
-            math.copysign(1.0, steer_to_lane(roads.arrays, plans("merge"), aside[0], lane)) == sign
+            math.copysign(1.0, steer_to_lane(roads.arrays, plans("merge"), aside[0], lane, 5.0))
+            == sign
         )
-    left = steer_to_lane(roads.arrays, plans("merge"), row[0], int(roads.lanes[lane]["left"]))
+    left = steer_to_lane(roads.arrays, plans("merge"), row[0], int(roads.lanes[lane]["left"]), 5.0)
     assert left > 0.0
 
 
@@ -72,7 +75,8 @@ def test_a_target_that_is_no_neighbour_counts_as_the_own_lane() -> None:
     far = roads.lane_ids.index("main_out_1")
     row = on_lane(roads, lane, 50.0, speed=10.0, d=0.4)
     own, other, none = (
-        steer_to_lane(roads.arrays, plans("merge"), row[0], target) for target in (lane, far, -1)
+        steer_to_lane(roads.arrays, plans("merge"), row[0], target, 5.0)
+        for target in (lane, far, -1)
     )
     assert own == other == none != 0.0
 
@@ -96,7 +100,7 @@ def test_the_controller_brings_a_car_to_the_middle_and_keeps_it_there(
     car = row[0]
     offsets = []
     for _ in range(round(60.0 / speed / 0.05)):
-        wheels = steer_to_lane(roads.arrays, table, car, int(car["lane"]))
+        wheels = steer_to_lane(roads.arrays, table, car, int(car["lane"]), 5.0)
         assert abs(wheels) <= math.pi / 3.0
         car["x"], car["y"], car["heading"], _, _ = bicycle_step(
             car["x"], car["y"], car["heading"], speed, 0.0, wheels, 5.0, 0.05

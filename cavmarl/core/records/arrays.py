@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.math.buckets import Lists
+from cavmarl.core.math.walls import Walls
 
 
 class RoadArrays(NamedTuple):
@@ -176,9 +177,11 @@ class Demand(NamedTuple):
     num_ids: int  # agents that an episode can have
     num_background: int
     reenter: bool  # whether a vehicle that leaves orders a new one
+    endless: bool  # whether agents get another goal before they reach theirs
     seats: bool  # whether the new one of an agent takes the same id
     speed_factor_spread: float
     blank: NDArray[np.void]  # VEHICLE (1,) what a new record starts from
+    agent_types: NDArray[np.int32]  # VTYPE rows that agents have in turn, by their number
 
 
 class Scratch(NamedTuple):
@@ -207,6 +210,7 @@ class Sensors(NamedTuple):
 
     stack: int  # frames in an observation
     ego: bool  # whether it is on; it writes at 0
+    ego_size: bool  # whether it tells of the vehicle's type
     route_at: int
     route_points: int
     route_spacing_m: float
@@ -224,7 +228,8 @@ class Sensors(NamedTuple):
     lidar_range_m: float
     lidar_speeds: bool
     rays: NDArray[np.float64]  # (lidar_rays, 2) directions in the ego frame
-    near_body: NDArray[np.int32]  # (neighbors,) room
+    walls: Walls  # that hide neighbours; none: they are seen through walls
+    near_body: NDArray[np.int32]  # (neighbors,) room; with walls, for those that they hide, too
     near_squared: NDArray[np.float64]
     echoes: NDArray[np.void]  # ECHO (lidar_rays,) room
     history_at: int

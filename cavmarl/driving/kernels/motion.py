@@ -245,6 +245,7 @@ def move_agent(
     plans: NDArray[np.void],  # PLAN (G, L)
     grid: LaneGrid,  # which lanes lie near a place
     row: np.void,  # VEHICLE, the committed record, which becomes the next one
+    kind: np.void,  # its VTYPE
     throttle: float,  # commanded acceleration in m/s²
     steering: float,  # commanded angle of the front wheels in rad
     phase: NDArray[np.int32],  # (num_signals,) PHASE rows that are on
@@ -252,15 +253,17 @@ def move_agent(
 ) -> None:
     """Advance an agent's vehicle by one tick."""
     before = before_tick(row)
+    throttle = clamp(throttle, -kind["most_decel"], kind["most_accel"])
+    steering = clamp(steering, -kind["most_steering"], kind["most_steering"])
     # No reverse gear: the brake ends at a standstill.
     throttle = max(throttle, -before.speed / dt)
     x, y, heading, speed, _ = bicycle_step(
-        row["x"], row["y"], before.heading, before.speed, throttle, steering, row["length"], dt
+        row["x"], row["y"], before.heading, before.speed, throttle, steering, kind["wheelbase"], dt
     )
     row["x"] = x
     row["y"] = y
     row["heading"] = wrap_angle(heading)
-    row["speed"] = clamp(speed, 0.0, MAX_SPEED_MPS)
+    row["speed"] = clamp(speed, 0.0, min(MAX_SPEED_MPS, kind["max_speed"]))
     row["throttle"] = throttle
     row["steering"] = steering
     row["events"] |= locate(roads, plans, grid, row)

@@ -37,7 +37,7 @@ MOST_TURN_RAD = 2.8  # a sharper turn counts as this
 CUT_RADIUS_M = 6.0  # a turn of this radius is cut,
 WIDE_RADIUS_M = 9.0  # one of that is followed
 NEAR_TURN_M = 10.0  # before it, a junction counts as one
-TURNING_RATIO = 1.118  # radius of the turning circle over the length, wheels turned by 45°
+TURNING_RATIO = 1.118  # radius of the turning circle over the wheelbase, wheels turned by 45°
 CHORD_M = 1.5  # real lanes have corners: their direction is that of a chord, this far to both sides
 
 
@@ -74,9 +74,11 @@ def take_meta_action(
 
 @kernel
 def steer_to_lane(
-    roads: RoadArrays, plans: NDArray[np.void], row: np.void, target_lane: int
+    roads: RoadArrays, plans: NDArray[np.void], row: np.void, target_lane: int, wheelbase: float
 ) -> float:
     """The steering angle in rad that brings a vehicle to the middle of a lane.
+
+    `wheelbase` is its own one, in m.
 
     A target that is neither the vehicle's lane nor a neighbour of it counts as the lane it is on.
     Beyond the lane's end the lane that the plan names goes on.
@@ -96,16 +98,16 @@ def steer_to_lane(
         s, d, _, _ = project(
             roads.points, here["first_point"], here["num_points"], row["x"], row["y"]
         )
-    aimed = _aim(roads, plans, row, lane, s)
+    aimed = _aim(roads, plans, row, lane, s, wheelbase)
     if aimed < math.inf:
         return aimed
     direction = _direction_at(roads, plans, row["goal"], lane, ahead)
-    return steering_control(row["speed"], d, wrap_angle(direction - row["heading"]), row["length"])
+    return steering_control(row["speed"], d, wrap_angle(direction - row["heading"]), wheelbase)
 
 
 @kernel
 def _aim_m(
-    roads: RoadArrays, plans: NDArray[np.void], row: np.void, lane: int, s: float
+    roads: RoadArrays, plans: NDArray[np.void], row: np.void, lane: int, s: float, wheelbase: float
 ) -> tuple[float, float]:
     """How far ahead a driver aims in a bend, in m, and how exactly it follows it, from 0 to 1.
 
@@ -128,7 +130,7 @@ def _aim_m(
     if turn < AIM_RAD:
         return AIM_M, 1.0
     radius_m = turned["length_m"] / turn
-    missing_m = max(TURNING_RATIO * row["length"] - radius_m, 0.0)
+    missing_m = max(TURNING_RATIO * wheelbase - radius_m, 0.0)
     earlier_m = missing_m * math.tan(0.5 * min(turn, MOST_TURN_RAD))
     most_m = min(AIM_M_PER_RAD * turn, MOST_AIM_M)
     aim_m = max(min(TURN_AIM_M + AIM_EARLIER * earlier_m, most_m), TURN_AIM_M)
@@ -136,7 +138,9 @@ def _aim_m(
 
 
 @kernel
-def _aim(roads: RoadArrays, plans: NDArray[np.void], row: np.void, lane: int, s: float) -> float:
+def _aim(
+    roads: RoadArrays, plans: NDArray[np.void], row: np.void, lane: int, s: float, wheelbase: float
+) -> float:
     """The steering angle in rad that brings a vehicle round a bend; inf where there is none.
 
     Pure pursuit: the arc through a place of the way ahead. So the car turns in before a bend that
@@ -145,7 +149,7 @@ def _aim(roads: RoadArrays, plans: NDArray[np.void], row: np.void, lane: int, s:
     """
     here = roads.lanes[lane]
     x0, y0, _, cos, sin, _ = lane_pose(roads.points, here["first_point"], here["num_points"], s)
-    aim_m, exact = _aim_m(roads, plans, row, lane, s)
+    aim_m, exact = _aim_m(roads, plans, row, lane, s, wheelbase)
     aim_m = max(aim_m, AIM_S * row["speed"])
     x, y = _point_at(roads, plans, row["goal"], lane, s + aim_m)
     aside = math.atan2(cos * (y - y0) - sin * (x - x0), cos * (x - x0) + sin * (y - y0))
@@ -160,8 +164,8 @@ def _aim(roads: RoadArrays, plans: NDArray[np.void], row: np.void, lane: int, s:
     # The arc that the middle of the rear drives, whose heading is the car's, and that of its centre
     # if this went where it heads.
     apart = max(apart, TURN_AIM_M)
-    aside_m = row["length"] * math.sin(abs(bearing))
-    following = math.atan2(2.0 * aside_m, apart + row["length"] * math.cos(bearing))
+    aside_m = wheelbase * math.sin(abs(bearing))
+    following = math.atan2(2.0 * aside_m, apart + wheelbase * math.cos(bearing))
     sin_slip = min(aside_m / apart, 1.0)
     cutting = math.atan2(2.0 * sin_slip, math.sqrt(1.0 - sin_slip * sin_slip))
     steering = exact * following + (1.0 - exact) * cutting

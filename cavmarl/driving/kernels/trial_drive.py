@@ -48,6 +48,7 @@ def stays_on_road(
     plan: NDArray[np.void],  # PLAN (1, L) with what follows the lanes ahead
     grid: LaneGrid,
     row: np.void,  # VEHICLE, a blank one with its size; written
+    wheelbase: float,  # m, its own one
     lane: int,  # on which it begins,
     begin_m: float,  # and where on it
     last_lane: int,  # on which it ends,
@@ -68,7 +69,7 @@ def stays_on_road(
     row["d"] = 0.0
     row["speed"] = TRIAL_MPS
     for _ in range(MOST_TICKS):
-        steering = steer_to_lane(roads, plan, row, row["lane"])
+        steering = steer_to_lane(roads, plan, row, row["lane"], wheelbase)
         row["x"], row["y"], row["heading"], _, _ = bicycle_step(
             row["x"],
             row["y"],
@@ -76,7 +77,7 @@ def stays_on_road(
             TRIAL_MPS,
             0.0,
             clamp(steering, -steering_rad, steering_rad),
-            row["length"],
+            wheelbase,
             TRIAL_DT_S,
         )
         if locate(roads, plan, grid, row) != 0:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from cavmarl.core.math.geometry import lane_pose, wrap_angle
 from cavmarl.core.math.neighbors import Grid, fill_grid, nearest_bodies
 from cavmarl.core.math.scalars import clamp
+from cavmarl.core.math.walls import is_cut
 from cavmarl.core.numba import kernel
 from cavmarl.core.records.arrays import Outputs, RoadArrays, Sensors, Travel, Worlds
 from cavmarl.core.records.codes import (
@@ -47,6 +48,8 @@ YAW_SCALE = 1.0  # rad/s
 OFFSET_SCALE = 4.0  # m
 ROOM_SCALE = 200.0  # m
 TO_GO_SCALE = 1000.0  # m
+LENGTH_SCALE = 20.0  # m
+WHEELBASE_SCALE = 10.0  # m
 HALF_S = 5.0  # a time of this length is a soonness of 0.5
 SLOWEST_MPS = 1.0  # a standing vehicle is taken to come on with
 
@@ -89,6 +92,18 @@ def observe_ego(
 
 
 @kernel
+def observe_size(kind: np.void, row: np.void, out: NDArray[np.float32]) -> None:
+    """What the vehicle's type sets apart, behind `observe_ego`."""
+    out[EGO_FEATURES] = unit(row["length"] / LENGTH_SCALE)
+    out[EGO_FEATURES + 1] = unit(row["width"] / OFFSET_SCALE)
+    out[EGO_FEATURES + 2] = unit(kind["wheelbase"] / WHEELBASE_SCALE)
+    out[EGO_FEATURES + 3] = unit(kind["most_steering"] / STEERING_SCALE)
+    out[EGO_FEATURES + 4] = unit(kind["most_accel"] / ACCEL_SCALE)
+    out[EGO_FEATURES + 5] = unit(kind["most_decel"] / ACCEL_SCALE)
+    out[EGO_FEATURES + 6] = unit(kind["max_speed"] / SPEED_SCALE)
+
+
+@kernel
 def observe_route(
     roads: RoadArrays,
     plans: NDArray[np.void],
@@ -124,7 +139,10 @@ def observe_route(
 def observe_neighbors(
     rows: NDArray[np.void], i: int, grid: Grid, sensors: Sensors, out: NDArray[np.float32]
 ) -> None:
-    """The nearest vehicles in the ego frame, nearest first; zeros where there are fewer."""
+    """The nearest vehicles in the ego frame, nearest first; zeros where there are fewer.
+
+    Those behind `sensors.walls` are left out.
+    """
     if sensors.neighbors == 0:
         return
     row = rows[i]
@@ -135,14 +153,19 @@ def observe_neighbors(
         row["y"],
         row["z"],
         sensors.neighbors_range_m,
-        sensors.neighbors,
+        sensors.near_body.shape[0],
         sensors.near_body,
         sensors.near_squared,
     )
     cos_heading = math.cos(row["heading"])
     sin_heading = math.sin(row["heading"])
-    for k in range(found):
-        other = grid.bodies[sensors.near_body[k]]
+    k = 0
+    for candidate in range(found):
+        if k == sensors.neighbors:
+            break
+        other = grid.bodies[sensors.near_body[candidate]]
+        if is_cut(sensors.walls, row["x"], row["y"], other["x"], other["y"]):
+            continue
         dx = other["x"] - row["x"]
         dy = other["y"] - row["y"]
         cos_other = other["cos"]
@@ -157,6 +180,7 @@ def observe_neighbors(
         out[at + 4] = unit((dvy * cos_heading - dvx * sin_heading) / SPEED_SCALE)
         out[at + 5] = unit(cos_other * cos_heading + sin_other * sin_heading)
         out[at + 6] = unit(sin_other * cos_heading - cos_other * sin_heading)
+        k += 1
 
 
 @kernel
@@ -278,6 +302,8 @@ def sense(
             out = seen[newest_frame(seen, sensors.stack) :]
             if sensors.ego:
                 observe_ego(roads, plans, row, out)
+                if sensors.ego_size:
+                    observe_size(travel.types[row["vtype"]], row, out)
             observe_route(roads, plans, row, sensors, out)
             observe_neighbors(rows, i, grid, sensors, out)
             phase = worlds.signal_phase[w]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import SensorsConfig
 from cavmarl.core.extensions import REGISTERED_SENSORS
+from cavmarl.core.math.walls import make_walls
 from cavmarl.core.records.arrays import Sensors
 from cavmarl.rewards.kernels.terms import TTC_REACH_M
 from cavmarl.roads.network import RoadNetwork
@@ -58,6 +59,9 @@ SENSORS: tuple[Sensor, ...] = (
     # The last of the package: see `carried_from`.
     Sensor("history", way_features.history, shape=way_features.history_shape),
 )
+
+# The nearest vehicles of which walls may hide some.
+MAX_NEIGHBORS_TRIED = 256
 
 # Those that `observe_optional` writes.
 FURTHER = frozenset(
@@ -131,14 +135,18 @@ def _starts(config: SensorsConfig) -> dict[str, int]:
     }
 
 
-def sensor_arrays(config: SensorsConfig) -> Sensors:
+def sensor_arrays(config: SensorsConfig, network: RoadNetwork) -> Sensors:
     """The settings and the room that `sense` takes."""
+    hides = not config.neighbors.through_walls
+    walls = network.walls if hides else network.walls[:0]
+    near = MAX_NEIGHBORS_TRIED if len(walls) else config.neighbors.count
     places = layout(config)
     starts = _starts(config)
     history = places.get("history", slice(0, 0))
     return Sensors(
         stack=config.stack,
         ego="ego" in places,
+        ego_size=config.ego.size,
         route_at=starts["route"],
         route_points=config.route.points,
         route_spacing_m=config.route.spacing_m,
@@ -157,8 +165,9 @@ def sensor_arrays(config: SensorsConfig) -> Sensors:
         lidar_speeds=config.lidar.speeds,
         rays=ray_directions(config.lidar.rays),
         echoes=np.zeros(config.lidar.rays, dtype=ECHO),
-        near_body=np.zeros(config.neighbors.count, dtype=np.int32),
-        near_squared=np.zeros(config.neighbors.count, dtype=np.float64),
+        walls=make_walls(np.stack([walls[name] for name in ("ax", "ay", "bx", "by")], axis=1)),
+        near_body=np.zeros(near, dtype=np.int32),
+        near_squared=np.zeros(near, dtype=np.float64),
         history_at=history.start,
         history=history.stop - history.start,
     )

@@ -30,6 +30,16 @@ _EGO = (
     ("target_speed", "target of the speed controller (discrete actions)", "40 m/s"),
 )
 
+_SIZE = (
+    ("length", "length of the own body", "20 m"),
+    ("width", "width of the own body", "4 m"),
+    ("wheelbase", "way between its axles", "10 m"),
+    ("most_steering", "most that its front wheels turn; 1: as the action says", "pi/4 rad"),
+    ("most_accel", "most that it can accelerate; 1: as the action says", "10 m/s²"),
+    ("most_decel", "most that it can brake; 1: as the action says", "10 m/s²"),
+    ("most_speed", "most that it can drive", "40 m/s"),
+)
+
 # As `kernels.observing_lanes` scales ways.
 _NEARNESS = f"{HALF_M:g} m / ({HALF_M:g} m + way)"
 _GAPS = (
@@ -75,7 +85,9 @@ def _numbered(count: int, subject: str, rows: Iterable[Row]) -> list[Feature]:
 
 def ego(config: SensorsConfig) -> list[Feature]:
     """The vehicle itself, its lane, and what the plan asks of it."""
-    return _features(_EGO) if config.ego.enabled else []
+    if not config.ego.enabled:
+        return []
+    return _features((*_EGO, *(_SIZE if config.ego.size else ())))
 
 
 def route(config: SensorsConfig) -> list[Feature]:

@@ -126,17 +126,18 @@ def _drive_agent(
         row["tick"] += 1
         return
     note_stop(roads, row, plans[row["goal"], row["lane"]]["link"], worlds.signal_phase[w])
+    kind = travel.types[row["vtype"]]
     throttle = commands[w, row["agent"], 0]
     steering = commands[w, row["agent"], 1]
     if discrete:
         throttle = speed_control(row["speed"], row["target_speed"])
-        steering = steer_to_lane(roads, plans, row, row["target_lane"])
+        steering = steer_to_lane(roads, plans, row, row["target_lane"], kind["wheelbase"])
     throttle = clamp(throttle, -accel_limit, accel_limit)
     steering = clamp(steering, -steering_limit, steering_limit)
     throttle, steering = _delay(
         worlds.pending, w, row["agent"], worlds.ticks[w], throttle, steering
     )
-    move_agent(roads, plans, lane_grid, row, throttle, steering, worlds.signal_phase[w], dt)
+    move_agent(roads, plans, lane_grid, row, kind, throttle, steering, worlds.signal_phase[w], dt)
     # The indicator is automatic: drivers behind make room for a vehicle that has to change lanes.
     row["blinker"] = needed_change(roads, travel, row, travel.steps[own_step(roads, row)])
 
@@ -299,7 +300,9 @@ def suggest(
             elif change < 0:
                 target = lane["right"]
             out[w, agent, 0] = scratch.accel[i]
-            out[w, agent, 1] = steer_to_lane(roads, plans, row, target)
+            out[w, agent, 1] = steer_to_lane(
+                roads, plans, row, target, travel.types[row["vtype"]]["wheelbase"]
+            )
             if discrete:
                 wanted = nearest_speed(
                     target_speeds, max(row["speed"] + scratch.accel[i] * lookahead_s, 0.0)

@@ -55,6 +55,7 @@ GIVE_UP_S = 10.0  # a driver that waits longer than this to change lanes takes a
 def _order(
     demand: Demand,
     roads: RoadArrays,
+    travel: Travel,
     gate: Gate,
     worlds: Worlds,
     w: int,
@@ -73,6 +74,8 @@ def _order(
     departure["agent"] = agent
     departure["order"] = -1
     departure["vtype"] = demand.blank[0]["vtype"]
+    if agent >= 0:
+        departure["vtype"] = demand.agent_types[agent % demand.agent_types.shape[0]]
     departure["stop"] = -1
     departure["stops_end"] = -1
     departure["lane_code"] = LANE_GIVEN
@@ -83,7 +86,7 @@ def _order(
     spread = 2.0 * uniform(key, vehicle, 0, STREAM_SPEED_FACTOR) - 1.0
     departure["speed_factor"] = 1.0 + demand.speed_factor_spread * spread
     length = roads.lanes[departure["lane"]]["length_m"]
-    body = demand.blank[0]["length"]
+    body = travel.types[departure["vtype"]]["length"]
     departure["pos"] = body + 1.0
     if agent >= 0 or not demand.enter_at_start[own_map]:
         free = max(length - body - END_ROOM_M, 0.0)
@@ -175,7 +178,6 @@ def populate(
     `demand`: the generator's tables. `worlds`: written where chosen; ticks and keys are already
     those of the new episode.
     """
-    half = 0.5 * demand.blank[0]["length"]
     for w in range(worlds.ticks.shape[0]):
         if not chosen[w]:
             continue
@@ -192,10 +194,11 @@ def populate(
         for n in range(demand.num_agents + demand.num_background):
             agent = n if n < demand.num_agents else -1
             trips = demand.agent_trips if agent >= 0 else demand.start_trips
-            _order(demand, roads, gate, worlds, w, agent, trips)
+            _order(demand, roads, travel, gate, worlds, w, agent, trips)
             departure = gate.queue[w, gate.num_queue[w] - 1]
             vehicle = departure["id"]
             kind = travel.types[departure["vtype"]]
+            half = 0.5 * kind["length"]
             for attempt in range(PLACE_TRIES):
                 trip = _draw(trips, own_map, worlds.keys[w], vehicle, attempt)
                 lane = trips.pairs[trip, 0]
@@ -220,11 +223,13 @@ def populate(
 
 @kernel
 def _needs_goal(demand: Demand, roads: RoadArrays, travel: Travel, row: np.void) -> bool:
-    """Whether a background vehicle picks another goal: near it in a closed world, or stuck.
+    """Whether a vehicle picks another goal: near it where trips do not end, or stuck.
 
-    Stuck is a vehicle that has stood for `GIVE_UP_S` at the end of a lane that its way does not
-    follow.
+    Agents are never stuck; stuck is a vehicle that has stood for `GIVE_UP_S` at the end of a lane
+    that its way does not follow.
     """
+    if row["driver"] == DRIVER_AGENT:
+        return demand.endless and row["to_go"] <= WANDER_M
     if row["driver"] != DRIVER_BACKGROUND:
         return False
     if row["order"] >= 0:
@@ -266,9 +271,9 @@ def choose_goals(
     worlds: Worlds,
     dt: float,
 ) -> None:
-    """Give the background vehicles of `next_rows` that need it another goal, if one is in reach.
+    """Give the vehicles of `next_rows` that need it another goal, if one is in reach.
 
-    Asked about once a second.
+    Asked about once a second. What an agent is farther from its goal by is no way driven back.
     """
     turns = max(1, round(1.0 / dt))
     for w in range(worlds.ticks.shape[0]):
@@ -295,6 +300,8 @@ def choose_goals(
                     row["goal"] = goal
                     row["way"] = way
                     row["leg"] += 1
+                    if row["driver"] == DRIVER_AGENT:
+                        row["step_to_go"] += to_go - row["to_go"]
                     row["to_go"] = to_go
                     row["events"] &= ~EVENT_ARRIVED
                     break
@@ -311,7 +318,9 @@ def _next_leaving(gate: Gate, w: int, first: int) -> int:
 
 
 @kernel
-def settle(demand: Demand, roads: RoadArrays, gate: Gate, worlds: Worlds, dt: float) -> None:
+def settle(
+    demand: Demand, roads: RoadArrays, travel: Travel, gate: Gate, worlds: Worlds, dt: float
+) -> None:
     """Count the vehicles that have left, and order those that follow.
 
     They go in the order of their ids, so that those that follow get the same numbers wherever the
@@ -339,13 +348,13 @@ def settle(demand: Demand, roads: RoadArrays, gate: Gate, worlds: Worlds, dt: fl
             if not demand.reenter or ordered:
                 continue
             if agent < 0:
-                _order(demand, roads, gate, worlds, w, -1, demand.enter_trips)
+                _order(demand, roads, travel, gate, worlds, w, -1, demand.enter_trips)
             elif demand.seats:
-                _order(demand, roads, gate, worlds, w, agent, demand.agent_trips)
+                _order(demand, roads, travel, gate, worlds, w, agent, demand.agent_trips)
             elif gate.num_entered[w] < demand.num_ids:
                 follower = gate.num_entered[w]
                 gate.num_entered[w] = follower + 1
-                _order(demand, roads, gate, worlds, w, follower, demand.agent_trips)
+                _order(demand, roads, travel, gate, worlds, w, follower, demand.agent_trips)
         gate.num_passing[w] = 0
 
 
