@@ -73,3 +73,12 @@ def test_a_suite_that_cannot_work_is_refused(tmp_path: Path, text: str, message:
     file.write_text(text)
     with pytest.raises(ConfigError, match=message):
         load_suite(file)
+
+
+def test_the_tasks_are_entries_as_they_are() -> None:
+    suite = load_suite(find_settings("suite", "tasks"))
+    worlds = worlds_of(suite, ROOT / "envs")
+    assert [world.env for world in worlds] == list(suite.maps)
+    assert {world.agents for world in worlds} == {None}
+    assert suite.background is None
+    assert suite.horizon_s is None

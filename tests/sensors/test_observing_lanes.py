@@ -25,7 +25,8 @@ def observe(name: str, rows: NDArray[np.void], i: int, phase: NDArray[np.int32])
     fill_grid(rows, len(rows), grid)
     place = layout(CONFIG)["lanes"]
     out = np.zeros(place.stop, np.float32)
-    observe_lanes(roads.arrays, travel(name), rows, i, grid, phase, sensor_arrays(CONFIG, roads), out)
+    sensors = sensor_arrays(CONFIG, roads)
+    observe_lanes(roads.arrays, travel(name), rows, i, grid, phase, sensors, out)
     assert place.stop - place.start == LANES_FEATURES
     assert not out[: place.start].any()
     return [float(value) for value in out[place]]

@@ -1,0 +1,58 @@
+"""The notebooks of `examples/` are the scripts beside them, and run cell by cell."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from docs.notebooks import notebook, scripts
+
+SCRIPTS = scripts()
+
+each = pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+
+# Runs the code cells of a notebook one after the other, as Jupyter's "run all" does.
+RUN = """\
+import json, sys
+shared = {"__name__": "__main__"}
+for cell in json.load(open(sys.argv[1], encoding="utf-8"))["cells"]:
+    if cell["cell_type"] == "code":
+        exec(compile("".join(cell["source"]), sys.argv[1], "exec"), shared)
+"""
+
+
+def test_there_are_three() -> None:
+    assert len(SCRIPTS) == 3
+
+
+@each
+def test_a_notebook_is_what_its_script_makes(script: Path) -> None:
+    made = script.with_suffix(".ipynb").read_text(encoding="utf-8")
+    assert made == notebook(script.read_text(encoding="utf-8")), "run python -m docs.notebooks"
+    kinds = [cell["cell_type"] for cell in json.loads(made)["cells"]]
+    assert kinds[0] == "markdown"
+    assert kinds.count("code") >= 2
+
+
+@each
+def test_a_notebook_runs(script: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if script.stem == "train_and_evaluate":
+        pytest.importorskip("torch", reason="needs the extra: torch")
+    if script.stem == "own_map_and_reward":
+        pytest.importorskip("sumo", reason="needs the extra: sumo")
+    monkeypatch.setenv("CAVMARL_SHORT", "1")
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    made = script.with_suffix(".ipynb")
+    ran = subprocess.run(
+        [sys.executable, "-c", RUN, str(made)],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout.strip()
