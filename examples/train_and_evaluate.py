@@ -13,7 +13,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-import cavmarl
+from cavmarl.evaluate import evaluate
 
 SHORT = bool(os.environ.get("CAVMARL_SHORT"))  # as the tests run it
 
@@ -26,7 +26,6 @@ command = [
     "cavmarl",
     "train",
     "ppo",
-    "--",
     "--env",
     "merge",
     "--runs",
@@ -40,7 +39,7 @@ print(sorted(path.name for path in (runs / "lesson").iterdir()))
 # episodes; independent runs give the interval.
 
 # %%
-report = cavmarl.evaluate(
+report = evaluate(
     "merge",
     ["idm", str(runs / "lesson")],
     episodes=1 if SHORT else 8,

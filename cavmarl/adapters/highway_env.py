@@ -277,7 +277,7 @@ def _whole_config(
 
 def _observation(settings: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
     """The sensor that is meant, and its keys of env.yaml."""
-    kind = settings.get("type")
+    kind = str(settings.get("type"))
     if kind not in OBSERVATIONS:
         raise ConfigError(f"observation.type = {kind!r}: there are {', '.join(OBSERVATIONS)}")
     sensor, usual = OBSERVATIONS[kind]

@@ -21,17 +21,15 @@ class Suite:
     """
 
     maps: tuple[str, ...]  # names of environments, or map files below the folder of maps
-    agents: tuple[int, ...] = ()  # numbers of agents
+    agents: tuple[int, ...] | None = None  # numbers of agents
     background: int | None = None  # background vehicles of every world
     horizon_s: float | None = None  # of every episode
 
     def __post_init__(self) -> None:
-        if not self.maps:
-            raise ConfigError("maps = []: must be at least one")
         for name in ("maps", "agents"):
             values = getattr(self, name)
-            if len(set(values)) < len(values):
-                raise ConfigError(f"{name} = {values!r}: must have each once")
+            if values is not None and (not values or len(set(values)) < len(values)):
+                raise ConfigError(f"{name} = {values!r}: must be at least one, and each once")
 
 
 @dataclass(frozen=True)
@@ -51,7 +49,7 @@ def worlds_of(suite: Suite, maps: Path) -> list[SuiteWorld]:
     found = {Path(name).name.split(".")[0]: env for name, env in _found(suite, maps)}
     if len(found) < len(suite.maps):
         raise ConfigError(f"maps = {suite.maps!r}: two have one name; rename a file")
-    if not suite.agents:
+    if suite.agents is None:
         return [SuiteWorld(name, env, None) for name, env in found.items()]
     return [
         SuiteWorld(f"{name}-{agents}", env, agents)
@@ -92,7 +90,7 @@ def run_suite(
     repeats and seed are as in `evaluate`.
     """
     reports = {}
-    keys: dict[str, object] = {"population.mode": "respawn"} if suite.agents else {}
+    keys: dict[str, object] = {} if suite.agents is None else {"population.mode": "respawn"}
     if suite.horizon_s is not None:
         keys["horizon_s"] = suite.horizon_s
     for world in worlds:

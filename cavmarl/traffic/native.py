@@ -35,7 +35,7 @@ from cavmarl.traffic.scenarios.scene import Scene
 from cavmarl.traffic.schedule import Schedule
 from cavmarl.traffic.sumo.route_book import RouteBook, StopBook
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
-from cavmarl.traffic.turning_circle import Body, with_tight_turns
+from cavmarl.traffic.turning_circle import TurningBody, with_tight_turns
 from cavmarl.traffic.way_search import WaySlots, way_slots
 
 FAST_FACTOR = 1.5  # a speed over the limit that hardly any driver of the demand wants
@@ -101,7 +101,8 @@ class NativeTraffic:
         """PLAN (G, L) of the goal edges: on each map's lanes, the ways to its goals."""
         names = dict.fromkeys(self.population.types)
         bodies = tuple(
-            Body(*(float(kind[name]) for name in Body._fields)) for kind in agent_types(names)
+            TurningBody(*(float(kind[name]) for name in TurningBody._fields))
+            for kind in agent_types(names)
         )
         roads = with_tight_turns(self.network, ActionConfig().steering_rad, bodies)
         maps = self.network.maps

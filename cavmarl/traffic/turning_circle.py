@@ -25,7 +25,7 @@ TURN_RAD = 0.9  # ways that turn less within `NEAR_M` are tight for no car
 NEAR_M = 12.0
 
 
-class Body(NamedTuple):
+class TurningBody(NamedTuple):
     """What a turn asks of a vehicle, named and measured as in `VTYPE`."""
 
     length: float
@@ -34,12 +34,12 @@ class Body(NamedTuple):
     most_steering: float
 
 
-CAR_BODY = Body(5.0, 2.0, 5.0, np.inf)
+CAR_BODY = TurningBody(5.0, 2.0, 5.0, np.inf)
 
 
 @lru_cache(maxsize=1)
 def with_tight_turns(
-    network: RoadNetwork, steering_rad: float, bodies: tuple[Body, ...] = (CAR_BODY,)
+    network: RoadNetwork, steering_rad: float, bodies: tuple[TurningBody, ...] = (CAR_BODY,)
 ) -> RoadArrays:
     """The map with turns that one of some vehicles cannot take marked as U-turns; plans avoid them.
 
@@ -62,7 +62,7 @@ def with_tight_turns(
 class _Trial:
     """A vehicle that is driven over single turns."""
 
-    def __init__(self, network: RoadNetwork, steering_rad: float, body: Body) -> None:
+    def __init__(self, network: RoadNetwork, steering_rad: float, body: TurningBody) -> None:
         self._body = body
         self._network = network
         self._steering_rad = min(steering_rad, body.most_steering)

@@ -12,8 +12,8 @@ from gymnasium.utils.env_checker import check_env
 
 import cavmarl  # registers the ids
 from cavmarl.adapters.highway_tasks import TASKS
+from cavmarl.config.library_names import HIGHWAY_TASKS
 from cavmarl.core.errors import ConfigError
-from cavmarl.env.registration import HIGHWAY_TASKS
 
 assert cavmarl
 

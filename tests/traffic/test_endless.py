@@ -2,36 +2,39 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 import cavmarl
 from cavmarl.config.env import TERMS
 
-PROGRESS, ARRIVAL = TERMS.index("progress"), TERMS.index("arrival")
+PROGRESS = TERMS.index("progress")
 
 
-def drive(steps: int, endless: bool = True, **keywords: object) -> tuple[list[bytes], float, bool]:
-    vec = cavmarl.make_vec(
-        "ring", agents=3, background=6, overrides={"traffic.endless": endless}, **keywords
-    )
+def drive(endless: bool) -> tuple[float, bool]:
+    """Way of one car alone on a ring of 260 m in 90 s, in m, and whether its trip has ended."""
+    overrides = {"traffic.endless": endless, "traffic.demand": []}
+    vec = cavmarl.make_vec("ring22", overrides=overrides)
     vec.reset(seed=2)
-    seen, way_m, ended = [], 0.0, False
-    for _ in range(steps):
-        observations, _, terminated, _, _ = vec.step(vec.suggest_actions())
-        terms = vec.worlds.arrays.terms[0, :, PROGRESS]
-        way_m += float(terms.sum())
-        assert np.all(terms > -1.0)  # another goal is no way back
+    way_m, ended = 0.0, False
+    for _ in range(449):
+        _, _, terminated, _, _ = vec.step(vec.suggest_actions())
+        progress_m = float(vec.worlds.arrays.terms[0, 0, PROGRESS])
+        assert progress_m > -0.1  # another goal is no way back
+        way_m += progress_m
         ended |= bool(terminated.any())
-        seen.append(observations.tobytes())
-    return seen, way_m, ended
+    return way_m, ended
 
 
-def test_no_agent_arrives_where_trips_are_endless() -> None:
-    _, way_m, ended = drive(500)
+def test_no_trip_ends_where_trips_are_endless() -> None:
+    way_m, ended = drive(endless=True)
     assert not ended
-    assert way_m > 3 * 400.0  # each has driven round
-    assert drive(500, endless=False)[2]
+    assert way_m > 2 * 260.0  # it has driven round, and each metre was counted
+    assert drive(endless=False)[1]
 
 
 def test_zones_change_nothing() -> None:
-    assert drive(200)[0] == drive(200, zones=2)[0]
+    def seen(zones: int) -> list[bytes]:
+        overrides = {"traffic.endless": True}
+        vec = cavmarl.make_vec("ring", agents=3, background=6, zones=zones, overrides=overrides)
+        vec.reset(seed=2)
+        return [vec.step(vec.suggest_actions())[0].tobytes() for _ in range(200)]
+
+    assert seen(1) == seen(2)
