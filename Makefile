@@ -26,7 +26,7 @@ FUZZ_TARGETS ?= network programs buildings map cached zones demand sumocfg entry
 # Tests start many processes: none is to parse the sources anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help demo test quick ray check bench bounds soak model fuzz oldest libraries maps lock sbom audit pictures docs clean
+.PHONY: help demo test quick ray check bench bounds soak model fuzz oldest libraries maps rules lock sbom audit pictures docs clean
 .DEFAULT_GOAL := help
 
 help: ## say what there is
@@ -91,6 +91,9 @@ maps: $(READY) ## make the maps of all entries anew from the options beside them
 	    sed --in-place '2,/^-->$$/d' $$name && \
 	    { test $$folder != envs/cities/map || gzip --force --best --no-name $$name; }) || exit 1; done
 
+rules: $(READY) $(TOOLS)/.ready ## ask ASAM's checker whether exported OpenDRIVE keeps its rules
+	$(BIN)/pytest tests/maps/exports/test_opendrive_rules.py
+
 lock: $(READY) ## write constraints-hashes.txt: each file of an installation with its hash
 	$(BIN)/python -m docs.supply_chain lock
 
@@ -127,7 +130,7 @@ $(READY): pyproject.toml constraints.txt
 
 $(TOOLS)/.ready:
 	"$(PYTHON)" -m venv --clear $(TOOLS)
-	$(TOOLS)/bin/python -m pip install --quiet cyclonedx-bom pip-audit
+	$(TOOLS)/bin/python -m pip install --quiet cyclonedx-bom pip-audit asam-qc-opendrive
 	@touch $@
 
 $(SITE)/.ready: docs/requirements.txt
