@@ -81,6 +81,9 @@ def _mended(draft: Path, facts: Mapping[str, str]) -> bytes:
     """The export by ASAM's rules, with what the map says of its origin, and without the date."""
     root: Element = defusedxml.ElementTree.fromstring(draft.read_bytes(), forbid_dtd=True)
     mend_curves(root)
+    _join_controllers(root)
+    for one in root.iter("object"):
+        _mend_object(one)
     header = root.find("header")
     if header is not None:
         header.attrib.pop("date", None)
@@ -89,6 +92,30 @@ def _mended(draft: Path, facts: Mapping[str, str]) -> bytes:
             header.append(Element("userData", code=key, value=" ".join(value.split())))
     text: bytes = tostring(root, "utf-8")
     return b'<?xml version="1.0" encoding="UTF-8"?>\n' + text + b"\n"
+
+
+def _mend_object(element: Element) -> None:
+    """A crosswalk: its height, and its outline where 1.5 and later have it."""
+    element.attrib.setdefault("zOffset", "0")
+    outlines = element.findall("outline")
+    if outlines:
+        around = Element("outlines")
+        for outline in outlines:
+            element.remove(outline)
+            around.append(outline)
+        element.insert(0, around)
+
+
+def _join_controllers(root: Element) -> None:
+    """One controller a traffic light: netconvert writes one for each of its programs."""
+    found: dict[str, Element] = {}
+    for controller in root.findall("controller"):
+        first = found.setdefault(controller.get("id", ""), controller)
+        if first is controller:
+            continue
+        known = {control.get("signalId") for control in first}
+        first.extend(one for one in controller if one.get("signalId") not in known)
+        root.remove(controller)
 
 
 def _compared(one: RoadNetwork, other: RoadNetwork) -> RoundTrip:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 _SEALED_M = 1e-3  # from lane to lane, where one leads into the other
 _SAME_RAD = 0.01
 _SAME_GRADE = 1e-6
-_PARTS = 8  # of a curve, for its length
+_PARTS = 64  # of a curve, for its length: some nearly stand still and turn
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _U, _V = ("aU", "bU", "cU", "dU"), ("aV", "bV", "cV", "dV")
 
@@ -46,6 +46,8 @@ def mend_curves(root: Element) -> int:
     drawn = sum(_seal(road, roads) for road in roads.values() if road.get("junction", "-1") != "-1")
     for road in roads.values():
         _state_lengths(road)
+        if road.get("junction", "-1") != "-1":
+            _taper(road, roads)
         _join_lines(road)
         _drop_repeated(road.find("elevationProfile"))
     return drawn
@@ -107,6 +109,37 @@ def _seal(road: Element, roads: dict[str, Element]) -> bool:
     return not sealed
 
 
+def _taper(road: Element, roads: dict[str, Element]) -> None:
+    """Let lanes over a junction begin and end as wide as the lanes that they join."""
+    length_m = float(road.get("length", "0"))
+    for lane in road.iterfind("lanes/laneSection/right/lane"):
+        widths = []
+        for kind in ("predecessor", "successor"):
+            link, other = lane.find(f"link/{kind}"), road.find(f"link/{kind}")
+            if link is not None and other is not None:
+                there = roads.get(other.get("elementId", ""))
+                widths.append(_width_m(there, int(link.get("id", "0"))))
+        width = lane.find("width")
+        if width is None or len(widths) < 2 or None in widths or length_m < _SEALED_M:
+            continue
+        first, last = (float(one or 0.0) for one in widths)
+        if abs(last - first) < _SEALED_M and abs(float(width.get("a", "0")) - first) < _SEALED_M:
+            continue
+        step = last - first  # level at both ends
+        for key, value in zip(
+            "abcd", (first, 0.0, 3.0 * step / length_m**2, -2.0 * step / length_m**3), strict=True
+        ):
+            width.set(key, f"{value:.8f}")
+
+
+def _width_m(road: Element | None, lane: int) -> float | None:
+    for one in road.iterfind("lanes/laneSection/right/lane") if road is not None else ():
+        width = one.find("width")
+        if int(one.get("id", "0")) == lane and width is not None:
+            return float(width.get("a", "0"))
+    return None
+
+
 def _inner_m(road: Element, lane: int) -> float:
     """The side of a lane that is nearer to the reference line, positive to the left."""
     offset = road.find("lanes/laneOffset")
@@ -148,7 +181,7 @@ def _draw(
 
 
 def curve_length_m(found: Coefficients) -> float:
-    """Of a cubic curve by its coefficients (2, 4), by Gauss's quadrature in eight parts."""
+    """Of a cubic curve by its coefficients (2, 4), by Gauss's quadrature in parts."""
     p = ((np.arange(_PARTS)[:, None] + 0.5 * (_NODES + 1.0)) / _PARTS).ravel()
     slope = found[:, 1, None] + 2.0 * found[:, 2, None] * p + 3.0 * found[:, 3, None] * p * p
     return float(np.tile(_WEIGHTS, _PARTS) @ np.hypot(slope[0], slope[1]) / (2.0 * _PARTS))
