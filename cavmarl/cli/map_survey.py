@@ -34,9 +34,9 @@ def survey(
     json_path: JsonPath = None,
 ) -> None:
     """Map a world by lidar, GNSS and IMU; say how far the cloud is from the map's surface."""
-    import cavmarl
     from cavmarl.cosim.lidar_survey import SURVEY_RIG, Surveyor
     from cavmarl.cosim.survey_fit import fit_survey
+    from cavmarl.env.vector import make_vec
 
     if out.suffix.lower() not in (".ply", ".csv"):
         raise ConfigError(f"--out {out}: must end in .ply or .csv")
@@ -44,7 +44,7 @@ def survey(
     if buildings is not None:
         overrides["map.buildings"] = buildings
     console = Console()
-    worlds = cavmarl.make_vec(
+    worlds = make_vec(
         env, num_envs=vehicles, agents=1, background=0, workers=0, overrides=overrides
     )
     steps = round(time_s / _TICK_S)

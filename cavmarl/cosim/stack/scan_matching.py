@@ -37,8 +37,9 @@ _PAIR_M = 0.4  # pairs that are nearer say where the vehicle is
 _FEWEST_PAIRS, _LEAST_SHARE = 30, 0.5
 _DEVIATION_M = 0.08  # of a pair, map and scan
 _CORRELATED = 9.0  # so many pairs are worth one: neighbours err alike
-# Of the information along the best axis; below it, an axis is held by the noise of normals only.
-_WEAKEST = 0.1
+_WEAKEST = 1e-3  # of the information along the best axis, below which an axis says nothing
+# Along the best axis; scans err alike, and along others noise of normals looks like information.
+_LEAST_M = 0.1
 _LOST_M, _LOST_FIXES = 6.0, 20  # from the mean of so many fixes: the scans are laid elsewhere
 _TURN_M = 10.0  # a radian, against metres
 
@@ -137,13 +138,14 @@ class ScanMatching(GnssInertial):
         information = slopes.T @ slopes / (_CORRELATED * _DEVIATION_M**2)
         strength, axes = np.linalg.eigh(information)
         for share, axis in zip(strength.tolist(), axes.T, strict=True):
-            if share < _WEAKEST * strength[-1] or share < 1.0:
+            if share < _WEAKEST * strength[-1] or share < 1.0:  # a metre
                 continue
             off = seen - self._get()[:3]
             off[2] = wrap(float(off[2]))
             scale = np.array([1.0, 1.0, _TURN_M])
             row = np.append(axis * scale, 0.0)
-            self._take(row, float(row[:3] @ off), 1.0 / math.sqrt(share), gate=math.inf)
+            deviation = max(1.0 / math.sqrt(share), _LEAST_M * math.sqrt(strength[-1] / share))
+            self._take(row, float(row[:3] @ off), deviation, gate=math.inf)
 
 
 class _Walls:

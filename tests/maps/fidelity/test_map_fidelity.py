@@ -10,9 +10,9 @@ import pytest
 from typer.testing import CliRunner
 
 from cavmarl.cli import app
-from cavmarl.core.errors import CavmarlError
+from cavmarl.core.errors import CavmarlError, MapError
 from cavmarl.engine.world_setup import find_map
-from cavmarl.maps.fidelity.cloud_files import read_cloud
+from cavmarl.maps.fidelity.cloud_files import Cloud, read_cloud
 from cavmarl.maps.fidelity.cloud_registration import moved, nearest_distances
 from cavmarl.maps.fidelity.map_surface import map_surface
 from cavmarl.maps.fidelity.road_edges import fit_roads
