@@ -17,11 +17,12 @@ from cavmarl.roads.network import RoadNetwork
 
 Points = NDArray[np.float64]
 
-_ON_LANE_M = 0.35  # in the plane, from a place of a lane
+_ON_LANE_M = 0.4  # in the plane, from a place of a lane
 _HIGH_M = 0.5  # above the road: no ground
 _WALL_M = 2.0  # farther from a wall, a point is something else
 _SEEN_M = 0.5  # a place of a lane has a point that near
 _MARGIN_M = 1.0
+_SAMPLED_M = 0.5  # of the map's surface
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ def fit_survey(cloud: Cloud, network: RoadNetwork) -> tuple[SurveyFit, Compariso
     gicp: Any = require("small_gicp", "clouds")
     plane = cloud.points[:, :2]
     box = (*(plane.min(axis=0) - _MARGIN_M), *(plane.max(axis=0) + _MARGIN_M))
-    whole, spacing_m = map_surface(network, box)
+    whole, spacing_m = map_surface(network, box, _SAMPLED_M)
     lanes = map_surface(replace(network, walls=network.walls[:0]), box, spacing_m)[0].points
     flat = np.array([1.0, 1.0, 0.0])
     rows, squares = gicp.KdTree(lanes * flat).batch_nearest_neighbor_search(cloud.points * flat)

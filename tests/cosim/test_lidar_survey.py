@@ -55,6 +55,7 @@ def test_echoes_lie_where_rays_end() -> None:
     assert len(lidar_points(lidar, scan, 7.0)) == 1
 
 
+@pytest.mark.slow
 def test_a_survey_lies_on_the_map(tmp_path: Path) -> None:
     cloud, told = tmp_path / "grid.ply", tmp_path / "told.json"
     words = ["survey", "grid4x4", "-o", str(cloud), "--time-s", "12", "--vehicles", "1"]

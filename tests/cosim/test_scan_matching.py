@@ -49,6 +49,7 @@ def cloud(world: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_scans_take_a_bias_of_gnss_away(world: Any, cloud: Path) -> None:
     from cavmarl.cosim.stack.scan_matching import ScanMatching
 
