@@ -287,8 +287,9 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
         ended = arrays.terminations[0, self._listed] & (not self._seats)
         observations, infos = self._observations(), self._infos()
         rewards = dict(zip(shown, arrays.rewards[0, self._listed].tolist(), strict=True))
-        terminations = _flags(shown, ended)
-        truncations = _flags(shown, ~ended & truncated)
+        timed_out = ended & arrays.truncations[0, self._listed]
+        terminations = _flags(shown, ended & ~timed_out)
+        truncations = _flags(shown, timed_out | (~ended & truncated))
         if truncated:
             self._list(self._rows[:0])
         elif ended.any():
