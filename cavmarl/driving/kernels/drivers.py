@@ -45,6 +45,7 @@ from cavmarl.driving.kernels.swept_areas import (
     before_swept,
     behind_fork,
     swept_stop,
+    wait_place,
 )
 from cavmarl.driving.kernels.ways import leave, next_step
 
@@ -158,11 +159,15 @@ def _at_line(
     if to_line <= 0.0:
         # Its front is over the line: it does not wait there any more.
         press, hold = press_inside(roads, travel, rows, i, link, -distance, way, phase, dt, scratch)
-        press = max(press, before_swept(roads, rows, i, kind, link, front, dt, scratch))
-        return press, hold, False
+        swept = before_swept(roads, rows, i, kind, link, front, hold != HOLD_NONE, dt, scratch)
+        return max(press, swept), hold, False
     hold = may_enter(roads, travel, rows, i, link, distance, way, phase, scratch)
+    waits = hold
+    if hold == HOLD_NONE:
+        waits = waits_inside(roads, travel, rows, i, link, distance, way, phase, scratch)
     if roads.links[link]["num_sweeps"] > 0:
-        stop = front + swept_stop(roads, rows, i, link, -front, hold != HOLD_NONE, scratch)
+        # Before the line or at its waiting position inside: it leaves room where it waits anyway.
+        stop = front + swept_stop(roads, rows, i, link, -front, waits != HOLD_NONE, scratch)
         if hold != HOLD_NONE:
             to_line = min(to_line, max(stop, 0.0))
         elif stop < math.inf:
@@ -171,9 +176,8 @@ def _at_line(
         return before_line(kind, speed, to_line, dt), hold, True
     if front > SEE_FOES_M and kind["model"] == MODEL_KRAUSS and is_minor(roads, link, phase):
         return before_line(kind, speed, front + LINE_MARGIN_M, dt), HOLD_NONE, False
-    waits = waits_inside(roads, travel, rows, i, link, distance, way, phase, scratch)
     if waits != HOLD_NONE:
-        to_wait = front + roads.links[link]["wait_m"]
+        to_wait = front + wait_place(roads, link, 0.5 * row["length"])
         return before_line(kind, speed, to_wait, dt), HOLD_NONE, False
     return no_press(kind), HOLD_NONE, False
 
@@ -230,7 +234,9 @@ def _road_ahead(
         press, hold = press_inside(
             roads, travel, rows, i, here["link"], place, row["way"], phase, dt, scratch
         )
-        swept = before_swept(roads, rows, i, kind, here["link"], -place - half, dt, scratch)
+        swept = before_swept(
+            roads, rows, i, kind, here["link"], -place - half, hold != HOLD_NONE, dt, scratch
+        )
         press = max(press, fork, swept)
     look = min(look_ahead_m(kind, speed), travel.view_m)
     see = min(see_line_m(kind, speed) + half, travel.see_m)

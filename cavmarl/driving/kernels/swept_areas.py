@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays, Scratch
 from cavmarl.core.records.codes import HOLD_NONE, MODEL_KRAUSS
-from cavmarl.core.records.rows import SIZE_LENGTHS_M
+from cavmarl.core.records.rows import SIZE_BODIES_M, SIZE_LENGTHS_M
 from cavmarl.driving.kernels.announcing import APPROACH_STANDING_M, STANDING_MPS
 from cavmarl.driving.kernels.following import before_line, behind, no_press
 
 VAN_M, BUS_M = SIZE_LENGTHS_M
+CAR_BODY_M, VAN_BODY_M, BUS_BODY_M = SIZE_BODIES_M
 EASY_STOP = 2.0  # m/s², of one that needs more to stop before the area it is said that it comes;
 HARD_STOP = 3.5  # one that needs more goes first
 SOON_M = 3.5  # one that is so near to the area may be in it at once
@@ -32,6 +33,13 @@ def _size(half: float) -> int:
     return int(2.0 * half > VAN_M) + int(2.0 * half > BUS_M)
 
 
+@inlined_kernel
+def _body_m(half: float, size: int) -> float:
+    """How long a vehicle counts as: areas end where a body of its class ends at the line."""
+    least = CAR_BODY_M if size == 0 else (VAN_BODY_M if size == 1 else BUS_BODY_M)
+    return float(max(2.0 * half, least))
+
+
 @kernel
 def swept_stop(
     roads: RoadArrays,
@@ -39,17 +47,18 @@ def swept_stop(
     i: int,  # the row that asks
     link: int,  # that it is on, or takes next
     place: float,  # of its front, m beyond its stop line
-    held: bool,  # whether it has to stop at that line anyway
+    held: bool,  # whether it has to stop at that line, or inside, anyway
     scratch: Scratch,
 ) -> float:
     """How far beyond the stop line row i's front may go, in m; inf where nothing is in the way."""
     row = rows[i]
     size = _size(0.5 * row["length"])
+    rear = place - _body_m(0.5 * row["length"], size)
     stop = math.inf
     first = roads.links[link]["first_sweep"]
     for k in range(first, first + roads.links[link]["num_sweeps"]):
         sweep = roads.sweeps[k]
-        if sweep["own"] != size or place - row["length"] > sweep["leave_m"]:
+        if sweep["own"] != size or rear > sweep["leave_m"]:
             continue
         for n in range(scratch.link_start[sweep["foe"]], scratch.link_end[sweep["foe"]]):
             foe = scratch.approach[n]
@@ -64,13 +73,30 @@ def swept_stop(
     return stop
 
 
+@kernel
+def wait_place(roads: RoadArrays, link: int, half: float) -> float:
+    """Where inside a junction a vehicle on `link` waits, in m beyond its stop line.
+
+    That is the map's waiting position, or before it where others of any size would sweep over it.
+    """
+    size = _size(half)
+    place = roads.links[link]["wait_m"]
+    first = roads.links[link]["first_sweep"]
+    for k in range(first, first + roads.links[link]["num_sweeps"]):
+        sweep = roads.sweeps[k]
+        if sweep["own"] == size and sweep["enter_m"] > 0.0:
+            place = min(place, sweep["enter_m"])
+    return float(place)
+
+
 @inlined_kernel
 def _is_in_the_way(
     rows: NDArray[np.void], row: np.void, foe: np.void, sweep: np.void, place: float, held: bool
 ) -> bool:
     """Whether a row whose front is at `place` has to wait for one APPROACH."""
     foe_place = foe["half"] - foe["dist"]
-    if foe_place - 2.0 * foe["half"] > sweep["foe_leave_m"] or row["wait_s"] > GIVE_UP_S:
+    foe_rear = foe_place - _body_m(foe["half"], sweep["other"])
+    if foe_rear > sweep["foe_leave_m"] or row["wait_s"] > GIVE_UP_S:
         return False
     inside = place > sweep["enter_m"]
     foe_inside = foe_place > sweep["foe_enter_m"]
@@ -115,13 +141,17 @@ def before_swept(
     kind: np.void,
     link: int,
     front: float,
+    held: bool,
     dt: float,
     scratch: Scratch,
 ) -> float:
-    """How a swept area presses row i, whose front is `front` m before the stop line of a link."""
+    """How a swept area presses row i, whose front is `front` m before the stop line of a link.
+
+    `held`: see `swept_stop`.
+    """
     if roads.links[link]["num_sweeps"] == 0:
         return no_press(kind)
-    stop = swept_stop(roads, rows, i, link, -front, False, scratch)
+    stop = swept_stop(roads, rows, i, link, -front, held, scratch)
     return (
         no_press(kind) if stop == math.inf else before_line_gently(kind, rows[i], stop + front, dt)
     )
