@@ -261,7 +261,9 @@ def _road_ahead(
             end = _lane_end(
                 roads, travel, row, kind, before, before_way, distance, merge_room_m, dt
             )
-            press = max(press, end)
+            # Who has left that lane by any link may still have its rear over the end.
+            leaving = behind_fork(roads, kind, row, before, -1, distance, scratch)
+            press = max(press, end, leaving)
             break
         stops = False
         if link >= 0 and distance < see:
