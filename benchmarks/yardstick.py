@@ -159,7 +159,7 @@ def drive(env: str, model: str, agents: int, seconds: int, seed: int) -> Drive:
     running = np.ones(vec.num_envs, dtype=np.bool_)
     step = 0
     while running.any():
-        before = [vec.simulation.vehicles(world).copy() for world in range(vec.num_envs)]
+        before = [vec.simulation.vehicles(w).copy() for w in range(vec.num_envs)]
         _, rewards, _, _, infos = vec.step(vec.suggest_actions())
         acted = infos["acted"] & running[:, None]
         over = infos["episode_over"] & running
@@ -174,9 +174,9 @@ def drive(env: str, model: str, agents: int, seconds: int, seed: int) -> Drive:
                     found.counts[what] += 1
                     found.faults.append(_fault(vec, what, trip, before, step))
         running &= ~over
-        for world, row in watch.look(np.flatnonzero(running).tolist()):
+        for number, row in watch.look(np.flatnonzero(running).tolist()):
             found.counts["stands"] += 1
-            found.faults.append(_place(vec, "stands", world, row, step))
+            found.faults.append(_place(vec, "stands", number, row, step))
     return found
 
 
@@ -213,7 +213,7 @@ class _Standing:
             if not long.size:
                 continue
             shown = signal_codes(self._vec.network, simulation.signal_phases(world))
-            for i in long:
+            for i in long.tolist():
                 key = (world, int(rows[i]["id"]))
                 if key not in self._told and not self._has_cause(rows, i, shown):
                     self._told.add(key)

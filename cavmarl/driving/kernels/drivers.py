@@ -44,6 +44,7 @@ from cavmarl.driving.kernels.swept_areas import (
     before_line_gently,
     before_swept,
     behind_fork,
+    room_m,
     swept_stop,
     wait_place,
 )
@@ -159,15 +160,15 @@ def _at_line(
     if to_line <= 0.0:
         # Its front is over the line: it does not wait there any more.
         press, hold = press_inside(roads, travel, rows, i, link, -distance, way, phase, dt, scratch)
-        swept = before_swept(roads, rows, i, kind, link, front, hold != HOLD_NONE, dt, scratch)
+        swept = before_swept(roads, rows, i, kind, link, front, hold, dt, scratch)
         return max(press, swept), hold, False
     hold = may_enter(roads, travel, rows, i, link, distance, way, phase, scratch)
-    waits = hold
+    waits = HOLD_NONE
     if hold == HOLD_NONE:
         waits = waits_inside(roads, travel, rows, i, link, distance, way, phase, scratch)
     if roads.links[link]["num_sweeps"] > 0:
-        # Before the line or at its waiting position inside: it leaves room where it waits anyway.
-        stop = front + swept_stop(roads, rows, i, link, -front, waits != HOLD_NONE, scratch)
+        room = room_m(hold, waits)
+        stop = front + swept_stop(roads, rows, i, link, -front, room, scratch)
         if hold != HOLD_NONE:
             to_line = min(to_line, max(stop, 0.0))
         elif stop < math.inf:
@@ -234,9 +235,7 @@ def _road_ahead(
         press, hold = press_inside(
             roads, travel, rows, i, here["link"], place, row["way"], phase, dt, scratch
         )
-        swept = before_swept(
-            roads, rows, i, kind, here["link"], -place - half, hold != HOLD_NONE, dt, scratch
-        )
+        swept = before_swept(roads, rows, i, kind, here["link"], -place - half, hold, dt, scratch)
         press = max(press, fork, swept)
     look = min(look_ahead_m(kind, speed), travel.view_m)
     see = min(see_line_m(kind, speed) + half, travel.see_m)

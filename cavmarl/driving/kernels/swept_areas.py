@@ -47,7 +47,8 @@ def swept_stop(
     i: int,  # the row that asks
     link: int,  # that it is on, or takes next
     place: float,  # of its front, m beyond its stop line
-    held: bool,  # whether it has to stop at that line, or inside, anyway
+    # it has to stop anyway, and leaves room for those that are so near to their lines, m; or -inf
+    room_m: float,
     scratch: Scratch,
 ) -> float:
     """How far beyond the stop line row i's front may go, in m; inf where nothing is in the way."""
@@ -64,13 +65,33 @@ def swept_stop(
             foe = scratch.approach[n]
             if foe["row"] == i or _size(foe["half"]) != sweep["other"]:
                 continue
-            if _is_in_the_way(rows, row, foe, sweep, place, held):
-                # One that is in the area, too, stops where it is. Behind one that stands, a driver
-                # waits before the junction: on it, the other might have to wait for it.
+            if _is_in_the_way(rows, row, foe, sweep, place, room_m):
+                # One that is in the area, too, stops where it is. Behind one that stands, or may
+                # have to for it, it waits before the junction: else neither could go on.
                 stop = min(stop, max(sweep["enter_m"], place))
-                if place <= 0.0 and foe["speed"] <= STANDING_MPS:
+                if place <= 0.0 and (
+                    foe["speed"] <= STANDING_MPS or _must_yield(roads, sweep["foe"], link)
+                ):
                     stop = min(stop, 0.0)
     return stop
+
+
+@kernel
+def _must_yield(roads: RoadArrays, link: int, other: int) -> bool:
+    """Whether vehicles on a link give way to those on another one."""
+    first = roads.links[link]["first_conflict"]
+    for c in range(first, first + roads.links[link]["num_conflicts"]):
+        if roads.conflicts[c]["foe"] == other:
+            return bool(roads.conflicts[c]["must_yield"])
+    return False
+
+
+@inlined_kernel
+def room_m(at_line: int, inside: int) -> float:
+    """For whom a vehicle leaves room that waits at its line or inside, see `swept_stop`."""
+    if at_line != HOLD_NONE:
+        return APPROACH_STANDING_M
+    return math.inf if inside != HOLD_NONE else -math.inf
 
 
 @kernel
@@ -91,7 +112,7 @@ def wait_place(roads: RoadArrays, link: int, half: float) -> float:
 
 @inlined_kernel
 def _is_in_the_way(
-    rows: NDArray[np.void], row: np.void, foe: np.void, sweep: np.void, place: float, held: bool
+    rows: NDArray[np.void], row: np.void, foe: np.void, sweep: np.void, place: float, room_m: float
 ) -> bool:
     """Whether a row whose front is at `place` has to wait for one APPROACH."""
     foe_place = foe["half"] - foe["dist"]
@@ -104,7 +125,7 @@ def _is_in_the_way(
         return True
     if inside and not foe_inside:
         return False
-    if held and not inside and foe_place > -APPROACH_STANDING_M:
+    if not inside and foe_place > -room_m:
         return True  # it loses nothing if it leaves room
     if rows[foe["row"]]["hold"] != HOLD_NONE:
         return False
@@ -141,17 +162,17 @@ def before_swept(
     kind: np.void,
     link: int,
     front: float,
-    held: bool,
+    hold: int,
     dt: float,
     scratch: Scratch,
 ) -> float:
     """How a swept area presses row i, whose front is `front` m before the stop line of a link.
 
-    `held`: see `swept_stop`.
+    `hold`: why it waits inside anyway, HOLD_*.
     """
     if roads.links[link]["num_sweeps"] == 0:
         return no_press(kind)
-    stop = swept_stop(roads, rows, i, link, -front, held, scratch)
+    stop = swept_stop(roads, rows, i, link, -front, room_m(HOLD_NONE, hold), scratch)
     return (
         no_press(kind) if stop == math.inf else before_line_gently(kind, rows[i], stop + front, dt)
     )

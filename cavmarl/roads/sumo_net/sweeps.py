@@ -112,7 +112,7 @@ def _find_pair(
 def _begin_m(link: np.void, enter_m: float) -> float:
     """Where the shared area of a conflict begins: a front at its waiting position is before it."""
     waits = enter_m >= link["wait_m"] - LINE_MARGIN_M
-    return float(max(enter_m, link["wait_m"] + WAIT_SLACK_M if waits else 0.0))
+    return float(max(enter_m, link["wait_m"] + WAIT_SLACK_M + STEP_M if waits else 0.0))
 
 
 def _find_behind(
