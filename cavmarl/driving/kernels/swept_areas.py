@@ -25,6 +25,7 @@ EASY_STOP = 2.0  # m/s², of one that needs more to stop before the area it is s
 HARD_STOP = 3.5  # one that needs more goes first
 SOON_M = 3.5  # one that is so near to the area may be in it at once
 LONG_FORK_M = 6.0  # how much further long vehicles need to be clear of one another at a fork
+WAIT_EARLIER_M = 3.0  # how much before the map's position a long vehicle waits inside, at most
 GIVE_UP_S = 60.0  # one that has stood so long goes on, whatever is in the area
 
 
@@ -98,14 +99,17 @@ def room_m(at_line: int, inside: int) -> float:
 def wait_place(roads: RoadArrays, link: int, half: float) -> float:
     """Where inside a junction a vehicle on `link` waits, in m beyond its stop line.
 
-    That is the map's waiting position, or before it where others of any size would sweep over it.
+    That is the map's waiting position. Long vehicles wait up to `WAIT_EARLIER_M` before it where
+    others would sweep over it: cars go back only where one comes, see `swept_stop`.
     """
     size = _size(half)
-    place = roads.links[link]["wait_m"]
+    wait_m = place = roads.links[link]["wait_m"]
+    if size == 0:
+        return float(wait_m)
     first = roads.links[link]["first_sweep"]
     for k in range(first, first + roads.links[link]["num_sweeps"]):
         sweep = roads.sweeps[k]
-        if sweep["own"] == size and sweep["enter_m"] > 0.0:
+        if sweep["own"] == size and sweep["enter_m"] > max(wait_m - WAIT_EARLIER_M, 0.0):
             place = min(place, sweep["enter_m"])
     return float(place)
 
