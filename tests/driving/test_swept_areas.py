@@ -9,7 +9,9 @@ import pytest
 
 from cavmarl.core.records.codes import HOLD_NONE, HOLD_SIGNAL, HOLD_YIELD
 from cavmarl.driving.kernels.approach import APPROACH
-from cavmarl.driving.kernels.swept_areas import room_m, swept_stop, wait_place
+from cavmarl.driving.kernels.following import behind, no_press
+from cavmarl.driving.kernels.swept_areas import behind_fork, room_m, swept_stop, wait_place
+from cavmarl.driving.vehicle_types import generated_types
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network
 from tests.support.demand_worlds import make
@@ -155,3 +157,24 @@ def test_nothing_touches_buses_that_turn(path: Path, tmp_path: Path) -> None:
     stats = world.traffic_stats()
     assert not touched
     assert stats.arrived > 40
+
+
+def test_a_rear_over_the_end_of_a_lane_counts_for_one_that_has_to_leave_the_lane(
+    network: RoadNetwork,
+) -> None:
+    """Whichever way a bus has gone: its rear stands on the lane, where a follower must stop."""
+    link = int(np.flatnonzero(network.links["num_sweeps"] > 0)[0])
+    lane = int(network.links[link]["from_lane"])
+    length_m = float(network.lanes[lane]["length_m"])
+    rows = on_lane(network, lane, length_m - 20.0, id=1, speed=5.0, length=CAR_M)
+    room = scratch(network, 2)
+    entry = np.zeros(1, APPROACH)
+    entry["link"], entry["row"], entry["id"], entry["half"] = link, 1, 2, 0.5 * BUS_M
+    entry["dist"] = -1.0
+    room.approach[0] = entry[0]
+    room.link_start[link], room.link_end[link] = 0, 1
+    kind = generated_types()[0]
+    press = behind_fork(network.arrays, kind, rows[0], lane, -1, 20.0, room)
+    assert press == behind(kind, 5.0, 20.0 + 1.0 - 2.5 - 6.0, 0.0, kind["decel"])
+    room.approach[0]["dist"] = -0.5 * BUS_M - 40.0  # its rear has left
+    assert behind_fork(network.arrays, kind, rows[0], lane, -1, 20.0, room) == no_press(kind)
