@@ -8,6 +8,7 @@ VENV_PACKAGE := { test "$$(id -u)" = 0 && apt-get update && apt-get install --ye
 OLDEST := .venv-oldest
 LIBRARIES := .venv-libraries
 TOOLS := .venv-tools
+SITE := .venv-docs
 # What old versions of others will no longer do is no news; the rest stays an error.
 OLDEST_WARNINGS := -W default::DeprecationWarning -W default::PendingDeprecationWarning
 OLDEST_TESTS := tests/core tests/driving tests/engine tests/handoff tests/rewards tests/roads tests/sensors \
@@ -25,7 +26,7 @@ FUZZ_TARGETS ?= network programs buildings map cached zones demand sumocfg entry
 # Tests start many processes: none is to parse the sources anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help demo test quick ray check bench bounds soak model fuzz oldest libraries maps lock sbom audit pictures clean
+.PHONY: help demo test quick ray check bench bounds soak model fuzz oldest libraries maps rules lock sbom audit pictures docs clean
 .DEFAULT_GOAL := help
 
 help: ## say what there is
@@ -90,6 +91,9 @@ maps: $(READY) ## make the maps of all entries anew from the options beside them
 	    sed --in-place '2,/^-->$$/d' $$name && \
 	    { test $$folder != envs/cities/map || gzip --force --best --no-name $$name; }) || exit 1; done
 
+rules: $(READY) $(TOOLS)/.ready ## ask ASAM's checker whether exported OpenDRIVE keeps its rules
+	$(BIN)/pytest tests/maps/exports/test_opendrive_rules.py
+
 lock: $(READY) ## write constraints-hashes.txt: each file of an installation with its hash
 	$(BIN)/python -m docs.supply_chain lock
 
@@ -105,8 +109,11 @@ pictures: $(READY) ## draw the pictures of the README, the cards and the pages a
 	$(BIN)/python -m docs.pictures.sensor_pictures docs/images
 	$(BIN)/python -m docs.pictures.moving docs/images
 
+docs: $(SITE)/.ready ## build the site of all pages into dist/site
+	NO_MKDOCS_2_WARNING=1 $(SITE)/bin/mkdocs build --clean
+
 clean: ## remove .venv, builds and caches; runs/ stays
-	rm -rf .venv $(OLDEST) $(LIBRARIES) $(TOOLS) fuzz/corpus build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf .venv $(OLDEST) $(LIBRARIES) $(TOOLS) $(SITE) fuzz/corpus build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find cavmarl agents benchmarks train tests -name __pycache__ -prune -exec rm -rf {} +
 
 # torch comes first and alone, so that a CPU build that pip is told of (PIP_EXTRA_INDEX_URL,
@@ -123,7 +130,12 @@ $(READY): pyproject.toml constraints.txt
 
 $(TOOLS)/.ready:
 	"$(PYTHON)" -m venv --clear $(TOOLS)
-	$(TOOLS)/bin/python -m pip install --quiet cyclonedx-bom pip-audit
+	$(TOOLS)/bin/python -m pip install --quiet cyclonedx-bom pip-audit asam-qc-opendrive
+	@touch $@
+
+$(SITE)/.ready: docs/requirements.txt
+	"$(PYTHON)" -m venv --clear $(SITE)
+	$(SITE)/bin/python -m pip install --quiet --requirement docs/requirements.txt
 	@touch $@
 
 $(OLDEST)/.ready: pyproject.toml constraints-oldest.txt

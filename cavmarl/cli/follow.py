@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Any
 
 from rich.console import Console
@@ -22,6 +23,9 @@ def follow(
     stage: Annotated[
         list[str] | None, about("A stage of the stack to replace.", metavar="STAGE=NAME")
     ] = None,
+    cloud: Annotated[
+        Path | None, about("A point-cloud map, for localisation=scan_matching.", exists=True)
+    ] = None,
     joins_s: Annotated[float, about("Seconds that the world may take to answer.")] = 60.0,
     secret_file: SecretFile = None,
     json_path: JsonPath = None,
@@ -33,7 +37,7 @@ def follow(
     from cavmarl.cosim.stack.stack import STAGES, StackConfig
     from cavmarl.engine.world_setup import load_roads
 
-    config = StackConfig(**_stages(stage or [], tuple(STAGES)))
+    config = StackConfig(**_stages(stage or [], tuple(STAGES)), cloud=cloud)
     network = load_roads(*load_config(env))
     steps = 0
     secret = read_secret(secret_file)

@@ -78,7 +78,7 @@ def lead(
         float | None, about("Simulated seconds a second; default: as fast as possible.")
     ] = None,
     rig: Annotated[
-        Literal["none", "reference"],
+        Literal["none", "reference", "camera"],
         about("Mount the sensors that the reference stack drives with."),
     ] = "none",
     zones: Annotated[int | None, about("Shadows zones.count.")] = None,
@@ -87,7 +87,7 @@ def lead(
 ) -> None:
     """Run a world as its time master; followers that join over a socket drive its agents."""
     from cavmarl.cosim.followers.followed_world import FollowedWorld
-    from cavmarl.cosim.stack.stack import REFERENCE_RIG
+    from cavmarl.cosim.stack.stack import RIGS
     from cavmarl.cosim.time_master import RealTime
     from cavmarl.env.parallel import parallel_env
 
@@ -95,8 +95,8 @@ def lead(
         raise ConfigError("--followers must be 0 or more, --steps 1 or more")
     console = Console()
     pacer = None if pace is None else RealTime(pace)
-    if rig == "reference":
-        given = {"clock.ctrl_dt_s": 0.05, "rig": REFERENCE_RIG, **world.overrides}
+    if rig in RIGS:
+        given = {"clock.ctrl_dt_s": 0.05, "rig": RIGS[rig], **world.overrides}
         world = replace(world, overrides=given)
     made = parallel_env(world.env, zones=zones, workers=workers, **world.keywords)
     with (

@@ -211,7 +211,18 @@ class LocalWorlds:
             simulation.goal_edges[simulation.network.lanes["map"][rows["lane"]], rows["goal"]],
             rows["speed"].astype(np.float64),
         )
-        return [Driven(*row) for row in zip(*(column.tolist() for column in columns), strict=True)]
+        found = [Driven(*row) for row in zip(*(each.tolist() for each in columns), strict=True)]
+        return [row._replace(heard=self._heard(world, row.agent)) for row in found]
+
+    def _heard(self, world: int, agent: int) -> list[list[int]] | None:
+        """See `Driven.heard`."""
+        if not self.world.config.v2x.enabled:
+            return None
+        reports = self.simulation.messages.mail.signals[world, agent]
+        reports = reports[reports["sender"] >= 0]
+        age = self.ticks()[world] - reports["tick"]
+        heard = np.stack([reports["subject"], reports["code"], age], axis=1)
+        return [list(map(int, row)) for row in heard.tolist()]
 
     def signal_phases(self, world: int) -> NDArray[np.int32]:
         """(num_signals,) PHASE rows that are on in one world; a view."""

@@ -100,6 +100,9 @@ class Driven(NamedTuple):
     width_m: float  # of its body
     goal_edge: int  # EDGE row of where it is to go
     speed_mps: float
+    # SPAT that it has received of each signal: SIGNAL row, PHASE row, ticks since it was sent;
+    # None: there are no messages
+    heard: list[list[int]] | None = None
 
 
 class SteppedWorlds(Protocol):

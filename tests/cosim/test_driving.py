@@ -58,4 +58,4 @@ def test_a_process_drives_through_town_from_its_sensors_alone(tmp_path: Path) ->
     assert told["traffic"]["arrived"] >= 1
     assert told["barrier"][0]["answers"] == told["steps"]
     stages = json.loads(Path(followed).read_text())["stages"]
-    assert set(stages) == {"perception", "localisation", "planning", "control"}
+    assert set(stages) == {"perception", "localisation", "signals", "planning", "control"}

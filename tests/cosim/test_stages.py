@@ -275,7 +275,9 @@ def test_echoes_become_an_object_with_a_velocity(grid: HdMap) -> None:
 
 
 def test_stages_are_chosen_by_name() -> None:
-    with pytest.raises(ConfigError, match="perception = 'radar': must be lidar or blind"):
+    with pytest.raises(
+        ConfigError, match="perception = 'radar': must be lidar or lidar_camera or blind"
+    ):
         StackConfig(perception="radar")
     assert StackConfig(perception="blind").planning == "lane_route"
 

@@ -135,3 +135,18 @@ def test_no_path_of_a_real_map_runs_backwards(built_map: Callable[[str], Path], 
 @pytest.mark.parametrize("name", ["bologna_acosta/acosta_buslanes", "mcity/mcity", "Town10HD"])
 def test_no_path_of_a_city_runs_backwards(shared_maps: Path, name: str) -> None:
     _check_forward(read_network(shared_maps / "net" / f"{name}.net.xml"))
+
+
+def test_a_path_drawn_anew_has_an_even_grade() -> None:
+    shapes = [
+        _line((0.0, 0.0), (50.0, 0.0)),
+        _line((49.0, 0.1), (50.0, 40.0)),
+        _line((50.0, 0.0), (49.0, 0.1)),
+    ]
+    shapes[1][:, 2] = 0.5
+    shapes[2][-1, 2] = 0.5
+    mend_backward_paths(shapes, [Way(0, (2,), 1)])
+    step = np.diff(shapes[2], axis=0)
+    grade = step[:, 2] / np.hypot(step[:, 0], step[:, 1])
+    assert grade == pytest.approx(np.full(len(grade), grade[0]), rel=1e-6)
+    assert shapes[2][[0, -1], 2].tolist() == [0.0, 0.5]

@@ -44,9 +44,9 @@ class StackDriver:
         self._edges = {name: row for row, name in enumerate(network.edge_ids)}
         sensors = [sensor_of(view.name, view.settings) for view in welcome.sensors]
         step_s = welcome.dt_s * welcome.ticks_per_step
-        self._vehicle = vehicle_of(HdMap(network), sensors, step_s)
-        self._scale = (welcome.acceleration_mps2, welcome.steering_rad)
         self._config = StackConfig() if config is None else config
+        self._vehicle = vehicle_of(HdMap(network), sensors, step_s, self._config.cloud)
+        self._scale = (welcome.acceleration_mps2, welcome.steering_rad)
         self._driven: dict[str, tuple[int, int]] = {}
         self.stacks: dict[str, Stack] = {}
         Stack(self._vehicle, self._config)  # to know now what it lacks

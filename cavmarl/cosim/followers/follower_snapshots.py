@@ -16,6 +16,7 @@ from cavmarl.cosim.followers.follower_messages import (
     VehicleView,
     Welcome,
 )
+from cavmarl.cosim.stack.signal_reading import SPAT
 from cavmarl.env.parallel import CavEnv
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.parallel.step_arrays import Driven
@@ -81,6 +82,11 @@ def take_snapshot(
             for sensor, seen in _due(env, world, k, time_s).items():
                 data = np.ascontiguousarray(seen.data)
                 views.append(_array(name, sensor, data, seen.stamp_s, seen.lost))
+                arrays.append(data)
+            heard = by_agent[k].heard
+            if heard is not None:
+                data = np.array(heard, dtype=np.int32).reshape(1, -1, 3)
+                views.append(_array(name, SPAT, data, np.array([time_s]), np.zeros(1, np.bool_)))
                 arrays.append(data)
         shown = _signals(env, world)
         views.append(_array("", "signals", shown, np.array([time_s]), np.zeros(1, np.bool_)))

@@ -20,6 +20,7 @@ from cavmarl.cosim.stack.stack_types import EgoPose, Obstacle, Readings, StackSe
 
 _GAP_M = 0.8
 _ROAD_M = 2.5  # from the centre of a lane
+_BESIDE_ROAD_M = 6.0  # the same, for pedestrians: they may step onto it
 _RANGE_MARGIN_M = 0.05
 _MATCH_M = 3.0  # between an object and where it was expected
 _ALPHA, _BETA = 0.5, 0.2
@@ -38,6 +39,7 @@ class _Track:
     vy_mps: float
     seen_s: float
     times: int
+    kind: str
 
 
 class LidarObjects:
@@ -61,16 +63,26 @@ class LidarObjects:
                 scan = np.asarray(samples.values[~samples.lost][-1], dtype=np.float64)
                 echoes.extend(_groups(lidar, scan, pose))
         if echoes:
+            self._look(readings, pose)
             boxes = [box for group in echoes if (box := self._box(group, pose)) is not None]
             self._last = [self._follow(box, time_s) for box in boxes]
             self._tracks = [track for track in self._tracks if time_s - track.seen_s < _FORGET_S]
         return self._last
 
+    def _look(self, readings: Readings, pose: EgoPose) -> None:
+        """Take in what other sensors have before objects are told apart."""
+
+    def _kind(self, group: NDArray[np.float64]) -> str:
+        """What echoes (n, 2) belong to: by a lidar alone it is not known."""
+        return "unknown"
+
     def _box(self, group: NDArray[np.float64], pose: EgoPose) -> Obstacle | None:
         """The box around echoes (n, 2), along the lane that they are on; None: off the road."""
         x_m, y_m = group.mean(axis=0).tolist()
-        lanes = self._map.near(x_m, y_m, _ROAD_M)
-        if not lanes:
+        kind = self._kind(group)
+        beside_m = _BESIDE_ROAD_M if kind == "pedestrian" else _ROAD_M
+        lanes = self._map.near(x_m, y_m, beside_m)
+        if not lanes or kind == "building":
             return None
         heading = _along(lanes, pose)
         cos, sin = math.cos(heading), math.sin(heading)
@@ -85,6 +97,7 @@ class LidarObjects:
             float(np.ptp(across)),
             0.0,
             0.0,
+            kind,
         )
 
     def _follow(self, box: Obstacle, time_s: float) -> Obstacle:
@@ -101,7 +114,7 @@ class LidarObjects:
             if off < nearest:
                 best, nearest = track, off
         if best is None:
-            self._tracks.append(_Track(box.x_m, box.y_m, 0.0, 0.0, time_s, 1))
+            self._tracks.append(_Track(box.x_m, box.y_m, 0.0, 0.0, time_s, 1, box.kind))
             return box
         elapsed = time_s - best.seen_s
         for axis, speed, seen in (("x_m", "vx_mps", box.x_m), ("y_m", "vy_mps", box.y_m)):
@@ -112,6 +125,9 @@ class LidarObjects:
             setattr(best, axis, expected + _ALPHA * surprise)
             setattr(best, speed, getattr(best, speed) + beta * surprise / elapsed)
         best.seen_s, best.times = time_s, best.times + 1
+        if box.kind != "unknown":
+            best.kind = box.kind
+        box = box._replace(kind=best.kind)
         speed_mps = math.hypot(best.vx_mps, best.vy_mps)
         if best.times < _FEW or speed_mps < _STILL_MPS:
             return box

@@ -35,6 +35,8 @@ _EXPECTED_M = 1.5  # by which a lane on the way is preferred
 _ACCEL, _DECEL, _HEADWAY_S, _GAP_M = 1.5, 2.5, 1.4, 2.0
 _HARDEST = 6.0
 _BESIDE_M = 0.3  # that is left to a body beside the way
+_BESIDE_WALKER_M = 0.8  # the same, of a pedestrian
+_WALK_S = 3.0  # that a pedestrian is taken to walk on
 _BEND_MPS2 = 2.0  # sideways, in a bend
 _BRAKE_FOR_YELLOW = 3.0
 _CLEAR_S = 4.0  # that vehicles that go first are away from where the ways meet
@@ -175,12 +177,19 @@ class LaneRoute:
         for obstacle in obstacles:
             s, d, cos, sin = _beside(points, obstacle.x_m, obstacle.y_m)
             half_width = 0.5 * max(obstacle.width_m, 0.5)
-            free = 0.5 * mission.width_m + half_width + _BESIDE_M
-            if s <= 0.0 or abs(d) > free:
+            on_foot = obstacle.kind == "pedestrian"
+            free = 0.5 * mission.width_m + half_width + (_BESIDE_WALKER_M if on_foot else _BESIDE_M)
+            least = abs(d)
+            if on_foot:  # where it will be when we are there
+                aside = obstacle.vy_mps * cos - obstacle.vx_mps * sin
+                soon = d + aside * min(s / max(pose.speed_mps, 1.0), _WALK_S)
+                least = 0.0 if d * soon < 0.0 else min(least, abs(soon))
+            if s <= 0.0 or least > free:
                 continue
             gap = s - 0.5 * obstacle.length_m - 0.5 * mission.length_m
             speed = max(0.0, obstacle.vx_mps * cos + obstacle.vy_mps * sin)
-            found.append(_Limit(_behind(pose.speed_mps, speed, gap), "gap"))
+            limit = _behind(pose.speed_mps, 0.0 if on_foot else speed, gap)
+            found.append(_Limit(limit, "pedestrian" if on_foot else "gap"))
         return found
 
     def _lines(

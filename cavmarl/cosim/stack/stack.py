@@ -13,6 +13,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,10 +21,12 @@ from numpy.typing import NDArray
 
 from cavmarl.config.rig import GnssConfig
 from cavmarl.core.errors import ConfigError
+from cavmarl.cosim.stack.camera_classes import LidarCamera
 from cavmarl.cosim.stack.hd_map import HdMap, wrap
 from cavmarl.cosim.stack.localisation import GnssInertial
 from cavmarl.cosim.stack.perception import LidarObjects
 from cavmarl.cosim.stack.route_planning import LaneRoute
+from cavmarl.cosim.stack.signal_reading import SpatSignals, ToldSignals
 from cavmarl.cosim.stack.stack_types import (
     Control2D,
     ControlStage,
@@ -34,6 +37,7 @@ from cavmarl.cosim.stack.stack_types import (
     Perception,
     Planning,
     Readings,
+    SignalReading,
     StackMount,
     StackSensor,
     Trajectory,
@@ -119,6 +123,13 @@ REFERENCE_RIG: dict[str, dict[str, Any]] = {
 }
 
 
+# For `perception=lidar_camera`.
+CAMERA_RIG = REFERENCE_RIG | {
+    "eyes": {"type": "semantic_camera", "rate_hz": 10, "x_m": 0.6, "z_m": 1.4, "range_m": 60.0}
+}
+RIGS = {"reference": REFERENCE_RIG, "camera": CAMERA_RIG}
+
+
 class Vehicle(NamedTuple):
     """What a stage may know of the vehicle that it is made for."""
 
@@ -126,6 +137,7 @@ class Vehicle(NamedTuple):
     sensors: Sequence[StackSensor]  # that are mounted
     geodesy: Geodesy | None  # where the map is on the earth; None: there is no GNSS
     tick_s: float
+    cloud: Path | None = None  # a point-cloud map, in the frame of the map
 
 
 class Blind:
@@ -135,22 +147,39 @@ class Blind:
         return []
 
 
-def _localisation(vehicle: Vehicle) -> Localisation:
+def _geodesy(vehicle: Vehicle) -> Geodesy:
     if vehicle.geodesy is None:
         raise ConfigError(
-            "localisation = gnss_imu: there is no gnss among the sensors; mount one under `rig`, "
+            "localisation: there is no gnss among the sensors; mount one under `rig`, "
             "as {gnss: {type: gnss, rate_hz: 10}}"
         )
-    return GnssInertial(vehicle.sensors, vehicle.geodesy, vehicle.hd_map, vehicle.tick_s)
+    return vehicle.geodesy
+
+
+def _gnss_imu(vehicle: Vehicle) -> Localisation:
+    geodesy = _geodesy(vehicle)
+    return GnssInertial(vehicle.sensors, geodesy, vehicle.hd_map, vehicle.tick_s)
+
+
+def _scan_matching(vehicle: Vehicle) -> Localisation:
+    from cavmarl.cosim.stack.scan_matching import ScanMatching  # needs the extra `clouds`
+
+    geodesy = _geodesy(vehicle)
+    return ScanMatching(vehicle.sensors, geodesy, vehicle.hd_map, vehicle.tick_s, vehicle.cloud)
 
 
 # Stage → name → how it is made. A stage of one's own is one more entry.
 STAGES: dict[str, dict[str, Callable[[Vehicle], Any]]] = {
     "perception": {
         "lidar": lambda vehicle: LidarObjects(vehicle.sensors, vehicle.hd_map),
+        "lidar_camera": lambda vehicle: LidarCamera(vehicle.sensors, vehicle.hd_map),
         "blind": lambda vehicle: Blind(),
     },
-    "localisation": {"gnss_imu": _localisation},
+    "localisation": {"gnss_imu": _gnss_imu, "scan_matching": _scan_matching},
+    "signals": {
+        "told": lambda vehicle: ToldSignals(),
+        "spat": lambda vehicle: SpatSignals(vehicle.hd_map),
+    },
     "planning": {"lane_route": lambda vehicle: LaneRoute(vehicle.hd_map)},
     "control": {"pure_pursuit": lambda vehicle: PurePursuit(vehicle.tick_s)},
 }
@@ -160,10 +189,12 @@ STAGES: dict[str, dict[str, Callable[[Vehicle], Any]]] = {
 class StackConfig:
     """Which stages a stack is made of."""
 
-    perception: str = "lidar"  # `lidar`, or `blind`
-    localisation: str = "gnss_imu"  # `gnss_imu`
+    perception: str = "lidar"  # `lidar`, `lidar_camera`, or `blind`
+    localisation: str = "gnss_imu"  # `gnss_imu`, or `scan_matching` against `cloud`
+    signals: str = "told"  # by the world; or `spat`, by what roadside units send
     planning: str = "lane_route"  # `lane_route`
     control: str = "pure_pursuit"  # `pure_pursuit`
+    cloud: Path | None = None  # a point-cloud map
 
     def __post_init__(self) -> None:
         for stage, known in STAGES.items():
@@ -204,6 +235,7 @@ class Stack:
         made = {name: known[getattr(chosen, name)](vehicle) for name, known in STAGES.items()}
         self._perception: Perception = made["perception"]
         self._localisation: Localisation = made["localisation"]
+        self._signals: SignalReading = made["signals"]
         self._planning: Planning = made["planning"]
         self._control: ControlStage = made["control"]
         self.times = StageTimes()
@@ -220,8 +252,8 @@ class Stack:
     ) -> Control2D:
         """One step of all stages; without a pose the vehicle brakes.
 
-        `readings`: what the sensors have that is due. `signals`: what signals show; see
-        `Planning.plan`. `time_s`: simulated.
+        `readings`: what the sensors have that is due. `signals`: what the world says of signals;
+        see `SignalReading`. `time_s`: simulated.
         """
         self.times.steps += 1
         pose = self.pose = self._timed(
@@ -233,8 +265,9 @@ class Stack:
         self.obstacles = self._timed(
             "perception", self._perception.perceive, readings, pose, time_s
         )
+        shown = self._timed("signals", self._signals.read, readings, signals)
         trajectory = self._timed(
-            "planning", self._planning.plan, pose, self.obstacles, signals, mission
+            "planning", self._planning.plan, pose, self.obstacles, shown, mission
         )
         self.reason = trajectory.reason
         driven: Control2D = self._timed("control", self._control.control, pose, trajectory, mission)
@@ -253,10 +286,12 @@ def sensor_of(name: str, settings: Mapping[str, Any]) -> StackSensor:
     return StackSensor(name, settings["type"], mount, settings)
 
 
-def vehicle_of(hd_map: HdMap, sensors: Sequence[StackSensor], tick_s: float) -> Vehicle:
+def vehicle_of(
+    hd_map: HdMap, sensors: Sequence[StackSensor], tick_s: float, cloud: Path | None = None
+) -> Vehicle:
     """What stages may know.
 
-    `sensors`: that are mounted.
+    `sensors`: that are mounted. `cloud`: a point-cloud map.
 
     Raises MissingExtraError: the map is projected, and pyproj is not installed; MapError: its
     projection is unknown.
@@ -267,4 +302,4 @@ def vehicle_of(hd_map: HdMap, sensors: Sequence[StackSensor], tick_s: float) -> 
         names = ("rate_hz", "origin_lat_deg", "origin_lon_deg", "origin_height_m")
         config = GnssConfig(**{name: gnss[0].settings[name] for name in names})
         geodesy = geodesy_of(hd_map.network, config)
-    return Vehicle(hd_map, sensors, geodesy, tick_s)
+    return Vehicle(hd_map, sensors, geodesy, tick_s, cloud)

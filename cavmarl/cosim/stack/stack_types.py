@@ -65,6 +65,7 @@ class Obstacle(NamedTuple):
     width_m: float
     vx_mps: float
     vy_mps: float
+    kind: str = "unknown"  # or `vehicle`, `cyclist`, `pedestrian`, where a camera tells
 
 
 class Mission(NamedTuple):
@@ -89,7 +90,8 @@ class Trajectory:
 
     points: NDArray[np.float64]  # (n, 2) the way ahead, from beside the vehicle on; at least two
     accel_mps2: float  # along it, now
-    reason: str = "free"  # what that is for: `free`, `gap`, `stop_line`, `yield` or `end`
+    # what that is for: `free`, `gap`, `pedestrian`, `stop_line`, `yield` or `end`
+    reason: str = "free"
     lanes: Sequence[int] = field(default_factory=tuple)
 
 
@@ -107,6 +109,14 @@ class Localisation(Protocol):
         ...
 
     def reset_pose(self, pose: EgoPose) -> None: ...
+
+
+class SignalReading(Protocol):
+    """Messages, or what the world says → what signals show."""
+
+    def read(self, readings: Readings, told: NDArray[np.uint8] | None) -> NDArray[np.uint8] | None:
+        """(num_links,) SIGNAL_* codes, 255: none; None: unknown."""
+        ...
 
 
 class Planning(Protocol):

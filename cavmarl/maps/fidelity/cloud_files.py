@@ -75,6 +75,25 @@ def read_cloud(path: Path) -> Cloud:
     return cloud
 
 
+def write_cloud(path: Path, cloud: Cloud) -> None:
+    """Places as csv or ply, as `read_cloud` reads them.
+
+    Raises MapError: another ending, or the file cannot be written.
+    """
+    if path.suffix.lower() not in (".csv", ".ply"):
+        raise MapError(f"{path}: clouds are written as .csv or .ply")
+    try:
+        if path.suffix.lower() == ".csv":
+            head = "x,y,z"
+            np.savetxt(path, cloud.points, "%.4f", delimiter=",", header=head, comments="")
+            return
+        head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(cloud.points)}\n"
+        head += "".join(f"property double {axis}\n" for axis in "xyz") + "end_header\n"
+        path.write_bytes(head.encode() + cloud.points.astype("<f8").tobytes())
+    except OSError as error:
+        raise MapError(f"{path}: cannot be written ({error.strerror or error})") from error
+
+
 def _known() -> str:
     return f"give a point cloud ({', '.join(CLOUD_ENDINGS)})"
 

@@ -10,6 +10,7 @@ from cavmarl.core.errors import ConfigError, MapError, require
 from cavmarl.maps.fidelity.cloud_files import Cloud
 
 NEIGHBOURS = 8
+_SWAPPED = 0.4  # of the points that lie on the map only if x and y are swapped
 _VOXEL_BITS = 20  # of a voxel's number on an axis, and its sign
 
 
@@ -59,13 +60,14 @@ def neighbour_distances(points: Any, number: int, threads: int = 2) -> Any:
 def crop(cloud: Cloud, box_m: tuple[float, float, float, float], margin_m: float) -> Cloud:
     """What lies within a box of the plane, and so much around it.
 
-    Raises MapError: nothing does.
+    Raises MapError: nothing does, or much more would with x and y swapped.
     """
     low = np.array(box_m[:2]) - margin_m
     high = np.array(box_m[2:]) + margin_m
     plane = cloud.points[:, :2]
     inside = ((plane >= low) & (plane <= high)).all(axis=1)
-    if not inside.any():
+    swapped = ((plane[:, ::-1] >= low) & (plane[:, ::-1] <= high)).all(axis=1)
+    if not inside.any() or swapped.mean() > inside.mean() + _SWAPPED:
         raise _elsewhere(cloud, low, high)
     return cloud.kept(cloud.points[inside], "off the map")
 

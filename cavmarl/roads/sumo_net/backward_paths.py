@@ -139,11 +139,13 @@ def _curve(before: Shape, after: Shape) -> Shape:
     # The handles that make the curve an arc of a circle where both ends lie on one.
     handle = chord * 2.0 / (3.0 * (1.0 + np.sqrt(max(0.5 * (1.0 + cos_turn), 0.0))))
     nodes = np.stack([start, start + handle * leaves, end - handle * arrives, end])
-    nodes[1:3, 2] = start[2] + (end[2] - start[2]) * np.array([1.0, 2.0]) / 3.0
     number = int(np.clip(np.ceil(chord / CURVE_M), 8, MOST_POINTS))
     t = np.linspace(0.0, 1.0, number + 1)[:, None]
     basis = np.hstack([(1 - t) ** 3, 3 * t * (1 - t) ** 2, 3 * t * t * (1 - t), t**3])
-    return _clean(basis @ nodes)
+    curve = basis @ nodes
+    s = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(curve[:, :2], axis=0).T))])
+    curve[:, 2] = start[2] + (end[2] - start[2]) * s / max(s[-1], SAME_POINT_M)  # an even grade
+    return _clean(curve)
 
 
 def _direction(pair: Shape) -> NDArray[np.float64]:

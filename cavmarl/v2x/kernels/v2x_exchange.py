@@ -85,7 +85,8 @@ def _take_others(
                 continue
             for k in range(packet["first"], packet["first"] + packet["count"]):
                 report = reports[k]
-                if report["subject"] == me["id"]:
+                # Of a SPAT the subject is a signal, and no vehicle.
+                if kind != KIND_SPAT and report["subject"] == me["id"]:
                     continue
                 place = find(box, num, report["subject"])
                 if place < 0 and new:

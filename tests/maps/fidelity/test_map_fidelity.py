@@ -10,9 +10,9 @@ import pytest
 from typer.testing import CliRunner
 
 from cavmarl.cli import app
-from cavmarl.core.errors import CavmarlError
+from cavmarl.core.errors import CavmarlError, MapError
 from cavmarl.engine.world_setup import find_map
-from cavmarl.maps.fidelity.cloud_files import read_cloud
+from cavmarl.maps.fidelity.cloud_files import Cloud, read_cloud
 from cavmarl.maps.fidelity.cloud_registration import moved, nearest_distances
 from cavmarl.maps.fidelity.map_surface import map_surface
 from cavmarl.maps.fidelity.road_edges import fit_roads
@@ -100,3 +100,16 @@ def test_what_cannot_be_compared_is_refused(tmp_path: Path) -> None:
     code, said = run(far, far, "--align", "edges")
     assert code == 2
     assert "no roads" in said
+
+
+def test_a_cloud_that_lies_on_the_map_only_if_swapped_is_refused() -> None:
+    from cavmarl.maps.fidelity.cloud_filters import crop
+
+    random = np.random.default_rng(0)
+    places = np.column_stack([random.uniform(0, 900, 500), random.uniform(0, 90, 500)])
+    cloud = Cloud("measured", np.column_stack([places, np.zeros(500)]))
+    box = (0.0, 0.0, 900.0, 90.0)
+    assert len(crop(cloud, box, 1.0).points) == 500
+    turned = Cloud("measured", cloud.points[:, [1, 0, 2]])
+    with pytest.raises(MapError, match="--frame swapped"):
+        crop(turned, box, 1.0)

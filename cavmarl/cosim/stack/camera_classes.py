@@ -1,0 +1,116 @@
+"""Perception by lidar and camera: what a lidar groups to objects, a camera's classes name.
+
+Echoes of an object are projected into the newest picture of each camera that shows classes, at
+three heights of a body; the class that most of these pixels have is the object's (late fusion, as
+in Vora et al.: "PointPainting", CVPR 2020, with a picture that is segmented already).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import ConfigError
+from cavmarl.cosim.stack.hd_map import HdMap
+from cavmarl.cosim.stack.perception import LidarObjects
+from cavmarl.cosim.stack.stack_types import EgoPose, Readings, StackSensor
+from cavmarl.sensors.kernels.panorama import SEMANTIC_NAMES
+from cavmarl.sensors.kernels.rig_frames import rotation
+
+_HEIGHTS_M = (0.3, 0.7, 1.1)  # of a body, above the ground
+_NEAREST_M = 0.5  # before the camera
+_KINDS = {
+    "building": "building",
+    "car": "vehicle",
+    "truck": "vehicle",
+    "bus": "vehicle",
+    "tram": "vehicle",
+    "motorcycle": "vehicle",
+    "bicycle": "cyclist",
+    "pedestrian": "pedestrian",
+}
+KIND_OF_CLASS = tuple(_KINDS.get(name, "") for name in SEMANTIC_NAMES)
+
+
+class _Eye(NamedTuple):
+    """A camera: where it is on its vehicle, and its focal length in pixels."""
+
+    sensor: StackSensor
+    turn: NDArray[np.float64]
+    place_m: NDArray[np.float64]
+    focal_px: float
+
+
+class LidarCamera(LidarObjects):
+    """The stage.
+
+    `sensors`: of the vehicle: lidars, and semantic cameras, one at least.
+
+    Raises ConfigError: there is no such camera.
+    """
+
+    def __init__(self, sensors: Sequence[StackSensor], hd_map: HdMap) -> None:
+        super().__init__(sensors, hd_map)
+        self._eyes = [_eye(sensor) for sensor in sensors if sensor.type == "semantic_camera"]
+        if not self._eyes:
+            raise ConfigError(
+                "perception = lidar_camera: there is no semantic_camera among the sensors; mount "
+                "one under `rig`, as {eyes: {type: semantic_camera, rate_hz: 10, z_m: 1.4}}"
+            )
+        self._pictures: dict[str, NDArray[np.uint8]] = {}
+        self._pose = EgoPose(0.0, 0.0, 0.0, 0.0)
+
+    def _look(self, readings: Readings, pose: EgoPose) -> None:
+        self._pose = pose
+        for eye in self._eyes:
+            samples = readings.get(eye.sensor.name)
+            if samples is not None and not samples.lost.all():
+                newest = samples.values[~samples.lost][-1]
+                self._pictures[eye.sensor.name] = np.asarray(newest, dtype=np.uint8)
+
+    def _kind(self, group: NDArray[np.float64]) -> str:
+        """The kind that most pixels of echoes (n, 2) on the map show; unknown where none does."""
+        votes = np.zeros(len(SEMANTIC_NAMES), np.int64)
+        for eye in self._eyes:
+            picture = self._pictures.get(eye.sensor.name)
+            if picture is not None:
+                classes = _pixels(eye, picture, self._in_vehicle(group))
+                votes += np.bincount(classes, minlength=len(votes))[: len(votes)]
+        votes[[number for number, kind in enumerate(KIND_OF_CLASS) if not kind]] = 0
+        return KIND_OF_CLASS[int(votes.argmax())] if votes.any() else "unknown"
+
+    def _in_vehicle(self, group: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Echoes in the frame of the vehicle, (3 n, 3), at three heights each."""
+        cos, sin = math.cos(self._pose.heading_rad), math.sin(self._pose.heading_rad)
+        plane = (group - (self._pose.x_m, self._pose.y_m)) @ np.array([[cos, -sin], [sin, cos]])
+        return np.concatenate(
+            [np.column_stack([plane, np.full(len(plane), height)]) for height in _HEIGHTS_M]
+        )
+
+
+def _eye(sensor: StackSensor) -> _Eye:
+    settings = sensor.settings
+    yaw, pitch, roll = (math.radians(settings[key]) for key in ("yaw_deg", "pitch_deg", "roll_deg"))
+    turn = np.zeros((3, 3))
+    rotation(yaw, pitch, roll, turn)
+    place_m = np.array([settings["x_m"], settings["y_m"], settings["z_m"]])
+    focal_px = 0.5 * settings["width"] / math.tan(0.5 * math.radians(settings["fov_deg"]))
+    return _Eye(sensor, turn, place_m, focal_px)
+
+
+def _pixels(
+    eye: _Eye, picture: NDArray[np.uint8], points: NDArray[np.float64]
+) -> NDArray[np.uint8]:
+    """The classes of the pixels onto which points (n, 3) of the vehicle's frame fall."""
+    ahead, left, up = ((points - eye.place_m) @ eye.turn).T
+    seen = ahead > _NEAREST_M
+    height, width = picture.shape
+    column = np.floor(0.5 * width - eye.focal_px * left[seen] / ahead[seen]).astype(np.int64)
+    row = np.floor(0.5 * height - eye.focal_px * up[seen] / ahead[seen]).astype(np.int64)
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    found: NDArray[np.uint8] = picture[row[inside], column[inside]]
+    return found

@@ -1,0 +1,209 @@
+"""Localisation against a point-cloud map: lidar scans matched with its walls, in the filter.
+
+Between scans the filter of `localisation` goes on from GNSS, IMU and odometry. Each scan is laid
+onto the map's upright surfaces by generalized ICP (small_gicp), from where the filter takes the
+vehicle to be. What the pairs of points say of place and heading goes into the filter with the
+information that their normals have: along a street without ends it says nothing, and GNSS stays.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import ConfigError, require
+from cavmarl.cosim.stack.hd_map import HdMap, wrap
+from cavmarl.cosim.stack.lidar_points import lidar_points
+from cavmarl.cosim.stack.localisation import GnssInertial
+from cavmarl.cosim.stack.stack_types import EgoPose, Mission, Readings, StackSensor
+from cavmarl.maps.fidelity.cloud_files import read_cloud
+from cavmarl.maps.fidelity.cloud_registration import FEWEST_POINTS, Target, moved
+from cavmarl.sensors.mounted.geodesy import Geodesy
+
+Points = NDArray[np.float64]
+
+_RANGE_M = 50.0  # of echoes that are used
+_LOWEST_M, _HIGHEST_M = 0.3, 4.0  # above the road: no ground, nothing that only trees reach
+_UPRIGHT = 0.5  # most of a normal's vertical part
+_AROUND_M = 60.0  # of the map, for a scan
+_EXTRUDED_M = (-0.2, 0.0, 0.2)  # a plane scan is taken for upright walls
+_GATE_M = 1.5  # farther pairs are other things
+_PAIR_M = 0.4  # pairs that are nearer say where the vehicle is
+_FEWEST_PAIRS, _LEAST_SHARE = 30, 0.5
+_DEVIATION_M = 0.08  # of a pair, map and scan
+_CORRELATED = 9.0  # so many pairs are worth one: neighbours err alike
+_WEAKEST = 1e-3  # of the information along the best axis, below which an axis says nothing
+# Along the best axis; scans err alike, and along others noise of normals looks like information.
+_LEAST_M = 0.1
+_LOST_M, _LOST_FIXES = 6.0, 20  # from the mean of so many fixes: the scans are laid elsewhere
+_TURN_M = 10.0  # a radian, against metres
+
+
+class ScanMatching(GnssInertial):
+    """The stage.
+
+    `sensors`: of the vehicle; a GNSS and a lidar at least. `cloud`: the map's file, in its frame.
+
+    Raises:
+        ConfigError: no lidar, no file, or a cloud without walls.
+        MapError: the file cannot be read.
+    """
+
+    def __init__(
+        self,
+        sensors: Sequence[StackSensor],
+        geodesy: Geodesy,
+        hd_map: HdMap,
+        tick_s: float,
+        cloud: Path | None,
+    ) -> None:
+        super().__init__(sensors, geodesy, hd_map, tick_s)
+        lidars = [sensor for sensor in sensors if sensor.type == "lidar"]
+        if not lidars:
+            raise ConfigError("localisation = scan_matching: there is no lidar among the sensors")
+        if cloud is None:
+            raise ConfigError(
+                "localisation = scan_matching: needs a point-cloud map: give its file (--cloud), "
+                "as `cavmarl map survey` writes it"
+            )
+        self._lidar = max(lidars, key=lambda sensor: int(sensor.settings["layers"]))
+        self._walls = _Walls(cloud)
+        self.matched = self.refused = 0  # scans
+        self.lost = 0  # how often the place was taken from GNSS anew
+        self._astray: list[tuple[float, float]] = []  # of the last fixes, from the place
+
+    def locate(self, readings: Readings, mission: Mission, time_s: float) -> EgoPose | None:
+        pose = super().locate(readings, mission, time_s)
+        self._watch(self._fix(readings))
+        samples = readings.get(self._lidar.name)
+        if pose is None or samples is None or samples.lost.all():
+            return pose
+        scan = np.asarray(samples.values[~samples.lost][-1], dtype=np.float64)
+        if self._match(lidar_points(self._lidar, scan, _RANGE_M)):
+            self.matched += 1
+        else:
+            self.refused += 1
+        x_m, y_m, heading, speed_mps = self._get().tolist()
+        return EgoPose(x_m, y_m, wrap(heading), max(0.0, speed_mps), self._yaw_rate)
+
+    def _watch(self, fix: tuple[float, float] | None) -> None:
+        """Begin anew from GNSS where its fixes, in the mean, lie far from the place."""
+        if fix is None:
+            return
+        state = self._get()
+        self._astray = self._astray[1 - _LOST_FIXES :]
+        self._astray.append((fix[0] - float(state[0]), fix[1] - float(state[1])))
+        mean = np.mean(self._astray, axis=0)
+        if len(self._astray) == _LOST_FIXES and float(np.hypot(*mean)) > _LOST_M:
+            state[:2] += mean
+            self._spread = np.diag([2.0, 2.0, 0.1, 1.0]) ** 2
+            self._astray = []
+            self.lost += 1
+
+    def _match(self, echoes: Points) -> bool:
+        """Take in what echoes (n, 3) of the vehicle's frame say; whether they fit the map."""
+        upright = echoes[(echoes[:, 2] > _LOWEST_M) & (echoes[:, 2] < _HIGHEST_M)]
+        if len(upright) and float(np.ptp(upright[:, 2])) < 1e-6:
+            upright = np.concatenate([upright + np.array([0.0, 0.0, up]) for up in _EXTRUDED_M])
+        x_m, y_m, heading, _ = self._get().tolist()
+        target = self._walls.around(x_m, y_m)
+        if target is None or len(upright) < FEWEST_POINTS:
+            return False
+        begin = _motion(x_m, y_m, self._walls.ground_m(x_m, y_m), heading)
+        motion = _laid(target, upright, begin)
+        placed = moved(upright, motion)
+        rows, distance_m = target.nearest(placed)
+        paired = distance_m < _PAIR_M
+        if paired.sum() < max(_FEWEST_PAIRS, _LEAST_SHARE * (distance_m < _GATE_M).sum()):
+            return False
+        seen = np.array(
+            [motion[0, 3], motion[1, 3], math.atan2(float(motion[1, 0]), float(motion[0, 0]))]
+        )
+        normals = np.asarray(target.cloud.normals())[rows[paired], :2]
+        self._take_match(seen, normals, placed[paired, :2] - seen[:2])
+        return True
+
+    def _take_match(self, seen: Points, normals: Points, arms_m: Points) -> None:
+        """Take in a place and a heading (3,), as far as normals (n, 2) of pairs tell them.
+
+        `arms_m`: (n, 2) from the vehicle to each pair.
+        """
+        turn = (normals[:, 1] * arms_m[:, 0] - normals[:, 0] * arms_m[:, 1]) / _TURN_M
+        slopes = np.column_stack([normals, turn])
+        information = slopes.T @ slopes / (_CORRELATED * _DEVIATION_M**2)
+        strength, axes = np.linalg.eigh(information)
+        for share, axis in zip(strength.tolist(), axes.T, strict=True):
+            if share < _WEAKEST * strength[-1] or share < 1.0:  # a metre
+                continue
+            off = seen - self._get()[:3]
+            off[2] = wrap(float(off[2]))
+            scale = np.array([1.0, 1.0, _TURN_M])
+            row = np.append(axis * scale, 0.0)
+            deviation = max(1.0 / math.sqrt(share), _LEAST_M * math.sqrt(strength[-1] / share))
+            self._take(row, float(row[:3] @ off), deviation, gate=math.inf)
+
+
+class _Walls:
+    """The upright part of a cloud, by place, and how high its ground lies."""
+
+    def __init__(self, path: Path) -> None:
+        points = read_cloud(path).points
+        whole = Target(points)
+        upright = np.abs(np.asarray(whole.cloud.normals())[:, 2]) < _UPRIGHT
+        self._points = points[upright]
+        ground = points[~upright]
+        if len(self._points) < FEWEST_POINTS:
+            raise ConfigError(
+                f"{path}: has no walls to match scans with ({len(self._points)} upright points): "
+                "survey a map with buildings (map.buildings), or use localisation=gnss_imu"
+            )
+        gicp: Any = require("small_gicp", "clouds")
+        self._ground = ground if len(ground) else self._points
+        flat = np.column_stack([self._ground[:, :2], np.zeros(len(self._ground))])
+        self._tree = gicp.KdTree(flat)
+        self._held: tuple[float, float, Target | None] | None = None
+
+    def ground_m(self, x_m: float, y_m: float) -> float:
+        """The height of the ground of the cloud that is nearest to a place."""
+        rows, _ = self._tree.batch_nearest_neighbor_search(np.array([[x_m, y_m, 0.0]]))
+        return float(self._ground[int(np.asarray(rows)[0]), 2])
+
+    def around(self, x_m: float, y_m: float) -> Target | None:
+        """The walls around a place; None: there are too few. It is kept while one is near."""
+        held = self._held
+        if held is None or math.hypot(held[0] - x_m, held[1] - y_m) > 0.25 * _AROUND_M:
+            apart = np.abs(self._points[:, :2] - (x_m, y_m)).max(axis=1)
+            near = self._points[apart < 1.25 * _AROUND_M]
+            target = Target(near) if len(near) >= FEWEST_POINTS else None
+            held = self._held = (x_m, y_m, target)
+        return held[2]
+
+
+def _motion(x_m: float, y_m: float, z_m: float, heading: float) -> Points:
+    cos, sin = math.cos(heading), math.sin(heading)
+    return np.array(
+        [[cos, -sin, 0.0, x_m], [sin, cos, 0.0, y_m], [0.0, 0.0, 1.0, z_m], [0.0, 0.0, 0.0, 1.0]]
+    )
+
+
+def _laid(target: Target, points: Points, begin: Points) -> Points:
+    """The motion (4, 4) that lays points of the vehicle's frame onto walls, from a guess on."""
+    gicp: Any = require("small_gicp", "clouds")
+    shift = np.eye(4)
+    shift[:3, 3] = -target.middle_m
+    source = gicp.PointCloud(points)
+    gicp.estimate_covariances(source, gicp.KdTree(source), 10)
+    motion = shift @ begin
+    for gate_m in (_GATE_M, _PAIR_M):
+        found = gicp.align(
+            target.cloud, source, target.tree, motion, max_correspondence_distance=gate_m
+        )
+        motion = np.asarray(found.T_target_source)
+    shift[:3, 3] = target.middle_m
+    laid: Points = shift @ motion
+    return laid

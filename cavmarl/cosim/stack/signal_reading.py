@@ -1,0 +1,46 @@
+"""What signals show, as a stack knows it: told by the world, or heard from roadside units."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.records.codes import SIGNAL_NONE, SIGNAL_RED
+from cavmarl.cosim.stack.hd_map import HdMap
+from cavmarl.cosim.stack.stack_types import Readings
+
+SPAT = "v2x.spat"  # among a vehicle's readings: (n, 3) SIGNAL row, PHASE row, age in ticks
+
+
+class ToldSignals:
+    """The world says it: ground truth."""
+
+    def read(self, readings: Readings, told: NDArray[np.uint8] | None) -> NDArray[np.uint8] | None:
+        return told
+
+
+class SpatSignals:
+    """SPAT messages (SAE J2735) that the vehicle has received; what it is told is not used.
+
+    The letters of a phase are the map's. A signal of which nothing is heard counts as red: the
+    vehicle stops at its line.
+    """
+
+    def __init__(self, hd_map: HdMap) -> None:
+        network = hd_map.network
+        self._network = network
+        self._has_one = network.links["signal"] >= 0
+
+    def read(self, readings: Readings, told: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
+        """(num_links,) SIGNAL_* codes."""
+        network = self._network
+        shown = np.full(len(network.links), SIGNAL_NONE, dtype=np.uint8)
+        shown[self._has_one] = SIGNAL_RED
+        heard = readings.get(SPAT)
+        if heard is None or not len(heard.values):
+            return shown
+        for signal, phase, _ in heard.values[-1].tolist():
+            links = np.flatnonzero(network.links["signal"] == signal)
+            letters = network.phases["first_state"][phase] + network.links["signal_index"][links]
+            shown[links] = network.phase_states[letters]
+        return shown

@@ -1,0 +1,88 @@
+"""A surveyed cloud beside the surface of the map that it was made in."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import MapError, require
+from cavmarl.maps.fidelity.cloud_files import Cloud
+from cavmarl.maps.fidelity.cloud_registration import FEWEST_POINTS, Target, nearest_distances
+from cavmarl.maps.fidelity.comparison import Comparison, compare
+from cavmarl.maps.fidelity.map_surface import map_surface
+from cavmarl.roads.network import RoadNetwork
+
+Points = NDArray[np.float64]
+
+_ON_LANE_M = 0.4  # in the plane, from a place of a lane
+_HIGH_M = 0.5  # above the road: no ground
+_WALL_M = 2.0  # farther from a wall, a point is something else
+_SEEN_M = 0.5  # a place of a lane has a point that near
+_MARGIN_M = 1.0
+_SAMPLED_M = 0.5  # of the map's surface
+
+
+@dataclass(frozen=True)
+class SurveyFit:
+    """How far a cloud is from a map's surface; all in m."""
+
+    height_rmse_m: float  # of points on lanes, from the lane
+    height_median_m: float
+    wall_rmse_m: float | None  # of points near walls, across the wall; None: there are none
+    wall_median_m: float | None
+    seen_share: float  # of the lanes around the cloud
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def fit_survey(cloud: Cloud, network: RoadNetwork) -> tuple[SurveyFit, Comparison]:
+    """Measure a cloud in the map's frame against the map, as it is: nothing is aligned.
+
+    Ground beside lanes, which the map has not, is left out and counted.
+
+    Raises MapError: nothing of the cloud lies on the map.
+    """
+    gicp: Any = require("small_gicp", "clouds")
+    plane = cloud.points[:, :2]
+    box = (*(plane.min(axis=0) - _MARGIN_M), *(plane.max(axis=0) + _MARGIN_M))
+    whole, spacing_m = map_surface(network, box, _SAMPLED_M)
+    lanes = map_surface(replace(network, walls=network.walls[:0]), box, spacing_m)[0].points
+    flat = np.array([1.0, 1.0, 0.0])
+    rows, squares = gicp.KdTree(lanes * flat).batch_nearest_neighbor_search(cloud.points * flat)
+    above_m = cloud.points[:, 2] - lanes[np.asarray(rows), 2]
+    high = above_m > _HIGH_M
+    ground = (np.asarray(squares) < _ON_LANE_M**2) & ~high
+    kept = cloud.kept(cloud.points[ground | high], "ground beside lanes")
+    if not ground.any() or len(kept.points) < FEWEST_POINTS:
+        raise MapError(f"{cloud.name}: has no ground on the lanes of '{network.name}': drive on")
+    wall_m = _across_walls(network, box, spacing_m, cloud.points[high])
+    seen = nearest_distances(lanes, kept.points) < _SEEN_M
+    fit = SurveyFit(
+        height_rmse_m=float(np.sqrt(np.mean(above_m[ground] ** 2))),
+        height_median_m=float(np.median(above_m[ground])),
+        wall_rmse_m=float(np.sqrt(np.mean(wall_m**2))) if len(wall_m) else None,
+        wall_median_m=float(np.median(wall_m)) if len(wall_m) else None,
+        seen_share=float(seen.mean()),
+    )
+    return fit, compare(kept, whole, registered=False)
+
+
+def _across_walls(network: RoadNetwork, box: Any, spacing_m: float, points: Points) -> Points:
+    """Distances of points to walls, across these, without sign."""
+    if not len(network.walls) or not len(points):
+        return np.zeros(0)
+    whole = map_surface(network, box, spacing_m)[0].points
+    lanes = map_surface(replace(network, walls=network.walls[:0]), box, spacing_m)[0].points
+    walls = whole[len(lanes) :]
+    if len(walls) < FEWEST_POINTS:
+        return np.zeros(0)
+    target = Target(walls)
+    rows, distance_m = target.nearest(points)
+    near = distance_m < _WALL_M
+    normals = np.asarray(target.cloud.normals())[rows[near], :3]
+    found: Points = np.abs(((points[near] - walls[rows[near]]) * normals).sum(axis=1))
+    return found
