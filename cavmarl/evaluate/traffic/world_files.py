@@ -64,16 +64,22 @@ def make_files(
         MapError: a cut of a map cannot be driven.
         MissingExtraError: SUMO is not installed.
     """
+    net, routes = make_net(draw, folder, maps), folder / ROUTES_FILE
+    _write_demand(draw, net, routes, seconds)
+    return net, routes
+
+
+def make_net(draw: WorldDraw, folder: Path, maps: Sequence[Path]) -> Path:
+    """Write the net of a world into a folder, as `make_files` does."""
     folder.mkdir(parents=True, exist_ok=True)
-    net, routes = folder / NET_FILE, folder / ROUTES_FILE
+    net = folder / NET_FILE
     if draw.net.kind == "cut":
         _cut(draw, net, maps)
     else:
         _run_tool(
             "bin/netgenerate", *draw.net.options, f"--seed={draw.seed}", f"--output-file={net}"
         )
-    _write_demand(draw, net, routes, seconds)
-    return net, routes
+    return net
 
 
 def _cut(draw: WorldDraw, net: Path, maps: Sequence[Path]) -> None:

@@ -1,0 +1,235 @@
+"""How the built-in driver does in agents' seats: alone and among its kind, on any maps.
+
+Every trip counts, those that the end of the run cuts, too. A vehicle stands without a cause if it
+has stood for `STANDS_S`, its signal is not red and no other vehicle is near ahead of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+
+from benchmarks.harness import Report, Say, about, check_range, numbers_of, run, silent
+from cavmarl.cli.output import Seed
+from cavmarl.core.errors import CavmarlError, ConfigError
+from cavmarl.core.records.codes import SIGNAL_NONE
+from cavmarl.engine.world_setup import load_world
+from cavmarl.env.vector import CavVectorEnv
+from cavmarl.evaluate.recorder import Recorder
+from cavmarl.evaluate.traffic.world_draw import draw_world
+from cavmarl.evaluate.traffic.world_files import cut_maps, make_net
+from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.render.ground import signal_codes
+from cavmarl.roads.network import SIGNAL_STATES
+
+MOST_SHARE = 0.0005  # of the trips that may end off the road, and with a collision
+STANDS_S = 120.0
+NEAR_AHEAD_M = 20.0  # another vehicle whose centre is so near ahead is a cause to stand
+TOGETHER = 100  # vehicles that are stepped at once, about
+FAULTS = ("off_road", "collision", "wrong_way", "red_light", "stands")
+SHOWN = 12  # faults named below the table
+GREEN = [SIGNAL_STATES.index(letter) for letter in "gGoOs"] + [SIGNAL_NONE]
+
+
+@dataclass
+class Drive:
+    """What became of the trips of one driver on one map."""
+
+    trips: int = 0
+    arrived: int = 0
+    counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(FAULTS, 0))
+    faults: list[dict[str, Any]] = field(default_factory=list)  # where and when
+
+    def add(self, other: Drive) -> None:
+        self.trips += other.trips
+        self.arrived += other.arrived
+        for name in FAULTS:
+            self.counts[name] += other.counts[name]
+        self.faults += other.faults
+
+    @property
+    def holds(self) -> bool:
+        most = MOST_SHARE * self.trips
+        rare = self.counts["off_road"] <= most and self.counts["collision"] <= most
+        return rare and not (self.counts["wrong_way"] or self.counts["stands"])
+
+    def row(self, name: str, model: str, agents: int) -> dict[str, Any]:
+        shares = {fault: 100.0 * self.counts[fault] / max(self.trips, 1) for fault in FAULTS}
+        own = {"map": name, "model": model, "agents": agents, "trips": self.trips}
+        arrived = {"arrived": 100.0 * self.arrived / max(self.trips, 1)}
+        return own | arrived | shares | {"stands": self.counts["stands"], "faults": self.faults}
+
+
+def measure(
+    maps: Annotated[
+        list[str] | None, typer.Argument(help="Names, folders or map files of environments.")
+    ] = None,
+    worlds: Annotated[int, about("Nets drawn by chance, besides.")] = 0,
+    first_seed: Annotated[int, about("They have the seeds from here on.")] = 0,
+    agents: Annotated[str, about("Agents at once, as 1,100.")] = "1,100",
+    models: Annotated[str, about("How they follow: IDM, Krauss or both.")] = "IDM,Krauss",
+    seconds: Annotated[int, about("Simulated seconds of each run.")] = 300,
+    seed: Seed = 0,
+    say: Say = silent,
+) -> Report:
+    """Trips of the built-in driver that end off the road, in a collision, or stand for ever."""
+    check_range(worlds=(worlds, 0, 10_000), seconds=(seconds, 1, 100_000))
+    check_range(first_seed=(first_seed, 0, 10**9))
+    crowds = numbers_of("--agents", agents)
+    chosen = [name.strip() for name in models.split(",")]
+    if not maps and not worlds:
+        raise ConfigError("no map: name some, or draw nets with --worlds")
+    rows: list[dict[str, Any]] = []
+    notes: list[str] = []
+    sums = {(model, crowd): Drive() for model in chosen for crowd in crowds}
+    with TemporaryDirectory() as folder:
+        for name, make in _maps(maps or [], range(first_seed, first_seed + worlds), Path(folder)):
+            say(name)
+            try:
+                path = make()
+                found = {key: drive(path, *key, seconds, seed) for key in sums}
+            except CavmarlError as error:
+                if name in (maps or []):
+                    raise
+                notes.append(f"{name} is left out: {error}")
+                continue
+            for key, driven in found.items():
+                sums[key].add(driven)
+                rows.append(driven.row(name, *key))
+                notes += [_told(name, *key, fault) for fault in driven.faults]
+    total = [drive.row("all", *key) | {"faults": []} for key, drive in sums.items()]
+    columns = {"map": "map", "model": "model", "agents": "agents", "trips": "trips"}
+    columns |= {"arrived, %": "arrived:.1f"}
+    columns |= {f"{name.replace('_', ' ')}, %": f"{name}:.3f" for name in FAULTS[:-1]}
+    columns |= {f"stand {STANDS_S:.0f} s": "stands"}
+    shown = [row for row in rows if not worlds or row["faults"] or row["map"] in (maps or [])]
+    more = [f"and {len(notes) - SHOWN} more"] if len(notes) > SHOWN else []
+    return Report(
+        f"the built-in driver in agents' seats, {seconds} s",
+        columns,
+        [*shown, *total],
+        notes[:SHOWN] + more,
+        {"notes": notes, "seconds": seconds, "seed": seed},
+        all(drive.holds for drive in sums.values()),
+    )
+
+
+def _maps(
+    named: Sequence[str], seeds: Sequence[int], folder: Path
+) -> Iterator[tuple[str, Callable[[], str]]]:
+    """Label and maker of each map."""
+    for name in named:
+        yield name, lambda name=name: name  # type: ignore[misc]
+    cuts = cut_maps(None) if seeds else ()
+    for seed in seeds:
+        draw = draw_world(seed)
+        yield (
+            f"world {seed}: {' '.join(draw.features)}",
+            lambda draw=draw: str(make_net(draw, folder / str(draw.seed), cuts)),  # type: ignore[misc]
+        )
+
+
+def _told(name: str, model: str, agents: int, fault: dict[str, Any]) -> str:
+    place = f"({fault['x']:.1f}, {fault['y']:.1f}) on {fault['lane']} at {fault['time_s']:.1f} s"
+    return f"{name}, {model}, {agents}: {fault['what']}, world {fault['world']}, {place}"
+
+
+def drive(env: str, model: str, agents: int, seconds: int, seed: int) -> Drive:
+    """Let the built-in driver drive so many agents at once for some time."""
+    overrides = {
+        "traffic.model": model,
+        "population.mode": "respawn",
+        "horizon_s": float(seconds),
+    }
+    world = load_world(env, agents=agents, background=0, overrides=overrides)
+    vec = CavVectorEnv(LocalWorlds(world, max(1, min(16, TOGETHER // (5 * agents)))))
+    weights = np.array(vec.config.terms.weight_of_each)
+    recorder = Recorder(vec.num_envs, vec.num_agents, vec.max_cycles, vec.step_s, weights)
+    watch = _Standing(vec)
+    found = Drive()
+    _, infos = vec.reset(seed=seed)
+    running = np.ones(vec.num_envs, dtype=np.bool_)
+    step = 0
+    while running.any():
+        before = [vec.simulation.vehicles(w).copy() for w in range(vec.num_envs)]
+        _, rewards, _, _, infos = vec.step(vec.suggest_actions())
+        acted = infos["acted"] & running[:, None]
+        over = infos["episode_over"] & running
+        done = infos["vehicle_done"] & acted
+        ended = recorder.add(step, acted, rewards, infos["terms"], done, over, infos["arrivals"])
+        step += 1
+        found.trips += len(ended)
+        found.arrived += int(ended["arrived"].sum())
+        for trip in ended:
+            for what in FAULTS[:-1]:
+                if trip[what]:
+                    found.counts[what] += 1
+                    found.faults.append(_fault(vec, what, trip, before, step))
+        running &= ~over
+        for number, row in watch.look(np.flatnonzero(running).tolist()):
+            found.counts["stands"] += 1
+            found.faults.append(_place(vec, "stands", number, row, step))
+    return found
+
+
+def _fault(
+    vec: CavVectorEnv, what: str, trip: np.void, before: list[NDArray[np.void]], step: int
+) -> dict[str, Any]:
+    rows = before[trip["episode"]]
+    return _place(vec, what, int(trip["episode"]), rows[rows["agent"] == trip["agent"]][0], step)
+
+
+def _place(vec: CavVectorEnv, what: str, world: int, row: np.void, step: int) -> dict[str, Any]:
+    return {
+        "what": what.replace("_", " "),
+        "world": world,
+        "time_s": step * vec.step_s,
+        "x": float(row["x"]),
+        "y": float(row["y"]),
+        "lane": vec.network.lane_ids[row["lane"]],
+    }
+
+
+class _Standing:
+    """Finds vehicles that have stood for `STANDS_S` without a cause, each once."""
+
+    def __init__(self, vec: CavVectorEnv) -> None:
+        self._vec = vec
+        self._told: set[tuple[int, int]] = set()
+
+    def look(self, worlds: Sequence[int]) -> Iterator[tuple[int, np.void]]:
+        simulation = self._vec.simulation
+        for world in worlds:
+            rows = simulation.vehicles(world)
+            long = np.flatnonzero(rows["wait_s"] >= STANDS_S)
+            if not long.size:
+                continue
+            shown = signal_codes(self._vec.network, simulation.signal_phases(world))
+            for i in long.tolist():
+                key = (world, int(rows[i]["id"]))
+                if key not in self._told and not self._has_cause(rows, i, shown):
+                    self._told.add(key)
+                    yield world, rows[i]
+
+    def _has_cause(self, rows: NDArray[np.void], i: int, shown: NDArray[np.uint8]) -> bool:
+        row = rows[i]
+        step = self._vec.simulation.plans[row["goal"], row["lane"]]
+        if step["link"] >= 0 and shown[step["link"]] not in GREEN:
+            return True
+        along_x, along_y = math.cos(row["heading"]), math.sin(row["heading"])
+        to_x, to_y = rows["x"] - row["x"], rows["y"] - row["y"]
+        ahead = along_x * to_x + along_y * to_y > 0.0
+        near = np.hypot(to_x, to_y) < NEAR_AHEAD_M
+        return bool((ahead & near & (np.arange(len(rows)) != i)).any())
+
+
+if __name__ == "__main__":
+    run(measure)

@@ -1,0 +1,57 @@
+"""The yardstick: its counts, its bound, and when a vehicle stands without a cause."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmarks import yardstick
+from cavmarl.core.errors import ConfigError
+from cavmarl.engine.world_setup import load_world
+from cavmarl.env.vector import CavVectorEnv
+from cavmarl.parallel.local_worlds import LocalWorlds
+
+
+def test_trips_on_a_good_map_hold() -> None:
+    found = yardstick.measure(["merge"], agents="2", models="IDM", seconds=30)
+    assert found.holds
+    (own, total) = found.rows
+    assert own["map"] == "merge"
+    assert total["map"] == "all"
+    assert own["trips"] == total["trips"] >= 2
+    assert own["off_road"] == own["collision"] == own["stands"] == 0
+
+
+def test_a_bound_that_is_broken_is_told() -> None:
+    one = yardstick.Drive(trips=2000)
+    one.counts["off_road"] = 1
+    assert one.holds, "0.05 % are allowed"
+    one.counts["off_road"] = 2
+    assert not one.holds
+    one.counts["off_road"] = 0
+    one.counts["wrong_way"] = 1
+    assert not one.holds
+
+
+def test_a_vehicle_that_stands_has_a_cause_at_red_and_behind_another() -> None:
+    world = load_world("grid4x4", agents=2, background=0)
+    vec = CavVectorEnv(LocalWorlds(world, 1))
+    vec.reset(seed=1)
+    rows = vec.simulation.vehicles(0)
+    rows["wait_s"] = [yardstick.STANDS_S, 0.0]
+    rows["x"][1] = rows["x"][0] + 500.0 * np.cos(rows["heading"][0])
+    rows["y"][1] = rows["y"][0] + 500.0 * np.sin(rows["heading"][0])
+    watch = yardstick._Standing(vec)
+    red = np.zeros(len(vec.network.links), dtype=np.uint8)
+    red[:] = yardstick.SIGNAL_STATES.index("r")
+    green = np.full(len(vec.network.links), yardstick.SIGNAL_STATES.index("G"), dtype=np.uint8)
+    assert watch._has_cause(rows, 0, red)
+    assert not watch._has_cause(rows, 0, green)
+    rows["x"][1] = rows["x"][0] + 8.0 * np.cos(rows["heading"][0])
+    rows["y"][1] = rows["y"][0] + 8.0 * np.sin(rows["heading"][0])
+    assert watch._has_cause(rows, 0, green)
+
+
+def test_no_map_is_refused() -> None:
+    with pytest.raises(ConfigError, match="no map: name some"):
+        yardstick.measure()
