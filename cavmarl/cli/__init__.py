@@ -12,6 +12,7 @@ import typer
 from typer.core import TyperGroup
 
 from cavmarl.cli import (
+    baseline,
     bench,
     demand,
     demo,
@@ -63,6 +64,7 @@ app = typer.Typer(
 app.command()(evaluate.evaluate)
 app.command()(evaluate.report)
 app.command()(suite.suite)
+app.command()(baseline.baseline)
 app.command()(verify.verify)
 app.command()(verify_determinism.verify_determinism)
 app.command()(journal.journal)

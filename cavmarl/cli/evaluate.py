@@ -200,6 +200,24 @@ def place_table(policy: str, rows: Sequence[Mapping[str, Any]]) -> Table:
     return grid(heads, lines, escape(f"{Path(policy).name} near borders and inside"), wraps=True)
 
 
+def map_table(policy: str, rows: Sequence[Mapping[str, Any]]) -> Table:
+    """What a driver does on each map, the worst first."""
+    from cavmarl.evaluate.by_map import SHOWN
+    from cavmarl.evaluate.metrics import METRICS
+
+    shown = [metric for metric in METRICS if metric.name in SHOWN]
+    heads = ["map", "trips", *(metric.title for metric in shown)]
+    lines = [
+        [
+            escape(row["map"]),
+            str(row["trips"]),
+            *(number(row[metric.name], metric.scale) for metric in shown),
+        ]
+        for row in rows
+    ]
+    return grid(heads, lines, escape(f"{Path(policy).name} by map, the worst first"), wraps=True)
+
+
 def _heads(names: Iterable[str]) -> list[str]:
     return ["", *(escape(Path(name).name) for name in names)]
 
@@ -238,6 +256,8 @@ def _show(
     console.print(report_table(found))
     if len(found.policies) > 1:
         console.print(difference_table(found))
+    for name, of_maps in found.by_map.items():
+        console.print(map_table(name, of_maps))
     from cavmarl.evaluate.evaluation import load_places
 
     for name, rows in load_places(folder).items():

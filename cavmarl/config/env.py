@@ -285,6 +285,9 @@ class TrafficConfig(Section, key="traffic"):
         speed_factor_spread: half width of the drivers' uniform spread of desired speed over limit.
         model: how the generator's vehicles follow their leader: `IDM`, `Krauss`, `ACC`, or a model
             that is registered (docs/extending.md). Those of `demand` drive as their type says.
+        trip_horizon: so many times what its way takes at the limits, and one cycle of each signal
+            on it, an agent's trip may take; then the vehicle leaves, and the trip is truncated.
+            0: only the episode's horizon cuts it.
     """
 
     source: Literal["native", "sumo-demand", "sumo-traffic"] = "native"
@@ -298,9 +301,15 @@ class TrafficConfig(Section, key="traffic"):
     endless: bool = False
     speed_factor_spread: Annotated[float, Within(0.0, 0.5)] = 0.1
     model: str = "IDM"
+    trip_horizon: Annotated[float, Within(0.0, 1000.0)] = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        self.need(
+            "trip_horizon",
+            self.trip_horizon == 0.0 or self.trip_horizon >= 1.0,
+            "must be 0 (none), or 1 or more: no vehicle is faster than the limits allow",
+        )
         self.need(
             "source",
             self.source == "native" or bool(self.demand),

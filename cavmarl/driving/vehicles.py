@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-RECORD_VERSION = 1
+RECORD_VERSION = 2
 
 # The order is that of use: what every driver asks of every other comes first and shares two cache
 # lines, what only some ask comes last.
@@ -79,6 +79,7 @@ VEHICLE = np.dtype(
         ("leg", np.int32),  # how many ways it has had before
         ("order", np.int32),  # DEPARTURE row of the demand file's orders; -1: of the generator
         ("departed", np.int64),  # tick of insertion
+        ("due", np.int64),  # tick at which an agent's trip is cut; -1: none
         # ownership and transfer
         ("owner", np.int32),  # zone that may change this row
         ("source_zone", np.int32),  # of the transfer in flight
@@ -116,6 +117,7 @@ _NOTHING = (
     "stopped_at",
     "hit",
     "last_change",
+    "due",
     "memory",
     "order",
     "stop",

@@ -29,6 +29,7 @@ def describe_world(
         "config": resolved,
         "config_sha256": hashlib.sha256(text.encode()).hexdigest(),
         "map": network.name,
+        "maps": list(network.map_names),
         "map_source_sha256": network.source_hash,
         "map_content_sha256": network.content_hash,
         "demand_content_sha256": None if demand is None else demand.content_hash,

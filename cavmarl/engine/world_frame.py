@@ -12,6 +12,7 @@ from cavmarl.core.records.codes import (
     EVENT_ARRIVED,
     EVENT_COLLIDED,
     EVENT_OFF_ROAD,
+    EVENT_OUT_OF_TIME,
     EVENT_RED_LIGHT,
     EVENT_WRONG_WAY,
 )
@@ -57,6 +58,7 @@ _KINDS = {
     EVENT_WRONG_WAY: "wrong_way",
     EVENT_RED_LIGHT: "red_light",
     EVENT_ARRIVED: "arrived",
+    EVENT_OUT_OF_TIME: "out_of_time",
 }
 
 
@@ -77,7 +79,8 @@ class FrameEvent(NamedTuple):
     """What happened between two frames."""
 
     tick: int  # of the later frame
-    # departed, left, arrived, collision, off_road, wrong_way, red_light, transferred or signal
+    # departed, left, arrived, collision, off_road, wrong_way, red_light, out_of_time,
+    # transferred or signal
     kind: str
     vehicle: int  # id; -1: of no vehicle
     agent: int  # index; -1: no agent's

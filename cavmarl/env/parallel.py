@@ -276,8 +276,7 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
 
     def _report(self) -> Stepped:
         """What the agents get after a step; decides which stay."""
-        arrays = self.worlds.arrays
-        truncated = self._steps >= self.max_cycles
+        arrays, truncated = self.worlds.arrays, self._steps >= self.max_cycles
         if not truncated:
             entered = arrays.vehicle_ids[0] >= 0
             entered[self._listed] = False
@@ -287,8 +286,9 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
         ended = arrays.terminations[0, self._listed] & (not self._seats)
         observations, infos = self._observations(), self._infos()
         rewards = dict(zip(shown, arrays.rewards[0, self._listed].tolist(), strict=True))
-        terminations = _flags(shown, ended)
-        truncations = _flags(shown, ~ended & truncated)
+        late = ended & arrays.truncations[0, self._listed]
+        terminations = _flags(shown, ended & ~late)
+        truncations = _flags(shown, late | (~ended & truncated))
         if truncated:
             self._list(self._rows[:0])
         elif ended.any():

@@ -305,10 +305,11 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
 
         Returns:
             observations (W, A, D), rewards (W, A), terminations (W, A): the agent's vehicle ended;
-            truncations (W, A): the episode was cut at the horizon; and infos: `mask` (W, A) agents
-            that act next; `acted` (W, A) agents that acted in this step, so their rewards count;
-            `terms` (W, A, T) in the order of `config.TERMS`; `arrivals` (W,) vehicles that reached
-            their goal since the reset, agents included; `episode_over` (W,) which worlds are over;
+            truncations (W, A): its trip was cut at the episode's horizon, or its own; and infos:
+            `mask` (W, A) agents that act next; `acted` (W, A) agents that acted in this step, so
+            their rewards count; `terms` (W, A, T) in the order of `config.TERMS`; `arrivals` (W,)
+            vehicles that reached their goal since the reset, agents included; `episode_over` (W,)
+            which worlds are over;
             `final_observations` (W, A, D) before a reset and with the last ones of agents that
             left: the same array as the observations in a step where none did.
 
@@ -343,6 +344,7 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
             "mask": self._mask.copy(),
             "episode_over": over.copy(),
         }
+        terminations &= ~arrays.truncations  # a trip that its own horizon cut has no end
         return observations, arrays.rewards.copy(), terminations, arrays.truncations.copy(), infos
 
     def _observations(self) -> Observations:

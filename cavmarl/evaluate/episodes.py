@@ -18,12 +18,14 @@ from cavmarl.env.vector import CavVectorEnv
 from cavmarl.evaluate.border_terms import BorderTerms
 from cavmarl.evaluate.encounters import EncounterWatch, MessageRecord
 from cavmarl.evaluate.failure_clips import Failure
-from cavmarl.evaluate.recorder import Recorder
+from cavmarl.evaluate.recorder import SLOWEST, Recorder
 from cavmarl.evaluate.run_watch import RunWatch, recording_path
+from cavmarl.evaluate.standing import StandingWatch
 from cavmarl.evaluate.tables import EPISODE, TRACK, TRANSFER, TRIP
 from cavmarl.evaluate.transfer_rows import TransferRecorder
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.policies.policy import Policy, load_policy
+from cavmarl.roads.kernels.map_draw import map_of
 from cavmarl.zones.partition.zone_statistics import imbalance
 
 MAX_VEHICLES = 100_000  # of the worlds that are stepped together
@@ -156,8 +158,11 @@ class _Part:
             vec.max_cycles,
             vec.step_s,
             np.array(vec.config.terms.weight_of_each),
+            # A trip that has a horizon of its own and arrives is in time.
+            math.inf if vec.config.traffic.trip_horizon else SLOWEST,
         )
         self._watch = EncounterWatch(vec, self._recorder)
+        self._standing = StandingWatch(vec, self._recorder)
         self._tracked = tracked
         self.borders = BorderTerms(vec.simulation.partition, vec.step_s)
         self._tracks: list[NDArray[np.void]] = [np.zeros(0, TRACK)]
@@ -184,6 +189,8 @@ class _Part:
         vec = self._vec
         observations, infos = vec.reset(seed=seed, options={"first_world": first})
         driver.reset(policy_seed)
+        keys, maps = vec.simulation.worlds.keys, len(vec.network.maps)
+        self._recorder.maps[:] = [map_of(key, maps) for key in keys]
         handed_over = TransferRecorder(vec.simulation.transfers)
         imbalance, messages = _Imbalance(vec), MessageRecord(vec)
         running = np.arange(vec.num_envs) < self._count
@@ -192,6 +199,7 @@ class _Part:
         steps = 0
         while running.any():
             self._watch.locate()
+            self._standing.look(steps, infos["mask"])
             imbalance.add(running)
             messages.add(running)
             if self._tracked and running[0] and steps % every == 0:

@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 
 from cavmarl.config.checks import check_count
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
-from cavmarl.core.errors import ConfigError, JournalError, PolicyError, RecordingError, require
+from cavmarl.core.errors import (
+    ConfigError,
+    JournalError,
+    ManifestError,
+    PolicyError,
+    RecordingError,
+    require,
+)
 from cavmarl.engine.world_description import describe_world
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
@@ -42,6 +49,7 @@ from cavmarl.evaluate.provenance.manifest import (
 from cavmarl.evaluate.report import EvaluationReport, make_report
 from cavmarl.evaluate.tables import (
     EPISODE,
+    METRICS_VERSION,
     TRACK,
     TRANSFER,
     TRIP,
@@ -159,15 +167,30 @@ def load_report(folder: Path) -> EvaluationReport:
     Raises:
         ManifestError: no closed manifest, or results that it does not know.
     """
-    manifest = read_closed(folder)
+    manifest = read_evaluation(folder)
     speeds = json.loads((folder / SPEED_FILE).read_text(encoding="utf-8"))
     timed = {name: tuple(Speed(**run) for run in speeds[name]) for name in manifest["policies"]}
     return make_report(load_tables(folder), timed, manifest, load_transfers(folder))
 
 
+def read_evaluation(folder: Path) -> dict[str, Any]:
+    """The closed manifest of an evaluation whose metrics are those of this version.
+
+    Raises ManifestError: none, an open one, results that it does not know, or other metrics.
+    """
+    manifest = read_closed(folder)
+    version = manifest.get("metrics_version", 1)
+    if version != METRICS_VERSION:
+        raise ManifestError(
+            f"{folder}: its metrics are of version {version}, those of this cavmarl of version "
+            f"{METRICS_VERSION}; figures of different versions are not compared: evaluate again"
+        )
+    return manifest
+
+
 def load_tables(folder: Path) -> dict[str, tuple[Rows, Rows]]:
     """TRIP and EPISODE records by policy; raises as `load_report`."""
-    names = read_closed(folder)["policies"]
+    names = read_evaluation(folder)["policies"]
     trips = read_table(folder / TRIPS_FILE, TRIP)
     episodes = read_table(folder / EPISODES_FILE, EPISODE)
     return {name: (trips.get(name, np.zeros(0, TRIP)), episodes[name]) for name in names}
@@ -254,6 +277,7 @@ def _prepare(folder: Path, job: EpisodeJob, repeats: int) -> tuple[list[EpisodeJ
         "episodes": job.episodes,
         "seeds": seeds,
         "job": asdict(job),
+        "metrics_version": METRICS_VERSION,
         "plan": {"processes": processes, "worlds_at_once": worlds},
         "world": describe_world(config, network, demand, partition),
     }

@@ -15,10 +15,10 @@ from cavmarl.engine.world_frame import WorldFrame
 
 CLIP_S = 10.0
 REACH_M = 70.0  # from where the trip ended: what a clip shows
-STILL_M = 5.0  # a vehicle that has driven less in a clip is blocked
 
 # Worst first.
-CAUSES = ("collision", "off_road", "red_light", "wrong_way", "blocked", "out_of_time", "slow")
+FATES = ("collision", "off_road", "red_light", "wrong_way", "stood", "blocked", "out_of_time")
+CAUSES = (*FATES, "slow")
 
 
 @dataclass(frozen=True)
@@ -76,15 +76,9 @@ class FailureClips:
         last = recent[-1]
         mine = last.vehicles[last.vehicles["agent"] == trip["agent"]]
         row = mine[0] if len(mine) else None
-        driven_m, speed = math.inf, float(trip["mean_speed_mps"])
-        if row is not None:
-            began = recent[0].vehicles
-            began = began[began["id"] == row["id"]]
-            speed = float(row["speed"])
-            if len(began) and len(recent) == self._length:
-                driven_m = float(row["distance_m"]) - float(began["distance_m"][0])
-        cause = cause_of(trip, driven_m)
-        by_delay = cause in ("blocked", "out_of_time", "slow")
+        speed = float(trip["mean_speed_mps"] if row is None else row["speed"])
+        cause = cause_of(trip)
+        by_delay = cause in ("stood", "blocked", "out_of_time", "slow")
         place = trip if row is None else row
         names = ("end_x_m", "end_y_m") if row is None else ("x", "y")
         center = tuple(round(float(place[name]), 2) for name in names)
@@ -104,14 +98,9 @@ class FailureClips:
         return Failure(cause, severity, told, clip_of(recent, (center[0], center[1])))
 
 
-def cause_of(trip: np.void, driven_m: float) -> str:
-    """Why a trip is no success, of `CAUSES`; `driven_m` in its last ten seconds."""
-    for cause in ("collision", "off_road", "red_light", "wrong_way"):
-        if trip[cause]:
-            return cause
-    if trip["unfinished"]:
-        return "blocked" if driven_m < STILL_M else "out_of_time"
-    return "slow"
+def cause_of(trip: np.void) -> str:
+    """Why a trip is no success, of `CAUSES`."""
+    return next((cause for cause in FATES if trip[cause]), "slow")
 
 
 def worst(failures: Iterable[Failure], most: int) -> list[Failure]:

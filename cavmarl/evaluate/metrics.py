@@ -11,8 +11,11 @@ from numpy.typing import NDArray
 from cavmarl.config.env import TERMS
 from cavmarl.evaluate.tables import reward_column
 
-Per = Literal["trip", "episode"]
+Per = Literal["trip", "episode", "run"]
 Better = Literal["more", "less"] | None
+
+KM_PER_INFRACTION = "km_per_infraction"
+INFRACTIONS = ("collision", "off_road", "red_light", "wrong_way")
 
 
 @dataclass(frozen=True)
@@ -57,9 +60,18 @@ METRICS = (
     _share("arrived", "arrived", "trips that arrived", "more"),
     _share("collision", "collision", "trips that ended by touching a vehicle", "less"),
     _share("off_road", "off road", "trips that ended off the road", "less"),
-    _share("unfinished", "unfinished", "trips that the horizon cut", "less"),
+    _share("unfinished", "unfinished", "trips that a horizon cut: the episode's, or their own",
+           "less"),
+    _share("blocked", "blocked", "trips that were cut where the built-in driver would stand, too",
+           "less"),
+    _share("stood", "stood", "trips that were cut where they stood, and the built-in driver would "
+           "drive", "less"),
+    _share("out_of_time", "out of time", "trips that were cut under way", "less"),
     _share("red_light", "red light", "trips that passed a red light", "less"),
     _share("wrong_way", "wrong way", "trips that drove against a lane", "less"),
+    Metric(KM_PER_INFRACTION, "way per infraction", "km", "run",
+           "kilometres driven for each collision, way off the road, red light and wrong way; with "
+           "none, all kilometres, which it is above", "more"),
     Metric("agent_arrivals_per_h", "agents arriving", "1/h", "episode",
            "agents that arrived in an hour of simulated time", "more"),
     Metric("background_arrivals_per_h", "others arriving", "1/h", "episode",
@@ -105,9 +117,18 @@ def metric_values(
     if metric.per == "episode":
         return np.asarray(episodes[metric.name], dtype=np.float64)
     rows = trips[trips["counted"]]
+    if metric.per == "run":
+        return _km_per_infraction(rows)
     if metric.arrived:
         rows = rows[rows["arrived"]]
     return np.asarray(rows[metric.name], dtype=np.float64)
+
+
+def _km_per_infraction(trips: NDArray[np.void]) -> NDArray[np.float64]:
+    """One value; none without trips."""
+    infractions = sum(int(trips[name].sum()) for name in INFRACTIONS)
+    km = np.maximum(trips["distance_m"], 0.0).sum(keepdims=True) / 1000.0
+    return np.asarray(km / max(infractions, 1), dtype=np.float64)[: len(trips)]
 
 
 def least_value(metric: Metric, trips: NDArray[np.void]) -> float:

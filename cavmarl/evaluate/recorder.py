@@ -13,6 +13,7 @@ from cavmarl.rewards.kernels.terms import TTC_HORIZON_S
 SHORT_TTC_S = 1.5  # below this a driver has no time left to react (Hayward 1972; SSAM)
 PET_HORIZON_S = 10.0  # a later pass after another is no encounter
 SLOWEST = 3.0  # times what the way takes at the limit: a success takes no longer
+STILL_S = 10.0  # a vehicle that has stood for so long when its trip is cut has not been under way
 MIN_DISTANCE_M = 1.0  # of a trip whose delay a kilometre is compared
 JERK_UNIT_MPS3 = 10.0  # of the term `comfort`
 MESSAGE_COLUMNS = ("v2x_reception_ratio", "v2x_latency_s", "v2x_busy_ratio")
@@ -26,7 +27,8 @@ class Recorder:
     A trip counts if it began in the first half of its episode: so each had at least half an episode
     to end, and which trips count does not depend on how they end.
 
-    `weights` (T,) are those of the terms in the reward.
+    `weights` (T,) are those of the terms in the reward. `slowest`: times what the way takes at the
+    limit, the longest that a success takes.
     """
 
     def __init__(
@@ -36,11 +38,13 @@ class Recorder:
         max_steps: int,
         step_s: float,
         weights: NDArray[np.float64],
+        slowest: float = SLOWEST,
     ) -> None:
         shape = (num_worlds, num_agents)
         self._half = max_steps / 2.0
         self._step_s = step_s
         self._weights = weights
+        self._slowest = slowest
         self._sums = np.zeros((*shape, weights.size))
         self._rewards = np.zeros(shape)
         self._worst_ttc = np.zeros(shape)
@@ -54,6 +58,9 @@ class Recorder:
         self._trips: list[NDArray[np.void]] = []
         self.least_pet_s = np.full(shape, np.inf)  # written by the watcher of junctions
         self.places_m = np.full((*shape, 2), np.nan)  # likewise: before the step
+        self.still_s = np.zeros(shape)  # written by the watcher of standing vehicles
+        self.would_go = np.zeros(shape, dtype=np.bool_)  # likewise: the built-in driver, there
+        self.maps = np.zeros(num_worlds, dtype=np.int64)  # of each world
 
     def add(
         self,
@@ -104,14 +111,17 @@ class Recorder:
         began = self._began[ended]
         pet = self.least_pet_s[ended]
         rows = np.zeros(world.size, dtype=TRIP)
-        rows["episode"], rows["agent"] = world, agent
+        rows["episode"], rows["agent"], rows["map"] = world, agent, self.maps[world]
         rows["began_s"] = began * self._step_s
         rows["counted"] = began < self._half
         rows["collision"] = sums[:, _TERM["collision"]] > 0.0
         rows["off_road"] = (sums[:, _TERM["off_road"]] > 0.0) & ~rows["collision"]
         out = rows["collision"] | rows["off_road"]
         rows["arrived"] = (sums[:, _TERM["arrival"]] > 0.0) & ~out
-        rows["unfinished"] = ~(rows["arrived"] | out)
+        rows["unfinished"] = late = ~(rows["arrived"] | out)
+        still, would_go = self.still_s[ended] >= STILL_S, self.would_go[ended]
+        rows["blocked"], rows["stood"] = late & still & ~would_go, late & still & would_go
+        rows["out_of_time"] = late & ~still
         rows["red_light"] = sums[:, _TERM["red_light"]] > 0.0
         rows["wrong_way"] = sums[:, _TERM["wrong_way"]] > 0.0
         rows["reward"] = self._rewards[ended]
@@ -121,7 +131,8 @@ class Recorder:
         rows["delay_s"] = sums[:, _TERM["delay"]]
         at_fault = rows["red_light"] | rows["wrong_way"]
         free_s = rows["duration_s"] - rows["delay_s"]
-        rows["success"] = rows["arrived"] & ~at_fault & (rows["duration_s"] <= SLOWEST * free_s)
+        in_time = rows["duration_s"] <= self._slowest * free_s
+        rows["success"] = rows["arrived"] & ~at_fault & in_time
         rows["mean_jerk_mps3"] = JERK_UNIT_MPS3 * sums[:, _TERM["jerk"]] / steps
         rows["mean_speeding"] = sums[:, _TERM["speeding"]] / steps
         rows["least_ttc_s"] = TTC_HORIZON_S * (1.0 - self._worst_ttc[ended])

@@ -7,13 +7,14 @@ differ among themselves; it says nothing about another run.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.evaluate.by_map import rows_by_map
 from cavmarl.evaluate.episodes import Speed
 from cavmarl.evaluate.metrics import METRICS, Metric, least_value, metric_values
 from cavmarl.evaluate.statistics import (
@@ -94,6 +95,8 @@ class EvaluationReport:
     episodes: int  # of each run
     seeds: tuple[int, ...]  # of the runs
     manifest: Mapping[str, Any]  # the closed manifest of the results
+    # of each policy what `rows_by_map` says; nothing where there is one map
+    by_map: Mapping[str, Sequence[Mapping[str, Any]]]
 
     def __getitem__(self, policy: str) -> PolicyReport:
         return self.policies[policy]
@@ -141,7 +144,8 @@ def make_report(
         )
         for name, metrics in found.items()
     }
-    return EvaluationReport(policies, len(seeds), manifest["episodes"], seeds, manifest)
+    by_map = rows_by_map(tables, manifest["world"]["maps"])
+    return EvaluationReport(policies, len(seeds), manifest["episodes"], seeds, manifest, by_map)
 
 
 def _find(metric: Metric, trips: NDArray[np.void], episodes: NDArray[np.void], runs: int) -> Found:

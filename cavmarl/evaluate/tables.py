@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,8 @@ from cavmarl.config.env import TERMS
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 
 Rows = NDArray[np.void]
+
+METRICS_VERSION: Final = 2  # goes up whenever a column or a metric means something else
 
 PASSENGER = 1 << VEHICLE_CLASSES.index("passenger")
 TOLERANCE_M = 0.5  # that a line of the map may leave its lane's centre by
@@ -28,13 +30,18 @@ TRIP = np.dtype(
         ("run", np.int64),
         ("episode", np.int64),
         ("agent", np.int64),  # index of the agent that drove it
+        ("map", np.int64),  # number of the map among those of the environment
         ("began_s", np.float64),  # time of the episode at its first decision
         ("counted", np.bool_),  # began in the first half of its episode
         ("arrived", np.bool_),  # how it ended: one of these four
         ("collision", np.bool_),
         ("off_road", np.bool_),
-        ("unfinished", np.bool_),  # the horizon cut it
-        # arrived within SLOWEST times the free time, without a red light and never the wrong way
+        ("unfinished", np.bool_),  # a horizon cut it: the episode's, or its own
+        ("blocked", np.bool_),  # and how: it stood, and the built-in driver would have stood, too;
+        ("stood", np.bool_),  # it stood, and the built-in driver would have driven;
+        ("out_of_time", np.bool_),  # it was under way
+        # arrived in time, without a red light and never the wrong way; in time is within SLOWEST
+        # times the free time, where trips have no horizon of their own
         ("success", np.bool_),
         ("red_light", np.bool_),  # whether it ever passed one
         ("wrong_way", np.bool_),  # whether it ever drove against its lane

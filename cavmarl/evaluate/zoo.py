@@ -28,8 +28,9 @@ from cavmarl.evaluate.evaluation import (
     TRIPS_FILE,
     evaluate,
     load_tables,
+    read_evaluation,
 )
-from cavmarl.evaluate.provenance.manifest import hash_of_file, read_closed
+from cavmarl.evaluate.provenance.manifest import hash_of_file
 from cavmarl.policies.policy import TOGETHER, policy_files
 
 RESULT_FOLDER = "result"
@@ -97,7 +98,7 @@ def verify_entry(policy: str | Path, progress: Progress | None = None) -> Verifi
     if len(weights) < 2:
         raise PolicyError(f"{policy}: is a script; the zoo has trained drivers only")
     name = folder.name
-    document = read_closed(folder / RESULT_FOLDER)
+    document = read_evaluation(folder / RESULT_FOLDER)
     job = _job_of(document, folder)
     _check_weights(document, name, weights)
     spec = WorldSpec.of(job["env"], **{key: job[key] for key in _KEYS})
@@ -162,7 +163,7 @@ def _entry(name: str, folder: Path) -> ZooEntry:
     result = folder / RESULT_FOLDER
     if not result.is_dir():
         return ZooEntry(name, folder, weights_bytes, "", 0, {})
-    document = read_closed(result)
+    document = read_evaluation(result)
     trips, _ = load_tables(result)[next(iter(document["policies"]))]
     counted = trips[trips["counted"]]
     shares = {key: float(counted[key].mean()) for key in SHARES} if len(counted) else {}

@@ -30,8 +30,9 @@ class StepArrays(NamedTuple):
     observations: NDArray[np.float32]  # (W, A, D) for the next action
     final_observations: NDArray[np.float32]  # (W, A, D) where something ended, before that
     rewards: NDArray[np.float32]  # (W, A)
-    terminations: NDArray[np.bool_]  # (W, A) the vehicle ended
-    truncations: NDArray[np.bool_]  # (W, A) the horizon ended it
+    terminations: NDArray[np.bool_]  # (W, A) the vehicle is gone
+    # (W, A) a horizon cut its trip: the episode's, or its own, and then it is gone, too
+    truncations: NDArray[np.bool_]
     acted: NDArray[np.bool_]  # (W, A) agents that have acted
     vehicle_done: NDArray[np.bool_]  # (W, A)
     vehicle_ids: NDArray[np.int64]  # (W, A) of the vehicle at the end of the step; -1: it had none

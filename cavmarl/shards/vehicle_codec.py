@@ -42,7 +42,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
         "control and route": "throttle steering target_speed target_lane blinker "
         "lane side_lane s d link goal way leg stop stops_end to_go",
         "actor configuration": "driver vtype length width height sensor_phase",
-        "synchronization": "tick departed transfer",
+        "synchronization": "tick departed due transfer",
         "agent logic": "rng_key speed_factor hold wait_s stopped_at stopped_s last_change hit "
         "events step_to_go step_jerk distance_m free_s episode_return memory",
     }.items()

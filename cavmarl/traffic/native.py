@@ -142,6 +142,7 @@ class NativeTraffic:
         """
         more = agent_types(self._other_types, model_code(self.traffic.model))
         found = self._travel_of_others
+        found = found._replace(trip_horizon=self.traffic.trip_horizon, tick_s=self.dt)
         return found._replace(types=np.concatenate([found.types, more])) if len(more) else found
 
     @property

@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 
 from cavmarl.core.records.arrays import Gate, Outputs
-from cavmarl.core.records.codes import EVENT_ARRIVED, EVENT_COLLIDED, NUM_COUNTS
+from cavmarl.core.records.codes import (
+    EVENT_ARRIVED,
+    EVENT_COLLIDED,
+    EVENT_OUT_OF_TIME,
+    NUM_COUNTS,
+)
 from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.engine.kernels.step_results import Results, keep_last, report, report_who_goes_on
 from cavmarl.engine.world_setup import load_world
@@ -13,6 +18,8 @@ from cavmarl.traffic.departure_queue import make_gate
 from tests.naive import step_results as naive
 
 WORLDS, AGENTS, TERMS, HORIZON = 5, 4, 3, 7
+LATE = EVENT_OUT_OF_TIME
+KINDS = [0, 1 << 20, EVENT_COLLIDED, EVENT_ARRIVED, LATE, LATE | EVENT_COLLIDED]
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +37,7 @@ def outputs_of(rng: np.random.Generator) -> Outputs:
         terminated=present & (rng.random(shape) < 0.2),
         present=present,
         acted=present & (rng.random(shape) < 0.8),
-        events=rng.choice([0, 1 << 20, EVENT_COLLIDED, EVENT_ARRIVED], shape).astype(np.int32),
+        events=rng.choice(KINDS, shape).astype(np.int32),
         vehicle_ids=rng.integers(-1, 99, shape),
     )
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.records.arrays import Gate, Outputs
-from cavmarl.core.records.codes import COUNT_ARRIVED, EVENTS_THAT_END
+from cavmarl.core.records.codes import COUNT_ARRIVED, EVENTS_OF_FATE, EVENTS_THAT_END
 from cavmarl.engine.kernels.step_results import Results
 
 
@@ -16,7 +16,8 @@ def report(outputs: Outputs, steps: NDArray[np.int64], horizon: int, results: Re
     for name in ("rewards", "terms", "acted", "vehicle_ids"):
         getattr(results, name)[:] = getattr(outputs, name)
     results.terminations[:] = outputs.terminated
-    results.truncations[:] = outputs.acted & at_horizon & ~outputs.terminated
+    cut = np.where(outputs.terminated, outputs.events & EVENTS_OF_FATE == 0, at_horizon)
+    results.truncations[:] = outputs.acted & cut
     results.vehicle_done[:] = outputs.events & EVENTS_THAT_END != 0
     return bool(outputs.terminated.any())
 

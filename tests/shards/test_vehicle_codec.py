@@ -268,8 +268,8 @@ def test_refusals_have_their_types() -> None:
         unpacked(state + b"\0", vehicle, TICK)
     with pytest.raises(MessageError, match="begins with"):
         unpacked(b"CVMO" + state[4:], vehicle, TICK)
-    with pytest.raises(MessageError, match=r"version 2\.0; this build reads 1\."):
-        unpacked(state[:4] + struct.pack("<H", 2) + state[6:], vehicle, TICK)
+    with pytest.raises(MessageError, match=r"version 3\.0; this build reads 2\."):
+        unpacked(state[:4] + struct.pack("<H", 3) + state[6:], vehicle, TICK)
     with pytest.raises(MessageError, match=f"expected is vehicle {vehicle + 1}"):
         unpacked(state, vehicle + 1, TICK)
     with pytest.raises(MessageError, match=f"at tick {TICK + 1}"):

@@ -73,6 +73,8 @@ class Travel(NamedTuple):
     see_m: float  # how far before a line its centre is when a driver first asks about it
     num_fixed: int  # steps from here on are written while the world runs
     scripts: Scripts
+    trip_horizon: float = 0.0  # so many times its free time a trip of an agent may take; 0: any
+    tick_s: float = 0.1
 
 
 class Common(NamedTuple):

@@ -10,8 +10,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from cavmarl.core.numba import inlined_kernel
+from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays, Travel
+from cavmarl.roads.kernels.signal_phases import program_at
+
+MOST_CHANGES = 8  # of lanes at the end of one of them
 
 
 @inlined_kernel
@@ -54,3 +57,39 @@ def way_left(roads: RoadArrays, row: np.void, step: np.void) -> float:
     if here["internal"]:
         left += roads.links[here["link"]]["length_m"] - here["link_offset_m"]
     return float(step["to_go"] + left)
+
+
+@kernel
+def goes_on(roads: RoadArrays, travel: Travel, lane: int, way: int) -> tuple[int, int, int]:
+    """`next_step`, from the lane that the plan asks for where it does not go on from this one."""
+    for _ in range(MOST_CHANGES):
+        following, way_there, link = next_step(roads, travel, lane, way)
+        if following >= 0 or roads.lanes[lane]["internal"]:
+            return following, way_there, link
+        change = travel.steps[way + lane]["change"]
+        if change == 0:
+            break
+        lane = roads.lanes[lane]["left"] if change > 0 else roads.lanes[lane]["right"]
+        if lane < 0:
+            break
+    return -1, way, -1
+
+
+@kernel
+def time_of_way(roads: RoadArrays, travel: Travel, row: np.void, begin_s: float) -> float:
+    """Seconds that the way takes at the limits, `Travel.trip_horizon` times, and its signals.
+
+    Each signal counts with a whole cycle of the program that is on at `begin_s`.
+    """
+    lane, way = row["lane"], row["way"]
+    free_s = -row["s"] / roads.lanes[lane]["speed_mps"]
+    signals_s = 0.0
+    for _ in range(roads.lanes.shape[0]):
+        free_s += roads.lanes[lane]["length_m"] / roads.lanes[lane]["speed_mps"]
+        lane, way, link = goes_on(roads, travel, lane, way)
+        if lane < 0:
+            break
+        if link >= 0 and roads.links[link]["signal"] >= 0:
+            program = program_at(roads, roads.links[link]["signal"], begin_s, travel.tick_s)
+            signals_s += roads.programs[program]["cycle_s"]
+    return float(travel.trip_horizon * free_s + signals_s)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.numba import kernel
 from cavmarl.core.records.arrays import Gate, Outputs
-from cavmarl.core.records.codes import COUNT_ARRIVED, EVENTS_THAT_END
+from cavmarl.core.records.codes import COUNT_ARRIVED, EVENTS_OF_FATE, EVENTS_THAT_END
 
 
 class Results(NamedTuple):
@@ -50,8 +50,10 @@ def report(
             results.vehicle_ids[w, agent] = outputs.vehicle_ids[w, agent]
             results.acted[w, agent] = acted
             results.terminations[w, agent] = terminated
-            results.truncations[w, agent] = acted and at_horizon and not terminated
-            results.vehicle_done[w, agent] = outputs.events[w, agent] & EVENTS_THAT_END != 0
+            events = outputs.events[w, agent]
+            cut = events & EVENTS_OF_FATE == 0 if terminated else at_horizon
+            results.truncations[w, agent] = acted and cut
+            results.vehicle_done[w, agent] = events & EVENTS_THAT_END != 0
             for k in range(outputs.terms.shape[2]):
                 results.terms[w, agent, k] = outputs.terms[w, agent, k]
             ended |= terminated

@@ -20,7 +20,8 @@ from cavmarl.core.records.arrays import RoadArrays, Travel
 from cavmarl.core.records.codes import SIGNAL_GREEN_MAJOR, SIGNAL_RED, SIGNAL_RED_YELLOW
 from cavmarl.core.records.rows import is_off_lanes
 from cavmarl.driving.kernels.gaps import link_signal
-from cavmarl.sensors.kernels.observing_way import MOST_LANES, goes_on
+from cavmarl.driving.kernels.ways import goes_on
+from cavmarl.sensors.kernels.observing_way import MOST_LANES
 from cavmarl.sensors.kernels.sensor_arrays import ConflictsSensor
 
 CONFLICT_FEATURES = 9

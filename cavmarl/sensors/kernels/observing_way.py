@@ -25,7 +25,7 @@ from cavmarl.core.records.codes import (
 )
 from cavmarl.driving.kernels.gaps import link_signal, must_stop
 from cavmarl.driving.kernels.signal_timing import time_to_change
-from cavmarl.driving.kernels.ways import next_step
+from cavmarl.driving.kernels.ways import goes_on
 from cavmarl.sensors.kernels.sense import SPEED_SCALE, gives_way_on, soonness, unit
 from cavmarl.sensors.kernels.sensor_arrays import WaySensor
 
@@ -35,23 +35,6 @@ CURVATURE_SCALE = 0.2  # 1/m
 WIDTH_SCALE = 8.0  # m
 LINE_HALF_M = 20.0  # a line at this distance is half as near as can be
 MOST_LANES = 48  # that a way is followed over
-MOST_CHANGES = 8  # of lanes at the end of one of them
-
-
-@kernel
-def goes_on(roads: RoadArrays, travel: Travel, lane: int, way: int) -> tuple[int, int, int]:
-    """`next_step`, from the lane that the plan asks for where it does not go on from this one."""
-    for _ in range(MOST_CHANGES):
-        following, way_there, link = next_step(roads, travel, lane, way)
-        if following >= 0 or roads.lanes[lane]["internal"]:
-            return following, way_there, link
-        change = travel.steps[way + lane]["change"]
-        if change == 0:
-            break
-        lane = roads.lanes[lane]["left"] if change > 0 else roads.lanes[lane]["right"]
-        if lane < 0:
-            break
-    return -1, way, -1
 
 
 @kernel

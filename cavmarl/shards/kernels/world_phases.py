@@ -25,6 +25,7 @@ from cavmarl.core.records.codes import (
     DRIVER_SCRIPTED,
     EVENT_ARRIVED,
     EVENT_COLLIDED,
+    EVENT_OUT_OF_TIME,
     EVENTS_THAT_END,
 )
 from cavmarl.core.records.rows import is_lost
@@ -138,6 +139,8 @@ def _drive_agent(
         worlds.pending, w, row["agent"], worlds.ticks[w], throttle, steering
     )
     move_agent(roads, plans, lane_grid, row, kind, throttle, steering, worlds.signal_phase[w], dt)
+    if row["due"] >= 0 and row["tick"] >= row["due"]:
+        row["events"] |= EVENT_OUT_OF_TIME
     # The indicator is automatic: drivers behind make room for a vehicle that has to change lanes.
     row["blinker"] = needed_change(roads, travel, row, travel.steps[own_step(roads, row)])
 

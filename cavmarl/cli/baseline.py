@@ -1,0 +1,82 @@
+"""`cavmarl baseline`: chance, the built-in driver, a trained one and an oracle on your own map."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated
+
+from rich.console import Console
+from rich.markup import escape
+
+from cavmarl.cli.evaluate import progress_bar, report_cell
+from cavmarl.cli.output import (
+    Agents,
+    Background,
+    JsonPath,
+    MapName,
+    Seed,
+    about,
+    grid,
+    make_folder,
+    write_json,
+)
+from cavmarl.core.errors import ConfigError, require
+
+
+def baseline(
+    where: MapName,
+    policy: Annotated[
+        str, about("The trained driver: a name or a folder.", "--policy", "-p")
+    ] = "cities_ippo",
+    episodes: Annotated[int, about("Episodes of each driver.", "--episodes", "-n")] = 6,
+    agents: Agents = None,
+    background: Background = None,
+    seed: Seed = 0,
+    out: Annotated[Path | None, about("A new folder; default: one in runs/.")] = None,
+    json_path: JsonPath = None,
+) -> None:
+    """Drive a map as chance, `idm` and a trained driver do, and as `idm` does alone; one page."""
+    require("matplotlib", "report")
+    require("jinja2", "report")
+    require("torch", "torch")
+    from cavmarl.evaluate.baseline import baseline_rows, figures, run_baseline, write_baseline
+
+    stamp = datetime.now().strftime("%Y%m%d-%H%M%S-%f")
+    folder = out or Path("runs/baseline") / f"{Path(where).name.split('.')[0]}-{stamp}"
+    if folder.exists() and any(folder.iterdir()):
+        raise ConfigError(f"--out {folder}: there is something already; give a new folder")
+    make_folder(folder)
+    console = Console()
+    with progress_bar(console) as bar:
+        task = bar.add_task("")
+
+        def show(driver: str, steps: int, most: int) -> None:
+            bar.update(task, description=f"{driver} drives", completed=steps, total=most)
+
+        found = run_baseline(
+            where,
+            folder,
+            policy=policy,
+            agents=agents,
+            background=background,
+            episodes=episodes,
+            seed=seed,
+            progress=show,
+        )
+    drivers = baseline_rows(found)
+    rows = [
+        (metric.title, *(report_cell(metric, row[k]) for row in drivers.values()))
+        for k, metric in enumerate(figures())
+    ]
+    counts = [str(one.trips) for part in found.values() for one in part.policies.values()]
+    title = f"{Path(where).name}, {episodes} episodes, seed {seed}"
+    caption = "oracle: idm alone on the road. Shares [Wilson's 95 %], means (SD)"
+    heads = ("", *map(escape, drivers))
+    table = grid(heads, [("trips", *counts), *rows], escape(title), caption, wraps=True)
+    console.print(table)
+    write_baseline(folder, found, folder / "baseline.html")
+    write_json(json_path, {part: report.to_dict() for part, report in found.items()})
+    console.print(
+        f"page: {folder / 'baseline.html'}", markup=False, highlight=False, soft_wrap=True
+    )

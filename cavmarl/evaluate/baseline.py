@@ -1,0 +1,140 @@
+"""A baseline for a map: chance, the built-in driver, a trained one, and what an oracle could do.
+
+All drive the same trips under the rules of one environment, on another map. The oracle is the
+built-in driver alone on the road: nothing is in its way, so no driver among others does better for
+long. What is missing to it is what traffic costs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from cavmarl.config.registry import load_config, resolve_maps
+from cavmarl.config.world_spec import WorldSpec
+from cavmarl.core.errors import require
+from cavmarl.evaluate.episodes import Progress
+from cavmarl.evaluate.evaluation import evaluate, load_map, load_tables, load_tracks
+from cavmarl.evaluate.metrics import KM_PER_INFRACTION, METRICS, Metric
+from cavmarl.evaluate.provenance.manifest import write_text
+from cavmarl.evaluate.report import EvaluationReport, Found
+
+RULES = "cities"  # the environment whose rules hold, and whose driver drives
+GENERALIST = "cities_ippo"
+ORACLE = "oracle"
+AMONG, ALONE = "among", "alone"  # folders of the results
+FIGURES = (
+    "success",
+    "collision",
+    "off_road",
+    "red_light",
+    "stood",
+    "blocked",
+    "out_of_time",
+    KM_PER_INFRACTION,
+    "delay_s",
+    "mean_jerk_mps3",
+)
+_PAGE = Path(__file__).with_name("baseline.html.j2")
+
+
+def run_baseline(
+    where: str,
+    out: Path,
+    *,
+    policy: str = GENERALIST,
+    agents: int | None = None,
+    background: int | None = None,
+    episodes: int = 6,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> dict[str, EvaluationReport]:
+    """Evaluate `random_actions`, `idm` and a trained driver among others, and `idm` alone.
+
+    Args:
+        where: a map file, or an environment, whose maps are taken.
+        out: folder of the results, `among` and `alone` in it.
+        policy: the trained driver.
+        agents: of each world; None: as many as the rules say.
+        background: likewise.
+        episodes: of each driver among others; alone it drives as many for each agent, up to 64.
+        seed: of the episodes.
+        progress: as in `evaluate`.
+
+    Raises as `evaluate`: of a map that cannot be driven, or a driver that does not fit.
+    """
+    config, base_dir = load_config(where)
+    maps = [str(path) for path in resolve_maps(config, base_dir)]
+    overrides = {"map.source": maps[0] if len(maps) == 1 else maps}
+    busy = WorldSpec(
+        env=RULES, agents=agents, background=background, seed=seed, overrides=overrides
+    )
+    empty = WorldSpec(env=RULES, agents=1, background=0, seed=seed, overrides=overrides)
+    drivers = {Path(name).name: name for name in ("random_actions", "idm", policy)}
+    alone = min(64, 8 * episodes)
+    return {
+        AMONG: evaluate(busy, drivers, episodes=episodes, out=out / AMONG, progress=progress),
+        ALONE: evaluate(empty, {ORACLE: "idm"}, episodes=alone, out=out / ALONE, progress=progress),
+    }
+
+
+def baseline_rows(found: Mapping[str, EvaluationReport]) -> dict[str, list[Found]]:
+    """Of each driver, the oracle last, its `FIGURES`."""
+    return {
+        name: [driver[figure] for figure in FIGURES]
+        for part in (AMONG, ALONE)
+        for name, driver in found[part].policies.items()
+    }
+
+
+def figures() -> Sequence[Metric]:
+    """The metrics of a row of `baseline_rows`."""
+    by_name = {metric.name: metric for metric in METRICS}
+    return [by_name[name] for name in FIGURES]
+
+
+def write_baseline(folder: Path, found: Mapping[str, EvaluationReport], path: Path) -> None:
+    """Write what `run_baseline` left in a folder as one page, which asks no server for anything.
+
+    Raises MissingExtraError: matplotlib or Jinja2 is not installed.
+    """
+    require("matplotlib", "report")
+    jinja2 = require("jinja2", "report")
+    from cavmarl.evaluate import plots
+
+    among = folder / AMONG
+    tables, tracks, outline = load_tables(among), load_tracks(among), load_map(among)
+    report = found[AMONG]
+    template = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    ).from_string(_PAGE.read_text(encoding="utf-8"))
+    content: dict[str, Any] = {
+        "world": report.manifest["world"],
+        "episodes": report.episodes,
+        "seed": report.seeds[0],
+        "trips": {
+            name: driver.trips for part in found.values() for name, driver in part.policies.items()
+        },
+        "metrics": figures(),
+        "rows": {name: _texts(row) for name, row in baseline_rows(found).items()},
+        "outcomes": plots.plot_outcomes(report),
+        "maps": {
+            name: plots.plot_map(outline, tracks[name], tables[name][0], plots.color_of(k))
+            for k, name in enumerate(report.policies)
+        },
+    }
+    write_text(path, template.render(content))
+
+
+def _texts(row: Sequence[Found]) -> list[tuple[str, str]]:
+    """Mean and interval of each figure."""
+    return [
+        (
+            "-" if one.mean is None else f"{metric.scale * one.mean:.2f}",
+            ""
+            if one.interval is None
+            else f"{metric.scale * one.interval.low:.1f} … {metric.scale * one.interval.high:.1f}",
+        )
+        for metric, one in zip(figures(), row, strict=True)
+    ]
