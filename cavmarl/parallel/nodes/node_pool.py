@@ -149,17 +149,22 @@ class NodePool:
         self._starter, listener = start(hosts, nodes, config.workers, base_dir, route)
         self._newcomers = Newcomers(listener, job, files, self._room, system)
         try:
-            self._newcomers.await_ready(nodes, config.workers.join_timeout_s, self._starter.trouble)
-            self._seat()
-            self._tell_zones(self._coordinator.host(), ZoneMoves(self.zones, {}, []), begins=True)
-            self._commit()
-            self._new.clear()
+            self._begin(nodes)
         except (LinkLostError, SilenceError) as error:
             self.close()
             raise WorkerError(f"{error} before it had begun; see standard error") from error
         except BaseException:
             self.close()
             raise
+
+    def _begin(self, nodes: int) -> None:
+        """Wait until so many nodes have joined, and give them their zones."""
+        join_timeout_s = self.world.config.workers.join_timeout_s
+        self._newcomers.await_ready(nodes, join_timeout_s, self._starter.trouble)
+        self._seat()
+        self._tell_zones(self._coordinator.host(), ZoneMoves(self.zones, {}, []), begins=True)
+        self._commit()
+        self._new.clear()
 
     @property
     def pids(self) -> list[int]:
