@@ -28,8 +28,7 @@ from cavmarl.driving.kernels.ways import next_step, own_step, way_left
 LATERAL_MPS = 1.4  # fastest sideways motion of a lane change
 LATERAL_RATIO = 0.35  # and no faster than this share of the speed,
 LATERAL_MIN_MPS = 0.5  # but never stuck between two lanes
-MAX_DRIFT_RAD = 0.12  # largest angle between a vehicle that changes lanes and its lane,
-MAX_SWING_M = 0.3  # and by how much its corners swing out, at most
+MAX_DRIFT_RAD = 0.12  # largest angle between a car that changes lanes and its lane
 MAX_BODY_LANES = 8  # that a body may lie on, before and behind its centre
 STANDING_MPS = 0.1
 ARRIVE_M = 5.0  # a trip ends this far before the end of its goal edge
@@ -224,8 +223,7 @@ def move_background(
     heading = place_on_lane(roads, travel, row)
     if row["d"] != offset and speed > STANDING_MPS:
         drift = math.atan2((row["d"] - offset) / dt, speed)
-        most = min(MAX_DRIFT_RAD, 2.0 * MAX_SWING_M / row["length"])
-        heading = wrap_angle(heading + clamp(drift, -most, most))
+        heading = wrap_angle(heading + clamp(drift, -MAX_DRIFT_RAD, MAX_DRIFT_RAD))
     row["heading"] = heading
     turned = wrap_angle(heading - before.heading)
     row["steering"] = 0.0
