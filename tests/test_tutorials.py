@@ -7,12 +7,14 @@ import re
 import shlex
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 from cavmarl.cli import app
+from cavmarl.core.extensions import REGISTERED_MODELS, REGISTERED_SENSORS, REGISTERED_TERMS
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "docs" / "tutorials"
@@ -20,6 +22,17 @@ NEEDS_SERVICE = "nodes_and_service"
 DEAR = {"train"}  # seconds: it trains
 PAGES = sorted(path.stem for path in FOLDER.glob("*.md") if path.stem != "README")
 QUICK = [name for name in PAGES if name not in (NEEDS_SERVICE, *DEAR)]
+
+
+@pytest.fixture(autouse=True)
+def nothing_stays_registered() -> Iterator[None]:
+    """Worker processes of later tests cannot import what a page has registered."""
+    registries = (REGISTERED_TERMS, REGISTERED_SENSORS, REGISTERED_MODELS)
+    before = [set(registry.names) for registry in registries]
+    yield
+    for registry, names in zip(registries, before, strict=True):
+        for name in set(registry.names) - names:
+            registry.remove(name)
 
 
 def run_page(name: str) -> None:

@@ -40,7 +40,7 @@ def list_drivers(json_path: JsonPath = None) -> None:
         shares = (number(entry.shares.get(key), 100.0) for key in SHORT)
         cells = (f"{entry.weights_bytes / 1000.0:.0f}", entry.environment or "no result")
         rows.append((escape(entry.name), *cells, str(entry.trips), *shares))
-    Console().print(grid(heads, rows, caption="shares in % of the result's trips"))
+    Console().print(grid(heads, rows, caption="shares in % of the result's trips", wraps=True))
     fields = ("environment", "weights_bytes", "trips", "shares")
     told = {one.name: {field: getattr(one, field) for field in fields} for one in found}
     write_json(json_path, told)

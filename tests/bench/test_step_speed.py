@@ -29,7 +29,7 @@ def test_every_row_is_measured_each_turn() -> None:
     pytest.importorskip("highway_env")
     told: list[str] = []
     found = measure_step_speed(agents=3, worlds=2, repeats=2, progress=told.append)
-    rows = {(row.sensors, row.who): row for row in found.rows}
+    rows = {(row.sensors, row.side): row for row in found.rows}
     assert len(rows) == len(found.rows) == 9
     for row in found.rows:
         assert 0.0 < row.low <= row.median <= row.high

@@ -11,10 +11,12 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+import numpy as np
 import pytest
 
 from cavmarl import CavVectorEnv, make_vec
 from cavmarl.core.errors import CavmarlError, ProtocolError
+from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.handoff.coordinator.coordinator_setup import make_coordinators
 from cavmarl.handoff.fault_injection.fault_plan import Crash, Faults
 from cavmarl.handoff.fault_injection.message_coordinator import MessageCoordinator
@@ -23,11 +25,13 @@ from cavmarl.ownership.messages import Commit, Done, Message, Offer, Record
 from cavmarl.ownership.replicas import Replicas
 from cavmarl.ownership.safeguards import ALL_ON
 from cavmarl.ownership.transport import Network, Rates
+from cavmarl.shards.vehicle_codec import _HEADER
 from tests.support.faulted import BUSY, NOISE, Recorded, follow, record, replay
 
 STEPS = 20
 ZONES = 4
 LIFETIME = 16
+VEHICLE_X_BYTE = np.dtype(VEHICLE).fields["x"][1] + 5  # type: ignore[index]
 LATE = {kind: replace(rates, delay=0.5, duplicate=0.5, longest_delay=64)
         for kind, rates in NOISE.items()}  # fmt: skip
 # What is not lost here goes through the network all the same, and not straight.
@@ -111,7 +115,7 @@ def test_at08_a_state_that_is_damaged_in_memory_is_refused(
 
     def damaged(replicas: Replicas, offer: Offer, tick: int, schema: int) -> Any:
         state = bytearray(offer.state)
-        state[len(state) // 3] ^= 0x10
+        state[_HEADER.size + VEHICLE_X_BYTE] ^= 0x10
         return prepare(replicas, offer._replace(state=bytes(state)), tick, schema)
 
     monkeypatch.setattr(Replicas, "prepare", damaged)
