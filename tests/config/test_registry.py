@@ -76,7 +76,7 @@ def test_a_bare_map_file_gets_a_default_environment(here: Path, suffix: str) -> 
 
 def test_an_unknown_name_is_told_the_nearest_and_all(here: Path) -> None:
     with pytest.raises(
-        UnknownEnvironmentError, match=r"'twon'; did you mean town\?.*grid4x4, .*mer"
+        UnknownEnvironmentError, match=r"'twon'; did you mean town\?.*grid4x4, .*me"
     ):
         load_config("twon")
 

@@ -31,7 +31,7 @@ from tests.support.faulted import BUSY, NOISE, Recorded, follow, record, replay
 STEPS = 20
 ZONES = 4
 LIFETIME = 16
-VEHICLE_X_BYTE = np.dtype(VEHICLE).fields["x"][1] + 5  # type: ignore[index]
+SPEED_BYTE = np.dtype(VEHICLE).fields["speed"][1] + 5  # type: ignore[index]
 LATE = {kind: replace(rates, delay=0.5, duplicate=0.5, longest_delay=64)
         for kind, rates in NOISE.items()}  # fmt: skip
 # What is not lost here goes through the network all the same, and not straight.
@@ -115,7 +115,7 @@ def test_at08_a_state_that_is_damaged_in_memory_is_refused(
 
     def damaged(replicas: Replicas, offer: Offer, tick: int, schema: int) -> Any:
         state = bytearray(offer.state)
-        state[_HEADER.size + VEHICLE_X_BYTE] ^= 0x10
+        state[_HEADER.size + SPEED_BYTE] ^= 0x10
         return prepare(replicas, offer._replace(state=bytes(state)), tick, schema)
 
     monkeypatch.setattr(Replicas, "prepare", damaged)

@@ -38,12 +38,12 @@ VARIANTS: tuple[tuple[str, Mapping[str, bool | float]], ...] = (
 ROOMY = {"failed_u_turn": "A1B1_1", "pedestrian_crossing": "A1B1_0"}
 # The reference driver on grid4x4, seed 0, nobody else on the road.
 GOLDEN = {
-    ("failed_u_turn", False): "d328218ab78180a26e908b8588cbff9e",
-    ("intersection_blockage", False): "d05a0f96382e3b2e9fb20bb638085bc8",
-    ("merge_conflict", False): "f231e9b48c351919c77298a9bf9a7207",
-    ("pedestrian_crossing", False): "1ecd190d1f275fa51cb0fc8c4db01b5a",
-    ("pedestrian_crossing", True): "17751e9da0f775beba34f709cf661460",
-    ("road_closure", False): "4c0d6855a8ae2af9dddd74a9eddd257e",
+    ("failed_u_turn", False): "8c96686d6f7f4c3fb7618e14c20de981",
+    ("intersection_blockage", False): "8076b53af2bd13a47b5420ae08f51132",
+    ("merge_conflict", False): "ab0d9157919a39a12c4311264c6b7dd0",
+    ("pedestrian_crossing", False): "d9ea21caeb1504be3cb9b7ae9c1e6289",
+    ("pedestrian_crossing", True): "2bdf5731261a74ff181a519b9daf6bfd",
+    ("road_closure", False): "63057a9b811d30cff149b764fa08d7f0",
     ("signal_outage", False): "e6dd0ced6cdf7682f6a0cdc530f0cb84",
     ("unprotected_left_turn", False): "c61fa293d08fb4492f54009630ed42ba",
 }
