@@ -2,7 +2,8 @@
 
 It drives towards a little less than the speed of uniform flow, by 0.03 m/s more each second, and
 never faster than it can brake behind the vehicle ahead. Those behind follow without a stop. In
-`ring22` this dissolves the stop and go of 21 human drivers; elsewhere it is of no use. It needs
+`ring22` this dissolves the stop and go of 21 human drivers; elsewhere it is of no use. It reads the
+world's clock, which no sensor shows, and steers by the built-in driver's suggestions. It needs
 `sensors.ego`, `sensors.lanes` and continuous actions.
 """
 

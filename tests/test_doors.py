@@ -23,6 +23,7 @@ from cavmarl.sensors.registry import find_sensor, sensor_names
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "extending.md"
 ENV, AGENTS, BACKGROUND, STEPS = "grid4x4", 12, 40, 40
+KINDS = ("A term", "A sensor", "A driver model", "A backend")
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +38,7 @@ def examples(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Mod
             name = "outside_" + title.lower().replace(" ", "_")
             (folder / f"{name}.py").write_text("\n\n".join(blocks), encoding="utf-8")
             found[title] = importlib.import_module(name)
-    assert {"A term", "A sensor", "A driver model", "A backend"} < set(found)
+    assert list(found) == [*KINDS, "A simulator for zones"]
     yield found
     sys.path.remove(str(folder))
     for registry in (REGISTERED_TERMS, REGISTERED_SENSORS, REGISTERED_MODELS):
@@ -103,6 +104,20 @@ def test_a_batched_answer_is_of_each_agent_alone() -> None:
     with pytest.raises(RegisteredFunctionError, match=r"'relative' depends on .* of the batch"):
         drive(env)
     env.close()
+
+
+def test_workers_do_without_what_they_cannot_import_and_do_not_need() -> None:
+    """As where a notebook has registered something, and other worlds have workers."""
+
+    def zero(view: cavmarl.AgentView) -> float:
+        return 0.0
+
+    zero.__module__ = "a_page_of_a_notebook"
+    cavmarl.register_term("zero", zero)
+    cavmarl.make_vec("ring", num_envs=2, workers=1).close()
+    with pytest.raises(ConfigError, match=r"'zero' is registered in 'a_page_of_a_notebook'"):
+        cavmarl.make_vec("ring", workers=1, overrides={"terms.weights": {"zero": 1.0}})
+    REGISTERED_TERMS.remove("zero")
 
 
 def test_a_batched_answer_has_a_number_for_each_agent() -> None:

@@ -26,7 +26,7 @@ QUICK = [name for name in PAGES if name not in (NEEDS_SERVICE, *DEAR)]
 
 @pytest.fixture(autouse=True)
 def nothing_stays_registered() -> Iterator[None]:
-    """Worker processes of later tests cannot import what a page has registered."""
+    """Tests that follow find no names of a page."""
     registries = (REGISTERED_TERMS, REGISTERED_SENSORS, REGISTERED_MODELS)
     before = [set(registry.names) for registry in registries]
     yield

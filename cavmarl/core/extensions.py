@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import inspect
 from collections.abc import Callable, Iterable
+from importlib.util import find_spec
 from typing import Any, Generic, TypeVar
 
 from cavmarl.core.errors import ConfigError, WorkerError
@@ -78,14 +79,23 @@ def extension_modules(names: Iterable[str]) -> list[str]:
     used = set(names)
     for registry in (REGISTERED_TERMS, REGISTERED_SENSORS, REGISTERED_MODELS):
         for name, module in registry.modules.items():
-            if module != "__main__":
+            if _is_importable(module):
                 found[module] = None
             elif name in used:
+                place = "the program itself" if module == "__main__" else f"'{module}'"
                 raise ConfigError(
-                    f"'{name}' is registered in the program itself, which workers do not import: "
+                    f"'{name}' is registered in {place}, which workers do not import: "
                     "put it into a module of its own, or leave out workers"
                 )
     return list(found)
+
+
+def _is_importable(module: str) -> bool:
+    """Whether another process finds a module; not what a notebook or a page has run."""
+    try:
+        return module != "__main__" and find_spec(module) is not None
+    except (ImportError, ValueError):
+        return False
 
 
 def load_extensions(modules: Iterable[str]) -> None:
