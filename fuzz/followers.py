@@ -34,7 +34,7 @@ from cavmarl.cosim.followers.follower_messages import (
     Hello,
     Say,
     Ticked,
-    letter_of,
+    payload_of,
 )
 from cavmarl.cosim.followers.follower_snapshots import SnapshotTime, take_snapshot, welcome_to
 from cavmarl.cosim.time_master import TimeMaster
@@ -178,7 +178,7 @@ def _lines(*said: Words) -> bytes:
     """The same, to be packed."""
     found = []
     for kind, message, arrays in ((*words, None, ())[:3] for words in said):
-        letter = None if message is None else letter_of(message)
+        letter = None if message is None else payload_of(message)
         size = sum(array.nbytes for array in arrays or ())
         found.append(json.dumps([kind, letter, size]))
     return "\n".join(found).encode()

@@ -134,9 +134,9 @@ class _Timed:
     def __init__(self, vec: CavVectorEnv) -> None:
         worlds = vec.worlds
         assert isinstance(worlds, LocalWorlds)
-        assert worlds.farm is not None
+        assert worlds.sensor_workers is not None
         self._vec = vec
-        self._farm: SensorWorkers = worlds.farm
+        self._sensor_workers: SensorWorkers = worlds.sensor_workers
         self._runtime, self._rig, self._ticks = (Stopwatch(time.perf_counter_ns) for _ in range(3))
         simulation = vec.simulation
         simulation.instrument(self._runtime.around)
@@ -153,11 +153,11 @@ class _Timed:
         self._parts_ms: dict[str, list[float]] = {name: [] for name in PARTS}
 
     def window(self, steps: int) -> Window:
-        pool = self._farm.pool
+        pool = self._sensor_workers.pool
         assert pool is not None
-        before, began = copy.copy(self._farm.times), pool.processor_s()
+        before, began = copy.copy(self._sensor_workers.times), pool.processor_s()
         leader_s = sum(self.step() for _ in range(steps))
-        ended, moved = pool.processor_s(), self._farm.times.since(before)
+        ended, moved = pool.processor_s(), self._sensor_workers.times.since(before)
         return Window(
             steps,
             leader_s,
@@ -175,25 +175,25 @@ class _Timed:
         actions = vec.suggest_actions()
         for watch in (self._runtime, self._rig, self._ticks):
             watch.clear()
-        before, simulated_s = copy.copy(self._farm.times), vec.simulated_s
+        before, simulated_s = copy.copy(self._sensor_workers.times), vec.simulated_s
         began_cpu, began = time.process_time(), time.perf_counter()
         vec.step(actions)
         step_s = time.perf_counter() - began
         cpu_s = time.process_time() - began_cpu
-        farm = self._farm.times.since(before)
-        self._note(step_s, vec.simulated_s - simulated_s, farm)
+        times = self._sensor_workers.times.since(before)
+        self._note(step_s, vec.simulated_s - simulated_s, times)
         return cpu_s
 
-    def _note(self, step_s: float, simulated_s: float, farm: SensorWorkerTimes) -> None:
+    def _note(self, step_s: float, simulated_s: float, times: SensorWorkerTimes) -> None:
         self._step_ms.append(1e3 * step_s)
-        self._wait_ms.append(1e3 * farm.wait_s)
+        self._wait_ms.append(1e3 * times.wait_s)
         parts = dict.fromkeys(PARTS, 0.0)
         for name, ns in self._runtime.phases().items():
             parts[_PART_OF.get(name, "physics")] += 1e-9 * ns
         rig_s = 1e-9 * sum(self._rig.phases().values())
-        parts["sensor compute"] = farm.busy_s + farm.own_s
-        parts["barrier"] = farm.wait_s - farm.busy_s
-        parts["sensor transport"] = rig_s - farm.own_s - farm.wait_s
+        parts["sensor compute"] = times.busy_s + times.own_s
+        parts["barrier"] = times.wait_s - times.busy_s
+        parts["sensor transport"] = rig_s - times.own_s - times.wait_s
         ticks_s = 1e-9 * sum(self._ticks.phases().values())
         parts["environment"] = step_s - simulated_s + max(0.0, simulated_s - ticks_s)
         for name, part_s in parts.items():
@@ -210,11 +210,11 @@ class _Timed:
             tuple(self._wait_ms),
             {name: tuple(values) for name, values in self._parts_ms.items()},
             windows,
-            tuple(float(1e3 * cost_s) for cost_s in self._farm.costs_s),
+            tuple(float(1e3 * cost_s) for cost_s in self._sensor_workers.costs_s),
             describe_rig(config),
             tuple(self._digests),
             config.clock.ticks_per_step,
-            len(self._farm.deaths),
+            len(self._sensor_workers.deaths),
         )
 
 

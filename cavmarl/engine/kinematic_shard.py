@@ -44,12 +44,12 @@ class KinematicShard:
     def __init__(
         self, config: EnvConfig, network: RoadNetwork, partition: ZonePartition, zone: int
     ) -> None:
-        commons = SharedOutputs(config, network, 1)
+        shared = SharedOutputs(config, network, 1)
         self._tick = tick = make_tick(
-            config, network, partition, None, commons, make_frames(config, 1, huge_zeros),
+            config, network, partition, None, shared, make_frames(config, 1, huge_zeros),
             huge_zeros, None,
         )  # fmt: skip
-        self._commons = commons
+        self._shared = shared
         self._refuse_what_is_shared(config, network)
         self._shard = tick.shards[zone]
         tick.executor = self._executor = SerialExecutor([self._shard])
@@ -65,7 +65,7 @@ class KinematicShard:
         self.reset(0)
 
     def _refuse_what_is_shared(self, config: EnvConfig, network: RoadNetwork) -> None:
-        size = self._commons.outputs.observations.shape[2]
+        size = self._shared.outputs.observations.shape[2]
         wrong = {
             "v2x, rig or scenario": bool(self._tick.attached),
             "traffic-actuated signals": network.num_controllers > 0,
@@ -91,7 +91,7 @@ class KinematicShard:
         self._commands.controls[...] = 0.0
         self._is_moved = False
         self._write(np.zeros(0, dtype=VEHICLE))
-        self._commons.switch_signals(worlds)
+        self._shared.switch_signals(worlds)
 
     def spawn(self, vehicles: NDArray[np.void]) -> None:
         """Own the vehicles VEHICLE (n,) from the present tick on."""
@@ -154,7 +154,7 @@ class KinematicShard:
         self._is_moved = False
         worlds = self._shard.worlds
         worlds.ticks[0] += 1
-        self._commons.switch_signals(worlds)
+        self._shared.switch_signals(worlds)
         if worlds.ticks[0] % self._per_step == 0:
             self._tick.sense(self._everywhere)
         return int(worlds.ticks[0])
@@ -165,7 +165,7 @@ class KinematicShard:
 
     def read_sensors(self) -> dict[int, NDArray[np.float32]]:
         """What the owned vehicles of agents have sensed last, by their ids: (D,) each."""
-        own, outputs = self.read_vehicles(), self._commons.outputs
+        own, outputs = self.read_vehicles(), self._shared.outputs
         driven = own[own["agent"] >= 0]
         return {
             int(row["id"]): outputs.observations[0, row["agent"]].copy()
@@ -183,8 +183,8 @@ class KinematicShard:
             "vehicles": self.read_vehicles().view(np.uint8),
             "ghosts": np.array(ghosts, dtype=VEHICLE).view(np.uint8),
             "controls": self._commands.controls,
-            "observations": self._commons.outputs.observations,
-            "present": self._commons.outputs.present,
+            "observations": self._shared.outputs.observations,
+            "present": self._shared.outputs.present,
             **{f"common_{name}": _plain(array) for name, array in common._asdict().items()},
         }
         content = io.BytesIO()
@@ -201,8 +201,8 @@ class KinematicShard:
             common = common_of(self._shard.worlds)
             targets = [
                 (self._commands.controls, saved["controls"]),
-                (self._commons.outputs.observations, saved["observations"]),
-                (self._commons.outputs.present, saved["present"]),
+                (self._shared.outputs.observations, saved["observations"]),
+                (self._shared.outputs.present, saved["present"]),
                 *((getattr(common, name), saved[f"common_{name}"]) for name in Common._fields),
             ]
             if any(_plain(target).shape != array.shape for target, array in targets):

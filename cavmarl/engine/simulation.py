@@ -88,13 +88,13 @@ class Simulation(WorldViews):
         self._keeper: Keeper | None = None
         self._recutter: Recutter | None = None
         announce_compilation()
-        commons = SharedOutputs(config, network, num_worlds, observations, zeros)
+        shared = SharedOutputs(config, network, num_worlds, observations, zeros)
         self._tick = make_tick(
             config,
             network,
             self.partition,
             self.demand,
-            commons,
+            shared,
             self.frames,
             zeros,
             None if like is None else like._tick.traffic.for_worlds(num_worlds),

@@ -37,14 +37,14 @@ class Tick:
         shards: Sequence[Shard],  # one a zone
         division: Division,  # of all shards
         traffic: NativeTraffic,  # what comes
-        commons: SharedOutputs,  # what all shards share
+        shared: SharedOutputs,  # what all shards share
         gate: Gate,  # through which vehicles come and go
         attached: tuple[Attached, ...],  # what acts in each tick beside the traffic
     ) -> None:
         self.shards = shards
         self.division = division
         self.traffic = traffic
-        self.commons = commons
+        self.shared = shared
         self.gate = gate  # through which vehicles come and go; a reset may replace it
         self.attached = attached
         self.executor: Executor = SerialExecutor(shards)
@@ -137,17 +137,17 @@ class Tick:
         self.executor.each("detect")
         if self.peers is not None:
             self.peers.share_detections(self._shard.worlds)
-        self.commons.switch_signals(self._shard.worlds)
+        self.shared.switch_signals(self._shard.worlds)
 
     def sense(self, chosen: NDArray[np.bool_]) -> None:
         """Clear → sense → settle → credit, in the chosen worlds (W,)."""
         if not self._has_agents:
             return
-        self.commons.clear_outputs(chosen)
+        self.shared.clear_outputs(chosen)
         self.executor.each("sense", chosen)
         if self.peers is not None:
-            self.peers.share_outputs(self.commons.outputs, chosen)
-        self.commons.settle_outputs(chosen)
+            self.peers.share_outputs(self.shared.outputs, chosen)
+        self.shared.settle_outputs(chosen)
         self.executor.each("credit", chosen)
 
     def leave(self) -> None:
@@ -235,7 +235,7 @@ class Tick:
         self.executor = wrap(self.executor)
         self.division = wrap(self.division)
         self.traffic = wrap(self.traffic)
-        self.commons = wrap(self.commons)
+        self.shared = wrap(self.shared)
         if self.coordination is not None:
             self.coordination = wrap(self.coordination)
         if self.sumo is not None:

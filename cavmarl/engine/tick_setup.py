@@ -29,14 +29,14 @@ def make_tick(
     network: RoadNetwork,
     partition: ZonePartition,
     demand: DemandFile | SumoDemand | None,  # of files, or SUMO's, beside the generator's
-    commons: SharedOutputs,  # what all zones of a world share
+    shared: SharedOutputs,  # what all zones of a world share
     frames: Frames,  # of the mounted sensors
     zeros: Zeros,  # where large arrays lie
     # of other worlds of the same environment, as many as these; None: it is made
     traffic: NativeTraffic | None,
 ) -> Tick:
     """The phases of a tick, over shards that are made here."""
-    num_worlds = commons.outputs.present.shape[0]
+    num_worlds = shared.outputs.present.shape[0]
     blank = blank_vehicle()
     if traffic is None:
         traffic = NativeTraffic(
@@ -53,7 +53,7 @@ def make_tick(
             sumo=demand if isinstance(demand, SumoDemand) else None,
         )
     shards, division = divide(
-        config, network, partition, traffic, commons.outputs, num_worlds, zeros
+        config, network, partition, traffic, shared.outputs, num_worlds, zeros
     )
     attached = attach(
         ComponentContext(
@@ -63,13 +63,13 @@ def make_tick(
             shards=shards,
             division=division,
             travel=shards[0].travel,
-            outputs=commons.outputs,
+            outputs=shared.outputs,
             zeros=zeros,
             frames=frames,
         )
     )
     gate = make_gate(num_worlds, traffic.capacity, network.arrays, blank.dtype)
-    return Tick(shards, division, traffic, commons, gate, attached)
+    return Tick(shards, division, traffic, shared, gate, attached)
 
 
 def attach(host: ComponentContext) -> tuple[Attached, ...]:

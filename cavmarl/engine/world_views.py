@@ -58,7 +58,7 @@ class WorldViews:
     @property
     def outputs(self) -> Outputs:
         """What the agents got at the end of the last step; arrays that the next step overwrites."""
-        return self._tick.commons.outputs
+        return self._tick.shared.outputs
 
     @property
     def messages(self) -> Bus:

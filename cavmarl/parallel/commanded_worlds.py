@@ -63,7 +63,7 @@ class OrderedWorlds(ABC):
         """Note which worker runs what from now on."""
 
     @abstractmethod
-    def _send(self, task: Task, letter: Any, commits: bool) -> None:
+    def _send(self, task: Task, payload: Any, commits: bool) -> None:
         """Let all workers do a task."""
 
     @abstractmethod
@@ -133,10 +133,10 @@ class OrderedWorlds(ABC):
     def signal_phases(self, world: int) -> NDArray[np.int32]:
         return np.array(self._ask(Task.SIGNAL_PHASES, world), dtype=np.int32)
 
-    def _order(self, task: Task, letter: Any = None, commits: bool = True) -> None:
+    def _order(self, task: Task, payload: Any = None, commits: bool = True) -> None:
         """`_send`, with the errors that the worlds would raise in this process."""
         try:
-            self._send(task, letter, commits)
+            self._send(task, payload, commits)
         except WorkerFailureError as failure:
             raise own_error(failure) from failure
         except WorkerDeathError as death:

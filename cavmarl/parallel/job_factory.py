@@ -21,7 +21,7 @@ from cavmarl.parallel.processes.shared_memory import Segment, arrays_in
 from cavmarl.parallel.processes.state_image import Image
 from cavmarl.parallel.processes.worker_loop import Job, serve
 from cavmarl.parallel.recipe import CHANGED, world_of
-from cavmarl.parallel.sensor_workers.sensor_worker_setup import farm_of
+from cavmarl.parallel.sensor_workers.sensor_worker_setup import sensor_workers_of
 from cavmarl.parallel.step_arrays import StepArrays, layout_of
 from cavmarl.parallel.team.team_job import LeaderJob
 from cavmarl.parallel.work_shares import Part
@@ -47,14 +47,18 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
         return LocalWorlds(world, count, part, in_next_step=in_next_step, like=one, runs=runs)
 
     def make_watched(part: Part) -> LocalWorlds:
-        return hire(make(part.first, part.last, runs_of(recipe["runs"], part)), part)
+        return attach_sensor_workers(
+            make(part.first, part.last, runs_of(recipe["runs"], part)), part
+        )
 
-    def hire(worlds: LocalWorlds, part: Part) -> LocalWorlds:
+    def attach_sensor_workers(worlds: LocalWorlds, part: Part) -> LocalWorlds:
         if config.workers.sensors:
             memory = Segment(os.dup(recipe["arrays"]), 0)
             bounds = (part.first, part.last)
             base_dir, num_worlds = Path(recipe["base_dir"]), recipe["num_worlds"]
-            worlds.hire(farm_of(world, base_dir, memory, bounds, num_worlds))
+            worlds.attach_sensor_workers(
+                sensor_workers_of(world, base_dir, memory, bounds, num_worlds)
+            )
         return worlds
 
     mover = recipe["mover"]
@@ -71,25 +75,31 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
             return list(moving)
     jobs: list[Job] = []
     job: CheckpointJob
-    for part, descriptors, case in zip(parts, recipe["diaries"], recipe["cases"], strict=True):
+    for part, descriptors, case in zip(
+        parts, recipe["checkpoint_logs"], recipe["cases"], strict=True
+    ):
         if recipe["runs"]:
-            (tape,) = descriptors
+            (actions,) = descriptors
             commands = commands_of(arrays.part(part.first, part.last))
-            log = ActionLog(tape, commands)
+            log = ActionLog(actions, commands)
             jobs.append(ActionLogJob(partial(make_watched, part), part.first, log))
             continue
-        diary = CheckpointLog(config, part.last - part.first, descriptors)
+        checkpoint_log = CheckpointLog(config, part.last - part.first, descriptors)
         if len(part.zones) > 1:
             share, in_next_step = arrays.part(part.first, part.last), recipe["in_next_step"]
             worlds = LocalWorlds(
                 world, 1, share, in_next_step=in_next_step, zeros=huge_shared_zeros
             )
             theirs = None if spent_s is None else spent_s[part.first]
-            leader = LeaderJob(hire(worlds, part), part.first, part.zones, diary, theirs)
+            leader = LeaderJob(
+                attach_sensor_workers(worlds, part), part.first, part.zones, checkpoint_log, theirs
+            )
             job = leader
             jobs += [leader, *leader.followers()]
         else:
-            job = CheckpointJob(hire(make(part.first, part.last), part), part.first, diary)
+            job = CheckpointJob(
+                attach_sensor_workers(make(part.first, part.last), part), part.first, checkpoint_log
+            )
             jobs.append(job)
         job.case = WorldCases(Segment(case, 0))
     return jobs

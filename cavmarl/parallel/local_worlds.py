@@ -52,7 +52,7 @@ class LocalWorlds:
     ) -> None:
         self.world = world
         self.in_next_step = in_next_step  # when worlds begin anew
-        self.farm: SensorWorkers | None = None  # its sensor workers; None: there are none
+        self.sensor_workers: SensorWorkers | None = None  # its sensor workers; None: there are none
         form = world.config.observation
         self._senses = form.mode == "sensors"
         self._is_flat = form.kind == "flat"
@@ -317,16 +317,16 @@ class LocalWorlds:
         """None, likewise."""
         return {}
 
-    def hire(self, farm: SensorWorkers) -> None:
+    def attach_sensor_workers(self, sensor_workers: SensorWorkers) -> None:
         """From now on let others sense for the rigs; what they write is in `arrays`."""
         mounted = self.simulation.mounted
         assert mounted is not None
-        mounted.rig.sense = farm
-        self.farm = farm
+        mounted.rig.sense = sensor_workers
+        self.sensor_workers = sensor_workers
 
     def close(self) -> None:
-        if self.farm is not None:
-            self.farm.close()
+        if self.sensor_workers is not None:
+            self.sensor_workers.close()
         self.simulation.close()
 
 

@@ -84,7 +84,7 @@ class PooledWorlds(OrderedWorlds):
                 "which would change; leave one of the two 0"
             )
         warn_if_crowded(config.workers.sensors, len(parts))
-        diaries = [
+        checkpoint_logs = [
             []
             if may_change
             else [Segment.make(0)]
@@ -101,7 +101,9 @@ class PooledWorlds(OrderedWorlds):
             arrays=segment.fd,
             in_next_step=in_next_step,
             parts=parts,
-            diaries=[[one.fd for one in diary] for diary in diaries],
+            checkpoint_logs=[
+                [one.fd for one in checkpoint_log] for checkpoint_log in checkpoint_logs
+            ],
             cases=[case.fd for case in cases],
             runs=runs_as_text(config.zones, num_worlds),
             mover=None if memory is None else memory.recipe,
@@ -109,7 +111,12 @@ class PooledWorlds(OrderedWorlds):
         leaders = [0, *accumulate(len(part.zones) for part in parts)]
         teams = tuple(tuple(range(*bounds)) for bounds in pairwise(leaders))
         moving = () if memory is None else memory.segments
-        segments = (segment, *(one for diary in diaries for one in diary), *moving, *cases)
+        segments = (
+            segment,
+            *(one for checkpoint_log in checkpoint_logs for one in checkpoint_log),
+            *moving,
+            *cases,
+        )
         pins = config.workers.pin
         what = Program(program or PROGRAM, recipe, _names(parts), segments, TASK_NAMES, pins, teams)
         try:
@@ -153,13 +160,13 @@ class PooledWorlds(OrderedWorlds):
     def _pids(self) -> dict[int, int]:
         return dict(enumerate(self.pool.pids))
 
-    def _send(self, task: Task, letter: Any, commits: bool) -> None:
-        self.pool.run(task, letter, commits)
+    def _send(self, task: Task, payload: Any, commits: bool) -> None:
+        self.pool.run(task, payload, commits)
 
     def _ask(self, task: Task, world: int, more: Any = None) -> Any:
         number = range(len(self.arrays.mask))[world]
-        letter = number if more is None else [number, more]
-        return self.pool.ask(self._asked[number], task, letter)
+        payload = number if more is None else [number, more]
+        return self.pool.ask(self._asked[number], task, payload)
 
 
 def _names(parts: list[Part]) -> tuple[str, ...]:

@@ -52,24 +52,24 @@ class WorldsJob(Job):
         self._first = first
         self._commands = commands_of(worlds.arrays)
 
-    def perform(self, task: int, letter: Any) -> Any:
+    def perform(self, task: int, payload: Any) -> Any:
         worlds = self._worlds
         if task == Task.STEP:
             worlds.step(self._commands)
         elif task == Task.RESET:
-            worlds.reset(letter["seed"], letter["first_world"] + self._first)
+            worlds.reset(payload["seed"], payload["first_world"] + self._first)
         elif task == Task.SUGGEST:
             worlds.suggest()
         elif task == Task.WRITE_STATES:
             worlds.write_states()
         elif task == Task.STATE_HASH:
-            return worlds.state_hash(letter - self._first)
+            return worlds.state_hash(payload - self._first)
         elif task == Task.TRAFFIC_STATS:
-            return worlds.traffic_stats(letter - self._first)
+            return worlds.traffic_stats(payload - self._first)
         elif task == Task.DRIVEN:
-            return worlds.driven(letter[0] - self._first, letter[1])
+            return worlds.driven(payload[0] - self._first, payload[1])
         elif task == Task.SIGNAL_PHASES:
-            return worlds.signal_phases(letter - self._first).tolist()
+            return worlds.signal_phases(payload - self._first).tolist()
         elif task == Task.SAVE:
             self.case.put(worlds.save_worlds())
         elif task == Task.LOAD:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cavmarl.parallel.processes.worker_loop import TRUTH
+from cavmarl.parallel.processes.worker_loop import COMMITTED
 from cavmarl.parallel.processes.worker_processes import WorkerProcesses
 from cavmarl.verify import worker_kills
 from tests.cli.test_main import refusal, run
@@ -34,10 +34,10 @@ def test_a_successor_that_forgets_is_found_out(
     replace = WorkerProcesses.replace
 
     def without_memory(
-        crew: WorkerProcesses, k: int, mail: bytes | None, ordered: tuple[int, ...]
+        processes: WorkerProcesses, k: int, mail: bytes | None, ordered: tuple[int, ...]
     ) -> str:
-        crew.orders[k, TRUTH] = -1
-        return replace(crew, k, mail, ordered)
+        processes.orders[k, COMMITTED] = -1
+        return replace(processes, k, mail, ordered)
 
     monkeypatch.setattr(WorkerProcesses, "replace", without_memory)
     monkeypatch.setattr(worker_kills, "same_bytes", lambda *_: True)  # states tell it alone

@@ -26,8 +26,8 @@ from cavmarl.cosim.followers.follower_messages import (
     FollowerSnapshot,
     Hello,
     Say,
-    letter_of,
-    read_letter,
+    payload_of,
+    read_payload,
 )
 from cavmarl.parallel.hosts.framed_socket import FramedSocket
 from tests.cosim.conftest import hashes, make_env, seated
@@ -47,13 +47,13 @@ def refusal(connection: socket.socket) -> str:
     heard = line.hear(10.0)
     assert heard.kind is Say.REFUSAL
     line.close()
-    return str(heard.letter["reason"])
+    return str(heard.payload["reason"])
 
 
 def hello_in(version: int) -> bytes:
     near, far = socket.socketpair()
     wire = FramedSocket(near, FOLLOWERS._replace(version=version))
-    wire.send(Say.HELLO, 0, letter_of(Hello("x", [])))
+    wire.send(Say.HELLO, 0, payload_of(Hello("x", [])))
     raw = far.recv(1 << 16)
     wire.close()
     far.close()
@@ -123,7 +123,7 @@ def test_one_that_speaks_byte_by_byte_is_not_waited_for(
 def test_a_crowd_does_not_keep_a_follower_out(address: Path) -> None:
     with FollowedWorld(make_env(), address) as world:
         world.reset(seed=1)
-        crowd = [call(address) for _ in range(reception.MAX_GUESTS)]
+        crowd = [call(address) for _ in range(reception.MAX_CALLERS)]
         world._admit(0.0)
         late = call(address)
         late.sendall(hello_in(1))
@@ -195,7 +195,7 @@ def test_a_hello_for_too_many_is_refused(address: Path) -> None:
         world.reset(seed=0)
         hashes(world, 2)
         heard = line.hear(10.0)
-        assert "wants 5000 vehicles" in heard.letter["reason"]
+        assert "wants 5000 vehicles" in heard.payload["reason"]
         line.close()
 
 
@@ -215,7 +215,7 @@ def test_any_bytes_are_a_frame_or_a_typed_error(raw: bytes) -> None:
         line.close()
 
 
-@settings(deadline=None)  # the first call makes what checks letters
+@settings(deadline=None)  # the first call makes what checks payloads
 @given(
     st.recursive(
         st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
@@ -223,10 +223,10 @@ def test_any_bytes_are_a_frame_or_a_typed_error(raw: bytes) -> None:
         max_leaves=8,
     )
 )
-def test_any_letter_is_a_message_or_a_typed_error(letter: object) -> None:
+def test_any_payload_is_a_message_or_a_typed_error(payload: object) -> None:
     for kind in (Hello, Control, FollowerSnapshot):
         try:
-            read_letter(kind, letter)
+            read_payload(kind, payload)
         except FollowerError:
             pass
 

@@ -45,7 +45,7 @@ class Halves:
     """
 
     def __init__(self, whole: Simulation) -> None:
-        self.commons = SharedOutputs(whole.config, whole.network, whole.num_worlds)
+        self.shared = SharedOutputs(whole.config, whole.network, whole.num_worlds)
         traffic = whole._tick.traffic
         shards = []
         partition = cut_map(whole.network, "strips", 2)
@@ -58,7 +58,7 @@ class Halves:
                 traffic.plans,
                 traffic.travel,
                 zoned,
-                self.commons.outputs,
+                self.shared.outputs,
                 zone,
                 partition.arrays,
                 halo,
@@ -94,9 +94,9 @@ class Halves:
 
     def sense(self, chosen: NDArray[np.bool_]) -> None:
         """What a simulation does at the end of a step."""
-        self.commons.clear_outputs(chosen)
+        self.shared.clear_outputs(chosen)
         self.each("sense", chosen)
-        self.commons.settle_outputs(chosen)
+        self.shared.settle_outputs(chosen)
         self.each("credit", chosen)
 
 
@@ -123,7 +123,7 @@ def test_agents_get_the_same(env: str, mode: str, agents: int, background: int) 
     rng = np.random.default_rng(5)
     start(whole, seed=5)
     halves.take(whole.worlds, {})
-    halves.commons.switch_signals(halves.shards[0].worlds)
+    halves.shared.switch_signals(halves.shards[0].worlds)
     halves.sense(np.array([True, True]))
     both = 0
     for step in range(STEPS):
@@ -137,10 +137,10 @@ def test_agents_get_the_same(env: str, mode: str, agents: int, background: int) 
             noise = rng.normal(0.0, (2.0, 0.05), size=(*whole.outputs.present.shape, 2))
             whole.step(Commands(suggested(whole) + noise, idle(whole).meta_actions))
         both += halves.take(whole.worlds, returns)
-        halves.commons.switch_signals(halves.shards[0].worlds)
+        halves.shared.switch_signals(halves.shards[0].worlds)
         halves.sense(chosen)
         for name, mine, one in zip(
-            whole.outputs._fields, halves.commons.outputs, whole.outputs, strict=True
+            whole.outputs._fields, halves.shared.outputs, whole.outputs, strict=True
         ):
             np.testing.assert_array_equal(mine, one, err_msg=f"{name}, step {step}")
         expected = returns_of(whole.worlds)
@@ -163,7 +163,7 @@ def test_signals_are_the_same(tmp_path: Path) -> None:
             whole.step(idle(whole))
         halves.take(whole.worlds, {})
         halves.each("detect")
-        halves.commons.switch_signals(halves.shards[0].worlds)
+        halves.shared.switch_signals(halves.shards[0].worlds)
         for name in ("signal_phase", "controllers", "detected_s"):
             expected = getattr(whole.worlds, name)
             assert getattr(halves.shards[0].worlds, name).tobytes() == expected.tobytes()

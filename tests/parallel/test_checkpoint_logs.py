@@ -1,4 +1,4 @@
-"""Workers that die around the step in which their diary begins anew, and diaries by themselves."""
+"""Workers that die while their checkpoint log begins anew, and such logs alone."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_worlds_that_are_reset_when_the_diary_is_full(make: Make, kind: dict[str
 
 
 @pytest.fixture
-def diary() -> Iterator[CheckpointLog]:
+def checkpoint_log() -> Iterator[CheckpointLog]:
     load_kernels()
     config = load_world("merge").config
     segments = make_segments(config, 1)
@@ -78,28 +78,33 @@ def commands_like(entry: Commands, value: int) -> Commands:
     )
 
 
-def noted(diary: CheckpointLog) -> list[float]:
-    return [float(entry.controls.flat[0]) for entry in diary.steps()]
+def noted(checkpoint_log: CheckpointLog) -> list[float]:
+    return [float(entry.controls.flat[0]) for entry in checkpoint_log.steps()]
 
 
-def state_of(diary: CheckpointLog) -> list[float]:
-    (found,) = diary.state([np.zeros(3)])
+def state_of(checkpoint_log: CheckpointLog) -> list[float]:
+    (found,) = checkpoint_log.state([np.zeros(3)])
     return [float(value) for value in found]
 
 
-def test_what_is_committed_stays_until_the_next_is(diary: CheckpointLog) -> None:
-    diary.prepare([np.full(3, 1.0)])
-    diary.begin()
+def test_what_is_committed_stays_until_the_next_is(checkpoint_log: CheckpointLog) -> None:
+    checkpoint_log.prepare([np.full(3, 1.0)])
+    checkpoint_log.begin()
     for value in range(STEPS):
-        diary.note(commands_like(diary.entries[0], value))
-    assert diary.is_full
-    committed = diary.place.copy()
-    diary.prepare([np.full(3, 2.0)])
-    assert diary.is_prepared
-    assert (state_of(diary), len(diary)) == ([1.0] * 3, STEPS), "nothing has begun anew"
-    diary.begin()
-    diary.note(commands_like(diary.entries[0], 99))
-    assert (state_of(diary), noted(diary)) == ([2.0] * 3, [99.0])
-    diary.go_to(committed)  # the order in which it began anew was not committed
-    assert (state_of(diary), noted(diary)) == ([1.0] * 3, [float(k) for k in range(STEPS)])
-    assert not diary.is_prepared
+        checkpoint_log.note(commands_like(checkpoint_log.entries[0], value))
+    assert checkpoint_log.is_full
+    committed = checkpoint_log.place.copy()
+    checkpoint_log.prepare([np.full(3, 2.0)])
+    assert checkpoint_log.is_prepared
+    assert (state_of(checkpoint_log), len(checkpoint_log)) == ([1.0] * 3, STEPS), (
+        "nothing has begun anew"
+    )
+    checkpoint_log.begin()
+    checkpoint_log.note(commands_like(checkpoint_log.entries[0], 99))
+    assert (state_of(checkpoint_log), noted(checkpoint_log)) == ([2.0] * 3, [99.0])
+    checkpoint_log.go_to(committed)  # the order in which it began anew was not committed
+    assert (state_of(checkpoint_log), noted(checkpoint_log)) == (
+        [1.0] * 3,
+        [float(k) for k in range(STEPS)],
+    )
+    assert not checkpoint_log.is_prepared

@@ -96,7 +96,7 @@ def test_many_and_large_arrays(ends: tuple[FramedSocket, FramedSocket]) -> None:
 
 
 def test_every_changed_byte_is_noticed() -> None:
-    whole = sent_bytes(letter={"answer": None}, arrays=ARRAYS)
+    whole = sent_bytes(payload={"answer": None}, arrays=ARRAYS)
     assert read(whole)[0].order == 7
     for at in range(len(whole)):
         changed = bytearray(whole)
@@ -140,23 +140,23 @@ class Caller:
         self._thread.start()
 
     def _run(self) -> None:
-        guest: PendingConnection | None = None
+        caller: PendingConnection | None = None
         time.sleep(self._busy_s)
         until_s = time.monotonic() + 5.0
         while not self.found and time.monotonic() < until_s:
             time.sleep(0.005)
             try:
-                if guest is None:
-                    guest = PendingConnection(self.door._listener.accept()[0], self.door.secret)
-                connection = guest.listen()
+                if caller is None:
+                    caller = PendingConnection(self.door._listener.accept()[0], self.door.secret)
+                connection = caller.listen()
             except BlockingIOError:
                 continue
             except (MessageError, OSError, EOFError) as error:
                 self.found.append(error)
-                guest and guest.close()
+                caller and caller.close()
                 return
-            if guest and connection:
-                self.found.append((guest.number, connection))
+            if caller and connection:
+                self.found.append((caller.number, connection))
 
     def join(self) -> Any:
         self._thread.join()

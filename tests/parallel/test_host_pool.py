@@ -19,7 +19,7 @@ import cavmarl.parallel.hosts.listener as listener
 from cavmarl.core.errors import WorkerDeathError, WorkerError, WorkerFailureError
 from cavmarl.parallel.hosts.host_commands import HostProgram
 from cavmarl.parallel.hosts.host_pool import HostPool
-from cavmarl.parallel.hosts.listener import MAX_GUESTS
+from cavmarl.parallel.hosts.listener import MAX_CALLERS
 from tests.support.forks import said_in_fork
 from tests.support.toy_hosts import ADD, DOZE, FAIL, FALL, TASKS, TOIL, TOTAL, WRITE, Processes
 
@@ -45,9 +45,9 @@ class Adder:
             self.expected[k] = self.expected[k] + one if task == ADD else one
         self.check()
 
-    def say(self, task: int, letter: Any = None) -> None:
+    def say(self, task: int, payload: Any = None) -> None:
         nothing: list[list[Any]] = [[], []]
-        self.pool.run(task, [letter, letter], nothing, lambda k, answer: [])
+        self.pool.run(task, [payload, payload], nothing, lambda k, answer: [])
 
     def check(self) -> None:
         for k in range(2):
@@ -203,7 +203,7 @@ def test_a_crowd_at_the_door_does_not_keep_a_successor_out(
     monkeypatch.setattr(listener, "GREETING_S", 600.0)  # the silent ones leave for no other reason
     adder = make(count=2)
     adder.run(WRITE)
-    crowd = [socket.create_connection(adder.processes.place) for _ in range(3 * MAX_GUESTS)]
+    crowd = [socket.create_connection(adder.processes.place) for _ in range(3 * MAX_CALLERS)]
     adder.run()
     adder.kill(0)
     adder.run()

@@ -138,12 +138,12 @@ def test_workers_that_die_while_something_moves(
     rng = random.Random(2)
     run, timers = Pool.run, []
 
-    def strike(self: Pool, task: int, letter: Any = None, commits: bool = True) -> Any:
+    def strike(self: Pool, task: int, payload: Any = None, commits: bool = True) -> Any:
         if task in (Task.PACK, Task.UNPACK, Task.HOST) and len(timers) < 8:
             pid = self.pids[rng.randrange(2)]
             timers.append(Timer(rng.uniform(0.0, 0.003), os.kill, (pid, how)))
             timers[-1].start()
-        return run(self, task, letter, commits)
+        return run(self, task, payload, commits)
 
     monkeypatch.setattr(Pool, "run", strike)
     assert same(drive(vec, steps=40, before=lambda _: [t.join() for t in timers]), whole)
@@ -177,12 +177,12 @@ def test_a_move_that_fails_has_not_been(
     vec = make("ring", workers=2, overrides=RESTLESS, **wanted)
     run, failed = Pool.run, []
 
-    def interrupt(self: Pool, task: int, letter: Any = None, commits: bool = True) -> Any:
+    def interrupt(self: Pool, task: int, payload: Any = None, commits: bool = True) -> Any:
         if task == Task.UNPACK and not failed:
             failed.append(task)
             self._open = self._all  # as if it came while the workers were at it
             raise KeyboardInterrupt
-        return run(self, task, letter, commits)
+        return run(self, task, payload, commits)
 
     monkeypatch.setattr(Pool, "run", interrupt)
     step = type(vec).step

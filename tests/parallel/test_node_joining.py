@@ -27,7 +27,7 @@ from cavmarl.core.errors import (
     WorkerError,
 )
 from cavmarl.env.vector import CavVectorEnv
-from cavmarl.parallel.hosts.listener import MAX_GUESTS, Listener
+from cavmarl.parallel.hosts.listener import MAX_CALLERS, Listener
 from cavmarl.parallel.nodes import node_starters
 from cavmarl.parallel.nodes.links import Link
 from cavmarl.parallel.nodes.newcomers import ANYONE, Newcomer, Newcomers
@@ -273,7 +273,7 @@ def test_a_crowd_of_strangers_disturbs_nobody(make: Make, whole: Any) -> None:
 
     assert same(drive(vec, steps=20, before=call_often), whole)
     assert worlds.losses == 0
-    assert psutil.Process().num_fds() <= before + len(strangers) + MAX_GUESTS
+    assert psutil.Process().num_fds() <= before + len(strangers) + MAX_CALLERS
     for stranger in strangers:
         stranger.close()
     pids = worlds.pids

@@ -88,14 +88,14 @@ def alone() -> list[list[bytes | str]]:
     return _drive()
 
 
-def _farm(vec: CavVectorEnv) -> SensorWorkers:
+def _sensor_workers(vec: CavVectorEnv) -> SensorWorkers:
     assert isinstance(vec.worlds, LocalWorlds)
-    assert vec.worlds.farm is not None
-    return vec.worlds.farm
+    assert vec.worlds.sensor_workers is not None
+    return vec.worlds.sensor_workers
 
 
 def _pids(vec: CavVectorEnv) -> list[int]:
-    pool = _farm(vec).pool
+    pool = _sensor_workers(vec).pool
     assert pool is not None
     return [pool.server_pid, *pool.pids]
 
@@ -202,7 +202,7 @@ def test_one_that_dies_is_replaced_and_senses_the_same(
             vec.step(vec.suggest_actions())
             seen.append(_results(vec))
         assert seen == alone
-        assert [how.name in death.cause for death in _farm(vec).deaths] == [True] * 3
+        assert [how.name in death.cause for death in _sensor_workers(vec).deaths] == [True] * 3
     finally:
         vec.close()
 
@@ -230,7 +230,7 @@ def test_one_that_dies_while_it_senses(alone: list[list[bytes | str]]) -> None:
         stop.set()
         killer.join()
         assert seen == alone
-        assert _farm(vec).deaths
+        assert _sensor_workers(vec).deaths
     finally:
         stop.set()
         vec.close()
@@ -241,13 +241,13 @@ def test_a_late_one_is_waited_for() -> None:
     try:
         vec.reset(seed=7)
         vec.step(vec.suggest_actions())
-        before = _farm(vec).times.wait_s
+        before = _sensor_workers(vec).times.wait_s
         pid = _pids(vec)[1]
         os.kill(pid, signal.SIGSTOP)
         threading.Timer(0.08, os.kill, (pid, signal.SIGCONT)).start()
         vec.step(vec.suggest_actions())
-        assert _farm(vec).times.wait_s - before > 0.05
-        assert not _farm(vec).deaths
+        assert _sensor_workers(vec).times.wait_s - before > 0.05
+        assert not _sensor_workers(vec).deaths
     finally:
         vec.close()
 
@@ -256,15 +256,17 @@ def test_a_frame_of_another_tick_is_refused() -> None:
     vec = _make(SMALL, sensor_workers=1)
     try:
         vec.reset(seed=7)
-        farm = _farm(vec)
+        sensor_workers = _sensor_workers(vec)
         mounted = vec.simulation.mounted
         assert mounted is not None
         sensor = mounted.rig.sensors[0]
-        turn = Turn(0, sensor, farm.shared.due_of(0), vec.worlds.arrays.frames[sensor.name])
+        turn = Turn(
+            0, sensor, sensor_workers.shared.due_of(0), vec.worlds.arrays.frames[sensor.name]
+        )
         turn.due.num[:] = 1
-        farm.shared.delivered[0, 0, 0] += 1
+        sensor_workers.shared.delivered[0, 0, 0] += 1
         with pytest.raises(WorkerError, match=r"rig\.wheels: the frame of tick 0 .* one of tick 1"):
-            farm.check([turn])
+            sensor_workers.check([turn])
     finally:
         vec.close()
 
@@ -295,7 +297,7 @@ def test_nobody_outlives_the_process_that_keeps_the_state(how: signal.Signals) -
         f"settings = {{'rig': {SMALL}}}\n"
         "vec = cavmarl.make_vec('grid4x4', agents=2, sensor_workers=2, overrides=settings)\n"
         "vec.reset(seed=0)\n"
-        "pool = vec.worlds.farm.pool\n"
+        "pool = vec.worlds.sensor_workers.pool\n"
         "print(pool.server_pid, *pool.pids, flush=True)\n"
         "while True:\n"
         "    vec.step(vec.suggest_actions())\n"

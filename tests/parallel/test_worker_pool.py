@@ -142,7 +142,7 @@ def test_one_that_dies_at_a_point_of_an_order(make: Make, point: int, tmp_path: 
 def test_an_image_that_is_not_what_was_written_is_refused(make: Make) -> None:
     pool = make(workers=1)
     pool.run(ADD)
-    image = pool._crew._held.segments[2 + pool._truth].map()
+    image = pool._processes._held.segments[2 + pool._committed].map()
     image[200] ^= 1
     os.kill(pool.pids[0], signal.SIGKILL)
     with pytest.raises(WorkerFailureError, match="not what it wrote"):
@@ -212,16 +212,16 @@ def test_one_that_toils_too_long_is_noticed(make: Make) -> None:
 
 
 @pytest.mark.parametrize(
-    ("task", "letter", "cause"),
+    ("task", "payload", "cause"),
     [(DIE, int(signal.SIGKILL), "SIGKILL"), (RUN_OUT, None, "out of memory")],
 )
 def test_a_task_that_everybody_dies_of(
-    make: Make, task: int, letter: int | None, cause: str
+    make: Make, task: int, payload: int | None, cause: str
 ) -> None:
     pool = make(workers=2, repeats=2)
     pids = [*pool.pids, pool.server_pid]
     with pytest.raises(WorkerDeathError, match=TASKS[task]) as caught:
-        pool.run(task, letter)
+        pool.run(task, payload)
     assert caught.value.causes == (cause,) * 3
     assert gone(pids)
     with pytest.raises(WorkerError, match="closed"):
@@ -471,7 +471,7 @@ def test_a_fork_of_the_pools_process_leaves_the_workers_alone(make: Make) -> Non
     pool = make(workers=1)
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(os, "getpid", lambda: 1)
-        pool._crew.release()
+        pool._processes.release()
     pool.run(ADD)
     assert totals(pool) == [[3.0, MORE]]
 

@@ -38,10 +38,10 @@ class ToyJob:
         if size != len(getattr(self, "totals", ())) or not size:
             self.totals = np.zeros(size)
 
-    def inputs(self, task: int, letter: Any) -> list[NDArray[Any]]:
+    def inputs(self, task: int, payload: Any) -> list[NDArray[Any]]:
         return [self.given] if task in (ADD, WRITE) else []
 
-    def perform(self, task: int, letter: Any) -> TaskOutcome:
+    def perform(self, task: int, payload: Any) -> TaskOutcome:
         if task == ADD:
             self.totals += self.given
         elif task == WRITE:
@@ -51,12 +51,12 @@ class ToyJob:
         elif task == FAIL:
             self.totals += 1000.0
             raise ValueError("asked to fail")
-        elif task == FALL and os.getpid() != letter:
+        elif task == FALL and os.getpid() != payload:
             os._exit(3)
-        elif task == DOZE and os.getpid() in letter:
+        elif task == DOZE and os.getpid() in payload:
             time.sleep(60.0)
         elif task == TOIL:
-            until_s = time.monotonic() + letter
+            until_s = time.monotonic() + payload
             while time.monotonic() < until_s:
                 pass
         return TaskOutcome(None, [self.totals] if task in (ADD, WRITE) else ())

@@ -23,15 +23,15 @@ POINTS = ("begun", "half done", "done", "image begun")
 AT_WORK, ENOUGH = "at work", "enough"  # files of those that toil
 
 
-def toil(letter: Any) -> None:
+def toil(payload: Any) -> None:
     """For so many s; or in a folder: say that it has begun, and go on until it is enough."""
-    if isinstance(letter, str):
-        with open(os.path.join(letter, AT_WORK), "wb", buffering=0) as heard:
+    if isinstance(payload, str):
+        with open(os.path.join(payload, AT_WORK), "wb", buffering=0) as heard:
             heard.write(b".")
-        while not os.path.exists(os.path.join(letter, ENOUGH)):
+        while not os.path.exists(os.path.join(payload, ENOUGH)):
             pass
         return
-    end = time.perf_counter() + letter
+    end = time.perf_counter() + payload
     while time.perf_counter() < end:
         pass
 
@@ -55,27 +55,27 @@ class Adder:
     def prepare(self) -> None:
         """Nothing is shared."""
 
-    def perform(self, task: int, letter: Any) -> Any:
+    def perform(self, task: int, payload: Any) -> Any:
         if task == TOTAL:
             return [float(self.numbers["a"].sum()), len(self.more)]
         if task == FALL:
             self.falls_at = ""
             with suppress(FileNotFoundError):  # whoever comes first falls, and nobody else
-                os.unlink(letter[1])
-                self.falls_at = POINTS[letter[0]]
+                os.unlink(payload[1])
+                self.falls_at = POINTS[payload[0]]
         self.pass_by("begun")
         self.numbers["a"][0] += 1.0
         self.pass_by("half done")
         self.numbers["a"][1:] += 1.0
         self.more = np.append(self.more, np.ones(1000))
         if task == FAIL:
-            raise ValueError(f"as told: {letter}")
+            raise ValueError(f"as told: {payload}")
         if task == DIE:
-            os.kill(os.getpid(), signal.SIGSEGV if letter is None else letter)
+            os.kill(os.getpid(), signal.SIGSEGV if payload is None else payload)
         if task == DOZE:
-            time.sleep(letter)
+            time.sleep(payload)
         if task == TOIL:
-            toil(letter)
+            toil(payload)
         if task == RUN_OUT:
             raise MemoryError
         return None

@@ -12,7 +12,7 @@ import numpy as np
 
 from cavmarl.core.errors import ActionError, ClockError, FollowerError, FollowerLostError
 from cavmarl.cosim.followers.follower_connection import FollowerConnection
-from cavmarl.cosim.followers.follower_messages import Control, Say, Ticked, read_letter
+from cavmarl.cosim.followers.follower_messages import Control, Say, Ticked, read_payload
 from cavmarl.cosim.followers.follower_snapshots import SnapshotTime, take_snapshot
 from cavmarl.cosim.time_master import TimeFollower
 from cavmarl.env.parallel import CavEnv
@@ -142,7 +142,7 @@ class Barrier:
                 found.left.append(seat)
                 return True
             case Say.CONTROL:
-                control = read_letter(Control, heard.letter)
+                control = read_payload(Control, heard.payload)
             case kind:
                 raise FollowerError(
                     f"{seat.line.name} says {kind.name}: controls of frame {moment.frame} are due"

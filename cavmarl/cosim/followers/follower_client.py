@@ -19,7 +19,7 @@ from cavmarl.cosim.followers.follower_messages import (
     Say,
     Ticked,
     Welcome,
-    read_letter,
+    read_payload,
 )
 
 CALL_S = 10.0
@@ -75,7 +75,7 @@ class Follower:
         self._line = call(address, CALL_S)
         try:
             self._line.say(Say.HELLO, Hello(name, list(vehicles), secret), within_s=CALL_S)
-            self.welcome = read_letter(Welcome, self._expect(joins_s, Say.WELCOME).letter)
+            self.welcome = read_payload(Welcome, self._expect(joins_s, Say.WELCOME).payload)
         except BaseException:
             self._line.close()
             raise
@@ -131,7 +131,7 @@ class Follower:
         Raises ClockError: the world's master refuses.
         """
         self._line.say(Say.TICK)
-        ticked = read_letter(Ticked, self._expect(None, Say.TICKED).letter)
+        ticked = read_payload(Ticked, self._expect(None, Say.TICKED).payload)
         if ticked.refused:
             raise ClockError(ticked.refused)
         return ticked
@@ -152,7 +152,7 @@ class Follower:
             return heard
         if heard.kind is Say.REFUSAL:
             self._line.skip(heard)
-            raise FollowerError(read_letter(FollowerRefusal, heard.letter).reason)
+            raise FollowerError(read_payload(FollowerRefusal, heard.payload).reason)
         raise FollowerError(f"{self._line.name} says {heard.kind.name}, which is not due")
 
 

@@ -30,8 +30,8 @@ from cavmarl.cosim.followers.follower_messages import (
     FollowerSnapshot,
     Hello,
     Say,
-    letter_of,
-    read_letter,
+    payload_of,
+    read_payload,
 )
 from cavmarl.parallel.hosts.framed_socket import HEAD_BYTES, FramedSocket, bytes_before_data
 
@@ -51,7 +51,7 @@ class ReceivedFrame(NamedTuple):
     """One frame."""
 
     kind: Say  # what it says
-    letter: Any  # as msgpack knows it
+    payload: Any  # as msgpack knows it
     size: int  # bytes of its data
 
 
@@ -133,9 +133,9 @@ class FollowerConnection:
             FollowerLostError: the other end does not read; the other end is gone.
         """
         self._allow(within_s)
-        letter = None if message is None else letter_of(message)
+        payload = None if message is None else payload_of(message)
         with self._blaming("read", within_s):
-            self._wire.send(kind, 0, letter, arrays)
+            self._wire.send(kind, 0, payload, arrays)
 
     def hear(self, within_s: float | None = None) -> ReceivedFrame:
         """The next frame; its data then have to be taken (`take`) or left out (`skip`).
@@ -146,7 +146,7 @@ class FollowerConnection:
         self._allow(within_s)
         with self._blaming("answered", within_s):
             frame = self._wire.receive()
-        return ReceivedFrame(Say(frame.kind), frame.letter, frame.size)
+        return ReceivedFrame(Say(frame.kind), frame.payload, frame.size)
 
     def has_come(self) -> bool:
         """Whether the next frame is here but for its data, so that `hear` does not wait.
@@ -175,7 +175,7 @@ class FollowerConnection:
 
         Raises FollowerError: as of `hear`.
         """
-        snapshot = read_letter(FollowerSnapshot, heard.letter)
+        snapshot = read_payload(FollowerSnapshot, heard.payload)
         sizes = [_size(view) for view in snapshot.arrays]
         if sum(sizes) != heard.size:
             raise FollowerError(
@@ -307,7 +307,7 @@ def _remove_leftover(path: Path) -> None:
 GREETING_S = 5.0  # for a caller to introduce itself
 REFUSING_S = 0.01  # for the words of a refusal, which the system takes at once
 NO_DESCRIPTORS_S = 0.05  # until the next attempt to accept
-MAX_GUESTS = 64  # not introduced yet
+MAX_CALLERS = 64  # not introduced yet
 GOES_ON = (
     "the world is whole and can be stepped on, with the built-in driver in its place or another "
     "follower"
@@ -385,7 +385,7 @@ class Reception:
 
     def _open(self) -> None:
         """Accept all that call now; one too many takes the place of the one that waits longest."""
-        for _ in range(MAX_GUESTS):
+        for _ in range(MAX_CALLERS):
             try:
                 connection, _ = self._listener.accept()
             except OSError as error:  # none calls any more, or it is gone already
@@ -393,7 +393,7 @@ class Reception:
                     self._find_descriptor()
                 return
             line = FollowerConnection(connection, "a caller", GOES_ON)
-            if len(self._since) == MAX_GUESTS:
+            if len(self._since) == MAX_CALLERS:
                 self._dismiss_the_oldest("too many callers have not introduced themselves")
             self._since[line] = time.monotonic()
             self._selector.register(line, selectors.EVENT_READ, line)
@@ -415,7 +415,7 @@ class Reception:
         if heard.kind is not Say.HELLO:
             raise FollowerError(f"a caller begins with {heard.kind.name}: HELLO comes first")
         line.skip(heard)
-        hello = read_letter(Hello, heard.letter)
+        hello = read_payload(Hello, heard.payload)
         if self._secret and not compare_digest(hello.secret.encode(), self._secret):
             raise FollowerError("a caller does not know the secret of this world")
         if not hello.name.isprintable():

@@ -1,8 +1,8 @@
 """The messages between a world and its followers; docs/followers.md specifies them.
 
-A frame is that of `hosts.wire`: a head, a letter in msgpack, and the bytes of arrays. No letter is
-ever run. Each is one of these classes, as a map of its fields; a letter with other fields, or with
-values of other types, is refused.
+A frame is that of `framed_socket`: a head, a payload in msgpack, and the bytes of arrays. A payload
+is data and never code. Each is one of these classes, as a map of its fields; a payload with other
+fields, or with values of other types, is refused.
 """
 
 from __future__ import annotations
@@ -175,23 +175,23 @@ class FollowerRefusal:
     reason: StrictStr
 
 
-def letter_of(message: Any) -> dict[str, Any]:
+def payload_of(message: Any) -> dict[str, Any]:
     """A message as the map that is sent."""
     return asdict(message)
 
 
-def read_letter(kind: type[T], letter: object) -> T:
-    """The message of a class that a letter is.
+def read_payload(kind: type[T], payload: object) -> T:
+    """The message of a class that a payload is.
 
     Raises FollowerError: it is none: a field is missing, unknown or of another type.
     """
     if kind not in _ADAPTERS:
         _ADAPTERS[kind] = TypeAdapter(kind)
     try:
-        checked: T = _ADAPTERS[kind].validate_python(letter)
+        checked: T = _ADAPTERS[kind].validate_python(payload)
     except ValidationError as error:
         first = error.errors()[0]
-        place = ".".join(map(str, first["loc"])) or "the letter"
+        place = ".".join(map(str, first["loc"])) or "the payload"
         raise FollowerError(
             f"no {kind.__name__} of protocol version {VERSION}: {place}: {first['msg']}"
         ) from error

@@ -90,26 +90,28 @@ class ActionLogJob(WorldsJob):
     They are made where they run, not where workers are forked: a journal belongs to one process.
     """
 
-    def __init__(self, make: Callable[[], LocalWorlds], first: int, tape: ActionLog) -> None:
+    def __init__(self, make: Callable[[], LocalWorlds], first: int, actions: ActionLog) -> None:
         self._make = make
         self._first = first
-        self._tape = tape
+        self._actions = actions
         self._count = np.zeros(1, dtype=np.int64)  # entries that the state follows from
-        self._is_there = False  # where the tape ends
+        self._is_there = False  # where the log of actions ends
 
-    def perform(self, task: int, letter: Any) -> Any:
+    def perform(self, task: int, payload: Any) -> Any:
         if not self._is_there:
             self._begin_anew()
         if task not in (Task.STEP, Task.RESET):
-            return super().perform(task, letter)
+            return super().perform(task, payload)
         is_reset = task == Task.RESET
-        seed = letter["seed"] if is_reset else None
-        first_world = letter["first_world"] if is_reset else 0
+        seed = payload["seed"] if is_reset else None
+        first_world = payload["first_world"] if is_reset else 0
         chosen = self._worlds.arrays.chosen
         count = self._count.item()
-        self._tape.write(count, LoggedAction(is_reset, seed, first_world, chosen, self._commands))
+        self._actions.write(
+            count, LoggedAction(is_reset, seed, first_world, chosen, self._commands)
+        )
         self._is_there = False
-        super().perform(task, letter)
+        super().perform(task, payload)
         self._count[0] = count + 1
         self._is_there = True
         return None
@@ -120,7 +122,7 @@ class ActionLogJob(WorldsJob):
         worlds = self._worlds
         chosen = worlds.arrays.chosen
         present = chosen.copy()  # of the command that waits
-        for entry in self._tape.read(self._count.item()):
+        for entry in self._actions.read(self._count.item()):
             if entry.is_reset:
                 chosen[:] = entry.chosen
                 worlds.reset(entry.seed, entry.first_world + self._first)
@@ -139,7 +141,7 @@ class ActionLogJob(WorldsJob):
         self._worlds.close()
 
     def save(self) -> list[NDArray[Any]]:
-        """How much of the tape is committed."""
+        """How much of the log is committed."""
         return [self._count]
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:

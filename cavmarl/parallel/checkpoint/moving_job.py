@@ -47,15 +47,15 @@ class MovingJob(WorldsJob):
         first, last = self._bounds[self._number : self._number + 2].tolist()
         return first, last
 
-    def perform(self, task: int, letter: Any) -> Any:
+    def perform(self, task: int, payload: Any) -> Any:
         if task == Task.PACK:
-            self._pack(letter)
+            self._pack(payload)
         elif task == Task.UNPACK:
-            self._unpack(letter)
+            self._unpack(payload)
         elif task == Task.STEP:
             self._spent_s[slice(*self._range)] += self.timed_step()
         else:
-            return super().perform(task, letter)
+            return super().perform(task, payload)
         return None
 
     def _pack(self, bounds: Sequence[int]) -> None:

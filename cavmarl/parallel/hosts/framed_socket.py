@@ -1,8 +1,8 @@
 """`FramedSocket`: frames over a connection.
 
-A frame is a head of fixed size, a letter (mostly a few numbers, as the dialect writes them: between
-hosts as JSON) and data (bytes of arrays, which both ends know the shapes of). Nothing in it is ever
-run: a sender can say numbers only.
+A frame is a head of fixed size, a payload (mostly a few numbers, as the dialect writes them;
+between hosts as JSON) and data (bytes of arrays, whose shapes both ends know). A frame carries
+numbers and text, never code.
 
     head    magic, version, kind, order, bytes of the payload, bytes of the data,
             checksum of the data, checksum of the head and the payload
@@ -55,15 +55,15 @@ class Dialect(NamedTuple):
     magic: bytes  # four bytes that every frame begins with
     version: int  # of everything that is said
     kinds: type[IntEnum]  # of frames
-    max_letter: int  # bytes of the longest payload
+    max_payload: int  # bytes of the longest payload
     max_data: int  # bytes of the most data
     write: Callable[[Any], bytes]  # a payload's bytes
     read: Callable[[bytes], Any]  # the payload again; a ValueError says that it is none
     cure: str  # what to do about another version
 
 
-def _as_json(letter: Any) -> bytes:
-    return json.dumps(letter).encode()
+def _as_json(payload: Any) -> bytes:
+    return json.dumps(payload).encode()
 
 
 HOSTS = Dialect(
@@ -83,7 +83,7 @@ class Frame(NamedTuple):
 
     kind: IntEnum  # what it says
     order: int  # which order it belongs to
-    letter: Any  # as the dialect reads it; None: nothing
+    payload: Any  # as the dialect reads it; None: nothing
     size: int  # bytes of data
     checksum: int  # of them
 
@@ -111,11 +111,11 @@ class FramedSocket:
         return self._socket.fileno()
 
     def send(
-        self, kind: IntEnum, order: int, letter: Any = None, arrays: Sequence[Array] = ()
+        self, kind: IntEnum, order: int, payload: Any = None, arrays: Sequence[Array] = ()
     ) -> None:
         """Send one frame. Raises OSError: the other end is gone, or does not read."""
         dialect = self._dialect
-        text = b"" if letter is None else dialect.write(letter)
+        text = b"" if payload is None else dialect.write(payload)
         data = [array.data.cast("B") for array in arrays if array.nbytes]
         checksum = _checksum(data)
         size = sum(len(piece) for piece in data)
@@ -136,8 +136,8 @@ class FramedSocket:
         self.is_torn = True
         raw = self._read(HEAD_BYTES)
         head = bytes(raw[: _HEAD.size])
-        kind, order, letter_size, size, checksum = _understood(head, dialect)
-        text = bytes(self._read(letter_size))
+        kind, order, payload_size, size, checksum = _understood(head, dialect)
+        text = bytes(self._read(payload_size))
         if _SUM.unpack(raw[_HEAD.size :])[0] != zlib.crc32(text, zlib.crc32(head)):
             raise MessageError("the head of a frame is not what was sent")
         self._frame = _frame(dialect, kind, order, text, size, checksum)
@@ -204,23 +204,23 @@ def bytes_before_data(head: bytes, dialect: Dialect) -> int:
 
 def _understood(head: bytes, dialect: Dialect) -> tuple[int, int, int, int, int]:
     """Kind, order, bytes of the payload, bytes and checksum of the data."""
-    magic, version, kind, order, letter_size, size, checksum = _HEAD.unpack(head)
+    magic, version, kind, order, payload_size, size, checksum = _HEAD.unpack(head)
     if magic != dialect.magic:
         raise MessageError(f"{head[:4]!r} begins no frame")
     if version != dialect.version:
         raise MessageError(
             f"a frame of version {version}, this is {dialect.version}: {dialect.cure}"
         )
-    if letter_size > dialect.max_letter or size > dialect.max_data:
-        raise MessageError(f"a frame of {letter_size} + {size} bytes is none")
-    return kind, order, letter_size, size, checksum
+    if payload_size > dialect.max_payload or size > dialect.max_data:
+        raise MessageError(f"a frame of {payload_size} + {size} bytes is none")
+    return kind, order, payload_size, size, checksum
 
 
 def _frame(dialect: Dialect, kind: int, order: int, text: bytes, size: int, checksum: int) -> Frame:
     """The same, understood."""
     try:
-        letter = dialect.read(text) if text else None
-        return Frame(dialect.kinds(kind), order, letter, size, checksum)
+        payload = dialect.read(text) if text else None
+        return Frame(dialect.kinds(kind), order, payload, size, checksum)
     except ValueError as error:
         raise MessageError(f"a frame that says nothing: {error}") from error
 

@@ -57,7 +57,7 @@ class HostPool:
         self._repeats = repeats
         self._all = tuple(range(len(program.parts)))
         self._names = program.parts
-        self._truths = [CommittedState(size) for size in program.sizes]
+        self._committed = [CommittedState(size) for size in program.sizes]
         self._hosts: dict[int, HostConnection] = {}
         self._number = 0
         self._open: OpenOrder | None = None
@@ -81,7 +81,7 @@ class HostPool:
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        return tuple(truth.size for truth in self._truths)
+        return tuple(committed.size for committed in self._committed)
 
     def rename(self, names: Sequence[str]) -> None:
         self._names = tuple(names)
@@ -100,7 +100,7 @@ class HostPool:
     def run(
         self,
         task: int,
-        letters: Sequence[Any],  # what is said to each part, as JSON knows it
+        payloads: Sequence[Any],  # what is said to each part, as JSON knows it
         inputs: Sequence[Arrays],  # arrays for each part
         # part, answer → arrays that what comes out is written to
         outputs: Callable[[int, Any], Arrays],
@@ -115,13 +115,13 @@ class HostPool:
             WorkerError: there is no host left, and none comes; the pool is closed.
             WorkerFailureError: an exception in a host; all are as they were before.
         """
-        return self._command(self._all, task, _said(letters, inputs), outputs, commits, sizes)
+        return self._command(self._all, task, _said(payloads, inputs), outputs, commits, sizes)
 
-    def ask(self, part: int, task: int, letter: Any = None) -> Any:
+    def ask(self, part: int, task: int, payload: Any = None) -> Any:
         """Let the host of one part do a task that changes nothing; raises as `run`."""
-        letters = [letter] * len(self._all)
+        payloads = [payload] * len(self._all)
         nothing: list[Arrays] = [()] * len(self._all)
-        return self._command((part,), task, _said(letters, nothing), _no_arrays, False)[0]
+        return self._command((part,), task, _said(payloads, nothing), _no_arrays, False)[0]
 
     def ping(self) -> None:
         """Let all hosts do nothing: an empty barrier."""
@@ -160,7 +160,7 @@ class HostPool:
         refuse_fork(self._pid, "the hosts")
         if self._open is not None:
             self._settle(self._open)
-        is_full = len(self._truths[0].since) == IMAGE_EVERY
+        is_full = len(self._committed[0].since) == IMAGE_EVERY
         self._number += 1
         order = self._open = OpenOrder(
             self._number, task, say, outputs, self.sizes if sizes is None else sizes,
@@ -174,8 +174,8 @@ class HostPool:
         if order.failure is not None:
             self._open = None
             raise order.failure
-        if commits:  # at once: an interruption finds the one truth or the other
-            self._truths = [self._truths[k].after(order, k) for k in parts]
+        if commits:  # at once: an interruption finds the one state or the other
+            self._committed = [self._committed[k].after(order, k) for k in parts]
         self._open = None
         for k in parts if task != NOTHING else ():
             self._hosts[k].knows = not self._hosts[k].is_gone
@@ -220,12 +220,12 @@ class HostPool:
 
     def _give(self, order: OpenOrder, k: int, host: HostConnection) -> None:
         """Give a host the command, and what is committed if it does not know it."""
-        program, truth = self._program, self._truths[k]
+        program, committed = self._program, self._committed[k]
         is_behind = not host.knows and order.task != NOTHING
-        before = [truth.image, *truth.since] if is_behind and truth.image.size else []
+        before = [committed.image, *committed.since] if is_behind and committed.image.size else []
         said, inputs = order.say(k, host.knows)
-        letter = Order(
-            order.task, said, size=truth.size, image=before[0].size if before else 0,
+        payload = Order(
+            order.task, said, size=committed.size, image=before[0].size if before else 0,
             repeats=max(len(before) - 1, 0), repeated=program.noted, saves=order.saves,
         )  # fmt: skip
         host.part, host.knows = k, host.knows and order.task == NOTHING
@@ -233,7 +233,7 @@ class HostPool:
         try:
             if host.is_gone:
                 raise EOFError
-            host.wire.send(Kind.ORDER, order.number, letter, [*before, *inputs])
+            host.wire.send(Kind.ORDER, order.number, payload, [*before, *inputs])
             host.heard_s = time.monotonic()  # it has read most of it
         except (EOFError, OSError) as error:
             self._lose(order, k, _words(error), restart=False)
@@ -261,7 +261,7 @@ class HostPool:
                 self._company.mute(host)  # it is missed with the next order
 
     def _take(self, order: OpenOrder, k: int, host: HostConnection, frame: Frame) -> None:
-        answer, saved = frame.letter["answer"], np.empty(frame.letter["image"], dtype=np.uint8)
+        answer, saved = frame.payload["answer"], np.empty(frame.payload["image"], dtype=np.uint8)
         host.wire.take([*order.outputs(k, answer), saved])
         order.answers[k], order.images[k] = answer, saved
         order.pending.discard(k)
@@ -273,7 +273,7 @@ class HostPool:
         order.pending.discard(k)
         first = order.failure is None or k < order.failure.worker
         if frame.kind == Kind.FAILED and first:
-            order.failure = WorkerFailureError(k, self._names[k], **frame.letter)
+            order.failure = WorkerFailureError(k, self._names[k], **frame.payload)
 
     def _lose(self, order: OpenOrder, k: int, cause: str, restart: bool) -> None:
         """A host is gone, or taken for it: another one goes on in its place."""
@@ -331,8 +331,8 @@ def _close(company: HostRegistry, pid: int) -> None:
         company.close()
 
 
-def _said(letters: Sequence[Any], inputs: Sequence[Arrays]) -> Say:
-    return lambda k, knows: (letters[k], inputs[k])
+def _said(payloads: Sequence[Any], inputs: Sequence[Arrays]) -> Say:
+    return lambda k, knows: (payloads[k], inputs[k])
 
 
 def _say_nothing(part: int, knows: bool) -> tuple[None, Arrays]:

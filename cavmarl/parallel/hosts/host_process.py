@@ -34,7 +34,7 @@ class Order(NamedTuple):
     """The payload of a command; its data are an image, what was done since, and what to do now."""
 
     task: int  # what to do
-    letter: Any  # what is said to it
+    payload: Any  # what is said to it
     size: int  # of the part that it is about, before it
     image: int  # bytes of the image to begin from; 0: go on from where you are
     repeats: int  # how often what was done since has to be done again; each has data of its own
@@ -73,11 +73,11 @@ class RemoteJob:
     def fit(self, size: int) -> None:
         """Be ready for a part of that size."""
 
-    def inputs(self, task: int, letter: Any) -> Sequence[Array]:
+    def inputs(self, task: int, payload: Any) -> Sequence[Array]:
         """Arrays that a command of this task fills, as many as its payload says."""
         raise NotImplementedError
 
-    def perform(self, task: int, letter: Any) -> TaskOutcome:
+    def perform(self, task: int, payload: Any) -> TaskOutcome:
         raise NotImplementedError
 
     def save(self) -> Sequence[Array]:
@@ -116,13 +116,13 @@ def serve(
             if frame.kind == Kind.END:
                 return
             try:
-                letter, arrays = _carry_out(job, Order(*frame.letter), data, taken, given)
+                payload, arrays = _carry_out(job, Order(*frame.payload), data, taken, given)
             except MemoryError:
                 os._exit(OUT_OF_MEMORY)
             except Exception as error:
                 line.reply(Kind.FAILED, describe(error))
             else:
-                line.reply(Kind.DONE, letter, arrays)
+                line.reply(Kind.DONE, payload, arrays)
     os._exit(0)
 
 
@@ -140,8 +140,8 @@ def _carry_out(
     for _ in range(order.repeats):
         at = _fill(job.inputs(order.repeated, None), data, at)
         job.perform(order.repeated, None)
-    _fill(job.inputs(order.task, order.letter), data, at)
-    answer, arrays = job.perform(order.task, order.letter)
+    _fill(job.inputs(order.task, order.payload), data, at)
+    answer, arrays = job.perform(order.task, order.payload)
     if not order.saves:
         return {"answer": answer, "image": 0}, arrays
     given.write(job.save())
@@ -179,10 +179,10 @@ class _Line:
         self._wire.take([data])
         return frame, data
 
-    def reply(self, kind: Kind, letter: Any, arrays: Sequence[Array] = ()) -> None:
+    def reply(self, kind: Kind, payload: Any, arrays: Sequence[Array] = ()) -> None:
         with self._lock:
             order, self._order = max(self._order, 0), -1
-            self._wire.send(kind, order, letter, arrays)
+            self._wire.send(kind, order, payload, arrays)
 
     def _beat(self) -> NoReturn:
         spent = 0

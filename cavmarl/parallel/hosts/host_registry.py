@@ -141,11 +141,11 @@ class HostRegistry:
             self.drop(host, restart=not isinstance(error, ENDED))
             return
         if frame.kind == Kind.FAILED:
-            raise WorkerFailureError(host.number, str(host), **frame.letter)
-        host.pid, host.machine = frame.letter["pid"], frame.letter["machine"]
-        if frame.letter["code"] != self._code:
+            raise WorkerFailureError(host.number, str(host), **frame.payload)
+        host.pid, host.machine = frame.payload["pid"], frame.payload["machine"]
+        if frame.payload["code"] != self._code:
             raise WorkerError(
-                f"{host} runs {frame.letter['code']}, this machine {self._code}: install the same "
+                f"{host} runs {frame.payload['code']}, this machine {self._code}: install the same "
                 "versions on all machines, or results would differ"
             )
         host.is_ready = True

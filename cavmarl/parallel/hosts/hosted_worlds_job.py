@@ -88,27 +88,27 @@ class HostedWorlds(RemoteJob):
         if size != len(self._worlds.arrays.mask):
             self._make(size)
 
-    def inputs(self, task: int, letter: Any) -> list[Array]:
+    def inputs(self, task: int, payload: Any) -> list[Array]:
         if task == Task.UNPACK:
-            move = WorldMove(*letter)
+            move = WorldMove(*payload)
             self._coming = buffers(move.coming, move.bytes)
             return [*self._coming]
         return inputs_of(task, self._worlds.arrays)
 
-    def perform(self, task: int, letter: Any) -> TaskOutcome:
+    def perform(self, task: int, payload: Any) -> TaskOutcome:
         """Do a task.
 
         The answer to a step is in which worlds something ended; to PACK, how many worlds leave, and
         the bytes of their cases.
         """
         if task == Task.PACK:
-            return self._pack(WorldMove(*letter))
+            return self._pack(WorldMove(*payload))
         if task == Task.UNPACK:
-            self._unpack(WorldMove(*letter))
+            self._unpack(WorldMove(*payload))
             return TaskOutcome(None, ())
         if task == Task.STEP:
             return self._step()
-        answer = self._job.perform(task, letter)
+        answer = self._job.perform(task, payload)
         return TaskOutcome(answer, results_of(task, self._worlds.arrays, answer))
 
     def _step(self) -> TaskOutcome:

@@ -35,9 +35,9 @@ from cavmarl.parallel.hosts.framed_socket import MAGIC, VERSION, FramedSocket
 NONCE = 16  # bytes of a random number
 PROOF = 32  # of an HMAC
 SECRET = 32
-GREETING_S = 5.0  # for a guest to prove its identity
+GREETING_S = 5.0  # for a caller to prove its identity
 CALL_S = 5.0  # for the system to connect
-MAX_GUESTS = 64  # not authenticated yet
+MAX_CALLERS = 64  # not authenticated yet
 BACKLOG = 1024  # callers that the system holds until they are accepted
 _SPOKEN = struct.Struct("<4sH")
 _HELLO = struct.Struct(f"<4sHI{NONCE}s")
@@ -114,7 +114,7 @@ class PendingConnection:
 
 
 class Listener:
-    """Listens, and lets in callers that know the secret; strangers cost little and are shown out.
+    """Lets in callers that know the secret; strangers cost little and are disconnected.
 
     Raises:
         WorkerError: the port cannot be listened on.
@@ -143,7 +143,7 @@ class Listener:
         except BaseException:
             self._listener.close()
             raise
-        self._guests: list[PendingConnection] = []
+        self._callers: list[PendingConnection] = []
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listener, selectors.EVENT_READ)
 
@@ -161,53 +161,55 @@ class Listener:
         admitted: list[tuple[int, socket.socket]] = []
         for key, _ in self._selector.select(0.0):
             if key.fileobj is self._listener:
-                for guest in self._welcome():
-                    self._listen(guest, admitted)
-            elif key.fileobj in self._guests:  # not shown out meanwhile
+                for caller in self._welcome():
+                    self._listen(caller, admitted)
+            elif key.fileobj in self._callers:  # not disconnected meanwhile
                 self._listen(key.fileobj, admitted)
         now = time.monotonic()
-        for guest in [guest for guest in self._guests if guest.until_s < now]:
-            self._show_out(guest)
+        for caller in [caller for caller in self._callers if caller.until_s < now]:
+            self._disconnect(caller)
         return admitted
 
     def _welcome(self) -> Iterator[PendingConnection]:
         """Accept all that call; where they are too many, the silent ones leave first."""
-        for _ in range(MAX_GUESTS):
+        for _ in range(MAX_CALLERS):
             try:
                 connection, _ = self._listener.accept()
             except OSError:
                 return
-            if len(self._guests) == MAX_GUESTS:
-                self._show_out(min(self._guests, key=lambda each: (each.number >= 0, each.until_s)))
+            if len(self._callers) == MAX_CALLERS:
+                self._disconnect(
+                    min(self._callers, key=lambda each: (each.number >= 0, each.until_s))
+                )
             try:
-                guest = PendingConnection(connection, self.secret)
+                caller = PendingConnection(connection, self.secret)
             except OSError:  # it is gone already
                 connection.close()
                 continue
-            self._guests.append(guest)
-            self._selector.register(guest, selectors.EVENT_READ)
-            yield guest
+            self._callers.append(caller)
+            self._selector.register(caller, selectors.EVENT_READ)
+            yield caller
 
-    def _listen(self, guest: PendingConnection, admitted: list[tuple[int, socket.socket]]) -> None:
+    def _listen(self, caller: PendingConnection, admitted: list[tuple[int, socket.socket]]) -> None:
         try:
-            connection = guest.listen()
+            connection = caller.listen()
         except (EOFError, OSError, MessageError):  # a stranger: ignored
-            self._show_out(guest)
+            self._disconnect(caller)
             return
         if connection is not None:
-            self._guests.remove(guest)
-            self._selector.unregister(guest)
-            admitted.append((guest.number, connection))
+            self._callers.remove(caller)
+            self._selector.unregister(caller)
+            admitted.append((caller.number, connection))
 
-    def _show_out(self, guest: PendingConnection) -> None:
-        self._guests.remove(guest)
-        self._selector.unregister(guest)
-        guest.close()
+    def _disconnect(self, caller: PendingConnection) -> None:
+        self._callers.remove(caller)
+        self._selector.unregister(caller)
+        caller.close()
 
     def close(self) -> None:
         self._selector.close()
-        for guest in self._guests:
-            guest.close()
+        for caller in self._callers:
+            caller.close()
         self._listener.close()
 
 

@@ -113,29 +113,29 @@ class RemoteWorlds(OrderedWorlds):
         self._bounds = [0, *accumulate(self._sizes)]
         self._mine = [self.arrays.part(*bounds) for bounds in pairwise(self._bounds)]
 
-    def _send(self, task: Task, letter: Any, commits: bool) -> None:
+    def _send(self, task: Task, payload: Any, commits: bool) -> None:
         if self.pool.sizes != self._sizes:
             self._look()
         if task == Task.PACK:
-            self._pack(letter)
+            self._pack(payload)
         elif task == Task.UNPACK:
-            self._unpack(letter)
+            self._unpack(payload)
         else:
-            self._carry_out(task, letter, commits)
+            self._carry_out(task, payload, commits)
 
-    def _carry_out(self, task: Task, letter: Any, commits: bool) -> None:
+    def _carry_out(self, task: Task, payload: Any, commits: bool) -> None:
         measures = task == Task.STEP and self.world.config.workers.balance_steps > 0
         spent_s = [np.zeros(size) for size in self._sizes] if measures else []
 
         def outputs(k: int, ended: Any) -> Arrays:
             return [*results_of(task, self._mine[k], ended), *spent_s[k : k + 1]]
 
-        letters = [letter] * len(self._mine)
+        payloads = [payload] * len(self._mine)
         if task == Task.RESET:  # a host counts its worlds from 0
-            firsts = [letter["first_world"] + first for first in self._bounds[:-1]]
-            letters = [{**letter, "first_world": first} for first in firsts]
+            firsts = [payload["first_world"] + first for first in self._bounds[:-1]]
+            payloads = [{**payload, "first_world": first} for first in firsts]
         inputs = [inputs_of(task, arrays) for arrays in self._mine]
-        self.pool.run(task, letters, inputs, outputs, commits)
+        self.pool.run(task, payloads, inputs, outputs, commits)
         if measures:
             self._spent_s[:, 0] += np.concatenate(spent_s)
 

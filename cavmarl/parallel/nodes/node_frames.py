@@ -26,9 +26,9 @@ _COMMON = (
 )  # fmt: skip
 
 
-def pieces_of(task: Task, letter: Any, arrays: StepArrays) -> list[Bytes]:
+def pieces_of(task: Task, payload: Any, arrays: StepArrays) -> list[Bytes]:
     """A command: the task, what it is told, and the arrays that it reads."""
-    said = json.dumps(letter).encode()
+    said = json.dumps(payload).encode()
     read = (_flat(getattr(arrays, name)).data for name in _INPUTS.get(task, ()))
     return [_HEAD.pack(task, len(said)), said, *read]
 
@@ -110,12 +110,12 @@ def take_results(
 
 
 def told_cases(cases: Sequence[bytes], only_reads: bool = False) -> dict[str, Any]:
-    """Worlds as bytes, as a letter; see `LocalWorlds.save_worlds`."""
+    """Worlds as bytes, as a payload; see `LocalWorlds.save_worlds`."""
     return {"cases": [b64encode(case).decode() for case in cases], "only_reads": only_reads}
 
 
-def cases_of(letter: Mapping[str, Any]) -> list[bytes]:
-    return [b64decode(case) for case in letter["cases"]]
+def cases_of(payload: Mapping[str, Any]) -> list[bytes]:
+    return [b64decode(case) for case in payload["cases"]]
 
 
 def _flat(array: NDArray[Any]) -> NDArray[np.uint8]:

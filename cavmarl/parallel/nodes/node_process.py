@@ -263,7 +263,7 @@ class NodeProgram:
 
     def _perform(self, frame: NodeFrame) -> None:
         worlds, peers = self._worlds, self._peers
-        task, letter = command_of(frame.data, worlds.arrays)
+        task, payload = command_of(frame.data, worlds.arrays)
         if frame.number:
             self._kept.keep(frame.number, self._living)
         match task:
@@ -273,10 +273,10 @@ class NodeProgram:
                 self._hosts.report(self._results(worlds.simulation.everywhere, stepped=True))
             case Task.RESET:
                 chosen = worlds.arrays.chosen.copy()
-                worlds.reset(letter["seed"], letter["first_world"])
+                worlds.reset(payload["seed"], payload["first_world"])
                 self._hosts.report(self._results(chosen, stepped=False))
-            case Task.LOAD if not letter["only_reads"]:
-                worlds.load_worlds(cases_of(letter))
+            case Task.LOAD if not payload["only_reads"]:
+                worlds.load_worlds(cases_of(payload))
                 self._hosts.report()
             case Task.HOST:
                 spent_s = [] if self._clock is None else self._clock.take_s().tolist()
@@ -290,7 +290,7 @@ class NodeProgram:
                 found = worlds.arrays.suggested.reshape(-1, 2)[where]
                 self._answer([where.data, found.reshape(-1).data])
             case _:
-                self._look(task, letter)
+                self._look(task, payload)
 
     def _results(self, sensed: Any, stepped: bool) -> list[Bytes]:
         peers = self._peers
@@ -298,32 +298,32 @@ class NodeProgram:
         before = peers.stepped if stepped else np.zeros_like(own)
         return results_of(self._worlds.arrays, own, before, with_common=self._tells)
 
-    def _look(self, task: Task, letter: Any) -> None:
+    def _look(self, task: Task, payload: Any) -> None:
         """Answer what only the first node can, which has the whole world meanwhile."""
         worlds, answer = self._worlds, None
         with self._peers.whole(worlds.simulation):
             if self._is_first:
-                answer = self._found(task, letter)
+                answer = self._found(task, payload)
         self._answer([] if answer is None else answer)
 
-    def _found(self, task: Task, letter: Any) -> list[Bytes]:
+    def _found(self, task: Task, payload: Any) -> list[Bytes]:
         worlds = self._worlds
         found: Any
         if task == Task.WRITE_STATES:
             worlds.write_states()
             return [worlds.arrays.states.reshape(-1).data]
         if task == Task.STATE_HASH:
-            found = worlds.state_hash(letter)
+            found = worlds.state_hash(payload)
         elif task == Task.SAVE:
             found = told_cases(worlds.save_worlds())
         elif task == Task.LOAD:
-            found = _refusal(worlds, cases_of(letter))
+            found = _refusal(worlds, cases_of(payload))
         elif task == Task.TRAFFIC_STATS:
-            found = worlds.traffic_stats(letter)
+            found = worlds.traffic_stats(payload)
         elif task == Task.DRIVEN:
-            found = worlds.driven(*letter)
+            found = worlds.driven(*payload)
         else:
-            found = worlds.signal_phases(letter).tolist()
+            found = worlds.signal_phases(payload).tolist()
         return [json.dumps(found).encode()]
 
     @property

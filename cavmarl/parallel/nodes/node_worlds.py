@@ -108,10 +108,10 @@ class NodeWorlds(NodePool):
             self._homes = before
             raise
 
-    def _command(self, task: Task, letter: Any = None) -> NodeCommand:
-        loads = task == Task.LOAD and not letter["only_reads"]
+    def _command(self, task: Task, payload: Any = None) -> NodeCommand:
+        loads = task == Task.LOAD and not payload["only_reads"]
         changes = loads or task in (Task.STEP, Task.RESET)
-        pieces = [bytes(piece) for piece in pieces_of(task, letter, self.arrays)]
+        pieces = [bytes(piece) for piece in pieces_of(task, payload, self.arrays)]
         return NodeCommand(pieces, changes, self._ticks_per_step if task == Task.STEP else 0)
 
     def _write(self, results: Sequence[memoryview], of_step: bool) -> None:
@@ -143,8 +143,8 @@ class NodeWorlds(NodePool):
             self._told[node] = now
         return sorted(found)
 
-    def _asked(self, task: Task, letter: Any) -> Any:
-        return json.loads(bytes(self.run(self._command(task, letter))[0]))
+    def _asked(self, task: Task, payload: Any) -> Any:
+        return json.loads(bytes(self.run(self._command(task, payload))[0]))
 
     def write_states(self) -> None:
         data = self.run(self._command(Task.WRITE_STATES))[0]

@@ -136,7 +136,7 @@ class ForkServer:
         finally:
             theirs.close()
 
-    def bury(self, process: Process) -> int:
+    def reap(self, process: Process) -> int:
         """Let a process that is dead be forgotten.
 
         Returns:
@@ -145,7 +145,7 @@ class ForkServer:
         Raises:
             ServerGoneError: the server does not answer.
         """
-        return int(self._ask({"bury": process.pid})["status"])
+        return int(self._ask({"reap": process.pid})["status"])
 
     def close(self) -> None:
         self._wire.close()

@@ -36,7 +36,7 @@ from cavmarl.parallel.processes.shared_memory import Segment
 from cavmarl.parallel.processes.state_image import Arrays, Image
 
 # Words of the pool's line, behind those of `barrier`.
-TASK, LETTER, SLOT, TRUTH, LOADS = 2, 3, 4, 5, 6
+TASK, PAYLOAD, SLOT, COMMITTED, LOADS = 2, 3, 4, 5, 6
 # Words of the worker's line: how its command ended, and on which core it began it.
 ANSWER, CORE = 2, 3
 SILENT, ANSWERED, FAILED = 0, 1, 2
@@ -54,7 +54,7 @@ class Job:
     def perform(
         self,
         task: int,  # which one; numbers from 0 on are the job's own
-        letter: Any,  # what the pool has to say to it, as JSON knows it; mostly nothing
+        payload: Any,  # what the pool has to say to it, as JSON knows it; mostly nothing
     ) -> Any:
         """Do a task; the answer, as JSON knows it, of those that have one."""
         raise NotImplementedError
@@ -145,8 +145,8 @@ def _fork_on_demand(
         if not message:
             _end(alive)
         order = json.loads(message)
-        if "bury" in order:
-            pid = order["bury"]
+        if "reap" in order:
+            pid = order["reap"]
             _, status = os.waitpid(pid, 0)
             alive.discard(pid)
             pool.send(json.dumps({"status": os.waitstatus_to_exitcode(status)}).encode())
@@ -201,17 +201,17 @@ def _obey(job: Job, meeting: Meeting, slots: Sequence[Image]) -> NoReturn:
         wait_s = _await(meeting, order, wait_s, time.perf_counter() - began)
         began = time.perf_counter()
         core = present_core()
-        number, _, task, has_letter, slot, truth, loads, _ = theirs.tolist()
-        letter = _receive(meeting.wire) if has_letter else None
+        number, _, task, has_payload, slot, committed, loads, _ = theirs.tolist()
+        payload = _receive(meeting.wire) if has_payload else None
         try:
-            if (is_new or loads) and truth >= 0:
+            if (is_new or loads) and committed >= 0:
                 dtypes = [array.dtype for array in job.save()]
                 if dtypes:
-                    job.load(list(slots[truth].read(dtypes)))
+                    job.load(list(slots[committed].read(dtypes)))
             is_new = False
             answer = None
             if task != NOTHING:
-                answer = job.perform(task, letter)
+                answer = job.perform(task, payload)
             if slot >= 0 and (saved := job.save()):
                 slots[slot].write(saved)
         except MemoryError:

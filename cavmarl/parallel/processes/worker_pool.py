@@ -60,22 +60,22 @@ class Pool:
         self._timeout_s = timeout_s
         self._repeats = repeats
         self._all = tuple(range(len(program.parts)))
-        self._truth = -1  # the slot of the committed images
+        self._committed = -1  # the slot of the committed images
         self._open: tuple[int, ...] = ()  # workers with an order that is not committed
         self._stale = [False] * len(program.parts)  # whose memory is not what is committed
         self._ordered_s = 0.0
         self._lasted: dict[int, float] = {}  # how long each task has taken the last time, s
         self._pid = os.getpid()
-        self._crew = WorkerProcesses(program, repeats)
-        self._finalizer = weakref.finalize(self, self._crew.release)
+        self._processes = WorkerProcesses(program, repeats)
+        self._finalizer = weakref.finalize(self, self._processes.release)
 
     @property
     def pids(self) -> list[int]:
-        return [process.pid for process in self._crew.processes.values()]
+        return [process.pid for process in self._processes.processes.values()]
 
     @property
     def server_pid(self) -> int:
-        return self._crew.server_pid
+        return self._processes.server_pid
 
     def team_of(self, worker: int) -> tuple[int, ...]:
         """The workers replaced with a worker, itself among them."""
@@ -84,7 +84,7 @@ class Pool:
     def processor_s(self) -> list[float]:
         return [processor_s(pid) for pid in self.pids]
 
-    def run(self, task: int, letter: Any = None, commits: bool = True) -> list[Any]:
+    def run(self, task: int, payload: Any = None, commits: bool = True) -> list[Any]:
         """Let all workers do a task.
 
         Returns:
@@ -94,11 +94,11 @@ class Pool:
             WorkerDeathError: too many processes died of it; the pool is closed.
             WorkerFailureError: an exception in a worker; all are as they were before.
         """
-        return self._command(self._all, task, letter, commits)
+        return self._command(self._all, task, payload, commits)
 
-    def ask(self, worker: int, task: int, letter: Any = None) -> Any:
+    def ask(self, worker: int, task: int, payload: Any = None) -> Any:
         """Let one worker do a task that changes nothing; raises as `run`."""
-        return self._command((worker,), task, letter, False)[0]
+        return self._command((worker,), task, payload, False)[0]
 
     def ping(self) -> None:
         """Let all workers do nothing: an empty barrier."""
@@ -112,42 +112,42 @@ class Pool:
         self._finalizer()
 
     def _command(
-        self, workers: tuple[int, ...], task: int, letter: Any, commits: bool
+        self, workers: tuple[int, ...], task: int, payload: Any, commits: bool
     ) -> list[Any]:
         if not self._finalizer.alive:
             raise WorkerError("the workers are closed: make the environment anew")
         refuse_fork(self._pid, "the workers")
         if self._open:
             self._settle()
-        mail = None if letter is None else MAIL + json.dumps(letter).encode()
+        mail = None if payload is None else MAIL + json.dumps(payload).encode()
         if mail is not None and len(mail) > MAX_MESSAGE:
             raise WorkerError(f"a payload of {len(mail)} bytes: at most {MAX_MESSAGE} can be sent")
-        slot = 1 - max(self._truth, 0) if commits else -1
+        slot = 1 - max(self._committed, 0) if commits else -1
         self._open = workers
         self._ordered_s = time.monotonic()
-        head = (task, mail is not None, slot, self._truth)
+        head = (task, mail is not None, slot, self._committed)
         expected_s = self._lasted.get(task, 0.0)
         sleeps = expected_s > LONG_WORK_S
         if workers == self._all:
-            self._crew.keep_apart()  # where they were with the last command
-        self._crew.order(workers, head, self._stale, mail, sleeps)
+            self._processes.keep_apart()  # where they were with the last command
+        self._processes.order(workers, head, self._stale, mail, sleeps)
         self._await(workers, mail, expected_s, sleeps)
         self._lasted[task] = time.monotonic() - self._ordered_s
         answers = self._read(workers)
         for k in workers:
             self._stale[k] = False
         if commits:
-            self._truth = slot
+            self._committed = slot
         self._open = ()
         return answers
 
     def _settle(self) -> None:
         """Let a command end that was interrupted, or failed; it is not committed."""
         for k in self._open:
-            watchdog = Watchdog(self._crew.processes[k].pid, self._timeout_s)
-            while not self._crew.settle(k, CHECK_S):
-                if watchdog.verdict() is not None or self._crew.is_left_alone(k):
-                    self._crew.processes[k].kill()
+            watchdog = Watchdog(self._processes.processes[k].pid, self._timeout_s)
+            while not self._processes.settle(k, CHECK_S):
+                if watchdog.verdict() is not None or self._processes.is_left_alone(k):
+                    self._processes.processes[k].kill()
             self._stale[k] = True
         self._open = ()
 
@@ -156,28 +156,28 @@ class Pool:
     ) -> None:
         pending = list(workers)
         if not sleeps:
-            pending = [k for k in workers if not self._crew.watch(k, expected_s)]
+            pending = [k for k in workers if not self._processes.watch(k, expected_s)]
         if pending:
             self._await_asleep(pending, mail, sleeps)
 
     def _await_asleep(self, pending: list[int], mail: bytes | None, is_lying: bool) -> None:
-        dead = self._crew.sleep(pending, CHECK_S, is_lying)
+        dead = self._processes.sleep(pending, CHECK_S, is_lying)
         first = len(self.deaths)
-        guard = _Guard(self._crew, self._timeout_s, self._ordered_s)
+        guard = _Guard(self._processes, self._timeout_s, self._ordered_s)
         while pending or dead:
             asked = pending
             pending = self._pending()
             if pending and len(pending) < len(asked):
                 # Orders are shared out so that all end together.
-                self._crew.forget_calls()
-                pending = [k for k in pending if not self._crew.watch(k, is_soon=True)]
+                self._processes.forget_calls()
+                pending = [k for k in pending if not self._processes.watch(k, is_soon=True)]
             self._note_done(first, pending)
             if not (pending or dead):
                 break
             suspects = dict.fromkeys(dead, "") or guard.hanging(pending)
-            suspected = {k: self._crew.processes[k] for k in suspects} | dead
+            suspected = {k: self._processes.processes[k] for k in suspects} | dead
             for k, cause in suspects.items():
-                if self._crew.processes[k] is suspected[k]:  # not replaced with another one's
+                if self._processes.processes[k] is suspected[k]:  # not replaced with another one's
                     self._replace(k, cause, mail)
             pending = self._pending()
             for k in pending:
@@ -185,7 +185,7 @@ class Pool:
                 causes = [death.cause for death in self.deaths[first:] if death.worker in team]
                 if len(causes) > self._repeats:
                     self._give_up(k, causes)
-            dead = self._crew.sleep(pending, CHECK_S) if pending else {}
+            dead = self._processes.sleep(pending, CHECK_S) if pending else {}
         self._note_done(first, pending)
 
     def _note_done(self, first: int, pending: list[int]) -> None:
@@ -195,32 +195,32 @@ class Pool:
                 death.done_s = time.monotonic()
 
     def _pending(self) -> list[int]:
-        return [k for k in self._open if not self._crew.has(k)]
+        return [k for k in self._open if not self._processes.has(k)]
 
     def _replace(self, k: int, cause: str, mail: bytes | None) -> None:
         """A worker's process is dead, or taken for it: another one goes on in its place."""
         noticed_s = time.monotonic()
         try:
-            found = self._crew.replace(k, mail, self._open)
+            found = self._processes.replace(k, mail, self._open)
         except BaseException:
             self.close()
             raise
-        number = self._crew.number(k)
+        number = self._processes.number(k)
         now = time.monotonic()
         self.deaths.append(Death(k, number, cause or found, self._ordered_s, noticed_s, now))
 
     def _give_up(self, k: int, causes: list[str]) -> None:
         self.close()
-        task = self._crew.orders.item(k, TASK)
+        task = self._processes.orders.item(k, TASK)
         what = "nothing" if task == NOTHING else self._program.tasks[task]
-        part, number = self._program.parts[k], self._crew.number(k)
+        part, number = self._program.parts[k], self._processes.number(k)
         raise WorkerDeathError(k, part, number, what, causes)
 
     def _read(self, workers: tuple[int, ...]) -> list[Any]:
         answers: list[Any] = []
         failure: WorkerFailureError | None = None
         for k in workers:
-            kind, answer = self._crew.answer(k)
+            kind, answer = self._processes.answer(k)
             if kind == FAILED and (failure is None or failure.kind == LeftAloneError.__name__):
                 failure = WorkerFailureError(k, self._program.parts[k], **answer)
             answers.append(answer)
@@ -232,8 +232,8 @@ class Pool:
 class _Guard:
     """Checks the workers that are waited for, from time to time."""
 
-    def __init__(self, crew: WorkerProcesses, timeout_s: float, since_s: float) -> None:
-        self._crew = crew
+    def __init__(self, processes: WorkerProcesses, timeout_s: float, since_s: float) -> None:
+        self._processes = processes
         self._timeout_s = timeout_s
         self._watchdogs: dict[int, Watchdog] = {}
         self._next_s = since_s + CHECK_S
@@ -245,7 +245,7 @@ class _Guard:
         self._next_s = now + CHECK_S
         found: dict[int, str] = {}
         for k in pending:
-            pid = self._crew.processes[k].pid
+            pid = self._processes.processes[k].pid
             if pid not in self._watchdogs:
                 self._watchdogs[pid] = Watchdog(pid, self._timeout_s)
             verdict = self._watchdogs[pid].verdict()

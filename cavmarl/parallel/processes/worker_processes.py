@@ -105,7 +105,7 @@ class WorkerProcesses:
     def order(
         self,
         workers: Sequence[int],
-        head: tuple[int, ...],  # words of the command, from TASK to TRUTH
+        head: tuple[int, ...],  # words of the command, from TASK to COMMITTED
         stale: Sequence[bool],  # of all workers, whose memory is not what is committed
         mail: bytes | None,  # what goes with it
         # this side goes to sleep at once: what it does from here on it does on a core on which a
@@ -231,7 +231,7 @@ class WorkerProcesses:
         server = self._held.server
         assert server is not None
         try:
-            statuses = {j: server.bury(process) for j, process in old.items()}
+            statuses = {j: server.reap(process) for j, process in old.items()}
             cause = _say(statuses[k])
             for j in team:
                 self._fork(j)

@@ -59,7 +59,7 @@ class SensorJob(Job):
             sensor.lines = lines
             sensor.sense(self._scenes, due, frames)
 
-    def perform(self, task: int, letter: Any) -> None:
+    def perform(self, task: int, payload: Any) -> None:
         began = perf_counter()
         self._look()
         shared, number = self._shared, self._number

@@ -39,7 +39,7 @@ class SensorWorkerPlan(NamedTuple):
 
     module: str  # that they run
     recipe: Mapping[str, Any]  # from which it makes its jobs; `shape` and `scene` are added
-    frames: Segment  # memory that samples are written to; it goes with the farm
+    frames: Segment  # memory that samples are written to; it is released with the sensor workers
     shape: SceneShape  # of what is shared
     num_lines: tuple[int, ...]  # (S,) into how many lines a frame of each sensor can be divided
     workers: WorkersConfig  # how they are watched, and how sensing is shared out

@@ -40,7 +40,9 @@ def local_worlds(
     segment = Segment.make(size_of(layout))
     arrays = StepArrays.of(arrays_in(segment.map(), layout))
     worlds = LocalWorlds(world, num_worlds, arrays, in_next_step=in_next_step)
-    worlds.hire(farm_of(world, base_dir, segment, (0, num_worlds), num_worlds))
+    worlds.attach_sensor_workers(
+        sensor_workers_of(world, base_dir, segment, (0, num_worlds), num_worlds)
+    )
     return worlds
 
 
@@ -56,7 +58,7 @@ def warn_if_crowded(sensor_workers: int, times: int) -> None:
         )
 
 
-def farm_of(
+def sensor_workers_of(
     world: World, base_dir: Path, arrays: Segment, part: tuple[int, int], num_worlds: int
 ) -> SensorWorkers:
     """The sensor workers of some worlds, to be started when they are needed."""

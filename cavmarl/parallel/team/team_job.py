@@ -31,18 +31,18 @@ class LeaderJob(CheckpointJob):
         worlds: LocalWorlds,  # the one; what its shards write is shared
         first: int,  # its number among all
         zones: Sequence[Sequence[int]],  # that each worker hosts, to begin with; the leader's first
-        diary: CheckpointLog,  # the checkpoint log in which it leaves the state behind
+        checkpoint_log: CheckpointLog,  # the checkpoint log in which it leaves the state behind
         # (k,) where the processor time of each zone is added up; None: not measured
         spent_s: NDArray[np.float64] | None = None,
     ) -> None:
-        super().__init__(worlds, first, diary)
+        super().__init__(worlds, first, checkpoint_log)
         self._zones = zones
         self._hosts = _hosts(zones)
         self._spent_s = spent_s
         worlds.simulation.host(self._lead)
 
     def _lead(self, shards: Sequence[Shard], gathering: tuple[float, float]) -> Leader:
-        commands = [(self._commands,), *((entry,) for entry in self._diary.entries)]
+        commands = [(self._commands,), *((entry,) for entry in self._log.entries)]
         chosen = [(self._worlds.simulation.everywhere,)]
         known: dict[str, Sequence[tuple[Any, ...]]] = {
             "begin_step": commands,
@@ -65,18 +65,18 @@ class LeaderJob(CheckpointJob):
         """The former leader is dead, and so are its followers."""
         self._team.forget()
 
-    def perform(self, task: int, letter: Any) -> Any:
+    def perform(self, task: int, payload: Any) -> Any:
         if task in ALONE:
-            return super().perform(task, letter)
+            return super().perform(task, payload)
         if task == Task.HOST:
-            self._host(_hosts(letter[self._first]))
+            self._host(_hosts(payload[self._first]))
             return None
         with self._leader.order():
             self._catch_up(task)
             if task == Task.STEP:
                 self._note_step()
             self._leader.end_after(LAST.get(Task(task), ""))
-            WorldsJob.perform(self, task, letter)
+            WorldsJob.perform(self, task, payload)
         if task in (Task.RESET, Task.LOAD):
             self._begin_anew()
         return None
@@ -107,9 +107,9 @@ class FollowerJob(Job):
         self._number = number
         self._hosts = hosts
 
-    def perform(self, task: int, letter: Any) -> None:
+    def perform(self, task: int, payload: Any) -> None:
         if task == Task.HOST:
-            self._host(_hosts(letter[self._world]))
+            self._host(_hosts(payload[self._world]))
         else:
             self._follower.follow()
 
