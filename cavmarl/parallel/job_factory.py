@@ -47,18 +47,15 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
         return LocalWorlds(world, count, part, in_next_step=in_next_step, like=one, runs=runs)
 
     def make_watched(part: Part) -> LocalWorlds:
-        return attach_sensor_workers(
-            make(part.first, part.last, runs_of(recipe["runs"], part)), part
-        )
+        return with_sensors(make(part.first, part.last, runs_of(recipe["runs"], part)), part)
 
-    def attach_sensor_workers(worlds: LocalWorlds, part: Part) -> LocalWorlds:
+    def with_sensors(worlds: LocalWorlds, part: Part) -> LocalWorlds:
         if config.workers.sensors:
             memory = Segment(os.dup(recipe["arrays"]), 0)
             bounds = (part.first, part.last)
             base_dir, num_worlds = Path(recipe["base_dir"]), recipe["num_worlds"]
-            worlds.attach_sensor_workers(
-                sensor_workers_of(world, base_dir, memory, bounds, num_worlds)
-            )
+            sensors = sensor_workers_of(world, base_dir, memory, bounds, num_worlds)
+            worlds.attach_sensor_workers(sensors)
         return worlds
 
     mover = recipe["mover"]
@@ -75,9 +72,8 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
             return list(moving)
     jobs: list[Job] = []
     job: CheckpointJob
-    for part, descriptors, case in zip(
-        parts, recipe["checkpoint_logs"], recipe["cases"], strict=True
-    ):
+    logs = recipe["checkpoint_logs"]
+    for part, descriptors, case in zip(parts, logs, recipe["cases"], strict=True):
         if recipe["runs"]:
             (actions,) = descriptors
             commands = commands_of(arrays.part(part.first, part.last))
@@ -87,19 +83,15 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
         checkpoint_log = CheckpointLog(config, part.last - part.first, descriptors)
         if len(part.zones) > 1:
             share, in_next_step = arrays.part(part.first, part.last), recipe["in_next_step"]
-            worlds = LocalWorlds(
-                world, 1, share, in_next_step=in_next_step, zeros=huge_shared_zeros
-            )
+            zeros = huge_shared_zeros
+            worlds = LocalWorlds(world, 1, share, in_next_step=in_next_step, zeros=zeros)
             theirs = None if spent_s is None else spent_s[part.first]
-            leader = LeaderJob(
-                attach_sensor_workers(worlds, part), part.first, part.zones, checkpoint_log, theirs
-            )
-            job = leader
+            sensed = with_sensors(worlds, part)
+            job = leader = LeaderJob(sensed, part.first, part.zones, checkpoint_log, theirs)
             jobs += [leader, *leader.followers()]
         else:
-            job = CheckpointJob(
-                attach_sensor_workers(make(part.first, part.last), part), part.first, checkpoint_log
-            )
+            sensed = with_sensors(make(part.first, part.last), part)
+            job = CheckpointJob(sensed, part.first, checkpoint_log)
             jobs.append(job)
         job.case = WorldCases(Segment(case, 0))
     return jobs
