@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from importlib.metadata import version
 from typing import Annotated, Any
@@ -104,19 +107,35 @@ def _exit_codes(
         bool, about("Show the version.", "--version", callback=_print_version, is_eager=True)
     ] = False,
 ) -> None:
-    """Exit codes: 0 success; 1 a check failed; 2 wrong use or bad input."""
+    """Exit codes: 0 success; 1 a check failed; 2 wrong use or bad input; 130 interrupted; 143 terminated."""
 
 
 def main(words: Sequence[str] | None = None) -> None:
     """Run a command; an error that cavmarl raises on purpose is one line and exit code 2.
 
-    Of an exception in the code of a user, the frames of that code are shown.
+    Of an exception in the code of a user, the frames of that code are shown. SIGTERM ends a
+    command as an interrupt does: what it has begun is closed and removed.
     """
     try:
-        app(args=None if words is None else list(words))
+        with _ended_by_sigterm():
+            app(args=None if words is None else list(words))
     except CavmarlError as error:
         print_error(str(error))
         sys.exit(2)
     except Exception as error:
         print_traceback(error)
         sys.exit(1)
+
+
+@contextmanager
+def _ended_by_sigterm() -> Iterator[None]:
+    """SIGTERM raises SystemExit here, unless the program that calls has a handler of its own."""
+    held = signal.getsignal(signal.SIGTERM)
+    if threading.current_thread() is not threading.main_thread() or held != signal.SIG_DFL:
+        yield
+        return
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, held)

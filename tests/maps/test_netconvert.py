@@ -229,6 +229,25 @@ def test_without_sumo_the_extra_is_named(
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
 def test_netconvert_ends_with_the_process_that_runs_it(tmp_path: Path, how: signal.Signals) -> None:
+    _end_in_netconvert(
+        tmp_path,
+        "from cavmarl.maps.netconvert import build_network; build_network(source, target)",
+        how,
+    )
+
+
+def test_a_command_that_is_terminated_leaves_nothing_half(tmp_path: Path) -> None:
+    code = _end_in_netconvert(
+        tmp_path,
+        "from cavmarl.cli import main; main(['map', 'build', source, '-o', target])",
+        signal.SIGTERM,
+    )
+    assert code == 128 + signal.SIGTERM
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.osm", "bin", "pid"]
+
+
+def _end_in_netconvert(tmp_path: Path, call: str, how: signal.Signals) -> int:
+    """End a program while its netconvert runs, see that this ends too; the exit code."""
     slow = tmp_path / "bin" / "netconvert"
     slow.parent.mkdir()
     slow.write_text(f"#!/bin/sh\necho $$ > {tmp_path}/pid\nexec sleep 600\n")
@@ -236,10 +255,9 @@ def test_netconvert_ends_with_the_process_that_runs_it(tmp_path: Path, how: sign
     source = tmp_path / "a.osm"
     source.write_text("<osm/>")
     program = (
-        "import sys; from pathlib import Path; from types import SimpleNamespace; "
-        "from cavmarl.maps import netconvert, netconvert_process; "
+        "from types import SimpleNamespace; from cavmarl.maps import netconvert_process; "
         f"netconvert_process.require = lambda *_: SimpleNamespace(SUMO_HOME={str(tmp_path)!r}); "
-        f"netconvert.build_network({str(source)!r}, {str(tmp_path / 'a.net.xml')!r})"
+        f"source, target = {str(source)!r}, {str(tmp_path / 'a.net.xml')!r}; {call}"
     )
     with subprocess.Popen([sys.executable, "-c", program]) as caller:
         told = tmp_path / "pid"
@@ -249,10 +267,11 @@ def test_netconvert_ends_with_the_process_that_runs_it(tmp_path: Path, how: sign
         pid = int(told.read_text())
         assert Path(f"/proc/{pid}").exists()
         caller.send_signal(how)
-        caller.wait(10.0)
+        code = caller.wait(10.0)
     while _runs(pid) and time.monotonic() < until_s:
         time.sleep(0.02)
     assert not _runs(pid)
+    return code
 
 
 def _runs(pid: int) -> bool:
