@@ -140,6 +140,8 @@ async def open_worlds(
             await asyncio.to_thread(worlds.add, session, document, state, number, keys)
         except WorkerError as error:
             raise problem("lost", f"its zones have no nodes: {error}") from error
+        finally:
+            link.close_key_file(session)
         link.expect(session)
     elif save:
         await _save(link, worlds, session)

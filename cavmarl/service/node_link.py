@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import os
 import secrets
 import socket
 import time
 from importlib.metadata import version
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import jwt
@@ -53,7 +52,7 @@ class NodeLink:
         self._keys: dict[str, Any] = {}
         self._expected: dict[str, float] = {}
         self._doors: dict[str, dict[str, Any]] = {}
-        self._key_files = TemporaryDirectory(prefix="cavmarl-")
+        self._key_files: dict[str, int] = {}
         self._gpu = 0.0
         self._is_supposed_idle = is_supposed_idle
 
@@ -133,17 +132,27 @@ class NodeLink:
             port = free.getsockname()[1]
         key = secrets.token_hex(16)
         self._doors[session] = {"host": host, "port": port, "key": key.encode().hex()}
-        path = Path(self._key_files.name) / session
-        path.touch(mode=0o600)
-        path.write_text(key)
         await self._tell_door(session)
-        keys = {"workers.key_file": str(path), "workers.join_timeout_s": JOIN_S}
+        keys = {"workers.key_file": self._in_memory(session, key), "workers.join_timeout_s": JOIN_S}
         shown = f"[{host}]" if ":" in host else host
         return {
             "nodes": document["nodes"],
             "hosts": f"{shown}:{port}",
             "overrides": world_keywords(document)["overrides"] | keys,
         }
+
+    def close_key_file(self, session: str) -> None:
+        """The worlds of a session have read their key."""
+        if session in self._key_files:
+            os.close(self._key_files.pop(session))
+
+    def _in_memory(self, session: str, key: str) -> str:
+        """The path of a file with a key, of which nothing is left when this process ends."""
+        self.close_key_file(session)
+        file = self._key_files[session] = os.memfd_create("cavmarl-key", os.MFD_CLOEXEC)
+        os.fchmod(file, 0o600)
+        os.write(file, key.encode())
+        return f"/proc/{os.getpid()}/fd/{file}"
 
     async def _tell_door(self, session: str) -> None:
         await self.ask("PUT", f"/sessions/{session}/door", json=self._doors[session])
@@ -171,7 +180,8 @@ class NodeLink:
     async def close(self) -> None:
         """Close the connections."""
         await self._client.close()
-        self._key_files.cleanup()
+        for session in tuple(self._key_files):
+            self.close_key_file(session)
 
 
 def is_final(error: ServiceError) -> bool:
