@@ -30,11 +30,12 @@ app = typer.Typer(help="Trained drivers: list, verify, compare.", no_args_is_hel
 
 @app.command("list")
 def list_drivers(json_path: JsonPath = None) -> None:
-    """Show the trained drivers, and what their results say."""
+    """Show the trained drivers, and what their results say; exit code 1 if one cannot be read."""
     from cavmarl.evaluate.zoo import zoo_entries
 
     heads = ("driver", "kB", "result of", "trips", *SHORT.values())
-    found = zoo_entries()
+    entries = zoo_entries()
+    found = [entry for entry in entries if not entry.refused]
     rows = []
     for entry in found:
         shares = (number(entry.shares.get(key), 100.0) for key in SHORT)
@@ -43,7 +44,12 @@ def list_drivers(json_path: JsonPath = None) -> None:
     Console().print(grid(heads, rows, caption="shares in % of the result's trips", wraps=True))
     fields = ("environment", "weights_bytes", "trips", "shares")
     told = {one.name: {field: getattr(one, field) for field in fields} for one in found}
-    write_json(json_path, told)
+    refused = {one.name: {"refused": one.refused} for one in entries if one.refused}
+    write_json(json_path, told | refused)
+    for one in refused.values():
+        Console(stderr=True).print(f"error: {one['refused']}", markup=False, highlight=False)
+    if refused:
+        raise typer.Exit(1)
 
 
 @app.command()

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.registry import agent_entries
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
-from cavmarl.core.errors import ConfigError, ManifestError, PolicyError
+from cavmarl.core.errors import CavmarlError, ConfigError, ManifestError, PolicyError
 from cavmarl.engine.world_description import describe_world
 from cavmarl.engine.world_setup import load_world
 from cavmarl.evaluate.episodes import Progress
@@ -48,6 +48,7 @@ class ZooEntry:
     environment: str  # with its version, as `merge-v1`; empty: no result
     trips: int  # of the result
     shares: Mapping[str, float]  # of trips, by a name of `SHARES`
+    refused: str = ""  # what is wrong with the entry, and its cure; the rest is empty then
 
 
 @dataclass(frozen=True)
@@ -78,8 +79,8 @@ class Cross:
 
 
 def zoo_entries() -> list[ZooEntry]:
-    """The trained drivers that a name can mean, by name."""
-    return [_entry(name, path) for name, path in sorted(agent_entries().items()) if path.is_dir()]
+    """The trained drivers that a name can mean, by name; one that cannot be read says why."""
+    return [_told(name, path) for name, path in sorted(agent_entries().items()) if path.is_dir()]
 
 
 def verify_entry(policy: str | Path, progress: Progress | None = None) -> Verification:
@@ -156,6 +157,13 @@ def cross(
 # The map by its file: how it is read may change, and then the driving shows it.
 _WORLD_KEYS = ("environment", "map_source_sha256", "demand_content_sha256")
 _KEYS = ("agents", "background", "max_cycles", "seed", "overrides")
+
+
+def _told(name: str, folder: Path) -> ZooEntry:
+    try:
+        return _entry(name, folder)
+    except CavmarlError as error:
+        return ZooEntry(name, folder, 0, "", 0, {}, f"{name}: {error}")
 
 
 def _entry(name: str, folder: Path) -> ZooEntry:
