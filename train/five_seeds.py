@@ -1,6 +1,7 @@
 """Training repeated with other seeds, and the drivers that came of it beside scripted ones.
 
     python train/five_seeds.py --config configs/train/merge.yaml
+    python train/five_seeds.py --config configs/train/tasks.yaml --env intersection exit --seeds 0 1
 
 Trains with each seed (`ppo.py`, one core each), lets all drivers and the scripted ones
 drive the same episodes, which no training has seen, and writes into the folder: `table.md`,
@@ -9,7 +10,8 @@ its own manifest. A seed that is trained already is not trained again, and one t
 goes on from its checkpoint. Trainings end with this program, however it ends.
 
 Of the trained drivers the interval is that of the mean over training seeds; of a scripted one, that
-of the mean over evaluation runs; both 95 %, by Student's t.
+of the mean over evaluation runs; both 95 %, by Student's t. `alone` is `idm` without any other
+vehicle: the ceiling, as long as what is missing to it is not the driver's fault.
 """
 
 from __future__ import annotations
@@ -28,14 +30,17 @@ from threading import Lock
 import numpy as np
 
 from cavmarl.config.io import read_yaml
+from cavmarl.config.world_spec import WorldKeys
 from cavmarl.core.errors import CavmarlError, ConfigError, require
 from cavmarl.core.processes import dying_with_parent
 from cavmarl.evaluate import EvaluationReport, evaluate
 from cavmarl.evaluate.provenance.training_record import CHECKPOINT_FILE, is_trained
 from cavmarl.evaluate.statistics import Interval, mean_interval
+from cavmarl.policies.policy import driver_keys
 
 PROGRAM = Path(__file__).with_name("ppo.py")
 SCRIPTED = ("idm", "random_actions")
+ALONE = "alone"
 METRICS = {
     "success": "success, %",
     "arrived": "arrived, %",
@@ -54,6 +59,8 @@ class Args:
     """The settings; see `parse_args`."""
 
     config: Path
+    env: str
+    settings: str
     seeds: list[int]
     jobs: int
     episodes: int
@@ -63,10 +70,12 @@ class Args:
     others: list[str]
 
 
-def parse_args(words: Sequence[str] | None = None) -> Args:
-    """The settings that the command line asks for."""
+def parse_args(words: Sequence[str] | None = None) -> list[Args]:
+    """The settings that the command line asks for, of each environment."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--config", type=Path, required=True, help="settings of ppo.py")
+    parser.add_argument("--env", nargs="+", help="one after the other; default: the config's")
+    parser.add_argument("--settings", default="", help="as of ppo.py; of the training alone")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4], help="of training")
     parser.add_argument("--jobs", type=int, default=1, help="seeds that are trained side by side")
     parser.add_argument("--episodes", type=int, default=64, help="of an evaluation run")
@@ -75,10 +84,22 @@ def parse_args(words: Sequence[str] | None = None) -> Args:
     parser.add_argument("--out", type=Path, help="folder (default: runs/CONFIG_seeds)")
     parser.add_argument("--others", nargs="*", default=[], help="more runs for the curves")
     given = vars(parser.parse_args(words))
-    given["out"] = given["out"] or Path("runs") / f"{given['config'].stem}_seeds"
+    out = given["out"] or Path("runs") / f"{given['config'].stem}_seeds"
+    envs = given["env"] or [env_of(given["config"])]
     if len(set(given["seeds"])) < 2 or given["repeats"] < 2 or given["jobs"] < 1:
         raise ConfigError("--seeds and --repeats: an interval needs two; --jobs: at least 1")
-    return Args(**given)
+    return [
+        Args(**given | {"env": env, "out": out if len(envs) == 1 else out / Path(env).stem})
+        for env in envs
+    ]
+
+
+def env_of(config: Path) -> str:
+    """What the settings in a file train on."""
+    settings = read_yaml(config)
+    if not isinstance(settings, dict):
+        raise ConfigError(f"{config}: must be a mapping of settings")
+    return str(settings.get("env", "merge"))
 
 
 @dataclass(frozen=True)
@@ -116,9 +137,11 @@ def train_seed(args: Args, seed: int, children: Children) -> None:
         words = ["--resume", str(folder)]
     else:
         words = ["--config", str(args.config), "--seed", str(seed), "--runs", str(args.out)]
-        words += ["--name", folder.name]
+        words += ["--name", folder.name, "--env", args.env]
+        if args.settings:
+            words += ["--settings", args.settings]
     command = [sys.executable, str(PROGRAM), *words]
-    if children.run(command, f"training seed {seed}"):
+    if children.run(command, f"training seed {seed} on {args.env}"):
         raise ConfigError(f"training with seed {seed} failed: {' '.join(command)}")
 
 
@@ -156,8 +179,10 @@ class Children:
                 child.kill()
 
 
-def summarise(report: EvaluationReport, args: Args) -> dict[str, dict[str, Row]]:
-    """Rows by driver and metric; the trained drivers are one."""
+def summarise(
+    report: EvaluationReport, alone: EvaluationReport, args: Args
+) -> dict[str, dict[str, Row]]:
+    """Rows by driver and metric; the trained drivers are one. `alone` is a report of `idm`."""
     trained = [report[f"seed_{seed}"] for seed in args.seeds]
     found: dict[str, dict[str, Row]] = {"trained": {}}
     for metric in METRICS:
@@ -165,12 +190,13 @@ def summarise(report: EvaluationReport, args: Args) -> dict[str, dict[str, Row]]
         known = np.array([mean for mean in means if mean is not None])
         mean = float(known.mean()) if known.size else None
         found["trained"][metric] = Row(mean, mean_interval(known), means)
-    for name in SCRIPTED:
+    scripted = {name: report[name] for name in SCRIPTED} | {ALONE: alone["idm"]}
+    for name, driver in scripted.items():
         found[name] = {
             metric: Row(
-                report[name][metric].mean,
-                report[name][metric].between_run_ci95,
-                [run.mean for run in report[name][metric].within_run],
+                driver[metric].mean,
+                driver[metric].between_run_ci95,
+                [run.mean for run in driver[metric].within_run],
             )
             for metric in METRICS
         }
@@ -183,11 +209,11 @@ def beats(rows: Mapping[str, Mapping[str, Row]], other: str, metric: str) -> boo
     return mine is not None and theirs is not None and mine.low > theirs.high
 
 
-def table(rows: Mapping[str, Mapping[str, Row]], args: Args, env: str) -> str:
+def table(rows: Mapping[str, Mapping[str, Row]], args: Args) -> str:
     """The result as Markdown."""
     count = len(args.seeds)
     lines = [
-        f"`{env}`: {count} training seeds; {args.repeats} runs of {args.episodes} episodes.",
+        f"`{args.env}`: {count} training seeds; {args.repeats} runs of {args.episodes} episodes.",
         "",
         "| | " + " | ".join(rows) + " |",
         "| --- |" + " ---: |" * len(rows),
@@ -241,39 +267,46 @@ def draw_curves(path: Path, folders: Sequence[Path], others: Sequence[Path], tit
     figure.savefig(path)
 
 
+def compare(args: Args) -> str:
+    """Train on an environment, evaluate, write; returns the table."""
+    args.out.mkdir(parents=True, exist_ok=True)
+    folders = train(args)
+    drivers = {folder.name: folder for folder in folders.values()}
+    keys: WorldKeys = {
+        "seed": args.evaluation_seed,
+        "overrides": driver_keys(folders[args.seeds[0]]),
+    }
+    report = evaluate(
+        args.env,
+        {**drivers, **{name: name for name in SCRIPTED}},
+        episodes=args.episodes,
+        repeats=args.repeats,
+        out=args.out / "evaluation",
+        **keys,
+    )
+    counts = {"episodes": args.episodes, "repeats": args.repeats}
+    alone = evaluate(args.env, "idm", agents=1, background=0, **counts, **keys)
+    rows = summarise(report, alone, args)
+    text = table(rows, args)
+    (args.out / "table.md").write_text(text, encoding="utf-8")
+    plain = {name: {key: asdict(row) for key, row in row.items()} for name, row in rows.items()}
+    (args.out / "result.json").write_text(json.dumps(plain, indent=2) + "\n", encoding="utf-8")
+    others = [Path(folder) for folder in args.others]
+    draw_curves(args.out / "curves.svg", list(folders.values()), others, args.env)
+    return text
+
+
 def main(words: Sequence[str] | None = None) -> int:
     """Train, evaluate, write; 0: done, 2: wrong use, 130: interrupted."""
     try:
-        args = parse_args(words)
-        settings = read_yaml(args.config)
-        if not isinstance(settings, dict):
-            raise ConfigError(f"{args.config}: must be a mapping of settings")
-        env = str(settings.get("env", "merge"))
-        args.out.mkdir(parents=True, exist_ok=True)
-        folders = train(args)
-        drivers = {folder.name: folder for folder in folders.values()}
-        report = evaluate(
-            env,
-            {**drivers, **{name: name for name in SCRIPTED}},
-            episodes=args.episodes,
-            seed=args.evaluation_seed,
-            repeats=args.repeats,
-            out=args.out / "evaluation",
-        )
-        rows = summarise(report, args)
-        text = table(rows, args, env)
-        (args.out / "table.md").write_text(text, encoding="utf-8")
-        plain = {name: {key: asdict(row) for key, row in row.items()} for name, row in rows.items()}
-        (args.out / "result.json").write_text(json.dumps(plain, indent=2) + "\n", encoding="utf-8")
-        others = [Path(folder) for folder in args.others]
-        draw_curves(args.out / "curves.svg", list(folders.values()), others, env)
+        for args in parse_args(words):
+            print(compare(args), flush=True)
     except CavmarlError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("interrupted: the same command goes on from the last checkpoints", file=sys.stderr)
         return 130
-    print(text)
     return 0
 
 

@@ -1,14 +1,13 @@
 """PPO with one network shared by all agents, on batched worlds: IPPO, or MAPPO with `--mappo`.
 
     python train/ppo.py --env merge --minutes 2
-    python train/ppo.py --env town --shared --keep 0.35 --epochs 2 --workers 2
+    python train/ppo.py --env town --start cities_ippo --workers 2
     python train/ppo.py --resume runs/merge_ippo_1 --total-agent-steps 8000000
 
 Read from top to bottom: the settings; `Batch`, what is learnt from; `Collector`, which drives the
 worlds; `Learner`, the update; `Run`, which takes turns between both. Every agent learns from its
 own observations and rewards, all share the weights (Schulman et al. 2017; de Witt et al. 2020);
-with `--mappo` the critic also sees the state of the world (Yu et al. 2022), the driver never does.
-docs/learning.md says what a run leaves behind, how it goes on, and when it repeats itself.
+with `--mappo` the critic also sees the world's state (Yu et al. 2022). See docs/learning.md.
 """
 
 from __future__ import annotations
@@ -27,6 +26,7 @@ from gymnasium.vector import AutoresetMode
 from rich.console import Console
 from torch import Tensor, nn
 
+from cavmarl.cli.output import parse_settings
 from cavmarl.config.env import TERMS
 from cavmarl.core.errors import ConfigError
 from cavmarl.env.vector import CavVectorEnv, make_vec
@@ -38,7 +38,7 @@ from cavmarl.learning.run_folder import RunFolder, parse_run
 from cavmarl.learning.scales import Scales
 from cavmarl.parallel.local_worlds import kept_elsewhere
 from cavmarl.policies.networks import ActorCritic, NetworkConfig
-from cavmarl.policies.policy import load_policy
+from cavmarl.policies.policy import driver_keys, load_policy, policy_files
 
 PHASES = ("simulation", "transfer", "inference", "learning")
 RED_LIGHT = TERMS.index("red_light")
@@ -55,6 +55,7 @@ class Args:
     agents: Annotated[int, "agents a world; 0: as the environment says"] = 0
     background: Annotated[int, "background vehicles a world; -1: as the environment says"] = -1
     num_envs: Annotated[int, "worlds that are stepped together"] = 16
+    settings: Annotated[str, "other keys of the environment: KEY=VALUE, by commas"] = ""
     zones: Annotated[int, "zones a world; 0: as the environment says"] = 0
     workers: Annotated[int, "processes that the worlds are shared out over; 0: this one"] = 0
     seed: Annotated[int, "root of all random numbers"] = 0
@@ -73,7 +74,7 @@ class Args:
     value_weight: Annotated[float, "of the value loss"] = 0.5
     imitation_weight: Annotated[float, "of the distance to the built-in driver, at the start"] = 0.0
     imitation_share: Annotated[float, "share of the run in which that weight falls to 0"] = 0.1
-    start: Annotated[str, "folder of a driver whose weights it begins with"] = ""
+    start: Annotated[str, "driver whose weights, sensors and actions it begins with"] = ""
     end_at_red: Annotated[bool, "expect nothing after running a red light, as at a crash"] = False
     opponents: Annotated[str, "drivers of some seats, not learnt from: names, by commas"] = ""
     opponent_share: Annotated[float, "share of the seats that each opponent drives"] = 0.1
@@ -121,8 +122,7 @@ class Batch:
     acted: Tensor  # (T, W, A) which entries are decisions of the network
     next_values: Tensor  # (T, W, A) what was to be expected after the step; 0 where a vehicle ended
     goes_on: Tensor  # (T, W, A) whether entry t + 1 is of the same vehicle and episode
-    # (T, W, A, …) what the built-in driver would have done, while it is imitated
-    suggested: Tensor | None = None
+    suggested: Tensor | None = None  # (T, W, A, …) the built-in driver's, while it is imitated
 
     def advantages(self, gamma: float, gae_lambda: float) -> Tensor:
         """(T, W, A) generalised advantage estimates (Schulman et al. 2016); 0 where no agent acted.
@@ -208,10 +208,10 @@ class Collector:
             actions, batch.log_probs[t] = self.network.draw(output)
             batch.values[t], batch.actions[t] = values, actions
         given = (actions.clamp(-1.0, 1.0) if self.network.continuous else actions).numpy()
+        seen, mask = self._observations.numpy(), self._mask.numpy()
         for k, opponent in enumerate(self._opponents):
             theirs = (self._seats == k).numpy()
-            seen = self._observations.numpy()
-            given[theirs] = opponent.act_batch(seen, self._mask.numpy() & theirs)[theirs]
+            given[theirs] = opponent.act_batch(seen, mask & theirs)[theirs]
         _, reward, ended, cut, infos = self.vec.step(given)
         terms = infos["terms"]
         if self._args.end_at_red:
@@ -282,7 +282,6 @@ class Learner:
         advantages = batch.advantages(args.gamma, args.gae_lambda)
         acted = batch.acted.flatten().nonzero().squeeze(1)
         chosen = self._filtered(advantages.flatten(), acted, batch.suggested is not None)
-        seats = batch.acted.shape[2]
 
         def of(values: Tensor, rows: Tensor) -> Tensor:
             return values.flatten(0, 2)[rows]
@@ -295,7 +294,7 @@ class Learner:
                     continue
                 states = batch.states.flatten(0, 1)
                 seen = network.normal(of(batch.observations, rows))
-                output, values = network.heads(seen, states[rows // seats])
+                output, values = network.heads(seen, states[rows // batch.acted.shape[2]])
                 log_prob, entropy = network.judge(output, of(batch.actions, rows))
                 change = log_prob - of(batch.log_probs, rows)
                 ratio = change.exp()
@@ -362,7 +361,7 @@ class Run:
         self.network = ActorCritic(self.config, (args.throttle_std, args.steering_std))
         self.learner = Learner(self.network, args)
         if args.start and not folder.began.parts:
-            self.learner.scales.start(Path(args.start))
+            self.learner.scales.start(policy_files(args.start)[0].parent)
         self.collector = Collector(vec, self.network, args, args.seed + self.updates)
         if not folder.began.parts:
             self.save()  # a run that is killed early begins from here
@@ -385,8 +384,7 @@ class Run:
         with collector.phase("learning"):
             numbers = self.learner.update(batch, left)
         new = int(batch.acted.sum())
-        self.agent_steps += new
-        self.updates += 1
+        self.agent_steps, self.updates = self.agent_steps + new, self.updates + 1
         row = {
             "updates": self.updates,
             "agent_steps": self.agent_steps,
@@ -409,6 +407,7 @@ class Run:
 @contextmanager
 def opened(args: Args) -> Iterator[Run]:
     """A run in its worlds and its folder, which are closed at the end."""
+    own = driver_keys(args.start) if args.start else {}
     vec = make_vec(
         args.env,
         num_envs=args.num_envs,
@@ -416,6 +415,7 @@ def opened(args: Args) -> Iterator[Run]:
         workers=args.workers,
         agents=args.agents or None,
         background=None if args.background < 0 else args.background,
+        overrides=own | parse_settings([word for word in args.settings.split(",") if word]),
         autoreset_mode=AutoresetMode.NEXT_STEP if args.mappo else AutoresetMode.SAME_STEP,
         copy=False,
     )

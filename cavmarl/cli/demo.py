@@ -1,4 +1,4 @@
-"""`cavmarl demo`: trains a driver, evaluates it and records videos."""
+"""`cavmarl demo`: adapts a driver, evaluates it, and leaves a page and videos."""
 
 from __future__ import annotations
 
@@ -29,8 +29,10 @@ def demo(
     seed: Seed = 0,
     json_path: JsonPath = None,
 ) -> None:
-    """Train on `merge`, evaluate beside `idm` and `random_actions`, drive `town`, leave videos."""
+    """Adapt `cities_ippo` to `merge`, evaluate, drive `town`; leave a page and videos."""
     from cavmarl.env.parallel import parallel_env
+    from cavmarl.evaluate.page import write_page
+    from cavmarl.policies.policy import driver_keys
 
     if not 0.0 < minutes <= 600.0 or not 0.0 < seconds <= 3600.0:
         raise ConfigError("--minutes must be above 0, at most 600; --seconds above 0, at most 3600")
@@ -39,33 +41,37 @@ def demo(
     require("imageio_ffmpeg", "render")
     make_folder(out)
     console = Console()
-    console.print(f"[bold]1. train[/] on merge, {minutes:g} min")
+    console.print(f"[bold]1. train[/] cities_ippo on merge, {minutes:g} min")
     stamp = f"{datetime.now():%Y%m%d-%H%M%S-%f}"
     trained = _train(out, f"driver-{stamp}", minutes, seed)
 
     console.print("[bold]2. evaluate[/] on merge, on other seeds")
     drivers = {"trained": str(trained), "idm": "idm", "random_actions": "random_actions"}
-    world = WorldSpec(env="merge", seed=EVALUATION_SEED)
+    keys = driver_keys(trained)
+    world = WorldSpec(env="merge", seed=EVALUATION_SEED, overrides=keys)
     folder = out / f"evaluation-{stamp}"
     found = evaluate_showing(console, world, drivers, out=folder, episodes=EPISODES)
     console.print(report_table(found))
+    page = out / "demo.html"
+    write_page(folder, page)
 
     console.print(f"[bold]3. drive[/] {seconds:g} s")
     videos = {"merge": str(trained), "town": "idm"}
     stats = {}
     for env, policy in videos.items():
-        made = parallel_env(env, render_mode="rgb_array")
+        made = parallel_env(env, render_mode="rgb_array", overrides=keys)
         video = out / f"{env}.mp4"
         stats[env] = drive(made, policy, seconds, EVALUATION_SEED, video, console)
         console.print(f"{Path(policy).name} in {env}: {_traffic(stats[env])}")
     console.print("[bold]made:[/]")
-    for path in (trained, *(out / f"{env}.mp4" for env in videos)):
+    for path in (trained, page, *(out / f"{env}.mp4" for env in videos)):
         console.print(f"  {path}", highlight=False)
     write_json(
         json_path,
         {
             "driver": str(trained),
             "report": found.to_dict(),
+            "page": str(page),
             "traffic": stats,
             "videos": [str(out / f"{env}.mp4") for env in videos],
         },

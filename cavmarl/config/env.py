@@ -344,6 +344,8 @@ class TermsConfig(Section, key="terms"):
     Attributes:
         weights: weight of each named term; terms that are not named weigh 0.
         team_share: share of the reward that is the mean over all live agents: 0 individual, 1 team.
+        team_range_m: only agents that are so near count in that mean, as the local coordination of
+            CoPO has it (Peng et al. 2021); 0: all do.
     """
 
     weights: dict[str, float] = field(
@@ -360,6 +362,7 @@ class TermsConfig(Section, key="terms"):
         }
     )
     team_share: Annotated[float, Within(0.0, 1.0)] = 0.0
+    team_range_m: Annotated[float, Within(0.0, 1e6)] = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()

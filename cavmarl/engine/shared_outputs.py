@@ -36,7 +36,7 @@ class SharedOutputs:
         self._roads = network.arrays
         self._sim_dt_s = config.clock.sim_dt_s
         self._weights = np.array(config.terms.weight_of_each)
-        self._team_share = config.terms.team_share
+        self._team = (config.terms.team_share, config.terms.team_range_m)
         self._switch_signals = specialized(switch_signals)
         self._clear_outputs = specialized(clear_outputs)
         self._settle_outputs = specialized(settle_outputs)
@@ -60,7 +60,7 @@ class SharedOutputs:
 
     def settle_outputs(self, chosen: NDArray[np.bool_]) -> None:
         """Finish the outputs of the chosen worlds (W,) after `sense`, before `credit`."""
-        self._settle_outputs(self.outputs, self._weights, self._team_share, chosen)
+        self._settle_outputs(self.outputs, self._weights, *self._team, chosen)
 
 
 def make_outputs(
@@ -86,4 +86,5 @@ def make_outputs(
         acted=zeros(agents, dtype=np.bool_),
         events=zeros(agents, dtype=np.int32),
         vehicle_ids=vehicle_ids,
+        places=zeros((*agents, 2), dtype=np.float64),
     )

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 Environment = CavEnv | CavVectorEnv
 
 TOGETHER = "+"  # between drivers that share the agents of a world
+SHIELDED = "shielded:"  # before a driver that the built-in one relieves
 
 
 class Policy(ABC):
@@ -142,7 +143,8 @@ def load_policy(policy: str | Path, env: Environment) -> Policy:
     Args:
         policy: a name of `agents/`, a folder with model.safetensors and config.json, or a `.py`
             file that defines `make_policy(env)`; several with `+` between them share the agents by
-            turns (`merge_ippo+idm`: agents 0, 2, … and agents 1, 3, …).
+            turns (`merge_ippo+idm`: agents 0, 2, … and agents 1, 3, …); `shielded:` before a driver
+            lets the built-in one act where that would brake harder.
         env: a `CavEnv`, also wrapped, or a `CavVectorEnv`.
 
     Raises:
@@ -158,6 +160,10 @@ def load_policy(policy: str | Path, env: Environment) -> Policy:
         )
     if parts := _shared(policy):
         return SharedPolicy(env, [load_policy(part, env) for part in parts])
+    if isinstance(policy, str) and policy.startswith(SHIELDED):
+        from cavmarl.policies.shield import ShieldedPolicy  # it is a `Policy`
+
+        return ShieldedPolicy(env, load_policy(policy.removeprefix(SHIELDED), env))
     path = _find(policy)
     if path.is_dir():
         return _load_network_policy(path, env)
@@ -168,7 +174,7 @@ def policy_files(policy: str | Path) -> tuple[Path, ...]:
     """The files that make a policy what it is: its script, or its weights and their description."""
     if parts := _shared(policy):
         return tuple(dict.fromkeys(file for part in parts for file in policy_files(part)))
-    path = _find(policy)
+    path = _find(policy.removeprefix(SHIELDED) if isinstance(policy, str) else policy)
     if not path.is_dir():
         return (path,)
     require("torch", "torch")
@@ -263,24 +269,32 @@ def _load_network_policy(folder: Path, env: Environment) -> NetworkPolicy:
     return NetworkPolicy(env, network)
 
 
-def _differences(config: NetworkConfig, here: EnvConfig) -> dict[str, tuple[Any, Any]]:
-    """Keys that make observations or actions mean something else: (in training, here)."""
+def driver_keys(policy: str | Path) -> dict[str, Any]:
+    """What a trained driver sees and does: overrides that make any environment fit for it.
+
+    Raises PolicyError: nothing of that name, or no trained driver.
+    """
+    folder = policy_files(policy)[0].parent
+    from cavmarl.policies.networks import load_network
+
+    return _keys(load_network(folder)[1])
+
+
+def _keys(config: NetworkConfig) -> dict[str, Any]:
+    """The keys of an environment that say what observations and actions mean."""
     from cavmarl.config.io import dotted_keys  # pydantic is slow to import
 
-    kind = config.action.kind
     scales = {
         "continuous": ("acceleration_mps2", "steering_rad"),
         "discrete": ("target_speeds_mps",),
         "grid": ("acceleration_mps2", "steering_rad", "grid_throttle", "grid_steering"),
-    }[kind]
-    found: dict[str, tuple[Any, Any]] = {}
-    for key in ("kind", *scales):
-        there, ours = getattr(config.action, key), getattr(here.action, key)
-        if there != ours:
-            found[f"action.{key}"] = (there, ours)
-    for key in dotted_keys(SensorsConfig):
-        value = attrgetter(key)
-        there, ours = value(config.sensors), value(here.sensors)
-        if there != ours:
-            found[f"sensors.{key}"] = (there, ours)
-    return found
+    }[config.action.kind]
+    actions = {f"action.{key}": getattr(config.action, key) for key in ("kind", *scales)}
+    sensors = ((key, attrgetter(key)(config.sensors)) for key in dotted_keys(SensorsConfig))
+    return actions | {f"sensors.{key}": value for key, value in sensors}
+
+
+def _differences(config: NetworkConfig, here: EnvConfig) -> dict[str, tuple[Any, Any]]:
+    """Keys that make observations or actions mean something else: (in training, here)."""
+    pairs = {key: (there, attrgetter(key)(here)) for key, there in _keys(config).items()}
+    return {key: (there, ours) for key, (there, ours) in pairs.items() if there != ours}

@@ -66,6 +66,7 @@ STATE = (
     StateArray(Outputs, "acted", (S, C)),
     StateArray(Outputs, "events", (S, C)),
     StateArray(Outputs, "vehicle_ids", (S, C)),
+    StateArray(Outputs, "places", (C,)),  # written before each use
 )
 
 

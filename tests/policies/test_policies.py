@@ -18,7 +18,7 @@ from cavmarl.core.errors import MissingExtraError, PolicyError
 from cavmarl.cosim.stack.stack import REFERENCE_RIG
 from cavmarl.env.parallel import CavEnv, parallel_env
 from cavmarl.env.vector import CavVectorEnv, make_vec
-from cavmarl.policies.policy import Policy, load_policy
+from cavmarl.policies.policy import Policy, driver_keys, load_policy, policy_files
 
 SCRIPTED = ("idm", "random_actions")
 ACTIONS = ("continuous", "discrete")
@@ -219,6 +219,39 @@ def test_the_overrides_that_a_refusal_names_make_it_fit(checkpoint: Path) -> Non
 
     cure = ast.literal_eval(str(caught.value).partition("overrides=")[2])
     load_policy(checkpoint, make_vec("merge", overrides={**changed, **cure}))
+    load_policy(checkpoint, make_vec("merge", overrides=changed | driver_keys(checkpoint)))
+
+
+@pytest.mark.parametrize("kind", ["batches", "dicts"])
+def test_a_shield_brakes_where_the_built_in_driver_would(kind: str) -> None:
+    name = "shielded:never_yield"
+    vec = small_vec() if kind == "batches" else make_vec("merge", num_envs=1, agents=3)
+    shielded, bare, idm = (load_policy(one, vec) for one in (name, "never_yield", "idm"))
+    one = parallel_env("merge", agents=3)
+    seen, _ = one.reset(seed=5)
+    alone = load_policy(name, one)
+    observations, infos = vec.reset(seed=5)
+    relieved = 0
+    for _ in range(40):
+        mask = infos["mask"]
+        found, own, safe = (p.act_batch(observations, mask) for p in (shielded, bare, idm))
+        brakes = (safe[..., 0] < 0.0) & (safe[..., 0] < own[..., 0])
+        np.testing.assert_array_equal(found[mask], np.where(brakes[..., None], safe, own)[mask])
+        relieved += int((brakes & mask).sum())
+        if kind == "dicts":
+            by_agent = alone.act(seen)
+            for k, agent in enumerate(one.possible_agents):
+                if agent in by_agent:
+                    np.testing.assert_array_equal(by_agent[agent], found[0, k])
+            seen, *_ = one.step(by_agent)
+        observations, _, _, _, infos = vec.step(found)
+    assert relieved
+    assert policy_files(name) == policy_files("never_yield")
+
+
+def test_a_shield_compares_throttles(checkpoint: Path) -> None:
+    with pytest.raises(PolicyError, match="shielded: compares throttles"):
+        load_policy("shielded:idm", small_vec(action__kind="discrete"))
 
 
 def test_missing_and_broken_files_are_named(checkpoint: Path, tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ import subprocess
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import psutil
 import pytest
@@ -42,7 +41,7 @@ def test_trainings_end_with_the_program(tmp_path: Path, ended_by: signal.Signals
         try:
             assert program.stdout
             said = {program.stdout.readline() for _ in range(2)}
-            assert said == {"training seed 0\n", "training seed 1\n"}
+            assert said == {f"training seed {seed} on ring\n" for seed in (0, 1)}
             trainings = [
                 os.pidfd_open(child.pid) for child in psutil.Process(program.pid).children()
             ]
@@ -81,10 +80,11 @@ def test_a_seed_that_was_cut_short_goes_on(tmp_path: Path) -> None:
             commands.append(command)
             return 0
 
-    args: Any = program.parse_args(["--config", "long.yaml", "--out", str(tmp_path)])
+    words = ["--config", "long.yaml", "--env", "ring", "--out", str(tmp_path)]
+    (args,) = program.parse_args(words)
     (tmp_path / "seed_1").mkdir()
     (tmp_path / "seed_1" / "checkpoint.pt").touch()
     for seed in (0, 1):
         program.train_seed(args, seed, Noted())
-    assert commands[0][-2:] == ["--name", "seed_0"]
+    assert commands[0][-4:] == ["--name", "seed_0", "--env", "ring"]
     assert commands[1][-2:] == ["--resume", str(tmp_path / "seed_1")]

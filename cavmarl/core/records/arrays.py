@@ -253,3 +253,4 @@ class Outputs(NamedTuple):
     acted: NDArray[np.bool_]  # (W, A) and had it during the whole step
     events: NDArray[np.int32]  # (W, A) EVENT_* bits of the step
     vehicle_ids: NDArray[np.int64]  # (W, A) -1 where absent
+    places: NDArray[np.float64]  # (W, A, 2) x and y of the vehicle, m; left over where absent

@@ -30,7 +30,7 @@ from cavmarl.parallel.nodes.links import (
 from cavmarl.zones.kernels.ghost_frames import count_ghosts, pack_ghosts, take_ghosts
 
 Array = NDArray[Any]
-PIECES = ("terms", "terminated", "present", "acted", "events", "vehicle_ids")
+PIECES = ("terms", "terminated", "present", "acted", "events", "vehicle_ids", "places")
 
 
 class NodePeers:

@@ -87,18 +87,25 @@ def clear_outputs(outputs: Outputs, chosen: NDArray[np.bool_]) -> None:
 
 @kernel
 def settle_outputs(
-    outputs: Outputs, weights: NDArray[np.float64], team_share: float, chosen: NDArray[np.bool_]
+    outputs: Outputs,
+    weights: NDArray[np.float64],
+    team_share: float,
+    team_range_m: float,
+    chosen: NDArray[np.bool_],
 ) -> None:
     """Finish the outputs that all shards have written.
 
     `outputs`: rewards are written, and the observations of absent agents become 0. `weights`: (T,)
     of the reward, a number for each term. `team_share`: share of the reward that is the mean over
-    the agents that acted.
+    the agents that acted, `team_range_m`: and are so near; 0: over all.
     """
     for w in range(chosen.size):
         if chosen[w]:
             _zero_absent(outputs, w)
-            _reward(outputs, w, weights, team_share)
+            if team_range_m > 0.0:
+                _share_near(outputs, w, weights, team_share, team_range_m)
+            else:
+                _share_all(outputs, w, weights, team_share)
 
 
 @kernel
@@ -109,15 +116,22 @@ def _zero_absent(outputs: Outputs, w: int) -> None:
 
 
 @kernel
-def _reward(outputs: Outputs, w: int, weights: NDArray[np.float64], team_share: float) -> None:
-    """Weighted sums of the terms, mixed with the team's mean; summed in agent order."""
+def _own_reward(outputs: Outputs, w: int, agent: int, weights: NDArray[np.float64]) -> float:
+    """The weighted sum of an agent's terms."""
+    own = 0.0
+    for k in range(weights.size):
+        own += weights[k] * outputs.terms[w, agent, k]
+    return own
+
+
+@kernel
+def _share_all(outputs: Outputs, w: int, weights: NDArray[np.float64], team_share: float) -> None:
+    """Own rewards, mixed with the team's mean; summed in agent order."""
     team = 0.0
     acted = 0
     for agent in range(outputs.rewards.shape[1]):
         if outputs.acted[w, agent]:
-            own = 0.0
-            for k in range(weights.size):
-                own += weights[k] * outputs.terms[w, agent, k]
+            own = _own_reward(outputs, w, agent, weights)
             outputs.rewards[w, agent] = own
             team += own
             acted += 1
@@ -128,6 +142,28 @@ def _reward(outputs: Outputs, w: int, weights: NDArray[np.float64], team_share: 
         if outputs.acted[w, agent]:
             own = outputs.rewards[w, agent]
             outputs.rewards[w, agent] = (1.0 - team_share) * own + team_share * team
+
+
+@kernel
+def _share_near(
+    outputs: Outputs, w: int, weights: NDArray[np.float64], team_share: float, range_m: float
+) -> None:
+    """Own rewards, mixed with the mean of those near, itself too; summed in agent order."""
+    for agent in range(outputs.rewards.shape[1]):
+        if not outputs.acted[w, agent]:
+            continue
+        x, y = outputs.places[w, agent, 0], outputs.places[w, agent, 1]
+        team = 0.0
+        near = 0
+        for other in range(outputs.rewards.shape[1]):
+            if outputs.acted[w, other]:
+                dx = outputs.places[w, other, 0] - x
+                dy = outputs.places[w, other, 1] - y
+                if dx * dx + dy * dy <= range_m * range_m:
+                    team += _own_reward(outputs, w, other, weights)
+                    near += 1
+        own = _own_reward(outputs, w, agent, weights)
+        outputs.rewards[w, agent] = (1.0 - team_share) * own + team_share * (team / near)
 
 
 @kernel

@@ -315,6 +315,8 @@ def sense(
             observe_lidar(rows, i, grid, sensors, out)
             outputs.present[w, agent] = True
             outputs.vehicle_ids[w, agent] = row["id"]
+            outputs.places[w, agent, 0] = row["x"]
+            outputs.places[w, agent, 1] = row["y"]
             if has_entered(row, ticks_per_step):
                 continue
             write_terms(roads, rows, i, grid, step_s, outputs.terms[w, agent])

@@ -1,0 +1,143 @@
+"""What messages are worth: drivers that learnt with and without them, on the blind junction.
+
+    python train/messages.py
+
+Trains both arms with each seed as `five_seeds.py` does, `on` with all messages and `off` with none
+(`v2x.channel.loss=1`: observations keep their shape), and lets them drive the same episodes, `on`
+with more and more loss. Writes into the folder: `table.md`, `result.json`, `loss.svg` and the runs.
+All intervals are 95 %, by Student's t over the training seeds; the arms are paired by seed.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from five_seeds import Args, Row, parse_args, train
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import CavmarlError, require
+from cavmarl.evaluate import evaluate
+from cavmarl.evaluate.statistics import Interval, mean_interval
+
+LOSS = "v2x.channel.loss"
+LOSSES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
+METRICS = {
+    "collision": ("collision, % of trips", 100.0),
+    "success": ("success, % of trips", 100.0),
+    "delay_s": ("delay of an arrival, s", 1.0),
+}
+Figures = Mapping[str, NDArray[np.float64]]  # by metric, (seeds,)
+
+
+def drive(args: Args, folders: Mapping[int, Path], loss: float, out: Path) -> Figures:
+    """What the drivers of an arm reach where so many messages are lost."""
+    drivers = {folder.name: folder for folder in folders.values()}
+    report = evaluate(
+        args.env,
+        drivers,
+        episodes=args.episodes,
+        repeats=args.repeats,
+        out=out,
+        seed=args.evaluation_seed,
+        overrides={LOSS: loss},
+    )
+    return {
+        name: np.array([report[driver][name].mean for driver in drivers], dtype=np.float64) * scale
+        for name, (_, scale) in METRICS.items()
+    }
+
+
+def row(values: NDArray[np.float64]) -> Row:
+    return Row(float(values.mean()), mean_interval(values), values.tolist())
+
+
+def table(arms: Mapping[str, Figures], args: Args) -> str:
+    """The result as Markdown."""
+    lines = [
+        f"`{args.env}`: {len(args.seeds)} training seeds an arm; {args.repeats} runs of "
+        f"{args.episodes} episodes.",
+        "",
+        "| | " + " | ".join(title for title, _ in METRICS.values()) + " |",
+        "| --- |" + " ---: |" * len(METRICS),
+    ]
+    for name, figures in arms.items():
+        lines.append(
+            f"| {name} | " + " | ".join(_cell(row(figures[key])) for key in METRICS) + " |"
+        )
+    apart = {key: arms["on"][key] - arms["off"][key] for key in METRICS}
+    lines.append("| on minus off | " + " | ".join(_cell(row(apart[key])) for key in METRICS) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _cell(found: Row) -> str:
+    interval = "" if found.interval is None else _ends(found.interval)
+    return f"{found.mean:.2f}{interval}"
+
+
+def _ends(interval: Interval) -> str:
+    return f" [{interval.low:.2f}, {interval.high:.2f}]"
+
+
+def draw(path: Path, curve: Mapping[float, Figures], off: Figures) -> None:
+    """Collisions and delay over loss: each seed, the mean, and the mean without messages."""
+    require("matplotlib", "report")
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 3.2), layout="constrained")
+    axes = figure.subplots(1, 2)
+    for axis, key in zip(axes, ("collision", "delay_s"), strict=True):
+        seeds = np.array([figures[key] for figures in curve.values()])  # (losses, seeds)
+        shares = [100.0 * loss for loss in curve]
+        axis.plot(shares, seeds, color="C0", linewidth=0.6, alpha=0.5)
+        axis.plot(shares, seeds.mean(1), color="C0", label="with messages")
+        axis.axhline(off[key].mean(), color="C1", label="without")
+        axis.set(xlabel="messages lost, %", ylabel=METRICS[key][0], ylim=(0.0, None))
+        axis.grid(color="0.9")
+    axes[0].legend(frameon=False)
+    figure.savefig(path)
+
+
+def compare(args: Args) -> str:
+    """Train both arms, evaluate, write; returns the table."""
+    arms = {"on": 0.0, "off": 1.0}
+    folders = {
+        arm: train(replace(args, out=args.out / arm, settings=f"{LOSS}={loss}"))
+        for arm, loss in arms.items()
+    }
+    room = args.out / "evaluation"
+    off = drive(args, folders["off"], arms["off"], room / "off")
+    curve = {loss: drive(args, folders["on"], loss, room / f"on_{loss:g}") for loss in LOSSES}
+    named = {"on": curve[0.0], "off": off}
+    named |= {f"on, {loss:.0%} lost": figures for loss, figures in curve.items() if loss}
+    text = table(named, args)
+    (args.out / "table.md").write_text(text, encoding="utf-8")
+    plain = {arm: {key: of.tolist() for key, of in one.items()} for arm, one in named.items()}
+    (args.out / "result.json").write_text(json.dumps(plain, indent=2) + "\n", encoding="utf-8")
+    draw(args.out / "loss.svg", curve, off)
+    return text
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Train, evaluate, write; 0: done, 2: wrong use, 130: interrupted."""
+    given = list(sys.argv[1:] if words is None else words)
+    if "--config" not in given:
+        given += ["--config", str(Path(__file__).parents[1] / "configs/train/blind_junction.yaml")]
+    try:
+        (args,) = parse_args(given)
+        print(compare(args))
+    except CavmarlError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("interrupted: the same command goes on from the last checkpoints", file=sys.stderr)
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
