@@ -23,14 +23,14 @@ import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from threading import Lock
 
 import numpy as np
 
 from cavmarl.config.io import read_yaml
-from cavmarl.config.world_spec import WorldKeys
+from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import CavmarlError, ConfigError, require
 from cavmarl.core.processes import dying_with_parent
 from cavmarl.evaluate import EvaluationReport, evaluate
@@ -272,21 +272,15 @@ def compare(args: Args) -> str:
     args.out.mkdir(parents=True, exist_ok=True)
     folders = train(args)
     drivers = {folder.name: folder for folder in folders.values()}
-    keys: WorldKeys = {
-        "seed": args.evaluation_seed,
-        "overrides": driver_keys(folders[args.seeds[0]]),
-    }
-    report = evaluate(
-        args.env,
-        {**drivers, **{name: name for name in SCRIPTED}},
-        episodes=args.episodes,
-        repeats=args.repeats,
-        out=args.out / "evaluation",
-        **keys,
-    )
-    counts = {"episodes": args.episodes, "repeats": args.repeats}
-    alone = evaluate(args.env, "idm", agents=1, background=0, **counts, **keys)
-    rows = summarise(report, alone, args)
+    keys = driver_keys(folders[args.seeds[0]])
+    world = WorldSpec(env=args.env, seed=args.evaluation_seed, overrides=keys)
+    policies: dict[str, str | Path] = {**drivers, **{name: name for name in SCRIPTED}}
+    episodes, repeats = args.episodes, args.repeats
+    out = args.out / "evaluation"
+    report = evaluate(world, policies, episodes=episodes, repeats=repeats, out=out)
+    alone = replace(world, agents=1, background=0)
+    oracle = evaluate(alone, "idm", episodes=episodes, repeats=repeats)
+    rows = summarise(report, oracle, args)
     text = table(rows, args)
     (args.out / "table.md").write_text(text, encoding="utf-8")
     plain = {name: {key: asdict(row) for key, row in row.items()} for name, row in rows.items()}

@@ -137,6 +137,26 @@ class SharedPolicy(Policy):
         return actions
 
 
+def built_in_actions(env: Environment, mask: NDArray[np.bool_]) -> NDArray[Any]:
+    """What the built-in driver would do: (W, A, …) as `Policy.act_batch` returns it, to be changed.
+
+    `mask`: (W, A), for its form. Raises PolicyError: actions are numbers of choices.
+    """
+    if env.config.action.kind != "continuous":
+        raise PolicyError(
+            f"action.kind = {env.config.action.kind}: this driver gives throttle and steering; "
+            "make the environment with overrides={'action.kind': 'continuous'}"
+        )
+    found = env.suggest_actions()
+    if isinstance(env, CavVectorEnv):
+        return np.array(found)
+    actions = np.zeros((*mask.shape, 2), dtype=np.float32)
+    for k, agent in enumerate(env.possible_agents):
+        if agent in found:
+            actions[0, k] = found[agent]
+    return actions
+
+
 def load_policy(policy: str | Path, env: Environment) -> Policy:
     """Seat a policy in an environment.
 

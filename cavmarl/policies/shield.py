@@ -7,9 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import PolicyError
-from cavmarl.env.parallel import CavEnv
-from cavmarl.policies.policy import Environment, Policy
+from cavmarl.policies.policy import Environment, Policy, built_in_actions
 
 
 class ShieldedPolicy(Policy):
@@ -20,13 +18,7 @@ class ShieldedPolicy(Policy):
     """
 
     def __init__(self, env: Environment, driver: Policy) -> None:
-        """Raises PolicyError: actions are numbers of choices."""
         super().__init__(env)
-        if env.config.action.kind != "continuous":
-            raise PolicyError(
-                f"shielded: compares throttles, but action.kind = {env.config.action.kind}; "
-                "drive without a shield, or with action.kind = continuous"
-            )
         self.driver = driver
 
     def reset(self, seed: int | None = None) -> None:
@@ -34,20 +26,12 @@ class ShieldedPolicy(Policy):
         self.driver.reset(seed)
 
     def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
-        """The driver's actions (W, A, 2), or the built-in driver's."""
+        """The driver's actions (W, A, 2), or the built-in driver's.
+
+        Raises PolicyError: actions are numbers of choices.
+        """
+        safe = built_in_actions(self.env, mask)
         actions = self.driver.act_batch(observations, mask).copy()
-        safe = self._suggested(mask)
         relieved = (safe[..., 0] < 0.0) & (safe[..., 0] < actions[..., 0])
         actions[relieved] = safe[relieved]
         return actions
-
-    def _suggested(self, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """What the built-in driver would do, (W, A, 2)."""
-        found = self.env.suggest_actions()
-        if not isinstance(self.env, CavEnv):
-            return np.asarray(found)
-        suggested = np.zeros((*mask.shape, 2), dtype=np.float32)
-        for k, agent in enumerate(self.env.possible_agents):
-            if agent in found:
-                suggested[0, k] = found[agent]
-        return suggested

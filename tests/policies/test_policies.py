@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from cavmarl.config.env import TERMS
 from cavmarl.config.registry import agent_entries
 from cavmarl.core.errors import MissingExtraError, PolicyError
 from cavmarl.cosim.stack.stack import REFERENCE_RIG
@@ -249,9 +250,34 @@ def test_a_shield_brakes_where_the_built_in_driver_would(kind: str) -> None:
     assert policy_files(name) == policy_files("never_yield")
 
 
-def test_a_shield_compares_throttles(checkpoint: Path) -> None:
-    with pytest.raises(PolicyError, match="shielded: compares throttles"):
-        load_policy("shielded:idm", small_vec(action__kind="discrete"))
+def test_a_shield_compares_throttles() -> None:
+    vec = small_vec(action__kind="discrete")
+    observations, infos = vec.reset(seed=0)
+    with pytest.raises(PolicyError, match=r"action\.kind = discrete: this driver gives throttle"):
+        load_policy("shielded:idm", vec).act_batch(observations, infos["mask"])
+
+
+def test_opponents_do_what_no_good_driver_does() -> None:
+    vec = make_vec("merge", num_envs=4, agents=8)
+    rows = {}
+    for name in ("blind", "phantom_braking", "idm"):
+        policy = load_policy(name, vec)
+        for again in range(2 if name != "idm" else 1):
+            observations, infos = vec.reset(seed=1)
+            policy.reset(3)
+            throttles, contacts = [], 0
+            for _ in range(100):
+                actions = policy.act_batch(observations, infos["mask"])
+                throttles.append(actions[..., 0][infos["mask"]])
+                observations, _, _, _, infos = vec.step(actions)
+                contacts += int((infos["terms"][..., TERMS.index("collision")] > 0.0).sum())
+            found = np.concatenate(throttles)
+            if again:
+                np.testing.assert_array_equal(found, rows[name][0])
+            rows[name] = (found, contacts)
+    assert rows["blind"][1] > 0 == rows["idm"][1]
+    hard = {name: float((found < -0.35).mean()) for name, (found, _) in rows.items()}
+    assert hard["phantom_braking"] > hard["idm"] + 0.02
 
 
 def test_missing_and_broken_files_are_named(checkpoint: Path, tmp_path: Path) -> None:

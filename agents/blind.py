@@ -1,0 +1,57 @@
+"""A driver that sees no other vehicle and no signal: an opponent to learn caution from.
+
+It steers as the built-in driver does, towards a speed of its own: a share of the limit that is
+drawn for each seat. It needs `sensors.ego` and continuous actions.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import PolicyError
+from cavmarl.engine.spaces import observation_parts
+from cavmarl.policies.policy import Environment, Policy, built_in_actions
+
+LEAST, MOST = 0.5, 1.1  # of the limit
+REACT_S = 1.0
+
+# Features of `ego` and their scale, see the table of any environment's card.
+SPEED, LIMIT = 0, 6
+SPEED_SCALE = 40.0
+
+
+class BlindPolicy(Policy):
+    """Follows its lane at a share of the limit that is drawn by the seed of `reset`."""
+
+    def __init__(self, env: Environment) -> None:
+        super().__init__(env)
+        parts = observation_parts(env.config.sensors)
+        if "ego" not in parts:
+            raise PolicyError("blind needs its own speed: set sensors.ego.enabled = true")
+        self._ego = parts["ego"].place
+        self._frame = max(part.place.stop for part in parts.values())
+        self.reset(0)
+
+    def reset(self, seed: int | None = None) -> None:
+        """Draw the shares anew; None draws a seed from the operating system."""
+        self._random = np.random.Generator(np.random.Philox(seed))
+        self._shares = np.zeros((0, 0))
+
+    def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
+        """(W, A, 2): the built-in driver's steering, and the throttle for the own speed."""
+        if self._shares.shape != mask.shape:
+            self._shares = self._random.uniform(LEAST, MOST, mask.shape)
+        actions = built_in_actions(self.env, mask)
+        ego = observations[..., -self._frame :][..., self._ego]
+        missing_mps = SPEED_SCALE * (self._shares * ego[..., LIMIT] - ego[..., SPEED])
+        throttle = missing_mps / REACT_S / self.env.config.action.acceleration_mps2
+        actions[..., 0] = np.clip(throttle, -1.0, 0.5)
+        return actions
+
+
+def make_policy(env: Environment) -> Policy:
+    """Seat the driver."""
+    return BlindPolicy(env)
