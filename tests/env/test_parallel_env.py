@@ -194,25 +194,6 @@ def test_the_reward_is_the_weighted_sum_of_the_terms(mode: str, share: float) ->
     assert paid > 0.0
 
 
-def test_a_share_of_the_reward_is_that_of_those_near() -> None:
-    share, range_m = 0.3, 40.0
-    near = {"terms.team_share": share, "terms.team_range_m": range_m}
-    env = make("merge", overrides={"terms.weights": {"delay": 1.0}, **near})
-    env.reset()
-    groups = set()
-    for _ in range(20):
-        _, rewards, _, _, infos = env.step(env.suggest_actions())
-        outputs = env.simulation.outputs
-        seats = [env.possible_agents.index(agent) for agent in rewards]
-        own = np.array([infos[agent]["delay"] for agent in rewards])
-        places = outputs.places[0, seats]
-        apart = np.linalg.norm(places[:, None] - places[None], axis=2) <= range_m
-        groups |= set(apart.sum(1).tolist())
-        expected = (1.0 - share) * own + share * (apart @ own) / apart.sum(1)
-        np.testing.assert_allclose(list(rewards.values()), expected, rtol=1e-5, atol=1e-6)
-    assert len(groups) > 1, "all have the same neighbours"
-
-
 def test_terms_that_are_not_named_weigh_nothing() -> None:
     env = make("ring", overrides={"terms.weights": {"delay": 2.0}})
     env.reset()

@@ -1,0 +1,27 @@
+"""Rewards that are shared with the agents nearby, as CoPO's local coordination has it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cavmarl import make_vec
+
+SHARE, RANGE_M = 0.3, 40.0
+
+
+def test_a_share_of_the_reward_is_that_of_those_near() -> None:
+    near = {"terms.team_share": SHARE, "terms.team_range_m": RANGE_M}
+    vec = make_vec("merge", num_envs=2, overrides={"terms.weights": {"delay": 1.0}, **near})
+    vec.reset(seed=0)
+    neighbours = set()
+    for _ in range(20):
+        _, rewards, _, _, infos = vec.step(vec.suggest_actions())
+        for world in range(2):
+            acted = infos["acted"][world]
+            own = infos["terms"][world, acted, -1].astype(np.float64)
+            places = vec.simulation.outputs.places[world, acted]
+            apart = np.linalg.norm(places[:, None] - places[None], axis=2) <= RANGE_M
+            neighbours |= set(apart.sum(1).tolist())
+            expected = (1.0 - SHARE) * own + SHARE * (apart @ own) / apart.sum(1)
+            np.testing.assert_allclose(rewards[world, acted], expected, rtol=1e-5, atol=1e-6)
+    assert len(neighbours) > 2
