@@ -107,7 +107,7 @@ def _exit_codes(
         bool, about("Show the version.", "--version", callback=_print_version, is_eager=True)
     ] = False,
 ) -> None:
-    """Exit codes: 0 success; 1 a check failed; 2 wrong use or bad input; 130 interrupted; 143 terminated."""
+    """Exit codes: 0 success; 1 failed check; 2 wrong use; 130 interrupted; 143 terminated."""
 
 
 def main(words: Sequence[str] | None = None) -> None:
