@@ -32,7 +32,7 @@ export PYTHONDONTWRITEBYTECODE :=
 help: ## say what there is
 	@awk -F':.*## ' '/^[a-z]+:.*## / { printf "make %-9s  %s\n", $$1, $$2 }' Makefile
 
-demo: $(READY) ## train on merge, evaluate, drive through town, leave a video (some minutes)
+demo: $(READY) ## adapt a driver to merge, evaluate, drive through town, leave a page and videos (some minutes)
 	$(BIN)/cavmarl demo
 
 test: $(READY) ## the tests but the slow ones; those of kernels that have a twin also without the compiler

@@ -20,6 +20,7 @@ from cavmarl.core.errors import ConfigError, require
 
 EVALUATION_SEED = 1000  # far from the seeds of training
 EPISODES = 32
+FAILURES = 12  # that are shown from near
 
 
 def demo(
@@ -39,6 +40,7 @@ def demo(
     require("torch", "torch")
     require("sumo", "sumo")  # it has the map of town
     require("imageio_ffmpeg", "render")
+    require("matplotlib", "report")
     make_folder(out)
     console = Console()
     console.print(f"[bold]1. train[/] cities_ippo on merge, {minutes:g} min")
@@ -50,7 +52,8 @@ def demo(
     keys = driver_keys(trained)
     world = WorldSpec(env="merge", seed=EVALUATION_SEED, overrides=keys)
     folder = out / f"evaluation-{stamp}"
-    found = evaluate_showing(console, world, drivers, out=folder, episodes=EPISODES)
+    counts = {"episodes": EPISODES, "failures": FAILURES}
+    found = evaluate_showing(console, world, drivers, out=folder, **counts)
     console.print(report_table(found))
     page = out / "demo.html"
     write_page(folder, page)
@@ -64,7 +67,7 @@ def demo(
         stats[env] = drive(made, policy, seconds, EVALUATION_SEED, video, console)
         console.print(f"{Path(policy).name} in {env}: {_traffic(stats[env])}")
     console.print("[bold]made:[/]")
-    for path in (trained, page, *(out / f"{env}.mp4" for env in videos)):
+    for path in (trained, page, folder / "failures.html", *(out / f"{env}.mp4" for env in videos)):
         console.print(f"  {path}", highlight=False)
     write_json(
         json_path,
