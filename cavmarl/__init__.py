@@ -59,6 +59,7 @@ if TYPE_CHECKING:
     from cavmarl.env.vector import CavVectorEnv, make_vec
     from cavmarl.parallel.backends import register_backend
     from cavmarl.policies.policy import Policy, load_policy
+    from cavmarl.recordings.extra_tables import RecordOptions
     from cavmarl.rewards.registered_terms import register_term
     from cavmarl.sensors.observed.feature import Feature
     from cavmarl.sensors.registry import register_sensor
@@ -94,6 +95,7 @@ __all__ = [
     "Policy",
     "PolicyError",
     "ProtocolError",
+    "RecordOptions",
     "RecordingError",
     "RegisteredFunctionError",
     "RouteError",
@@ -130,6 +132,7 @@ _LATE = {
     "make_vec": "env.vector",
     "parallel_env": "env.parallel",
     "raw_env": "env.registration",
+    "RecordOptions": "recordings.extra_tables",
     "register_backend": "parallel.backends",
     "register_driver_model": "driving.driver_models",
     "register_sensor": "sensors.registry",

@@ -18,12 +18,14 @@ from rich.table import Table
 
 from cavmarl.cli.output import (
     JsonPath,
+    RecordAlso,
     RecordPath,
     about,
     about_file,
     grid,
     make_folder,
     number,
+    recorded,
     with_world,
     write_json,
 )
@@ -64,6 +66,7 @@ def evaluate(
         Path | None, about("Folder of manifest and raw results; default: a new one in runs/.")
     ] = None,
     record: RecordPath = None,
+    record_also: RecordAlso = "",
     failures: Annotated[
         int, about("Write failures.html with so many of the worst trips, each with a replay.")
     ] = 0,
@@ -82,7 +85,7 @@ def evaluate(
     more: dict[str, Any] = {
         "episodes": episodes,
         "repeats": repeats,
-        "record": record,
+        "record": recorded(record, record_also),
         "failures": failures,
     }
     with ExitStack() as stack:

@@ -22,6 +22,7 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.core.seeds import check_seed
 
 if TYPE_CHECKING:
+    from cavmarl.recordings.extra_tables import RecordOptions
     from cavmarl.verify.differences import Difference
 
 
@@ -86,9 +87,27 @@ JsonPath = Annotated[Path | None, about_file("Write the result here as JSON.", "
 RecordPath = Annotated[
     Path | None, about("Record into this new folder, for `cavmarl replay`.", "--record")
 ]
+RecordAlso = Annotated[
+    str, about("Record these, too: observations, samples, messages; with commas.", "--record-also")
+]
 AtLeast = Annotated[
     float | None, about("Exit with 1 if it is not so many times as fast.", callback=check_bound)
 ]
+
+
+def recorded(path: Path | None, also: str) -> RecordOptions | None:
+    """What `--record` and `--record-also` ask for; None: nothing.
+
+    Raises ConfigError: more is to be recorded, but not where.
+    """
+    include = tuple(name.strip() for name in also.split(",") if name.strip())
+    if path is None:
+        if include:
+            raise ConfigError(f"--record-also {also}: say where, with --record FOLDER")
+        return None
+    from cavmarl.recordings.extra_tables import RecordOptions
+
+    return RecordOptions(path, include)
 
 
 def end_below(at_least: float | None, ratio: float | None) -> None:

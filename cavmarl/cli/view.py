@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Annotated
 from rich.console import Console
 
 from cavmarl.cli.evaluate import progress_bar
-from cavmarl.cli.output import JsonPath, PolicyName, RecordPath, about, with_world, write_json
+from cavmarl.cli.output import (
+    JsonPath,
+    PolicyName,
+    RecordAlso,
+    RecordPath,
+    about,
+    recorded,
+    with_world,
+    write_json,
+)
 from cavmarl.cli.web import WebHost, WebPort, WebToken, say
 from cavmarl.config.checks import check_count
 from cavmarl.config.world_spec import WorldSpec
@@ -44,18 +53,20 @@ def view(
     watch_only: Annotated[bool, about("Pages may not pause, step or drive.")] = False,
     worlds: Annotated[int, about("Worlds that the page can choose among.")] = 1,
     record: RecordPath = None,
+    record_also: RecordAlso = "",
     json_path: JsonPath = None,
 ) -> None:
     """Drive one world and show it from above."""
     from cavmarl.env.parallel import parallel_env
 
+    kept = recorded(record, record_also)
     if web:
         from cavmarl.viewer.show_world import show_worlds
 
         _check_web(seconds, video, ghosts_of, worlds, record)
         options = WebOptions(host, port, token, control=not watch_only)
         many = [
-            parallel_env(world.env, zones=zones, workers=workers, record=record, **world.keywords)
+            parallel_env(world.env, zones=zones, workers=workers, record=kept, **world.keywords)
             for _ in range(worlds)
         ]
         stats = show_worlds(many, policy, world.seed, options, say, seconds)
@@ -70,7 +81,7 @@ def view(
         check_display()
     mode = "human" if video is None else "rgb_array"
     made = parallel_env(
-        world.env, zones=zones, workers=workers, render_mode=mode, record=record, **world.keywords
+        world.env, zones=zones, workers=workers, render_mode=mode, record=kept, **world.keywords
     )
     made.ghosts_of = ghosts_of
     console = Console()

@@ -22,12 +22,12 @@ from cavmarl.core.records.codes import (
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.vehicle_way import way_ahead
 from cavmarl.engine.world_frame import ENDED, WorldFrame, frame_of
-from cavmarl.env.recorded_worlds import recording_of
+from cavmarl.env.recorded_worlds import WorldRecorder
 from cavmarl.parallel.backends import shows_state
 from cavmarl.parallel.journaled_worlds import unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds, kept_elsewhere
 from cavmarl.parallel.step_arrays import SteppedWorlds
-from cavmarl.recordings.recording_writer import RecordingWriter
+from cavmarl.recordings.extra_tables import RecordOptions
 from cavmarl.render.topdown import WorldView
 
 RENDER_MODES = ("human", "rgb_array")
@@ -84,7 +84,7 @@ class DrawnWorlds:
     _ready: bool = False  # whether `reset` has been called
     _view: WorldView | None
     _copied: LocalWorlds | None = None  # of worlds that other processes have
-    _writer: RecordingWriter | None = None
+    _writer: WorldRecorder | None = None
     _watchers: tuple[Callable[[], None], ...] = ()
 
     def _frame(self, world: int = 0, ghosts_of: int | None = None) -> NDArray[np.uint8] | None:
@@ -165,22 +165,24 @@ class DrawnWorlds:
             ended["events"][arrays.terms[world, agents, term] > 0.0] |= bit
         return ended
 
-    def record(self, path: str | Path | None) -> None:
+    def record(self, record: RecordOptions | str | Path | None) -> None:
         """Record all worlds from the next reset or step on, until `close`; see docs/recordings.md.
 
         Args:
-            path: a new folder; None: record nothing.
+            record: a new folder, or that and what else is recorded; None: record nothing.
 
         Raises:
+            ConfigError: something else is wanted that there is not.
             EpisodeError: a recording has begun already.
             RecordingError: there is something at `path`, or it cannot be written.
             MissingExtraError: pyarrow is not installed.
         """
-        if path is None:
+        if record is None:
             return
         if self._writer is not None:
-            raise EpisodeError(f"record({str(path)!r}): {self._writer.path} is recorded already")
-        self._writer = recording_of(path, self.worlds.world, self._standing())
+            path = str(RecordOptions.of(record).path)
+            raise EpisodeError(f"record({path!r}): {self._writer.path} is recorded already")
+        self._writer = WorldRecorder(record, self.worlds, self._standing())
 
     def _record_frames(self, chosen: NDArray[np.bool_] | None = None) -> None:
         """Show the present moment of the chosen worlds (W,), or of all, and record it."""

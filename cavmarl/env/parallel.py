@@ -33,6 +33,7 @@ from cavmarl.env.recorded_worlds import check_recording
 from cavmarl.env.world_copies import CopiedWithWorlds
 from cavmarl.parallel.backends import check_hosts, make_worlds, places_of
 from cavmarl.parallel.step_arrays import SteppedWorlds
+from cavmarl.recordings.extra_tables import RecordOptions
 from cavmarl.sensors.mounted.frames import SensorFrames
 
 # What an agent's info holds, behind the terms.
@@ -61,7 +62,7 @@ def parallel_env(
     seed: int | None = None,
     max_cycles: int | None = None,
     render_mode: str | None = None,
-    record: str | Path | None = None,
+    record: RecordOptions | str | Path | None = None,
     lenient: bool = False,
     overrides: Mapping[str, Any] | None = None,
 ) -> CavEnv:
@@ -83,7 +84,7 @@ def parallel_env(
         seed: of the first reset, if that is given none.
         max_cycles: steps until truncation; shadows horizon_s.
         render_mode: `human`, `rgb_array` or None.
-        record: a new folder to record into (docs/recordings.md); None: nothing.
+        record: a new folder to record into, or `RecordOptions` (docs/recordings.md).
         lenient: for libraries that act for absent agents, or beyond the bounds: values are clipped,
             actions of agents that have left ignored, and missing ones are the last, or 0. Sets
             action.out_of_range, .missing_action and .late_actions; traffic_stats() counts each.

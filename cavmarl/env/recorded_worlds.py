@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -12,15 +13,18 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.core.machine import describe_machine
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_description import describe_world
-from cavmarl.engine.world_setup import World
+from cavmarl.engine.world_frame import WorldFrame
+from cavmarl.env.recorded_extras import RecordedExtras, check_extras
 from cavmarl.parallel.backends import shows_state
-from cavmarl.parallel.local_worlds import kept_elsewhere
+from cavmarl.parallel.local_worlds import LocalWorlds, kept_elsewhere
+from cavmarl.parallel.step_arrays import SteppedWorlds
+from cavmarl.recordings.extra_tables import RecordOptions
 from cavmarl.recordings.recording_writer import RecordingWriter
 
 
 def check_recording(
     config: EnvConfig,
-    record: str | Path | None,
+    record: RecordOptions | str | Path | None,
     num_worlds: int,
     workers: int | str | None,
     hosts: str | None,
@@ -30,7 +34,11 @@ def check_recording(
     Raises:
         ConfigError: they are such worlds.
     """
-    if record is None or (not workers and hosts in (None, "local")):
+    if record is None:
+        return
+    options, is_here = RecordOptions.of(record), not workers and hosts in (None, "local")
+    check_extras(config, options.include, is_here)
+    if is_here:
         return
     key = kept_elsewhere(config)
     if not key and config.traffic.source != "native":
@@ -38,40 +46,76 @@ def check_recording(
     if key or not shows_state(num_worlds, workers, hosts):
         what = f" and {key}" if key else ""
         raise ConfigError(
-            f"record = {str(record)!r} with workers = {workers or hosts!r}{what}: such worlds are "
-            "only recorded in the caller's process; use workers=0"
+            f"record = {str(options.path)!r} with workers = {workers or hosts!r}{what}: such "
+            "worlds are only recorded in the caller's process; use workers=0"
         )
 
 
-def recording_of(
-    path: str | Path, world: World, simulation: Simulation, **more: Any
-) -> RecordingWriter:
-    """What writes frames of a world, with its manifest.
+class WorldRecorder:
+    """Records worlds that are stepped, with their manifest.
 
     Args:
-        path: of the recording.
-        world: what each of its worlds is made of.
-        simulation: one of them, for the reach of its zones.
+        record: where, and what besides what can be seen.
+        worlds: that are stepped.
+        simulation: they themselves, or a copy, for the reach of their zones.
         more: for the manifest.
 
     Raises:
-        RecordingError: there is something at `path`, or it cannot be written.
+        ConfigError: something is wanted that there is not.
+        RecordingError: there is something at the path, or it cannot be written.
         MissingExtraError: pyarrow is not installed.
     """
-    config = world.config
-    return RecordingWriter(
-        path,
-        environment=f"{config.name}-v{config.version}",
-        network=world.network,
-        partition=world.partition,
-        halo_m=float(simulation.zone_loads().halo_m),
-        sim_dt_s=config.clock.sim_dt_s,
-        step_s=config.clock.ctrl_dt_s,
-        manifest={
-            "started": datetime.now(UTC).isoformat(timespec="seconds"),
-            "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
-            "world": describe_world(config, world.network, world.demand, world.partition),
-            **more,
-            **describe_machine(),
-        },
-    )
+
+    def __init__(
+        self,
+        record: RecordOptions | str | Path,
+        worlds: SteppedWorlds,
+        simulation: Simulation,
+        **more: Any,
+    ) -> None:
+        options, world = RecordOptions.of(record), worlds.world
+        config = world.config
+        check_extras(config, options.include, is_here=isinstance(worlds, LocalWorlds))
+        self._extras = RecordedExtras(config, options.include, worlds.arrays, simulation)
+        self._writer = RecordingWriter(
+            options.path,
+            environment=f"{config.name}-v{config.version}",
+            network=world.network,
+            partition=world.partition,
+            halo_m=float(simulation.zone_loads().halo_m),
+            sim_dt_s=config.clock.sim_dt_s,
+            step_s=config.clock.ctrl_dt_s,
+            manifest={
+                "started": datetime.now(UTC).isoformat(timespec="seconds"),
+                "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+                "world": describe_world(config, world.network, world.demand, world.partition),
+                **more,
+                **describe_machine(),
+            },
+            extras=self._extras.dtypes,
+            features=self._extras.features,
+            terms=config.terms.names if options.include else (),
+        )
+
+    @property
+    def path(self) -> Path:
+        """Of the recording."""
+        return self._writer.path
+
+    def add(self, frames: Iterable[WorldFrame], first: int = 0) -> None:
+        """Take frames of worlds as they are now.
+
+        Args:
+            frames: by worlds as they are stepped.
+            first: number in the recording of the first of them.
+
+        Raises:
+            RecordingError: an earlier part could not be written.
+        """
+        these = list(frames)
+        extras = [self._extras.of(frame.world, frame.tick) for frame in these]
+        self._writer.add((frame._replace(world=first + frame.world) for frame in these), extras)
+
+    def close(self) -> None:
+        """Write what is left; raises as `add`."""
+        self._writer.close()

@@ -34,6 +34,7 @@ from cavmarl.env.saved_state import SavedState
 from cavmarl.env.world_copies import CopiedWithWorlds
 from cavmarl.parallel.backends import check_hosts, make_worlds, places_of
 from cavmarl.parallel.step_arrays import SteppedWorlds
+from cavmarl.recordings.extra_tables import RecordOptions
 from cavmarl.sensors.mounted.frames import SensorFrames
 from cavmarl.shards.shard import Commands
 
@@ -63,7 +64,7 @@ def make_vec(
     autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
     copy: bool = True,
     render_mode: str | None = None,
-    record: str | Path | None = None,
+    record: RecordOptions | str | Path | None = None,
     overrides: Mapping[str, Any] | None = None,
 ) -> CavVectorEnv:
     """Make `num_envs` worlds of one environment that are stepped together.
@@ -85,7 +86,7 @@ def make_vec(
         autoreset_mode: when a world that is over begins anew; see `CavVectorEnv`.
         copy: False returns observations without a copy.
         render_mode: `rgb_array` or None.
-        record: a new folder to record into, a subfolder a world (docs/recordings.md).
+        record: a new folder to record into, or `RecordOptions` (docs/recordings.md).
         overrides: values for any other key.
 
     Raises:

@@ -25,6 +25,7 @@ from cavmarl.evaluate.tables import EPISODE, TRACK, TRANSFER, TRIP
 from cavmarl.evaluate.transfer_rows import TransferRecorder
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.policies.policy import Policy, load_policy
+from cavmarl.recordings.extra_tables import RecordOptions
 from cavmarl.roads.kernels.map_draw import map_of
 from cavmarl.zones.partition.zone_statistics import imbalance
 
@@ -46,7 +47,7 @@ class EpisodeJob(WorldSpec):
     episodes: int  # how many; episode e is the first one of world e of the seed
     run: int = 0  # its number
     runs: int = 1  # how many there are
-    record: str = ""  # folder of recordings; empty: nothing is recorded
+    record: RecordOptions | None = None  # of recordings; None: nothing is recorded
     failures: int = 0  # how many failed trips are kept of each policy
 
 

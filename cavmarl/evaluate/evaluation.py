@@ -62,6 +62,7 @@ from cavmarl.handoff.coordinator.coordinator_setup import journal_path
 from cavmarl.ownership.transfer_summary import TransferSummary
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.policies.policy import load_policy
+from cavmarl.recordings.extra_tables import RecordOptions
 
 Rows = NDArray[np.void]
 Policies = str | Path | Sequence[str | Path] | Mapping[str, str | Path]
@@ -90,7 +91,7 @@ def evaluate(
     episodes: int = 32,
     repeats: int = 1,
     out: Path | None = None,
-    record: str | Path | None = None,
+    record: RecordOptions | str | Path | None = None,
     failures: int = 0,
     progress: Progress | None = None,
     watcher: Watcher | None = None,
@@ -107,8 +108,8 @@ def evaluate(
         episodes: of each run.
         repeats: independent runs.
         out: folder for manifest and raw results; None keeps nothing but the report.
-        record: a new folder for recordings, whose worlds are episodes; with several policies or
-            runs, in subfolders POLICY/run-N (docs/recordings.md).
+        record: a new folder for recordings, or `RecordOptions`; their worlds are episodes; with
+            several policies or runs, in subfolders POLICY/run-N (docs/recordings.md).
         failures: how many failed trips the page `failures.html` in `out` shows; 0: there is none.
         progress: called after every step of a run with the policy's name, the steps that it has
             done in this run, and the most there can be.
@@ -135,16 +136,18 @@ def evaluate(
     if failures:
         check_count("failures", failures, MAX_FAILURES)
         require("jinja2", "report")
-    folders = "" if record is None else str(Path(record).absolute())
+    recorded = None if record is None else RecordOptions.of(record)
+    if recorded is not None:
+        recorded = recorded.at(Path(recorded.path).absolute())
     job = EpisodeJob(
         **vars(spec),
         policies=_named(policies),
         episodes=episodes,
         runs=repeats,
-        record=folders,
+        record=recorded,
         failures=failures,
     )
-    _check_record(folders)
+    _check_record(recorded)
     with TemporaryDirectory() as room:
         folder = Path(room) if out is None else out
         jobs, is_divided = _prepare(folder, job, repeats)
@@ -152,11 +155,11 @@ def evaluate(
         return load_report(folder)
 
 
-def _check_record(folder: str) -> None:
+def _check_record(record: RecordOptions | None) -> None:
     """Refuse early what no recording can be made in."""
-    if folder:
+    if record is not None:
         require("pyarrow", "recordings")
-        path = Path(folder)
+        path = Path(record.path)
         if path.exists() and not (path.is_dir() and not any(path.iterdir())):
             raise RecordingError(f"{path}: there is something already; give a new folder")
 

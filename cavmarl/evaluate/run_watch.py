@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.env.recorded_worlds import recording_of
+from cavmarl.env.recorded_worlds import WorldRecorder
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.evaluate.failure_clips import Failure, FailureClips
+from cavmarl.recordings.extra_tables import RecordOptions
 
 
 class RunWatch:
@@ -22,7 +23,7 @@ class RunWatch:
         policy: its name in the results.
         run: its number.
         seed: of the run.
-        record: folder of the recording; None: none is made.
+        record: how it is recorded; None: it is not.
         failures: how many failed trips are kept.
         look: called at each moment of the worlds.
     """
@@ -33,7 +34,7 @@ class RunWatch:
         policy: str,
         run: int,
         seed: int,
-        record: Path | None,
+        record: RecordOptions | None,
         failures: int,
         look: Callable[[], None] | None = None,
     ) -> None:
@@ -43,7 +44,7 @@ class RunWatch:
         about = {"policy": policy, "run": run, "seed": seed}
         self._writer = None
         if record is not None:
-            self._writer = recording_of(record, vec.worlds.world, vec.simulation, **about)
+            self._writer = WorldRecorder(record, vec.worlds, vec.simulation, **about)
         self._clips = FailureClips(failures, vec.step_s, about) if failures else None
 
     @property
@@ -80,7 +81,7 @@ class RunWatch:
         if self._clips is not None:
             self._clips.add(frames)
         if self._writer is not None:  # a world of the recording is an episode of the run
-            self._writer.add(frame._replace(world=self._first + frame.world) for frame in frames)
+            self._writer.add(frames, self._first)
 
     def close(self) -> None:
         """Close the recording, if there is one."""
@@ -88,10 +89,11 @@ class RunWatch:
             self._writer.close()
 
 
-def recording_path(record: str, policy: str, run: int, is_only: bool) -> Path | None:
-    """Where one policy's run is recorded: `record` itself where there is no other."""
-    if not record:
-        return None
-    if is_only:
-        return Path(record)
-    return Path(record) / re.sub(r"[^\w.-]+", "_", policy).strip("._") / f"run-{run}"
+def recording_path(
+    record: RecordOptions | None, policy: str, run: int, is_only: bool
+) -> RecordOptions | None:
+    """How one policy's run is recorded: at the path itself where there is no other."""
+    if record is None or is_only:
+        return record
+    name = re.sub(r"[^\w.-]+", "_", policy).strip("._")
+    return record.at(Path(record.path) / name / f"run-{run}")

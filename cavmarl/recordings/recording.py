@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import RecordingError
 from cavmarl.engine.world_frame import WorldFrame
+from cavmarl.recordings.extra_tables import extra_rows
 from cavmarl.recordings.recording_format import (
     HEAD_FILE,
     NETWORK_FILE,
@@ -20,6 +21,7 @@ from cavmarl.recordings.recording_format import (
     RecordedFrame,
     RecordingHead,
     damaged,
+    dtype_of,
     events_of,
     frames_of,
     read_table,
@@ -60,6 +62,7 @@ class Recording:
         }
         self.worlds = sorted(self._parts)
         self._kept: tuple[Path | None, list[RecordedFrame]] = (None, [])
+        self._kept_extra: tuple[Path | None, Any] = (None, None)
         self._indices: dict[int, NDArray[np.void]] = {}
 
     @classmethod
@@ -157,6 +160,54 @@ class Recording:
         for frames in self._paths(world):
             path = frames.parent.parent / "events" / frames.name
             yield from events_of(path, read_table(path))
+
+    @property
+    def extras(self) -> list[str]:
+        """Names of the tables that were recorded on request."""
+        return list(self.head.extras)
+
+    def extra(self, table: str, world: int = 0, episode: int | None = None) -> NDArray[np.void]:
+        """All rows of a table on request, of one world; of one episode, or of all.
+
+        Raises:
+            RecordingError: it was not recorded, or a part is missing or damaged.
+        """
+        rows = [np.zeros(0, self._dtype(table))]
+        for frames in self._paths(world):
+            episodes, found = self._extra_of(table, frames)
+            rows.append(found if episode is None else found[episodes == episode])
+        return np.concatenate(rows)
+
+    def extra_at(self, table: str, tick: int, world: int = 0, episode: int = 0) -> Any:
+        """The rows (n,) of a table on request of one tick of which there is a frame.
+
+        Raises:
+            RecordingError: it was not recorded, or a part is missing or damaged.
+        """
+        index = self._index(world)
+        parts = index["part"][(index["episode"] == episode) & (index["tick"] == tick)]
+        if not len(parts):
+            return np.zeros(0, self._dtype(table))
+        episodes, rows = self._extra_of(table, self._paths(world)[int(parts[0])])
+        return rows[(episodes == episode) & (rows["tick"] == tick)]
+
+    def _dtype(self, table: str) -> np.dtype[Any]:
+        columns = self.head.extras.get(table)
+        if columns is None:
+            there = ", ".join(self.head.extras) or "none"
+            raise RecordingError(
+                f"{self.path}: has no {table}; it has {there}: record with "
+                f"RecordOptions(path, include=(…,)) or --record-also"
+            )
+        return dtype_of(columns)
+
+    def _extra_of(self, table: str, frames: Path) -> tuple[Any, NDArray[np.void]]:
+        """(episodes, rows) of the table of a part; the last one that was read is kept."""
+        dtype = self._dtype(table)
+        path = frames.parent.parent / table / frames.name
+        if self._kept_extra[0] != path:
+            self._kept_extra = path, extra_rows(path, read_table(path), dtype)
+        return self._kept_extra[1]
 
     def _paths(self, world: int) -> list[Path]:
         """The committed parts of a world: the files of their frames."""

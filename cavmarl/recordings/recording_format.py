@@ -5,8 +5,9 @@
     PATH/world-0/vehicles/      a row a vehicle and frame
     PATH/world-0/events/        a row an event
     PATH/world-0/frames/        a row a frame; its lists have signals, transfers and ghosts
+    PATH/world-0/observations/  and other tables on request, see `extra_tables`
 
-Each of the three folders has a file for each part, `000000.parquet` and so on. That in `frames/` is
+Each of these folders has a file for each part, `000000.parquet` and so on. That in `frames/` is
 written last and commits the part: what lies beside it without one does not count.
 """
 
@@ -14,7 +15,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,10 +27,10 @@ from cavmarl.engine.world_frame import ENDED, SEEN, FrameEvent, WorldFrame
 from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 HEAD_FILE = "recording.json"
 NETWORK_FILE = "network.bin"
-TABLES = ("vehicles", "events", "frames")  # in the order in which a part's are written
+TABLES = ("vehicles", "events", "frames")  # of every recording; the last one commits a part
 
 # Numbers that hardly repeat: their bytes are split into streams, which compress.
 _SPLIT = [name for name in SEEN.names or () if SEEN[name].kind == "f"]
@@ -40,6 +41,9 @@ _OPTIONS: dict[str, Any] = {
     "write_statistics": False,
     "write_page_checksum": True,  # so that a damaged file is found when it is read
 }
+
+
+Columns = Sequence[Sequence[Any]]  # name, dtype and shape of each column, as JSON has them
 
 
 class RecordedFrame(NamedTuple):
@@ -69,6 +73,10 @@ class RecordingHead:
     halo_m: float
     manifest: Mapping[str, Any]  # of the run
     status: str = "open"  # "closed" when it was ended in order
+    # of tables on request, by name: name, dtype and shape of each column
+    extras: Mapping[str, Columns] = field(default_factory=dict)
+    features: Sequence[Sequence[str]] = ()  # sensor and name of each number observed, newest frame
+    terms: Sequence[str] = ()  # names of the reward terms
     version: int = FORMAT_VERSION
 
     @property
@@ -109,6 +117,7 @@ class RecordingHead:
         try:
             head = cls(**document)
             head.partition  # noqa: B018 - refuses zones that are none
+            list(map(dtype_of, head.extras.values()))
             hash((head.network["sha256"], head.network["name"], head.network["source_sha256"]))
             if not (head.sim_dt_s > 0.0 and head.step_s > 0.0 and "world" in head.manifest):
                 raise ValueError("a key has no value")
@@ -117,6 +126,20 @@ class RecordingHead:
                 f"{path}: is damaged ({error}); restore it, or record the run again"
             ) from error
         return head
+
+
+def columns_of(dtype: np.dtype[Any]) -> list[list[Any]]:
+    """A dtype as JSON."""
+    found = []
+    for name in dtype.names or ():
+        base, shape = dtype[name].base, list(dtype[name].shape)
+        found.append([name, base.str, shape])
+    return found
+
+
+def dtype_of(columns: Columns) -> np.dtype[Any]:
+    """The dtype that `columns_of` told; raises ValueError or TypeError: it is none."""
+    return np.dtype([(str(name), str(kind), tuple(shape)) for name, kind, shape in columns])
 
 
 def arrow() -> Any:

@@ -7,16 +7,19 @@ import os
 import threading
 import time
 import weakref
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cavmarl.core.errors import RecordingError
 from cavmarl.core.processes import is_fork, refuse_fork
 from cavmarl.core.whole_file import write_whole
 from cavmarl.engine.world_frame import FrameEvent, WorldFrame, events_between
+from cavmarl.recordings.extra_tables import ExtraRows, extra_table, take_rows
 from cavmarl.recordings.recording_format import (
     HEAD_FILE,
     NETWORK_FILE,
@@ -25,6 +28,7 @@ from cavmarl.recordings.recording_format import (
     RecordedFrame,
     RecordingHead,
     arrow,
+    columns_of,
     event_table,
     frame_table,
     vehicle_table,
@@ -54,6 +58,9 @@ class RecordingWriter:
         sim_dt_s: seconds a tick.
         step_s: seconds a step.
         manifest: of the run, with the key `world`; numbers, text, lists and dicts.
+        extras: dtypes of the tables that are recorded on request, by name; `tick` is first.
+        features: sensor and name of each number that an agent observes, if that is recorded.
+        terms: names of the reward terms, likewise.
 
     Raises:
         RecordingError: there is something at `path`, or it cannot be written.
@@ -71,6 +78,9 @@ class RecordingWriter:
         sim_dt_s: float,
         step_s: float,
         manifest: Mapping[str, Any],
+        extras: Mapping[str, np.dtype[Any]] | None = None,
+        features: Sequence[Sequence[str]] = (),
+        terms: Sequence[str] = (),
     ) -> None:
         arrow()
         self.path = Path(path)
@@ -89,6 +99,9 @@ class RecordingWriter:
             rects=partition.rects.tolist(),
             halo_m=halo_m,
             manifest=manifest,
+            extras={name: columns_of(dtype) for name, dtype in (extras or {}).items()},
+            features=features,
+            terms=terms,
         )
         try:
             self.path.mkdir(parents=True, exist_ok=True)
@@ -98,16 +111,20 @@ class RecordingWriter:
             write_whole(self.path / HEAD_FILE, head.to_bytes())
         except OSError as error:
             raise _unwritable(self.path, error) from error
-        self._sink = _Sink(self.path, head)
+        self._sink = _Sink(self.path, head, dict(extras or {}))
         self._finish = weakref.finalize(self, self._sink.close)  # at the end of the process, too
 
-    def add(self, frames: Iterable[WorldFrame]) -> None:
+    def add(self, frames: Iterable[WorldFrame], extras: Iterable[Extras] = ()) -> None:
         """Take frames, one a world; a tick that is not after the last one begins an episode.
+
+        Args:
+            frames: of worlds.
+            extras: of each frame the rows of tables on request, by name.
 
         Raises:
             RecordingError: an earlier part could not be written.
         """
-        self._sink.add(list(frames))
+        self._sink.add(list(zip_longest(frames, extras, fillvalue={})))
 
     def close(self) -> None:
         """Write what is left and mark the recording as whole.
@@ -121,14 +138,21 @@ class RecordingWriter:
             self._sink.check()
 
 
+Extras = Mapping[str, NDArray[np.void]]
+_Moment = tuple[WorldFrame, Extras]
+
+
 class _Sink:
     """What the thread works on; it does not know the writer, so that one can go unseen."""
 
-    def __init__(self, path: Path, head: RecordingHead) -> None:
+    def __init__(
+        self, path: Path, head: RecordingHead, extras: Mapping[str, np.dtype[Any]]
+    ) -> None:
         self._path = path
         self._head = head
+        self._extras = extras
         self._pid = os.getpid()  # forks have no such thread
-        self._waiting: list[WorldFrame] = []
+        self._waiting: list[_Moment] = []
         self._waiting_bytes = 0
         self._changed = threading.Condition()
         self._closing = False
@@ -136,12 +160,15 @@ class _Sink:
         self._worlds: dict[int, _WorldParts] = {}
         self._thread: threading.Thread | None = None
 
-    def add(self, frames: list[WorldFrame]) -> None:
+    def add(self, moments: list[_Moment]) -> None:
         refuse_fork(self._pid, f"the frames of {self._path}")
         self.check()
-        size = sum(frame.vehicles.nbytes for frame in frames)
+        size = sum(
+            frame.vehicles.nbytes + sum(rows.nbytes for rows in extras.values())
+            for frame, extras in moments
+        )
         with self._changed:
-            self._waiting += frames
+            self._waiting += moments
             self._waiting_bytes += size
             if self._thread is None:  # not before: a process may fork until its worlds are made
                 self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
@@ -173,12 +200,12 @@ class _Sink:
         while True:
             with self._changed:
                 self._changed.wait_for(self._is_due, timeout=max(0.0, due - time.monotonic()))
-                frames, self._waiting, self._waiting_bytes = self._waiting, [], 0
+                moments, self._waiting, self._waiting_bytes = self._waiting, [], 0
                 last = self._closing
                 self._changed.notify_all()
             due = time.monotonic() + COMMIT_S
             try:
-                self._commit(frames)
+                self._commit(moments)
             except Exception as error:  # it is raised where frames are added
                 with self._changed:
                     self._error = error
@@ -190,12 +217,12 @@ class _Sink:
     def _is_due(self) -> bool:
         return self._closing or self._waiting_bytes > MOST_WAITING_BYTES
 
-    def _commit(self, frames: list[WorldFrame]) -> None:
-        for frame in frames:
+    def _commit(self, moments: list[_Moment]) -> None:
+        for frame, extras in moments:
             if frame.world not in self._worlds:
                 folder = self._path / f"world-{frame.world}"
-                self._worlds[frame.world] = _WorldParts(folder, self._head)
-            self._worlds[frame.world].take(frame)
+                self._worlds[frame.world] = _WorldParts(folder, self._head, self._extras)
+            self._worlds[frame.world].take(frame, extras)
         for parts in self._worlds.values():
             parts.commit()
 
@@ -203,17 +230,21 @@ class _Sink:
 class _WorldParts:
     """The parts of one world."""
 
-    def __init__(self, folder: Path, head: RecordingHead) -> None:
+    def __init__(
+        self, folder: Path, head: RecordingHead, extras: Mapping[str, np.dtype[Any]]
+    ) -> None:
         self._folder = folder
+        self._dtypes = extras
+        self._extras: dict[str, list[ExtraRows]] = {name: [] for name in extras}
         self._step_ticks = max(1, round(head.step_s / head.sim_dt_s))
         self._count = 0
         self._last: RecordedFrame | None = None
         self._frames: list[RecordedFrame] = []
         self._events: list[RecordedEvent] = []
-        for table in TABLES:
+        for table in (*extras, *TABLES):
             (folder / table).mkdir(parents=True)
 
-    def take(self, frame: WorldFrame) -> None:
+    def take(self, frame: WorldFrame, extras: Extras) -> None:
         last = self._last
         episode = 0 if last is None else last.episode
         if last is not None and frame.tick <= last.frame.tick:
@@ -226,6 +257,8 @@ class _WorldParts:
             self._events += (RecordedEvent(episode, event) for event in found)
         self._last = RecordedFrame(episode, frame)
         self._frames.append(self._last)
+        for name, rows in take_rows(extras, episode, frame.tick):
+            self._extras[name].append(rows)
 
     def _at_the_end(self, last: WorldFrame, first: WorldFrame) -> Iterator[FrameEvent]:
         """What happened in the step that ended an episode; its last frame is not to be had."""
@@ -242,15 +275,17 @@ class _WorldParts:
         """Write a part, if there is anything in it; the frames are last and commit it."""
         if not self._frames:
             return
-        tables = (
-            vehicle_table(self._frames),
-            event_table(self._events),
-            frame_table(self._frames),
-        )
-        for name, table in zip(TABLES, tables, strict=True):
+        tables = {
+            name: extra_table(rows, self._dtypes[name]) for name, rows in self._extras.items()
+        }
+        tables["vehicles"] = vehicle_table(self._frames)
+        tables["events"] = event_table(self._events)
+        tables["frames"] = frame_table(self._frames)
+        for name, table in tables.items():
             write_whole(self._folder / name / f"{self._count:06d}.parquet", write_table(table))
         self._count += 1
         self._frames, self._events = [], []
+        self._extras = {name: [] for name in self._dtypes}
 
 
 def _unwritable(path: Path, error: Exception) -> RecordingError:

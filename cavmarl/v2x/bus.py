@@ -56,6 +56,8 @@ from cavmarl.v2x.v2x_messages import (
 )
 
 Zeros = Callable[..., NDArray[Any]]
+Watch = Callable[[int, int, NDArray[np.void], NDArray[np.void]], None]
+"""Told a world, a tick, and what is sent in it: PACKET (n,) and REPORT (m,), views."""
 
 CELL_M = 100.0  # of the packets of a tick
 BODY_CELL_M = 25.0  # of the vehicles that others see
@@ -98,6 +100,7 @@ class Bus:
         self.mail = _make_mail(v2x, num_worlds, capacity, num_receivers, len(self.units), zeros)
         self._room = _make_room(network, self.mail, zoned, num_receivers)
         self._network: NetworkSimulator | None = None
+        self._watchers: tuple[Watch, ...] = ()
         self._exchange = specialized(exchange_messages)
         self._hand_out = specialized(hand_out)
         self.mail.owner[:] = -1
@@ -111,6 +114,10 @@ class Bus:
         if not self._config.channel.external:
             raise ConfigError("the channel is our own: set v2x.channel.external to connect another")
         self._network = network
+
+    def watch(self, watch: Watch) -> None:
+        """Tell one more, from now on, what is sent in each tick; again in a tick begun again."""
+        self._watchers = (*self._watchers, watch)
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
         """Forget all that was said in the chosen worlds (W,)."""
@@ -150,6 +157,18 @@ class Bus:
             self._sending, self._channel, self._roads, self._types, self.units, self._common,
             self._zoned, side, first, last, self.mail, self._room,
         )  # fmt: skip
+        if self._watchers:
+            self._show(first, last)
+
+    def _show(self, first: int, last: int) -> None:
+        mail = self.mail
+        for world in range(first, last):
+            tick = self._common.ticks.item(world)
+            slot = tick % (self._sending.latency + 1)
+            packets = mail.packets[world, slot, : mail.num_packets[world, slot]]
+            reports = mail.reports[world, slot, : mail.num_reports[world, slot]]
+            for watch in self._watchers:
+                watch(world, tick, packets, reports)
 
     def _receive_from(self, network: NetworkSimulator, world: int) -> None:
         mail, latency = self.mail, self._sending.latency

@@ -13,7 +13,12 @@ from cavmarl.recordings.recording import Recording
 from cavmarl.viewer.frame_publisher import TIME_LINE, FramePublisher
 from cavmarl.viewer.run_clock import RunClock
 from cavmarl.viewer.stage import Stage, first_stage
-from cavmarl.viewer.vehicle_details import hello_of_map, vehicle_state
+from cavmarl.viewer.vehicle_details import (
+    hello_of_map,
+    named_numbers,
+    named_terms,
+    vehicle_state,
+)
 
 MOST_TOLD = 500  # events of an episode
 QUIET = frozenset({"arrived", "transferred"})  # left out first where there are more
@@ -84,7 +89,14 @@ class ShownRecording:
         return self._recording.at(self._ticks[self._place], self._world, self._episode)
 
     def _tell(self, frame: WorldFrame, vehicle: int, sensors: bool) -> dict[str, Any]:
-        return vehicle_state(self._recording.network, self._agents, frame, vehicle)
+        found = vehicle_state(self._recording.network, self._agents, frame, vehicle)
+        head = self._recording.head
+        if found["here"] and "observations" in self._recording.extras:
+            rows = self._recording.extra_at("observations", frame.tick, self._world, self._episode)
+            for row in rows[rows["vehicle"] == vehicle]:
+                found["terms"] = named_terms(head.terms, row["terms"])
+                found["observation"] = named_numbers(head.features, row["values"])
+        return found
 
     def _tell_all_events(self) -> None:
         """The whole time line, at once; pages that come later get it from the audience."""

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from cavmarl.config.env import EnvConfig
 from cavmarl.core.records.codes import (
     DRIVER_AGENT,
     DRIVER_BACKGROUND,
@@ -19,7 +19,7 @@ from cavmarl.engine.world_frame import WorldFrame
 from cavmarl.env.parallel import CavEnv
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
-from cavmarl.sensors.observed import layout, sensors_of
+from cavmarl.sensors.observed import feature_names
 from cavmarl.viewer.map_geometry import map_origin
 from cavmarl.viewer.sensed_shapes import sensed_shapes
 from cavmarl.zones.partition.zone_partition import ZonePartition
@@ -123,10 +123,7 @@ def vehicle_details(
     arrays = env.worlds.arrays
     if agent < 0 or arrays.vehicle_ids[world, agent] != vehicle:
         return found
-    terms = arrays.terms[world, agent].tolist()
-    found["terms"] = [
-        [name, round(value, 4)] for name, value in zip(env.config.terms.names, terms, strict=True)
-    ]
+    found["terms"] = named_terms(env.config.terms.names, arrays.terms[world, agent])
     found["observation"] = _observed(env, world, agent)
     if sensors:
         found["shapes"] = sensed_shapes(env.config, arrays, world, agent)
@@ -143,25 +140,19 @@ def _observed(env: Shown, world: int, agent: int) -> list[list[Any]]:
             for name, numbers in sensed.items()
             for k, value in enumerate(numbers[world, agent].ravel()[: MOST_NUMBERS // len(sensed)])
         ]
-    return _named_features(config, newest_frame(config, arrays.observations[world, agent]))
+    return named_numbers(feature_names(config.sensors), arrays.observations[world, agent])
 
 
-def newest_frame(config: EnvConfig, observation: Any) -> Any:
-    """The last frame of a stack."""
-    return observation[-(len(observation) // config.sensors.stack) :]
-
-
-def _named_features(config: EnvConfig, numbers: Any) -> list[list[Any]]:
-    places = layout(config.sensors)
-    rows: list[list[Any]] = []
-    for sensor in sensors_of(config.sensors):
-        if sensor.name in places:
-            features = sensor.features(config.sensors)
-            rows += [
-                [sensor.name, feature.name, _number(value)]
-                for feature, value in zip(features, numbers[places[sensor.name]], strict=True)
-            ]
+def named_numbers(names: Sequence[Sequence[str]], numbers: Any) -> list[list[Any]]:
+    """Sensor, feature and number of each of the newest numbers, whose names are given."""
+    newest = numbers[-len(names) :] if len(names) else []
+    rows = [[*name, _number(value)] for name, value in zip(names, newest, strict=True)]
     return rows[:MOST_NUMBERS]
+
+
+def named_terms(names: Sequence[str], terms: Any) -> list[list[Any]]:
+    """Name and number of each reward term."""
+    return [[name, round(float(value), 4)] for name, value in zip(names, terms, strict=True)]
 
 
 def _number(value: Any) -> float | None:

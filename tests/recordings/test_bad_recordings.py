@@ -83,10 +83,10 @@ def gone(name: str) -> Callable[[Path], object]:
     [
         (gone("recording.json"), ["no recording.json", "give the path"]),
         (cut("recording.json"), ["recording.json", "cannot be read", "record the run again"]),
-        (replaced("recording.json", '"cavmarl_recording": 1', '"other": 1'), ["does not belong"]),
+        (replaced("recording.json", '"cavmarl_recording": 2', '"other": 1'), ["does not belong"]),
         (
-            replaced("recording.json", '"cavmarl_recording": 1', '"cavmarl_recording": 9'),
-            ["format 9", "reads 1", "use the version of cavmarl that wrote it"],
+            replaced("recording.json", '"cavmarl_recording": 2', '"cavmarl_recording": 9'),
+            ["format 9", "reads 2", "use the version of cavmarl that wrote it"],
         ),
         (replaced("recording.json", '"sim_dt_s"', '"dt"'), ["recording.json", "is damaged"]),
         (replaced("recording.json", '"rects"', '"rects_"'), ["recording.json", "is damaged"]),

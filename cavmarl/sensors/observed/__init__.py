@@ -77,6 +77,15 @@ def sensors_of(config: SensorsConfig) -> tuple[Sensor, ...]:
     return (*SENSORS, *(REGISTERED_SENSORS[name] for name in config.registered))
 
 
+def feature_names(config: SensorsConfig) -> list[tuple[str, str]]:
+    """Sensor and feature of each number of a frame of an observation."""
+    return [
+        (sensor.name, feature.name)
+        for sensor in sensors_of(config)
+        for feature in sensor.features(config)
+    ]
+
+
 def layout(config: SensorsConfig) -> dict[str, slice]:
     """Where each sensor's features lie in a frame; sensors that are off are left out."""
     places: dict[str, slice] = {}

@@ -1,0 +1,214 @@
+"""What a recording holds on request: observations, samples of sensors, messages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config.env import EnvConfig
+from cavmarl.core.errors import ConfigError
+from cavmarl.engine.simulation import Simulation
+from cavmarl.ownership.messages import COORDINATOR, Ack, Message, Nack, Record, Step
+from cavmarl.ownership.trace import LOG, TraceEntry, describe
+from cavmarl.parallel.step_arrays import StepArrays
+from cavmarl.sensors.observed import feature_names
+from cavmarl.v2x.kernels.v2x_records import REPORT
+
+SAMPLES = "samples-"  # begins the name of a sensor's table
+V2X, HANDOVERS = "v2x", "handovers"
+_WHOSE = [("tick", "<i8"), ("agent", "<i4"), ("vehicle", "<i8")]
+# A report of a packet; `sent` and `from_x`, `from_y` (m) are the packet's.
+_V2X = np.dtype(
+    [
+        ("tick", "<i8"),
+        ("from_x", "<f8"),
+        ("from_y", "<f8"),
+        *((name, REPORT[name].str) for name in REPORT.names or () if name != "tick"),
+        ("of_tick", "<i8"),  # when what it says was so
+    ]
+)
+# Zones, -1: the coordinator, -2: its log.
+_HANDOVERS = np.dtype(
+    [("tick", "<i8"), ("sender", "<i4"), ("receiver", "<i4"), ("kind", "O"), ("text", "O")]
+)
+
+Rows = NDArray[np.void]
+
+
+def check_extras(config: EnvConfig, include: Iterable[str], is_here: bool) -> None:
+    """Refuse to record what there is not, or not here.
+
+    Raises:
+        ConfigError: likewise.
+    """
+    sensed = config.observation.mode == "sensors" and config.observation.kind == "dict"
+    reasons = {
+        "observations": sensed and "they are samples here: include samples",
+        "samples": not config.rig and "no vehicle carries sensors: set rig",
+        "messages": (
+            not (config.v2x.enabled or config.zones.count > 1)
+            and "none are sent: set v2x.enabled, or zones.count above 1"
+        )
+        or (not is_here and "they are only seen in the caller's process: use workers=0"),
+    }
+    for name in include:
+        if reasons[name]:
+            raise ConfigError(f"record: include {name!r}: {reasons[name]}")
+
+
+class RecordedExtras:
+    """Gathers rows of the tables on request, world by world.
+
+    Args:
+        config: of the worlds.
+        include: of `observations`, `samples` and `messages` those that are wanted.
+        arrays: what comes out of their steps.
+        simulation: the worlds, of which messages are noted from now on.
+
+    Attributes:
+        dtypes: of the tables, by name.
+        features: sensor and name of each number of the newest frame of an observation.
+    """
+
+    def __init__(
+        self, config: EnvConfig, include: Iterable[str], arrays: StepArrays, simulation: Simulation
+    ) -> None:
+        self._arrays = arrays
+        wanted = frozenset(include)
+        self.dtypes: dict[str, np.dtype[Any]] = {}
+        self.features: list[tuple[str, str]] = []
+        if "observations" in wanted:
+            numbers, terms = arrays.observations.shape[2], arrays.terms.shape[2]
+            more = [("reward", "<f4"), ("terms", "<f4", (terms,)), ("values", "<f4", (numbers,))]
+            self.dtypes["observations"] = np.dtype([*_WHOSE, *more])
+            if config.observation.mode != "sensors":
+                self.features = feature_names(config.sensors)
+        if "samples" in wanted:
+            for name, frames in arrays.frames.items():
+                data = ("data", frames.data.dtype.str, frames.data.shape[3:])
+                own = np.dtype([*_WHOSE, ("stamp_s", "<f8"), ("lost", "|b1"), data])
+                self.dtypes[SAMPLES + name] = own
+        self._logs: dict[str, _SentLog] = {}
+        if "messages" in wanted:
+            self._listen(config, simulation)
+
+    def _listen(self, config: EnvConfig, simulation: Simulation) -> None:
+        if config.v2x.enabled:
+            self.dtypes[V2X], log = _V2X, _SentLog(_V2X)
+            self._logs[V2X] = log
+            simulation.messages.watch(partial(_note_sent, log))
+        if simulation.coordinators:
+            self.dtypes[HANDOVERS], log = _HANDOVERS, _SentLog(_HANDOVERS)
+            self._logs[HANDOVERS] = log
+            for world, coordinator in enumerate(simulation.coordinators):
+                coordinator.watch(_HandoverWatch(log, world))
+
+    def of(self, world: int, tick: int) -> Mapping[str, Rows]:
+        """The rows of a world since the last call, by table.
+
+        Args:
+            world: its number among those that are stepped.
+            tick: of its frame.
+        """
+        arrays, found = self._arrays, {name: log.take(world) for name, log in self._logs.items()}
+        agents = np.flatnonzero(arrays.vehicle_ids[world] >= 0)
+        for name, dtype in self.dtypes.items():
+            if name == "observations":
+                rows = self._whose(dtype, world, tick, agents)
+                rows["reward"] = arrays.rewards[world, agents]
+                rows["terms"] = arrays.terms[world, agents]
+                rows["values"] = arrays.observations[world, agents]
+                found[name] = rows
+            elif name.startswith(SAMPLES):
+                found[name] = self._samples(name, dtype, world, tick, agents)
+        return found
+
+    def _whose(self, dtype: np.dtype[Any], world: int, tick: int, agents: NDArray[np.intp]) -> Rows:
+        rows = np.zeros(len(agents), dtype)
+        rows["tick"], rows["agent"] = tick, agents
+        rows["vehicle"] = self._arrays.vehicle_ids[world, agents]
+        return rows
+
+    def _samples(
+        self, name: str, dtype: np.dtype[Any], world: int, tick: int, agents: NDArray[np.intp]
+    ) -> Rows:
+        """Those of the last step, of a sensor."""
+        frames = self._arrays.frames[name.removeprefix(SAMPLES)]
+        slots = frames.stamp_s.shape[2]
+        fresh = np.arange(slots) >= slots - frames.fresh[world, agents, None]
+        place, slot = np.nonzero(fresh)
+        rows = self._whose(dtype, world, tick, agents[place])
+        for column, array in (("data", frames.data), ("stamp_s", frames.stamp_s)):
+            rows[column] = array[world, agents[place], slot]
+        rows["lost"] = frames.lost[world, agents[place], slot]
+        return rows
+
+
+class _SentLog:
+    """Rows of each world, tick by tick, until they are taken; a tick begun again counts once."""
+
+    def __init__(self, dtype: np.dtype[Any]) -> None:
+        self._dtype = dtype
+        self._rows: dict[int, list[tuple[int, Rows]]] = {}
+
+    def note(self, world: int, tick: int, rows: Rows) -> None:
+        self._rows.setdefault(world, []).append((tick, rows))
+
+    def forget_from(self, world: int, tick: int) -> None:
+        """Forget what was sent in a tick that is begun again."""
+        kept = self._rows.get(world, [])
+        while kept and kept[-1][0] == tick:
+            kept.pop()
+
+    def take(self, world: int) -> Rows:
+        rows = [rows for _, rows in self._rows.pop(world, [])]
+        return np.concatenate([np.zeros(0, self._dtype), *rows])
+
+
+def _note_sent(log: _SentLog, world: int, tick: int, packets: Rows, reports: Rows) -> None:
+    """Note the packets of a tick, a row a report."""
+    counts = packets["count"]
+    packet = np.repeat(np.arange(len(packets)), counts)
+    within = np.arange(int(counts.sum())) - np.repeat(np.cumsum(counts) - counts, counts)
+    said = reports[packets["first"][packet] + within]
+    rows = np.zeros(len(said), _V2X)
+    for name in REPORT.names or ():
+        rows["of_tick" if name == "tick" else name] = said[name]
+    rows["tick"], rows["kind"] = tick, packets["kind"][packet]
+    rows["from_x"], rows["from_y"] = packets["x"][packet], packets["y"][packet]
+    rows["sender"] = packets["sender"][packet]
+    log.forget_from(world, tick)
+    log.note(world, tick, rows)
+
+
+class _HandoverWatch:
+    """Notes what a coordinator and its zones tell each other; a `coordinator.Watcher`."""
+
+    def __init__(self, log: _SentLog, world: int) -> None:
+        self._log = log
+        self._world = world
+
+    def logged(self, records: Iterable[Record]) -> None:
+        for record in records:
+            self._note(TraceEntry(LOG, record), COORDINATOR)
+
+    def delivered(self, destination: int, message: Message) -> None:
+        self._note(TraceEntry(destination, message), _sender_of(message))
+
+    def _note(self, entry: TraceEntry, sender: int) -> None:
+        item = entry.item
+        row = np.zeros(1, _HANDOVERS)
+        row[0] = item.tick, sender, entry.destination, type(item).__name__.upper(), describe(entry)
+        self._log.note(self._world, item.tick, row)
+
+
+def _sender_of(message: Message) -> int:
+    if isinstance(message, Step):
+        return COORDINATOR
+    if isinstance(message, Ack | Nack):
+        return message.zone
+    return int(getattr(message, "source", getattr(message, "zone", COORDINATOR)))

@@ -1,0 +1,115 @@
+"""What a recording holds on request besides what can be seen: rows of one dtype, a table each.
+
+Rows begin with `tick`. A column of float32 with an axis becomes a list, any other with axes its
+bytes, objects text; `recording.json` tells the dtypes, so that rows are read as they were.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import ConfigError
+from cavmarl.recordings.recording_format import arrow, damaged
+
+KINDS = ("observations", "samples", "messages")
+
+
+@dataclass(frozen=True)
+class RecordOptions:
+    """What `record` may be in the place of a path.
+
+    Attributes:
+        path: a new folder.
+        include: of `observations`, `samples` and `messages` those that are recorded, too.
+    """
+
+    path: str | Path
+    include: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in self.include:
+            if name not in KINDS:
+                raise ConfigError(f"record: include {name!r}: must be of {', '.join(KINDS)}")
+
+    @classmethod
+    def of(cls, record: Self | str | Path) -> RecordOptions:
+        """As it is, or a path alone."""
+        return record if isinstance(record, RecordOptions) else cls(record)
+
+    def at(self, path: Path) -> RecordOptions:
+        """The same at another path."""
+        return RecordOptions(path, self.include)
+
+
+class ExtraRows(NamedTuple):
+    """Rows of one table that belong to one frame."""
+
+    episode: int
+    rows: NDArray[np.void]
+
+
+def extra_table(parts: Sequence[ExtraRows], dtype: np.dtype[Any]) -> Any:
+    """The rows of some frames as a table; those of a tick before the frame's reset, too."""
+    pa = arrow()
+    rows = np.concatenate([np.zeros(0, dtype), *(part.rows for part in parts)])
+    counts = [len(part.rows) for part in parts]
+    episodes = np.repeat(np.array([part.episode for part in parts], np.int32), counts)
+    columns = {"episode": pa.array(episodes, pa.int32())}
+    for name in dtype.names or ():
+        column, base, shape = np.ascontiguousarray(rows[name]), dtype[name].base, dtype[name].shape
+        if base.kind == "O":
+            columns[name] = pa.array(column.tolist(), pa.string())
+        elif not shape:
+            columns[name] = pa.array(column)
+        elif base == np.float32:
+            flat = pa.array(column.reshape(-1))
+            columns[name] = pa.FixedSizeListArray.from_arrays(flat, int(np.prod(shape)))
+        else:
+            size = base.itemsize * int(np.prod(shape))
+            buffers = [None, pa.py_buffer(column.tobytes())]
+            kind = pa.binary(size)
+            columns[name] = pa.FixedSizeBinaryArray.from_buffers(kind, len(rows), buffers)
+    return pa.table(columns)
+
+
+def extra_rows(path: Path, table: Any, dtype: np.dtype[Any]) -> tuple[Any, NDArray[np.void]]:
+    """(episodes (n,), rows (n,)) of a table.
+
+    Raises RecordingError: it is not of that dtype.
+    """
+    rows = np.zeros(table.num_rows, dtype)
+    try:
+        for name in dtype.names or ():
+            column = table.column(name).combine_chunks()
+            base, shape = dtype[name].base, (len(rows), *dtype[name].shape)
+            if base.kind == "O":
+                rows[name] = column.to_pylist()
+            elif len(shape) == 1:
+                rows[name] = column.to_numpy(zero_copy_only=False)
+            elif base == np.float32:
+                flat = column.flatten().to_numpy(zero_copy_only=False)
+                rows[name] = flat.reshape(shape)
+            else:
+                rows[name] = np.frombuffer(b"".join(column.to_pylist()), base).reshape(shape)
+        return table.column("episode").to_numpy(), rows
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise damaged(path, str(error)) from error
+
+
+def take_rows(extras: Mapping[str, NDArray[np.void]], episode: int, tick: int) -> Any:
+    """(table, `ExtraRows`) of a frame; rows of later ticks than its own are of the episode before.
+
+    They were sent in the step in whose end the world began anew.
+    """
+    for name, rows in extras.items():
+        late = rows["tick"] > tick
+        if late.any():
+            yield name, ExtraRows(max(0, episode - 1), rows[late])
+            rows = rows[~late]
+        yield name, ExtraRows(episode, rows)
