@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import RecordingError, require
+from cavmarl.engine.kernels.seen_rows import split_rows
 from cavmarl.engine.world_frame import ENDED, SEEN, FrameEvent, WorldFrame
 from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.zones.partition.zone_partition import ZonePartition
@@ -32,6 +33,7 @@ HEAD_FILE = "recording.json"
 NETWORK_FILE = "network.bin"
 TABLES = ("vehicles", "events", "frames")  # of every recording; the last one commits a part
 
+ALIGNED = 64  # bytes, of columns in memory
 # Numbers that hardly repeat: their bytes are split into streams, which compress.
 _SPLIT = [name for name in SEEN.names or () if SEEN[name].kind == "f"]
 _OPTIONS: dict[str, Any] = {
@@ -192,18 +194,25 @@ def vehicle_table(frames: Sequence[RecordedFrame]) -> Any:
         "episode": np.repeat(np.array([one.episode for one in frames], np.int32), counts),
         "tick": np.repeat(np.array([one.frame.tick for one in frames], np.int64), counts),
     }
-    seen = {name: np.empty(sum(counts), SEEN[name]) for name in SEEN.names or ()}
-    at = 0
-    for one in frames:  # frame by frame: its rows stay in the cache while they are taken apart
-        rows = one.frame.vehicles
-        for name, column in seen.items():
-            column[at : at + len(rows)] = rows[name]
-        at += len(rows)
-    columns |= seen
+    columns |= _columns_of(np.concatenate([one.frame.vehicles.view(np.uint8) for one in frames]))
     arrays = {name: pa.array(column) for name, column in columns.items()}
     # Without nulls none of their bits is written: that takes a third of the time.
     fields = [pa.field(name, array.type, nullable=False) for name, array in arrays.items()]
     return pa.Table.from_arrays(list(arrays.values()), schema=pa.schema(fields))
+
+
+def _columns_of(raw: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
+    """The fields of the bytes of SEEN (n,) as arrays."""
+    sizes = np.array([SEEN[name].itemsize for name in SEEN.names or ()])
+    count = len(raw) // SEEN.itemsize
+    room = -(-sizes * count // ALIGNED) * ALIGNED
+    ends = np.cumsum(room)
+    out = np.empty(int(ends[-1]), np.uint8)
+    split_rows(raw.reshape(count, SEEN.itemsize), np.cumsum([0, *sizes]), ends - room, out)
+    return {
+        name: out[end - own : end - own + size * count].view(SEEN[name])
+        for name, size, own, end in zip(SEEN.names or (), sizes, room, ends, strict=True)
+    }
 
 
 def frame_table(frames: Sequence[RecordedFrame]) -> Any:

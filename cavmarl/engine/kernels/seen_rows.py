@@ -7,6 +7,26 @@ from numpy.typing import NDArray
 
 from cavmarl.core.numba import kernel
 
+_BLOCK = 512  # rows that stay in the cache while they are taken apart
+
+
+@kernel
+def split_rows(
+    raw: NDArray[np.uint8],  # (n, size of a row)
+    offsets: NDArray[np.int64],  # (C + 1,) where each field begins in a row
+    starts: NDArray[np.int64],  # (C,) where its column begins in `out`
+    out: NDArray[np.uint8],  # is written
+) -> None:
+    """Make columns of packed rows, while other threads have the interpreter."""
+    for first in range(0, raw.shape[0], _BLOCK):
+        last = min(first + _BLOCK, raw.shape[0])
+        for c in range(starts.size):
+            at = starts[c] + first * (offsets[c + 1] - offsets[c])
+            for k in range(first, last):
+                for byte in range(offsets[c], offsets[c + 1]):
+                    out[at] = raw[k, byte]
+                    at += 1
+
 
 @kernel
 def write_seen(
