@@ -12,7 +12,7 @@ from rich.console import Console
 from cavmarl.cli.evaluate import progress_bar
 from cavmarl.cli.output import JsonPath, about, about_file, write_json
 from cavmarl.cli.view import check_display
-from cavmarl.cli.web import WebHost, WebPort, WebToken, say
+from cavmarl.cli.web import WatchToken, WebHost, WebPort, WebToken, say
 from cavmarl.viewer.web_options import DEFAULT_PORT, WebOptions
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ def replay(
     port: WebPort = DEFAULT_PORT,
     host: WebHost = "127.0.0.1",
     token: WebToken = "",
+    watch_token: WatchToken = "",
     watch_only: Annotated[bool, about("Pages may not pause it or go to another moment.")] = False,
     json_path: JsonPath = None,
 ) -> None:
@@ -61,7 +62,9 @@ def replay(
     if web:
         from cavmarl.viewer.show_world import show_recording
 
-        show_recording(recording, WebOptions(host, port, token, control=not watch_only), say)
+        show_recording(
+            recording, WebOptions(host, port, token, watch_token, control=not watch_only), say
+        )
     elif video is not None or not wanted:
         _show(recording, world, episode, len(ticks), video, ghosts_of, console)
     document = {

@@ -21,7 +21,7 @@ from cavmarl.cli.output import (
     with_world,
     write_json,
 )
-from cavmarl.cli.web import WebHost, WebPort, WebToken, say
+from cavmarl.cli.web import WatchToken, WebHost, WebPort, WebToken, say
 from cavmarl.config.checks import check_count
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
@@ -50,6 +50,7 @@ def view(
     port: WebPort = DEFAULT_PORT,
     host: WebHost = "127.0.0.1",
     token: WebToken = "",
+    watch_token: WatchToken = "",
     watch_only: Annotated[bool, about("Pages may not pause, step or drive.")] = False,
     worlds: Annotated[int, about("Worlds that the page can choose among.")] = 1,
     record: RecordPath = None,
@@ -64,7 +65,7 @@ def view(
         from cavmarl.viewer.show_world import show_worlds
 
         _check_web(seconds, video, ghosts_of, worlds, record)
-        options = WebOptions(host, port, token, control=not watch_only)
+        options = WebOptions(host, port, token, watch_token, control=not watch_only)
         many = [
             parallel_env(world.env, zones=zones, workers=workers, record=kept, **world.keywords)
             for _ in range(worlds)

@@ -16,6 +16,8 @@ WebHost = Annotated[
 ]
 WebToken = Annotated[str, about("Token that a page has to give.", "--token", envvar=TOKEN_VARIABLE)]
 
+WatchToken = Annotated[str, about("Token of pages that may only watch.", "--watch-token")]
+
 
 def say(text: str) -> None:
     """Print a line as it is, an address among them."""

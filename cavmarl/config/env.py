@@ -237,6 +237,8 @@ class PopulationConfig(Section, key="population"):
             agents); the other modes do not read it.
         types: vehicles of the agents in turn, of `car`, `truck` and `bus`: agent k has the one
             at place k, counted round.
+        insertions: how many vehicles may be put into a world in one episode while it runs
+            (`insert_vehicle`, `close_road`); there is room for them.
     """
 
     mode: Literal["closed", "open", "respawn"] = "closed"
@@ -244,6 +246,7 @@ class PopulationConfig(Section, key="population"):
     background: Annotated[int, Whole(0, 1_000_000)] = 20
     budget: int | None = None
     types: tuple[Literal["car", "truck", "bus"], ...] = ("car",)
+    insertions: Annotated[int, Whole(0, 10_000)] = 0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -525,6 +528,11 @@ class EnvConfig(Section, key=""):
             "population.types",
             set(self.population.types) == {"car"},
             f"traffic.source = {source}: SUMO knows our car alone; leave it out",
+        )
+        self.need(
+            "population.insertions",
+            self.population.insertions == 0,
+            f"traffic.source = {source}: SUMO knows only vehicles of its demand; leave it out",
         )
         self.need(
             "scenario.name",

@@ -71,6 +71,8 @@ class Tick:
                 part.begin(commands)
         if is_first:
             self.executor.each("begin_step", commands)
+            if commands.inserted.size:
+                self.traffic.insert(self.gate, self._shard.worlds, commands.inserted)
         self._advance(commands)
         if self.attached:
             self._meet()

@@ -73,6 +73,8 @@ class WorldFrame(NamedTuple):
     transfers: tuple[TransferInFlight, ...] = ()
     ghosts: tuple[NDArray[np.int64], ...] = ()  # of each zone, the ids that it sees of others
     ended: NDArray[np.void] = _NONE_ENDED  # ENDED (m,): they are not among `vehicles`
+    # kind and detail of what was put into the world in the step before
+    asked: tuple[tuple[str, str], ...] = ()
 
 
 class FrameEvent(NamedTuple):
@@ -80,7 +82,7 @@ class FrameEvent(NamedTuple):
 
     tick: int  # of the later frame
     # departed, left, arrived, collision, off_road, wrong_way, red_light, out_of_time,
-    # transferred or signal
+    # transferred, signal; inserted or closed: put there from outside
     kind: str
     vehicle: int  # id; -1: of no vehicle
     agent: int  # index; -1: no agent's
@@ -92,6 +94,7 @@ def frame_of(
     world: int = 0,
     ghosts: bool = False,
     ended: NDArray[np.void] = _NONE_ENDED,
+    asked: tuple[tuple[str, str], ...] = (),
 ) -> WorldFrame:
     """The present moment of one world.
 
@@ -100,6 +103,7 @@ def frame_of(
         world: which of them.
         ghosts: whether to tell what each zone sees of the others' vehicles.
         ended: ENDED, of the last step.
+        asked: what was put into the world in it.
     """
     rows = simulation.vehicles(world)
     seen = np.empty(len(rows), dtype=SEEN)
@@ -115,11 +119,14 @@ def frame_of(
         () if view is None else view.transfers,
         view.ghosts if view is not None and ghosts else (),
         ended,
+        asked,
     )
 
 
 def events_between(before: WorldFrame, after: WorldFrame) -> Iterator[FrameEvent]:
     """What happened from one frame to the next of the same episode, in the order of vehicles."""
+    for kind, detail in after.asked:
+        yield FrameEvent(after.tick, kind, -1, -1, detail)
     ids, were = after.vehicles["id"], before.vehicles["id"]
     both = ids
     old: Any = slice(None)

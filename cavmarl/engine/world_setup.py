@@ -150,6 +150,7 @@ def _refuse_of_one_map(config: EnvConfig) -> None:
         "traffic.origins": config.traffic.origins,
         "traffic.destinations": config.traffic.destinations,
         "scenario.name": config.scenario.name,
+        "population.insertions": config.population.insertions,
         "zones.layout": config.zones.layout not in ZONE_LAYOUTS and config.zones.layout,
     }
     for key, value in named.items():

@@ -22,6 +22,7 @@ from cavmarl.core.records.codes import (
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.vehicle_way import way_ahead
 from cavmarl.engine.world_frame import ENDED, WorldFrame, frame_of
+from cavmarl.env.insertions import Insertions
 from cavmarl.env.recorded_worlds import WorldRecorder
 from cavmarl.parallel.backends import shows_state
 from cavmarl.parallel.journaled_worlds import unwatched
@@ -81,6 +82,7 @@ class DrawnWorlds:
     worlds: SteppedWorlds
     metadata: dict[str, Any]
     render_mode: str | None
+    _insertions: Insertions
     _ready: bool = False  # whether `reset` has been called
     _view: WorldView | None
     _copied: LocalWorlds | None = None  # of worlds that other processes have
@@ -129,7 +131,10 @@ class DrawnWorlds:
                 "workers=0"
             )
         simulation = self._shown()
-        return [frame_of(simulation, world, ghosts, self._ended(world)) for world in chosen]
+        return [
+            frame_of(simulation, world, ghosts, self._ended(world), self._insertions.told(world))
+            for world in chosen
+        ]
 
     @property
     def is_ready(self) -> bool:

@@ -29,6 +29,7 @@ from cavmarl.engine.world_setup import check_agents, make_world
 from cavmarl.env.actions import LENIENT, ActionDecoder
 from cavmarl.env.declared_events import DeclaredEvents
 from cavmarl.env.drawn_worlds import RENDER_MODES, DrawnWorlds, check_rendering
+from cavmarl.env.insertions import Insertions
 from cavmarl.env.recorded_worlds import check_recording
 from cavmarl.env.world_copies import CopiedWithWorlds
 from cavmarl.parallel.backends import check_hosts, make_worlds, places_of
@@ -184,6 +185,7 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
         self.state_space = state_space(worlds.arrays.states.shape[1] // STATE_FEATURES)
         self._decoder = ActionDecoder(config.action, 1, self.possible_agents)
         self._events = DeclaredEvents(config, 1)
+        self._insertions = Insertions(config, self.network, 1)
         self._first_seed = seed
         self._view = None
 
@@ -243,6 +245,7 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
         arrays.chosen[:] = True
         self.worlds.reset(seed, 0)
         self._decoder.forget(arrays.chosen)
+        self._insertions.forget(arrays.chosen)
         self._steps = 0
         self._ready = True
         self._record_frames()
@@ -270,7 +273,7 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
         active = self.worlds.arrays.mask[0, self._listed]
         needed = self.agents if active.all() else list(compress(self.agents, active.tolist()))
         commands = self._decoder.from_dict(actions, self.agents, needed)
-        self.worlds.step(self._events.add_to(commands))
+        self.worlds.step(self._insertions.add_to(self._events.add_to(commands)))
         self._steps += 1
         self._record_frames()
         return self._report()
@@ -317,7 +320,7 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
         """Let an empty world go on until an agent enters; ends without one at the horizon."""
         arrays = self.worlds.arrays
         while not arrays.episode_over[0] and self._steps < self._max_cycles:
-            self.worlds.step(self._decoder.idle())
+            self.worlds.step(self._insertions.add_to(self._decoder.idle()))
             self._steps += 1
             self._record_frames()
             if arrays.mask.any():
@@ -381,6 +384,37 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
         if agent not in self.agents:
             raise ActionError(f"declare_event('{agent}', …): it is not in the episode")
         self._events.declare(0, self.possible_agents.index(agent), cause)
+
+    def insert_vehicle(self, lane: str, position_m: float) -> None:
+        """Let a car of the traffic enter in the next step, or as soon as there is a safe gap.
+
+        It counts in `population.insertions`, drives to a goal of the generator's and is one of its
+        vehicles from then on.
+
+        Args:
+            lane: id of a lane of a road.
+            position_m: on it, of the front bumper.
+
+        Raises:
+            ActionError: no such lane or place, or cars may not drive there.
+            CapacityError: as many have been put there in this episode as may be.
+            ConfigError: `population.insertions` is 0.
+        """
+        self._insertions.vehicle(0, lane, position_m)
+
+    def close_road(self, edge: str) -> None:
+        """Close a road from the next step on, to the end of the episode.
+
+        On each of its lanes a car stands at its beginning, as soon as there is a safe gap; each
+        counts in `population.insertions`. Others wait behind them, or go round where they can.
+
+        Args:
+            edge: id of a road.
+
+        Raises:
+            ActionError, CapacityError, ConfigError: as of `insert_vehicle`.
+        """
+        self._insertions.barrier(0, edge)
 
     def frames(self, agent: str) -> dict[str, SensorFrames]:
         """What the sensors of an agent's `rig` have got in the last step, by name.

@@ -12,6 +12,7 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ConfigError, EpisodeError
 from cavmarl.env.actions import ActionDecoder
 from cavmarl.env.declared_events import DeclaredEvents
+from cavmarl.env.insertions import Insertions
 from cavmarl.parallel.checkpoint.world_cases import from_bytes, to_bytes
 from cavmarl.parallel.local_worlds import every_array, kept_elsewhere
 from cavmarl.parallel.step_arrays import SteppedWorlds
@@ -26,6 +27,7 @@ class SavedState:
     config: EnvConfig
     _decoder: ActionDecoder
     _events: DeclaredEvents
+    _insertions: Insertions
     _mask: NDArray[np.bool_]
     _ready: bool
 
@@ -79,5 +81,7 @@ class SavedState:
 
     def _memory(self) -> list[NDArray[Any]]:
         """What is kept beside the worlds."""
-        kept = (self._mask, self._events.memory, *self._decoder.memory)
+        kept = (
+            self._mask, self._events.memory, *self._insertions.memory, *self._decoder.memory
+        )  # fmt: skip
         return [*kept, *every_array(self.worlds.arrays)]

@@ -29,6 +29,7 @@ from cavmarl.env.actions import ActionDecoder
 from cavmarl.env.autoreset import known_mode, present_mode, refuse_over, with_rows
 from cavmarl.env.declared_events import DeclaredEvents
 from cavmarl.env.drawn_worlds import DrawnWorlds, check_rendering
+from cavmarl.env.insertions import Insertions
 from cavmarl.env.recorded_worlds import check_recording
 from cavmarl.env.saved_state import SavedState
 from cavmarl.env.world_copies import CopiedWithWorlds
@@ -205,6 +206,7 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
         self._read_only.flags.writeable = False
         self._mask = np.zeros((num_envs, self.num_agents), dtype=np.bool_)
         self._events = DeclaredEvents(config, num_envs)
+        self._insertions = Insertions(config, self.network, num_envs)
         self._first_seed = None if seed is None else check_seed(seed)
         self._copy = copy
         self._ready = False
@@ -273,6 +275,7 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
         self.worlds.arrays.chosen[:] = chosen
         self.worlds.reset(seed, first_world)
         self._decoder.forget(chosen)
+        self._insertions.forget(chosen)
         self._mask = self.worlds.arrays.mask.copy()
         self._over = self._over & ~chosen
         self._ready = True
@@ -325,11 +328,13 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
             refuse_over(self._over)
         commands = self._decoder.from_array(actions, self._mask)
         began = time.perf_counter()
-        self.worlds.step(self._events.add_to(commands))
+        self.worlds.step(self._insertions.add_to(self._events.add_to(commands)))
         self.simulated_s += time.perf_counter() - began
         self._record_frames()
         arrays = self.worlds.arrays
         over = self._over = arrays.episode_over.copy()
+        if np.count_nonzero(over):
+            self._insertions.forget(over)
         terminations = arrays.terminations.copy()
         observations = final_observations = self._observations()
         if np.count_nonzero(over) or np.count_nonzero(terminations):
@@ -382,6 +387,14 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
             ConfigError: no such cause, or no messages are sent in this environment.
         """
         self._events.declare(world, agent, cause)
+
+    def insert_vehicle(self, lane: str, position_m: float, world: int = 0) -> None:
+        """Let a car of the traffic enter a world in the next step, as `CavEnv.insert_vehicle`."""
+        self._insertions.vehicle(world, lane, position_m)
+
+    def close_road(self, edge: str, world: int = 0) -> None:
+        """Close a road of a world from the next step on, as `CavEnv.close_road`."""
+        self._insertions.barrier(world, edge)
 
     def _final_observations(self, ended: NDArray[np.bool_]) -> Observations:
         """The observations, and of the worlds (W,) where something ended those before that."""

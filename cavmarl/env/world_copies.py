@@ -6,6 +6,7 @@ from copy import deepcopy
 from typing import Any, ClassVar
 
 from cavmarl.env.actions import ActionDecoder
+from cavmarl.env.insertions import Insertions
 from cavmarl.parallel.step_arrays import SteppedWorlds
 
 
@@ -30,21 +31,24 @@ class CopiedWithWorlds(OwnWorlds):
     _MADE_OF_WORLDS: ClassVar = frozenset(
         (
             "worlds", "config", "network", "_view", "_read_only", "_decoder", "_writer",
-            "_watchers",
+            "_watchers", "_insertions",
         )
     )  # fmt: skip
 
     worlds: SteppedWorlds
     _decoder: ActionDecoder
+    _insertions: Insertions
 
     def __reduce__(self) -> tuple[Any, ...]:
         kept = {
             name: value for name, value in vars(self).items() if name not in self._MADE_OF_WORLDS
         }
-        return _made_again, (type(self), self.worlds), (kept, self._decoder.memory)
+        return _made_again, (type(self), self.worlds), (
+            kept, self._decoder.memory, self._insertions.memory
+        )  # fmt: skip
 
-    def __setstate__(self, state: tuple[dict[str, Any], Any]) -> None:
-        kept, self._decoder.memory = state
+    def __setstate__(self, state: tuple[dict[str, Any], Any, Any]) -> None:
+        kept, self._decoder.memory, self._insertions.memory = state
         vars(self).update(kept)
 
 

@@ -97,6 +97,7 @@ class OrderedWorlds(ABC):
             arrays.controls[:] = commands.controls
             arrays.meta_actions[:] = commands.meta_actions
         arrays.declared[:] = commands.declared if commands.declared.size else 0
+        arrays.inserted[:] = commands.inserted if commands.inserted.size else 0
         self._order(Task.STEP)
         self._steps += 1
 

@@ -45,6 +45,7 @@ class StepArrays(NamedTuple):
     controls: NDArray[np.float64]  # (W, A, 2) what agents do, as in `Commands`
     meta_actions: NDArray[np.int64]  # (W, A)
     declared: NDArray[np.int32]  # (W, A)
+    inserted: NDArray[np.float64]  # (W, I, 3)
     suggested: NDArray[np.float64]  # (W, A, 2) what the built-in driver would do
     states: NDArray[np.float32]  # (W, S) global states, of when they were last asked for
     frames: Frames  # what the rigs have sensed
@@ -84,6 +85,7 @@ def layout_of(config: EnvConfig, capacity: int, num_worlds: int) -> Layout:
         "controls": ("<f8", (*agents, 2)),
         "meta_actions": ("<i8", agents),
         "declared": ("<i4", agents),
+        "inserted": ("<f8", (num_worlds, config.population.insertions, 3)),
         "suggested": ("<f8", (*agents, 2)),
         "states": ("<f4", (num_worlds, *state_space(capacity).shape)),
         **frame_layout(config, num_worlds),

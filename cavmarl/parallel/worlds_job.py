@@ -93,4 +93,4 @@ class WorldsJob(Job):
 
 def commands_of(arrays: StepArrays) -> Commands:
     """What agents do in the next step; views."""
-    return Commands(arrays.controls, arrays.meta_actions, arrays.declared)
+    return Commands(arrays.controls, arrays.meta_actions, arrays.declared, arrays.inserted)

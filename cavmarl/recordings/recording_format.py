@@ -230,6 +230,7 @@ def frame_table(frames: Sequence[RecordedFrame]) -> Any:
             ("transfers", pa.list_(transfer)),
             ("ghosts", pa.list_(pa.list_(pa.int64()))),
             ("ended", pa.list_(ended)),
+            ("asked", pa.list_(pa.struct([("kind", pa.string()), ("detail", pa.string())]))),
         ]
     )
     rows = [
@@ -242,6 +243,7 @@ def frame_table(frames: Sequence[RecordedFrame]) -> Any:
             "transfers": [transfer._asdict() for transfer in frame.transfers],
             "ghosts": [ghosts.tolist() for ghosts in frame.ghosts],
             "ended": [{"agent": agent, "events": events} for agent, events in frame.ended.tolist()],
+            "asked": [{"kind": kind, "detail": detail} for kind, detail in frame.asked],
         }
         for episode, frame in frames
     ]
@@ -300,6 +302,7 @@ def _frame(world: int, row: Mapping[str, Any], vehicles: NDArray[np.void]) -> Wo
         tuple(TransferInFlight(**transfer) for transfer in row["transfers"]),
         tuple(np.array(ids, dtype=np.int64) for ids in row["ghosts"]),
         np.array(ended, dtype=ENDED),
+        tuple((one["kind"], one["detail"]) for one in row["asked"]),
     )
 
 

@@ -267,7 +267,11 @@ class _WorldParts:
         stay = stay.copy()
         stay["events"] = 0
         over = last._replace(
-            tick=last.tick + self._step_ticks, vehicles=stay, ended=first.ended, transfers=()
+            tick=last.tick + self._step_ticks,
+            vehicles=stay,
+            ended=first.ended,
+            transfers=(),
+            asked=first.asked,
         )
         return events_between(last, over)
 

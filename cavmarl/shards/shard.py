@@ -70,6 +70,9 @@ class Commands:
     meta_actions: NDArray[np.int64]  # (W, A) ACTION_* codes; discrete actions
     # (W, A) CAUSE_* of events that agents tell others of, 0: none; (0, 0): no messages
     declared: NDArray[np.int32] = field(default_factory=lambda: np.zeros((0, 0), np.int32))
+    # (W, I, 3) INSERT_* code, LANE and m on it of vehicles that are put into a world; (0, 0, 3):
+    # there is no room for any
+    inserted: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0, 3)))
 
 
 COMMANDS = tuple(entry.name for entry in fields(Commands))

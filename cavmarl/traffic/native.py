@@ -26,7 +26,7 @@ from cavmarl.roads.routing import PLAN, make_plans
 from cavmarl.traffic.demand import STOP, DemandFile
 from cavmarl.traffic.departure_queue import with_room
 from cavmarl.traffic.kernels.admission import accept, assign_lanes
-from cavmarl.traffic.kernels.demand_generator import call_orders, populate, settle
+from cavmarl.traffic.kernels.demand_generator import call_orders, insert, populate, settle
 from cavmarl.traffic.map_trips import MapTrips, for_each_map, together
 from cavmarl.traffic.rerouting import Rerouting
 from cavmarl.traffic.scenarios.cast import Cast
@@ -47,6 +47,7 @@ class _Calls:
 
     def __init__(self) -> None:
         self.call_orders = specialized(call_orders)
+        self.insert = specialized(insert)
         self.settle = specialized(settle)
         self.assign_lanes = specialized(assign_lanes)
         self.accept = specialized(accept)
@@ -166,9 +167,9 @@ class NativeTraffic:
         scripts = NO_SCRIPTS if self.cast is None else self.cast.scripts
         actors = types[:0] if self.cast is None else self.cast.types
         if self.file is None or self.schedule is None:
-            none = np.zeros(0, dtype=STOP)
             types = np.concatenate([types, actors])
-            return Travel(types, steps, none, 0, 0.0, VIEW_M, VIEW_M, len(steps), scripts)
+            stops = self._barrier_stops
+            return Travel(types, steps, stops, 0, 0.0, VIEW_M, VIEW_M, len(steps), scripts)
         types = np.concatenate([types, self.file.types, actors])
         steps = np.concatenate([steps, self.schedule.steps])
         num_fixed = len(steps)
@@ -181,7 +182,7 @@ class NativeTraffic:
         return Travel(
             types,
             steps,
-            self.file.stops,
+            np.concatenate([self.file.stops, self._barrier_stops]),
             first_detour,
             begin_s,
             view_m=self._farthest_m(look_ahead_m),
@@ -189,6 +190,18 @@ class NativeTraffic:
             num_fixed=num_fixed,
             scripts=scripts,
         )
+
+    @property
+    def _barrier_stops(self) -> NDArray[np.void]:
+        """STOP (L,), where a barrier stands on each lane; none where nothing may be put."""
+        lanes = self.network.lanes
+        stops = np.zeros(len(lanes) if self.population.insertions else 0, dtype=STOP)
+        stops["lane"], stops["at_edge"] = np.arange(len(stops)), -1
+        stops["end"] = np.minimum(
+            float(self.blank["length"][0]) + 1.0, lanes["length_m"][: len(stops)]
+        )
+        stops["duration"], stops["until"] = np.inf, -1.0
+        return stops
 
     def _travel_of_sumo(
         self, sumo: SumoDemand, types: NDArray[np.void], fixed: NDArray[np.void]
@@ -216,7 +229,8 @@ class NativeTraffic:
 
         IDM reacts to whatever is ahead, and agents may drive as fast as they like.
         """
-        if self.file is None or self.population.agents + self.population.background > 0:
+        own = self.population
+        if self.file is None or own.agents + own.background + own.insertions > 0:
             return VIEW_M
         fast_mps = FAST_FACTOR * float(self.network.lanes["speed_mps"].max())
         return max(
@@ -321,6 +335,11 @@ class NativeTraffic:
         """Put the orders that are due by the coming tick into the queue."""
         self._calls.call_orders(gate, worlds)
 
+    def insert(self, gate: Gate, worlds: Worlds, inserted: NDArray[np.float64]) -> None:
+        """Put what is to enter in this step into the queue; `inserted` as in `Commands`."""
+        args = (self.demand, self.network.arrays, self.travel, len(self.plans))
+        self._calls.insert(*args, inserted, gate, worlds)
+
     def accept(self, gate: Gate, running: NDArray[np.int64]) -> None:
         """Choose among vehicles that could enter; `running` (W,) are in the worlds already."""
         self._calls.accept(gate, running, self.capacity)
@@ -374,7 +393,7 @@ def _capacity(
     horizon_s: float,
 ) -> int:
     """No more vehicles than are ordered, or fit on the map."""
-    own = population.agents + population.background
+    own = population.agents + population.background + population.insertions
     if schedule is None or not len(schedule.demand.types):
         return own
     shortest = float(schedule.demand.types["length"].min())

@@ -12,7 +12,10 @@ from cavmarl.core.errors import MessageError
 MAX_TEXT = 4096
 MAX_PACE = 1000.0
 # Kinds that change the world or its clock; the others only change what the page itself is told.
-CONTROLS = frozenset({"pause", "play", "step", "pace", "reset", "seat", "drive", "seek"})
+CONTROLS = frozenset(
+    {"pause", "play", "step", "pace", "reset", "seat", "drive", "seek", "insert", "close"}
+)
+MAX_PLACE_M = 1e7
 
 
 @dataclass(frozen=True)
@@ -21,9 +24,12 @@ class PageRequest:
 
     Attributes:
         kind: `watch` a vehicle, mark the `ghosts` of a zone; of `CONTROLS`: `pause`, `play`,
-            `step`, `pace`, `reset`, take a `seat` and `drive` in it, `seek` a tick of a recording.
+            `step`, `pace`, `reset`, take a `seat` and `drive` in it, `seek` a tick of a recording,
+            `insert` a vehicle at a place, `close` the road there.
         number: the vehicle, zone, agent or tick, None for none; seconds of the world in one of ours
             as `pace`, 0 for as fast as it can.
+        x: of the place, m from the map's origin.
+        y: likewise.
         sensors: whether to tell what the sensors of a vehicle see that is watched.
         throttle: within [-1, 1].
         steering: within [-1, 1], positive to the left.
@@ -34,6 +40,8 @@ class PageRequest:
     throttle: float = 0.0
     steering: float = 0.0
     sensors: bool = False
+    x: float = 0.0
+    y: float = 0.0
 
 
 def read_object(text: str) -> dict[str, Any]:
@@ -73,6 +81,9 @@ def read_request(text: str) -> PageRequest:
         throttle = _within("throttle", found.get("throttle"), -1.0, 1.0)
         steering = _within("steering", found.get("steering"), -1.0, 1.0)
         return PageRequest(kind, None, throttle, steering)
+    if kind in ("insert", "close"):
+        x, y = (_within(name, found.get(name), -MAX_PLACE_M, MAX_PLACE_M) for name in ("x", "y"))
+        return PageRequest(kind, x=x, y=y)
     raise MessageError(f"a request of the kind {str(kind)[:40]!r}: there is none of that kind")
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from cavmarl.engine.world_frame import WorldFrame
 from cavmarl.viewer.frame_publisher import FramePublisher
+from cavmarl.viewer.inserted_here import put_in
 from cavmarl.viewer.run_clock import RunClock
 from cavmarl.viewer.run_loads import RunLoads
 from cavmarl.viewer.show_world import check_extra, serve_stages
@@ -76,9 +77,11 @@ class ShownEnv:
         self._clock.tick(time.monotonic(), self._env.step_s)
 
     def _heed(self) -> None:
-        for audience in self._audiences:
-            for _, request in audience.requests():
-                self._clock.heed(request)
+        for world, audience in enumerate(self._audiences):
+            for number, request in audience.requests():
+                if not self._clock.heed(request) and self._controlled and self._env.is_ready:
+                    tick = int(self._env.worlds.arrays.ticks[world])
+                    put_in(self._env, world, audience, number, request, tick)
 
     def _publish(self) -> None:
         for world, publisher in enumerate(self._publishers):

@@ -10,7 +10,7 @@ import numpy as np
 from cavmarl.core.errors import RecordingError
 from cavmarl.engine.world_frame import WorldFrame
 from cavmarl.recordings.recording import Recording
-from cavmarl.viewer.frame_publisher import TIME_LINE, FramePublisher
+from cavmarl.viewer.frame_publisher import ASKED, TIME_LINE, FramePublisher
 from cavmarl.viewer.run_clock import RunClock
 from cavmarl.viewer.stage import Stage, first_stage
 from cavmarl.viewer.vehicle_details import (
@@ -106,7 +106,7 @@ class ShownRecording:
         events = [
             list(found.event)
             for found in self._recording.events(self._world)
-            if found.episode == self._episode and found.event.kind in TIME_LINE
+            if found.episode == self._episode and found.event.kind in TIME_LINE | ASKED
         ]
         if len(events) > MOST_TOLD:
             events = [event for event in events if event[1] not in QUIET]

@@ -19,6 +19,7 @@ from cavmarl.engine.world_frame import WorldFrame
 from cavmarl.env.parallel import CavEnv
 from cavmarl.policies.policy import Policy
 from cavmarl.viewer.frame_publisher import FramePublisher
+from cavmarl.viewer.inserted_here import put_in
 from cavmarl.viewer.page_requests import PageRequest
 from cavmarl.viewer.run_clock import RunClock
 from cavmarl.viewer.stage import Stage
@@ -72,6 +73,10 @@ class ShownRun:
         self.publisher.publish(time.monotonic(), self.clock, self._see, self._tell)
         return wait_s
 
+    @property
+    def _tick(self) -> int:
+        return int(self._env.worlds.arrays.ticks[0])
+
     def _see(self, ghosts: bool) -> WorldFrame:
         return self._env.world_frames(ghosts=ghosts)[0]
 
@@ -103,6 +108,8 @@ class ShownRun:
         if request.kind == "reset":
             self._observations, _ = self._env.reset()
             self.publisher.is_new = True
+        elif put_in(self._env, 0, self._audience, number, request, self._tick):
+            return
         elif request.kind == "seat":
             self._give_seat(number, request.number)
         elif request.kind == "drive":

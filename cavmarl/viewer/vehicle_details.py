@@ -75,6 +75,8 @@ def hello_of(env: Shown, policy: str, *, is_driven_here: bool = True) -> dict[st
     hello = hello_of_map(f"{config.name}", env.network, partition, env.step_s) | own
     if is_driven_here:
         hello["may"] = [*hello["may"], "reset", "seat"]
+    if config.population.insertions:
+        hello["may"] = [*hello["may"], "insert", "close"]
     return hello
 
 

@@ -35,11 +35,11 @@ TYPES = {
 }
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
-    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    "frame-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'self'"
 )
 # Of Jupyter on this machine, and of the notebooks of VS Code.
 NOTEBOOKS = "http://127.0.0.1:* http://localhost:* vscode-webview:"
-FRAMED_POLICY = POLICY.replace("frame-ancestors 'none'", f"frame-ancestors {NOTEBOOKS}")
+FRAMED_POLICY = POLICY.replace("frame-ancestors 'self'", f"frame-ancestors 'self' {NOTEBOOKS}")
 HEADERS = {
     "content-security-policy": POLICY,
     "x-content-type-options": "nosniff",
@@ -190,6 +190,7 @@ class _LiveSocket:
         self._options = options
         self._stages = stages
         self._audience = stages[0].audience
+        self._may_control = options.control
 
     async def serve(self) -> None:
         await self._socket.accept()
@@ -201,7 +202,7 @@ class _LiveSocket:
             self._audience = stage.audience
             watcher = self._audience.join()
             try:
-                welcome = welcome_of(self._stages, number, self._options.control)
+                welcome = welcome_of(self._stages, number, self._may_control)
                 await self._send(json.dumps(welcome))
                 await self._send(stage.map_bytes)
                 await self._watch(watcher)
@@ -223,7 +224,10 @@ class _LiveSocket:
             return None
         token = first.get("token")
         given = token.encode() if isinstance(token, str) else b""
-        if not hmac.compare_digest(given, self._options.token.encode()):
+        watch = self._options.watch_token.encode()
+        if watch and hmac.compare_digest(given, watch):
+            self._may_control = False
+        elif not hmac.compare_digest(given, self._options.token.encode()):
             if self._options.token or given:
                 await asyncio.sleep(WRONG_TOKEN_S)
                 await self._socket.close(
@@ -275,5 +279,5 @@ class _LiveSocket:
             except (MessageError, KeyError) as error:
                 await self._socket.close(NOT_UNDERSTOOD, str(error)[:100])
                 return
-            if self._options.control or request.kind not in CONTROLS:
+            if self._may_control or request.kind not in CONTROLS:
                 self._audience.ask(watcher, request)

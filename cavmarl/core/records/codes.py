@@ -17,6 +17,11 @@ MODEL_IDM = 1
 MODEL_ACC = 2
 
 # DEPARTURE["lane_code"]: on which lane of its edge a vehicle enters
+# What is put into a world while it runs, `Commands.inserted`.
+INSERT_NONE = 0
+INSERT_VEHICLE = 1
+INSERT_BARRIER = 2  # it stands to the end of the episode
+
 LANE_GIVEN = 0
 LANE_FIRST = -1  # the one nearest to the kerb of those that it may use
 LANE_RANDOM = -2

@@ -266,4 +266,6 @@ def _digest(commands: Commands, w: int) -> bytes:
     digest.update(commands.meta_actions[w].tobytes())
     if commands.declared.any():
         digest.update(commands.declared[w].tobytes())
+    if commands.inserted.any():
+        digest.update(commands.inserted[w].tobytes())
     return digest.digest()

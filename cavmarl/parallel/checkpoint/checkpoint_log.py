@@ -114,7 +114,8 @@ class CheckpointLog:
 
 
 def _layout(config: EnvConfig, num_worlds: int) -> Layout:
-    agents: tuple[int, ...] = (2 * STEPS, num_worlds, config.population.num_ids)
-    return dict(
-        zip(COMMANDS, (("<f8", (*agents, 2)), ("<i8", agents), ("<i4", agents)), strict=True)
-    )
+    worlds: tuple[int, ...] = (2 * STEPS, num_worlds)
+    agents = (*worlds, config.population.num_ids)
+    inserted = (*worlds, config.population.insertions, 3)
+    kinds = (("<f8", (*agents, 2)), ("<i8", agents), ("<i4", agents), ("<f8", inserted))
+    return dict(zip(COMMANDS, kinds, strict=True))

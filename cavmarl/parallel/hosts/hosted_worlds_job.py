@@ -34,7 +34,7 @@ _BEGUN = ("observations", "mask", "vehicle_ids", "vehicle_done", "terms", "ticks
 def inputs_of(task: int, arrays: StepArrays) -> list[Array]:
     """What goes into a task, at both ends."""
     if task == Task.STEP:
-        return [arrays.controls, arrays.meta_actions, arrays.declared]
+        return [arrays.controls, arrays.meta_actions, arrays.declared, arrays.inserted]
     return [arrays.chosen] if task == Task.RESET else []
 
 

@@ -17,7 +17,7 @@ from cavmarl.parallel.worlds_job import Task
 
 _HEAD = struct.Struct("<II")
 _INPUTS: Mapping[Task, tuple[str, ...]] = {
-    Task.STEP: ("controls", "meta_actions", "declared"),
+    Task.STEP: ("controls", "meta_actions", "declared", "inserted"),
     Task.RESET: ("chosen",),
 }
 _COMMON = (

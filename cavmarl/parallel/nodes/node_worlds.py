@@ -84,6 +84,7 @@ class NodeWorlds(NodePool):
         if self.mover is not None:
             self.mover.before_step(self._move, self._measured)
         arrays.declared[:] = commands.declared if commands.declared.size else 0
+        arrays.inserted[:] = commands.inserted if commands.inserted.size else 0
         results = self.run(self._command(Task.STEP))
         self._ticks_done += self._ticks_per_step
         clear_sensed(arrays, np.ones(len(arrays.chosen), dtype=np.bool_))

@@ -29,8 +29,11 @@ from cavmarl.core.records.codes import (
     DRIVER_AGENT,
     DRIVER_BACKGROUND,
     EVENT_ARRIVED,
+    INSERT_BARRIER,
+    INSERT_NONE,
     LANE_GIVEN,
     POS_GIVEN,
+    SPEED_GIVEN,
     SPEED_MAX,
     SUM_DELAY_S,
     SUM_DISTANCE_M,
@@ -64,33 +67,81 @@ def _order(
 ) -> None:
     """Number and draw one departure and put it at the end of the queue."""
     own_map = map_of(worlds.keys[w], roads.maps.shape[0])
-    vehicle = gate.next_id[w]
-    gate.next_id[w] = vehicle + 1
-    key = worlds.keys[w]
+    departure = gate.queue[w, _number(demand, gate, worlds, w)]
+    vehicle, key = departure["id"], worlds.keys[w]
     trip = _draw(trips, own_map, key, vehicle, 0)
-    departure = gate.queue[w, gate.num_queue[w]]
-    gate.num_queue[w] += 1
-    departure["id"] = vehicle
     departure["agent"] = agent
-    departure["order"] = -1
-    departure["vtype"] = demand.blank[0]["vtype"]
     if agent >= 0:
         departure["vtype"] = demand.agent_types[agent % demand.agent_types.shape[0]]
-    departure["stop"] = -1
-    departure["stops_end"] = -1
-    departure["lane_code"] = LANE_GIVEN
-    departure["pos_code"] = POS_GIVEN
-    departure["speed_code"] = SPEED_MAX
-    departure["due"] = worlds.ticks[w]
     _send(roads, departure, trips.pairs[trip, 0], trips.pairs[trip, 1])
-    spread = 2.0 * uniform(key, vehicle, 0, STREAM_SPEED_FACTOR) - 1.0
-    departure["speed_factor"] = 1.0 + demand.speed_factor_spread * spread
     length = roads.lanes[departure["lane"]]["length_m"]
     body = travel.types[departure["vtype"]]["length"]
     departure["pos"] = body + 1.0
     if agent >= 0 or not demand.enter_at_start[own_map]:
         free = max(length - body - END_ROOM_M, 0.0)
         departure["pos"] += free * uniform(key, vehicle, 0, STREAM_PLACE)
+
+
+@kernel
+def _number(demand: Demand, gate: Gate, worlds: Worlds, w: int) -> int:
+    """Put a numbered departure of the generator's type at the end of the queue; its place."""
+    vehicle = gate.next_id[w]
+    gate.next_id[w] = vehicle + 1
+    place = gate.num_queue[w]
+    departure = gate.queue[w, place]
+    gate.num_queue[w] = place + 1
+    departure["id"] = vehicle
+    departure["agent"] = -1
+    departure["order"] = -1
+    departure["vtype"] = demand.blank[0]["vtype"]
+    departure["stop"] = -1
+    departure["stops_end"] = -1
+    departure["lane_code"] = LANE_GIVEN
+    departure["pos_code"] = POS_GIVEN
+    departure["speed_code"] = SPEED_MAX
+    departure["due"] = worlds.ticks[w]
+    spread = 2.0 * uniform(worlds.keys[w], vehicle, 0, STREAM_SPEED_FACTOR) - 1.0
+    departure["speed_factor"] = 1.0 + demand.speed_factor_spread * spread
+    return place
+
+
+@kernel
+def insert(
+    demand: Demand,
+    roads: RoadArrays,
+    travel: Travel,
+    num_goals: int,
+    inserted: NDArray[np.float64],  # as in `Commands`
+    gate: Gate,
+    worlds: Worlds,
+) -> None:
+    """Put what is to enter from outside at the end of the queue.
+
+    It drives to the first goal, from a drawn one on, that is farther than `WANDER_M`; on a lane
+    that leads to none it stands at its end. A barrier has the last STOP rows, one a lane.
+    """
+    lanes = roads.lanes.shape[0]
+    for w in range(worlds.ticks.shape[0]):
+        for n in range(inserted.shape[1]):
+            if inserted[w, n, 0] == INSERT_NONE or gate.num_queue[w] >= gate.queue.shape[1]:
+                continue
+            departure = gate.queue[w, _number(demand, gate, worlds, w)]
+            lane = np.int64(inserted[w, n, 1])
+            first = below(worlds.keys[w], departure["id"], 0, STREAM_ROUTE, num_goals)
+            _send(roads, departure, lane, first)
+            for k in range(num_goals):
+                goal = (first + k) % num_goals
+                to_go = travel.steps[goal * lanes + lane]["to_go"]
+                if to_go < math.inf and to_go > WANDER_M:
+                    _send(roads, departure, lane, goal)
+                    break
+            departure["pos"] = inserted[w, n, 2]
+            if inserted[w, n, 0] == INSERT_BARRIER:
+                departure["stop"] = travel.stops.shape[0] - lanes + lane
+                departure["stops_end"] = departure["stop"] + 1
+                departure["pos"] = travel.stops[departure["stop"]]["end"]
+                departure["speed_code"] = SPEED_GIVEN
+                departure["speed"] = 0.0
 
 
 @kernel

@@ -18,7 +18,7 @@ const SMOOTH_S = 1.5; // of the world, from frame to frame; beyond that vehicles
 const page = {
   hello: null, map: null, camera: null, gl: null, layers: null, vehicles: null,
   roster: new Roster(0, 0), frame: null, live: null, line: new TimeLine(), world: 0,
-  looksBack: false, chosen: null, wanted: null, following: false, told: null, shapes: null,
+  placing: null, allWorlds: false, token: "", looksBack: false, chosen: null, wanted: null, following: false, told: null, shapes: null,
   coloring: "agent", theme: "light", ghosts: null,
   arrived: 0, between: 100, dirty: true, socket: null, over: false,
   times: [], takes: [], firstPicture: 0, calls: 0, stillDrawn: 0,
@@ -86,14 +86,18 @@ function take(told) {
   else if (told.kind === "events") takeEvents(told.events);
   else if (told.kind === "seat") takeSeat(told);
   else if (told.kind === "loads") showLoads(told.rows);
+  else if (told.kind === "notice") briefly(told.text);
 }
 
 const may = (what) => page.hello.control && page.hello.may.includes(what);
 
 function takeHello(hello) {
   page.hello = hello;
+  for (const id of ["insert", "close"]) $(id).hidden = !may(id);
+  placing(null);
+  if (!page.allWorlds) $("all").hidden = hello.worlds.length < 2 || small;
   notice("");
-  $("title").textContent = hello.title;
+  $("title").textContent = small ? hello.worlds[hello.world] : hello.title;
   document.title = `${hello.title} – cavmarl`;
   for (const id of ["play", "step", "pace"]) $(id).disabled = !may(id === "play" ? "pause" : id);
   $("reset").hidden = !hello.may.includes("reset");
@@ -137,7 +141,10 @@ function takeMap(map) {
   }
   if (again) return;
   listenToPointers($("scene"), page.camera, {
-    click: choose,
+    click(px, py) {
+      if (page.placing) place(...page.camera.toMetres(px, py));
+      else choose(px, py);
+    },
     moved(byHand) {
       if (byHand) follow(false);
       dirty();
@@ -304,6 +311,46 @@ function choose(px, py) {
   watch(row < 0 ? null : page.frame.roster.ids[row]);
 }
 
+// ---- what is put into the world
+
+// The next click on the map, or Enter there, says where: "insert", "close" or null.
+function placing(kind) {
+  page.placing = kind;
+  for (const id of ["insert", "close"]) $(id).setAttribute("aria-pressed", String(id === kind));
+  $("scene").classList.toggle("placing", kind !== null);
+  if (kind) notice("Click on a road, or press Enter for the one in the middle. Escape leaves it.");
+  else notice("");
+}
+
+function togglePlacing(kind) {
+  placing(page.placing === kind ? null : kind);
+  if (page.placing) $("scene").focus();
+}
+
+function place(x, y) {
+  ask({ kind: page.placing, x, y });
+  placing(null);
+}
+
+function briefly(text) {
+  notice(text);
+  setTimeout(() => notice(""), 5000);
+}
+
+// ---- all worlds side by side, each in a small page of its own
+
+const small = parent !== window && Boolean(parent.viewer);
+
+function toggleAll() {
+  page.allWorlds = !page.allWorlds;
+  $("all").setAttribute("aria-pressed", String(page.allWorlds));
+  $("worlds").hidden = !page.allWorlds;
+  const shown = page.allWorlds ? page.hello.worlds : [];
+  $("worlds").style.setProperty("--columns", String(Math.ceil(Math.sqrt(shown.length))));
+  $("worlds").replaceChildren(...shown.map((name, k) =>
+    element("iframe", undefined, { src: `/?small#world=${k}`, title: name })));
+}
+
 function showSeat() {
   const driving = seat.agent !== null;
   $("seat").setAttribute("aria-pressed", String(driving));
@@ -328,7 +375,7 @@ function resize() {
     canvas.width = Math.max(1, Math.round(canvas.clientWidth * density));
     canvas.height = Math.max(1, Math.round(canvas.clientHeight * density));
   }
-  if (page.camera) page.camera.covered = innerWidth > 700 ? 310 : 0;
+  if (page.camera) page.camera.covered = innerWidth > 700 && !small ? 310 : 0;
   dirty();
 }
 
@@ -415,8 +462,7 @@ function find(text) {
   const agent = page.hello.agents.indexOf(wanted);
   const row = agent >= 0 ? page.roster.agents.indexOf(agent) : page.roster.find(Number(wanted));
   if (!wanted || row < 0) {
-    notice(`There is no vehicle ${wanted} now.`);
-    setTimeout(() => notice(""), 3000);
+    briefly(`There is no vehicle ${wanted} now.`);
     return;
   }
   watch(page.roster.ids[row]);
@@ -451,7 +497,10 @@ const ACTIONS = {
   Home: () => { follow(false); page.camera.home(); },
   f: () => follow(!page.following),
   "/": () => $("wanted").focus(),
-  Escape: () => { if (seat.agent !== null) toggleSeat(); else watch(null); },
+  Enter: () => {
+    if (page.placing) place(page.camera.x - page.camera.covered / 2 / page.camera.scale, page.camera.y);
+  },
+  Escape: () => { if (page.placing) placing(null); else if (seat.agent !== null) toggleSeat(); else watch(null); },
 };
 
 function onKey(event) {
@@ -482,6 +531,9 @@ function wire() {
   on("reset", "click", () => ask({ kind: "reset" }));
   on("pace", "change", () => ask({ kind: "pace", number: Number($("pace").value) }));
   on("past", "input", () => lookAt(Number($("past").value)));
+  on("insert", "click", () => togglePlacing("insert"));
+  on("close", "click", () => togglePlacing("close"));
+  on("all", "click", toggleAll);
   on("live", "click", () => lookAt(page.line.frames.length - 1));
   on("sensors", "change", askToWatch);
   on("world", "change", () => goTo(Number($("world").value)));
@@ -527,7 +579,8 @@ function begin() {
   wire();
   const named = /^#world=(\d+)$/.exec(location.hash);
   if (named) page.world = Number(named[1]);
-  connect("");
+  document.documentElement.classList.toggle("small", small);
+  connect(small ? parent.viewer.token : "");
   requestAnimationFrame(draw);
 }
 

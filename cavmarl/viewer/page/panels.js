@@ -76,7 +76,7 @@ export function showLegend(entries) {
 const WORDS = {
   collision: "collision", off_road: "off the road", wrong_way: "wrong way",
   red_light: "red light run", arrived: "arrived", transferred: "handed over",
-  episode: "new episode",
+  episode: "new episode", inserted: "vehicle added", closed: "road closed",
 };
 
 export function addEvents(events, stepTime, choose) {

@@ -1,0 +1,141 @@
+"""`Insertions`: what is put into running worlds from outside, until the next step."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config.env import EnvConfig
+from cavmarl.core.errors import ActionError, CapacityError, ConfigError
+from cavmarl.core.records.codes import INSERT_BARRIER, INSERT_NONE, INSERT_VEHICLE
+from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.shards.shard import Commands
+
+_CARS = 1 << VEHICLE_CLASSES.index("passenger")
+INSERTED, CLOSED = "inserted", "closed"  # kinds of the events that tell of it
+
+Asked = tuple[tuple[str, str], ...]
+"""Kind and detail of what was put into a world in one step, as `WorldFrame.asked` has it."""
+
+
+class Insertions:
+    """Vehicles and barriers for W worlds, at most `population.insertions` in an episode of each.
+
+    Args:
+        config: of the worlds.
+        network: their map.
+        num_worlds: W.
+    """
+
+    def __init__(self, config: EnvConfig, network: RoadNetwork, num_worlds: int) -> None:
+        self._most = config.population.insertions
+        self._network = network
+        self._lanes = {name: k for k, name in enumerate(network.lane_ids)} if self._most else {}
+        self._rows = np.zeros((num_worlds, self._most, 3))
+        self._waiting = np.zeros(num_worlds, dtype=np.int64)
+        self._used = np.zeros(num_worlds, dtype=np.int64)  # in the episode, with those that wait
+        self._told: list[Asked] = [()] * num_worlds  # of the last step
+
+    @property
+    def memory(self) -> tuple[NDArray[Any], ...]:
+        """What waits, and how many there have been."""
+        return self._rows, self._waiting, self._used
+
+    @memory.setter
+    def memory(self, memory: tuple[NDArray[Any], ...]) -> None:
+        self._rows[:], self._waiting[:], self._used[:] = memory
+
+    def vehicle(self, world: int, lane: str, position_m: float) -> None:
+        """Let a car enter on a lane, at a place of its front bumper.
+
+        Raises:
+            ActionError: no such world, lane or place, or cars may not drive there.
+            CapacityError: there have been as many as there is room for.
+            ConfigError: nothing may be put into these worlds.
+        """
+        row = self._lane(world, lane)
+        length_m = float(self._network.lanes["length_m"][row])
+        if not 0.0 <= position_m <= length_m:
+            raise ActionError(
+                f"position_m = {position_m:g}: lane {lane} is {length_m:.1f} m long; give a place "
+                "on it"
+            )
+        self._add(world, [(INSERT_VEHICLE, row, position_m)])
+
+    def barrier(self, world: int, edge: str) -> None:
+        """Let a car stand on each lane of an edge to the end of the episode; raises likewise."""
+        self._check(world)
+        lanes, edges = self._network.lanes, self._network.edge_ids
+        if edge not in edges:
+            raise ActionError(f"edge {edge!r}: the map has no such edge; give the id of one")
+        rows = np.flatnonzero(lanes["edge"] == edges.index(edge))
+        rows = rows[(lanes["permissions"][rows] & _CARS) != 0]
+        if not len(rows) or lanes["internal"][rows].any():
+            raise ActionError(f"edge {edge!r}: cars drive on no lane of it; give a road")
+        self._add(world, [(INSERT_BARRIER, int(row), 0.0) for row in rows])
+
+    def _check(self, world: int) -> None:
+        if not self._most:
+            raise ConfigError(
+                "nothing may be put into these worlds: set population.insertions to how many "
+                "vehicles may be in one episode"
+            )
+        if not 0 <= world < len(self._used):
+            raise ActionError(f"world {world}: there are the worlds 0 to {len(self._used) - 1}")
+
+    def _lane(self, world: int, lane: str) -> int:
+        self._check(world)
+        row, lanes = self._lanes.get(lane, -1), self._network.lanes
+        if row < 0:
+            raise ActionError(f"lane {lane!r}: the map has no such lane; give the id of one")
+        if lanes["internal"][row] or not lanes["permissions"][row] & _CARS:
+            raise ActionError(f"lane {lane!r}: cars enter on no such lane; give one of a road")
+        return row
+
+    def _add(self, world: int, rows: list[tuple[int, int, float]]) -> None:
+        used, waiting = int(self._used[world]), int(self._waiting[world])
+        if used + len(rows) > self._most:
+            raise CapacityError(
+                f"{len(rows)} more vehicles for world {world}: {used} of population.insertions = "
+                f"{self._most} have been put there in this episode; set it higher, or reset"
+            )
+        self._rows[world, waiting : waiting + len(rows)] = rows
+        self._waiting[world] += len(rows)
+        self._used[world] += len(rows)
+
+    def add_to(self, commands: Commands) -> Commands:
+        """Commands of a step with all that was asked for."""
+        if not self._most:
+            return commands
+        rows = self._rows.copy()
+        self._told = [self._text(w, count) for w, count in enumerate(self._waiting.tolist())]
+        self._rows[:] = INSERT_NONE
+        self._waiting[:] = 0
+        return replace(commands, inserted=rows)
+
+    def _text(self, world: int, count: int) -> Asked:
+        """What waits, in words: a road once."""
+        network = self._network
+        found: dict[Any, tuple[str, str]] = {}
+        for k, (kind, lane, place) in enumerate(self._rows[world, :count].tolist()):
+            if kind == INSERT_BARRIER:
+                edge = network.edge_ids[int(network.lanes["edge"][int(lane)])]
+                found[edge] = (CLOSED, edge)
+            else:
+                found[k] = (INSERTED, f"{network.lane_ids[int(lane)]} {place!r}")
+        return tuple(found.values())
+
+    def told(self, world: int) -> Asked:
+        """What was put into a world in the last step."""
+        return self._told[world]
+
+    def forget(self, chosen: NDArray[np.bool_]) -> None:
+        """Begin an episode in the chosen worlds (W,)."""
+        self._used[chosen] = 0
+        self._rows[chosen] = INSERT_NONE
+        self._waiting[chosen] = 0
+        for world in np.flatnonzero(chosen).tolist():
+            self._told[world] = ()

@@ -1,0 +1,182 @@
+"""Vehicles and barriers put into running worlds: the same wherever they run, and on record."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cavmarl import (
+    ActionError,
+    CapacityError,
+    CavEnv,
+    ConfigError,
+    make_vec,
+    parallel_env,
+)
+from cavmarl.recordings.recording import Recording
+
+ROOM = {"population.insertions": 12}
+
+
+def edge_of(env: CavEnv, k: int = 0) -> str:
+    """A road with cars on it; the k-th of them."""
+    rows = env.simulation.vehicles(0)
+    lanes = env.network.lanes[rows["lane"]]
+    edges = np.unique(lanes["edge"][~lanes["internal"]])
+    return env.network.edge_ids[int(edges[k])]
+
+
+def act(env: Any, step: int) -> None:
+    """What pages may ask for, at some steps."""
+    network = env.network
+    roads = np.flatnonzero(~network.lanes["internal"] & (network.lanes["length_m"] > 60.0))
+    if step in (4, 5, 30):
+        env.insert_vehicle(network.lane_ids[int(roads[step])], 20.0 + step)
+    if step == 10:
+        env.close_road(network.edge_ids[int(network.lanes["edge"][roads[7]])])
+
+
+def hashes(**more: Any) -> list[str]:
+    with closing(parallel_env("grid4x4", agents=3, background=40, overrides=ROOM, **more)) as env:
+        env.reset(seed=2)
+        found = []
+        for step in range(60):
+            act(env, step)
+            env.step(env.suggest_actions())
+            if step % 10 == 9:
+                found.append(env.state_hash())
+        return found
+
+
+def test_a_divided_world_with_insertions_equals_the_undivided_one() -> None:
+    undivided = hashes()
+    assert hashes(zones=4) == undivided
+    assert hashes(zones=4, workers=2) == undivided
+    assert hashes(zones=2, nodes=2) == undivided
+
+
+def test_room_alone_changes_nothing() -> None:
+    found = []
+    for overrides in ({}, ROOM):
+        with closing(parallel_env("grid4x4", agents=3, overrides=overrides)) as env:
+            env.reset(seed=2)
+            for _ in range(30):
+                env.step(env.suggest_actions())
+            found.append(env.state_hash())
+    assert found[0] == found[1]
+
+
+def test_a_run_follows_from_its_recording(tmp_path: Path) -> None:
+    with closing(
+        parallel_env("grid4x4", agents=3, background=40, overrides=ROOM, record=tmp_path / "run")
+    ) as env:
+        env.reset(seed=2)
+        for step in range(40):
+            act(env, step)
+            env.step(env.suggest_actions())
+        wanted = env.state_hash()
+    recording = Recording.open(tmp_path / "run")
+    told = {}
+    for found in recording.events():
+        if found.event.kind in ("inserted", "closed"):
+            told.setdefault(found.event.tick, []).append(found.event)
+    assert sorted(event.kind for events in told.values() for event in events) == [
+        "closed", "inserted", "inserted", "inserted",
+    ]  # fmt: skip
+    ticks = recording.ticks()
+    with closing(parallel_env("grid4x4", agents=3, background=40, overrides=ROOM)) as env:
+        env.reset(seed=2)
+        for tick in ticks[1:]:
+            for event in told.get(tick, ()):
+                if event.kind == "closed":
+                    env.close_road(event.detail)
+                else:
+                    lane, place = event.detail.rsplit(" ", 1)
+                    env.insert_vehicle(lane, float(place))
+            env.step(env.suggest_actions())
+        assert env.state_hash() == wanted
+
+
+def test_an_inserted_vehicle_drives_and_a_closed_road_stays_closed() -> None:
+    with closing(parallel_env("grid4x4", agents=1, background=0, overrides=ROOM)) as env:
+        env.reset(seed=0)
+        lanes = env.network.lanes
+        mine = int(env.simulation.vehicles(0)["lane"][0])
+        others = np.flatnonzero(
+            ~lanes["internal"] & (lanes["edge"] != lanes["edge"][mine]) & (lanes["length_m"] > 60)
+        )
+        lane = env.network.lane_ids[int(others[0])]
+        env.insert_vehicle(lane, 30.0)
+        env.step(env.suggest_actions())
+        rows = env.simulation.vehicles(0)
+        new = rows[rows["agent"] < 0][0]
+        assert env.network.lane_ids[int(new["lane"])] == lane
+        edge = env.network.edge_ids[int(lanes["edge"][others[-1]])]
+        env.close_road(edge)
+        for _ in range(100):
+            env.step(env.suggest_actions())
+        rows = env.simulation.vehicles(0)
+        moved = rows[rows["id"] == new["id"]]
+        assert moved["distance_m"][0] > 20.0
+        barriers = rows[(rows["agent"] < 0) & (rows["id"] != new["id"])]
+        names = {env.network.edge_ids[int(k)] for k in lanes["edge"][barriers["lane"]]}
+        assert names == {edge}
+        assert len(barriers) == int((lanes["edge"] == lanes["edge"][others[-1]]).sum())
+        assert (barriers["speed"] == 0.0).all()
+        assert (barriers["distance_m"] < 0.5).all()
+
+
+def test_what_cannot_be_put_there_is_refused_with_its_cure() -> None:
+    with closing(parallel_env("grid4x4")) as env:
+        env.reset(seed=0)
+        with pytest.raises(ConfigError, match=r"set population\.insertions"):
+            env.close_road(edge_of(env))
+    with closing(make_vec("grid4x4", num_envs=2, overrides={"population.insertions": 2})) as vec:
+        vec.reset(seed=0)
+        roads = np.flatnonzero(~vec.network.lanes["internal"])
+        lane = vec.network.lane_ids[int(roads[0])]
+        inside = vec.network.lane_ids[int(np.flatnonzero(vec.network.lanes["internal"])[0])]
+        with pytest.raises(ActionError, match="no such lane; give the id of one"):
+            vec.insert_vehicle("nowhere", 1.0)
+        with pytest.raises(ActionError, match="give one of a road"):
+            vec.insert_vehicle(inside, 1.0)
+        with pytest.raises(ActionError, match="m long; give a place on it"):
+            vec.insert_vehicle(lane, float("nan"))
+        with pytest.raises(ActionError, match="there are the worlds 0 to 1"):
+            vec.insert_vehicle(lane, 1.0, world=2)
+        with pytest.raises(ActionError, match="no such edge"):
+            vec.close_road("nowhere")
+        for _ in range(2):
+            vec.insert_vehicle(lane, 10.0, world=1)
+        with pytest.raises(CapacityError, match="set it higher, or reset"):
+            vec.insert_vehicle(lane, 10.0, world=1)
+        vec.insert_vehicle(lane, 10.0, world=0)
+        vec.reset()
+        vec.insert_vehicle(lane, 10.0, world=1)
+    with pytest.raises(ConfigError, match=r"population\.insertions = 3: .*of one map"):
+        parallel_env("cities", overrides={"population.insertions": 3})
+
+
+def test_saved_states_have_what_waits() -> None:
+    def finished(step: int, saved: bytes | None) -> tuple[str, bytes | None]:
+        with closing(make_vec("grid4x4", background=20, overrides=ROOM)) as vec:
+            vec.reset(seed=1)
+            if saved is not None:
+                vec.load_state(saved)
+            kept = None
+            for now in range(step, 30):
+                if saved is None:
+                    act(vec, now)
+                if now == 10 and saved is None:
+                    kept = vec.save_state()
+                if now > 10 and saved is not None:
+                    act(vec, now)
+                vec.step(vec.suggest_actions())
+            return vec.state_hash(0), kept
+
+    wanted, saved = finished(0, None)
+    assert finished(10, saved)[0] == wanted
