@@ -9,7 +9,7 @@ from typing import Annotated
 from rich.console import Console
 from rich.markup import escape
 
-from cavmarl.cli.evaluate import progress_bar, report_cell
+from cavmarl.cli.evaluate import report_cell
 from cavmarl.cli.output import (
     Agents,
     Background,
@@ -21,6 +21,7 @@ from cavmarl.cli.output import (
     make_folder,
     write_json,
 )
+from cavmarl.cli.progress import progress_bar
 from cavmarl.core.errors import ConfigError, require
 
 

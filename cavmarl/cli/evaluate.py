@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from cavmarl.cli.output import (
@@ -29,6 +28,7 @@ from cavmarl.cli.output import (
     with_world,
     write_json,
 )
+from cavmarl.cli.progress import progress_bar
 from cavmarl.cli.web import WebPort, say
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import require
@@ -132,25 +132,6 @@ def evaluate_showing(
             bar.update(task, description=what, completed=steps, total=most)
 
         return run(world, policies, out=out, progress=progress, **counts)
-
-
-def progress_bar(console: Console) -> Progress:
-    """A bar that goes away when the work is done."""
-    return Progress(
-        TextColumn("{task.description}", markup=False),
-        BarColumn(bar_width=24),
-        TimeElapsedColumn(),
-        console=console,
-        transient=True,
-    )
-
-
-@contextmanager
-def counting(console: Console, what: str) -> Iterator[Callable[[int, int], None]]:
-    """A bar while something is done; it moves when it is told how much of how much is."""
-    with progress_bar(console) as bar:
-        task = bar.add_task(what)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 def report_table(found: EvaluationReport) -> Table:

@@ -7,12 +7,12 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
 from cavmarl.cli.map_check import print_report
 from cavmarl.cli.output import JsonPath, about, grid, write_json
+from cavmarl.cli.progress import progress_bar
 from cavmarl.core.errors import ConfigError
 from cavmarl.maps.check import check_map
 from cavmarl.maps.heights.draping import MOST_GRADE, STEEP_GRADE, HeightOptions, HeightReport
@@ -73,7 +73,7 @@ def build(
         raise ConfigError("--limit-grade: is for heights: give --dem too")
     heights = HeightOptions(tuple(dem), limit_grade, max_grade) if dem else None
     console = Console()
-    with _progress(console) as progress:
+    with progress_bar(console) as progress:
         bar = progress.add_task("", total=len(STAGES) + 1)
 
         def told(stage: str) -> None:
@@ -99,11 +99,6 @@ def build(
     write_json(target.with_name(f"{map_name(target)}.stats.json"), document)
     write_json(json_path, document)
     raise typer.Exit(0 if report.drivable else 1)
-
-
-def _progress(console: Console) -> Progress:
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    return Progress(*columns, console=console, transient=True)
 
 
 def _box(text: str | None) -> Box | None:

@@ -7,10 +7,10 @@ from typing import Annotated, Any
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.text import Text
 
 from cavmarl.cli.output import Environment, JsonPath, Seed, about, about_file, grid, write_json
+from cavmarl.cli.progress import counting
 from cavmarl.core.errors import ConfigError
 from cavmarl.maps.fidelity.cloud_files import Cloud, write_cloud
 from cavmarl.maps.fidelity.exports import write_page, write_points
@@ -48,14 +48,10 @@ def survey(
         env, num_envs=vehicles, agents=1, background=0, workers=0, overrides=overrides
     )
     steps = round(time_s / _TICK_S)
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     try:
         worlds.reset(seed=seed)
-        with Progress(*columns, console=console, transient=True) as progress:
-            bar = progress.add_task("driving", total=steps)
-            found = Surveyor(worlds, range_m, voxel).run(
-                steps, lambda step: progress.update(bar, completed=step)
-            )
+        with counting(console, "driving") as told:
+            found = Surveyor(worlds, range_m, voxel).run(steps, lambda step: told(step, steps))
         if not len(found.cloud.points):
             raise ConfigError(f"--time-s {time_s:g}: no frame was taken: drive for longer")
         with console.status("comparing with the map …"):

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 
-from cavmarl.cli.evaluate import progress_bar
 from cavmarl.cli.output import JsonPath, about, about_file, write_json
+from cavmarl.cli.progress import progress_bar
 from cavmarl.cli.view import check_display
 from cavmarl.cli.web import WatchToken, WebHost, WebPort, WebToken, say
 from cavmarl.viewer.web_options import DEFAULT_PORT, WebOptions
@@ -57,7 +58,9 @@ def replay(
         console.print(f"{path}: was not closed: it has what was committed", markup=False)
     wanted = {name: file for name, file in {"fcd": fcd, "csv": csv, "mcap": mcap}.items() if file}
     for name, file in wanted.items():
-        frames = EXPORTS[name](recording, file, world, episode)
+        with progress_bar(console) as bar:
+            track = partial(bar.track, total=len(ticks), description=f"{name}: {file}")
+            frames = EXPORTS[name](recording, file, world, episode, track)
         console.print(f"{name}: {file}, {frames} frames", markup=False)
     if web:
         from cavmarl.viewer.show_world import show_recording

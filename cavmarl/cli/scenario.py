@@ -16,6 +16,7 @@ from rich.markup import escape
 from rich.table import Column, Table
 
 from cavmarl.cli.output import JsonPath, about, about_file, number, with_world, write_json
+from cavmarl.cli.progress import counting
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
 
@@ -117,15 +118,14 @@ def sweep(
     heads = ("scenario", "map", passes, "least TTC, s", "least PET, s", fails)
     table = Table(*(Column(head, no_wrap=True) for head in heads), box=box.MARKDOWN)
     rows = []
-    for row in sweep_scenarios(
-        names or scenario_names(),
-        map_names or ["grid4x4"],
-        range(seeds),
-        passes=passes,
-        fails=fails,
-        density=density,
-        agents=agents,
-    ):
+    chosen, maps = names or scenario_names(), map_names or ["grid4x4"]
+    keys = {"passes": passes, "fails": fails, "density": density, "agents": agents}
+    with counting(Console(), "scenarios") as told:
+        found = []
+        for row in sweep_scenarios(chosen, maps, range(seeds), **keys):
+            found.append(row)
+            told(len(found), len(chosen) * len(maps))
+    for row in found:
         rows.append(row)
         cells = (
             f"`{row.scenario}`",

@@ -143,13 +143,22 @@ def nodes(
 
 
 def sessions(
+    page: Annotated[
+        str | None, about("Have a page served of the worlds of this session, on its node.")
+    ] = None,
     service: Url = DEFAULT_URL,
     secret_file: SecretFile = None,
     authority: Authority = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Show sessions and jobs: your own, or all."""
+    """Show sessions and jobs: your own, or all; or the worlds of one, in a browser."""
     with connect(service, secret_file, authority) as client:
+        if page is not None:
+            told = client.take_up(page).page()
+            _tell(f"viewer: {told['address']}")
+            _tell(f"token: {told['token']}")
+            write_json(json_path, told)
+            return
         found = client.get("/sessions")
     rows = [
         (one["id"], one["owner_name"], "world" if one["job"] is None else "job",

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from cavmarl.cli.evaluate import report_cell
 from cavmarl.cli.output import JsonPath, Seed, about, grid, make_folder, write_json
+from cavmarl.cli.progress import counting
 from cavmarl.config.registry import find_settings
 
 if TYPE_CHECKING:
@@ -41,7 +42,8 @@ def suite(
     worlds = worlds_of(loaded, maps)
     make_folder(out)
     console = Console()
-    with console.status("") as status:
+    places = {world.label: k for k, world in enumerate(worlds)}
+    with counting(console, f"worlds of {name}") as told:
         reports = run_suite(
             loaded,
             worlds,
@@ -50,7 +52,7 @@ def suite(
             episodes=episodes,
             repeats=repeats,
             seed=seed,
-            began=lambda world: status.update(escape(world.label)),
+            began=lambda world: told(places[world.label], len(worlds)),
         )
     console.print(_table(reports))
     write_json(json_path, {label: found.to_dict() for label, found in reports.items()})

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated
 
 from rich.console import Console
 
-from cavmarl.cli.evaluate import progress_bar
 from cavmarl.cli.output import (
     JsonPath,
     PolicyName,
@@ -21,6 +20,7 @@ from cavmarl.cli.output import (
     with_world,
     write_json,
 )
+from cavmarl.cli.progress import progress_bar
 from cavmarl.cli.web import WatchToken, WebHost, WebPort, WebToken, say
 from cavmarl.config.checks import check_count
 from cavmarl.config.world_spec import WorldSpec

@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cavmarl.cli.evaluate import progress_bar
 from cavmarl.cli.output import JsonPath, about, grid, number, with_world, write_json
+from cavmarl.cli.progress import progress_bar
 from cavmarl.config.world_spec import WorldSpec
 
 if TYPE_CHECKING:

@@ -229,6 +229,11 @@ class RemoteWorld:
         """Hex digest of one world."""
         return str(self._client.run(self.flows.look("hash"))["hashes"][world])
 
+    def page(self) -> dict[str, str]:
+        """`address` and `token` of a page that shows the worlds, on the machine of their node."""
+        found: dict[str, str] = self._client.run(self.flows.look("page"))
+        return found
+
     def transfers(self) -> list[dict[str, Any]]:
         """Changes of owner of a divided world, the newest ones."""
         found: list[dict[str, Any]] = self._client.run(self.flows.look("transfers"))["transfers"]

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from cavmarl.config.env import TERMS
 from cavmarl.core.errors import TrainingError, require
@@ -159,6 +159,8 @@ def progress_bar(console: Console) -> Progress:
         TextColumn("{task.percentage:3.0f} %"),
         BarColumn(bar_width=10),
         TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
         TextColumn("{task.description}"),
         console=console,
     )

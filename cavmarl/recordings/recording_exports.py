@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -19,12 +19,16 @@ from cavmarl.engine.world_frame import SEEN, FrameEvent, WorldFrame
 from cavmarl.recordings.recording import Recording
 from cavmarl.roads.network import VEHICLE_CLASSES
 
-Export = Callable[[Recording, Path, int, int], int]
+Track = Callable[[Iterator[WorldFrame]], Iterable[WorldFrame]]
+"""Is given the frames and hands them on, to show how far they are."""
+Export = Callable[[Recording, Path, int, int, Track], int]
 _ENTITIES = "cavmarl.SceneEntities"
 _EVENT = "cavmarl.Event"
 
 
-def write_fcd(recording: Recording, path: Path, world: int, episode: int) -> int:
+def write_fcd(
+    recording: Recording, path: Path, world: int, episode: int, track: Track = iter
+) -> int:
     """Write SUMO's FCD output; x and y are the front bumper's, as SUMO has them.
 
     Angles are degrees clockwise from north, `pos` is where the front is along its lane.
@@ -34,6 +38,7 @@ def write_fcd(recording: Recording, path: Path, world: int, episode: int) -> int
         path: the file.
         world: of the recording.
         episode: of the world.
+        track: shows how far they are.
 
     Returns:
         How many frames it has.
@@ -46,7 +51,7 @@ def write_fcd(recording: Recording, path: Path, world: int, episode: int) -> int
     count = 0
     with _writing(path) as file:
         file.write('<?xml version="1.0" encoding="UTF-8"?>\n<fcd-export>\n')
-        for frame in recording.frames(world, episode):
+        for frame in track(recording.frames(world, episode)):
             file.write(f'    <timestep time="{frame.time_s:.2f}">\n')
             for row in frame.vehicles:
                 file.write(_fcd_line(row, network.lane_ids))
@@ -75,21 +80,25 @@ def _fcd_line(row: np.void, lane_ids: tuple[str, ...]) -> str:
     )
 
 
-def write_csv(recording: Recording, path: Path, world: int, episode: int) -> int:
+def write_csv(
+    recording: Recording, path: Path, world: int, episode: int, track: Track = iter
+) -> int:
     """Write a line a vehicle and frame, numbers in full; the rest as of `write_fcd`."""
     names = SEEN.names or ()
     count = 0
     with _writing(path) as file:
         lines = csv.writer(file, lineterminator="\n")
         lines.writerow(["tick", "time_s", *names])
-        for frame in recording.frames(world, episode):
+        for frame in track(recording.frames(world, episode)):
             moment = (frame.tick, repr(frame.time_s))
             lines.writerows((*moment, *row) for row in frame.vehicles.tolist())
             count += 1
     return count
 
 
-def write_mcap(recording: Recording, path: Path, world: int, episode: int) -> int:
+def write_mcap(
+    recording: Recording, path: Path, world: int, episode: int, track: Track = iter
+) -> int:
     """Write MCAP with JSON messages: `/vehicles` as Foxglove's SceneUpdate, and `/events`.
 
     Foxglove shows it in its 3D panel. The rest as of `write_fcd`.
@@ -109,7 +118,7 @@ def write_mcap(recording: Recording, path: Path, world: int, episode: int) -> in
         writer.start(profile="", library="cavmarl")
         scene = _channel(writer, "/vehicles", "foxglove.SceneUpdate", _SCENE_SCHEMA)
         told = _channel(writer, "/events", _EVENT, _EVENT_SCHEMA)
-        for frame in recording.frames(world, episode):
+        for frame in track(recording.frames(world, episode)):
             now_ns = round(frame.time_s * 1e9)
             _say(writer, scene, now_ns, _scene_update(frame, now_ns))
             for event in events.pop(frame.tick, ()):

@@ -300,6 +300,13 @@ class WorldHashes(_Answer):
     hashes: list[str]
 
 
+class WorldPage(_Answer):
+    """Where the worlds of a session can be watched, on the machine of their node."""
+
+    address: str
+    token: str  # that the page asks for
+
+
 class WorldTransfers(_Answer):
     """Changes of owner in divided worlds."""
 

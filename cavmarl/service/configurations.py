@@ -96,7 +96,9 @@ def _check(document: dict[str, Any]) -> None:
     except (CavmarlError, RecursionError) as error:
         raise problem("refused", str(error)) from error
     population = config.population
-    vehicles = document["num_envs"] * (population.num_ids + population.background)
+    vehicles = document["num_envs"] * (
+        population.num_ids + population.background + population.insertions
+    )
     if vehicles > MOST_VEHICLES:
         raise problem(
             "refused", f"{vehicles} vehicles in {document['num_envs']} worlds: at most "

@@ -216,6 +216,13 @@ async def get_transfers(request: Request, session: str, _: Opened) -> answers.Wo
     return answers.WorldTransfers(transfers=await in_turn(worlds, worlds[session].transfers))
 
 
+@router.get("/page")
+async def get_page(request: Request, session: str, _: Opened) -> answers.WorldPage:
+    """A page of the viewer that shows the worlds; it is served on the node's machine alone."""
+    worlds = _worlds(request)
+    return answers.WorldPage(**await in_turn(worlds, worlds[session].page))
+
+
 @router.delete("", status_code=204)
 async def close_worlds(request: Request, session: str, _: Opened) -> None:
     """Close the worlds of a session."""

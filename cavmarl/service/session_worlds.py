@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import itertools
+import secrets
 import threading
 from typing import Any
 
 import numpy as np
 
 from cavmarl.client.world_flows import flatten, pack
-from cavmarl.core.errors import CapacityError, ConfigError
+from cavmarl.core.errors import CapacityError, ConfigError, MissingExtraError
 from cavmarl.env.vector import make_vec
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.service.configurations import world_keywords
 from cavmarl.service.refusals import problem
+from cavmarl.viewer.shown_env import ShownEnv
+from cavmarl.viewer.web_options import WebOptions
 
 SAVED_EVERY = 50  # commands
 TOLD_OF_TRANSFERS = ("episode", "tick", "vehicle", "source", "target", "epoch")
@@ -48,6 +51,8 @@ class SessionWorld:
         self._worlds: LocalWorlds | NodeWorlds = self._vec.worlds  # type: ignore[assignment]
         self._told = [0] * len(self._worlds.transfers)  # transfers that the service has of each
         self._last = b""  # the answer to the last command
+        self._page: ShownEnv | None = None  # that shows them
+        self._page_token = ""
         if state:
             self._vec.load_state(state)
 
@@ -113,6 +118,19 @@ class SessionWorld:
         """Digest of each world."""
         return [self._vec.state_hash(world) for world in range(self._vec.num_envs)]
 
+    def page(self) -> dict[str, str]:
+        """Address and token of a page that shows them from now on; it may only watch."""
+        if self._page is None:
+            self._page_token = secrets.token_urlsafe(24)
+            options = WebOptions(port=0, token=self._page_token, control=False)
+            try:
+                self._page = ShownEnv(self._vec, options, title="a client of the service")
+                if self._vec.is_ready:
+                    self._page.refresh()
+            except (ConfigError, MissingExtraError) as error:
+                raise problem("refused", str(error)) from error
+        return {"address": self._page.address, "token": self._page_token}
+
     def transfers(self) -> list[dict[str, Any]]:
         """The newest changes of owner of divided worlds."""
         found = self._worlds.transfers
@@ -156,6 +174,8 @@ class SessionWorld:
 
     def close(self) -> None:
         """Let go of their memory and processes."""
+        if self._page is not None:
+            self._page.close()
         self._vec.close()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Mapping
 from typing import Any
@@ -20,7 +21,7 @@ class RunLoads:
     """Measures in a thread of its own, while there are watchers; a context manager.
 
     Args:
-        worlds: whose workers or nodes are watched; without any it does nothing.
+        worlds: whose workers or nodes are watched; without any, this process.
         audience: is told.
     """
 
@@ -31,8 +32,7 @@ class RunLoads:
         self._thread = threading.Thread(target=self._run, name="viewer loads", daemon=True)
 
     def __enter__(self) -> RunLoads:
-        if self._worlds.worker_pids:
-            self._thread.start()
+        self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -42,25 +42,27 @@ class RunLoads:
 
     def _run(self) -> None:
         while not self._over.is_set():
-            pids = dict(self._worlds.worker_pids)
-            watch = Watch(pids) if self._audience.wishes.watchers and pids else None
+            pids = dict(self._worlds.worker_pids) or {0: os.getpid()}
+            watch = Watch(pids) if self._audience.wishes.watchers else None
             self._over.wait(EVERY_S)
             if watch is not None:
-                rows = load_rows(pids, watch.snapshot(), self._worlds.plans)
+                zones = self._worlds.world.partition.count
+                rows = load_rows(pids, watch.snapshot(), self._worlds.plans, zones)
                 self._audience.tell_all({"kind": "loads", "rows": rows})
 
 
 def load_rows(
-    pids: Mapping[int, int], snapshot: LoadSnapshot, plans: tuple[Plan, ...]
+    pids: Mapping[int, int], snapshot: LoadSnapshot, plans: tuple[Plan, ...], zones: int = 1
 ) -> list[dict[str, Any]]:
     """What a page shows of each worker: its zones in the first world, and its LoadScore.
 
     Args:
         pids: of the workers' processes.
         snapshot: of the same workers.
-        plans: which worker hosts what.
+        plans: which worker hosts what; none where the first one hosts all.
+        zones: of a world.
     """
-    homes: dict[int, list[int]] = {}
+    homes: dict[int, list[int]] = {} if plans else {min(pids): list(range(zones))}
     for plan in plans[:1]:
         for shard, home in zip(plan.problem.shards, plan.homes, strict=True):
             if shard.world == plan.problem.shards[0].world:

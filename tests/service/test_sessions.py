@@ -15,6 +15,8 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
 
 import cavmarl
 from cavmarl.client import AsyncClient, Client, RemoteWorld
@@ -211,3 +213,26 @@ def test_kills_of_nodes_and_of_the_service_change_no_bit(tmp_path: Path) -> None
             kinds = [one["kind"] for one in client.get("/events", limit=1000)["events"]]
             assert kinds.count("node.down") >= 1
         nodes.stop()
+
+
+def test_a_session_is_shown_on_a_page_of_its_node(client: Client) -> None:
+    with open_world(client) as world:
+        world.reset(seed=1)
+        told = world.page()
+        assert told["address"].startswith("http://127.0.0.1:")
+        assert world.page() == told
+        live = told["address"].replace("http", "ws") + "live"
+        with connect(live, max_size=None, compression=None) as page:
+            page.send(json.dumps({"kind": "hello", "token": "wrong"}))
+            with pytest.raises(ConnectionClosed):
+                page.recv(timeout=10)
+        with connect(live, max_size=None, compression=None) as page:
+            page.send(json.dumps({"kind": "hello", "token": told["token"]}))
+            hello = json.loads(page.recv(timeout=10))
+            assert (hello["policy"], hello["control"]) == ("a client of the service", False)
+            for _ in range(3):
+                world.step(world.suggest_actions())
+            messages = [page.recv(timeout=10) for _ in range(3)]
+            assert 3 in [message[0] for message in messages if isinstance(message, bytes)]
+    with pytest.raises(httpx.ConnectError):
+        httpx.get(told["address"])

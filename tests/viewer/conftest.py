@@ -65,8 +65,9 @@ def serve() -> Iterator[Callable[..., Served]]:
             options: WebOptions | None = None,
             drives: bool = True,
             rig: dict[str, Any] | None = None,
+            insertions: int = 0,
         ) -> Served:
-            more = {"rig": rig or {}}
+            more = {"rig": rig or {}, "population.insertions": insertions}
             made = parallel_env(env, zones=zones, agents=3, background=background, overrides=more)
             return stack.enter_context(served(made, options or WebOptions(port=0), drives))
 

@@ -96,6 +96,39 @@ def test_a_seat_is_driven_with_the_arrow_keys(browser: Any, serve: Serve) -> Non
     assert not problems
 
 
+def test_a_vehicle_is_added_and_a_road_closed(browser: Any, serve: Serve) -> None:
+    served = serve(insertions=9, background=4)
+    page, problems, _ = opened(browser, served)
+    assert page.is_visible("#insert")
+    before = page.evaluate("viewer.frame.count")
+    page.click("#insert")
+    place = page.evaluate(
+        """(() => {
+          const [x, y] = viewer.vehicles.placeOf(0, 1);
+          const [px, py] = viewer.camera.toPixels(x, y);
+          const box = document.querySelector("#scene").getBoundingClientRect();
+          return [px + box.x, py + box.y];
+        })()"""
+    )
+    page.mouse.click(*place)
+    until(page, f"viewer.frame.count > {before}")
+    assert page.get_attribute("#insert", "aria-pressed") == "false"
+    page.click("#close")
+    page.mouse.click(*place)
+    until(page, "document.querySelector('#events').textContent.includes('road closed')")
+    assert "vehicle added" in page.text_content("#events")
+    page.click("#insert")
+    page.mouse.click(5, 400)
+    until(page, "document.querySelector('#notice').textContent.includes('no road for cars')")
+    assert not problems
+
+
+def test_without_room_nothing_can_be_added(browser: Any, serve: Serve) -> None:
+    page, _, _ = opened(browser, serve())
+    assert not page.is_visible("#insert")
+    assert not page.is_visible("#close")
+
+
 def test_every_control_has_a_name(browser: Any, serve: Serve) -> None:
     page, _, _ = opened(browser, serve())
     unnamed = page.evaluate(

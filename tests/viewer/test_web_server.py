@@ -205,6 +205,25 @@ def test_a_token_is_needed_where_there_is_one(serve: Serve) -> None:
         assert first_of(client, "hello")
 
 
+def test_a_token_to_watch_gives_no_control(serve: Serve) -> None:
+    options = WebOptions(port=0, token="a secret", watch_token="another")
+    served = serve(drives=False, options=options)
+    with welcome(served.server, "another") as client:
+        assert first_of(client, "hello")["control"] is False
+        client.send('{"kind": "pause"}')
+        client.send('{"kind": "insert", "x": 0, "y": 0}')
+        client.send('{"kind": "watch", "number": 0}')
+        for _ in range(200):
+            served.run.turn()
+            if served.audience.wishes.vehicles:
+                break
+            time.sleep(0.01)
+        assert served.audience.wishes.vehicles == {0}
+        assert not served.run.clock.is_paused
+    with welcome(served.server, "a secret") as client:
+        assert first_of(client, "hello")["control"] is True
+
+
 def test_other_machines_are_only_served_with_a_token() -> None:
     with pytest.raises(ServiceError, match=r"--host 0\.0\.0\.0: others can reach it; give a --to"):
         WebServer(WebOptions(host="0.0.0.0", port=0), [])
@@ -221,6 +240,8 @@ def test_other_machines_are_only_served_with_a_token() -> None:
         ('{"kind": "pace", "number": 1e9}', "from 0 to 1000"),
         ('{"kind": "drive", "throttle": 1, "steering": NaN}', "from -1 to 1"),
         ('{"kind": "drive", "throttle": "full"}', "must be a number"),
+        ('{"kind": "insert", "x": 1}', "y: must be a number"),
+        ('{"kind": "close", "x": 1e300, "y": 0}', "x = 1e+300: must be from"),
     ],
 )
 def test_what_is_not_understood_ends_the_connection(serve: Serve, text: str, reason: str) -> None:

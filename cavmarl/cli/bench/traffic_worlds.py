@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.table import Table
 
 from cavmarl.bench.harness import make_table
-from cavmarl.cli.evaluate import counting
 from cavmarl.cli.output import write_json
+from cavmarl.cli.progress import counting
 
 if TYPE_CHECKING:
     from cavmarl.evaluate.traffic.world_rows import Row

@@ -11,7 +11,6 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cavmarl.cli.evaluate import counting
 from cavmarl.cli.output import (
     JsonPath,
     PolicyName,
@@ -22,6 +21,7 @@ from cavmarl.cli.output import (
     with_world,
     write_json,
 )
+from cavmarl.cli.progress import counting
 from cavmarl.cli.verify.faults import check_campaign, print_figures, verify_campaign
 from cavmarl.cli.verify.kills import verify_with_kills
 from cavmarl.cli.verify.nodes import (

@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from cavmarl.cli.evaluate import counting
 from cavmarl.cli.output import JsonPath, PolicyName, about, say_difference, with_world, write_json
+from cavmarl.cli.progress import counting
 from cavmarl.config.world_spec import WorldSpec
 
 

@@ -12,8 +12,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cavmarl.cli.evaluate import counting
 from cavmarl.cli.output import pairs_grid, write_json
+from cavmarl.cli.progress import counting
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
 

@@ -11,8 +11,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cavmarl.cli.evaluate import counting
 from cavmarl.cli.output import grid, write_json
+from cavmarl.cli.progress import counting
 from cavmarl.config.world_spec import WorldSpec
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from cavmarl.cli.evaluate import counting
 from cavmarl.cli.output import grid, write_json
+from cavmarl.cli.progress import counting
 from cavmarl.config.world_spec import WorldSpec
 
 

@@ -6,11 +6,13 @@ import { MapLayers } from "./drawing.js";
 import { Seat } from "./driving.js";
 import { drawLabels, drawSensed } from "./overlay.js";
 import { $, addEvents, element, notice, showLegend, showLoads, showScale, showVehicle } from "./panels.js";
+import { Placing } from "./placing.js";
 import { showPictures, Shapes } from "./shapes.js";
 import { decodeFrame, decodeMap, FRAME, kindOf, MAP, Roster, ROSTER } from "./protocol.js";
 import { drawStill } from "./still.js";
 import { TimeLine } from "./timeline.js";
 import { VehicleLayer } from "./vehicles.js";
+import { small, toggleAll } from "./worlds.js";
 
 const COUNTED = 240;
 const SMOOTH_S = 1.5; // of the world, from frame to frame; beyond that vehicles jump
@@ -18,7 +20,7 @@ const SMOOTH_S = 1.5; // of the world, from frame to frame; beyond that vehicles
 const page = {
   hello: null, map: null, camera: null, gl: null, layers: null, vehicles: null,
   roster: new Roster(0, 0), frame: null, live: null, line: new TimeLine(), world: 0,
-  placing: null, allWorlds: false, token: "", looksBack: false, chosen: null, wanted: null, following: false, told: null, shapes: null,
+  token: "", looksBack: false, chosen: null, wanted: null, following: false, told: null, shapes: null,
   coloring: "agent", theme: "light", ghosts: null,
   arrived: 0, between: 100, dirty: true, socket: null, over: false,
   times: [], takes: [], firstPicture: 0, calls: 0, stillDrawn: 0,
@@ -29,6 +31,7 @@ const ask = (request) => {
   if (page.socket?.readyState === WebSocket.OPEN) page.socket.send(JSON.stringify(request));
 };
 const seat = new Seat(ask);
+const placing = new Placing(ask);
 const dirty = () => { page.dirty = true; };
 
 // ---- messages
@@ -93,9 +96,8 @@ const may = (what) => page.hello.control && page.hello.may.includes(what);
 
 function takeHello(hello) {
   page.hello = hello;
-  for (const id of ["insert", "close"]) $(id).hidden = !may(id);
-  placing(null);
-  if (!page.allWorlds) $("all").hidden = hello.worlds.length < 2 || small;
+  placing.show(may);
+  $("all").hidden = hello.worlds.length < 2 || small;
   notice("");
   $("title").textContent = small ? hello.worlds[hello.world] : hello.title;
   document.title = `${hello.title} – cavmarl`;
@@ -142,7 +144,7 @@ function takeMap(map) {
   if (again) return;
   listenToPointers($("scene"), page.camera, {
     click(px, py) {
-      if (page.placing) place(...page.camera.toMetres(px, py));
+      if (placing.kind) placing.at(...page.camera.toMetres(px, py));
       else choose(px, py);
     },
     moved(byHand) {
@@ -311,44 +313,9 @@ function choose(px, py) {
   watch(row < 0 ? null : page.frame.roster.ids[row]);
 }
 
-// ---- what is put into the world
-
-// The next click on the map, or Enter there, says where: "insert", "close" or null.
-function placing(kind) {
-  page.placing = kind;
-  for (const id of ["insert", "close"]) $(id).setAttribute("aria-pressed", String(id === kind));
-  $("scene").classList.toggle("placing", kind !== null);
-  if (kind) notice("Click on a road, or press Enter for the one in the middle. Escape leaves it.");
-  else notice("");
-}
-
-function togglePlacing(kind) {
-  placing(page.placing === kind ? null : kind);
-  if (page.placing) $("scene").focus();
-}
-
-function place(x, y) {
-  ask({ kind: page.placing, x, y });
-  placing(null);
-}
-
 function briefly(text) {
   notice(text);
   setTimeout(() => notice(""), 5000);
-}
-
-// ---- all worlds side by side, each in a small page of its own
-
-const small = parent !== window && Boolean(parent.viewer);
-
-function toggleAll() {
-  page.allWorlds = !page.allWorlds;
-  $("all").setAttribute("aria-pressed", String(page.allWorlds));
-  $("worlds").hidden = !page.allWorlds;
-  const shown = page.allWorlds ? page.hello.worlds : [];
-  $("worlds").style.setProperty("--columns", String(Math.ceil(Math.sqrt(shown.length))));
-  $("worlds").replaceChildren(...shown.map((name, k) =>
-    element("iframe", undefined, { src: `/?small#world=${k}`, title: name })));
 }
 
 function showSeat() {
@@ -498,9 +465,9 @@ const ACTIONS = {
   f: () => follow(!page.following),
   "/": () => $("wanted").focus(),
   Enter: () => {
-    if (page.placing) place(page.camera.x - page.camera.covered / 2 / page.camera.scale, page.camera.y);
+    if (placing.kind) placing.at(page.camera.x - page.camera.covered / 2 / page.camera.scale, page.camera.y);
   },
-  Escape: () => { if (page.placing) placing(null); else if (seat.agent !== null) toggleSeat(); else watch(null); },
+  Escape: () => { if (placing.kind) placing.set(null); else if (seat.agent !== null) toggleSeat(); else watch(null); },
 };
 
 function onKey(event) {
@@ -531,9 +498,8 @@ function wire() {
   on("reset", "click", () => ask({ kind: "reset" }));
   on("pace", "change", () => ask({ kind: "pace", number: Number($("pace").value) }));
   on("past", "input", () => lookAt(Number($("past").value)));
-  on("insert", "click", () => togglePlacing("insert"));
-  on("close", "click", () => togglePlacing("close"));
-  on("all", "click", toggleAll);
+  placing.wire();
+  on("all", "click", () => toggleAll(page.hello.worlds));
   on("live", "click", () => lookAt(page.line.frames.length - 1));
   on("sensors", "change", askToWatch);
   on("world", "change", () => goTo(Number($("world").value)));
