@@ -107,6 +107,9 @@ audit: $(READY) $(TOOLS)/.ready ## look all parts up among the known vulnerabili
 pictures: $(READY) ## draw the pictures of the README, the cards and the pages anew
 	$(BIN)/python -m docs.pictures.pictures docs/images
 	$(BIN)/python -m docs.pictures.sensor_pictures docs/images
+	$(BIN)/python -m docs.pictures.sensor_gallery docs/images/sensors
+	$(BIN)/python -m docs.pictures.paper_figures docs/images
+	$(BIN)/python -m docs.pictures.viewer_picture docs/images
 	$(BIN)/python -m docs.pictures.moving docs/images
 
 docs: $(SITE)/.ready ## build the site of all pages into dist/site

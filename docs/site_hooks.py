@@ -82,7 +82,11 @@ def gallery() -> str:
         (about,) = re.findall(r"^!\[([^\]]*)\]", text, re.MULTILINE)[:1] or [name]
         lines += [f"### [{name}](../envs/{name}/README.md)", ""]
         lines += [f"![{about}](images/{name}.png)", ""]
-    lines += ["## Sensors and divided worlds", ""]
+    lines += ["## Sensors", "", "What each tells one agent: drawn around it, or as numbers.", ""]
+    for path in sorted(ROOT.glob("docs/images/sensors/*.png")):
+        name = path.stem.replace("rig_", "rig.")
+        lines += [f"### {name}", "", f"![{name}](images/sensors/{path.name})", ""]
+    lines += ["## All together, and divided worlds", ""]
     for place, about in SENSORS.items():
         lines += [f"![{about}]({place})", "", f"*{about}*", ""]
     return "\n".join(lines)

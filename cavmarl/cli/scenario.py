@@ -119,7 +119,7 @@ def sweep(
     table = Table(*(Column(head, no_wrap=True) for head in heads), box=box.MARKDOWN)
     rows = []
     chosen, maps = names or scenario_names(), map_names or ["grid4x4"]
-    keys = {"passes": passes, "fails": fails, "density": density, "agents": agents}
+    keys: dict[str, Any] = {"passes": passes, "fails": fails, "density": density, "agents": agents}
     with counting(Console(), "scenarios") as told:
         found = []
         for row in sweep_scenarios(chosen, maps, range(seeds), **keys):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,8 +21,8 @@ from cavmarl.core.records.codes import (
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.vehicle_way import way_ahead
 from cavmarl.engine.world_frame import ENDED, WorldFrame, frame_of
-from cavmarl.env.insertions import Insertions
-from cavmarl.env.recorded_worlds import WorldRecorder
+from cavmarl.env.insertions import InsertedWorlds
+from cavmarl.env.recorded_worlds import Record, WorldRecorder
 from cavmarl.parallel.backends import shows_state
 from cavmarl.parallel.journaled_worlds import unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds, kept_elsewhere
@@ -70,7 +69,7 @@ def check_rendering(
         )
 
 
-class DrawnWorlds:
+class DrawnWorlds(InsertedWorlds):
     """Base of an environment whose worlds can be seen; pygame is loaded at the first picture.
 
     Attributes:
@@ -82,7 +81,6 @@ class DrawnWorlds:
     worlds: SteppedWorlds
     metadata: dict[str, Any]
     render_mode: str | None
-    _insertions: Insertions
     _ready: bool = False  # whether `reset` has been called
     _view: WorldView | None
     _copied: LocalWorlds | None = None  # of worlds that other processes have
@@ -170,7 +168,7 @@ class DrawnWorlds:
             ended["events"][arrays.terms[world, agents, term] > 0.0] |= bit
         return ended
 
-    def record(self, record: RecordOptions | str | Path | None) -> None:
+    def record(self, record: Record | None) -> None:
         """Record all worlds from the next reset or step on, until `close`; see docs/recordings.md.
 
         Args:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ActionError, CapacityError, ConfigError
 from cavmarl.core.records.codes import INSERT_BARRIER, INSERT_NONE, INSERT_VEHICLE
+from cavmarl.parallel.step_arrays import SteppedWorlds
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.shards.shard import Commands
 
@@ -139,3 +141,48 @@ class Insertions:
         self._waiting[chosen] = 0
         for world in np.flatnonzero(chosen).tolist():
             self._told[world] = ()
+
+
+class InsertedWorlds:
+    """Base of an environment into whose running worlds vehicles can be put."""
+
+    config: EnvConfig
+    network: RoadNetwork
+    worlds: SteppedWorlds
+
+    @cached_property
+    def _insertions(self) -> Insertions:
+        return Insertions(self.config, self.network, len(self.worlds.arrays.mask))
+
+    def insert_vehicle(self, lane: str, position_m: float, world: int = 0) -> None:
+        """Let a car enter a world in the next step, or as soon as there is a safe gap.
+
+        It counts in `population.insertions`, drives to a goal of the generator's and is one of its
+        vehicles from then on.
+
+        Args:
+            lane: id of a lane of a road.
+            position_m: on it, of the front bumper.
+            world: its number.
+
+        Raises:
+            ActionError: no such lane or place, or cars may not drive there.
+            CapacityError: as many have been put there in this episode as may be.
+            ConfigError: `population.insertions` is 0.
+        """
+        self._insertions.vehicle(world, lane, position_m)
+
+    def close_road(self, edge: str, world: int = 0) -> None:
+        """Close a road from the next step on, to the end of the episode.
+
+        On each of its lanes a car stands at its beginning, as soon as there is a safe gap; each
+        counts in `population.insertions`. Others wait behind them, or go round where they can.
+
+        Args:
+            edge: id of a road.
+            world: its number.
+
+        Raises:
+            ActionError, CapacityError, ConfigError: as of `insert_vehicle`.
+        """
+        self._insertions.barrier(world, edge)

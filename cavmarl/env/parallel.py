@@ -29,12 +29,10 @@ from cavmarl.engine.world_setup import check_agents, make_world
 from cavmarl.env.actions import LENIENT, ActionDecoder
 from cavmarl.env.declared_events import DeclaredEvents
 from cavmarl.env.drawn_worlds import RENDER_MODES, DrawnWorlds, check_rendering
-from cavmarl.env.insertions import Insertions
-from cavmarl.env.recorded_worlds import check_recording
+from cavmarl.env.recorded_worlds import Record, check_recording
 from cavmarl.env.world_copies import CopiedWithWorlds
 from cavmarl.parallel.backends import check_hosts, make_worlds, places_of
 from cavmarl.parallel.step_arrays import SteppedWorlds
-from cavmarl.recordings.extra_tables import RecordOptions
 from cavmarl.sensors.mounted.frames import SensorFrames
 
 # What an agent's info holds, behind the terms.
@@ -63,7 +61,7 @@ def parallel_env(
     seed: int | None = None,
     max_cycles: int | None = None,
     render_mode: str | None = None,
-    record: RecordOptions | str | Path | None = None,
+    record: Record | None = None,
     lenient: bool = False,
     overrides: Mapping[str, Any] | None = None,
 ) -> CavEnv:
@@ -95,8 +93,7 @@ def parallel_env(
         ConfigError: a key, value or combination that cannot work.
         MapError: the map cannot be read or driven.
         WorkerError: worker processes cannot be started, or have no memory.
-        MissingExtraError: hosts on Ray without Ray, or `record` without pyarrow.
-        RecordingError: `record` cannot be written.
+        MissingExtraError, RecordingError: no Ray, or pyarrow; `record` cannot be written.
     """
     workers, hosts = places_of(workers, hosts, nodes)
     check_hosts(workers, hosts)
@@ -185,7 +182,6 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
         self.state_space = state_space(worlds.arrays.states.shape[1] // STATE_FEATURES)
         self._decoder = ActionDecoder(config.action, 1, self.possible_agents)
         self._events = DeclaredEvents(config, 1)
-        self._insertions = Insertions(config, self.network, 1)
         self._first_seed = seed
         self._view = None
 
@@ -384,37 +380,6 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
         if agent not in self.agents:
             raise ActionError(f"declare_event('{agent}', …): it is not in the episode")
         self._events.declare(0, self.possible_agents.index(agent), cause)
-
-    def insert_vehicle(self, lane: str, position_m: float) -> None:
-        """Let a car of the traffic enter in the next step, or as soon as there is a safe gap.
-
-        It counts in `population.insertions`, drives to a goal of the generator's and is one of its
-        vehicles from then on.
-
-        Args:
-            lane: id of a lane of a road.
-            position_m: on it, of the front bumper.
-
-        Raises:
-            ActionError: no such lane or place, or cars may not drive there.
-            CapacityError: as many have been put there in this episode as may be.
-            ConfigError: `population.insertions` is 0.
-        """
-        self._insertions.vehicle(0, lane, position_m)
-
-    def close_road(self, edge: str) -> None:
-        """Close a road from the next step on, to the end of the episode.
-
-        On each of its lanes a car stands at its beginning, as soon as there is a safe gap; each
-        counts in `population.insertions`. Others wait behind them, or go round where they can.
-
-        Args:
-            edge: id of a road.
-
-        Raises:
-            ActionError, CapacityError, ConfigError: as of `insert_vehicle`.
-        """
-        self._insertions.barrier(0, edge)
 
     def frames(self, agent: str) -> dict[str, SensorFrames]:
         """What the sensors of an agent's `rig` have got in the last step, by name.

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterable
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ConfigError
@@ -21,10 +21,13 @@ from cavmarl.parallel.step_arrays import SteppedWorlds
 from cavmarl.recordings.extra_tables import RecordOptions
 from cavmarl.recordings.recording_writer import RecordingWriter
 
+Record: TypeAlias = RecordOptions | str | Path
+"""What `record` may be."""
+
 
 def check_recording(
     config: EnvConfig,
-    record: RecordOptions | str | Path | None,
+    record: Record | None,
     num_worlds: int,
     workers: int | str | None,
     hosts: str | None,
@@ -68,7 +71,7 @@ class WorldRecorder:
 
     def __init__(
         self,
-        record: RecordOptions | str | Path,
+        record: Record,
         worlds: SteppedWorlds,
         simulation: Simulation,
         **more: Any,

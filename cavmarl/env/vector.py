@@ -29,13 +29,11 @@ from cavmarl.env.actions import ActionDecoder
 from cavmarl.env.autoreset import known_mode, present_mode, refuse_over, with_rows
 from cavmarl.env.declared_events import DeclaredEvents
 from cavmarl.env.drawn_worlds import DrawnWorlds, check_rendering
-from cavmarl.env.insertions import Insertions
-from cavmarl.env.recorded_worlds import check_recording
+from cavmarl.env.recorded_worlds import Record, check_recording
 from cavmarl.env.saved_state import SavedState
 from cavmarl.env.world_copies import CopiedWithWorlds
 from cavmarl.parallel.backends import check_hosts, make_worlds, places_of
 from cavmarl.parallel.step_arrays import SteppedWorlds
-from cavmarl.recordings.extra_tables import RecordOptions
 from cavmarl.sensors.mounted.frames import SensorFrames
 from cavmarl.shards.shard import Commands
 
@@ -65,7 +63,7 @@ def make_vec(
     autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
     copy: bool = True,
     render_mode: str | None = None,
-    record: RecordOptions | str | Path | None = None,
+    record: Record | None = None,
     overrides: Mapping[str, Any] | None = None,
 ) -> CavVectorEnv:
     """Make `num_envs` worlds of one environment that are stepped together.
@@ -206,7 +204,6 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
         self._read_only.flags.writeable = False
         self._mask = np.zeros((num_envs, self.num_agents), dtype=np.bool_)
         self._events = DeclaredEvents(config, num_envs)
-        self._insertions = Insertions(config, self.network, num_envs)
         self._first_seed = None if seed is None else check_seed(seed)
         self._copy = copy
         self._ready = False
@@ -333,13 +330,12 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
         self._record_frames()
         arrays = self.worlds.arrays
         over = self._over = arrays.episode_over.copy()
-        if np.count_nonzero(over):
-            self._insertions.forget(over)
         terminations = arrays.terminations.copy()
         observations = final_observations = self._observations()
         if np.count_nonzero(over) or np.count_nonzero(terminations):
             final_observations = self._final_observations(over | terminations.any(axis=1))
             self._decoder.forget(over)
+            self._insertions.forget(over)
         self._mask = arrays.mask.copy()
         infos: dict[str, NDArray[Any]] = {
             "acted": arrays.acted.copy(),
@@ -387,14 +383,6 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
             ConfigError: no such cause, or no messages are sent in this environment.
         """
         self._events.declare(world, agent, cause)
-
-    def insert_vehicle(self, lane: str, position_m: float, world: int = 0) -> None:
-        """Let a car of the traffic enter a world in the next step, as `CavEnv.insert_vehicle`."""
-        self._insertions.vehicle(world, lane, position_m)
-
-    def close_road(self, edge: str, world: int = 0) -> None:
-        """Close a road of a world from the next step on, as `CavEnv.close_road`."""
-        self._insertions.barrier(world, edge)
 
     def _final_observations(self, ended: NDArray[np.bool_]) -> Observations:
         """The observations, and of the worlds (W,) where something ended those before that."""

@@ -207,7 +207,8 @@ class Recording:
         path = frames.parent.parent / table / frames.name
         if self._kept_extra[0] != path:
             self._kept_extra = path, extra_rows(path, read_table(path), dtype)
-        return self._kept_extra[1]
+        found: tuple[Any, NDArray[np.void]] = self._kept_extra[1]
+        return found
 
     def _paths(self, world: int) -> list[Path]:
         """The committed parts of a world: the files of their frames."""

@@ -8,7 +8,6 @@ import threading
 import time
 import weakref
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -124,7 +123,9 @@ class RecordingWriter:
         Raises:
             RecordingError: an earlier part could not be written.
         """
-        self._sink.add(list(zip_longest(frames, extras, fillvalue={})))
+        none: Extras = {}
+        these, more = list(frames), list(extras)
+        self._sink.add(list(zip(these, more or [none] * len(these), strict=True)))
 
     def close(self) -> None:
         """Write what is left and mark the recording as whole.

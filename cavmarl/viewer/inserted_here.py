@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from cavmarl.core.errors import ActionError, CapacityError, ConfigError
 from cavmarl.env.insertions import CLOSED, INSERTED
-from cavmarl.env.vector import CavVectorEnv
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.viewer.audience import Audience
 from cavmarl.viewer.map_geometry import map_origin
@@ -34,15 +31,14 @@ def put_in(
     """
     if request.kind not in ("insert", "close"):
         return False
-    more: dict[str, Any] = {"world": world} if isinstance(env, CavVectorEnv) else {}
     try:
         lane, place_m = lane_at(env.network, request.x, request.y)
         if request.kind == "insert":
             kind, detail = INSERTED, env.network.lane_ids[lane]
-            env.insert_vehicle(detail, place_m, **more)
+            env.insert_vehicle(detail, place_m, world)
         else:
             kind, detail = CLOSED, env.network.edge_ids[int(env.network.lanes["edge"][lane])]
-            env.close_road(detail, **more)
+            env.close_road(detail, world)
     except (ActionError, CapacityError, ConfigError) as error:
         audience.tell(watcher, {"kind": "notice", "text": str(error)})
     else:

@@ -36,6 +36,7 @@ from cavmarl.sensors.observed import layout
 MOST_RAYS = 360
 MOST_POINTS = 2000
 MOST_PIXELS = 64_000
+GNSS_UNITS = ("° latitude", "° longitude", "m above the ellipsoid")  # its `units` are the noise's
 FARTHEST = 1.0 - 1e-6  # a ray of this share of the range has met nothing
 
 Shape = dict[str, Any]
@@ -177,7 +178,7 @@ def _mounted(
         rgba[..., 3] = np.where(data > 0, 150, 0)
         return [_grid(name, rgba, _in_vehicle(settings, corners))]
     numbers = np.nan_to_num(data.astype(np.float64)).ravel()
-    units = getattr(settings, "units", ())
+    units = GNSS_UNITS if settings.type == "gnss" else getattr(settings, "units", ())  # type: ignore[attr-defined]
     told = [[unit, round(float(value), 4)] for unit, value in zip(units, numbers, strict=False)]
     return [{"name": name, "kind": "numbers", "rows": told}]
 

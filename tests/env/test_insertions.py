@@ -56,7 +56,11 @@ def test_a_divided_world_with_insertions_equals_the_undivided_one() -> None:
     undivided = hashes()
     assert hashes(zones=4) == undivided
     assert hashes(zones=4, workers=2) == undivided
-    assert hashes(zones=2, nodes=2) == undivided
+
+
+@pytest.mark.slow
+def test_over_nodes_it_is_the_same_too() -> None:
+    assert hashes(zones=2, nodes=2) == hashes()
 
 
 def test_room_alone_changes_nothing() -> None:

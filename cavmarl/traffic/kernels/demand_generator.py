@@ -87,7 +87,7 @@ def _number(demand: Demand, gate: Gate, worlds: Worlds, w: int) -> int:
     """Put a numbered departure of the generator's type at the end of the queue; its place."""
     vehicle = gate.next_id[w]
     gate.next_id[w] = vehicle + 1
-    place = gate.num_queue[w]
+    place: int = gate.num_queue[w]
     departure = gate.queue[w, place]
     gate.num_queue[w] = place + 1
     departure["id"] = vehicle
@@ -126,7 +126,7 @@ def insert(
             if inserted[w, n, 0] == INSERT_NONE or gate.num_queue[w] >= gate.queue.shape[1]:
                 continue
             departure = gate.queue[w, _number(demand, gate, worlds, w)]
-            lane = np.int64(inserted[w, n, 1])
+            lane = int(inserted[w, n, 1])
             first = below(worlds.keys[w], departure["id"], 0, STREAM_ROUTE, num_goals)
             _send(roads, departure, lane, first)
             for k in range(num_goals):
