@@ -18,7 +18,7 @@ const COUNTED = 240;
 const SMOOTH_S = 1.5; // of the world, from frame to frame; beyond that vehicles jump
 
 const page = {
-  hello: null, map: null, camera: null, gl: null, layers: null, vehicles: null,
+  hello: null, map: null, camera: null, gl: undefined, layers: null, vehicles: null,
   roster: new Roster(0, 0), frame: null, live: null, line: new TimeLine(), world: 0,
   token: "", looksBack: false, chosen: null, wanted: null, following: false, told: null, shapes: null,
   coloring: "agent", theme: "light", ghosts: null,
@@ -338,9 +338,11 @@ const share = () => {
 function resize() {
   const scene = $("scene");
   const density = devicePixelRatio || 1;
-  for (const canvas of page.gl ? [scene, $("labels")] : [$("labels")]) {
-    canvas.width = Math.max(1, Math.round(canvas.clientWidth * density));
-    canvas.height = Math.max(1, Math.round(canvas.clientHeight * density));
+  for (const canvas of page.gl === null ? [$("labels")] : [scene, $("labels")]) {
+    const width = Math.max(1, Math.round(canvas.clientWidth * density));
+    const height = Math.max(1, Math.round(canvas.clientHeight * density));
+    if (canvas.width !== width) canvas.width = width; // each makes its memory anew
+    if (canvas.height !== height) canvas.height = height;
   }
   if (page.camera) page.camera.covered = innerWidth > 700 && !small ? 310 : 0;
   dirty();
@@ -530,7 +532,13 @@ function wire() {
   }, 5000);
 }
 
+// What takes long comes while the world is on its way: it is asked for first.
 function begin() {
+  const named = /^#world=(\d+)$/.exec(location.hash);
+  if (named) page.world = Number(named[1]);
+  document.documentElement.classList.toggle("small", small);
+  connect(small ? parent.viewer.token : "");
+  resize();
   page.gl = $("scene").getContext("webgl2", { antialias: true, alpha: false });
   if (page.gl) {
     page.gl.enable(page.gl.DEPTH_TEST);
@@ -543,10 +551,6 @@ function begin() {
   }
   setTheme(matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
   wire();
-  const named = /^#world=(\d+)$/.exec(location.hash);
-  if (named) page.world = Number(named[1]);
-  document.documentElement.classList.toggle("small", small);
-  connect(small ? parent.viewer.token : "");
   requestAnimationFrame(draw);
 }
 
