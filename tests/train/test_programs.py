@@ -139,20 +139,3 @@ def test_wrong_use_of_five_seeds_is_refused(tmp_path: Path, words: list[str], me
     done = call("five_seeds.py", *(word.format(small=small, list=listed) for word in words))
     assert done.returncode == 2
     assert message in done.stderr
-
-
-def test_what_messages_are_worth(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib", reason="needs the extra: report")
-    config = tmp_path / "small.yaml"
-    config.write_text(SMALL.replace("env: merge", "env: blind_junction"))
-    words = ["--config", config, "--seeds", 0, 1, "--episodes", 1, "--repeats", 2]
-    done = call("messages.py", *words, "--out", tmp_path / "out")
-    assert done.returncode == 0, done.stderr
-    table = (tmp_path / "out" / "table.md").read_text()
-    assert done.stdout.rstrip().endswith(table.rstrip())
-    told = json.loads((tmp_path / "out" / "result.json").read_text())
-    assert list(told) == ["on", "off", *(f"on, {loss}% lost" for loss in (10, 20, 30, 40, 50))]
-    assert (tmp_path / "out" / "loss.svg").is_file()
-    arms = {arm: read_closed(tmp_path / "out" / arm / "seed_1") for arm in ("on", "off")}
-    losses = {arm: of["world"]["config"]["v2x"]["channel"]["loss"] for arm, of in arms.items()}
-    assert losses == {"on": 0.0, "off": 1.0}
