@@ -123,7 +123,7 @@ def test_a_notebook_of_this_machine_shows_the_page_within_its_own(vec: CavVector
         with joined(shown.address) as client:  # though no step comes any more
             assert tick_of(client) == vec.config.clock.ticks_per_step
         policy = httpx.get(shown.address).headers["content-security-policy"]
-        assert "frame-ancestors http://127.0.0.1:* http://localhost:* vscode-webview:" in policy
+        assert "frame-ancestors 'self' http://127.0.0.1:* http://localhost:* vscode" in policy
         assert "unsafe" not in policy
         with pytest.raises(ServiceError, match="give another --port"):
             cavmarl.show(vec, port=int(shown.address.split(":")[2].strip("/")))
