@@ -75,6 +75,8 @@ def table(arms: Mapping[str, Figures], args: Args) -> str:
 
 
 def _cell(found: Row) -> str:
+    if found.mean is None or np.isnan(found.mean):  # without an arrival there is no delay
+        return "-"
     interval = "" if found.interval is None else _ends(found.interval)
     return f"{found.mean:.2f}{interval}"
 
@@ -116,7 +118,10 @@ def compare(args: Args) -> str:
     named |= {f"on, {loss:.0%} lost": figures for loss, figures in curve.items() if loss}
     text = table(named, args)
     (args.out / "table.md").write_text(text, encoding="utf-8")
-    plain = {arm: {key: of.tolist() for key, of in one.items()} for arm, one in named.items()}
+    plain = {
+        arm: {key: [None if np.isnan(v) else v for v in of.tolist()] for key, of in one.items()}
+        for arm, one in named.items()
+    }
     (args.out / "result.json").write_text(json.dumps(plain, indent=2) + "\n", encoding="utf-8")
     draw(args.out / "loss.svg", curve, off)
     return text
