@@ -93,8 +93,9 @@ STOP_LINE_M = 0.7
 # A hull that covers more than so many times the area of its paths is land with roads around it.
 MAX_HULL_SHARE = 1.2
 MIN_HULL_M2 = 150.0  # smaller ones are filled in any case
-# SUMO's link directions from left to right: turn, left, half left, straight, half right, right.
-DIRECTIONS_FROM_LEFT = "tlLsRr"
+# SUMO's link directions from left to right: left, half left, straight, half right, right. A turn
+# comes before them, or after them where one drives on the left.
+DIRECTIONS_FROM_LEFT = "lLsRr"
 CAR_BIT = 1  # VEHICLE_CLASSES[0], passenger
 
 
@@ -287,13 +288,14 @@ def _centre_lines(network: RoadNetwork) -> Points:
 
 
 def _stop_lines(network: RoadNetwork) -> Points:
-    """Each link's share of its lane's stop line, the left turn's at the left."""
+    """Each link's share of its lane's stop line, as seen from there: the left turn's at the left."""
     links, lanes = network.links, network.lanes
+    order = DIRECTIONS_FROM_LEFT + "t" if network.left_hand else "t" + DIRECTIONS_FROM_LEFT
     quads = np.zeros((len(links), 4, 2))
     for lane in np.flatnonzero(lanes["num_links"] > 0):
         row = lanes[lane]
         rows = np.arange(row["first_link"], row["first_link"] + row["num_links"])
-        rank = [DIRECTIONS_FROM_LEFT.find(chr(links[link]["direction"])) for link in rows]
+        rank = [order.find(chr(links[link]["direction"])) for link in rows]
         end = network.points[row["first_point"] + row["num_points"] - 1]
         forward = np.array([end["cos"], end["sin"]])
         left = np.array([-end["sin"], end["cos"]])

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,6 +11,9 @@ from cavmarl.render.overlay import clock_text, scale_bar_m
 from cavmarl.render.shapes import convex_hull, offset_polyline, road_shapes
 from cavmarl.render.viewport import Viewport
 from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.sumo_net.reader import read_network
+from tests.support.mirrored import mirror_net
+from tests.support.netgenerate import netgenerate
 
 coordinates = st.tuples(st.integers(-20, 20), st.integers(-20, 20))
 
@@ -86,3 +91,18 @@ def test_clock(seconds: float, text: str) -> None:
 )
 def test_scale_bar_is_a_round_number(scale: float, length_m: float) -> None:
     assert scale_bar_m(scale) == length_m
+
+
+def test_where_one_drives_on_the_left_the_picture_is_mirrored(tmp_path: Path) -> None:
+    options = ["--grid", "--grid.number", "3", "--grid.length", "120", "-L", "2"]
+    plain = netgenerate(tmp_path / "right.net.xml", *options)
+    mirror = read_network(mirror_net(plain, tmp_path / "left.net.xml"))
+    right, left = road_shapes(read_network(plain)), road_shapes(mirror)
+    assert (mirror.links["direction"] == ord("t")).any()
+    for name in ("starts", "ends", "dashes", "centre_lines", "stop_lines"):
+        shown, other = getattr(right, name), getattr(left, name).copy()
+        other[..., 1] *= -1.0
+        assert shown.size
+        places = (shape.mean(axis=1) if shape.ndim == 3 else shape for shape in (shown, other))
+        here, there = (np.round(place[..., :2], 6) + 0.0 for place in places)
+        np.testing.assert_allclose(np.unique(here, axis=0), np.unique(there, axis=0), err_msg=name)
