@@ -1,7 +1,8 @@
 """How the built-in driver does in agents' seats: alone and among its kind, on any maps.
 
 Every trip counts, those that the end of the run cuts, too. A vehicle stands without a cause if it
-has stood for `STANDS_S`, its signal is not red and no other vehicle is near ahead of it.
+has stood for `STANDS_S`, its signal is not red, no other vehicle is near ahead of it or behind the
+junction, and none is on a way or near a line where it has to give way.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from cavmarl.roads.network import SIGNAL_STATES
 MOST_SHARE = 0.0005  # of the trips that may end off the road, and with a collision
 STANDS_S = 120.0
 NEAR_AHEAD_M = 20.0  # another vehicle whose centre is so near ahead is a cause to stand
+COMES_M = 100.0  # as is one so near to a line that has the right of way
 TOGETHER = 100  # vehicles that are stepped at once, about
 FAULTS = ("off_road", "collision", "wrong_way", "red_light", "stands")
 SHOWN = 12  # faults named below the table
@@ -221,14 +223,29 @@ class _Standing:
 
     def _has_cause(self, rows: NDArray[np.void], i: int, shown: NDArray[np.uint8]) -> bool:
         row = rows[i]
-        step = self._vec.simulation.plans[row["goal"], row["lane"]]
-        if step["link"] >= 0 and shown[step["link"]] not in GREEN:
-            return True
+        others = rows[np.arange(len(rows)) != i]
+        link = int(self._vec.simulation.plans[row["goal"], row["lane"]]["link"])
         along_x, along_y = math.cos(row["heading"]), math.sin(row["heading"])
-        to_x, to_y = rows["x"] - row["x"], rows["y"] - row["y"]
+        to_x, to_y = others["x"] - row["x"], others["y"] - row["y"]
         ahead = along_x * to_x + along_y * to_y > 0.0
-        near = np.hypot(to_x, to_y) < NEAR_AHEAD_M
-        return bool((ahead & near & (np.arange(len(rows)) != i)).any())
+        near = ahead & (np.hypot(to_x, to_y) < NEAR_AHEAD_M)
+        if near.any() or (link >= 0 and shown[link] not in GREEN):
+            return True
+        return link >= 0 and self._gives_way(others, link)
+
+    def _gives_way(self, others: NDArray[np.void], link: int) -> bool:
+        """Whether there is no room behind a link, or one comes that goes first."""
+        network = self._vec.network
+        lanes, target = network.lanes, network.links[link]
+        if ((others["lane"] == target["to_lane"]) & (others["s"] < NEAR_AHEAD_M)).any():
+            return True
+        conflicts = network.conflicts[target["first_conflict"] :][: target["num_conflicts"]]
+        inside = lanes["internal"][others["lane"]]
+        crosses = inside & np.isin(lanes["link"][others["lane"]], conflicts["foe"])
+        first = network.links["from_lane"][conflicts["foe"][conflicts["must_yield"]]]
+        to_line = lanes["length_m"][others["lane"]] - others["s"]
+        comes = np.isin(others["lane"], first) & (to_line < COMES_M)
+        return bool((crosses | comes).any())
 
 
 if __name__ == "__main__":

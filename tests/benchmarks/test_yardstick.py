@@ -52,6 +52,26 @@ def test_a_vehicle_that_stands_has_a_cause_at_red_and_behind_another() -> None:
     assert watch._has_cause(rows, 0, green)
 
 
+def test_one_that_comes_first_and_a_full_road_are_causes_to_stand() -> None:
+    vec = CavVectorEnv(LocalWorlds(load_world("town", agents=2, background=0), 1))
+    vec.reset(seed=1)
+    network, watch = vec.network, yardstick._Standing(vec)
+    others = vec.simulation.vehicles(0)[1:]
+    yields = np.flatnonzero(network.conflicts["must_yield"])
+    link = int(np.searchsorted(network.links["first_conflict"], yields[0], side="right")) - 1
+    foe = network.links[network.conflicts["foe"][yields[0]]]
+
+    def waits(lane: int, s: float) -> bool:
+        others["lane"], others["s"] = lane, s
+        return watch._gives_way(others, link)
+
+    assert waits(foe["from_lane"], network.lanes["length_m"][foe["from_lane"]] - 5.0)
+    assert waits(foe["next_lane"], 0.5)
+    behind = network.links["to_lane"][link]
+    assert waits(behind, 5.0)
+    assert not waits(behind, yardstick.NEAR_AHEAD_M + 1.0)
+
+
 def test_no_map_is_refused() -> None:
     with pytest.raises(ConfigError, match="no map: name some"):
         yardstick.measure()

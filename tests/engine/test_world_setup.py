@@ -18,7 +18,8 @@ from cavmarl.roads.cache import load_network
 from cavmarl.roads.horizon import horizon_of
 from cavmarl.zones.partition.zone_file import write_zones
 from cavmarl.zones.partition.zone_layouts import cut_map
-from tests.support.netgenerate import netgenerate
+from tests.support.driving import make_simulation, start
+from tests.support.netgenerate import netgenerate, random_map
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +79,20 @@ def test_a_horizon_by_the_map_is_from_one_to_fifteen_minutes(grid: Path) -> None
         for field in ("max_x", "max_y"):
             lanes[field] = side_m
         assert horizon_of(replace(network, lanes=lanes)) == horizon_s
+
+
+@pytest.mark.parametrize(
+    "number", [*range(3), *(pytest.param(k, marks=pytest.mark.slow) for k in range(3, 30))]
+)
+def test_on_a_bare_map_trips_connect_and_fit_the_horizon_twice(tmp_path: Path, number: int) -> None:
+    world = make_simulation(random_map(tmp_path, number), mode="respawn", agents=20)
+    roads = world.network
+    slowest_mps = float(roads.lanes["speed_mps"][~roads.lanes["internal"]].min())
+    for seed in range(3):
+        start(world, seed)
+        to_go = world.vehicles(0)["to_go"]
+        assert len(to_go) == 40
+        assert (to_go / slowest_mps < 0.5 * world.config.horizon_s).all()
 
 
 def test_each_process_and_episode_has_the_horizon_of_the_map(grid: Path) -> None:
