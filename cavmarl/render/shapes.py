@@ -288,7 +288,7 @@ def _centre_lines(network: RoadNetwork) -> Points:
 
 
 def _stop_lines(network: RoadNetwork) -> Points:
-    """Each link's share of its lane's stop line, as seen from there: the left turn's at the left."""
+    """Each link's share of its lane's stop line: the left turn's at the left."""
     links, lanes = network.links, network.lanes
     order = DIRECTIONS_FROM_LEFT + "t" if network.left_hand else "t" + DIRECTIONS_FROM_LEFT
     quads = np.zeros((len(links), 4, 2))
