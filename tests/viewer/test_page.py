@@ -203,6 +203,14 @@ def test_a_recording_is_searched_and_its_worlds_are_chosen(browser: Any, tmp_pat
         until(page, f"viewer.frame.tick === {wanted}")
         assert page.get_attribute("#past", "max") == str(span[1])
         assert page.is_hidden("#reset")
+        page.click("#all")
+        for k in range(2):
+            shown = f"document.querySelectorAll('#worlds iframe')[{k}].contentWindow"
+            until(page, f"Boolean({shown}.viewer && {shown}.viewer.frame)")
+            assert page.evaluate(f"{shown}.viewer.world") == k
+        page.click("#all")
+        assert page.locator("#worlds iframe").count() == 0
+        assert not problems
         page.select_option("#world", "0")
         until(page, "viewer.hello.world === 0 && viewer.frame")
         assert not problems

@@ -12,6 +12,7 @@ import pytest
 from cavmarl.core.errors import RecordingError
 from cavmarl.engine.world_frame import WorldFrame
 from cavmarl.env.vector import make_vec
+from cavmarl.recordings.extra_tables import RecordOptions
 from cavmarl.recordings.recording import Recording
 from cavmarl.viewer.frame_messages import FRAME_HEAD, Publication
 from cavmarl.viewer.page_requests import PageRequest
@@ -24,7 +25,8 @@ STEPS = 30
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two worlds, divided, thirty steps each."""
     folder = tmp_path_factory.mktemp("recorded") / "run"
-    vec = make_vec("grid4x4", num_envs=2, zones=2, agents=2, background=6, record=folder)
+    record = RecordOptions(folder, ("observations",))
+    vec = make_vec("grid4x4", num_envs=2, zones=2, agents=2, background=6, record=record)
     vec.reset(seed=0)
     for _ in range(STEPS):
         vec.step(vec.suggest_actions())
@@ -96,6 +98,21 @@ def test_a_vehicle_is_told_as_it_was(path: Path) -> None:
     assert found["here"]
     assert dict(found["rows"])["speed"].startswith(f"{row['speed']:.2f} m/s")
     assert not heard.shown._tell(frame, 10**6, True)["here"]
+
+
+def test_an_agent_is_told_with_what_it_observed(path: Path) -> None:
+    heard, recording = Heard(path, world=1), Recording(path)
+    tick = recording.ticks(1, 0)[5]
+    frame = recording.at(tick, 1, 0)
+    row = recording.extra_at("observations", tick, 1)[0]
+    found = heard.shown._tell(frame, int(row["vehicle"]), True)
+    names = [tuple(told[:2]) for told in found["observation"]]
+    assert names == [tuple(name) for name in recording.head.features]
+    numbers = [told[2] for told in found["observation"]]
+    assert numbers == pytest.approx(row["values"].tolist(), abs=1e-4)
+    assert [name for name, _ in found["terms"]] == list(recording.head.terms)
+    others = frame.vehicles[frame.vehicles["agent"] < 0]
+    assert "observation" not in heard.shown._tell(frame, int(others["id"][0]), True)
 
 
 def test_without_its_map_or_any_frame_it_is_refused(path: Path, tmp_path: Path) -> None:
