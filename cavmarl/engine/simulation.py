@@ -247,13 +247,13 @@ class Simulation(WorldViews):
 
     def _run_ticks(self, commands: Commands) -> None:
         ticks = self.config.clock.ticks_per_step
-        for number in range(ticks):
-            self.run_tick(commands, number == 0, number == ticks - 1)
         if self._recutter is not None:
-            partition = self._recutter.after_step(self.partition)
+            partition = self._recutter.before_step(self.partition)
             if partition is not None:
                 self.partition = partition
                 self._tick.executor = SerialExecutor(self._shards)
+        for number in range(ticks):
+            self.run_tick(commands, number == 0, number == ticks - 1)
 
     def run_tick(self, commands: Commands, is_first: bool, is_last: bool) -> None:
         """One tick of a step, begun again as often as it takes where hosts may die.

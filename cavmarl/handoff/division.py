@@ -51,6 +51,7 @@ class Division:
     Attributes:
         gathering: what shards are called with that `gather` their ghosts: how far outside of a zone
             a ghost can be that touches a vehicle in it, and how far inside one is at a border, m.
+        neighbours: (k, k) between which zones vehicles change their owner.
         call_hand_over: the kernel, with the types of all worlds' arrays found out once.
     """
 
@@ -58,14 +59,17 @@ class Division:
         self,
         shards: Sequence[Shard],  # one a zone, in the order of zones
         zoned: Zoned,  # their rows
-        zones: ZoneArrays,
+        partition: ZonePartition,
         halo: Halo,  # what each zone sees over its borders
         sight: Visibility,  # what says so for other zones
         touching_m: float,  # no ghost further outside of a zone can touch one of its vehicles
         borders: Borders,  # when a vehicle is near one
         codec: TransferCodec,  # of vehicles' states
+        may_teleport: bool,  # whether vehicles may be put anywhere between two ticks
     ) -> None:
-        self.zones = zones
+        self.zones: ZoneArrays = partition.arrays
+        self.neighbours = partition.within(sight.outside_m)
+        self.may_teleport = may_teleport
         self.borders = borders
         self.codec = codec
         self.book = make_book(*shards[0].worlds.rows.shape)  # vehicles near a border
@@ -78,7 +82,7 @@ class Division:
         self.gathering = (touching_m, borders.max_speed_mps * borders.ahead_s)
         self._gatherers: Executor | None = None
         self._ids, self._x, self._y = (zoned.rows[name] for name in ("id", "x", "y"))
-        self._rects: list[list[float]] = zones.rects.tolist()
+        self._rects: list[list[float]] = self.zones.rects.tolist()
         self._call_exchange = specialized(exchange)
         self._note_gathered = specialized(note_gathered)
         self._look = specialized(look)
@@ -121,6 +125,7 @@ class Division:
         """
         zones, halo = partition.arrays, self._sight.halo(partition)
         self.zones, self._halo, self._rects = zones, halo, zones.rects.tolist()
+        self.neighbours = partition.within(self._sight.outside_m)
         for shard in self._shards:
             shard.cut(zones, halo)
         self._zoned.num_outer[...] = -1
@@ -241,7 +246,7 @@ class Division:
 
     def contacts(self) -> NDArray[np.int64]:
         """(W,) vehicles that began to touch another, since each world's reset."""
-        return _total([shard.worlds.num_contacts for shard in self._shards])
+        return np.asarray(self._zoned.num_contacts.sum(axis=0), dtype=np.int64)
 
     def align(self) -> None:
         """Let all shards keep their rows on the same side, whatever a tick has come to."""
@@ -442,7 +447,3 @@ class Division:
             num_rows=running,
             num_contacts=self.contacts(),
         )
-
-
-def _total(counts: list[NDArray[np.int64]]) -> NDArray[np.int64]:
-    return np.asarray(np.sum(counts, axis=0), dtype=np.int64)

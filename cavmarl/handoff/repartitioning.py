@@ -48,10 +48,14 @@ class Recutter:
         self._tolerance = tolerance
         self._steps = 0
 
-    def after_step(self, partition: ZonePartition) -> ZonePartition | None:
-        """Note that a step is over; the new zones, if there are any."""
+    def before_step(self, partition: ZonePartition) -> ZonePartition | None:
+        """Note that a step begins; its zones, if they are others than before.
+
+        Nothing may look at vehicles between the cut and the next tick, which hands them over: their
+        owners may be far away from them.
+        """
         self._steps += 1
-        if self._steps % self._every:
+        if self._steps == 1 or (self._steps - 1) % self._every:
             return None
         began = time.perf_counter()
         division = self._division
@@ -65,7 +69,9 @@ class Recutter:
             return None
         self.cut(proposal.partition)
         ms = 1e3 * (time.perf_counter() - began)
-        self.recuts.append(Recut(self._steps, proposal.before, proposal.after, proposal.moved, ms))
+        self.recuts.append(
+            Recut(self._steps - 1, proposal.before, proposal.after, proposal.moved, ms)
+        )
         return proposal.partition
 
     def cut(self, partition: ZonePartition) -> None:

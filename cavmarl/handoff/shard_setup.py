@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from cavmarl.config.env import EnvConfig, ZonesConfig
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.memory import Zeros
 from cavmarl.core.records.arrays import Outputs
 from cavmarl.driving.kernels.motion import MAX_SPEED_MPS
 from cavmarl.handoff.division import Division
+from cavmarl.ownership.decisions import Neighbours
 from cavmarl.ownership.distances import Distances, check_coverage, needed_overlap_m
 from cavmarl.ownership.limits import DeadlinePolicy, Limits
 from cavmarl.rewards.registered_terms import terms_reach_m
@@ -84,12 +87,13 @@ def divide(
     division = Division(
         shards,
         zoned=zoned,
-        zones=partition.arrays,
+        partition=partition,
         halo=halo,
         sight=sight,
         touching_m=touching_m,
         borders=Borders(settings.hysteresis_m, settings.approach_ticks * dt, MAX_SPEED_MPS),
         codec=TransferCodec.of(shards[0].worlds, outputs, carried_from(config.sensors)),
+        may_teleport=traffic.sumo is not None,
     )
     return shards, division
 
@@ -128,6 +132,12 @@ def _goes_by_roads(config: EnvConfig, traffic: NativeTraffic) -> bool:
     """
     free = traffic.scene is not None or traffic.sumo is not None
     return config.zones.halo_m is None and not free
+
+
+def neighbours_of(division: Division) -> Neighbours:
+    """Between which zones the protocol lets vehicles change, while they are not cut anew."""
+    near = (frozenset(np.flatnonzero(row).tolist()) for row in division.neighbours)
+    return Neighbours(tuple(near), division.may_teleport)
 
 
 def limits_of(settings: ZonesConfig, schema: int = 1) -> Limits:

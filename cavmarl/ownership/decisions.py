@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from cavmarl.core.errors import ProtocolError
 from cavmarl.ownership.limits import Limits
@@ -24,12 +24,47 @@ class CommittedStates(Protocol):
         """`ledger.state_digest` of it."""
 
 
+class Neighbours(NamedTuple):
+    """Between which zones vehicles may change; known before the first tick."""
+
+    near: tuple[frozenset[int], ...]  # zone → those that its vehicles can be in a tick later
+    may_teleport: bool = False  # whether vehicles may be put elsewhere; then it is logged
+
+    def is_teleport(self, vehicle: int, source: int, target: int) -> bool:
+        """Whether a change of owner goes to a zone that is no neighbour.
+
+        Raises:
+            ProtocolError: it does, and vehicles are put nowhere.
+        """
+        if target in self.near[source]:
+            return False
+        if not self.may_teleport:
+            raise ProtocolError(refused(vehicle, source, target, self.near[source]))
+        return True
+
+
+def refused(vehicle: int, source: int, target: int, near: Iterable[int]) -> str:
+    """What is wrong with a change of owner that goes to a zone that is no neighbour."""
+    others = ", ".join(str(zone) for zone in sorted(near) if zone != source)
+    return (
+        f"vehicle {vehicle} of zone {source} is refused by zone {target}, which is no neighbour: "
+        f"no vehicle drives further than to zones {others} in a tick; what says where it is has "
+        "failed, and zones.check_invariants tells when"
+    )
+
+
 class Decisions:
     """Decides for each vehicle outside its owner's zone: switch, wait, or be forced."""
 
     def __init__(
-        self, readiness: Readiness, store: CommittedStates, limits: Limits, safeguards: Safeguards
+        self,
+        readiness: Readiness,
+        store: CommittedStates,
+        limits: Limits,
+        safeguards: Safeguards,
+        neighbours: Neighbours | None = None,  # None: each zone has all others
     ) -> None:
+        self.neighbours = neighbours
         self._readiness = readiness
         self._store = store
         self._limits = limits
@@ -37,9 +72,13 @@ class Decisions:
 
     def switches(
         self, table: Table, movers: Iterable[tuple[int, int]]
-    ) -> tuple[tuple[Switch, ...], tuple[Deferral, ...]]:
-        """What becomes of (vehicle, zone that contains it)."""
-        switches, deferred = [], []
+    ) -> tuple[tuple[Switch, ...], tuple[Deferral, ...], tuple[int, ...]]:
+        """What becomes of (vehicle, zone that contains it), and the ids of those put elsewhere.
+
+        Raises:
+            ProtocolError: a vehicle or a zone does not exist, or the zone is no neighbour.
+        """
+        switches, deferred, teleports = [], [], []
         for vehicle, zone in sorted(movers):
             if vehicle not in table.owners or zone not in table.hosts:
                 raise ProtocolError(f"vehicle {vehicle} in zone {zone}: one of them does not exist")
@@ -49,6 +88,8 @@ class Decisions:
                 target = self._readiness.holder(vehicle, table.tick, zone)
             if target == source:
                 continue
+            if self.neighbours and self.neighbours.is_teleport(vehicle, source, target):
+                teleports.append(vehicle)
             waited = table.deferred.get(vehicle, 0)
             may_wait = waited < self._limits.longest_deferral or not self._safeguards.deadline
             if self._ready(table, vehicle, target, epoch):
@@ -57,7 +98,8 @@ class Decisions:
                 deferred.append(Deferral(vehicle, waited + 1))
             else:
                 switches.append(Switch(vehicle, source, target, epoch + 1, True))
-        return tuple(switches), tuple(deferred)
+        gone = {switch.vehicle for switch in switches}
+        return tuple(switches), tuple(deferred), tuple(v for v in teleports if v in gone)
 
     def check_births(self, table: Table, births: Iterable[Birth]) -> None:
         """See that new vehicles are new."""

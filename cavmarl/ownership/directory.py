@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 
 from cavmarl.core.errors import JournalError, LostTickError, ProtocolError
-from cavmarl.ownership.decisions import CommittedStates, Decisions
+from cavmarl.ownership.decisions import CommittedStates, Decisions, Neighbours
 from cavmarl.ownership.ledger import world_digest
 from cavmarl.ownership.limits import DeadlinePolicy, Limits
 from cavmarl.ownership.messages import (
@@ -70,6 +70,7 @@ class Directory:
         store: CommittedStates,
         limits: Limits | None = None,
         safeguards: Safeguards = ALL_ON,
+        neighbours: Neighbours | None = None,  # None: each zone has all others
     ) -> None:
         self.run = run
         self.table = Table(zones, safeguards)
@@ -81,7 +82,7 @@ class Directory:
         self._store = store
         self._limits = Limits() if limits is None else limits
         self._safeguards = safeguards
-        self._decisions = Decisions(self.readiness, store, self._limits, safeguards)
+        self._decisions = Decisions(self.readiness, store, self._limits, safeguards, neighbours)
 
     @classmethod
     def restore(
@@ -91,11 +92,12 @@ class Directory:
         store: CommittedStates,
         limits: Limits | None = None,
         safeguards: Safeguards = ALL_ON,
+        neighbours: Neighbours | None = None,
     ) -> Directory:
         """The coordinator that wrote these records. Send what `resend` says before all else."""
         if not records or not isinstance(records[0], Reset):
             raise JournalError("a log begins with a RESET, which names the run")
-        directory = cls(records[0].run, zones, store, limits, safeguards)
+        directory = cls(records[0].run, zones, store, limits, safeguards, neighbours)
         for record in records:
             directory.table.apply(record)
         return directory
@@ -103,7 +105,13 @@ class Directory:
     def again(self, records: Sequence[Record]) -> Directory:
         """Another coordinator of the same world, with the state of a log; see `restore`."""
         zones = tuple(self.table.hosts)
-        return Directory.restore(records, zones, self._store, self._limits, self._safeguards)
+        return Directory.restore(
+            records, zones, self._store, self._limits, self._safeguards, self._decisions.neighbours
+        )
+
+    def know(self, neighbours: Neighbours) -> None:
+        """From now on let vehicles change between neighbours only."""
+        self._decisions.neighbours = neighbours
 
     # Episodes and hosts
 
@@ -165,8 +173,10 @@ class Directory:
             raise ProtocolError(f"tick {table.plan.record.tick} is not committed")
         new = tuple(sorted(births))
         self.check_births(new)
-        switches, deferred = self._decisions.switches(table, movers)
-        begun = self._logged(Begin(table.episode, table.tick + 1, switches, deferred, new, inputs))
+        switches, deferred, teleports = self._decisions.switches(table, movers)
+        begun = self._logged(
+            Begin(table.episode, table.tick + 1, switches, deferred, new, inputs, teleports)
+        )
         records = begun.records if self._safeguards.log_before_send else ()
         return Output(records, self.resend(payloads=payloads or {}).messages)
 

@@ -262,12 +262,16 @@ class Reset(Record):
 
 @dataclass(slots=True, unsafe_hash=True)
 class Begin(Record):
-    """What has been decided for the way to `tick`. `inputs` is the digest of the actions."""
+    """What has been decided for the way to `tick`. `inputs` is the digest of the actions.
+
+    `teleports` are the vehicles among `switches` whose new zone is no neighbour of the old one.
+    """
 
     switches: tuple[Switch, ...] = ()
     deferred: tuple[Deferral, ...] = ()
     births: tuple[Birth, ...] = ()
     inputs: bytes = b""
+    teleports: tuple[int, ...] = ()
 
 
 @dataclass(slots=True, unsafe_hash=True)

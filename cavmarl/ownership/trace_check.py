@@ -11,7 +11,7 @@ A tick costs what changes in it: vehicles that stay where they are are never loo
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -83,8 +83,9 @@ class TraceChecker:
         # zones and coordinator live in one process, so that there are records alone, and perhaps
         # only of ticks that have something to tell of
         is_direct: bool = False,
+        near: Sequence[Container[int]] | None = None,  # zone → its neighbours; None: all
     ) -> None:
-        self._is_direct = is_direct
+        self._is_direct, self.near = is_direct, near
         self.owners: dict[int, Owner] = {}  # vehicle → owner as of the committed tick
         self.changes: list[OwnerStep] = []  # what the last COMMIT did to them
         self._longest, self._lifetime = longest_deferral, lifetime
@@ -155,6 +156,8 @@ class TraceChecker:
         for vehicle, source, target, epoch, forced in record.switches:
             owner = self.owners.get(vehicle)
             _require(owner == (source, epoch - 1), f"v{vehicle} is owned by {owner}")
+            known = self.near is None or target in self.near[source]
+            _require(known or vehicle in record.teleports, f"v{vehicle} goes to no neighbour")
             waited = self._deferred.get(vehicle, 0)
             if forced:
                 _require(waited >= self._longest, f"v{vehicle} is forced after {waited} ticks")

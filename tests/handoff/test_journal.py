@@ -342,6 +342,7 @@ def form(hint: Any, name: str = "") -> str:
 
 MEANINGS = {
     "run": "16 bytes that name the run",
+    "teleports": "vehicles among `switches` whose new zone is no neighbour of the old one",
     "inputs": "digest of the actions",
     "removed": "vehicles that left; the reason is the runtime's code",
     "zones": "of each zone: its process, how many vehicles it owns and the digest of their ids and "

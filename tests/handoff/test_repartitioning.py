@@ -12,6 +12,9 @@ import pytest
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.env.vector import make_vec
+from cavmarl.handoff import repartitioning
+from cavmarl.handoff.repartition_plan import Proposal
+from cavmarl.zones.partition.zone_partition import ZonePartition
 from tests.support.driving import drive, make_simulation, start
 
 OFTEN = {
@@ -118,3 +121,33 @@ def test_what_cannot_be_cut_anew_is_refused(overrides: dict[str, Any], words: st
 def test_zones_of_one_world_over_workers_stay() -> None:
     with pytest.raises(ConfigError, match="over workers needs zones that stay"):
         make_vec("grid4x4", zones=4, workers=2, overrides={"zones.repartition_steps": 5})
+
+
+def test_zones_that_change_places_hand_over_what_no_vehicle_could_drive(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Vehicles of a zone that is far away now are teleports, and nobody can tell."""
+    path = tmp_path / "run.jsonl"
+    strips = {"zones.layout": "strips", "zones.journal": str(path), "zones.count": 9, **OFTEN}
+    strips["zones.repartition_steps"] = 6
+    whole, recut = (
+        make_simulation("grid4x4", mode="closed", agents=6, background=60, overrides=overrides)
+        for overrides in ({}, strips)
+    )
+
+    def turn(network: Any, partition: ZonePartition, *_: Any, **__: Any) -> Proposal:
+        return Proposal(ZonePartition(partition.bounds, partition.rects[::-1]), 2.0, 1.0, 60)
+
+    monkeypatch.setattr(repartitioning, "propose_zones", turn)
+    for simulation in (whole, recut):
+        start(simulation, seed=4)
+    for _ in range(12):
+        drive(whole)
+        drive(recut)
+        assert whole.state_hash() == recut.state_hash()
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    (turned,) = [line for line in lines if line.get("teleports")]
+    switches = {vehicle: (source, target) for vehicle, source, target, *_ in turned["switches"]}
+    assert len(switches) > 40
+    for vehicle, (source, target) in switches.items():
+        assert (vehicle in turned["teleports"]) == (abs(source - target) > 1)

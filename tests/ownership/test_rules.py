@@ -13,6 +13,7 @@ from cavmarl.core.errors import (
     LostTickError,
     ProtocolError,
 )
+from cavmarl.ownership.decisions import Neighbours
 from cavmarl.ownership.directory import Directory, StoreError
 from cavmarl.ownership.distances import Distances, check_coverage, needed_overlap_m
 from cavmarl.ownership.ledger import row_hash, world_digest
@@ -30,10 +31,13 @@ from cavmarl.ownership.messages import (
     Refusal,
     Removed,
     Step,
+    Switch,
 )
 from cavmarl.ownership.offers import Approach
 from cavmarl.ownership.safeguards import ALL_ON
 from cavmarl.ownership.store import MemoryStore
+from cavmarl.ownership.trace import LOG, TraceEntry
+from cavmarl.ownership.trace_check import TraceChecker
 from cavmarl.ownership.transitions import State
 from cavmarl.ownership.transport import FaultPlan, Network, Rates
 from tests.ownership.bench import Bench, version
@@ -495,3 +499,29 @@ def test_r35_offers_name_vehicles_of_their_own() -> None:
     bench, _ = prepared(ALL_ON)
     with pytest.raises(ProtocolError, match="offers vehicle 8"):
         bench.endpoints[0].offer([Approach(8, 1, b"")])
+
+
+def test_r36_a_change_to_a_zone_that_is_no_neighbour_is_refused() -> None:
+    in_a_row = tuple(map(frozenset, ({0, 1}, {0, 1, 2}, {1, 2})))
+    for may_teleport in (False, True):
+        bench = Bench(zones=3)
+        bench.directory.know(Neighbours(in_a_row, may_teleport))
+        bench.tick(births=[(7, 0), (8, 1)], offers=[(7, 2), (8, 2)])
+        if may_teleport:
+            bench.begin([(7, 2), (8, 2)])
+            begun = bench.log[-1]
+            assert isinstance(begun, Begin)
+            assert [switch.vehicle for switch in begun.switches] == [7, 8]
+            assert begun.teleports == (7,)
+            continue
+        with pytest.raises(ProtocolError, match=r"vehicle 7 of zone 0 .* zone 2, .* to zones 1 in"):
+            bench.begin([(7, 2)])
+        bench.begin([(8, 2)])
+        checker = TraceChecker(2, 16, near=in_a_row)
+        *before, begun = bench.trace.entries
+        assert isinstance(begun.item, Begin)
+        for entry in before:
+            checker.take(entry)
+        wrong = Begin(0, begun.item.tick, (Switch(7, 0, 2, 1, False),))
+        with pytest.raises(ProtocolError, match="v7 goes to no neighbour"):
+            checker.take(TraceEntry(LOG, wrong))

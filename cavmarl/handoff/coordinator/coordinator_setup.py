@@ -25,7 +25,7 @@ from cavmarl.handoff.fault_injection.fault_plan import Faults, read_faults
 from cavmarl.handoff.fault_injection.injected_faults import Crashes, FaultyCoordinator, FaultyPhases
 from cavmarl.handoff.fault_injection.message_coordinator import MessageCoordinator
 from cavmarl.handoff.fault_injection.recovery import Recovery
-from cavmarl.handoff.shard_setup import limits_of
+from cavmarl.handoff.shard_setup import limits_of, neighbours_of
 from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import RUN_BYTES
@@ -167,7 +167,8 @@ def _referee(
         counts = partial(division.counts, w)
         book = HandoffLog(division, w)
         return LocalCoordinator(directory, journal, book, counts, transfers)
-    arguments = (run, zones, states, limits, Network(faults.plan()), journal, safeguards)
+    network, near = Network(faults.plan()), neighbours_of(division)
+    arguments = (run, zones, states, limits, network, journal, safeguards, near)
     coordinator = (
         MessageCoordinator(*arguments)
         if crashes is None
@@ -182,7 +183,8 @@ def _monitor(
 ) -> InvariantMonitor:
     """The monitor of all worlds, and is told what their coordinators do."""
     is_direct = isinstance(coordinators[0], LocalCoordinator)
-    records = [OwnersOnRecord(division.count, limits, is_direct) for _ in coordinators]
+    near = None if is_direct else neighbours_of(division).near  # else zones may be cut anew
+    records = [OwnersOnRecord(division.count, limits, is_direct, near) for _ in coordinators]
     for coordinator, record in zip(coordinators, records, strict=True):
         coordinator.watch(record)
         if isinstance(coordinator, LocalCoordinator):

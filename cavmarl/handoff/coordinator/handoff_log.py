@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from time import perf_counter
 from typing import NamedTuple
 
@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError, ProtocolError
 from cavmarl.handoff.division import Division
-from cavmarl.ownership.messages import Birth
+from cavmarl.ownership.decisions import refused
+from cavmarl.ownership.messages import Birth, Switch
 from cavmarl.zones.kernels.handoff import NOT_OWNED
 
 
@@ -40,6 +41,8 @@ class HandoffLog:
         self._book = division.book
         self._hand_over = division.call_hand_over
         self._release = division.call_release
+        self._neighbours = division.neighbours
+        self._teleports: set[tuple[int, int]] = set()  # tick and vehicle, of changes not taken yet
 
     def hand_over(
         self,
@@ -52,6 +55,8 @@ class HandoffLog:
 
         Raises:
             ConfigError: a zone has not seen a vehicle that enters it.
+            ProtocolError: a vehicle enters a zone that is no neighbour of its own, though zones
+                stay and vehicles are put nowhere.
         """
         division, book, w = self._division, self._book, self._world
         changed = 0
@@ -64,17 +69,50 @@ class HandoffLog:
             )  # fmt: skip
             if changed < 0:
                 self._refuse(changed)
+        if changed:
+            self._note_teleports(changed)
+        self._neighbours = division.neighbours
         # Vehicles that entered after the ghosts were renewed have not been checked.
         if book.owned.item(w) != (vehicles if everybody else vehicles - len(newborn)):
             raise ProtocolError(f"zones own {division.counts(w)} vehicles, not {vehicles}")
         book.ms[w] = 1e3 * perf_counter()
         return changed
 
+    def _note_teleports(self, changed: int) -> None:
+        """Note which of the newest changes go to zones that are no neighbours."""
+        division, last = self._division, len(self)
+        new = self._book.changes[self._world, last - changed : last]
+        near = division.neighbours[new["source"], new["target"]]
+        if near.all():
+            return
+        are_cut = self._neighbours is not division.neighbours
+        far = new[~near]
+        if not (are_cut or division.may_teleport):
+            raise self._no_neighbour(OwnerChange(*far[0].item()))
+        self._teleports.update(zip(far["tick"].tolist(), far["vehicle"].tolist(), strict=True))
+
+    def teleports(self, switches: Iterable[Switch], tick: int) -> tuple[int, ...]:
+        """Vehicles that have changed in a tick to a zone that is no neighbour of the old one."""
+        if not self._teleports:
+            return ()
+        return tuple(s.vehicle for s in switches if (tick, s.vehicle) in self._teleports)
+
+    def forget_teleports(self, tick: int) -> None:
+        """Those up to a tick are not asked for any more."""
+        if self._teleports:
+            self._teleports = {entry for entry in self._teleports if entry[0] > tick}
+
     def _refuse(self, why: int) -> None:
         change = OwnerChange(*self._book.changes[self._world, len(self)].item())
         if why == NOT_OWNED:
             raise ConfigError(f"zone {change.source} does not own vehicle {change.vehicle}")
+        if not self._division.neighbours[change.source, change.target]:
+            raise self._no_neighbour(change)
         raise self._division.unseen(change.vehicle, change.target)
+
+    def _no_neighbour(self, change: OwnerChange) -> ProtocolError:
+        zones = np.flatnonzero(self._division.neighbours[change.source]).tolist()
+        return ProtocolError(refused(change.vehicle, change.source, change.target, zones))
 
     def release(self, changed: int) -> None:
         """The tick is over in which the newest so many have changed."""
@@ -117,4 +155,5 @@ class HandoffLog:
 
     def reset(self, tick: int) -> None:
         self._book.num_changes[self._world] = 0
+        self._teleports.clear()
         self._book.tick[self._world] = tick

@@ -8,7 +8,7 @@ records, and costs what changes in them. The words of an error are found when th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,9 +57,15 @@ class OwnersOnRecord:
         ask: lets the coordinator make the records that it still owes.
     """
 
-    def __init__(self, zones: int, limits: Limits, is_direct: bool = False) -> None:
+    def __init__(
+        self,
+        zones: int,
+        limits: Limits,
+        is_direct: bool = False,
+        near: Sequence[Container[int]] | None = None,  # zone → its neighbours; None: all
+    ) -> None:
         self.entered = self.left = 0  # vehicles that zones have begun to own, since the reset
-        self._checker = TraceChecker(limits.longest_deferral, limits.lifetime, is_direct)
+        self._checker = TraceChecker(limits.longest_deferral, limits.lifetime, is_direct, near)
         self._sums = np.zeros(zones, dtype=np.uint64)
         self._current = self._sums  # with what records that are still to come add to them
         self.ask: Callable[[], None] = _nothing

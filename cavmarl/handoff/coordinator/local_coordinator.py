@@ -125,8 +125,7 @@ class LocalCoordinator(Coordinator):
             self._removed = []
         if self.journal is not None:
             switches = tuple(map(_switch, self._book.newest(changed)))
-            episode = self._directory.table.episode
-            self._record(Begin(episode, self._tick + 1, switches, (), self._new, inputs))
+            self._record(self._begun(self._tick + 1, switches, self._new, inputs))
 
     def end(self, rows: Callable[[int], int], stored: Callable[[int], int] | None = None) -> None:
         """Commit, if the zones own what they should, as `Coordinator.end` says."""
@@ -176,6 +175,7 @@ class LocalCoordinator(Coordinator):
             self._transfers.add_later(
                 len(changes), sum(removed_now), lambda: _rows(changes, episode, removed_now)
             )
+        self._book.forget_teleports(self._tick)
         acknowledged, aborted = self._book.take_counts()
         self._transfers.count(acknowledged=acknowledged, aborted=aborted)
 
@@ -185,12 +185,23 @@ class LocalCoordinator(Coordinator):
         columns = (changes[name].tolist() for name in ("vehicle", "source", "target", "epoch"))
         switches = tuple(map(Switch, *columns, repeat(False)))
         if is_told:
-            self._record(Begin(table.episode, tick, switches, (), news.births))
+            self._record(self._begun(tick, switches, news.births))
         if news.births:
             self._directory.check_births(news.births)
         table.settle(tick, switches, news.births, news.removed)
         if is_told:
             self._record(self._committed(news.removed, _no_digest))
+
+    def _begun(
+        self,
+        tick: int,
+        switches: tuple[Switch, ...],
+        births: tuple[Birth, ...],
+        inputs: bytes = b"",
+    ) -> Begin:
+        teleports = self._book.teleports(switches, tick)
+        episode = self._directory.table.episode
+        return Begin(episode, tick, switches, (), births, inputs, teleports)
 
     def _committed(self, removed: tuple[Removed, ...], rows: Callable[[int], int]) -> Commit:
         table = self._directory.table

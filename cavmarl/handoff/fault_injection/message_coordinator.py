@@ -9,6 +9,7 @@ from typing import Protocol, TypeAlias
 from cavmarl.core.errors import ProtocolError
 from cavmarl.handoff.coordinator.coordinator import ArrivingVehicle, Coordinator, Near
 from cavmarl.handoff.coordinator.journal import AnyJournal, MemoryJournal
+from cavmarl.ownership.decisions import Neighbours
 from cavmarl.ownership.directory import SILENCE, Directory
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.limits import Limits
@@ -72,8 +73,10 @@ class MessageCoordinator(Coordinator):
         post: Post,  # carries the messages
         journal: AnyJournal | None = None,  # takes the records; None: not kept
         safeguards: Safeguards = ALL_ON,  # remedies of the protocol; tests take one away
+        neighbours: Neighbours | None = None,  # between which zones vehicles may change
     ) -> None:
-        super().__init__(Directory(run, range(zones), states, limits, safeguards), journal)
+        directory = Directory(run, range(zones), states, limits, safeguards, neighbours)
+        super().__init__(directory, journal)
         self.endpoints: dict[int, Endpoint] = {}  # zone → its host's side
         self.post = post  # what carries the messages
         self.resent: Counter[str] = Counter()

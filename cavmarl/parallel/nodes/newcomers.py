@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from cavmarl.core.errors import WorkerError, WorkerFailureError
+from cavmarl.ownership.decisions import Neighbours
 from cavmarl.parallel.commanded_worlds import own_error
 from cavmarl.parallel.hosts.host_process import code_stamp
 from cavmarl.parallel.nodes.links import FrameKind, Link, LinkLostError, Links, NodeFrame
@@ -31,6 +32,7 @@ class Newcomer:
     pid: int = 0  # of its process, there
     is_let_in: bool = False  # it runs what the caller runs
     place: tuple[str, int] | None = None  # where other nodes can call, once it has loaded the world
+    neighbours: Neighbours | None = None  # between which zones vehicles change, by that world
 
 
 class Newcomers:
@@ -122,8 +124,9 @@ class Newcomers:
                 case FrameKind.WANTED if newcomer.is_let_in:
                     self._send_files(number, json.loads(bytes(frame.data)))
                 case FrameKind.READY if newcomer.is_let_in:
-                    host, port = json.loads(bytes(frame.data))
+                    host, port, near, may_teleport = json.loads(bytes(frame.data))
                     newcomer.place = str(host), int(port)
+                    newcomer.neighbours = Neighbours(tuple(map(frozenset, near)), may_teleport)
                     self.ready.append(number)
                 case FrameKind.FAILED:
                     name, text, trace = json.loads(bytes(frame.data))

@@ -9,6 +9,7 @@ from cavmarl.core.errors import MessageError, ProtocolError
 from cavmarl.handoff.coordinator.invariant_monitor import OwnersOnRecord
 from cavmarl.handoff.coordinator.journal import AnyJournal
 from cavmarl.handoff.zone_view import TransferInFlight
+from cavmarl.ownership.decisions import Neighbours
 from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import Ack, Begin, Birth, Message, Nack, Output
@@ -110,9 +111,10 @@ class NodeCoordinator:
         self._links = links
         self.switched = 0
 
-    def host(self) -> list[list[Hosting]]:
+    def host(self, neighbours: Neighbours) -> list[list[Hosting]]:
         """Begin; what the hosts of all zones have to know, by worlds."""
         for world in self._worlds:
+            world.directory.know(neighbours)
             world.write(world.directory.reset())
             for zone, node in enumerate(self._node_of):
                 world.write(world.directory.host(zone, worker=node))

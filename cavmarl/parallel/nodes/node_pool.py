@@ -162,7 +162,10 @@ class NodePool:
         join_timeout_s = self.world.config.workers.join_timeout_s
         self._newcomers.await_ready(nodes, join_timeout_s, self._starter.trouble)
         self._seat()
-        self._tell_zones(self._coordinator.host(), ZoneMoves(self.zones, {}, []), begins=True)
+        neighbours = self._nodes[0].neighbours
+        assert neighbours is not None
+        hostings = self._coordinator.host(neighbours)
+        self._tell_zones(hostings, ZoneMoves(self.zones, {}, []), begins=True)
         self._commit()
         self._new.clear()
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from cavmarl.core.errors import CavmarlError, ConfigError, MessageError, NodeRefusedError
 from cavmarl.engine.shard_clock import ShardClock
-from cavmarl.handoff.shard_setup import limits_of
+from cavmarl.handoff.shard_setup import limits_of, neighbours_of
 from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.ownership.reactions import Hosting
 from cavmarl.parallel.hosts.host_process import code_stamp
@@ -95,8 +95,9 @@ class NodeProgram:
         self._commands = commands_of(worlds.arrays)
         worlds.keep_logs()
         self._listener = self._system.listen(self._address, self._secret)
-        said = json.dumps(self._listener.place).encode()
-        links.send(COORDINATOR, FrameKind.READY, 0, [said])
+        near, may_teleport = neighbours_of(worlds.simulation.division)
+        said = [*self._listener.place, list(map(sorted, near)), may_teleport]
+        links.send(COORDINATOR, FrameKind.READY, 0, [json.dumps(said).encode()])
 
     def _fetch(self, files: Sequence[WorldFile]) -> None:
         """Get those that this machine does not have."""

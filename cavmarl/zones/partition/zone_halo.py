@@ -23,10 +23,7 @@ def zone_halo(partition: ZonePartition, halo_m: float) -> Halo:
     """What `kernels.exchange.exchange` takes, where all vehicles within the halo are seen."""
     if not (math.isfinite(halo_m) and halo_m >= 0.0):
         raise ConfigError(f"halo_m = {halo_m!r}: must be a finite number from 0")
-    rects = partition.reaching
-    gaps = np.maximum(rects[:, None, :2] - rects[None, :, 2:], 0.0)
-    gaps = np.maximum(gaps, gaps.swapaxes(0, 1))
-    near = (gaps * gaps).sum(axis=2) <= halo_m * halo_m
+    near = partition.within(halo_m)
     start = np.concatenate([[0], np.cumsum(near.sum(axis=1))]).astype(np.int32)
     return Halo(
         halo_m=float(halo_m),

@@ -99,6 +99,14 @@ class ZonePartition:
             for a in range(self.count)
         )
 
+    def within(self, distance_m: float) -> NDArray[np.bool_]:
+        """(k, k) which zones are no further apart; each is no further from itself."""
+        rects = self.reaching
+        gaps = np.maximum(rects[:, None, :2] - rects[None, :, 2:], 0.0)
+        gaps = np.maximum(gaps, gaps.swapaxes(0, 1))
+        near: NDArray[np.bool_] = (gaps * gaps).sum(axis=2) <= distance_m * distance_m
+        return near
+
     @property
     def side_neighbors(self) -> tuple[tuple[int, ...], ...]:
         """For each zone those that share a side with it: corners are hardly ever crossed."""
