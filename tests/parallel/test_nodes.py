@@ -14,10 +14,12 @@ import psutil
 import pytest
 
 from cavmarl import ConfigError, make_vec, parallel_env
-from cavmarl.core.errors import WorkerDeathError, WorkerError
+from cavmarl.core.errors import MessageError, WorkerDeathError, WorkerError
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.handoff.coordinator.journal import JournalReader
+from cavmarl.parallel.nodes.node_actions import Actions, read_refusal, take_actions
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
+from cavmarl.parallel.step_arrays import StepArrays
 from tests.support.actuated import actuated_grid
 from tests.support.forks import said_in_fork
 from tests.support.vec_runs import Make, drive, same
@@ -50,6 +52,51 @@ def test_nobody_can_tell(make: Make, arguments: dict[str, Any], nodes: int) -> N
     assert same(drive(vec), whole)
     assert len(over_nodes(vec).pids) == nodes
     assert over_nodes(vec).recoveries == 0
+
+
+def test_an_action_that_comes_to_the_wrong_node_is_refused_and_sent_to_the_owner(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = drive(make("grid4x4", **WANTED))
+    vec = make("grid4x4", zones=4, nodes=3, **WANTED)
+    worlds = over_nodes(vec)
+    assert same(drive(vec), whole)
+    assert (worlds.migrations > 0, worlds.redirected) == (True, 0)
+
+    def mistake(step: int) -> None:
+        owned = worlds._owner >= 0
+        worlds._owner[owned] = (worlds._owner[owned] + 1) % 3
+
+    assert same(drive(vec, before=mistake), whole)
+    assert worlds.redirected > 50
+
+
+def test_a_node_is_told_what_its_own_agents_do() -> None:
+    arrays = StepArrays.of(
+        {name: np.zeros((1, 4, 2)) for name in StepArrays._fields[:-2]} | {"mask": np.ones((1, 4))}
+    )
+    arrays.controls[0, :, 0] = range(4)
+    arrays = arrays._replace(mask=np.array([[True, True, True, False]]))
+    actions = Actions.of(arrays._replace(meta_actions=np.arange(4)[None]))
+    owner = np.array([1, 0, -1, 1], np.int32)
+    there = StepArrays(*(array.copy() for array in arrays[:-2]), {}, {})
+    data = memoryview(b"".join(map(bytes, actions.of_node(1, owner))))
+    there = there._replace(meta_actions=np.zeros((1, 4), np.int64))
+    there.controls[...] = -1.0
+    told, at = take_actions(data, 0, there)
+    unowned, _ = take_actions(data, at, there)
+    assert (told.tolist(), unowned.tolist()) == ([0], [2, 3])
+    assert there.controls[0, :, 0].tolist() == [0.0, -1.0, 2.0, 3.0]
+    assert there.meta_actions.tolist() == [[0, 0, 2, 3]]
+
+
+@pytest.mark.parametrize(
+    "found", [bytes(8), np.array([4, 1]).tobytes(), np.array([0, 7]).tobytes()]
+)
+def test_a_refusal_that_cannot_be_is_none(found: bytes) -> None:
+    assert read_refusal(memoryview(np.array([3, 1]).tobytes()), 4, {0, 1}).tolist() == [[3], [1]]
+    with pytest.raises(MessageError, match="refusal"):
+        read_refusal(memoryview(found), 4, {0, 1})
 
 
 def test_a_fork_neither_steps_nor_ends_the_nodes(make: Make) -> None:

@@ -70,6 +70,8 @@ class FrameKind(IntEnum):
     REFUSED = 19  # C → N: why it is of no use
     END = 20  # C → N: it is needed no more
     GIVE = 21  # N → N: the state of zones that another node hosts from now on
+    NOT_MINE = 22  # N → C: agents whose actions have come to the wrong node, and who owns them
+    ACTIONS = 23  # C → N: those
 
 
 class NodeFrame(NamedTuple):
@@ -90,6 +92,8 @@ URGENT = frozenset(
         FrameKind.AGENT,
         FrameKind.FAILED,
         FrameKind.GIVE,
+        FrameKind.NOT_MINE,
+        FrameKind.ACTIONS,
     }
 )
 Urgent: TypeAlias = Callable[[int, NodeFrame], None]

@@ -17,7 +17,7 @@ from cavmarl.parallel.worlds_job import Task
 
 _HEAD = struct.Struct("<II")
 _INPUTS: Mapping[Task, tuple[str, ...]] = {
-    Task.STEP: ("controls", "meta_actions", "declared", "inserted"),
+    Task.STEP: ("declared", "inserted"),
     Task.RESET: ("chosen",),
 }
 _COMMON = (
@@ -27,19 +27,19 @@ _COMMON = (
 
 
 def pieces_of(task: Task, payload: Any, arrays: StepArrays) -> list[Bytes]:
-    """A command: the task, what it is told, and the arrays that it reads."""
+    """A command: the task, what it is told, and the arrays that all nodes read."""
     said = json.dumps(payload).encode()
     read = (_flat(getattr(arrays, name)).data for name in _INPUTS.get(task, ()))
     return [_HEAD.pack(task, len(said)), said, *read]
 
 
-def command_of(data: memoryview, arrays: StepArrays) -> tuple[Task, Any]:
-    """The same at the other end; the arrays are written to those that are given."""
+def command_of(data: memoryview, arrays: StepArrays) -> tuple[Task, Any, int]:
+    """The same at the other end, and where it ends; the arrays are written to those given."""
     task, size = _HEAD.unpack_from(data)
     at = _HEAD.size + size
     for name in _INPUTS.get(Task(task), ()):
         at = _fill(_flat(getattr(arrays, name)), data, at)
-    return Task(task), json.loads(bytes(data[_HEAD.size : _HEAD.size + size]))
+    return Task(task), json.loads(bytes(data[_HEAD.size : _HEAD.size + size])), at
 
 
 def results_of(
@@ -87,9 +87,10 @@ def take_results(
     arrays: StepArrays,
     with_common: bool,  # it comes from the node that tells what all know alike: the first one
     of_step: bool,  # and not of a reset
-) -> None:
-    """Write what a node has sent to the arrays."""
+) -> NDArray[np.int64]:
+    """Write what a node has sent to the arrays; the agents that it owns, over all worlds."""
     at = 0
+    own = np.zeros(0, dtype=np.int64)
     if with_common:
         for name in _COMMON:
             at = _fill(_flat(getattr(arrays, name)), data, at)
@@ -97,16 +98,18 @@ def take_results(
             ended = arrays.episode_over | arrays.terminations.any(axis=1)
             for array in _sensed(arrays)[1]:
                 array[ended] = 0
-    for sensed in _sensed(arrays):
+    for is_final, sensed in enumerate(_sensed(arrays)):
         num = int(np.frombuffer(data, np.int64, 1, at)[0])
         at += 8
         if num:
             where = np.frombuffer(data, np.int64, num, at)
             at += where.nbytes
+            own = own if is_final else where
             for target in map(_by_agent, sensed):
                 rows = np.frombuffer(data, target.dtype, num * target[0].size, at)
                 target[where] = rows.reshape(num, *target.shape[1:])
                 at += rows.nbytes
+    return own
 
 
 def told_cases(cases: Sequence[bytes], only_reads: bool = False) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from cavmarl.parallel.nodes.links import (
     NodeFrame,
     RecoveryOrderedError,
 )
+from cavmarl.parallel.nodes.node_actions import NOBODY
 from cavmarl.zones.kernels.ghost_frames import count_ghosts, pack_ghosts, take_ghosts
 
 Array = NDArray[Any]
@@ -39,6 +40,7 @@ class NodePeers:
     Attributes:
         own: (W, A) agents that this node has sensed for last.
         stepped: the same at the end of the last step, before worlds began anew.
+        owner: (W · A,) the node that has sensed for each agent last; `NOBODY`: none.
     """
 
     def __init__(
@@ -73,6 +75,7 @@ class NodePeers:
         self._is_stepping = False
         self.own: Array = np.zeros_like(simulation.outputs.present)
         self.stepped = self.own.copy()
+        self.owner: NDArray[np.int32] = np.full(self.own.size, NOBODY, dtype=np.int32)
 
     def begin_step(self) -> None:
         """What is sensed next is what a step gave."""
@@ -98,6 +101,11 @@ class NodePeers:
             for w, num in enumerate(self._zoned.num_owned[zone].tolist()):
                 agents = self._zoned.rows["agent"][side, zone, w, :num]
                 self.own[w, agents[agents >= 0]] = True
+        mine = np.flatnonzero(self.own.reshape(-1))
+        self.owner[:] = NOBODY
+        self.owner[mine] = self._number
+        for number, data in self._swap([mine.data] for _ in self._others):
+            self.owner[np.frombuffer(data, np.int64)] = number
 
     def share_rows(self, gate: Gate, side: int) -> None:
         zoned = self._zoned
@@ -216,9 +224,12 @@ class NodePeers:
         arrays = [_by_agent(getattr(outputs, name)) for name in PIECES]
         pieces = [np.int64(where.size).tobytes(), where.data]
         pieces += [_bytes(array[where]) for array in arrays]
-        for _, data in self._swap(pieces for _ in self._others):
+        self.owner.reshape(self.own.shape)[chosen] = NOBODY
+        self.owner[where] = self._number
+        for number, data in self._swap(pieces for _ in self._others):
             (num,), at = _read(data, 0, np.int64, 1)
             agents, at = _read(data, at, np.int64, int(num))
+            self.owner[agents] = number
             for array in arrays:
                 found, at = _read(data, at, array.dtype, int(num) * array[0].size)
                 array[agents] = found.reshape(int(num), *array.shape[1:])

@@ -39,6 +39,7 @@ from cavmarl.parallel.nodes.links import (
     said_by,
 )
 from cavmarl.parallel.nodes.newcomers import Newcomer, Newcomers
+from cavmarl.parallel.nodes.node_actions import NOBODY, NodeCommand, read_refusal
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
 from cavmarl.parallel.nodes.node_files import files_of
 from cavmarl.parallel.nodes.node_starters import Route, Start, start_nodes, straight
@@ -58,14 +59,6 @@ END_S = 1.0  # for nodes to hear that they are needed no more
 SPARES = 1  # nodes more than are wanted that may wait for another one's end
 
 
-class NodeCommand(NamedTuple):
-    """What all nodes are to do."""
-
-    pieces: list[bytes]  # of its frame
-    changes: bool  # what the worlds are
-    ticks: int  # of the worlds
-
-
 class _State(NamedTuple):
     """What nodes have kept before a command."""
 
@@ -83,6 +76,7 @@ class NodePool:
         losses: how many nodes were lost.
         recoveries: how often the worlds have gone back because of that.
         replacements: how many nodes host zones in the place of others.
+        redirected: how many actions a node has refused that was not the owner of the agent.
 
     Raises:
         ConfigError: a setting that such worlds cannot have, or more nodes than zones.
@@ -118,7 +112,11 @@ class NodePool:
         self._log: list[NodeCommand] = []  # since that state
         self._lost: list[int] = []
         self._is_torn = False
-        self.losses = self.recoveries = self.replacements = 0
+        self.losses = self.recoveries = self.replacements = self.redirected = 0
+        # (W · A,) the node that owns each agent, as far as is known
+        self._owner = np.full(self.arrays.mask.size, NOBODY, dtype=np.int32)
+        self._tellers: list[int] = []  # the nodes of the last results
+        self._performed: NodeCommand | None = None
         self._timeout_s = config.workers.timeout_s
         self._pid = os.getpid()
         self._ticks_per_step = config.clock.ticks_per_step
@@ -278,8 +276,10 @@ class NodePool:
     def _perform(self, command: NodeCommand) -> list[memoryview]:
         """Do a command once. Raises LinkLostError: a node is lost."""
         kept = self._opened.number if self._opened and self._log and command is self._log[-1] else 0
+        self._performed = command
         for number in self._living:
-            self._links.send(number, FrameKind.COMMAND, kept, command.pieces)
+            pieces = command.of_node(number, self._owner)
+            self._links.send(number, FrameKind.COMMAND, kept, pieces)
         if not command.changes:
             return [frame.data for frame in self._take(FrameKind.RESULT).values()]
         results: list[memoryview] = []
@@ -300,8 +300,27 @@ class NodePool:
             raise own_error(failure) from failure
         elif frame.kind is FrameKind.PONG:
             self._watch.hear_pong(number, frame)
+        elif frame.kind is FrameKind.NOT_MINE:
+            if frame.number == self._generation:
+                self._send_on(frame)
         else:
             self._coordinator.hear(number, frame)
+
+    def _send_on(self, frame: NodeFrame) -> None:
+        """Send actions that a node refuses to the owners that it names.
+
+        Raises:
+            MessageError: there are no such agents, or owners.
+        """
+        found = read_refusal(frame.data, self._owner.size, set(self._living))
+        if self._performed is None or self._performed.actions is None:
+            raise MessageError("actions are refused where there are none")
+        for owner in np.unique(found[1]).tolist():
+            agents = found[0, found[1] == owner]
+            self._owner[agents] = owner
+            self.redirected += len(agents)
+            pieces = self._performed.actions.some(agents)
+            self._links.send(owner, FrameKind.ACTIONS, self._generation, pieces)
 
     def _lose(self, lost: LinkLostError, is_silent: bool = False) -> None:
         """A node is gone: nothing of it counts any more."""
@@ -392,6 +411,7 @@ class NodePool:
             except (ValueError, TypeError, struct.error, ProtocolError) as error:
                 raise LinkLostError(number, MessageError(f"no report: {error}")) from error
         self._coordinator.commit({n: (messages, said) for n, (messages, said, _) in read.items()})
+        self._tellers = list(read)
         return [more for _, _, more in read.values()]
 
     def _node_of(self) -> list[int]:

@@ -6,6 +6,7 @@ import json
 import os
 import socket
 import traceback
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, NoReturn
@@ -30,6 +31,7 @@ from cavmarl.parallel.nodes.links import (
     RecoveryOrderedError,
 )
 from cavmarl.parallel.nodes.meeting import call_node, calls_of
+from cavmarl.parallel.nodes.node_actions import refusal, take_actions
 from cavmarl.parallel.nodes.node_files import WorldFile, recipe_with
 from cavmarl.parallel.nodes.node_frames import cases_of, command_of, results_of, told_cases
 from cavmarl.parallel.nodes.node_loads import totals
@@ -75,6 +77,7 @@ class NodeProgram:
         self._secret = secret
         self._number = -1  # until the caller has said it
         self._generation = 0
+        self._actions: deque[NodeFrame] = deque()  # that have been sent here after all
 
     def join(self) -> None:
         """Load the world, and say where other nodes can call.
@@ -134,7 +137,9 @@ class NodeProgram:
         self._peers = NodePeers(simulation, self._links, zones, self._number, generation << 32)
         limits = limits_of(simulation.config.zones, simulation.division.codec.schema)
         mounted = simulation.mounted
-        carried = [] if mounted is None else [*mounted.arrays()]
+        arrays = self._worlds.arrays
+        carried = [arrays.controls, arrays.meta_actions]
+        carried += [] if mounted is None else mounted.arrays()
         self._hosts = ZoneHosts(
             simulation.division, mine, node_of, told, limits, self._links, carried, generation,
             simulation.config.zones.check_invariants,
@@ -152,6 +157,8 @@ class NodeProgram:
             self._kept.take(number, frame)
         elif frame.kind is FrameKind.AGENT:
             self._hosts.keep_agent(frame)
+        elif frame.kind is FrameKind.ACTIONS:
+            self._actions.append(frame)
         elif frame.kind is FrameKind.GIVE:
             self._kept.take_given(number, frame)
         elif frame.kind is FrameKind.PING:
@@ -264,11 +271,12 @@ class NodeProgram:
 
     def _perform(self, frame: NodeFrame) -> None:
         worlds, peers = self._worlds, self._peers
-        task, payload = command_of(frame.data, worlds.arrays)
+        task, payload, at = command_of(frame.data, worlds.arrays)
         if frame.number:
             self._kept.keep(frame.number, self._living)
         match task:
             case Task.STEP:
+                self._await_actions(frame.data, at)
                 peers.begin_step()
                 worlds.step(self._commands)
                 self._hosts.report(self._results(worlds.simulation.everywhere, stepped=True))
@@ -292,6 +300,32 @@ class NodeProgram:
                 self._answer([where.data, found.reshape(-1).data])
             case _:
                 self._look(task, payload)
+
+    def _await_actions(self, data: memoryview, at: int) -> None:
+        """Return when it is known what all agents of this node do in the next step.
+
+        Those of other nodes are refused, with the number of their owner.
+
+        Raises:
+            RecoveryOrderedError: the coordinator wants something else by now.
+        """
+        arrays, owner = self._worlds.arrays, self._peers.owner
+        told, at = take_actions(data, at, arrays)
+        unowned, _ = take_actions(data, at, arrays)
+        wrong = told[owner[told] != self._number]
+        if len(wrong):
+            said = refusal(wrong, owner)
+            self._links.send(COORDINATOR, FrameKind.NOT_MINE, self._generation, said)
+        missing = owner == self._number
+        missing[told] = missing[unowned] = False
+        while missing.any():
+            while self._actions:
+                late = self._actions.popleft()
+                if late.number == self._generation:
+                    missing[take_actions(late.data, 0, arrays)[0]] = False
+            if missing.any():
+                self._links.heed()
+                self._links.pump(None)
 
     def _results(self, sensed: Any, stepped: bool) -> list[Bytes]:
         peers = self._peers

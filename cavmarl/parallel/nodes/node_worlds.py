@@ -18,6 +18,7 @@ from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.parallel.commanded_worlds import uncopied
 from cavmarl.parallel.mover import Mover
+from cavmarl.parallel.nodes.node_actions import NOBODY, Actions, NodeCommand
 from cavmarl.parallel.nodes.node_frames import (
     cases_of,
     clear_sensed,
@@ -26,7 +27,7 @@ from cavmarl.parallel.nodes.node_frames import (
     told_cases,
 )
 from cavmarl.parallel.nodes.node_loads import NodeLoad, since
-from cavmarl.parallel.nodes.node_pool import NodeCommand, NodePool
+from cavmarl.parallel.nodes.node_pool import NodePool
 from cavmarl.parallel.nodes.node_starters import Route, Start, start_nodes, straight
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.step_arrays import Driven
@@ -113,11 +114,16 @@ class NodeWorlds(NodePool):
         loads = task == Task.LOAD and not payload["only_reads"]
         changes = loads or task in (Task.STEP, Task.RESET)
         pieces = [bytes(piece) for piece in pieces_of(task, payload, self.arrays)]
-        return NodeCommand(pieces, changes, self._ticks_per_step if task == Task.STEP else 0)
+        if task != Task.STEP:
+            return NodeCommand(pieces, changes, 0)
+        return NodeCommand(pieces, changes, self._ticks_per_step, Actions.of(self.arrays))
 
     def _write(self, results: Sequence[memoryview], of_step: bool) -> None:
-        for number, data in enumerate(results):
-            take_results(data, self.arrays, with_common=number == 0, of_step=of_step)
+        arrays = self.arrays
+        begun = np.ones_like(arrays.chosen) if of_step else arrays.chosen
+        self._owner.reshape(arrays.mask.shape)[begun] = NOBODY
+        for n, (number, data) in enumerate(zip(self._tellers, results, strict=True)):
+            self._owner[take_results(data, arrays, with_common=n == 0, of_step=of_step)] = number
 
     def suggest(self) -> None:
         """Write what the built-in driver would do in the agents' place."""

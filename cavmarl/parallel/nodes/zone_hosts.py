@@ -59,7 +59,7 @@ class ZoneHosts:
         hostings: Sequence[Sequence[Hosting]],  # of each world, of these zones
         limits: Limits,
         links: Links,  # to the coordinator and to all other nodes
-        carried: Sequence[NDArray[Any]],  # (W, A, …) kept of agents beside their vehicles' states
+        carried: Sequence[NDArray[Any]],  # (W, A, …) of agents: what they do, what is kept of them
         generation: int = 0,  # how often nodes have been lost
         is_checked: bool = False,  # whether the caller checks what zones own
     ) -> None:
@@ -247,19 +247,17 @@ class ZoneHosts:
                     self._take_agent(w, vehicle)
 
     def _agent(self, w: int, vehicle: int) -> int:
-        """The agent whose vehicle it is, of which something is carried; -1: none."""
-        if not self._carried:
-            return -1
+        """The agent whose vehicle it is; -1: none."""
         zone, row = self._division.find(w, vehicle)
         return int(self._division.owned(w, zone)["agent"][row])
 
     def _send_agent(self, w: int, zone: int, vehicle: int) -> None:
         """Send what is kept of an agent to the node that its vehicle goes to, if it is another."""
-        agent = self._agent(w, vehicle)
         target = self._targets[w].pop(vehicle, -1)
-        if agent < 0:
+        if target in self._zones:
             return
-        if target not in self._zones:
+        agent = self._agent(w, vehicle)
+        if agent >= 0:
             kept = (np.ascontiguousarray(array[w, agent]).tobytes() for array in self._carried)
             pieces = [_LENGTH.pack(w, 0), np.int64(vehicle).tobytes(), *kept]
             self._links.send(self._node_of[target], FrameKind.AGENT, self._generation, pieces)
