@@ -82,6 +82,9 @@ class SimulatedNodes:
             self._machine.end(self._processes[number])
         self._processes[number] = self._start(number)
 
+    def stopped(self) -> set[int]:
+        return set()  # a machine elsewhere does not tell
+
     def close(self) -> None:
         """They end by themselves."""
 

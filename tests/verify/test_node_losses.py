@@ -53,4 +53,4 @@ def test_the_command(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_the_command_refuses_layouts(capsys: pytest.CaptureFixture[str]) -> None:
     said = refusal(capsys, "verify", "grid4x4", "--nodes", "2", "--layout", "strips")
-    assert "--layout does not go with --nodes" in said
+    assert "does not go with --nodes; use --set zones.layout" in said

@@ -253,6 +253,14 @@ def _run_again(path: Path, env: str | None, json_path: Path | None) -> None:
         raise typer.Exit(1)
 
 
+_CURES = {
+    "--faults": "worlds over nodes are verified with --faults simulated or campaign, those over "
+    "workers without; a plan of faults goes with --zones",
+    "--layout": "use --set zones.layout=FILE",
+    "--journal": "use --set zones.journal=FILE",
+}
+
+
 def _refuse_with_kill(
     what: str, env: str | None, counts: list[int] | None, others: dict[str, str | Path | None]
 ) -> None:
@@ -262,7 +270,7 @@ def _refuse_with_kill(
         raise ConfigError(f"--zones {','.join(map(str, counts))}: {what} takes one number of zones")
     for option, value in others.items():
         if value is not None:
-            raise ConfigError(f"{option} does not go with {what}: zones.layout is for --set")
+            raise ConfigError(f"{option} {value}: does not go with {what}; {_CURES[option]}")
 
 
 def _counts(text: str) -> list[int]:

@@ -121,7 +121,7 @@ class NodePool:
         self._pid = os.getpid()
         self._ticks_per_step = config.clock.ticks_per_step
         self._links = Links(_nothing, system)
-        self._watch = NodeWatch(self._links)
+        self._watch = NodeWatch(self._links, lambda: self._starter.stopped())
         self._nodes: dict[int, Newcomer] = {}  # what is known of each that lives
         self._new: dict[int, tuple[str, int]] = {}  # where the others can call those of them
         runs = prepare_runs(config.zones, num_worlds)
@@ -195,8 +195,8 @@ class NodePool:
         """
         found: dict[int, NodeFrame] = {}
         while missing := [number for number in self._living if number not in found]:
-            wait = partial(self._links.take, missing, self._timeout_s)
-            for number, frame in self._watch.wait(self._living, wait).items():
+            wait = partial(self._links.take, missing)
+            for number, frame in self._watch.wait(self._living, self._timeout_s, wait).items():
                 if frame.number == self._generation:
                     found[number] = frame
         for number, frame in found.items():
@@ -284,7 +284,7 @@ class NodePool:
             return [frame.data for frame in self._take(FrameKind.RESULT).values()]
         results: list[memoryview] = []
         for _ in range(command.ticks):
-            self._watch.wait(self._living, partial(self._coordinator.begin, self._timeout_s))
+            self._watch.wait(self._living, self._timeout_s, self._coordinator.begin)
             results = self._commit()
         return results if command.ticks else self._commit()
 

@@ -16,6 +16,7 @@ from cavmarl.parallel.hosts.listener import Listener
 from cavmarl.parallel.hosts.ray_actors import RayActors
 from cavmarl.parallel.nodes.node_process import run_on_ray
 from cavmarl.parallel.nodes.node_system import NodeListener
+from cavmarl.parallel.processes.watchdog import is_stopped
 
 NODE = "cavmarl.parallel.nodes.local_node"  # the program of a node
 LOCAL = "127.0.0.1"  # where nodes of this machine meet
@@ -41,6 +42,10 @@ class NodeStarter(Protocol):
 
     def replace(self, number: int, is_silent: bool) -> None:
         """One is lost, or silent, and may still run."""
+        ...
+
+    def stopped(self) -> set[int]:
+        """Nodes whose processes are stopped (SIGSTOP), as far as that can be seen."""
         ...
 
     def close(self) -> None: ...
@@ -80,6 +85,9 @@ class LocalNodes:
         self._processes[number].wait()
         self._processes[number] = self._start(number)
 
+    def stopped(self) -> set[int]:
+        return {n for n, process in enumerate(self._processes) if is_stopped(process.pid)}
+
     def close(self) -> None:
         for process in self._processes:
             with suppress(subprocess.TimeoutExpired):
@@ -105,6 +113,9 @@ class RayNodes:
         else:  # Ray starts it again
             self._actors.trouble()
 
+    def stopped(self) -> set[int]:
+        return set()  # Ray does not say
+
     def close(self) -> None:
         self._actors.close()
 
@@ -117,6 +128,9 @@ class JoinedNodes:
 
     def replace(self, number: int, is_silent: bool) -> None:
         """Another one may be started by hand."""
+
+    def stopped(self) -> set[int]:
+        return set()  # they are on other machines
 
     def close(self) -> None:
         """They end with the connection."""

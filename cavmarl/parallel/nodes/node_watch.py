@@ -16,6 +16,7 @@ from cavmarl.parallel.nodes.links import (
     said_by,
 )
 
+LOOK_S = 0.5  # between looks; a process that is stopped at two of them is given up
 PONG_S = 1.0  # for a living node to answer
 MISSED_S = 0.1  # to hear which others miss a node
 VAIN = 5  # times that all nodes answer and yet nothing comes of a command
@@ -30,8 +31,12 @@ class SilentNodeError(LinkLostError):
 class NodeWatch:
     """Of the nodes at the other ends of some connections."""
 
-    def __init__(self, links: Links) -> None:
-        self._links = links
+    def __init__(
+        self,
+        links: Links,
+        stopped: Callable[[], set[int]],  # nodes whose processes are known to be stopped
+    ) -> None:
+        self._links, self._stopped = links, stopped
         self._missed: list[int] = []  # the two ends of connections that nodes have lost
         # nodes that answered the last PING, and whose frames each waits for
         self._answered: dict[int, list[int]] = {}
@@ -46,21 +51,44 @@ class NodeWatch:
         if frame.number == self._pings:
             self._answered[number] = list(said_by(frame))
 
-    def wait(self, living: Sequence[int], wait: Callable[[], Found]) -> Found:
+    def wait(
+        self,
+        living: Sequence[int],
+        timeout_s: float,
+        wait: Callable[[float], Found],  # for so many seconds; may be called again after silence
+    ) -> Found:
         """What comes of waiting, again and again as long as all nodes answer meanwhile.
 
         Raises:
-            SilentNodeError: one does not, or another one waits for it in vain.
+            SilentNodeError: one does not, its process is stopped, or another one waits for it in
+                vain.
             WorkerError: all answer, and nothing comes of it.
         """
         silence: SilenceError | None = None
         for _ in range(VAIN):
             try:
-                return wait()
+                return self._wait(timeout_s, wait)
             except SilenceError as error:
                 silence = error
                 self._ask(living)
-        raise WorkerError(f"{silence}, though they live") from silence
+        raise WorkerError(f"{silence}, {VAIN} times, though all nodes live") from silence
+
+    def _wait(self, timeout_s: float, wait: Callable[[float], Found]) -> Found:
+        """Wait, and look now and then whether a process is stopped."""
+        stopped: set[int] = set()
+        left_s = timeout_s
+        while left_s > LOOK_S:
+            try:
+                return wait(LOOK_S)
+            except SilenceError:
+                left_s -= LOOK_S
+                before, stopped = stopped, self._stopped()
+                for number in sorted(before & stopped):
+                    raise SilentNodeError(number, MessageError("its process is stopped")) from None
+        try:
+            return wait(left_s)
+        except SilenceError as silence:
+            raise SilenceError(f"nothing has come for {timeout_s:g} s") from silence
 
     def _ask(self, living: Sequence[int]) -> None:
         """Ask all whether they live, and for whom they wait."""

@@ -35,6 +35,12 @@ from cavmarl.parallel.worlds_job import Task
 from cavmarl.shards.shard import Commands
 
 
+PLANNED = (
+    "a plan loses messages and hosts within one process; cavmarl verify ENV --nodes 2 --faults "
+    "simulated or campaign does so to nodes"
+)
+
+
 class NodeWorlds(NodePool):
     """W worlds over n nodes; a `SteppedWorlds`.
 
@@ -232,16 +238,27 @@ def check_nodes(world: World, nodes: int) -> None:
             "more zones or fewer nodes"
         )
     refused = {
-        "v2x.channel.external": config.v2x.enabled and config.v2x.channel.external,
-        "zones.faults": config.zones.faults,
-        "zones.reproducers": config.zones.reproducers,
-        "zones.repartition_steps": config.zones.repartition_steps,
-        "workers.sensors": config.workers.sensors,
-        "workers.monitor_cpu": config.workers.monitor_cpu,
+        "v2x.channel.external": (
+            config.v2x.enabled and config.v2x.channel.external,
+            "the channel is a function of the caller's process, and messages are worked out at the "
+            "nodes",
+        ),
+        "zones.faults": (config.zones.faults, PLANNED),
+        "zones.reproducers": (config.zones.reproducers, PLANNED),
+        "zones.repartition_steps": (
+            config.zones.repartition_steps,
+            "to cut zones by their vehicles takes the places of all of them, which no process has; "
+            "workers.balance_steps moves whole zones",
+        ),
+        "workers.sensors": (
+            config.workers.sensors,
+            "each node senses for its own vehicles; use more nodes in place of sensor workers",
+        ),
+        "workers.monitor_cpu": (
+            config.workers.monitor_cpu,
+            "it watches the caller's machine, and nodes may be elsewhere",
+        ),
     }
-    for key, value in refused.items():
+    for key, (value, why) in refused.items():
         if value:
-            raise ConfigError(
-                f"{key} = {value!r}: worlds over nodes do not have it yet; leave it out, or use "
-                "workers in place of nodes"
-            )
+            raise ConfigError(f"{key} = {value!r}: worlds over nodes do not have it: {why}")

@@ -53,6 +53,11 @@ class Watchdog:
         return None
 
 
+def is_stopped(pid: int) -> bool:
+    """Whether a process is stopped (SIGSTOP), where the system tells."""
+    return _look_if_there(pid)[0] in "Tt"
+
+
 def processor_s(pid: int) -> float:
     """Processor time that a process has taken, s."""
     return int(Path(f"/proc/{pid}/schedstat").read_text(encoding="ascii").split()[0]) / 1e9
