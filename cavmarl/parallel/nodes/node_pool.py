@@ -277,6 +277,7 @@ class NodePool:
         """Do a command once. Raises LinkLostError: a node is lost."""
         kept = self._opened.number if self._opened and self._log and command is self._log[-1] else 0
         self._performed = command
+        self._owner[~np.isin(self._owner, self._living)] = NOBODY  # of lost ones any may be
         for number in self._living:
             pieces = command.of_node(number, self._owner)
             self._links.send(number, FrameKind.COMMAND, kept, pieces)

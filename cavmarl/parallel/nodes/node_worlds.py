@@ -34,7 +34,6 @@ from cavmarl.parallel.step_arrays import Driven
 from cavmarl.parallel.worlds_job import Task
 from cavmarl.shards.shard import Commands
 
-
 PLANNED = (
     "a plan loses messages and hosts within one process; cavmarl verify ENV --nodes 2 --faults "
     "simulated or campaign does so to nodes"
