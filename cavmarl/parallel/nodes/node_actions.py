@@ -19,7 +19,7 @@ from cavmarl.parallel.step_arrays import StepArrays
 Agents = NDArray[np.int64]
 """Some, counted over all worlds."""
 
-NOBODY = -1  # owns an agent that has no vehicle
+UNOWNED = -1  # owns an agent that has no vehicle
 
 
 class Actions(NamedTuple):
@@ -41,7 +41,7 @@ class Actions(NamedTuple):
             number: of the node.
             owner: (W · A,) the node of each agent, as far as is known.
         """
-        acts = self.mask & (owner != NOBODY)
+        acts = self.mask & (owner != UNOWNED)
         own = np.flatnonzero(acts & (owner == number))
         return self.some(own) + self.some(np.flatnonzero(~acts))
 

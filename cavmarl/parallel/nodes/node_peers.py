@@ -27,7 +27,7 @@ from cavmarl.parallel.nodes.links import (
     NodeFrame,
     RecoveryOrderedError,
 )
-from cavmarl.parallel.nodes.node_actions import NOBODY
+from cavmarl.parallel.nodes.node_actions import UNOWNED
 from cavmarl.zones.kernels.ghost_frames import count_ghosts, pack_ghosts, take_ghosts
 
 Array = NDArray[Any]
@@ -40,7 +40,7 @@ class NodePeers:
     Attributes:
         own: (W, A) agents that this node has sensed for last.
         stepped: the same at the end of the last step, before worlds began anew.
-        owner: (W · A,) the node that has sensed for each agent last; `NOBODY`: none.
+        owner: (W · A,) the node that has sensed for each agent last; `UNOWNED`: none.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class NodePeers:
         self._is_stepping = False
         self.own: Array = np.zeros_like(simulation.outputs.present)
         self.stepped = self.own.copy()
-        self.owner: NDArray[np.int32] = np.full(self.own.size, NOBODY, dtype=np.int32)
+        self.owner: NDArray[np.int32] = np.full(self.own.size, UNOWNED, dtype=np.int32)
 
     def begin_step(self) -> None:
         """What is sensed next is what a step gave."""
@@ -102,7 +102,7 @@ class NodePeers:
                 agents = self._zoned.rows["agent"][side, zone, w, :num]
                 self.own[w, agents[agents >= 0]] = True
         mine = np.flatnonzero(self.own.reshape(-1))
-        self.owner[:] = NOBODY
+        self.owner[:] = UNOWNED
         self.owner[mine] = self._number
         for number, data in self._swap([mine.data] for _ in self._others):
             self.owner[np.frombuffer(data, np.int64)] = number
@@ -224,7 +224,7 @@ class NodePeers:
         arrays = [_by_agent(getattr(outputs, name)) for name in PIECES]
         pieces = [np.int64(where.size).tobytes(), where.data]
         pieces += [_bytes(array[where]) for array in arrays]
-        self.owner.reshape(self.own.shape)[chosen] = NOBODY
+        self.owner.reshape(self.own.shape)[chosen] = UNOWNED
         self.owner[where] = self._number
         for number, data in self._swap(pieces for _ in self._others):
             (num,), at = _read(data, 0, np.int64, 1)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cavmarl.core.errors import (
     MessageError,
@@ -39,7 +40,7 @@ from cavmarl.parallel.nodes.links import (
     said_by,
 )
 from cavmarl.parallel.nodes.newcomers import Newcomer, Newcomers
-from cavmarl.parallel.nodes.node_actions import NOBODY, NodeCommand, read_refusal
+from cavmarl.parallel.nodes.node_actions import UNOWNED, NodeCommand, read_refusal
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
 from cavmarl.parallel.nodes.node_files import files_of
 from cavmarl.parallel.nodes.node_starters import Route, Start, start_nodes, straight
@@ -83,6 +84,10 @@ class NodePool:
         WorkerError: a node cannot be started.
     """
 
+    _owner: NDArray[np.int32]  # (W · A,) the node that owns each agent, as far as is known
+    _tellers: Sequence[int] = ()  # the nodes of the last results
+    _performed: NodeCommand | None = None  # what they do now
+
     def __init__(
         self,
         world: World,  # what each is made of
@@ -113,10 +118,6 @@ class NodePool:
         self._lost: list[int] = []
         self._is_torn = False
         self.losses = self.recoveries = self.replacements = self.redirected = 0
-        # (W · A,) the node that owns each agent, as far as is known
-        self._owner = np.full(self.arrays.mask.size, NOBODY, dtype=np.int32)
-        self._tellers: list[int] = []  # the nodes of the last results
-        self._performed: NodeCommand | None = None
         self._timeout_s = config.workers.timeout_s
         self._pid = os.getpid()
         self._ticks_per_step = config.clock.ticks_per_step
@@ -160,6 +161,7 @@ class NodePool:
         join_timeout_s = self.world.config.workers.join_timeout_s
         self._newcomers.await_ready(nodes, join_timeout_s, self._starter.trouble)
         self._seat()
+        self._owner = np.full(self.arrays.mask.size, UNOWNED, dtype=np.int32)
         neighbours = self._nodes[0].neighbours
         assert neighbours is not None
         hostings = self._coordinator.host(neighbours)
@@ -277,7 +279,7 @@ class NodePool:
         """Do a command once. Raises LinkLostError: a node is lost."""
         kept = self._opened.number if self._opened and self._log and command is self._log[-1] else 0
         self._performed = command
-        self._owner[~np.isin(self._owner, self._living)] = NOBODY  # of lost ones any may be
+        self._owner[~np.isin(self._owner, self._living)] = UNOWNED  # of lost ones any may be
         for number in self._living:
             pieces = command.of_node(number, self._owner)
             self._links.send(number, FrameKind.COMMAND, kept, pieces)

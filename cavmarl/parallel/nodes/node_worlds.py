@@ -18,7 +18,7 @@ from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.parallel.commanded_worlds import uncopied
 from cavmarl.parallel.mover import Mover
-from cavmarl.parallel.nodes.node_actions import NOBODY, Actions, NodeCommand
+from cavmarl.parallel.nodes.node_actions import UNOWNED, Actions, NodeCommand
 from cavmarl.parallel.nodes.node_frames import (
     cases_of,
     clear_sensed,
@@ -126,7 +126,7 @@ class NodeWorlds(NodePool):
     def _write(self, results: Sequence[memoryview], of_step: bool) -> None:
         arrays = self.arrays
         begun = np.ones_like(arrays.chosen) if of_step else arrays.chosen
-        self._owner.reshape(arrays.mask.shape)[begun] = NOBODY
+        self._owner.reshape(arrays.mask.shape)[begun] = UNOWNED
         for n, (number, data) in enumerate(zip(self._tellers, results, strict=True)):
             self._owner[take_results(data, arrays, with_common=n == 0, of_step=of_step)] = number
 
