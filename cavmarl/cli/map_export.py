@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,7 +15,8 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import find_map
 from cavmarl.maps.exports.geojson import write_geojson
 from cavmarl.maps.exports.lanelet import write_lanelet2
-from cavmarl.maps.exports.opendrive import MOST_OFF, write_opendrive
+from cavmarl.maps.exports.opendrive import write_opendrive
+from cavmarl.maps.exports.opendrive_trip import MOST_OFF, CarRoads, RoundTrip
 from cavmarl.roads.cache import load_network
 
 
@@ -36,14 +38,9 @@ def export(
     if opendrive is not None:
         with console.status(f"writing {opendrive} …"):
             trip = write_opendrive(path, opendrive)
-        told = trip.to_dict()
-        rows = [[key, *map(_shown, told[key])] for key in ("edges", "lanes", "links", "road_m")]
-        console.print(grid([f"{opendrive}: for cars", "map", "read back"], rows))
+        _show(console, opendrive, trip)
         sound = trip.same
-        if not sound:
-            words = f"differs in its topology, or by more than {MOST_OFF:.0%} in its length"
-            console.print(Text(f"{opendrive}: {words}", style="red"))
-        document["opendrive"] = told
+        document["opendrive"] = trip.to_dict()
     if lanelet2 is not None:
         with console.status(f"writing {lanelet2} …"):
             document["lanelet2"] = write_lanelet2(network, lanelet2)
@@ -55,5 +52,18 @@ def export(
     raise typer.Exit(0 if sound else 1)
 
 
-def _shown(value: float) -> str:
-    return str(value) if isinstance(value, int) else f"{value:.1f}"
+def _show(console: Console, target: Path, trip: RoundTrip) -> None:
+    def row(name: str) -> list[str]:
+        values = [getattr(one, name) for one in (trip.map, trip.file, trip.read)]
+        return [name, *(f"{one:.1f}" if isinstance(one, float) else str(one) for one in values)]
+
+    rows = [row(one.name) for one in fields(CarRoads) if one.name != "merges"]
+    console.print(grid([f"{target}: for cars", "map", "file", "read by netconvert"], rows))
+    for problem in trip.problems:
+        console.print(Text(f"{target}: {problem}", style="red"))
+    if trip.read.links < trip.map.links or trip.read_off > MOST_OFF:
+        words = (
+            "netconvert's reader leaves out lanes that merge into one lane, and cuts roads at "
+            "junctions anew; the file has them"
+        )
+        console.print(Text(f"note: {words}", style="yellow"))

@@ -13,6 +13,8 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.maps.exports.opendrive_lanes import LANES, part_roads
+
 _SEALED_M = 1e-3  # from lane to lane, where one leads into the other
 _SAME_RAD = 0.01
 _SAME_GRADE = 1e-6
@@ -42,6 +44,7 @@ class RoadEnd:
 
 def mend_curves(root: Element) -> int:
     """Mend all roads of a document; how many roads over junctions had to be drawn anew."""
+    part_roads(root)
     roads = {road.get("id", ""): road for road in root.iter("road")}
     drawn = sum(_seal(road, roads) for road in roads.values() if road.get("junction", "-1") != "-1")
     for road in roads.values():
@@ -85,7 +88,7 @@ def _seal(road: Element, roads: dict[str, Element]) -> bool:
         roads.get(link.get("elementId", "")) if link is not None else None
         for link in (road.find("link/predecessor"), road.find("link/successor"))
     )
-    lanes = road.findall("lanes/laneSection/right/lane")
+    lanes = road.findall(LANES)
     if before is None or after is None or not lanes or len(_geometries(road)) != 1:
         return False
     first = lanes[0]  # the innermost one
@@ -112,7 +115,7 @@ def _seal(road: Element, roads: dict[str, Element]) -> bool:
 def _taper(road: Element, roads: dict[str, Element]) -> None:
     """Let lanes over a junction begin and end as wide as the lanes that they join."""
     length_m = float(road.get("length", "0"))
-    for lane in road.iterfind("lanes/laneSection/right/lane"):
+    for lane in road.iterfind(LANES):
         widths = []
         for kind in ("predecessor", "successor"):
             link, other = lane.find(f"link/{kind}"), road.find(f"link/{kind}")
@@ -133,7 +136,7 @@ def _taper(road: Element, roads: dict[str, Element]) -> None:
 
 
 def _width_m(road: Element | None, lane: int) -> float | None:
-    for one in road.iterfind("lanes/laneSection/right/lane") if road is not None else ():
+    for one in road.iterfind(LANES) if road is not None else ():
         width = one.find("width")
         if int(one.get("id", "0")) == lane and width is not None:
             return float(width.get("a", "0"))
@@ -144,7 +147,7 @@ def _inner_m(road: Element, lane: int) -> float:
     """The side of a lane that is nearer to the reference line, positive to the left."""
     offset = road.find("lanes/laneOffset")
     inner_m = 0.0 if offset is None else float(offset.get("a", "0"))
-    for one in road.iterfind("lanes/laneSection/right/lane"):
+    for one in road.iterfind(LANES):
         width = one.find("width")
         if int(one.get("id", "0")) > lane and width is not None:
             inner_m -= float(width.get("a", "0"))
