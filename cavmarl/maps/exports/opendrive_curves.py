@@ -1,7 +1,8 @@
 """What netconvert's OpenDRIVE lacks for the rules of ASAM's checker, mended in its curves.
 
 netconvert states lengths of cubic curves that are up to a decimetre off, repeats elevations that go
-on as they are, and draws the roads on which vehicles turn round from the wrong side.
+on as they are, and draws the roads on which vehicles turn round from the wrong side, or about one
+point. Lines over junctions miss the directions of roads by up to some milliradians.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ from numpy.typing import NDArray
 from cavmarl.maps.exports.opendrive_lanes import LANES, part_roads
 
 _SEALED_M = 1e-3  # from lane to lane, where one leads into the other
-_SAME_RAD = 0.01
+_SAME_RAD = 1e-4  # the outermost lane of a wide road is 20 m from the reference line
+_PIVOT_M = 0.5  # shorter, a line on which vehicles turn round takes the other side of their lane
 _SAME_GRADE = 1e-6
 _PARTS = 64  # of a curve, for its length: some nearly stand still and turn
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
@@ -96,11 +98,14 @@ def _seal(road: Element, roads: dict[str, Element]) -> bool:
         0 if link is None else int(link.get("id", "0"))
         for link in (first.find("link/predecessor"), first.find("link/successor"))
     ]
-    offset = road.find("lanes/laneOffset")
-    offset_m = 0.0 if offset is None else float(offset.get("a", "0"))
+    offset_m = _offset_m(road)
     leaves, arrives = _end(before, at_start=False), _end(after, at_start=True)
     start = leaves.beside(_inner_m(before, ids[0]) - offset_m)
     end = arrives.beside(_inner_m(after, ids[1]) - offset_m)
+    if math.dist(start, end) < _PIVOT_M and leaves.direction @ arrives.direction < 0.0:
+        offset_m = _set_offset(road, sum(_width_m(road, -k - 1) or 0.0 for k in range(len(lanes))))
+        start = leaves.beside(_inner_m(before, ids[0]) - offset_m)
+        end = arrives.beside(_inner_m(after, ids[1]) - offset_m)
     drawn = (_end(road, at_start=True), _end(road, at_start=False))
     sealed = all(
         math.dist(one.beside(0.0), place) < _SEALED_M
@@ -143,10 +148,25 @@ def _width_m(road: Element | None, lane: int) -> float | None:
     return None
 
 
+def _offset_m(road: Element) -> float:
+    """How far to the left of the reference line lanes begin."""
+    offset = road.find("lanes/laneOffset")
+    return 0.0 if offset is None else float(offset.get("a", "0"))
+
+
+def _set_offset(road: Element, offset_m: float) -> float:
+    lanes, offset = road.find("lanes"), road.find("lanes/laneOffset")
+    if offset is None and lanes is not None:
+        offset = Element("laneOffset", s="0", b="0", c="0", d="0")
+        lanes.insert(0, offset)
+    if offset is not None:
+        offset.set("a", f"{offset_m:.2f}")
+    return offset_m
+
+
 def _inner_m(road: Element, lane: int) -> float:
     """The side of a lane that is nearer to the reference line, positive to the left."""
-    offset = road.find("lanes/laneOffset")
-    inner_m = 0.0 if offset is None else float(offset.get("a", "0"))
+    inner_m = _offset_m(road)
     for one in road.iterfind(LANES):
         width = one.find("width")
         if int(one.get("id", "0")) > lane and width is not None:

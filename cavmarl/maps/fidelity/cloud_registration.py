@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError, MapError, require
-from cavmarl.maps.fidelity.cloud_filters import neighbour_distances
 
 Points = NDArray[np.float64]
 
@@ -23,6 +22,7 @@ _WIDEST_M = 10.0  # what is farther from the other cloud is never taken for the 
 _HELD = 0.005
 # The kept part lies on the other cloud if it is nearer to it than its own neighbours are, about.
 _SPACINGS, _LEAST_LIMIT_M, _MOST_LIMIT_M = 2.5, 0.1, 0.5
+_SAMPLE = 10_000  # points, for the spacing
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,8 @@ class Alignment:
     limit_m: float  # of `trimmed_rmse_m`
     stages: int
     problems: tuple[str, ...]  # why it is not to be believed; empty if it is
+    before_m: Points  # (n,) of each point of the source to its nearest, as it was given
+    distance_m: Points  # where it was laid
 
     @property
     def converged(self) -> bool:
@@ -90,6 +92,13 @@ class Target:
         self.tree = gicp.KdTree(self.cloud, threads)
         gicp.estimate_normals_covariances(self.cloud, self.tree, _NORMAL_NEIGHBOURS, threads)
 
+    @property
+    def spacing_m(self) -> float:
+        """The median distance of a point to its nearest neighbour."""
+        sample = self.points[:: -(-len(self.points) // _SAMPLE)]
+        _, squares = self.tree.batch_knn_search(sample, 2, self.threads)
+        return float(np.sqrt(np.median(np.asarray(squares)[:, 1])))
+
     def nearest(self, points: Points) -> tuple[NDArray[np.int64], Points]:
         """The number of the nearest point of each of (n, 3) places, and the distance in m."""
         rows, squares = self.tree.batch_nearest_neighbor_search(
@@ -113,20 +122,17 @@ def align(source: Points, target: Target, *, keep: float = 0.8) -> Alignment:
     if not 0.1 <= keep <= 1.0:
         raise ConfigError(f"keep {keep:g}: must be a share from 0.1 to 1 of the points")
     own = Target(source, target.threads)
-    cloud = gicp.PointCloud(source - target.middle_m)
-    gicp.estimate_normals_covariances(
-        cloud, gicp.KdTree(cloud, own.threads), _NORMAL_NEIGHBOURS, own.threads
-    )
-    centred = source - target.middle_m
     motion, last_m = np.eye(4), np.inf
-    rows, distance_m = target.nearest(source)
-    gate_m = min(max(2.0 * float(np.quantile(distance_m, 0.95)), 1.0), _WIDEST_M)
+    motion[:3, 3] = own.middle_m - target.middle_m
+    rows, before_m = target.nearest(source)
+    distance_m = before_m
+    gate_m = min(max(2.0 * float(np.quantile(before_m, 0.95)), 1.0), _WIDEST_M)
     stages = 0
     while stages < _STAGES:
         stages += 1
         found = gicp.align(
             target.cloud,
-            cloud,
+            own.cloud,
             target.tree,
             motion,
             max_correspondence_distance=gate_m,
@@ -136,14 +142,17 @@ def align(source: Points, target: Target, *, keep: float = 0.8) -> Alignment:
             translation_epsilon=0.1 * _SETTLED_M,
         )
         step = np.linalg.inv(motion) @ found.T_target_source
-        last_m = _size_m(step, centred)
+        last_m = _size_m(step, own.points)
         motion = np.asarray(found.T_target_source)
-        rows, distance_m = target.nearest(moved(centred, motion) + target.middle_m)
+        rows, distance_m = target.nearest(moved(own.points, motion) + target.middle_m)
         narrower_m = min(gate_m, max(2.0 * float(np.quantile(distance_m, keep)), 1e-3))
         if last_m < _SETTLED_M and narrower_m > 0.95 * gate_m:
             break
         gate_m = narrower_m
-    return _judged(own, target, motion, rows, distance_m, keep, stages, last_m)
+    problems, rmse_m, limit_m = _judged(own, target, rows, distance_m, keep, stages, last_m)
+    absolute = motion.copy()
+    absolute[:3, 3] += target.middle_m - motion[:3, :3] @ own.middle_m
+    return Alignment(absolute, rmse_m, limit_m, stages, problems, before_m, distance_m)
 
 
 def _size_m(step: Points, points: Points) -> float:
@@ -155,16 +164,16 @@ def _size_m(step: Points, points: Points) -> float:
 def _judged(
     own: Target,
     target: Target,
-    motion: Points,
     rows: NDArray[np.int64],
     distance_m: Points,
     keep: float,
     stages: int,
     last_m: float,
-) -> Alignment:
+) -> tuple[tuple[str, ...], float, float]:
+    """What speaks against it, the RMSE of the pairs kept, and its limit."""
     order = np.argsort(distance_m, kind="stable")[: max(int(keep * len(distance_m)), 1)]
     rmse_m = float(np.sqrt(np.mean(distance_m[order] ** 2)))
-    spacing_m = max(_spacing_m(own), _spacing_m(target))
+    spacing_m = max(own.spacing_m, target.spacing_m)
     limit_m = float(np.clip(_SPACINGS * spacing_m, _LEAST_LIMIT_M, _MOST_LIMIT_M))
     problems = []
     if last_m > 10.0 * _SETTLED_M:
@@ -182,14 +191,4 @@ def _judged(
             f"nothing holds it along ({along}), where it can slide: give walls (--buildings), or "
             "a cloud with more than a plane"
         )
-    turn = motion[:3, :3]
-    absolute = np.eye(4)
-    absolute[:3, :3] = turn
-    absolute[:3, 3] = motion[:3, 3] + target.middle_m - turn @ target.middle_m
-    return Alignment(absolute, rmse_m, limit_m, stages, tuple(problems))
-
-
-def _spacing_m(cloud: Target) -> float:
-    """The median distance of a point to its nearest neighbour."""
-    distance_m = neighbour_distances(cloud.points, 1, cloud.threads)[:, 0]
-    return float(np.median(distance_m))
+    return tuple(problems), rmse_m, limit_m

@@ -96,12 +96,14 @@ def compare(
     target = Target(reference.points, threads)
     begin = np.eye(4) if start is None else start
     placed = moved(source.points, begin)
-    _, before_m = target.nearest(placed)
     alignment = align(placed, target, keep=keep) if registered else None
-    transform = begin if alignment is None else alignment.transform @ begin
-    laid = moved(source.points, transform)
-    _, distance_m = target.nearest(laid)
-    reverse_m = nearest_distances(reference.points, laid, threads)
+    if alignment is None:
+        transform, (_, before_m) = begin, target.nearest(placed)
+        distance_m = before_m
+    else:
+        transform, before_m = alignment.transform @ begin, alignment.before_m
+        distance_m = alignment.distance_m
+    reverse_m = nearest_distances(reference.points, moved(source.points, transform), threads)
     return Comparison(
         source, reference, float(before_m.mean()), alignment, distance_m, reverse_m, transform
     )
