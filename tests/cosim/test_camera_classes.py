@@ -20,6 +20,11 @@ from cavmarl.cosim.stack.stack_types import EgoPose, Mission, Obstacle
 
 
 def test_a_pedestrian_and_a_van_are_told_apart() -> None:
+    """None is taken for another: a pixel's class is exact, and as wide as 0.2 m at 16 m.
+
+    Echoes are 2 cm off, so most pixels of a group are its object's; what lies between a pedestrian
+    and the van is left out, because groups join what is nearer than 0.8 m.
+    """
     env = cavmarl.parallel_env(
         "grid4x4",
         agents=1,
@@ -34,7 +39,7 @@ def test_a_pedestrian_and_a_van_are_told_apart() -> None:
     sensors = [sensor_of(v.name, v.settings) for v in welcome_to(env, ["car_0"], 0).sensors]
     stage = LidarCamera(sensors, HdMap(env.network))
     kinds: dict[str, int] = {}
-    wrong = 0
+    wrong = []
     for step in range(60):
         if not env.agents:
             break
@@ -50,10 +55,11 @@ def test_a_pedestrian_and_a_van_are_told_apart() -> None:
             walker, van = off[on_foot].min(initial=99.0), off[~on_foot].min(initial=99.0)
             if seen.kind == "unknown" or (walker > 0.6) == (van > 3.0 or walker < 3.0):
                 continue  # not seen by the camera, or one beside the other
-            wrong += seen.kind != ("pedestrian" if walker < 0.6 else "vehicle")
+            if seen.kind != ("pedestrian" if walker < 0.6 else "vehicle"):
+                wrong.append(seen)
             kinds[seen.kind] = kinds.get(seen.kind, 0) + 1
         env.step(env.suggest_actions())
-    assert wrong <= 0.03 * sum(kinds.values()), (wrong, kinds)  # 2 of 139 as the van uncovers one
+    assert not wrong
     assert kinds.get("pedestrian", 0) >= 3, kinds
     assert kinds.get("vehicle", 0) >= 3, kinds
 

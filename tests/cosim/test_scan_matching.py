@@ -10,29 +10,20 @@ import numpy as np
 import pytest
 
 import cavmarl
-from cavmarl.config.registry import find_entry
+from benchmarks.localisation import STEP_S, Drive, rig_with, write_surface
 from cavmarl.core.errors import ConfigError
-from cavmarl.cosim.followers.follower_client import sight_of
-from cavmarl.cosim.followers.follower_snapshots import SnapshotTime, take_snapshot, welcome_to
+from cavmarl.cosim.followers.follower_snapshots import welcome_to
 from cavmarl.cosim.stack.hd_map import HdMap
-from cavmarl.cosim.stack.localisation import GnssInertial
-from cavmarl.cosim.stack.stack import REFERENCE_RIG, Stack, StackConfig, sensor_of, vehicle_of
-from cavmarl.cosim.stack.stack_types import Mission
-from cavmarl.maps.buildings import with_buildings
+from cavmarl.cosim.stack.stack import Stack, StackConfig, sensor_of, vehicle_of
 from cavmarl.maps.fidelity.cloud_files import Cloud, write_cloud
-from cavmarl.maps.fidelity.map_surface import map_surface
 
 pytest.importorskip("small_gicp", reason="needs the extra 'clouds'")
-
-BIASED = {name: dict(keys) for name, keys in REFERENCE_RIG.items() if name != "markings"}
-BIASED["gnss"]["bias"] = [2.0, 2.0, 0.0]
-
 
 @pytest.fixture(scope="module")
 def world() -> Any:
     overrides = {
-        "rig": BIASED,
-        "clock.ctrl_dt_s": 0.05,
+        "rig": rig_with(1.0, 2.0, markings=False),
+        "clock.ctrl_dt_s": STEP_S,
         "map.buildings": "map/buildings.poly.xml",
     }
     return cavmarl.parallel_env("grid4x4", agents=2, background=0, overrides=overrides)
@@ -41,41 +32,28 @@ def world() -> Any:
 @pytest.fixture(scope="module")
 def cloud(world: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The map's own surface, as a cloud."""
-    path = tmp_path_factory.mktemp("cloud") / "grid.ply"
-    network = with_buildings(world.network, find_entry("grid4x4") / "map" / "buildings.poly.xml")
-    surface, _ = map_surface(network, network.extent_m, 0.4)
-    noise = np.random.default_rng(0).normal(0.0, 0.03, surface.points.shape)
-    write_cloud(path, Cloud("grid", surface.points + noise))
-    return path
+    return write_surface(world, tmp_path_factory.mktemp("cloud") / "grid.ply")
 
 
 @pytest.mark.slow
 def test_scans_take_a_bias_of_gnss_away(world: Any, cloud: Path) -> None:
-    from cavmarl.cosim.stack.scan_matching import ScanMatching
+    """The filter alone is off by the bias; with scans by no more than a scan alone may be.
 
-    world.reset(seed=3)
-    sensors = [sensor_of(v.name, v.settings) for v in welcome_to(world, ["car_0"], 0).sensors]
-    vehicle = vehicle_of(HdMap(world.network), sensors, 0.05, cloud)
-    assert vehicle.geodesy is not None
-    kept = (sensors, vehicle.geodesy, vehicle.hd_map, 0.05)
-    before, after = GnssInertial(*kept), ScanMatching(*kept, cloud)
-    off: dict[str, list[float]] = {"before": [], "after": []}
-    for step in range(200):
-        tick = int(world.worlds.ticks()[0])
-        sight = sight_of(*take_snapshot(world, [0], SnapshotTime(step, 0, tick, False)))
-        view = sight.snapshot.vehicles["car_0"]
-        mission = Mission(0, view.vclass, view.length_m, view.width_m)
-        rows = world.simulation.vehicles()
-        row = rows[rows["agent"] == 0][0]
-        for name, stage in (("before", before), ("after", after)):
-            pose = stage.locate(sight.sensors["car_0"], mission, sight.snapshot.time_s)
-            assert pose is not None
-            off[name].append(math.hypot(pose.x_m - row["x"], pose.y_m - row["y"]))
-        world.step(world.suggest_actions())
-    assert after.matched > 50
-    assert np.mean(off["before"][100:]) > 1.0
-    assert np.mean(off["after"][100:]) < 0.8
-    assert np.mean(off["after"][100:]) < 0.6 * np.mean(off["before"][100:])
+    By fixes of 1 m at 10 Hz and a drift of 0.1 m in √s the filter's place has a deviation of
+    √(0.1 · √0.1) m = 0.18 m about the biased one. A scan has 0.1 m east and north (lidar 2 cm, map
+    3 cm, points 0.4 m apart), so its distance is 0.1 · √(π/2) m in the mean.
+    """
+    drive = Drive(world, cloud, seed=3)
+    for _ in range(200):
+        assert drive.step()
+    bias_m = float(np.hypot(*np.mean(drive.fixes_m, axis=0)))
+    before, after = (float(np.mean(off[100:])) for off in drive.off_m.values())
+    assert bias_m > 3.0, "more than a scan finds its place from"
+    assert before == pytest.approx(bias_m, abs=3.0 * 0.18)
+    assert after < 0.1 * math.sqrt(0.5 * math.pi)
+    matching = drive.stages["scan_matching"]
+    assert (matching.refused, matching.lost) == (0, 0)
+    assert matching.bias == pytest.approx(np.mean(drive.fixes_m, axis=0), abs=3.0 * 0.1)
 
 
 def test_what_is_missing_is_said(world: Any, cloud: Path, tmp_path: Path) -> None:

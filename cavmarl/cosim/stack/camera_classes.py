@@ -2,7 +2,8 @@
 
 Echoes of an object are projected into the newest picture of each camera that shows classes, at
 three heights of a body; the class that most of these pixels have is the object's (late fusion, as
-in Vora et al.: "PointPainting", CVPR 2020, with a picture that is segmented already).
+in Vora et al.: "PointPainting", CVPR 2020, with a picture that is segmented already). A camera that
+is not where the lidar is sees nearer objects in front of some echoes: these have no say.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from cavmarl.sensors.kernels.rig_frames import rotation
 
 _HEIGHTS_M = (0.3, 0.7, 1.1)  # of a body, above the ground
 _NEAREST_M = 0.5  # before the camera
+_BEHIND_M = 2.0  # farther than the nearest echo that way: it may be covered
 _KINDS = {
     "building": "building",
     "car": "vehicle",
@@ -62,15 +64,26 @@ class LidarCamera(LidarObjects):
                 "one under `rig`, as {eyes: {type: semantic_camera, rate_hz: 10, z_m: 1.4}}"
             )
         self._pictures: dict[str, NDArray[np.uint8]] = {}
+        self._covered_m: dict[str, NDArray[np.float64]] = {}  # of each column of a picture
         self._pose = EgoPose(0.0, 0.0, 0.0, 0.0)
 
-    def _look(self, readings: Readings, pose: EgoPose) -> None:
+    def _look(
+        self, readings: Readings, pose: EgoPose, groups: Sequence[NDArray[np.float64]]
+    ) -> None:
         self._pose = pose
+        echoes = self._in_vehicle(np.concatenate(groups))
         for eye in self._eyes:
             samples = readings.get(eye.sensor.name)
             if samples is not None and not samples.lost.all():
                 newest = samples.values[~samples.lost][-1]
                 self._pictures[eye.sensor.name] = np.asarray(newest, dtype=np.uint8)
+            width = int(eye.sensor.settings["width"])
+            ahead_m, column, _ = _projected(eye, echoes)
+            nearest_m = np.full(width + 2, np.inf)  # and a column to either side
+            np.minimum.at(nearest_m, np.clip(column, -1, width) + 1, ahead_m)
+            self._covered_m[eye.sensor.name] = _BEHIND_M + np.minimum.reduce(
+                [nearest_m[:-2], nearest_m[1:-1], nearest_m[2:]]
+            )
 
     def _kind(self, group: NDArray[np.float64]) -> str:
         """The kind that most pixels of echoes (n, 2) on the map show; unknown where none does."""
@@ -78,7 +91,8 @@ class LidarCamera(LidarObjects):
         for eye in self._eyes:
             picture = self._pictures.get(eye.sensor.name)
             if picture is not None:
-                classes = _pixels(eye, picture, self._in_vehicle(group))
+                covered_m = self._covered_m[eye.sensor.name]
+                classes = _pixels(eye, picture, covered_m, self._in_vehicle(group))
                 votes += np.bincount(classes, minlength=len(votes))[: len(votes)]
         votes[[number for number, kind in enumerate(KIND_OF_CLASS) if not kind]] = 0
         return KIND_OF_CLASS[int(votes.argmax())] if votes.any() else "unknown"
@@ -102,15 +116,31 @@ def _eye(sensor: StackSensor) -> _Eye:
     return _Eye(sensor, turn, place_m, focal_px)
 
 
-def _pixels(
-    eye: _Eye, picture: NDArray[np.uint8], points: NDArray[np.float64]
-) -> NDArray[np.uint8]:
-    """The classes of the pixels onto which points (n, 3) of the vehicle's frame fall."""
+def _projected(
+    eye: _Eye, points: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+    """Depth in m, column and row of points (n, 3) of the vehicle's frame before a camera."""
     ahead, left, up = ((points - eye.place_m) @ eye.turn).T
     seen = ahead > _NEAREST_M
+    settings = eye.sensor.settings
+    column = np.floor(0.5 * settings["width"] - eye.focal_px * left[seen] / ahead[seen])
+    row = np.floor(0.5 * settings["height"] - eye.focal_px * up[seen] / ahead[seen])
+    return ahead[seen], column.astype(np.int64), row.astype(np.int64)
+
+
+def _pixels(
+    eye: _Eye,
+    picture: NDArray[np.uint8],
+    covered_m: NDArray[np.float64],
+    points: NDArray[np.float64],
+) -> NDArray[np.uint8]:
+    """The classes of the pixels onto which points (n, 3) of the vehicle's frame fall.
+
+    `covered_m`: by column, the depth from which on a point may lie behind another one.
+    """
+    ahead_m, column, row = _projected(eye, points)
     height, width = picture.shape
-    column = np.floor(0.5 * width - eye.focal_px * left[seen] / ahead[seen]).astype(np.int64)
-    row = np.floor(0.5 * height - eye.focal_px * up[seen] / ahead[seen]).astype(np.int64)
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    inside[inside] = ahead_m[inside] <= covered_m[column[inside]]
     found: NDArray[np.uint8] = picture[row[inside], column[inside]]
     return found

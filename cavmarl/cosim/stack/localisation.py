@@ -1,5 +1,8 @@
 """Localisation by GNSS, IMU and odometry: an extended Kalman filter of x, y, heading and speed.
 
+The bias of the fixes, east and north, is part of the state; here it is taken to be 0, because
+nothing tells it from the place.
+
 The model is that of Thrun, Burgard, Fox: "Probabilistic Robotics", 2005, chapter 3.3, with the
 kinematic bicycle's slip angle: the centre moves at heading + asin(r L / 2 v) where r is the yaw
 rate and L the length between the axles. The first fix tells the place; the heading comes from the
@@ -38,6 +41,7 @@ _LANE_SURE_M = 0.6  # lateral deviation below which lanes can be told apart
 _GATE = 9.0  # squared deviations beyond which what a camera says of lanes is not believed
 _COURSE_M = 8.0  # driven before the fixes' course is compared with the heading
 _STRAIGHT_RAD = 0.5
+_SIZE = 6  # x, y, heading, speed, bias of the fixes east and north
 
 
 class GnssInertial:
@@ -45,6 +49,9 @@ class GnssInertial:
 
     `sensors`: of the vehicle; one GNSS at least. `geodesy`: where the map is on the earth.
     """
+
+    bias_m = 0.0  # standard deviation of the bias of fixes
+    bias_drift_m = 0.0  # of its change in a second
 
     def __init__(
         self, sensors: Sequence[StackSensor], geodesy: Geodesy, hd_map: HdMap, tick_s: float
@@ -54,16 +61,21 @@ class GnssInertial:
         self._map = hd_map
         self._tick_s = tick_s
         self._state: NDArray[np.float64] | None = None
-        self._spread = np.eye(4)
+        self._spread = np.eye(_SIZE)
         self._yaw_rate = 0.0
         self._before_s: float | None = None
         self._anchor: tuple[float, float] | None = None
         self._driven_m = self._turned_rad = 0.0
 
+    @property
+    def bias(self) -> tuple[float, float]:
+        """Of the fixes east and north, in m, as far as it is known."""
+        east, north = self._get()[4:].tolist()
+        return east, north
+
     def reset_pose(self, pose: EgoPose) -> None:
         """Be told where the vehicle is, to within some centimetres."""
-        self._state = np.array([pose.x_m, pose.y_m, pose.heading_rad, pose.speed_mps])
-        self._spread = np.diag([0.05, 0.05, 0.02, 0.2]) ** 2
+        self._set((pose.x_m, pose.y_m, pose.heading_rad, pose.speed_mps), (0.05, 0.05, 0.02, 0.2))
         self._anchor = None
 
     def locate(self, readings: Readings, mission: Mission, time_s: float) -> EgoPose | None:
@@ -85,8 +97,23 @@ class GnssInertial:
             ahead = float(speed[0]) - float(self._get()[3])
             self._take(np.array([0.0, 0.0, 0.0, 1.0]), ahead, deviation, gate=math.inf)
         self._take_lane(readings)
-        x_m, y_m, heading, speed_mps = self._get().tolist()
+        return self._pose()
+
+    def _pose(self) -> EgoPose:
+        x_m, y_m, heading, speed_mps = self._get()[:4].tolist()
         return EgoPose(x_m, y_m, wrap(heading), max(0.0, speed_mps), self._yaw_rate)
+
+    def _set(self, place: Sequence[float], deviations: Sequence[float]) -> None:
+        """Begin anew: x, y, heading and speed, and their standard deviations; the bias unknown."""
+        self._state = np.array([*place, 0.0, 0.0])
+        self._spread = np.diag([*deviations, self.bias_m, self.bias_m]) ** 2
+
+    def _set_by_fix(self, place: Sequence[float], deviations: Sequence[float]) -> None:
+        """The same, with a place from a fix: it is off by the bias, too."""
+        self._set(place, deviations)
+        for axis in (0, 1):
+            self._spread[axis, axis] += self.bias_m**2
+            self._spread[axis, 4 + axis] = self._spread[4 + axis, axis] = -(self.bias_m**2)
 
     def _get(self) -> NDArray[np.float64]:
         assert self._state is not None
@@ -123,9 +150,11 @@ class GnssInertial:
         speed_mps = 0.0 if speed is None else float(speed[0])
         mount = self._by_type["gnss"].mount
         x_m, y_m = _centre(fix, mount, best.heading_rad)
-        self._state = np.array([x_m, y_m, best.heading_rad, speed_mps])
         deviation = self._deviation("gnss", 0, _LEAST["gnss"])
-        self._spread = np.diag([deviation, deviation, _FIRST_HEADING_RAD, 2.0]) ** 2
+        self._set_by_fix(
+            (x_m, y_m, best.heading_rad, speed_mps),
+            (deviation, deviation, _FIRST_HEADING_RAD, 2.0),
+        )
         self._anchor = fix
         self._driven_m = self._turned_rad = 0.0
 
@@ -133,7 +162,7 @@ class GnssInertial:
         """Where the model and the inertial sensors say that it is now."""
         state = self._get()
         accel, self._yaw_rate = self._inertia(readings)
-        x_m, y_m, heading, speed = state.tolist()
+        x_m, y_m, heading, speed = state[:4].tolist()
         half = 0.5 * mission.length_m
         slip = math.asin(max(-0.9, min(0.9, self._yaw_rate * half / speed))) if speed > 1.0 else 0.0
         course = heading + slip + 0.5 * self._yaw_rate * elapsed_s
@@ -145,12 +174,13 @@ class GnssInertial:
                 y_m + driven * sin,
                 heading + self._yaw_rate * elapsed_s,
                 speed + accel * elapsed_s,
+                *state[4:],
             ]
         )
-        slope = np.eye(4)
+        slope = np.eye(_SIZE)
         slope[0, 2], slope[1, 2] = -driven * sin, driven * cos
         slope[0, 3], slope[1, 3] = elapsed_s * cos, elapsed_s * sin
-        drift = np.diag(_DRIFT) ** 2 * elapsed_s
+        drift = np.diag([*_DRIFT, self.bias_drift_m, self.bias_drift_m]) ** 2 * elapsed_s
         self._spread = slope @ self._spread @ slope.T + drift
         self._driven_m += driven
         self._turned_rad += abs(self._yaw_rate) * elapsed_s
@@ -171,10 +201,10 @@ class GnssInertial:
         state = self._get()
         x_m, y_m = _centre(fix, self._by_type["gnss"].mount, float(state[2]))
         for axis, seen in enumerate((x_m, y_m)):
-            row = np.zeros(4)
-            row[axis] = 1.0
+            row = np.zeros(_SIZE)
+            row[axis] = row[4 + axis] = 1.0
             deviation = self._deviation("gnss", axis, _LEAST["gnss"])
-            self._take(row, seen - float(self._get()[axis]), deviation, gate=math.inf)
+            self._take(row, seen - float(row @ self._get()), deviation, gate=math.inf)
         self._compare_course(fix)
 
     def _compare_course(self, fix: tuple[float, float]) -> None:
@@ -185,8 +215,8 @@ class GnssInertial:
         if self._turned_rad < _STRAIGHT_RAD:
             apart = wrap(math.atan2(north, east) - float(state[2]))
             if abs(apart) > 0.5 * math.pi:
-                state[:3] = fix[0], fix[1], wrap(float(state[2]) + apart)
-                self._spread = np.diag([1.0, 1.0, _FIRST_HEADING_RAD, 1.0]) ** 2
+                turned = (*fix, wrap(float(state[2]) + apart), float(state[3]))
+                self._set_by_fix(turned, (1.0, 1.0, _FIRST_HEADING_RAD, 1.0))
         self._anchor = fix
         self._driven_m = self._turned_rad = 0.0
 
@@ -194,7 +224,7 @@ class GnssInertial:
         seen = self._newest(readings, "lane_boundary")
         if seen is None:
             return
-        x_m, y_m, heading, _ = self._get().tolist()
+        x_m, y_m, heading = self._get()[:3].tolist()
         if math.sqrt(max(self._spread[0, 0], self._spread[1, 1])) > _LANE_SURE_M:
             return
         offset = 0.5 * float(seen[1] - seen[0])
@@ -221,9 +251,10 @@ class GnssInertial:
     ) -> bool:
         """Take in one number; whether it was believed.
 
-        `row`: (4,) how it depends on the state. `surprise`: the number less what was expected.
+        `row`: how it depends on the first numbers of the state, as many as it has. `surprise`: the number less what was expected.
         `gate`: squared deviations beyond which it is not believed.
         """
+        row = np.concatenate([row, np.zeros(_SIZE - len(row))])
         spread = float(row @ self._spread @ row) + deviation**2
         if surprise**2 > gate * spread:
             return False

@@ -23,6 +23,7 @@ _ROAD_M = 2.5  # from the centre of a lane
 _BESIDE_ROAD_M = 6.0  # the same, for pedestrians: they may step onto it
 _RANGE_MARGIN_M = 0.05
 _MATCH_M = 3.0  # between an object and where it was expected
+_SAME_M = 0.5  # the same, for an object that takes its kind from an earlier sight: 0.1 s before
 _ALPHA, _BETA = 0.5, 0.2
 _FORGET_S = 0.5
 _STILL_MPS = 0.6
@@ -63,14 +64,16 @@ class LidarObjects:
                 scan = np.asarray(samples.values[~samples.lost][-1], dtype=np.float64)
                 echoes.extend(_groups(lidar, scan, pose))
         if echoes:
-            self._look(readings, pose)
+            self._look(readings, pose, echoes)
             boxes = [box for group in echoes if (box := self._box(group, pose)) is not None]
             self._last = [self._follow(box, time_s) for box in boxes]
             self._tracks = [track for track in self._tracks if time_s - track.seen_s < _FORGET_S]
         return self._last
 
-    def _look(self, readings: Readings, pose: EgoPose) -> None:
-        """Take in what other sensors have before objects are told apart."""
+    def _look(
+        self, readings: Readings, pose: EgoPose, groups: Sequence[NDArray[np.float64]]
+    ) -> None:
+        """Take in what other sensors have before groups of echoes (n, 2) are told apart."""
 
     def _kind(self, group: NDArray[np.float64]) -> str:
         """What echoes (n, 2) belong to: by a lidar alone it is not known."""
@@ -105,7 +108,7 @@ class LidarObjects:
         best, nearest = None, _MATCH_M
         for track in self._tracks:
             elapsed = time_s - track.seen_s
-            if elapsed <= 0.0:
+            if elapsed <= 0.0 or _differ(track.kind, box.kind):
                 continue
             off = math.hypot(
                 box.x_m - track.x_m - track.vx_mps * elapsed,
@@ -127,11 +130,17 @@ class LidarObjects:
         best.seen_s, best.times = time_s, best.times + 1
         if box.kind != "unknown":
             best.kind = box.kind
-        box = box._replace(kind=best.kind)
+        elif nearest < _SAME_M:
+            box = box._replace(kind=best.kind)
         speed_mps = math.hypot(best.vx_mps, best.vy_mps)
         if best.times < _FEW or speed_mps < _STILL_MPS:
             return box
         return box._replace(vx_mps=best.vx_mps, vy_mps=best.vy_mps)
+
+
+def _differ(one: str, other: str) -> bool:
+    """Whether two kinds are known, and not the same."""
+    return one != other and "unknown" not in (one, other)
 
 
 def _along(lanes: Sequence[OnLane], pose: EgoPose) -> float:

@@ -4,6 +4,9 @@ Between scans the filter of `localisation` goes on from GNSS, IMU and odometry. 
 onto the map's upright surfaces by generalized ICP (small_gicp), from where the filter takes the
 vehicle to be. What the pairs of points say of place and heading goes into the filter with the
 information that their normals have: along a street without ends it says nothing, and GNSS stays.
+
+Fixes have a bias of some metres, which the filter learns from the scans. As long as the place is
+not known, and where scans no longer fit, a scan is tried at many places around it.
 """
 
 from __future__ import annotations
@@ -11,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +43,13 @@ _CORRELATED = 9.0  # so many pairs are worth one: neighbours err alike
 _WEAKEST = 1e-3  # of the information along the best axis, below which an axis says nothing
 # Along the best axis; scans err alike, and along others noise of normals looks like information.
 _LEAST_M = 0.1
-_LOST_M, _LOST_FIXES = 6.0, 20  # from the mean of so many fixes: the scans are laid elsewhere
+_BIAS_M, _BIAS_DRIFT_M = 3.0, 0.02  # of fixes; and how it changes in a second
+_SURE_M = 0.5  # standard deviation of the place, below which a scan is tried there alone
+_SIGMAS, _STEPS = 2.5, 6  # how far around it is tried otherwise, in how many steps to a side
+_TRIED = 150  # echoes of a scan
+_FIRST_TRIED = 3  # places that are then matched in full
+_FAR_COST = 0.05  # of the share of echoes that fit, at the edge of what is tried
+_LOST_SCANS = 20  # that fit nowhere, one after another: the place is not known
 _TURN_M = 10.0  # a radian, against metres
 
 
@@ -53,6 +62,8 @@ class ScanMatching(GnssInertial):
         ConfigError: no lidar, no file, or a cloud without walls.
         MapError: the file cannot be read.
     """
+
+    bias_m, bias_drift_m = _BIAS_M, _BIAS_DRIFT_M
 
     def __init__(
         self,
@@ -74,59 +85,71 @@ class ScanMatching(GnssInertial):
         self._lidar = max(lidars, key=lambda sensor: int(sensor.settings["layers"]))
         self._walls = _Walls(cloud)
         self.matched = self.refused = 0  # scans
-        self.lost = 0  # how often the place was taken from GNSS anew
-        self._astray: list[tuple[float, float]] = []  # of the last fixes, from the place
+        self.lost = 0  # how often the place had to be found anew
+        self._astray = 0  # scans that fit nowhere, the last ones
 
     def locate(self, readings: Readings, mission: Mission, time_s: float) -> EgoPose | None:
         pose = super().locate(readings, mission, time_s)
-        self._watch(self._fix(readings))
         samples = readings.get(self._lidar.name)
         if pose is None or samples is None or samples.lost.all():
             return pose
         scan = np.asarray(samples.values[~samples.lost][-1], dtype=np.float64)
-        if self._match(lidar_points(self._lidar, scan, _RANGE_M)):
-            self.matched += 1
-        else:
-            self.refused += 1
-        x_m, y_m, heading, speed_mps = self._get().tolist()
-        return EgoPose(x_m, y_m, wrap(heading), max(0.0, speed_mps), self._yaw_rate)
+        fits = self._match(lidar_points(self._lidar, scan, _RANGE_M))
+        self.matched += fits
+        self.refused += not fits
+        self._astray = 0 if fits else self._astray + 1
+        if self._astray >= _LOST_SCANS:
+            self._forget()
+        return self._pose()
 
-    def _watch(self, fix: tuple[float, float] | None) -> None:
-        """Begin anew from GNSS where its fixes, in the mean, lie far from the place."""
-        if fix is None:
-            return
+    def _forget(self) -> None:
+        """The place is off by as much as a fix may be."""
         state = self._get()
-        self._astray = self._astray[1 - _LOST_FIXES :]
-        self._astray.append((fix[0] - float(state[0]), fix[1] - float(state[1])))
-        mean = np.mean(self._astray, axis=0)
-        if len(self._astray) == _LOST_FIXES and float(np.hypot(*mean)) > _LOST_M:
-            state[:2] += mean
-            self._spread = np.diag([2.0, 2.0, 0.1, 1.0]) ** 2
-            self._astray = []
-            self.lost += 1
+        place = (state[:2] + self.bias).tolist()
+        self._set_by_fix((*place, float(state[2]), float(state[3])), (1.0, 1.0, 0.1, 1.0))
+        self._astray = 0
+        self.lost += 1
 
     def _match(self, echoes: Points) -> bool:
         """Take in what echoes (n, 3) of the vehicle's frame say; whether they fit the map."""
         upright = echoes[(echoes[:, 2] > _LOWEST_M) & (echoes[:, 2] < _HIGHEST_M)]
         if len(upright) and float(np.ptp(upright[:, 2])) < 1e-6:
             upright = np.concatenate([upright + np.array([0.0, 0.0, up]) for up in _EXTRUDED_M])
-        x_m, y_m, heading, _ = self._get().tolist()
+        x_m, y_m, heading = self._get()[:3].tolist()
         target = self._walls.around(x_m, y_m)
         if target is None or len(upright) < FEWEST_POINTS:
             return False
         begin = _motion(x_m, y_m, self._walls.ground_m(x_m, y_m), heading)
-        motion = _laid(target, upright, begin)
-        placed = moved(upright, motion)
-        rows, distance_m = target.nearest(placed)
-        paired = distance_m < _PAIR_M
-        if paired.sum() < max(_FEWEST_PAIRS, _LEAST_SHARE * (distance_m < _GATE_M).sum()):
+        fits = [_fit(target, upright, start) for start in self._starts(target, upright, begin)]
+        best = max(fits, key=lambda fit: int(fit.paired.sum()))
+        if best.paired.sum() < max(_FEWEST_PAIRS, _LEAST_SHARE * (best.distance_m < _GATE_M).sum()):
             return False
+        motion = best.motion
         seen = np.array(
             [motion[0, 3], motion[1, 3], math.atan2(float(motion[1, 0]), float(motion[0, 0]))]
         )
-        normals = np.asarray(target.cloud.normals())[rows[paired], :2]
-        self._take_match(seen, normals, placed[paired, :2] - seen[:2])
+        normals = np.asarray(target.cloud.normals())[best.rows[best.paired], :2]
+        self._take_match(seen, normals, best.placed[best.paired, :2] - seen[:2])
         return True
+
+    def _starts(self, target: Target, echoes: Points, begin: Points) -> list[Points]:
+        """Motions (4, 4) to match from: of where the vehicle may be, those that fit best."""
+        deviation_m = math.sqrt(float(np.linalg.eigvalsh(self._spread[:2, :2])[-1]))
+        if deviation_m < _SURE_M:
+            return [begin]
+        reach_m = _SIGMAS * deviation_m
+        steps = np.linspace(-reach_m, reach_m, 2 * _STEPS + 1)
+        around = np.array([(x, y, 0.0) for x in steps for y in steps if math.hypot(x, y) < reach_m])
+        placed = moved(echoes[:: -(-len(echoes) // _TRIED)], begin)
+        _, distance_m = target.nearest((around[:, None] + placed).reshape(-1, 3))
+        near = np.exp(-0.5 * (distance_m.reshape(len(around), -1) / _PAIR_M) ** 2).mean(axis=1)
+        score = near - _FAR_COST * np.square(np.hypot(around[:, 0], around[:, 1]) / reach_m)
+        starts = [begin]
+        for row in np.argsort(-score, kind="stable")[:_FIRST_TRIED].tolist():
+            start = begin.copy()
+            start[:3, 3] += around[row]
+            starts.append(start)
+        return starts
 
     def _take_match(self, seen: Points, normals: Points, arms_m: Points) -> None:
         """Take in a place and a heading (3,), as far as normals (n, 2) of pairs tell them.
@@ -143,9 +166,9 @@ class ScanMatching(GnssInertial):
             off = seen - self._get()[:3]
             off[2] = wrap(float(off[2]))
             scale = np.array([1.0, 1.0, _TURN_M])
-            row = np.append(axis * scale, 0.0)
+            row = axis * scale
             deviation = max(1.0 / math.sqrt(share), _LEAST_M * math.sqrt(strength[-1] / share))
-            self._take(row, float(row[:3] @ off), deviation, gate=math.inf)
+            self._take(row, float(row @ off), deviation, gate=math.inf)
 
 
 class _Walls:
@@ -189,6 +212,27 @@ def _motion(x_m: float, y_m: float, z_m: float, heading: float) -> Points:
     return np.array(
         [[cos, -sin, 0.0, x_m], [sin, cos, 0.0, y_m], [0.0, 0.0, 1.0, z_m], [0.0, 0.0, 0.0, 1.0]]
     )
+
+
+class _Fit(NamedTuple):
+    """A scan that was laid onto walls."""
+
+    motion: Points  # (4, 4) from the vehicle's frame to the map's
+    placed: Points  # (n, 3) the echoes on the map
+    rows: NDArray[np.int64]  # the wall point that is nearest to each
+    distance_m: Points  # (n,) how far away that is
+
+    @property
+    def paired(self) -> NDArray[np.bool_]:
+        """Echoes that say where the vehicle is."""
+        near: NDArray[np.bool_] = self.distance_m < _PAIR_M
+        return near
+
+
+def _fit(target: Target, points: Points, start: Points) -> _Fit:
+    motion = _laid(target, points, start)
+    placed = moved(points, motion)
+    return _Fit(motion, placed, *target.nearest(placed))
 
 
 def _laid(target: Target, points: Points, begin: Points) -> Points:
