@@ -105,7 +105,10 @@ def _row(world: ParallelEnv, cloud: Path, seed: int, steps: int, skipped: int) -
     row: dict[str, Any] = {"seed": seed, "bias_m": float(np.hypot(*np.mean(drive.fixes_m, 0)))}
     for stage in STAGES:
         off = np.array(drive.off_m[stage][skipped:])
-        row |= {f"{stage}_mean_m": float(off.mean()), f"{stage}_p95_m": float(np.quantile(off, 0.95))}
+        row |= {
+            f"{stage}_mean_m": float(off.mean()),
+            f"{stage}_p95_m": float(np.quantile(off, 0.95)),
+        }
     matching = drive.stages["scan_matching"]
     assert isinstance(matching, ScanMatching)
     row |= {"matched": matching.matched, "refused": matching.refused, "lost": matching.lost}

@@ -19,6 +19,7 @@ from cavmarl.maps.fidelity.cloud_files import Cloud, write_cloud
 
 pytest.importorskip("small_gicp", reason="needs the extra 'clouds'")
 
+
 @pytest.fixture(scope="module")
 def world() -> Any:
     overrides = {

@@ -35,6 +35,7 @@ _LOWEST_M, _HIGHEST_M = 0.3, 4.0  # above the road: no ground, nothing that only
 _UPRIGHT = 0.5  # most of a normal's vertical part
 _AROUND_M = 60.0  # of the map, for a scan
 _EXTRUDED_M = (-0.2, 0.0, 0.2)  # a plane scan is taken for upright walls
+_GATE = 16.0  # squared deviations from what the filter says, beyond which a match is another place
 _GATE_M = 1.5  # farther pairs are other things
 _PAIR_M = 0.4  # pairs that are nearer say where the vehicle is
 _FEWEST_PAIRS, _LEAST_SHARE = 30, 0.5
@@ -50,6 +51,7 @@ _TRIED = 150  # echoes of a scan
 _FIRST_TRIED = 3  # places that are then matched in full
 _FAR_COST = 0.05  # of the share of echoes that fit, at the edge of what is tried
 _LOST_SCANS = 20  # that fit nowhere, one after another: the place is not known
+_ASIDE_M, _WORSE = 0.5, 3.0  # so far to the side a match is worse by so much, or it slides
 _TURN_M = 10.0  # a radian, against metres
 
 
@@ -121,16 +123,20 @@ class ScanMatching(GnssInertial):
             return False
         begin = _motion(x_m, y_m, self._walls.ground_m(x_m, y_m), heading)
         fits = [_fit(target, upright, start) for start in self._starts(target, upright, begin)]
-        best = max(fits, key=lambda fit: int(fit.paired.sum()))
+        best = max(fits, key=lambda fit: fit.likelihood - 0.5 * self._apart(fit.pose))
         if best.paired.sum() < max(_FEWEST_PAIRS, _LEAST_SHARE * (best.distance_m < _GATE_M).sum()):
             return False
-        motion = best.motion
-        seen = np.array(
-            [motion[0, 3], motion[1, 3], math.atan2(float(motion[1, 0]), float(motion[0, 0]))]
-        )
-        normals = np.asarray(target.cloud.normals())[best.rows[best.paired], :2]
-        self._take_match(seen, normals, best.placed[best.paired, :2] - seen[:2])
+        if self._apart(best.pose) > _GATE:
+            return False
+        self._take_match(target, best)
         return True
+
+    def _apart(self, pose: Points) -> float:
+        """Squared deviations by which a place and a heading (3,) are off what the filter says."""
+        off = pose - self._get()[:3]
+        off[2] = wrap(float(off[2]))
+        spread = self._spread[:3, :3] + np.diag([_PAIR_M, _PAIR_M, _PAIR_M / _TURN_M]) ** 2
+        return float(off @ np.linalg.solve(spread, off))
 
     def _starts(self, target: Target, echoes: Points, begin: Points) -> list[Points]:
         """Motions (4, 4) to match from: of where the vehicle may be, those that fit best."""
@@ -151,11 +157,19 @@ class ScanMatching(GnssInertial):
             starts.append(start)
         return starts
 
-    def _take_match(self, seen: Points, normals: Points, arms_m: Points) -> None:
-        """Take in a place and a heading (3,), as far as normals (n, 2) of pairs tell them.
-
-        `arms_m`: (n, 2) from the vehicle to each pair.
-        """
+    def _take_match(self, target: Target, fit: _Fit) -> None:
+        """Take in a place and a heading, as far as the normals of pairs tell them."""
+        normals = _normals(target, fit)
+        free = [
+            axis for axis in np.linalg.eigh(normals.T @ normals)[1].T if _slides(target, fit, axis)
+        ]
+        for axis in free:  # stays where the filter has it
+            fit = fit.shifted(target, axis * float(axis @ (self._get()[:2] - fit.pose[:2])))
+        normals = _normals(target, fit)
+        for axis in free:
+            normals = normals - np.outer(normals @ axis, axis)
+        seen = fit.pose
+        arms_m = fit.placed[fit.paired, :2] - seen[:2]
         turn = (normals[:, 1] * arms_m[:, 0] - normals[:, 0] * arms_m[:, 1]) / _TURN_M
         slopes = np.column_stack([normals, turn])
         information = slopes.T @ slopes / (_CORRELATED * _DEVIATION_M**2)
@@ -165,8 +179,7 @@ class ScanMatching(GnssInertial):
                 continue
             off = seen - self._get()[:3]
             off[2] = wrap(float(off[2]))
-            scale = np.array([1.0, 1.0, _TURN_M])
-            row = axis * scale
+            row = axis * (1.0, 1.0, _TURN_M)
             deviation = max(1.0 / math.sqrt(share), _LEAST_M * math.sqrt(strength[-1] / share))
             self._take(row, float(row @ off), deviation, gate=math.inf)
 
@@ -222,11 +235,50 @@ class _Fit(NamedTuple):
     rows: NDArray[np.int64]  # the wall point that is nearest to each
     distance_m: Points  # (n,) how far away that is
 
+    def shifted(self, target: Target, by_m: Points) -> _Fit:
+        """Laid elsewhere in the plane, by (2,)."""
+        motion, placed = self.motion.copy(), self.placed.copy()
+        motion[:2, 3] += by_m
+        placed[:, :2] += by_m
+        return _Fit(motion, placed, *target.nearest(placed))
+
+    @property
+    def pose(self) -> Points:
+        """(3,) x, y and heading."""
+        motion = self.motion
+        heading = math.atan2(float(motion[1, 0]), float(motion[0, 0]))
+        return np.array([motion[0, 3], motion[1, 3], heading])
+
+    @property
+    def likelihood(self) -> float:
+        return _likelihood(self.distance_m)
+
     @property
     def paired(self) -> NDArray[np.bool_]:
         """Echoes that say where the vehicle is."""
         near: NDArray[np.bool_] = self.distance_m < _PAIR_M
         return near
+
+
+def _likelihood(distance_m: Points) -> float:
+    """Its logarithm, with a worst distance for what the map does not have."""
+    near = np.minimum(distance_m, _PAIR_M) / (0.5 * _PAIR_M)
+    return -0.5 * float(np.square(near).sum()) / _CORRELATED
+
+
+def _slides(target: Target, fit: _Fit, axis: Points) -> bool:
+    """Whether a scan fits about as well to one side along an axis (2,) of the plane.
+
+    Normals alone do not say so: those of a rough wall point along it, too.
+    """
+    sides = [fit.shifted(target, way * axis).likelihood for way in (-_ASIDE_M, _ASIDE_M)]
+    return fit.likelihood - max(sides) < _WORSE
+
+
+def _normals(target: Target, fit: _Fit) -> Points:
+    """(n, 2) of the walls that echoes lie on."""
+    found: Points = np.asarray(target.cloud.normals())[fit.rows[fit.paired], :2]
+    return found
 
 
 def _fit(target: Target, points: Points, start: Points) -> _Fit:

@@ -166,11 +166,26 @@ def _check_metres(path: Path, keys: dict[int, int]) -> None:
     unit = keys.get(_VERTICAL_UNIT)
     if unit is None and keys.get(_LINEAR_UNIT) in _FEET and _VERTICAL not in keys:
         unit = keys[_LINEAR_UNIT]
-    if unit in _FEET:
+    feet = _FEET.get(unit or 0)
+    if unit is None and _LINEAR_UNIT not in keys and _VERTICAL not in keys:
+        feet = _feet_of(keys.get(_PROJECTED, 0))
+    if feet is not None:
         raise MapError(
-            f"{path}: its heights are in {_FEET[unit]}: convert them to metres (gdal_calc.py "
+            f"{path}: its heights are in {feet}: convert them to metres (gdal_calc.py "
             "--calc 'A*0.3048', then gdal_edit.py with a CRS in metres)"
         )
+
+
+def _feet_of(projected: int) -> str | None:
+    """What a projection in feet calls them; None: it is in metres, or unknown."""
+    if projected in (0, _USER_DEFINED):
+        return None
+    pyproj: Any = require("pyproj", "maps")
+    try:
+        unit = str(pyproj.CRS.from_epsg(projected).axis_info[0].unit_name)
+    except (pyproj.exceptions.CRSError, IndexError):
+        return None
+    return "feet" if "foot" in unit else None
 
 
 def _placed(path: Path, tags: dict[int, Any]) -> tuple[float, float, float, float]:

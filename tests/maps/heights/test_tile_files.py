@@ -15,6 +15,7 @@ from tests.support.terrain import plane, write_geotiff, write_hgt
 
 PLACES = np.array([[11.001, 48.001], [11.012, 48.009], [11.0071, 48.0033]])
 GROUND = plane(0.03, 0.05)
+NEW_YORK = (1024, 0, 1, 1, 1025, 0, 1, 2, 3072, 0, 1, 2263)  # state plane, in US feet by its code
 FEET = (1024, 0, 1, 2, 1025, 0, 1, 2, 2048, 0, 1, 4326, 4099, 0, 1, 9002)
 
 
@@ -69,7 +70,12 @@ def test_voids_everywhere_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("keys", "message"),
-    [((), "no projection"), (FEET, "in feet"), ((1024, 0, 1, 1, 3072, 0, 1, 32767), "no proj")],
+    [
+        ((), "no projection"),
+        (FEET, "in feet"),
+        (NEW_YORK, "in feet"),
+        ((1024, 0, 1, 1, 3072, 0, 1, 32767), "no proj"),
+    ],
 )
 def test_models_without_a_frame_are_refused(
     tmp_path: Path, keys: tuple[int, ...], message: str
