@@ -72,7 +72,7 @@ def measure(
         columns[f"{short} 95 %"] = f"{stage}_p95_m:.3f"
     columns |= {"used": "matched", "refused": "refused", "ms": "step_ms:.1f"}
     notes = [
-        "GNSS: how far its fixes are off in the mean; used, refused: scans; ms: of processor, a step"
+        "GNSS: how far its fixes are off in the mean; used, refused: scans; ms: a step, processor"
     ]
     title = f"place off, m: GNSS {noise:g} m of noise, {bias:g} m of bias"
     return Report(title + ("" if markings else ", no lane markings"), columns, rows, notes)

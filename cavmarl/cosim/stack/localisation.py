@@ -251,8 +251,8 @@ class GnssInertial:
     ) -> bool:
         """Take in one number; whether it was believed.
 
-        `row`: how it depends on the first numbers of the state, as many as it has. `surprise`: the number less what was expected.
-        `gate`: squared deviations beyond which it is not believed.
+        `row`: how it depends on the first numbers of the state, as many as it has. `surprise`: the
+        number less what was expected. `gate`: squared deviations beyond which it is not believed.
         """
         row = np.concatenate([row, np.zeros(_SIZE - len(row))])
         spread = float(row @ self._spread @ row) + deviation**2

@@ -47,7 +47,7 @@ _LEAST_M = 0.1
 _BIAS_M, _BIAS_DRIFT_M = 3.0, 0.02  # of fixes; and how it changes in a second
 _SURE_M = 0.5  # standard deviation of the place, below which a scan is tried there alone
 _SIGMAS, _STEPS = 2.5, 6  # how far around it is tried otherwise, in how many steps to a side
-_TRIED = 150  # echoes of a scan
+_TRIED, _TRY_EVERY = 150, 5  # echoes of a scan; and which scans
 _FIRST_TRIED = 3  # places that are then matched in full
 _FAR_COST = 0.05  # of the share of echoes that fit, at the edge of what is tried
 _LOST_SCANS = 20  # that fit nowhere, one after another: the place is not known
@@ -89,6 +89,7 @@ class ScanMatching(GnssInertial):
         self.matched = self.refused = 0  # scans
         self.lost = 0  # how often the place had to be found anew
         self._astray = 0  # scans that fit nowhere, the last ones
+        self._next_try = 0  # scans until one is tried at many places
 
     def locate(self, readings: Readings, mission: Mission, time_s: float) -> EgoPose | None:
         pose = super().locate(readings, mission, time_s)
@@ -109,7 +110,7 @@ class ScanMatching(GnssInertial):
         state = self._get()
         place = (state[:2] + self.bias).tolist()
         self._set_by_fix((*place, float(state[2]), float(state[3])), (1.0, 1.0, 0.1, 1.0))
-        self._astray = 0
+        self._astray = self._next_try = 0
         self.lost += 1
 
     def _match(self, echoes: Points) -> bool:
@@ -141,8 +142,10 @@ class ScanMatching(GnssInertial):
     def _starts(self, target: Target, echoes: Points, begin: Points) -> list[Points]:
         """Motions (4, 4) to match from: of where the vehicle may be, those that fit best."""
         deviation_m = math.sqrt(float(np.linalg.eigvalsh(self._spread[:2, :2])[-1]))
-        if deviation_m < _SURE_M:
+        self._next_try -= 1
+        if deviation_m < _SURE_M or self._next_try > 0:
             return [begin]
+        self._next_try = _TRY_EVERY
         reach_m = _SIGMAS * deviation_m
         steps = np.linspace(-reach_m, reach_m, 2 * _STEPS + 1)
         around = np.array([(x, y, 0.0) for x in steps for y in steps if math.hypot(x, y) < reach_m])

@@ -27,8 +27,8 @@ def map_surface(network: RoadNetwork, box_m: Box, spacing_m: float = 0.25) -> tu
     if not len(lanes):
         place = "x {0:.1f} … {2:.1f}, y {1:.1f} … {3:.1f}".format(*box_m)
         raise MapError(
-            f"the map '{network.name}' has no lane within {place}: give another cloud, or the frame "
-            "that it is in (--frame projected, degrees, swapped)"
+            f"the map '{network.name}' has no lane within {place}: give another cloud, or "
+            "the frame that it is in (--frame projected, degrees, swapped)"
         )
     area_m2 = float((network.lanes["length_m"][lanes] * network.lanes["width_m"][lanes]).sum())
     walls = _walls_in(network, box_m)
