@@ -25,7 +25,7 @@ from cavmarl.cosim.stack.localisation import GnssInertial
 from cavmarl.cosim.stack.scan_matching import ScanMatching
 from cavmarl.cosim.stack.stack import REFERENCE_RIG, sensor_of, vehicle_of
 from cavmarl.cosim.stack.stack_types import Mission
-from cavmarl.env.parallel import ParallelEnv
+from cavmarl.env.parallel import CavEnv
 from cavmarl.maps.fidelity.cloud_files import Cloud, write_cloud
 from cavmarl.maps.fidelity.map_surface import map_surface
 
@@ -87,7 +87,7 @@ def rig_with(noise_m: float, bias_m: float, markings: bool) -> dict[str, dict[st
     return rig
 
 
-def write_surface(world: ParallelEnv, path: Path) -> Path:
+def write_surface(world: CavEnv, path: Path) -> Path:
     """The map's own lanes and walls as a cloud."""
     surface, _ = map_surface(world.network, world.network.extent_m, CLOUD_SPACING_M)
     noise = np.random.default_rng(0).normal(0.0, CLOUD_NOISE_M, surface.points.shape)
@@ -95,7 +95,7 @@ def write_surface(world: ParallelEnv, path: Path) -> Path:
     return path
 
 
-def _row(world: ParallelEnv, cloud: Path, seed: int, steps: int, skipped: int) -> dict[str, Any]:
+def _row(world: CavEnv, cloud: Path, seed: int, steps: int, skipped: int) -> dict[str, Any]:
     drive = Drive(world, cloud, seed)
     for _ in range(steps):
         if not drive.step():
@@ -124,7 +124,7 @@ class Drive:
         busy_s: processor time of scan matching.
     """
 
-    def __init__(self, world: ParallelEnv, cloud: Path, seed: int) -> None:
+    def __init__(self, world: CavEnv, cloud: Path, seed: int) -> None:
         self._world = world
         world.reset(seed=seed)
         sensors = [sensor_of(v.name, v.settings) for v in welcome_to(world, [AGENT], 0).sensors]

@@ -9,7 +9,15 @@ from rich.console import Console
 from rich.table import Table
 
 from cavmarl.cli.lead import DEFAULT_PLACE, SecretFile, address_of, read_secret
-from cavmarl.cli.output import Environment, JsonPath, about, grid, write_json
+from cavmarl.cli.output import (
+    Environment,
+    JsonPath,
+    Settings,
+    about,
+    grid,
+    parse_settings,
+    write_json,
+)
 from cavmarl.core.errors import ConfigError
 
 
@@ -26,6 +34,7 @@ def follow(
     cloud: Annotated[
         Path | None, about("A point-cloud map, for localisation=scan_matching.", exists=True)
     ] = None,
+    settings: Settings = None,
     joins_s: Annotated[float, about("Seconds that the world may take to answer.")] = 60.0,
     secret_file: SecretFile = None,
     json_path: JsonPath = None,
@@ -38,7 +47,7 @@ def follow(
     from cavmarl.engine.world_setup import load_roads
 
     config = StackConfig(**_stages(stage or [], tuple(STAGES)), cloud=cloud)
-    network = load_roads(*load_config(env))
+    network = load_roads(*load_config(env, overrides=parse_settings(settings)))
     steps = 0
     secret = read_secret(secret_file)
     with Follower(address_of(at), vehicles.split(","), name, joins_s, secret) as follower:

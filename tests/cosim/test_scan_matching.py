@@ -11,10 +11,13 @@ import pytest
 
 import cavmarl
 from benchmarks.localisation import STEP_S, Drive, rig_with, write_surface
+from cavmarl.config.registry import load_config
 from cavmarl.core.errors import ConfigError
+from cavmarl.cosim.followers.follower_driver import StackDriver
 from cavmarl.cosim.followers.follower_snapshots import welcome_to
 from cavmarl.cosim.stack.hd_map import HdMap
 from cavmarl.cosim.stack.stack import Stack, StackConfig, sensor_of, vehicle_of
+from cavmarl.engine.world_setup import load_roads
 from cavmarl.maps.fidelity.cloud_files import Cloud, write_cloud
 
 pytest.importorskip("small_gicp", reason="needs the extra 'clouds'")
@@ -75,6 +78,14 @@ def test_what_is_missing_is_said(world: Any, cloud: Path, tmp_path: Path) -> Non
     with pytest.raises(ConfigError, match="has no walls"):
         stack(sensors, flat)
     assert stack(sensors, cloud).pose is None
+
+
+def test_a_stack_takes_the_map_with_the_keys_of_the_world(world: Any) -> None:
+    welcome = welcome_to(world, ["car_0"], 0)
+    with pytest.raises(ConfigError, match=r"another map than .*--set map\.buildings"):
+        StackDriver(load_roads(*load_config("grid4x4")), welcome)
+    keys = {"map.buildings": "map/buildings.poly.xml"}
+    assert not StackDriver(load_roads(*load_config("grid4x4", overrides=keys)), welcome).stacks
 
 
 MATCHING = {"localisation": "scan_matching"}

@@ -35,7 +35,8 @@ class StackDriver:
         if welcome.map_hash != network.source_hash:
             raise ConfigError(
                 f"{welcome.environment} is on another map than '{network.name}': give the stack "
-                "the environment or the map file that the world was made from"
+                "the environment or the map file that the world was made from, and its keys of "
+                "`map` (--set map.buildings=…)"
             )
         if welcome.action != "continuous":
             raise ConfigError(
