@@ -238,14 +238,13 @@ def press_inside(
     kind = travel.types[row["vtype"]]
     half = 0.5 * row["length"]
     front = place + half
-    press = no_press(kind)
+    press, hold = no_press(kind), HOLD_NONE
     target = roads.links[link]
-    wait_m = target["wait_m"]
-    if front <= wait_m + WAIT_SLACK_M:
+    if front <= target["wait_m"] + WAIT_SLACK_M:
         hold = waits_inside(roads, travel, rows, i, link, -place, way, phase, scratch)
         if hold != HOLD_NONE:
             to_wait = wait_place(roads, link, half) - front
-            return before_line(kind, row["speed"], to_wait, dt), hold
+            press = before_line(kind, row["speed"], to_wait, dt)
     first = target["first_conflict"]
     for c in range(first, first + target["num_conflicts"]):
         conflict = roads.conflicts[c]
@@ -255,7 +254,7 @@ def press_inside(
             foe = scratch.approach[k]
             if foe["row"] != i:
                 press = max(press, _press_of(roads, kind, row, conflict, foe, place, dt))
-    return press, HOLD_NONE
+    return press, hold
 
 
 @kernel

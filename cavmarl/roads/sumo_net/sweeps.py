@@ -93,8 +93,6 @@ def _find_pair(
         theirs_m = _begin_m(b, row["foe_enter_m"]), float(row["foe_leave_m"])
     for own, (half, wide) in enumerate(BODIES):
         for foe, (foe_half, foe_wide) in enumerate(BODIES):
-            if foes and own == foe == 0:
-                continue  # the conflict keeps cars apart
             mine, theirs = poses[one][own], poses[other][foe]
             if merging:  # behind the junction one follows the other
                 mine = mine[mine[:, 0] <= a["length_m"]]
