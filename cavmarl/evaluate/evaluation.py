@@ -138,7 +138,7 @@ def evaluate(
         require("jinja2", "report")
     recorded = None if record is None else RecordOptions.of(record)
     if recorded is not None:
-        recorded = recorded.at(Path(recorded.path).absolute())
+        recorded = recorded.at(str(Path(recorded.path).absolute()))  # as a manifest tells it
     job = EpisodeJob(
         **vars(spec),
         policies=_named(policies),

@@ -42,7 +42,7 @@ class RecordOptions:
         """As it is, or a path alone."""
         return record if isinstance(record, RecordOptions) else cls(record)
 
-    def at(self, path: Path) -> RecordOptions:
+    def at(self, path: str | Path) -> RecordOptions:
         """The same at another path."""
         return RecordOptions(path, self.include)
 

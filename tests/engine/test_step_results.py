@@ -39,6 +39,7 @@ def outputs_of(rng: np.random.Generator) -> Outputs:
         acted=present & (rng.random(shape) < 0.8),
         events=rng.choice(KINDS, shape).astype(np.int32),
         vehicle_ids=rng.integers(-1, 99, shape),
+        places=np.zeros((*shape, 2)),
     )
 
 

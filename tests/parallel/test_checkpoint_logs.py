@@ -75,6 +75,7 @@ def commands_like(entry: Commands, value: int) -> Commands:
         np.full_like(entry.controls, value),
         np.full_like(entry.meta_actions, value),
         np.full_like(entry.declared, value),
+        np.full_like(entry.inserted, value),
     )
 
 

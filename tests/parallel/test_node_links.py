@@ -8,6 +8,7 @@ import zlib
 import pytest
 
 from cavmarl.core.errors import MessageError
+from cavmarl.ownership.decisions import Neighbours
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import Done
 from cavmarl.parallel.nodes.links import (
@@ -76,7 +77,7 @@ def test_a_node_speaks_for_its_own_zones() -> None:
     """One that says something of another's zone is cut off."""
     links, far = pair()
     coordinator = NodeCoordinator([bytes(16)], [0, 0, 1], Limits(), links, [None])
-    coordinator.host()
+    coordinator.host(Neighbours((frozenset((1,)), frozenset((0, 2)), frozenset((1,)))))
     links.urgent = coordinator.hear
     table = coordinator._worlds[0].directory.table
     done = {
