@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -50,7 +50,7 @@ SEEN = np.dtype(
 )
 # An agent whose vehicle ended in the step before the frame, and by which EVENT_* bits.
 ENDED = np.dtype([("agent", "<i4"), ("events", "<i4")])
-_NONE_ENDED = np.zeros(0, dtype=ENDED)
+NONE_ENDED = np.zeros(0, dtype=ENDED)
 
 _KINDS = {
     EVENT_COLLIDED: "collision",
@@ -72,7 +72,7 @@ class WorldFrame(NamedTuple):
     signals: NDArray[np.int32]  # (num_signals,) PHASE rows that are on
     transfers: tuple[TransferInFlight, ...] = ()
     ghosts: tuple[NDArray[np.int64], ...] = ()  # of each zone, the ids that it sees of others
-    ended: NDArray[np.void] = _NONE_ENDED  # ENDED (m,): they are not among `vehicles`
+    ended: NDArray[np.void] = NONE_ENDED  # ENDED (m,): they are not among `vehicles`
     # kind and detail of what was put into the world in the step before
     asked: tuple[tuple[str, str], ...] = ()
 
@@ -93,8 +93,9 @@ def frame_of(
     simulation: WorldViews,
     world: int = 0,
     ghosts: bool = False,
-    ended: NDArray[np.void] = _NONE_ENDED,
+    ended: NDArray[np.void] = NONE_ENDED,
     asked: tuple[tuple[str, str], ...] = (),
+    room: Callable[[int], NDArray[np.void]] | None = None,
 ) -> WorldFrame:
     """The present moment of one world.
 
@@ -104,10 +105,12 @@ def frame_of(
         ghosts: whether to tell what each zone sees of the others' vehicles.
         ended: ENDED, of the last step.
         asked: what was put into the world in it.
+        room: memory for so many SEEN; None: new memory.
     """
     rows = simulation.vehicles(world)
-    seen = np.empty(len(rows), dtype=SEEN)
-    write_seen(rows, np.argsort(rows["id"]), simulation.types, seen)
+    seen = np.empty(len(rows), dtype=SEEN) if room is None else room(len(rows))
+    order = np.argsort(rows["id"], kind="stable")  # faster where many are sorted already
+    write_seen(rows, order, simulation.types, seen)
     view = simulation.zone_view(world) if simulation.partition.count > 1 else None
     tick = int(simulation.ticks()[world])
     return WorldFrame(

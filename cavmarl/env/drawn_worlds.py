@@ -20,7 +20,7 @@ from cavmarl.core.records.codes import (
 )
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.vehicle_way import way_ahead
-from cavmarl.engine.world_frame import ENDED, WorldFrame, frame_of
+from cavmarl.engine.world_frame import ENDED, NONE_ENDED, WorldFrame, frame_of
 from cavmarl.env.insertions import InsertedWorlds
 from cavmarl.env.recorded_worlds import Record, WorldRecorder
 from cavmarl.parallel.backends import shows_state
@@ -116,6 +116,14 @@ class DrawnWorlds(InsertedWorlds):
             ConfigError: no such world, or one whose state cannot be had here.
             EpisodeError: before the first reset.
         """
+        return self._frames_of(chosen, ghosts)
+
+    def _frames_of(
+        self,
+        chosen: Sequence[int],
+        ghosts: bool,
+        room: Callable[[int], NDArray[np.void]] | None = None,
+    ) -> list[WorldFrame]:
         worlds = self.worlds
         count = len(worlds.arrays.mask)
         if wrong := [world for world in chosen if not 0 <= world < count]:
@@ -128,9 +136,9 @@ class DrawnWorlds(InsertedWorlds):
                 f"{key}: frames of such worlds can only be had in the caller's process; use "
                 "workers=0"
             )
-        simulation = self._shown()
+        simulation, told = self._shown(), self._insertions.told
         return [
-            frame_of(simulation, world, ghosts, self._ended(world), self._insertions.told(world))
+            frame_of(simulation, world, ghosts, self._ended(world), told(world), room)
             for world in chosen
         ]
 
@@ -161,6 +169,8 @@ class DrawnWorlds(InsertedWorlds):
     def _ended(self, world: int) -> NDArray[np.void]:
         """ENDED of the last step."""
         arrays = self.worlds.arrays
+        if not arrays.vehicle_done[world].any():
+            return NONE_ENDED
         agents = np.flatnonzero(arrays.vehicle_done[world])
         ended = np.zeros(len(agents), dtype=ENDED)
         ended["agent"] = agents
@@ -192,7 +202,7 @@ class DrawnWorlds(InsertedWorlds):
         if self._writer is not None:
             every = range(len(self.worlds.arrays.mask))
             some = every if chosen is None else np.flatnonzero(chosen).tolist()
-            self._writer.add(self.world_frames(some, ghosts=True))
+            self._writer.add(self._frames_of(some, ghosts=True, room=self._writer.room))
         for look in self._watchers:
             look()
 

@@ -114,6 +114,8 @@ class RecordedExtras:
             world: its number among those that are stepped.
             tick: of its frame.
         """
+        if not self.dtypes:
+            return {}
         arrays, found = self._arrays, {name: log.take(world) for name, log in self._logs.items()}
         agents = np.flatnonzero(arrays.vehicle_ids[world] >= 0)
         for name, dtype in self.dtypes.items():

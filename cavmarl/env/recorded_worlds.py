@@ -8,6 +8,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import numpy as np
+from numpy.typing import NDArray
+
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.machine import describe_machine
@@ -104,6 +107,10 @@ class WorldRecorder:
     def path(self) -> Path:
         """Of the recording."""
         return self._writer.path
+
+    def room(self, count: int) -> NDArray[np.void]:
+        """SEEN (count,) for a frame that is added here and used nowhere else."""
+        return self._writer.memory.take(count)
 
     def add(self, frames: Iterable[WorldFrame], first: int = 0) -> None:
         """Take frames of worlds as they are now.

@@ -19,6 +19,7 @@ from cavmarl.core.processes import is_fork, refuse_fork
 from cavmarl.core.whole_file import write_whole
 from cavmarl.engine.world_frame import FrameEvent, WorldFrame, events_between
 from cavmarl.recordings.extra_tables import ExtraRows, extra_table, take_rows
+from cavmarl.recordings.frame_memory import FrameMemory
 from cavmarl.recordings.recording_format import (
     HEAD_FILE,
     NETWORK_FILE,
@@ -60,6 +61,9 @@ class RecordingWriter:
         extras: dtypes of the tables that are recorded on request, by name; `tick` is first.
         features: sensor and name of each number that an agent observes, if that is recorded.
         terms: names of the reward terms, likewise.
+
+    Attributes:
+        memory: that frames may lie in whose rows are read here alone.
 
     Raises:
         RecordingError: there is something at `path`, or it cannot be written.
@@ -110,7 +114,8 @@ class RecordingWriter:
             write_whole(self.path / HEAD_FILE, head.to_bytes())
         except OSError as error:
             raise _unwritable(self.path, error) from error
-        self._sink = _Sink(self.path, head, dict(extras or {}))
+        self.memory = FrameMemory()
+        self._sink = _Sink(self.path, head, dict(extras or {}), self.memory)
         self._finish = weakref.finalize(self, self._sink.close)  # at the end of the process, too
 
     def add(self, frames: Iterable[WorldFrame], extras: Iterable[Extras] = ()) -> None:
@@ -147,9 +152,14 @@ class _Sink:
     """What the thread works on; it does not know the writer, so that one can go unseen."""
 
     def __init__(
-        self, path: Path, head: RecordingHead, extras: Mapping[str, np.dtype[Any]]
+        self,
+        path: Path,
+        head: RecordingHead,
+        extras: Mapping[str, np.dtype[Any]],
+        memory: FrameMemory,
     ) -> None:
         self._path = path
+        self._memory = memory
         self._head = head
         self._extras = extras
         self._pid = os.getpid()  # forks have no such thread
@@ -222,7 +232,9 @@ class _Sink:
         for frame, extras in moments:
             if frame.world not in self._worlds:
                 folder = self._path / f"world-{frame.world}"
-                self._worlds[frame.world] = _WorldParts(folder, self._head, self._extras)
+                self._worlds[frame.world] = _WorldParts(
+                    folder, self._head, self._extras, self._memory
+                )
             self._worlds[frame.world].take(frame, extras)
         for parts in self._worlds.values():
             parts.commit()
@@ -232,9 +244,14 @@ class _WorldParts:
     """The parts of one world."""
 
     def __init__(
-        self, folder: Path, head: RecordingHead, extras: Mapping[str, np.dtype[Any]]
+        self,
+        folder: Path,
+        head: RecordingHead,
+        extras: Mapping[str, np.dtype[Any]],
+        memory: FrameMemory,
     ) -> None:
         self._folder = folder
+        self._memory = memory
         self._dtypes = extras
         self._extras: dict[str, list[ExtraRows]] = {name: [] for name in extras}
         self._step_ticks = max(1, round(head.step_s / head.sim_dt_s))
@@ -256,6 +273,8 @@ class _WorldParts:
         elif last is not None:
             found = events_between(last.frame, frame)
             self._events += (RecordedEvent(episode, event) for event in found)
+        if last is not None and not self._frames:  # it was committed, and is compared now
+            self._memory.give_back(last.frame.vehicles)
         self._last = RecordedFrame(episode, frame)
         self._frames.append(self._last)
         for name, rows in take_rows(extras, episode, frame.tick):
@@ -289,6 +308,8 @@ class _WorldParts:
         for name, table in tables.items():
             write_whole(self._folder / name / f"{self._count:06d}.parquet", write_table(table))
         self._count += 1
+        for recorded in self._frames[:-1]:
+            self._memory.give_back(recorded.frame.vehicles)
         self._frames, self._events = [], []
         self._extras = {name: [] for name in self._dtypes}
 
