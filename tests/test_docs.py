@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
+import shlex
 from dataclasses import MISSING, fields, is_dataclass
 from functools import cache
 from pathlib import Path
@@ -12,7 +13,9 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 import pytest
+import typer
 
+from cavmarl.cli import app
 from cavmarl.config.env import TERMS, EnvConfig
 from cavmarl.config.io import dotted_keys
 from cavmarl.config.rig import CollisionConfig, SampledConfig
@@ -22,6 +25,7 @@ from tests.support.generated import check_block, table
 
 ROOT = Path(__file__).resolve().parents[1]
 MAX_LINE = 120
+USAGE: Any = typer.BadParameter.__base__  # what a command line that is not understood raises
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("envs/*/README.md")])
 UNITS = {
     "m": "m", "s": "s", "mps": "m/s", "mps2": "m/s²", "rad": "rad", "ticks": "ticks", "hz": "Hz",
@@ -222,3 +226,37 @@ def default_text(value: object) -> str:
         case float():
             return f"`{value:.6g}`"
     return f"`{value}`"
+
+
+@pytest.mark.parametrize(
+    "page",
+    [page for page in PAGES if page.name != "CHANGELOG.md" and page.parent.name != "decisions"],
+    ids=lambda page: page.relative_to(ROOT).as_posix(),
+)
+def test_commands_of_pages_are_understood(page: Path) -> None:
+    """Each command is there, and has the options that it is given."""
+    for line in commands_of(page.read_text(encoding="utf-8")):
+        command: Any = typer.main.get_command(app)
+        context = command.make_context("cavmarl", [], resilient_parsing=True)
+        words = shlex.split(line.replace("…", ""), comments=True)[1:]
+        while hasattr(command, "get_command") and words and not words[0].startswith("-"):
+            found = command.get_command(context, words[0])
+            assert found is not None, line
+            context = type(context)(found, parent=context, **found.context_settings)
+            command, words = found, words[1:]
+        try:
+            _, left, _ = command.make_parser(context).parse_args(words)
+        except USAGE as error:
+            if "requires an argument" not in str(error):  # as a page may name an option
+                raise
+            left = []
+        assert not left or context.ignore_unknown_options, line
+
+
+def commands_of(text: str) -> list[str]:
+    """Calls of `cavmarl` in code; `[…]` around what can be left out goes, and what comes after."""
+    blocks = re.findall(r"```(?:sh|console)\n(.*?)```", text, re.DOTALL)
+    lines = [line for block in blocks for line in re.sub(r"\\\n\s*", " ", block).splitlines()]
+    lines += [re.sub(r"\s+", " ", inline) for inline in re.findall(r"`(cavmarl [^`]+)`", text)]
+    calls = [re.split(r" (?:\||>|&&|;|&)(?: |$)", line.strip().lstrip("$ "))[0] for line in lines]
+    return [re.sub(r" \[.*?\]", "", call) for call in calls if call.startswith("cavmarl ")]
