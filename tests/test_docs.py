@@ -255,7 +255,7 @@ def test_commands_of_pages_are_understood(page: Path) -> None:
 
 def commands_of(text: str) -> list[str]:
     """Calls of `cavmarl` in code; `[…]` around what can be left out goes, and what comes after."""
-    blocks = re.findall(r"```(?:sh|console)\n(.*?)```", text, re.DOTALL)
+    blocks = re.findall(r"```(?:sh|bash|console)\n(.*?)```", text, re.DOTALL)
     lines = [line for block in blocks for line in re.sub(r"\\\n\s*", " ", block).splitlines()]
     lines += [re.sub(r"\s+", " ", inline) for inline in re.findall(r"`(cavmarl [^`]+)`", text)]
     calls = [re.split(r" (?:\||>|&&|;|&)(?: |$)", line.strip().lstrip("$ "))[0] for line in lines]
