@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -19,6 +20,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from cavmarl.core.errors import ConfigError
+from cavmarl.core.progress import progress_bar
 
 Say = Callable[[str], None]
 Key = TypeVar("Key")
@@ -109,8 +111,16 @@ def numbers_of(option: str, text: str) -> list[int]:
 
 @contextmanager
 def measuring(console: Console) -> Iterator[Say]:
-    with console.status("") as status:
-        yield status.update
+    """A line of what is measured; where that is `3 of 7`, with a bar and the time left."""
+    with progress_bar(console) as bar:
+        task = bar.add_task("", total=None)
+
+        def say(text: str) -> None:
+            turn = re.search(r"\b(\d+) of (\d+)\b", text)
+            done, total = (int(turn[1]) - 1, int(turn[2])) if turn else (0, None)
+            bar.update(task, description=text, completed=done, total=total)
+
+        yield say
 
 
 def make_table(

@@ -21,8 +21,8 @@ from cavmarl.cli.output import (
     make_folder,
     write_json,
 )
-from cavmarl.cli.progress import progress_bar
 from cavmarl.core.errors import ConfigError, require
+from cavmarl.core.progress import progress_bar
 
 
 def baseline(

@@ -28,10 +28,10 @@ from cavmarl.cli.output import (
     with_world,
     write_json,
 )
-from cavmarl.cli.progress import progress_bar
 from cavmarl.cli.web import WebPort, say
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import require
+from cavmarl.core.progress import progress_bar
 from cavmarl.viewer.web_options import DEFAULT_PORT, WebOptions
 
 if TYPE_CHECKING:

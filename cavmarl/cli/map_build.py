@@ -12,8 +12,8 @@ from rich.text import Text
 
 from cavmarl.cli.map_check import print_report
 from cavmarl.cli.output import JsonPath, about, grid, write_json
-from cavmarl.cli.progress import progress_bar
 from cavmarl.core.errors import ConfigError
+from cavmarl.core.progress import progress_bar
 from cavmarl.maps.check import check_map
 from cavmarl.maps.heights.draping import MOST_GRADE, STEEP_GRADE, HeightOptions, HeightReport
 from cavmarl.maps.netconvert import STAGES, Box, BuildResult, build_network

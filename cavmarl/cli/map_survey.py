@@ -10,8 +10,8 @@ from rich.console import Console
 from rich.text import Text
 
 from cavmarl.cli.output import Environment, JsonPath, Seed, about, about_file, grid, write_json
-from cavmarl.cli.progress import counting
 from cavmarl.core.errors import ConfigError
+from cavmarl.core.progress import counting
 from cavmarl.maps.fidelity.cloud_files import Cloud, write_cloud
 from cavmarl.maps.fidelity.exports import write_page, write_points
 

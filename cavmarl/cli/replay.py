@@ -11,9 +11,9 @@ import typer
 from rich.console import Console
 
 from cavmarl.cli.output import JsonPath, about, about_file, write_json
-from cavmarl.cli.progress import progress_bar
 from cavmarl.cli.view import check_display
 from cavmarl.cli.web import WatchToken, WebHost, WebPort, WebToken, say
+from cavmarl.core.progress import progress_bar
 from cavmarl.viewer.web_options import DEFAULT_PORT, WebOptions
 
 if TYPE_CHECKING:

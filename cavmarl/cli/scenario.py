@@ -16,9 +16,9 @@ from rich.markup import escape
 from rich.table import Column, Table
 
 from cavmarl.cli.output import JsonPath, about, about_file, number, with_world, write_json
-from cavmarl.cli.progress import counting
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
+from cavmarl.core.progress import counting
 
 if TYPE_CHECKING:
     from cavmarl.evaluate.scenarios.scenario_runs import ScenarioRun

@@ -12,8 +12,8 @@ from rich.table import Table
 
 from cavmarl.cli.evaluate import report_cell
 from cavmarl.cli.output import JsonPath, Seed, about, grid, make_folder, write_json
-from cavmarl.cli.progress import counting
 from cavmarl.config.registry import find_settings
+from cavmarl.core.progress import counting
 
 if TYPE_CHECKING:
     from cavmarl.evaluate import EvaluationReport

@@ -20,11 +20,11 @@ from cavmarl.cli.output import (
     with_world,
     write_json,
 )
-from cavmarl.cli.progress import progress_bar
 from cavmarl.cli.web import WatchToken, WebHost, WebPort, WebToken, say
 from cavmarl.config.checks import check_count
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
+from cavmarl.core.progress import progress_bar
 from cavmarl.viewer.web_options import DEFAULT_PORT, WebOptions
 
 MOST_WORLDS = 16  # of a page

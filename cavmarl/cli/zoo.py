@@ -10,8 +10,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from cavmarl.cli.output import JsonPath, about, grid, number, with_world, write_json
-from cavmarl.cli.progress import progress_bar
 from cavmarl.config.world_spec import WorldSpec
+from cavmarl.core.progress import progress_bar
 
 if TYPE_CHECKING:
     from cavmarl.evaluate.episodes import Progress

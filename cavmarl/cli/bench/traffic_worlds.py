@@ -10,7 +10,7 @@ from rich.table import Table
 
 from cavmarl.bench.harness import make_table
 from cavmarl.cli.output import write_json
-from cavmarl.cli.progress import counting
+from cavmarl.core.progress import counting
 
 if TYPE_CHECKING:
     from cavmarl.evaluate.traffic.world_rows import Row

@@ -21,7 +21,6 @@ from cavmarl.cli.output import (
     with_world,
     write_json,
 )
-from cavmarl.cli.progress import counting
 from cavmarl.cli.verify.faults import check_campaign, print_figures, verify_campaign
 from cavmarl.cli.verify.kills import verify_with_kills
 from cavmarl.cli.verify.nodes import (
@@ -33,6 +32,7 @@ from cavmarl.cli.verify.nodes import (
 from cavmarl.config.env import ZONE_LAYOUTS
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError, LostTickError
+from cavmarl.core.progress import counting
 
 if TYPE_CHECKING:
     from cavmarl.verify.equivalence import Equivalence, ZoneResult

@@ -9,8 +9,8 @@ import typer
 from rich.console import Console
 
 from cavmarl.cli.output import JsonPath, PolicyName, about, say_difference, with_world, write_json
-from cavmarl.cli.progress import counting
 from cavmarl.config.world_spec import WorldSpec
+from cavmarl.core.progress import counting
 
 
 @with_world()

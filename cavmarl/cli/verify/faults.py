@@ -13,9 +13,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from cavmarl.cli.output import pairs_grid, write_json
-from cavmarl.cli.progress import counting
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
+from cavmarl.core.progress import counting
 
 if TYPE_CHECKING:
     from cavmarl.verify.equivalence import Equivalence

@@ -12,8 +12,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from cavmarl.cli.output import grid, write_json
-from cavmarl.cli.progress import counting
 from cavmarl.config.world_spec import WorldSpec
+from cavmarl.core.progress import counting
 
 if TYPE_CHECKING:
     from cavmarl.verify.worker_kills import Kill, KillReport

@@ -10,8 +10,8 @@ from rich.console import Console
 from rich.markup import escape
 
 from cavmarl.cli.output import grid, write_json
-from cavmarl.cli.progress import counting
 from cavmarl.config.world_spec import WorldSpec
+from cavmarl.core.progress import counting
 
 
 def verify_over_nodes(
