@@ -126,7 +126,7 @@ def test_zones_of_one_world_over_workers_stay() -> None:
 def test_zones_that_change_places_hand_over_what_no_vehicle_could_drive(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Vehicles of a zone that is far away now are teleports, and nobody can tell."""
+    """Vehicles of a zone that is far away now are teleports; nothing else is different."""
     path = tmp_path / "run.jsonl"
     strips = {"zones.layout": "strips", "zones.journal": str(path), "zones.count": 9, **OFTEN}
     strips["zones.repartition_steps"] = 6

@@ -1,0 +1,49 @@
+"""Memory of frames is used again when nothing reads it any more, and never before."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import cavmarl
+from cavmarl.engine.world_frame import SEEN, events_between
+from cavmarl.recordings import recording_writer
+from cavmarl.recordings.frame_memory import FrameMemory
+from cavmarl.recordings.recording import Recording
+
+
+def test_rows_come_back_only_when_they_are_given_back() -> None:
+    memory = FrameMemory()
+    first, second = memory.take(10), memory.take(10)
+    assert not np.shares_memory(first, second)
+    memory.give_back(np.empty(10, dtype=SEEN)[:5])  # of elsewhere
+    assert not np.shares_memory(memory.take(10), second)
+    memory.give_back(first)
+    assert np.shares_memory(memory.take(12), first)
+    memory.give_back(second)
+    assert len(memory.take(1000)) == 1000, "what is too small is let go"
+
+
+def test_frames_in_memory_that_is_used_again_are_recorded_as_they_were(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recording_writer, "COMMIT_S", 0.005)
+    env = cavmarl.parallel_env("merge", record=tmp_path / "run")
+    env.reset(seed=4)
+    shown = list(env.world_frames())
+    while env.agents and len(shown) < 400:
+        env.step(env.suggest_actions())
+        shown += env.world_frames()
+    env.close()
+    recorded = list(Recording.open(tmp_path / "run").frames(world=0))
+    assert len(list((tmp_path / "run/world-0/vehicles").iterdir())) > 3, "several parts"
+    assert [frame.vehicles.tobytes() for frame in recorded[: len(shown)]] == [
+        frame.vehicles.tobytes() for frame in shown
+    ]
+    happened = [one for pair in pairwise(shown) for one in events_between(*pair)]
+    assert happened, "vehicles depart and leave"
+    told = [event for _, event in Recording.open(tmp_path / "run").events(world=0)]
+    assert told[: len(happened)] == happened
