@@ -35,7 +35,7 @@ from cavmarl.roads.network import (
 from cavmarl.roads.sumo_net.reader import map_name, read_network, source_hash
 
 # Raise this when the reader gives other rows for the same file; record types count by themselves.
-FORMAT = 27
+FORMAT = 34
 
 _DIGEST_BYTES = 32  # SHA-256 of the rest begins an entry: NumPy would stumble over a broken one
 

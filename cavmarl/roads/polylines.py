@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ Shape = NDArray[np.float64]
 SAME_POINT_M = 1e-3
 # The length of an internal lane whose two ends are the same point (SUMO joins lanes that meet).
 STUB_M = 0.01
+UNLIKE_M = 3.0  # a neighbour that begins or ends so far from the ends of a lane makes a point of it
 
 
 def clean_shape(points: Sequence[tuple[float, float, float]]) -> Shape:
@@ -57,6 +58,29 @@ def extend_stubs(shapes: list[Shape], before: Mapping[int, int]) -> None:
             step[2] = 0.0
             shapes[row] = shapes[row][[0, 0]]
             shapes[row][1] += step * (STUB_M / np.hypot(step[0], step[1]))
+
+
+def split_beside_ends(shapes: list[Shape], outer: Iterable[int]) -> None:
+    """Add a point where a neighbour lane begins or ends beside a lane, far from its own ends.
+
+    So places between two points lie in proportion on the neighbour.
+
+    Args:
+        shapes: one (n, 3) array a lane row; changed in place.
+        outer: rows of lanes whose neighbour has the next row.
+    """
+    for row, beside in ((row + own, row + 1 - own) for row in outer for own in (0, 1)):
+        for end in (shapes[beside][0], shapes[beside][-1]):
+            shape = shapes[row]
+            steps = np.diff(shape, axis=0)
+            sizes = np.hypot(steps[:, 0], steps[:, 1])
+            along = ((end - shape[:-1])[:, :2] * steps[:, :2]).sum(axis=1) / sizes
+            along = np.clip(along, 0.0, sizes)
+            places = shape[:-1] + steps * (along / sizes)[:, None]
+            k = int(np.argmin(np.hypot(*(places - end)[:, :2].T)))
+            before, after = sizes[:k].sum() + along[k], sizes[k:].sum() - along[k]
+            if min(before, after) > UNLIKE_M and SAME_POINT_M < along[k] < sizes[k] - SAME_POINT_M:
+                shapes[row] = np.insert(shape, k + 1, places[k], axis=0)
 
 
 def point_rows(shapes: Sequence[Shape]) -> tuple[NDArray[np.void], NDArray[np.int32]]:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cavmarl.core.records.codes import HOLD_NONE, HOLD_SIGNAL, MODEL_KRAUSS
+from cavmarl.core.records.codes import EVENT_ARRIVED, HOLD_NONE, HOLD_SIGNAL, MODEL_KRAUSS
 from cavmarl.driving.kernels.gaps import is_minor
 from cavmarl.driving.kernels.junctions import may_enter
 from cavmarl.driving.kernels.motion import move_background
@@ -96,3 +96,17 @@ def test_a_lane_change_goes_on_at_a_stand(speed: float, sideways_mps: float) -> 
     row = on_lane(roads, 0, 10.0, speed=speed, d=1.0)
     move_background(roads.arrays, tables, row[0], tables.steps[0], 0.0, 0, 0.1)
     assert row["d"][0] == pytest.approx(1.0 - 0.1 * sideways_mps)
+
+
+@pytest.mark.parametrize("length", [5.0, 12.0])
+def test_a_background_trip_ends_with_the_front_before_what_turns_over_the_lane(
+    length: float,
+) -> None:
+    tables, roads = travel("grid4x4"), entry_network("grid4x4")
+    steps, lengths = tables.steps[: len(roads.lanes)], roads.lanes["length_m"]
+    goal = int(np.flatnonzero((steps["next"] < 0) & (steps["to_go"] == lengths))[0])
+    end_m = float(lengths[goal])
+    for front_m, arrived in ((6.0, False), (4.9, True)):
+        row = on_lane(roads, goal, end_m - front_m - 0.5 * length, speed=1.0, length=length)
+        move_background(roads.arrays, tables, row[0], tables.steps[goal], 0.0, 0, 0.1)
+        assert bool(row["events"][0] & EVENT_ARRIVED) == arrived

@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cavmarl.core.records.codes import HOLD_NONE, HOLD_SIGNAL
+from cavmarl.core.records.codes import HOLD_NONE, HOLD_SIGNAL, HOLD_YIELD
 from cavmarl.driving.kernels.approach import APPROACH
-from cavmarl.driving.kernels.swept_areas import swept_stop
+from cavmarl.driving.kernels.following import behind, no_press
+from cavmarl.driving.kernels.swept_areas import behind_fork, room_m, swept_stop, wait_place
+from cavmarl.driving.vehicle_types import generated_types
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network
 from tests.support.demand_worlds import make
@@ -80,7 +82,7 @@ class Meeting:
              for k, (lane, length) in enumerate(zip(lanes, (BUS_M, CAR_M), strict=True))]
         )  # fmt: skip
 
-    def stop(self, asks: int, places: tuple[float, float], held: bool = False) -> float:
+    def stop(self, asks: int, places: tuple[float, float], room_m: float = -np.inf) -> float:
         """Where the front of one has to stop; `places`: of both fronts beyond their lines."""
         room = scratch(self.network, 2)
         other = 1 - asks
@@ -93,7 +95,7 @@ class Meeting:
         room.link_start[:] = room.link_end[:] = 0
         room.link_end[links[other]] = 1
         roads = self.network.arrays
-        return float(swept_stop(roads, self.rows, asks, links[asks], places[asks], held, room))
+        return float(swept_stop(roads, self.rows, asks, links[asks], places[asks], room_m, room))
 
 
 def test_a_bus_waits_before_the_junction_for_a_car_that_stands_at_the_line(
@@ -110,9 +112,26 @@ def test_a_car_that_has_to_stop_anyway_leaves_room_for_a_bus(network: RoadNetwor
     meeting = Meeting(network)
     enter_m = meeting.sweep["foe_enter_m"]
     meeting.rows["hold"][0] = HOLD_SIGNAL  # it waits for its green
-    assert meeting.stop(1, (-20.0, -12.0), held=True) == enter_m
-    assert meeting.stop(1, (-40.0, -12.0), held=True) == np.inf
+    red, inside = room_m(HOLD_SIGNAL, HOLD_NONE), room_m(HOLD_NONE, HOLD_YIELD)
+    assert meeting.stop(1, (-20.0, -12.0), red) == enter_m
+    assert meeting.stop(1, (-40.0, -12.0), red) == np.inf
+    assert meeting.stop(1, (-40.0, -12.0), inside) == enter_m, "it cannot go back later"
     assert meeting.stop(1, (-2.0, -12.0)) == np.inf, "it drives on where nothing stops it"
+
+
+def test_long_vehicles_wait_inside_before_what_others_sweep(network: RoadNetwork) -> None:
+    """The place that a bus waits at lies before every area that begins between there and there."""
+    earlier = 0
+    for link in np.flatnonzero(network.links["wait_m"] < np.inf).tolist():
+        row = network.links[link]
+        sweeps = network.sweeps[row["first_sweep"] :][: row["num_sweeps"]]
+        place = wait_place(network.arrays, link, 0.5 * BUS_M)
+        begins = sweeps["enter_m"][sweeps["own"] == BUS]
+        begins = begins[begins > max(row["wait_m"] - 3.0, 0.0)]
+        assert place == min([row["wait_m"], *begins])
+        assert wait_place(network.arrays, link, 0.5 * CAR_M) == row["wait_m"]
+        earlier += place < row["wait_m"]
+    assert earlier > 0
 
 
 def test_of_two_before_it_the_one_further_along_goes_first(network: RoadNetwork) -> None:
@@ -138,3 +157,24 @@ def test_nothing_touches_buses_that_turn(path: Path, tmp_path: Path) -> None:
     stats = world.traffic_stats()
     assert not touched
     assert stats.arrived > 40
+
+
+def test_a_rear_over_the_end_of_a_lane_counts_for_one_that_has_to_leave_the_lane(
+    network: RoadNetwork,
+) -> None:
+    """Whichever way a bus has gone: its rear stands on the lane, where a follower must stop."""
+    link = int(np.flatnonzero(network.links["num_sweeps"] > 0)[0])
+    lane = int(network.links[link]["from_lane"])
+    length_m = float(network.lanes[lane]["length_m"])
+    rows = on_lane(network, lane, length_m - 20.0, id=1, speed=5.0, length=CAR_M)
+    room = scratch(network, 2)
+    entry = np.zeros(1, APPROACH)
+    entry["link"], entry["row"], entry["id"], entry["half"] = link, 1, 2, 0.5 * BUS_M
+    entry["dist"] = -1.0
+    room.approach[0] = entry[0]
+    room.link_start[link], room.link_end[link] = 0, 1
+    kind = generated_types()[0]
+    press = behind_fork(network.arrays, kind, rows[0], lane, -1, 20.0, room)
+    assert press == behind(kind, 5.0, 20.0 + 1.0 - 2.5 - 6.0, 0.0, kind["decel"])
+    room.approach[0]["dist"] = -0.5 * BUS_M - 40.0  # its rear has left
+    assert behind_fork(network.arrays, kind, rows[0], lane, -1, 20.0, room) == no_press(kind)

@@ -112,7 +112,7 @@ def test_a_batch_of_worlds(how: str, copied: bool) -> None:
 
 
 def test_one_vehicle_and_agents_in_turn() -> None:
-    one = gymnasium.make("cavmarl/merge-v1")
+    one = gymnasium.make("cavmarl/merge-v2")
     one.reset(seed=4)
     one.step(np.zeros(2, np.float32))
     other = copy.deepcopy(one)

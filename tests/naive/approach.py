@@ -10,6 +10,17 @@ from cavmarl.roads.network import RoadNetwork
 Entry = tuple[int, int, float]  # link, vehicle's id, m of its centre to the stop line
 
 
+def link_into(roads: RoadNetwork, row: np.void) -> int:
+    """The link that leads to its lane, its own one if it does; -1 without junction."""
+    if row["link"] >= 0 and roads.links[row["link"]]["to_lane"] == row["lane"]:
+        return int(row["link"])
+    own = roads.lanes[row["lane"]]
+    into = roads.into[own["first_into"] :][: own["num_into"]]
+    return (
+        int(roads.lanes[into[0]]["link"]) if into.size and roads.lanes[into[0]]["internal"] else -1
+    )
+
+
 def announcements(roads: RoadNetwork, travel: Travel, row: np.void) -> list[Entry]:
     """What one vehicle announces."""
     lane, way, name = int(row["lane"]), int(row["way"]), int(row["id"])
@@ -18,11 +29,11 @@ def announcements(roads: RoadNetwork, travel: Travel, row: np.void) -> list[Entr
     if here["internal"]:
         driven = float(here["link_offset_m"] + row["s"])
         found.append((int(here["link"]), name, -driven))
-    elif row["link"] >= 0 and roads.links[row["link"]]["to_lane"] == lane:
-        link = roads.links[row["link"]]
+    elif (came_by := link_into(roads, row)) >= 0:
+        link = roads.links[came_by]
         rear = float(link["length_m"] + row["s"] - 0.5 * row["length"])
         if rear < max(link["length_m"], link["fork_m"], link["swept_m"]):
-            found.append((int(row["link"]), name, -float(link["length_m"] + row["s"])))
+            found.append((came_by, name, -float(link["length_m"] + row["s"])))
     sight = min(30.0 + 8.0 * float(row["speed"]), 150.0)
     to_end = float(here["length_m"] - row["s"])
     ahead: list[tuple[int, float]] = []
@@ -32,6 +43,8 @@ def announcements(roads: RoadNetwork, travel: Travel, row: np.void) -> list[Entr
         else:
             step = travel.steps[way + lane]
             if step["next"] < 0:
+                if not ahead and to_end < 15.0 and here["num_links"]:
+                    found.append((int(here["first_link"]), name, max(to_end, 0.0)))
                 break
             ahead.append((int(step["link"]), to_end))
             lane, way = int(step["next"]), way + int(step["shift"])

@@ -25,7 +25,7 @@ from cavmarl.traffic.kernels.entering import (
     follower_brakes,
     speed_at,
 )
-from tests.support.traffic import network, on_lane, scratch, travel_by
+from tests.support.traffic import network, on_lane, scratch, travel, travel_by
 
 ROADS = network("merge")
 PLAN = make_plans(ROADS, [ROADS.edge_ids.index("main_out")])
@@ -218,3 +218,26 @@ def test_who_follows_must_not_brake_hard(behind_m: float, pace: float, brakes: b
         ROADS.arrays, TRAVEL, cars, departure(), KIND, MAIN[0], 100.0, 10.0, room
     )
     assert found == brakes
+
+
+def test_all_who_come_are_asked_not_only_the_nearest() -> None:
+    """A vehicle that stands nearer, on another way into the lane, hides no fast one behind it."""
+    roads, ways = network("grid4x4"), travel("grid4x4")
+    lane = next(
+        k for k, row in enumerate(roads.lanes) if row["num_into"] > 1 and not row["internal"]
+    )
+    first = roads.lanes[lane]["first_into"]
+    stands, comes = (int(roads.into[first + k]) for k in range(2))
+    end_m = roads.lanes["length_m"]
+    for near, far in ((stands, comes), (comes, stands)):
+        cars = np.concatenate([
+            on_lane(roads, near, float(end_m[near]) - 12.0, ways, id=1),
+            on_lane(roads, far, float(end_m[far]) - 14.0, ways, speed=12.0, id=2),
+        ])  # fmt: skip
+        room = scratch(roads, 2)
+        index_lanes(roads.arrays, ways, cars, 2, room)
+        asked = (roads.arrays, ways, cars, departure(lane), KIND, lane, 2.5, 0.0, room)
+        assert follower_brakes(*asked)
+        cars[1]["speed"] = 0.0
+        index_lanes(roads.arrays, ways, cars, 2, room)
+        assert not follower_brakes(*asked)

@@ -9,6 +9,12 @@ from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_SCRIPTED
 
 ENTER_REACH_M = 80.0  # how far along its lane a departing vehicle looks for others
 SIZE_LENGTHS_M = (5.5, 8.0)  # longer vehicles are of the next size class: car, van or truck, bus
+SIZE_BODIES_M = (
+    5.1,
+    7.6,
+    12.2,
+)  # the length that a vehicle of each class is taken to have at least
+WAIT_SLACK_M = 0.5  # a front this far beyond a waiting position inside a junction still waits there
 SWEPT_BEYOND_M = 5.0  # how far beyond a junction others may still mind a vehicle's rear
 FORK_BEYOND_M = 3.0  # how far beyond a junction paths from one lane can still run together
 LOST_M = (

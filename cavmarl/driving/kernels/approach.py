@@ -18,6 +18,7 @@ from cavmarl.driving.kernels.announcing import announced_m
 from cavmarl.driving.kernels.ways import leave, next_step, own_step
 
 MAX_LINKS_AHEAD = 2
+STANDS_BEFORE_M = 15.0  # the centre of one that waits before the end of a lane to leave it
 BLOCK = 64  # rows that are still near in memory when they are looked at again
 
 APPROACH = np.dtype(
@@ -107,6 +108,22 @@ def _announce_claims(travel: Travel, row: np.void, i: int, pairs: int, scratch: 
 
 
 @inlined_kernel
+def _link_into(roads: RoadArrays, row: np.void) -> int:
+    """The link by which a vehicle has come to its lane, or -1.
+
+    For one that has entered the road there, or has changed lanes, the first that leads there.
+    """
+    link = int(row["link"])
+    if link >= 0 and roads.links[link]["to_lane"] == row["lane"]:
+        return link
+    here = roads.lanes[row["lane"]]
+    if here["num_into"] == 0:
+        return -1
+    before = roads.lanes[roads.into[here["first_into"]]]
+    return int(before["link"]) if before["internal"] else -1
+
+
+@inlined_kernel
 def _announce(
     roads: RoadArrays,
     travel: Travel,
@@ -122,13 +139,15 @@ def _announce(
     s = row["s"]
     if here["internal"]:
         pairs = _note(scratch, pairs, here["link"], row, i, -(here["link_offset_m"] + s))
-    elif row["link"] >= 0 and s - 0.5 * row["length"] < SWEPT_BEYOND_M:
+    elif s - 0.5 * row["length"] < SWEPT_BEYOND_M:
         # Its centre has left the junction, its rear has not, or not the fork before it, or where
         # others wait for it.
-        left = roads.links[row["link"]]
-        minded = max(left["length_m"], left["fork_m"], left["swept_m"])
-        if left["to_lane"] == lane and left["length_m"] + s - 0.5 * row["length"] < minded:
-            pairs = _note(scratch, pairs, row["link"], row, i, -(left["length_m"] + s))
+        link = _link_into(roads, row)
+        if link >= 0:
+            left = roads.links[link]
+            minded = max(left["length_m"], left["fork_m"], left["swept_m"])
+            if left["length_m"] + s - 0.5 * row["length"] < minded:
+                pairs = _note(scratch, pairs, link, row, i, -(left["length_m"] + s))
     reach = announced_m(row["speed"])
     distance = here["length_m"] - s
     way = row["way"]
@@ -139,6 +158,9 @@ def _announce(
         else:
             lane, way, link = next_step(roads, travel, lane, way)
         if lane < 0:
+            # It has to change lanes before the end: there it is in the way of who turns beside it.
+            if distance < STANDS_BEFORE_M and found == 0 and here["num_links"] > 0:
+                pairs = _note(scratch, pairs, here["first_link"], row, i, max(distance, 0.0))
             break
         if link >= 0:
             if roads.links[link]["num_conflicts"] + roads.links[link]["num_sweeps"] > 0:

@@ -44,7 +44,9 @@ from cavmarl.driving.kernels.swept_areas import (
     before_line_gently,
     before_swept,
     behind_fork,
+    room_m,
     swept_stop,
+    wait_place,
 )
 from cavmarl.driving.kernels.ways import leave, next_step
 
@@ -158,11 +160,15 @@ def _at_line(
     if to_line <= 0.0:
         # Its front is over the line: it does not wait there any more.
         press, hold = press_inside(roads, travel, rows, i, link, -distance, way, phase, dt, scratch)
-        press = max(press, before_swept(roads, rows, i, kind, link, front, dt, scratch))
-        return press, hold, False
+        swept = before_swept(roads, rows, i, kind, link, front, hold, dt, scratch)
+        return max(press, swept), hold, False
     hold = may_enter(roads, travel, rows, i, link, distance, way, phase, scratch)
+    waits = HOLD_NONE
+    if hold == HOLD_NONE:
+        waits = waits_inside(roads, travel, rows, i, link, distance, way, phase, scratch)
     if roads.links[link]["num_sweeps"] > 0:
-        stop = front + swept_stop(roads, rows, i, link, -front, hold != HOLD_NONE, scratch)
+        room = room_m(hold, waits)
+        stop = front + swept_stop(roads, rows, i, link, -front, room, scratch)
         if hold != HOLD_NONE:
             to_line = min(to_line, max(stop, 0.0))
         elif stop < math.inf:
@@ -171,9 +177,8 @@ def _at_line(
         return before_line(kind, speed, to_line, dt), hold, True
     if front > SEE_FOES_M and kind["model"] == MODEL_KRAUSS and is_minor(roads, link, phase):
         return before_line(kind, speed, front + LINE_MARGIN_M, dt), HOLD_NONE, False
-    waits = waits_inside(roads, travel, rows, i, link, distance, way, phase, scratch)
     if waits != HOLD_NONE:
-        to_wait = front + roads.links[link]["wait_m"]
+        to_wait = front + wait_place(roads, link, 0.5 * row["length"])
         return before_line(kind, speed, to_wait, dt), HOLD_NONE, False
     return no_press(kind), HOLD_NONE, False
 
@@ -230,7 +235,7 @@ def _road_ahead(
         press, hold = press_inside(
             roads, travel, rows, i, here["link"], place, row["way"], phase, dt, scratch
         )
-        swept = before_swept(roads, rows, i, kind, here["link"], -place - half, dt, scratch)
+        swept = before_swept(roads, rows, i, kind, here["link"], -place - half, hold, dt, scratch)
         press = max(press, fork, swept)
     look = min(look_ahead_m(kind, speed), travel.view_m)
     see = min(see_line_m(kind, speed) + half, travel.see_m)
@@ -255,7 +260,9 @@ def _road_ahead(
             end = _lane_end(
                 roads, travel, row, kind, before, before_way, distance, merge_room_m, dt
             )
-            press = max(press, end)
+            # Who has left that lane by any link may still have its rear over the end.
+            leaving = behind_fork(roads, kind, row, before, -1, distance, scratch)
+            press = max(press, end, leaving)
             break
         stops = False
         if link >= 0 and distance < see:

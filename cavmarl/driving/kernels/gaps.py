@@ -26,6 +26,7 @@ from cavmarl.core.records.codes import (
     SIGNAL_YELLOW_MAJOR,
     SIGNAL_YELLOW_MINOR,
 )
+from cavmarl.core.records.rows import WAIT_SLACK_M
 from cavmarl.driving.kernels.announcing import IMPATIENT_S, STANDING_MPS, is_let_stand
 from cavmarl.driving.kernels.following import LINE_MARGIN_M
 
@@ -43,7 +44,6 @@ CRAWL_MPS = 5.0  # a stream that is slower lets others in
 STUCK_S = 90.0  # after which it passes others that stand and give way, too
 STOP_SIGN_S = 0.5  # how long one stands at a stop sign, and before a tie is broken;
 STOOD_S = 0.1  # background vehicles, as SUMO's, only for a moment
-WAIT_SLACK_M = 0.5  # a front this far beyond a waiting position still waits there
 STATE_MAJOR = ord("M")
 STATE_EQUAL = ord("=")
 STATE_STOP = ord("s")

@@ -29,16 +29,17 @@ from cavmarl.core.records.codes import (
     SIGNAL_YELLOW_MAJOR,
     SIGNAL_YELLOW_MINOR,
 )
+from cavmarl.core.records.rows import WAIT_SLACK_M
 from cavmarl.driving.kernels.announcing import STANDING_MPS
 from cavmarl.driving.kernels.following import LINE_MARGIN_M, before_line, behind, no_press
 from cavmarl.driving.kernels.gaps import (
     ROOM_M,
     STOP_SIGN_S,
-    WAIT_SLACK_M,
     foe_blocks,
     link_signal,
     must_stop,
 )
+from cavmarl.driving.kernels.swept_areas import wait_place
 from cavmarl.driving.kernels.ways import next_step
 
 # m/s², a driver stops for yellow where this braking is enough; Krauss's brakes as hard as it can
@@ -237,13 +238,13 @@ def press_inside(
     kind = travel.types[row["vtype"]]
     half = 0.5 * row["length"]
     front = place + half
-    press = no_press(kind)
+    press, hold = no_press(kind), HOLD_NONE
     target = roads.links[link]
-    wait_m = target["wait_m"]
-    if front <= wait_m + WAIT_SLACK_M:
+    if front <= target["wait_m"] + WAIT_SLACK_M:
         hold = waits_inside(roads, travel, rows, i, link, -place, way, phase, scratch)
         if hold != HOLD_NONE:
-            return before_line(kind, row["speed"], wait_m - front, dt), hold
+            to_wait = wait_place(roads, link, half) - front
+            press = before_line(kind, row["speed"], to_wait, dt)
     first = target["first_conflict"]
     for c in range(first, first + target["num_conflicts"]):
         conflict = roads.conflicts[c]
@@ -253,7 +254,7 @@ def press_inside(
             foe = scratch.approach[k]
             if foe["row"] != i:
                 press = max(press, _press_of(roads, kind, row, conflict, foe, place, dt))
-    return press, HOLD_NONE
+    return press, hold
 
 
 @kernel

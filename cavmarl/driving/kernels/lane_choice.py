@@ -113,6 +113,8 @@ def _change_is_safe(
     half = 0.5 * row["length"]
     lane = roads.lanes[target]
     s = beside_s(roads, row["lane"], target, row["s"])
+    if s >= roads.lanes[target]["length_m"]:
+        return False  # it has ended beside
     desired = _desired(roads, kind, row, target)
     ahead = 0.0
     j = ahead_on(scratch, target, s, row["id"], travel.view_m)
@@ -176,6 +178,17 @@ def _change_is_safe(
 
 
 @inlined_kernel
+def _rear_is_inside(lane: np.void, row: np.void) -> bool:
+    """Whether a vehicle's rear is still in the junction, where others turn into the lane beside it.
+
+    On lanes too short for the vehicle that does not count: it would never change.
+    """
+    half = 0.5 * row["length"]
+    inside: bool = row["s"] < half and lane["length_m"] > 2.0 * row["length"]
+    return inside
+
+
+@inlined_kernel
 def _may_change(
     roads: RoadArrays,
     travel: Travel,
@@ -191,6 +204,8 @@ def _may_change(
     lane = roads.lanes[row["lane"]]
     target = lane["left"] if side > 0 else lane["right"]
     if lane["internal"] or target < 0 or (needed != 0 and needed != side):
+        return False
+    if _rear_is_inside(lane, row):
         return False
     rest = lane["length_m"] - row["s"] - SIDEWAYS_S * row["speed"]
     if rest < (0.5 * row["length"] if needed == 0 or row["speed"] > CREEP_MPS else 0.0):

@@ -28,10 +28,11 @@ from cavmarl.driving.kernels.ways import next_step, own_step, way_left
 LATERAL_MPS = 1.4  # fastest sideways motion of a lane change
 LATERAL_RATIO = 0.35  # and no faster than this share of the speed,
 LATERAL_MIN_MPS = 0.5  # but never stuck between two lanes
-MAX_DRIFT_RAD = 0.12  # largest angle between a car that changes lanes and its lane
+MAX_DRIFT_RAD = 0.12  # largest angle between a vehicle that changes lanes and its lane,
+MAX_SWING_M = 0.3  # and by how much its corners swing out, at most
 MAX_BODY_LANES = 8  # that a body may lie on, before and behind its centre
 STANDING_MPS = 0.1
-ARRIVE_M = 5.0  # a trip ends this far before the end of its goal edge
+ARRIVE_M = 5.0  # a trip ends this far before the end of its goal edge; a background one's front
 MAX_SPEED_MPS = 60.0
 CROSSINGS_PER_TICK = 16  # lane borders that one tick can cross
 
@@ -223,7 +224,8 @@ def move_background(
     heading = place_on_lane(roads, travel, row)
     if row["d"] != offset and speed > STANDING_MPS:
         drift = math.atan2((row["d"] - offset) / dt, speed)
-        heading = wrap_angle(heading + clamp(drift, -MAX_DRIFT_RAD, MAX_DRIFT_RAD))
+        most = min(MAX_DRIFT_RAD, 2.0 * MAX_SWING_M / row["length"])
+        heading = wrap_angle(heading + clamp(drift, -most, most))
     row["heading"] = heading
     turned = wrap_angle(heading - before.heading)
     row["steering"] = 0.0
@@ -233,7 +235,7 @@ def move_background(
         row["to_go"] = way_left(roads, row, step)
     else:
         row["to_go"] = way_left(roads, row, travel.steps[own_step(roads, row)])
-    if row["to_go"] <= ARRIVE_M:
+    if row["to_go"] <= ARRIVE_M + 0.5 * row["length"]:
         row["events"] |= EVENT_ARRIVED
     account(row, before, roads, row["speed_factor"], dt)
     make_stop(roads, travel, row, before.lane, dt)

@@ -15,21 +15,30 @@ from numpy.typing import NDArray
 from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays, Scratch
 from cavmarl.core.records.codes import HOLD_NONE, MODEL_KRAUSS
-from cavmarl.core.records.rows import SIZE_LENGTHS_M
+from cavmarl.core.records.rows import SIZE_BODIES_M, SIZE_LENGTHS_M
 from cavmarl.driving.kernels.announcing import APPROACH_STANDING_M, STANDING_MPS
 from cavmarl.driving.kernels.following import before_line, behind, no_press
 
 VAN_M, BUS_M = SIZE_LENGTHS_M
+CAR_BODY_M, VAN_BODY_M, BUS_BODY_M = SIZE_BODIES_M
 EASY_STOP = 2.0  # m/s², of one that needs more to stop before the area it is said that it comes;
 HARD_STOP = 3.5  # one that needs more goes first
 SOON_M = 3.5  # one that is so near to the area may be in it at once
 LONG_FORK_M = 6.0  # how much further long vehicles need to be clear of one another at a fork
+WAIT_EARLIER_M = 3.0  # how much before the map's position a long vehicle waits inside, at most
 GIVE_UP_S = 60.0  # one that has stood so long goes on, whatever is in the area
 
 
 @inlined_kernel
 def _size(half: float) -> int:
     return int(2.0 * half > VAN_M) + int(2.0 * half > BUS_M)
+
+
+@inlined_kernel
+def _body_m(half: float, size: int) -> float:
+    """How long a vehicle counts as: areas end where a body of its class ends at the line."""
+    least = CAR_BODY_M if size == 0 else (VAN_BODY_M if size == 1 else BUS_BODY_M)
+    return float(max(2.0 * half, least))
 
 
 @kernel
@@ -39,38 +48,82 @@ def swept_stop(
     i: int,  # the row that asks
     link: int,  # that it is on, or takes next
     place: float,  # of its front, m beyond its stop line
-    held: bool,  # whether it has to stop at that line anyway
+    # it has to stop anyway, and leaves room for those that are so near to their lines, m; or -inf
+    room_m: float,
     scratch: Scratch,
 ) -> float:
     """How far beyond the stop line row i's front may go, in m; inf where nothing is in the way."""
     row = rows[i]
     size = _size(0.5 * row["length"])
+    rear = place - _body_m(0.5 * row["length"], size)
     stop = math.inf
     first = roads.links[link]["first_sweep"]
     for k in range(first, first + roads.links[link]["num_sweeps"]):
         sweep = roads.sweeps[k]
-        if sweep["own"] != size or place - row["length"] > sweep["leave_m"]:
+        if sweep["own"] > size:
+            break  # they are sorted by it
+        if sweep["own"] != size or rear > sweep["leave_m"]:
             continue
         for n in range(scratch.link_start[sweep["foe"]], scratch.link_end[sweep["foe"]]):
             foe = scratch.approach[n]
             if foe["row"] == i or _size(foe["half"]) != sweep["other"]:
                 continue
-            if _is_in_the_way(rows, row, foe, sweep, place, held):
-                # One that is in the area, too, stops where it is. Behind one that stands, a driver
-                # waits before the junction: on it, the other might have to wait for it.
+            if _is_in_the_way(rows, row, foe, sweep, place, room_m):
+                # One that is in the area, too, stops where it is. Behind one that stands, or may
+                # have to for it, it waits before the junction: else neither could go on.
                 stop = min(stop, max(sweep["enter_m"], place))
-                if place <= 0.0 and foe["speed"] <= STANDING_MPS:
+                if place <= 0.0 and (
+                    foe["speed"] <= STANDING_MPS or _must_yield(roads, sweep["foe"], link)
+                ):
                     stop = min(stop, 0.0)
     return stop
 
 
+@kernel
+def _must_yield(roads: RoadArrays, link: int, other: int) -> bool:
+    """Whether vehicles on a link give way to those on another one."""
+    first = roads.links[link]["first_conflict"]
+    for c in range(first, first + roads.links[link]["num_conflicts"]):
+        if roads.conflicts[c]["foe"] == other:
+            return bool(roads.conflicts[c]["must_yield"])
+    return False
+
+
+@inlined_kernel
+def room_m(at_line: int, inside: int) -> float:
+    """For whom a vehicle leaves room that waits at its line or inside, see `swept_stop`."""
+    if at_line != HOLD_NONE:
+        return APPROACH_STANDING_M
+    return math.inf if inside != HOLD_NONE else -math.inf
+
+
+@kernel
+def wait_place(roads: RoadArrays, link: int, half: float) -> float:
+    """Where inside a junction a vehicle on `link` waits, in m beyond its stop line.
+
+    That is the map's waiting position. Long vehicles wait up to `WAIT_EARLIER_M` before it where
+    others would sweep over it: cars go back only where one comes, see `swept_stop`.
+    """
+    size = _size(half)
+    wait_m = place = roads.links[link]["wait_m"]
+    if size == 0:
+        return float(wait_m)
+    first = roads.links[link]["first_sweep"]
+    for k in range(first, first + roads.links[link]["num_sweeps"]):
+        sweep = roads.sweeps[k]
+        if sweep["own"] == size and sweep["enter_m"] > max(wait_m - WAIT_EARLIER_M, 0.0):
+            place = min(place, sweep["enter_m"])
+    return float(place)
+
+
 @inlined_kernel
 def _is_in_the_way(
-    rows: NDArray[np.void], row: np.void, foe: np.void, sweep: np.void, place: float, held: bool
+    rows: NDArray[np.void], row: np.void, foe: np.void, sweep: np.void, place: float, room_m: float
 ) -> bool:
     """Whether a row whose front is at `place` has to wait for one APPROACH."""
     foe_place = foe["half"] - foe["dist"]
-    if foe_place - 2.0 * foe["half"] > sweep["foe_leave_m"] or row["wait_s"] > GIVE_UP_S:
+    foe_rear = foe_place - _body_m(foe["half"], sweep["other"])
+    if foe_rear > sweep["foe_leave_m"] or row["wait_s"] > GIVE_UP_S:
         return False
     inside = place > sweep["enter_m"]
     foe_inside = foe_place > sweep["foe_enter_m"]
@@ -78,7 +131,7 @@ def _is_in_the_way(
         return True
     if inside and not foe_inside:
         return False
-    if held and not inside and foe_place > -APPROACH_STANDING_M:
+    if not inside and foe_place > -room_m:
         return True  # it loses nothing if it leaves room
     if rows[foe["row"]]["hold"] != HOLD_NONE:
         return False
@@ -115,13 +168,17 @@ def before_swept(
     kind: np.void,
     link: int,
     front: float,
+    hold: int,
     dt: float,
     scratch: Scratch,
 ) -> float:
-    """How a swept area presses row i, whose front is `front` m before the stop line of a link."""
+    """How a swept area presses row i, whose front is `front` m before the stop line of a link.
+
+    `hold`: why it waits inside anyway, HOLD_*.
+    """
     if roads.links[link]["num_sweeps"] == 0:
         return no_press(kind)
-    stop = swept_stop(roads, rows, i, link, -front, False, scratch)
+    stop = swept_stop(roads, rows, i, link, -front, room_m(HOLD_NONE, hold), scratch)
     return (
         no_press(kind) if stop == math.inf else before_line_gently(kind, rows[i], stop + front, dt)
     )

@@ -15,8 +15,8 @@ from cavmarl.core.numba import inlined_kernel, kernel
 def swept_range(
     mine: NDArray[np.float64],
     theirs: NDArray[np.float64],
-    own: tuple[float, float, float],
-    other: tuple[float, float, float],
+    own: tuple[float, float, float, float, float],
+    other: tuple[float, float, float, float, float],
     level_m: float,
     foes: bool,
 ) -> tuple[float, float, float, float]:
@@ -25,11 +25,12 @@ def swept_range(
     Args:
         mine: (n, 6) place of the centre from the stop line, x, y, z, cosine and sine of the body.
         theirs: (m, 6) the same of the other path.
-        own: half length and half width of the body in m, and the length of its path.
+        own: half length and half width of the body in m, the length of its path, and where on it
+            the shared area of a conflict begins and ends; the last two are read of foes only.
         other: the same of the other one.
         level_m: bodies that differ more in height do not touch.
-        foes: whether a conflict keeps them apart on the junction: only pairs count of which one
-            stands before its line or has left.
+        foes: whether a conflict keeps them apart in its area: only pairs count of which one has
+            its front before that, as at its line or at its waiting position, or has left it.
     """
     first, last = math.inf, -math.inf
     foe_first, foe_last = math.inf, -math.inf
@@ -43,7 +44,9 @@ def swept_range(
                 continue
             foe_s = theirs[j, 0]
             on, foe_on = _is_on(s, own), _is_on(foe_s, other)
-            if (foes and on and foe_on) or not (on or foe_on):
+            if not (on or foe_on):
+                continue
+            if foes and _is_in_area(s, own) and _is_in_area(foe_s, other):
                 continue
             if boxes_overlap(
                 mine[i, 1],
@@ -65,7 +68,14 @@ def swept_range(
 
 
 @inlined_kernel
-def _is_on(s: float, body: tuple[float, float, float]) -> bool:
+def _is_on(s: float, body: tuple[float, float, float, float, float]) -> bool:
     """Whether a body at place `s` reaches over its junction."""
     on: bool = s + body[0] > 0.0 and s - body[0] < body[2]
     return on
+
+
+@inlined_kernel
+def _is_in_area(s: float, body: tuple[float, float, float, float, float]) -> bool:
+    """Whether a body at place `s` reaches over the shared area of the conflict."""
+    inside: bool = s + body[0] > body[3] and s - body[0] < body[4]
+    return inside

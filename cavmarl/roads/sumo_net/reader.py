@@ -15,7 +15,13 @@ from cavmarl.core.errors import MapError
 from cavmarl.core.math.geometry import project
 from cavmarl.core.records.rows import FORK_BEYOND_M, SWEPT_BEYOND_M
 from cavmarl.roads.network import EDGE, JUNCTION, LANE, LINK, GeoReference, RoadNetwork
-from cavmarl.roads.polylines import clean_shape, extend_stubs, point_rows, refuse_points
+from cavmarl.roads.polylines import (
+    clean_shape,
+    extend_stubs,
+    point_rows,
+    refuse_points,
+    split_beside_ends,
+)
 from cavmarl.roads.sumo_net.backward_paths import Way, mend_backward_paths
 from cavmarl.roads.sumo_net.conflicts import (
     LinkPath,
@@ -96,10 +102,12 @@ def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
     refuse_points(shapes[:num_normal], lane_ids[:num_normal])
     mend_backward_paths(shapes, [_way(move, lane_row) for move in chosen.movements])
     extend_stubs(shapes, before)
+    edges = _edge_rows(chosen, net, node_row)
+    outer = _outer_rows(chosen, edges)
+    split_beside_ends(shapes, outer[outer < num_normal])
     points, first_point = point_rows(shapes)
 
-    edges = _edge_rows(chosen, net, node_row)
-    lanes = _lane_rows(chosen, edges, points, first_point, parsed.left_hand)
+    lanes = _lane_rows(chosen, edges, points, first_point, outer, parsed.left_hand)
     links = _link_rows(chosen.movements, lane_row, lanes, node_row, signal_rows)
     into = _connect(lanes, links, chosen.movements, lane_row)
     paths = [_path(move, lane_row, lanes, points) for move in chosen.movements]
@@ -218,6 +226,7 @@ def _lane_rows(
     edges: NDArray[np.void],
     points: NDArray[np.void],
     first_point: NDArray[np.int32],
+    outer: NDArray[np.intp],
     left_hand: bool,
 ) -> NDArray[np.void]:
     lanes = np.zeros(len(chosen.lanes), LANE)
@@ -236,19 +245,23 @@ def _lane_rows(
 
     for field in ("left", "right", "successor", "link"):
         lanes[field] = -1
+    inwards, outwards = ("right", "left") if left_hand else ("left", "right")
+    lanes[inwards][outer] = outer + 1
+    lanes[outwards][outer + 1] = outer
+    return lanes
+
+
+def _outer_rows(chosen: NetworkSelection, edges: NDArray[np.void]) -> NDArray[np.intp]:
+    """Rows of the lanes beside which, towards the middle of the road, runs that of the next row."""
+    edge = np.repeat(np.arange(len(edges)), edges["num_lanes"])
     position = np.array([lane.getIndex() for lane in chosen.lanes])
     # Lanes cut by an internal junction have parts of unlike lengths: they do not run side by side.
     uncut = {id(move.chain[0]) for move in chosen.movements if len(move.chain) == 1}
     beside = np.array(
         [not lane.getID().startswith(":") or id(lane) in uncut for lane in chosen.lanes]
     )
-    pair = (lanes["edge"][:-1] == lanes["edge"][1:]) & (position[:-1] + 1 == position[1:])
-    pair &= beside[:-1] & beside[1:]
-    outer = np.flatnonzero(pair)
-    inwards, outwards = ("right", "left") if left_hand else ("left", "right")
-    lanes[inwards][outer] = outer + 1
-    lanes[outwards][outer + 1] = outer
-    return lanes
+    pair = (edge[:-1] == edge[1:]) & (position[:-1] + 1 == position[1:])
+    return np.flatnonzero(pair & beside[:-1] & beside[1:])
 
 
 def _link_rows(

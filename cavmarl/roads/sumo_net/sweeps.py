@@ -15,14 +15,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.records.rows import SIZE_LENGTHS_M
+from cavmarl.core.records.rows import SIZE_BODIES_M, SIZE_LENGTHS_M, WAIT_SLACK_M
 from cavmarl.roads.kernels.swept_range import swept_range
 from cavmarl.roads.network import SWEEP
-from cavmarl.roads.sumo_net.conflicts import CLEARANCE_M, LinkPath
+from cavmarl.roads.sumo_net.conflicts import CLEARANCE_M, LINE_MARGIN_M, LinkPath
 
 # Half length and half width of the bodies of each size class, with a margin: a car, a van or truck,
 # a bus. A vehicle counts as the next longer one.
-BODIES = ((2.55, 0.95), (3.8, 1.25), (6.1, 1.3))
+BODIES = tuple(zip((0.5 * m for m in SIZE_BODIES_M), (0.95, 1.25, 1.3), strict=True))
 STEP_M = 0.5
 BEFORE_M = 10.0  # of the front to its line, and
 BEYOND_M = 4.0  # of the rear behind the junction: where bodies are asked about
@@ -63,8 +63,13 @@ def sweep_rows(movements: Movements) -> tuple[NDArray[np.void], NDArray[np.int32
         poses.clear()
     counts = [len(rows) for rows in found]
     sweeps = np.zeros(sum(counts), SWEEP)
-    sweeps[:] = [row for rows in found for row in sorted(rows)]
+    sweeps[:] = [row for rows in found for row in sorted(rows, key=_by_own_size)]
     return sweeps, np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+
+
+def _by_own_size(row: tuple[float, ...]) -> tuple[float, ...]:
+    """What rows of a link are sorted by: a driver reads those of its size only."""
+    return (row[1], *row)
 
 
 def _find_pair(
@@ -78,8 +83,14 @@ def _find_pair(
     if not _is_near(poses[one][0], poses[other][0]):
         return
     merging = a["to_lane"] == b["to_lane"]
-    own_foes = movements.conflicts["foe"][a["first_conflict"] :][: a["num_conflicts"]]
-    foes = bool((own_foes == other).any())
+    conflicts = movements.conflicts[a["first_conflict"] :][: a["num_conflicts"]]
+    area = conflicts[conflicts["foe"] == other]
+    foes = bool(area.size)
+    mine_m = theirs_m = (0.0, 0.0)
+    if foes:
+        row = area[0]
+        mine_m = _begin_m(a, row["enter_m"]), float(row["leave_m"])
+        theirs_m = _begin_m(b, row["foe_enter_m"]), float(row["foe_leave_m"])
     for own, (half, wide) in enumerate(BODIES):
         for foe, (foe_half, foe_wide) in enumerate(BODIES):
             mine, theirs = poses[one][own], poses[other][foe]
@@ -89,8 +100,8 @@ def _find_pair(
             first, last, foe_first, foe_last = swept_range(
                 mine,
                 theirs,
-                (half, wide, float(a["length_m"])),
-                (foe_half, foe_wide, float(b["length_m"])),
+                (half, wide, float(a["length_m"]), *mine_m),
+                (foe_half, foe_wide, float(b["length_m"]), *theirs_m),
                 CLEARANCE_M,
                 foes,
             )
@@ -101,6 +112,12 @@ def _find_pair(
             there = (foe_first + foe_half - MARGIN_M, foe_last - foe_half + MARGIN_M)
             found[one].append((other, own, foe, *here, *there))
             found[other].append((one, foe, own, *there, *here))
+
+
+def _begin_m(link: np.void, enter_m: float) -> float:
+    """Where the shared area of a conflict begins: a front at its waiting position is before it."""
+    waits = enter_m >= link["wait_m"] - LINE_MARGIN_M
+    return float(max(enter_m, link["wait_m"] + WAIT_SLACK_M + STEP_M if waits else 0.0))
 
 
 def _find_behind(
@@ -119,7 +136,12 @@ def _find_behind(
             mine = poses[turn][own]
             mine = mine[mine[:, 0] <= -half]
             first, last, foe_first, foe_last = swept_range(
-                mine, theirs, (half, wide, 0.0), (foe_half, foe_wide, length), CLEARANCE_M, False
+                mine,
+                theirs,
+                (half, wide, 0.0, 0.0, 0.0),
+                (foe_half, foe_wide, length, 0.0, 0.0),
+                CLEARANCE_M,
+                False,
             )
             if first == np.inf:
                 continue

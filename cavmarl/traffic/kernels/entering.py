@@ -30,7 +30,7 @@ from cavmarl.core.records.codes import (
 )
 from cavmarl.core.records.rows import ENTER_REACH_M
 from cavmarl.driving.kernels.following import accel_behind, speed_behind
-from cavmarl.driving.kernels.lane_index import ahead_on, last_on, neighbor_behind
+from cavmarl.driving.kernels.lane_index import ahead_on, behind_on, comes_over, last_on
 from cavmarl.driving.kernels.ways import next_step
 
 ENTER_GAP_M = 1.0  # m between bumpers, the least with which a vehicle enters
@@ -202,18 +202,44 @@ def follower_brakes(
     speed: float,
     scratch: Scratch,
 ) -> bool:
-    """Whether the follower would have to brake hard for a vehicle that enters."""
-    k, distance = neighbor_behind(
-        roads, scratch, lane, s, departure["id"], ENTER_REACH_M, travel.view_m
-    )
-    if k < 0:
-        return False
+    """Whether a follower, by whichever lane it comes, would have to brake hard for an entrant."""
+    own_id = departure["id"]
+    half = 0.5 * kind["length"]
+    k = behind_on(scratch, lane, s, own_id)
+    if k >= 0:
+        apart = s - scratch.entries[k]["s"]
+        seen = apart <= travel.view_m
+        return seen and _brakes(roads, travel, rows, kind, lane, k, apart - half, speed, scratch)
+    row = roads.lanes[lane]
+    for n in range(row["first_into"], row["first_into"] + row["num_into"]):
+        k, apart = comes_over(
+            roads, scratch, roads.into[n], s, own_id, ENTER_REACH_M, travel.view_m
+        )
+        if k >= 0 and _brakes(roads, travel, rows, kind, lane, k, apart - half, speed, scratch):
+            return True
+    return False
+
+
+@kernel
+def _brakes(
+    roads: RoadArrays,
+    travel: Travel,
+    rows: NDArray[np.void],
+    kind: np.void,
+    lane: int,
+    k: int,
+    apart: float,
+    speed: float,
+    scratch: Scratch,
+) -> bool:
+    """Whether entry k, whose centre is `apart` m behind the rear of an entrant, brakes hard."""
     follower = scratch.entries[k]
-    gap = distance - 0.5 * kind["length"] - follower["half"]
+    gap = apart - follower["half"]
     if gap < ENTER_GAP_M:
         return True
     other = rows[follower["row"]]
     theirs = travel.types[other["vtype"]]
     desired = roads.lanes[lane]["speed_mps"] * other["speed_factor"]
     pace = follower["speed"]
-    return accel_behind(theirs, pace, desired, gap, speed, kind["decel"]) < -ENTER_DECEL
+    hard: bool = accel_behind(theirs, pace, desired, gap, speed, kind["decel"]) < -ENTER_DECEL
+    return hard
