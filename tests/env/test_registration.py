@@ -37,11 +37,11 @@ def test_every_entry_has_its_ids(name: str) -> None:
 def test_the_discrete_ids_have_meta_actions_whatever_else_is_set() -> None:
     """Programs such as CleanRL's take an id and nothing else."""
     five = gymnasium.spaces.Discrete(5)
-    assert gymnasium.make("cavmarl/ringDiscrete-v1").action_space == five
+    assert gymnasium.make("cavmarl/ringDiscrete-v2").action_space == five
     assert gymnasium.make("cavmarl/ring-v2").action_space != five
     more = {"overrides": {"sensors.lidar.rays": 8}}
-    assert gymnasium.make("cavmarl/ringDiscrete-v1", **more).action_space == five
-    rows = gymnasium.make_vec("cavmarl/ringDiscreteAgents-v1", num_envs=2, **more)
+    assert gymnasium.make("cavmarl/ringDiscrete-v2", **more).action_space == five
+    rows = gymnasium.make_vec("cavmarl/ringDiscreteAgents-v2", num_envs=2, **more)
     assert rows.single_action_space == five
 
 

@@ -158,7 +158,7 @@ def _announce(
         else:
             lane, way, link = next_step(roads, travel, lane, way)
         if lane < 0:
-            # It has to change lanes before the end: there it is in the way of who turns beside it.
+            # It has to change lanes before the end, in the way of vehicles that turn beside it.
             if distance < STANDS_BEFORE_M and found == 0 and here["num_links"] > 0:
                 pairs = _note(scratch, pairs, here["first_link"], row, i, max(distance, 0.0))
             break

@@ -260,7 +260,7 @@ def _road_ahead(
             end = _lane_end(
                 roads, travel, row, kind, before, before_way, distance, merge_room_m, dt
             )
-            # Who has left that lane by any link may still have its rear over the end.
+            # A vehicle that has left that lane by any link may still have its rear over the end.
             leaving = behind_fork(roads, kind, row, before, -1, distance, scratch)
             press = max(press, end, leaving)
             break

@@ -16,6 +16,7 @@ from cavmarl.core.math.geometry import project
 from cavmarl.core.records.rows import FORK_BEYOND_M, SWEPT_BEYOND_M
 from cavmarl.roads.network import EDGE, JUNCTION, LANE, LINK, GeoReference, RoadNetwork
 from cavmarl.roads.polylines import (
+    Shape,
     clean_shape,
     extend_stubs,
     point_rows,
@@ -95,13 +96,9 @@ def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
     nodes = net.getNodes()
     node_row = {id(node): row for row, node in enumerate(nodes)}
 
-    before = _before(chosen, lane_row)
     num_normal = sum(lane.getEdge().getFunction() == "" for lane in chosen.lanes)
     lane_ids = tuple(lane.getID() for lane in chosen.lanes)
-    shapes = [clean_shape(lane.getShape3D()) for lane in chosen.lanes]
-    refuse_points(shapes[:num_normal], lane_ids[:num_normal])
-    mend_backward_paths(shapes, [_way(move, lane_row) for move in chosen.movements])
-    extend_stubs(shapes, before)
+    shapes = _shapes(chosen, lane_row, lane_ids[:num_normal])
     edges = _edge_rows(chosen, net, node_row)
     outer = _outer_rows(chosen, edges)
     split_beside_ends(shapes, outer[outer < num_normal])
@@ -154,6 +151,17 @@ def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
         geo=_geo_reference(net),
         left_hand=parsed.left_hand,
     )
+
+
+def _shapes(
+    chosen: NetworkSelection, lane_row: dict[int, int], normal_ids: Sequence[str]
+) -> list[Shape]:
+    """The middle of each lane as a vehicle can drive it, (n, 3) in m; lanes of roads come first."""
+    shapes = [clean_shape(lane.getShape3D()) for lane in chosen.lanes]
+    refuse_points(shapes[: len(normal_ids)], normal_ids)
+    mend_backward_paths(shapes, [_way(move, lane_row) for move in chosen.movements])
+    extend_stubs(shapes, _before(chosen, lane_row))
+    return shapes
 
 
 def _geo_reference(net: Any) -> GeoReference | None:
