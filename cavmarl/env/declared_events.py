@@ -43,10 +43,11 @@ class DeclaredEvents:
         self._are_any = True
 
     def add_to(self, commands: Commands) -> Commands:
-        """Commands of a step with all that has been declared for it."""
-        if not self._are_any:
-            return commands
-        declared = self._causes.copy()
-        self._causes[:] = 0
-        self._are_any = False
-        return replace(commands, declared=declared)
+        """Commands of a step with all that has been declared for it, which waits until `taken`."""
+        return replace(commands, declared=self._causes.copy()) if self._are_any else commands
+
+    def taken(self) -> None:
+        """The step has been: nothing waits any more."""
+        if self._are_any:
+            self._causes[:] = 0
+            self._are_any = False

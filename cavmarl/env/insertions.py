@@ -11,13 +11,19 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ActionError, CapacityError, ConfigError
-from cavmarl.core.records.codes import INSERT_BARRIER, INSERT_NONE, INSERT_VEHICLE
+from cavmarl.core.records.codes import (
+    INSERT_BARRIER,
+    INSERT_NONE,
+    INSERT_OPEN,
+    INSERT_VEHICLE,
+)
+from cavmarl.env.declared_events import DeclaredEvents
 from cavmarl.parallel.step_arrays import SteppedWorlds
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.shards.shard import Commands
 
 _CARS = 1 << VEHICLE_CLASSES.index("passenger")
-INSERTED, CLOSED = "inserted", "closed"  # kinds of the events that tell of it
+INSERTED, CLOSED, OPENED = "inserted", "closed", "opened"  # kinds of the events that tell of it
 
 Asked = tuple[tuple[str, str], ...]
 """Kind and detail of what was put into a world in one step, as `WorldFrame.asked` has it."""
@@ -39,16 +45,17 @@ class Insertions:
         self._rows = np.zeros((num_worlds, self._most, 3))
         self._waiting = np.zeros(num_worlds, dtype=np.int64)
         self._used = np.zeros(num_worlds, dtype=np.int64)  # in the episode, with those that wait
+        self._barriers = np.full((num_worlds, self._most), -1)  # LANE of each that stands; -1: none
         self._told: list[Asked] = [()] * num_worlds  # of the last step
 
     @property
     def memory(self) -> tuple[NDArray[Any], ...]:
-        """What waits, and how many there have been."""
-        return self._rows, self._waiting, self._used
+        """What waits, how many there have been, and which lanes are closed."""
+        return self._rows, self._waiting, self._used, self._barriers
 
     @memory.setter
     def memory(self, memory: tuple[NDArray[Any], ...]) -> None:
-        self._rows[:], self._waiting[:], self._used[:] = memory
+        self._rows[:], self._waiting[:], self._used[:], self._barriers[:] = memory
 
     def vehicle(self, world: int, lane: str, position_m: float) -> None:
         """Let a car enter on a lane, at a place of its front bumper.
@@ -68,16 +75,55 @@ class Insertions:
         self._add(world, [(INSERT_VEHICLE, row, position_m)])
 
     def barrier(self, world: int, edge: str) -> None:
-        """Let a car stand on each lane of an edge to the end of the episode; raises likewise."""
-        self._check(world)
-        lanes, edges = self._network.lanes, self._network.edge_ids
-        if edge not in edges:
-            raise ActionError(f"edge {edge!r}: the map has no such edge; give the id of one")
-        rows = np.flatnonzero(lanes["edge"] == edges.index(edge))
+        """Let a car stand on each lane of an edge until it is opened; raises likewise."""
+        lanes = self._network.lanes
+        rows = self._lanes_of(world, edge)
         rows = rows[(lanes["permissions"][rows] & _CARS) != 0]
         if not len(rows) or lanes["internal"][rows].any():
             raise ActionError(f"edge {edge!r}: cars drive on no lane of it; give a road")
+        if np.isin(rows, self._barriers[world]).any():
+            raise ActionError(f"edge {edge!r}: it is closed already; open it, or close another one")
         self._add(world, [(INSERT_BARRIER, int(row), 0.0) for row in rows])
+        free = np.flatnonzero(self._barriers[world] < 0)
+        self._barriers[world, free[: len(rows)]] = rows
+
+    def no_barrier(self, world: int, edge: str) -> None:
+        """Let the cars that close an edge drive on.
+
+        Those that no step has put there yet are not, and there is room for others.
+
+        Raises:
+            ActionError: no such world or edge, or it is not closed.
+            ConfigError: nothing may be put into these worlds.
+        """
+        mine = np.isin(self._barriers[world], self._lanes_of(world, edge))
+        lanes = self._barriers[world, mine]
+        if not len(lanes):
+            raise ActionError(f"edge {edge!r}: it is not closed; give the id of one that is")
+        self._barriers[world, mine] = -1
+        waiting = self._rows[world, : self._waiting[world]].copy()
+        new = (waiting[:, 0] == INSERT_BARRIER) & np.isin(waiting[:, 1], lanes)
+        if new.any():
+            self._used[world] -= np.count_nonzero(new)
+            opened = waiting[~new]
+        else:
+            opened = np.concatenate([waiting, [(INSERT_OPEN, lane, 0.0) for lane in lanes]])
+        self._rows[world] = INSERT_NONE
+        self._rows[world, : len(opened)] = opened
+        self._waiting[world] = len(opened)
+
+    def closed(self, world: int) -> tuple[str, ...]:
+        """Edges that are closed, by id."""
+        lanes = self._barriers[world]
+        edges = np.unique(self._network.lanes["edge"][lanes[lanes >= 0]])
+        return tuple(self._network.edge_ids[edge] for edge in edges.tolist())
+
+    def _lanes_of(self, world: int, edge: str) -> NDArray[np.intp]:
+        self._check(world)
+        edges = self._network.edge_ids
+        if edge not in edges:
+            raise ActionError(f"edge {edge!r}: the map has no such edge; give the id of one")
+        return np.flatnonzero(self._network.lanes["edge"] == edges.index(edge))
 
     def _check(self, world: int) -> None:
         if not self._most:
@@ -109,26 +155,29 @@ class Insertions:
         self._used[world] += len(rows)
 
     def add_to(self, commands: Commands) -> Commands:
-        """Commands of a step with all that was asked for."""
-        if not self._most:
-            return commands
-        rows = self._rows.copy()
-        self._told = [self._text(w, count) for w, count in enumerate(self._waiting.tolist())]
-        self._rows[:] = INSERT_NONE
-        self._waiting[:] = 0
-        return replace(commands, inserted=rows)
+        """Commands of a step with all that was asked for, which waits until `taken`."""
+        return replace(commands, inserted=self._rows.copy()) if self._most else commands
+
+    def taken(self) -> None:
+        """The step has been: nothing waits any more."""
+        if self._most:
+            self._told = [self._text(w, count) for w, count in enumerate(self._waiting.tolist())]
+            self._rows[:] = INSERT_NONE
+            self._waiting[:] = 0
 
     def _text(self, world: int, count: int) -> Asked:
         """What waits, in words: a road once."""
         network = self._network
-        found: dict[Any, tuple[str, str]] = {}
-        for k, (kind, lane, place) in enumerate(self._rows[world, :count].tolist()):
-            if kind == INSERT_BARRIER:
-                edge = network.edge_ids[int(network.lanes["edge"][int(lane)])]
-                found[edge] = (CLOSED, edge)
-            else:
-                found[k] = (INSERTED, f"{network.lane_ids[int(lane)]} {place!r}")
-        return tuple(found.values())
+        found: list[tuple[str, str]] = []
+        for kind, lane, place in self._rows[world, :count].tolist():
+            if kind == INSERT_VEHICLE:
+                found.append((INSERTED, f"{network.lane_ids[int(lane)]} {place!r}"))
+                continue
+            edge = network.edge_ids[int(network.lanes["edge"][int(lane)])]
+            told = (CLOSED if kind == INSERT_BARRIER else OPENED, edge)
+            if told not in found:
+                found.append(told)
+        return tuple(found)
 
     def told(self, world: int) -> Asked:
         """What was put into a world in the last step."""
@@ -137,6 +186,7 @@ class Insertions:
     def forget(self, chosen: NDArray[np.bool_]) -> None:
         """Begin an episode in the chosen worlds (W,)."""
         self._used[chosen] = 0
+        self._barriers[chosen] = -1
         self._rows[chosen] = INSERT_NONE
         self._waiting[chosen] = 0
         for world in np.flatnonzero(chosen).tolist():
@@ -149,6 +199,7 @@ class InsertedWorlds:
     config: EnvConfig
     network: RoadNetwork
     worlds: SteppedWorlds
+    _events: DeclaredEvents
 
     @cached_property
     def _insertions(self) -> Insertions:
@@ -173,7 +224,7 @@ class InsertedWorlds:
         self._insertions.vehicle(world, lane, position_m)
 
     def close_road(self, edge: str, world: int = 0) -> None:
-        """Close a road from the next step on, to the end of the episode.
+        """Close a road from the next step on, until it is opened or the episode is over.
 
         On each of its lanes a car stands at its beginning, as soon as there is a safe gap; each
         counts in `population.insertions`. Others wait behind them, or go round where they can.
@@ -183,6 +234,33 @@ class InsertedWorlds:
             world: its number.
 
         Raises:
-            ActionError, CapacityError, ConfigError: as of `insert_vehicle`.
+            ActionError: as of `insert_vehicle`, or it is closed already.
+            CapacityError, ConfigError: as of `insert_vehicle`.
         """
         self._insertions.barrier(world, edge)
+
+    def open_road(self, edge: str, world: int = 0) -> None:
+        """Open a road that was closed: from the next step on the cars there drive on.
+
+        They go to a goal of the generator's, as others that were put there; they still count in
+        `population.insertions`.
+
+        Args:
+            edge: id of a road.
+            world: its number.
+
+        Raises:
+            ActionError: no such road, or it is not closed.
+            ConfigError: `population.insertions` is 0.
+        """
+        self._insertions.no_barrier(world, edge)
+
+    def closed_roads(self, world: int = 0) -> tuple[str, ...]:
+        """Ids of the roads that `close_road` has closed, also from the next step on."""
+        return self._insertions.closed(world)
+
+    def _take_step(self, commands: Commands) -> None:
+        """Step the worlds with all that waits for a step; after a failure that still waits."""
+        self.worlds.step(self._insertions.add_to(self._events.add_to(commands)))
+        self._events.taken()
+        self._insertions.taken()

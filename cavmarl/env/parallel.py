@@ -269,7 +269,7 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
         active = self.worlds.arrays.mask[0, self._listed]
         needed = self.agents if active.all() else list(compress(self.agents, active.tolist()))
         commands = self._decoder.from_dict(actions, self.agents, needed)
-        self.worlds.step(self._insertions.add_to(self._events.add_to(commands)))
+        self._take_step(commands)
         self._steps += 1
         self._record_frames()
         return self._report()
@@ -316,7 +316,7 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
         """Let an empty world go on until an agent enters; ends without one at the horizon."""
         arrays = self.worlds.arrays
         while not arrays.episode_over[0] and self._steps < self._max_cycles:
-            self.worlds.step(self._insertions.add_to(self._decoder.idle()))
+            self._take_step(self._decoder.idle())
             self._steps += 1
             self._record_frames()
             if arrays.mask.any():

@@ -325,7 +325,7 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
             refuse_over(self._over)
         commands = self._decoder.from_array(actions, self._mask)
         began = time.perf_counter()
-        self.worlds.step(self._insertions.add_to(self._events.add_to(commands)))
+        self._take_step(commands)
         self.simulated_s += time.perf_counter() - began
         self._record_frames()
         arrays = self.worlds.arrays

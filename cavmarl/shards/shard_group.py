@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.numba.specialized import specialized
 from cavmarl.core.records.arrays import Demand, Gate
+from cavmarl.core.records.codes import INSERT_OPEN
 from cavmarl.shards.kernels.group_phases import (
     FRAME,
     Members,
@@ -19,6 +20,7 @@ from cavmarl.shards.kernels.group_phases import (
     choose_goals_each,
     credit_each,
     detect_each,
+    drive_on_each,
     forget_each,
     gather_each,
     propose_each,
@@ -72,6 +74,7 @@ class ShardGroup:
         self._admit = specialized(admit_each)
         self._meta_actions = np.zeros(self._controls.shape[:2], dtype=np.int64)
         self._begin_step = specialized(begin_step_each)
+        self._drive_on = specialized(drive_on_each)
         self._detect = specialized(detect_each)
         self._sense = specialized(sense_each)
         self._credit = specialized(credit_each)
@@ -93,10 +96,13 @@ class ShardGroup:
             getattr(shard, phase)(*arguments)
 
     def begin_step(self, commands: Commands) -> None:
-        """Open the accounts of a step and take its meta-actions."""
+        """Open the accounts of a step, take its meta-actions, let barriers drive on."""
+        first, inserted = self._first, commands.inserted
+        if (inserted[..., 0] == INSERT_OPEN).any():
+            first_stop = len(self._travel.stops) - len(self._roads.lanes)
+            self._drive_on(self._members, first.side, np.array(inserted), first_stop)
         if self._config.population.agents == 0:
             return
-        first = self._first
         np.copyto(self._meta_actions, commands.meta_actions)
         self._begin_step(
             self._members, first.side, self._roads,

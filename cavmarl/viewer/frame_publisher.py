@@ -14,7 +14,7 @@ FRAMES_HZ = 20.0
 DETAILS_HZ = 5.0
 # What the time line shows of `FrameEvent`; departures and signals are too many.
 TIME_LINE = frozenset({"collision", "off_road", "red_light", "arrived", "wrong_way", "transferred"})
-ASKED = frozenset({"inserted", "closed"})  # pages that ask for it are told at once
+ASKED = frozenset({"inserted", "closed", "opened"})  # pages that ask for it are told at once
 MOST_EVENTS = 50  # of a frame
 
 SeeFrame = Callable[[bool], WorldFrame]

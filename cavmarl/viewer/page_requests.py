@@ -13,7 +13,7 @@ MAX_TEXT = 4096
 MAX_PACE = 1000.0
 # Kinds that change the world or its clock; the others only change what the page itself is told.
 CONTROLS = frozenset(
-    {"pause", "play", "step", "pace", "reset", "seat", "drive", "seek", "insert", "close"}
+    {"pause", "play", "step", "pace", "reset", "seat", "drive", "seek", "insert", "close", "open"}
 )
 MAX_PLACE_M = 1e7
 
@@ -25,7 +25,7 @@ class PageRequest:
     Attributes:
         kind: `watch` a vehicle, mark the `ghosts` of a zone; of `CONTROLS`: `pause`, `play`,
             `step`, `pace`, `reset`, take a `seat` and `drive` in it, `seek` a tick of a recording,
-            `insert` a vehicle at a place, `close` the road there.
+            `insert` a vehicle at a place, `close` the road there, or `open` it again.
         number: the vehicle, zone, agent or tick, None for none; seconds of the world in one of ours
             as `pace`, 0 for as fast as it can.
         x: of the place, m from the map's origin.
@@ -81,7 +81,7 @@ def read_request(text: str) -> PageRequest:
         throttle = _within("throttle", found.get("throttle"), -1.0, 1.0)
         steering = _within("steering", found.get("steering"), -1.0, 1.0)
         return PageRequest(kind, None, throttle, steering)
-    if kind in ("insert", "close"):
+    if kind in ("insert", "close", "open"):
         x, y = (_within(name, found.get(name), -MAX_PLACE_M, MAX_PLACE_M) for name in ("x", "y"))
         return PageRequest(kind, x=x, y=y)
     raise MessageError(f"a request of the kind {str(kind)[:40]!r}: there is none of that kind")

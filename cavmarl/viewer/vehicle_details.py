@@ -76,7 +76,7 @@ def hello_of(env: Shown, policy: str, *, is_driven_here: bool = True) -> dict[st
     if is_driven_here:
         hello["may"] = [*hello["may"], "reset", "seat"]
     if config.population.insertions:
-        hello["may"] = [*hello["may"], "insert", "close"]
+        hello["may"] = [*hello["may"], "insert", "close", "open"]
     return hello
 
 

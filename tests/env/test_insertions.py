@@ -36,8 +36,11 @@ def act(env: Any, step: int) -> None:
     roads = np.flatnonzero(~network.lanes["internal"] & (network.lanes["length_m"] > 60.0))
     if step in (4, 5, 30):
         env.insert_vehicle(network.lane_ids[int(roads[step])], 20.0 + step)
+    road = network.edge_ids[int(network.lanes["edge"][roads[7]])]
     if step == 10:
-        env.close_road(network.edge_ids[int(network.lanes["edge"][roads[7]])])
+        env.close_road(road)
+    if step == 35:
+        env.open_road(road)
 
 
 def hashes(**more: Any) -> list[str]:
@@ -86,10 +89,10 @@ def test_a_run_follows_from_its_recording(tmp_path: Path) -> None:
     recording = Recording.open(tmp_path / "run")
     told = {}
     for found in recording.events():
-        if found.event.kind in ("inserted", "closed"):
+        if found.event.kind in ("inserted", "closed", "opened"):
             told.setdefault(found.event.tick, []).append(found.event)
     assert sorted(event.kind for events in told.values() for event in events) == [
-        "closed", "inserted", "inserted", "inserted",
+        "closed", "inserted", "inserted", "inserted", "opened",
     ]  # fmt: skip
     ticks = recording.ticks()
     with closing(parallel_env("grid4x4", agents=3, background=40, overrides=ROOM)) as env:
@@ -98,6 +101,8 @@ def test_a_run_follows_from_its_recording(tmp_path: Path) -> None:
             for event in told.get(tick, ()):
                 if event.kind == "closed":
                     env.close_road(event.detail)
+                elif event.kind == "opened":
+                    env.open_road(event.detail)
                 else:
                     lane, place = event.detail.rsplit(" ", 1)
                     env.insert_vehicle(lane, float(place))
@@ -132,6 +137,60 @@ def test_an_inserted_vehicle_drives_and_a_closed_road_stays_closed() -> None:
         assert len(barriers) == int((lanes["edge"] == lanes["edge"][others[-1]]).sum())
         assert (barriers["speed"] == 0.0).all()
         assert (barriers["distance_m"] < 0.5).all()
+        env.open_road(edge)
+        for _ in range(30):
+            env.step(env.suggest_actions())
+        rows = env.simulation.vehicles(0)
+        assert (rows[np.isin(rows["id"], barriers["id"])]["distance_m"] > 5.0).all()
+
+
+def test_barriers_that_wait_for_a_gap_never_enter_a_road_that_is_opened() -> None:
+    with closing(parallel_env("grid4x4", agents=1, background=0, overrides=ROOM)) as env:
+        env.reset(seed=0)
+        roads = env.network.lanes["edge"][~env.network.lanes["internal"]]
+        number = next(int(road) for road in roads if env.network.edge_ids[road] != edge_of(env))
+        edge = env.network.edge_ids[number]
+        lanes = np.flatnonzero(env.network.lanes["edge"] == number)
+        for lane in lanes.tolist():
+            env.insert_vehicle(env.network.lane_ids[lane], 6.0)
+        env.close_road(edge)
+        env.step(env.suggest_actions())  # their places are taken
+        assert env.traffic_stats()["waiting"] == len(lanes)
+        env.open_road(edge)
+        env.step(env.suggest_actions())
+        assert env.traffic_stats()["waiting"] == 0
+        assert len(env.simulation.vehicles(0)) == 1 + len(lanes)
+        env.close_road(edge)
+        env.open_road(edge)
+        assert env.closed_roads() == ()
+
+
+def test_a_step_that_fails_has_what_was_put_there_when_it_is_taken_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    overrides = {**ROOM, "v2x.enabled": True}
+    found = []
+    for fails in (False, True):
+        with closing(parallel_env("grid4x4", agents=3, overrides=overrides)) as env:
+            env.reset(seed=2)
+            act(env, 4)
+            env.close_road(edge_of(env, 2))
+            env.declare_event("car_0", "obstacle")
+            if fails:
+                actions = env.suggest_actions()
+                with monkeypatch.context() as patch:
+                    patch.setattr(env.worlds, "step", interrupted)
+                    with pytest.raises(KeyboardInterrupt):
+                        env.step(actions)
+                assert env.closed_roads() == (edge_of(env, 2),)
+            for _ in range(10):
+                env.step(env.suggest_actions())
+            found.append((env.state_hash(), env.traffic_stats()))
+    assert found[0] == found[1]
+
+
+def interrupted(commands: Any) -> None:
+    raise KeyboardInterrupt
 
 
 def test_what_cannot_be_put_there_is_refused_with_its_cure() -> None:
@@ -154,6 +213,8 @@ def test_what_cannot_be_put_there_is_refused_with_its_cure() -> None:
             vec.insert_vehicle(lane, 1.0, world=2)
         with pytest.raises(ActionError, match="no such edge"):
             vec.close_road("nowhere")
+        with pytest.raises(ActionError, match="not closed; give the id of one that is"):
+            vec.open_road(vec.network.edge_ids[0])
         for _ in range(2):
             vec.insert_vehicle(lane, 10.0, world=1)
         with pytest.raises(CapacityError, match="set it higher, or reset"):

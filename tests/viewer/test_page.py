@@ -96,7 +96,7 @@ def test_a_seat_is_driven_with_the_arrow_keys(browser: Any, serve: Serve) -> Non
     assert not problems
 
 
-def test_a_vehicle_is_added_and_a_road_closed(browser: Any, serve: Serve) -> None:
+def test_a_vehicle_is_added_and_a_road_closed_and_opened(browser: Any, serve: Serve) -> None:
     served = serve(insertions=9, background=4)
     page, problems, _ = opened(browser, served)
     assert page.is_visible("#insert")
@@ -117,6 +117,12 @@ def test_a_vehicle_is_added_and_a_road_closed(browser: Any, serve: Serve) -> Non
     page.mouse.click(*place)
     until(page, "document.querySelector('#events').textContent.includes('road closed')")
     assert "vehicle added" in page.text_content("#events")
+    page.click("#open")
+    page.mouse.click(*place)
+    until(page, "document.querySelector('#events').textContent.includes('road opened')")
+    page.click("#open")
+    page.mouse.click(*place)
+    until(page, "document.querySelector('#notice').textContent.includes('no closed road')")
     page.click("#insert")
     page.mouse.click(5, 400)
     until(page, "document.querySelector('#notice').textContent.includes('no road for cars')")

@@ -20,7 +20,8 @@ MODEL_ACC = 2
 # What is put into a world while it runs, `Commands.inserted`.
 INSERT_NONE = 0
 INSERT_VEHICLE = 1
-INSERT_BARRIER = 2  # it stands to the end of the episode
+INSERT_BARRIER = 2  # it stands until its lane is opened, or to the end of the episode
+INSERT_OPEN = 3  # a lane: its barrier drives on, or is not put there
 
 LANE_GIVEN = 0
 LANE_FIRST = -1  # the one nearest to the kerb of those that it may use

@@ -33,6 +33,7 @@ from cavmarl.sensors.kernels.output_reset import credit
 from cavmarl.sensors.kernels.sense import sense
 from cavmarl.shards.kernels.world_phases import advance, begin_step, resolve
 from cavmarl.traffic.kernels.admission import admit, propose, rank_lanes
+from cavmarl.traffic.kernels.barriers import drive_on
 from cavmarl.traffic.kernels.demand_generator import choose_goals
 from cavmarl.traffic.kernels.leaving import drop_ghosts, leave
 from cavmarl.zones.kernels.ghost_exchange import gather
@@ -174,6 +175,14 @@ def begin_step_each(
     for zone in members.numbers:
         worlds = _worlds(members, zone, side, side)
         begin_step(roads, worlds, discrete, meta_actions, target_speeds)
+
+
+@kernel
+def drive_on_each(
+    members: Members, side: int, inserted: NDArray[np.float64], first_stop: int
+) -> None:
+    for zone in members.numbers:
+        drive_on(inserted, first_stop, _worlds(members, zone, side, side))
 
 
 @kernel

@@ -31,6 +31,7 @@ from cavmarl.core.records.codes import (
     EVENT_ARRIVED,
     INSERT_BARRIER,
     INSERT_NONE,
+    INSERT_OPEN,
     LANE_GIVEN,
     POS_GIVEN,
     SPEED_GIVEN,
@@ -42,6 +43,7 @@ from cavmarl.core.records.codes import (
 from cavmarl.driving.kernels.motion import place_on_lane
 from cavmarl.driving.kernels.ways import own_step, time_of_way, way_left
 from cavmarl.roads.kernels.map_draw import map_of
+from cavmarl.traffic.kernels.barriers import withdraw
 from cavmarl.traffic.kernels.entering import speed_at
 
 PLACE_TRIES = 24  # places tried for a vehicle at reset before it has to queue
@@ -123,10 +125,13 @@ def insert(
     lanes = roads.lanes.shape[0]
     for w in range(worlds.ticks.shape[0]):
         for n in range(inserted.shape[1]):
+            lane = int(inserted[w, n, 1])
+            if inserted[w, n, 0] == INSERT_OPEN:
+                withdraw(gate, w, travel.stops.shape[0] - lanes + lane)
+                continue
             if inserted[w, n, 0] == INSERT_NONE or gate.num_queue[w] >= gate.queue.shape[1]:
                 continue
             departure = gate.queue[w, _number(demand, gate, worlds, w)]
-            lane = int(inserted[w, n, 1])
             first = below(worlds.keys[w], departure["id"], 0, STREAM_ROUTE, num_goals)
             _send(roads, departure, lane, first)
             for k in range(num_goals):

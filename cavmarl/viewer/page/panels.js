@@ -77,6 +77,7 @@ const WORDS = {
   collision: "collision", off_road: "off the road", wrong_way: "wrong way",
   red_light: "red light run", arrived: "arrived", transferred: "handed over",
   episode: "new episode", inserted: "vehicle added", closed: "road closed",
+  opened: "road opened",
 };
 
 export function addEvents(events, stepTime, choose) {

@@ -2,7 +2,7 @@
 
 import { $, notice } from "./panels.js";
 
-const KINDS = ["insert", "close"];
+const KINDS = ["insert", "close", "open"];
 
 export class Placing {
   constructor(ask) {

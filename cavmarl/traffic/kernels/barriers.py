@@ -1,0 +1,42 @@
+"""Barriers that close lanes: vehicles that make a stop without an end, until they may drive on."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.numba import kernel
+from cavmarl.core.records.arrays import Gate, Worlds
+from cavmarl.core.records.codes import INSERT_OPEN
+
+
+@kernel
+def drive_on(
+    inserted: NDArray[np.float64],  # as in `Commands`
+    first_stop: int,  # STOP row of the barrier on lane 0; those of other lanes follow
+    worlds: Worlds,  # rows are written, of ghosts too
+) -> None:
+    """End the stops of the barriers on lanes that are opened."""
+    for w in range(inserted.shape[0]):
+        for n in range(inserted.shape[1]):
+            if inserted[w, n, 0] != INSERT_OPEN:
+                continue
+            stop = first_stop + int(inserted[w, n, 1])
+            for i in range(worlds.num_rows[w]):
+                row = worlds.rows[w, i]
+                if row["stop"] == stop and row["stops_end"] == stop + 1:
+                    row["stop"] = stop + 1
+                    row["stopped_s"] = 0.0
+
+
+@kernel
+def withdraw(gate: Gate, w: int, stop: int) -> None:
+    """Take the departures that would make a barrier's stop out of the queue."""
+    kept = 0
+    for q in range(gate.num_queue[w]):
+        if gate.queue[w, q]["stop"] == stop:
+            continue
+        if kept < q:
+            gate.queue[w, kept] = gate.queue[w, q]
+        kept += 1
+    gate.num_queue[w] = kept
