@@ -353,3 +353,17 @@ def test_code_of_the_working_directory_runs_by_its_path_alone(
     (tmp_path / "agents" / "merge_ippo" / "model.safetensors").touch()
     with pytest.raises(PolicyError, match=r"'merge_ippo': is a driver of cavmarl, and"):
         load_policy("merge_ippo", env)
+
+
+def test_idm_changes_lanes_at_the_end_of_a_lane_that_is_short() -> None:
+    """On 25 m of road it is not in the other lane before the end: it stood there for ever."""
+    vec = make_vec("cities_validation", num_envs=1, agents=1, background=0)
+    driver = load_policy("idm", vec)
+    observations, infos = vec.reset(seed=500, options={"first_world": 89})
+    driver.reset(500)
+    stood_s = 0.0
+    for _ in range(500):
+        observations, _, _, _, infos = vec.step(driver.act_batch(observations, infos["mask"]))
+        stood_s = max(stood_s, *vec.simulation.vehicles(0)["wait_s"], 0.0)
+    vec.close()
+    assert 0.0 < stood_s < 60.0  # at a red light

@@ -62,6 +62,7 @@ FALL_IN_M = 100.0  # before the place where a lane change must be made
 # length further back to change left: two that want to swap do not stand side by side for ever.
 MERGE_ROOM_M = 2.0
 SWAP_ROOM_M = 3.0
+CHANGING_ROOM_M = -0.8  # of a steered one on its way into the other lane: to the very end
 MERGE_ROOM_SHARE = 0.25  # to the right at most this share of the lane's length
 ROW_LINES = 3  # of a VEHICLE row that drivers ask for
 RETURN_MPS = 5.0  # at which a lost vehicle looks for its lane
@@ -398,10 +399,10 @@ def decide(
             change = choose_lane(roads, travel, rows, i, tick, needed, own_wish, scratch)
         if change != 0 and driver == DRIVER_AGENT:
             # A steered vehicle on its way into a neighbour lane still minds its own lane, to the
-            # very end, and already the leader in the other one.
+            # very end, and already the leader in the other one. Standing, it could not steer.
             lane = roads.lanes[row["lane"]]
             press, allowed, _, _ = _road_ahead(
-                roads, travel, rows, k, step[i], phase, 0.0, dt, scratch
+                roads, travel, rows, k, step[i], phase, CHANGING_ROOM_M, dt, scratch
             )
             target = lane["left"] if change > 0 else lane["right"]
             press = max(press, _beside(roads, travel, kind, row, target, scratch))

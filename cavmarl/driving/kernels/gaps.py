@@ -20,6 +20,7 @@ from cavmarl.core.records.codes import (
     HOLD_YIELD,
     SIGNAL_GREEN_MINOR,
     SIGNAL_NONE,
+    SIGNAL_OFF_BLINKING,
     SIGNAL_RED,
     SIGNAL_RED_YELLOW,
     SIGNAL_STOP_THEN_GO,
@@ -131,7 +132,9 @@ def ignores(
         return True  # it has to stand once, too, and has not yet
     if foe["speed"] > STANDING_MPS or not _gives_way(foe, foe_link):
         return False
-    if not (_in_turn(state) or row["wait_s"] > STUCK_S):
+    # Where its signal is off and blinks, the foe has to give way, too.
+    in_turn = _in_turn(state) or signal == SIGNAL_OFF_BLINKING
+    if not (in_turn or row["wait_s"] > STUCK_S):
         return False  # the other road comes first even while it waits itself
     # Among equals each may wait for the next all around: those that wait do not stop one another.
     if (state == STATE_EQUAL and row["wait_s"] > IMPATIENT_S) or _goes_on(row, link):
