@@ -13,7 +13,7 @@ from rich.text import Text
 from cavmarl.cli.map_check import print_report
 from cavmarl.cli.output import JsonPath, about, grid, write_json
 from cavmarl.core.errors import ConfigError
-from cavmarl.core.progress import progress_bar
+from cavmarl.core.progress import in_stages
 from cavmarl.maps.check import check_map
 from cavmarl.maps.heights.draping import MOST_GRADE, STEEP_GRADE, HeightOptions, HeightReport
 from cavmarl.maps.netconvert import STAGES, Box, BuildResult, build_network
@@ -73,13 +73,7 @@ def build(
         raise ConfigError("--limit-grade: is for heights: give --dem too")
     heights = HeightOptions(tuple(dem), limit_grade, max_grade) if dem else None
     console = Console()
-    with progress_bar(console) as progress:
-        bar = progress.add_task("", total=len(STAGES) + 1)
-
-        def told(stage: str) -> None:
-            number = STAGES.index(stage) if stage in STAGES else len(STAGES)
-            progress.update(bar, description=stage, completed=number)
-
+    with in_stages(console, [*STAGES, "checks"]) as told:
         result = build_network(
             source,
             target,

@@ -14,14 +14,16 @@ from rich.text import Text
 
 from cavmarl.cli.output import Environment, JsonPath, about, about_file, grid, write_json
 from cavmarl.core.errors import ConfigError
+from cavmarl.core.progress import in_stages
 from cavmarl.engine.world_setup import find_map
 from cavmarl.maps.check import MapReport, check_map
 from cavmarl.maps.check_page import write_check_page
-from cavmarl.maps.defects import Defect, find_defects
+from cavmarl.maps.defects import SEARCHES, Defect, find_defects
 from cavmarl.maps.mending import mend
 from cavmarl.roads.cache import load_network
 
 _SHOWN = 12
+_READ, _COUNT, _PAGE, _MEND = "reading", "figures", "page", "mending"
 
 
 def check(
@@ -39,19 +41,25 @@ def check(
     if fix is not None and not fix.name.endswith(".net.xml"):
         raise ConfigError(f"--fix {fix}: must end in .net.xml")
     console = Console()
-    with console.status(f"checking {env} …"):
+    done: list[str] = []
+    left: list[Defect] = []
+    with in_stages(console, [_READ, _COUNT, *SEARCHES, _PAGE, _MEND]) as told:
+        told(_READ)
         path = find_map(env)
         network = load_network(path)
+        told(_COUNT)
         report = check_map(network)
-        defects = find_defects(network, path, buildings)
+        defects = find_defects(network, path, buildings, told)
+        if page is not None:
+            told(_PAGE)
+            write_check_page(page, network, defects)
+        if fix is not None:
+            told(_MEND)
+            done, left = mend(path, fix, defects)
     print_report(console, report)
     _print_defects(console, defects)
     document = report.to_dict() | {"defects": [defect.to_dict() for defect in defects]}
-    if page is not None:
-        write_check_page(page, network, defects)
     if fix is not None:
-        with console.status(f"mending {env} …"):
-            done, left = mend(path, fix, defects)
         for line in done:
             console.print(Text(f"mended: {line}"))
         console.print(Text(f"{fix}: {len(done)} mended, {len(left)} left, to be mended by hand"))

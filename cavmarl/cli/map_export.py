@@ -12,12 +12,15 @@ from rich.text import Text
 
 from cavmarl.cli.output import Environment, JsonPath, about_file, grid, write_json
 from cavmarl.core.errors import ConfigError
+from cavmarl.core.progress import in_stages
 from cavmarl.engine.world_setup import find_map
 from cavmarl.maps.exports.geojson import write_geojson
 from cavmarl.maps.exports.lanelet import write_lanelet2
-from cavmarl.maps.exports.opendrive import write_opendrive
+from cavmarl.maps.exports.opendrive import STAGES, write_opendrive
 from cavmarl.maps.exports.opendrive_trip import MOST_OFF, CarRoads, RoundTrip
 from cavmarl.roads.cache import load_network
+
+_LOAD, _LANELETS, _LINES = "map", "Lanelet2", "GeoJSON"
 
 
 def export(
@@ -31,23 +34,27 @@ def export(
     if opendrive is None and lanelet2 is None and geojson is None:
         raise ConfigError("nothing to export: give --opendrive, --lanelet2 or --geojson")
     console = Console()
-    path = find_map(env)
-    network = load_network(path)
     document: dict[str, Any] = {}
     sound = True
-    if opendrive is not None:
-        with console.status(f"writing {opendrive} …"):
-            trip = write_opendrive(path, opendrive)
-        _show(console, opendrive, trip)
-        sound = trip.same
-        document["opendrive"] = trip.to_dict()
-    if lanelet2 is not None:
-        with console.status(f"writing {lanelet2} …"):
-            document["lanelet2"] = write_lanelet2(network, lanelet2)
-        console.print(Text(f"{lanelet2}: {document['lanelet2']['read back']} lanelets read back"))
-    if geojson is not None:
-        document["geojson"] = {"lanes": write_geojson(network, geojson, path)}
-        console.print(Text(f"{geojson}: {document['geojson']['lanes']} lanes"))
+    stages = [_LOAD, *(STAGES if opendrive else ())]
+    stages += [name for name, file in ((_LANELETS, lanelet2), (_LINES, geojson)) if file]
+    with in_stages(console, stages) as told:
+        told(_LOAD)
+        path = find_map(env)
+        network = load_network(path)
+        if opendrive is not None:
+            trip = write_opendrive(path, opendrive, told=told)
+            _show(console, opendrive, trip)
+            sound = trip.same
+            document["opendrive"] = trip.to_dict()
+        if lanelet2 is not None:
+            told(_LANELETS)
+            document["lanelet2"] = found = write_lanelet2(network, lanelet2)
+            console.print(Text(f"{lanelet2}: {found['read back']} lanelets read back"))
+        if geojson is not None:
+            told(_LINES)
+            document["geojson"] = {"lanes": write_geojson(network, geojson, path)}
+            console.print(Text(f"{geojson}: {document['geojson']['lanes']} lanes"))
     write_json(json_path, document)
     raise typer.Exit(0 if sound else 1)
 

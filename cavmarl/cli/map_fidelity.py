@@ -12,6 +12,7 @@ from rich.text import Text
 
 from cavmarl.cli.output import JsonPath, about, about_file, grid, write_json
 from cavmarl.core.errors import ConfigError
+from cavmarl.core.progress import in_stages
 from cavmarl.engine.world_setup import find_map
 from cavmarl.maps.buildings import with_buildings
 from cavmarl.maps.fidelity.cloud_files import Cloud, is_cloud, read_cloud
@@ -27,6 +28,7 @@ from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
 
 _ALIGNMENTS = ("icp", "edges", "none")
+_STAGES = ("points", "surroundings", "distances", "roads")
 _MARGIN_M = 5.0  # around the map, and of the map around a cloud
 
 Reference = Annotated[
@@ -71,16 +73,22 @@ def fidelity(
         raise ConfigError(f"--align edges: {reference} is a cloud and has no roads: give a map")
     console = Console()
     rows, fits = [], []
-    with console.status("comparing clouds …"):
-        for path in filter(None, (cloud, cloud2)):
+    paths = list(filter(None, (cloud, cloud2)))
+    stages = [[f"{name} of cloud {k + 1}" for name in _STAGES] for k in range(len(paths))]
+    with in_stages(console, [name for one in stages for name in one]) as told:
+        for path, (read, beside, compared, fitted) in zip(paths, stages, strict=True):
+            told(read)
             one = _filtered(read_cloud(path), frame, network, begin, voxel, outliers)
+            told(beside)
             motion, other = begin, None
             if network is None:
                 other = _filtered(read_cloud(Path(reference)), "map", None, None, voxel, outliers)
             else:
                 one, motion, other = _beside_map(one, network, begin, align)
+            told(compared)
             rows.append(compare(one, other, start=motion, keep=keep, registered=align == "icp"))
             if network is not None:
+                told(fitted)
                 fits.append(fit_roads(network, rows[-1].aligned, network.extent_m))
     _print(console, rows, fits)
     write_json(json_path, _document(rows, fits))

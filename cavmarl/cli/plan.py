@@ -12,6 +12,7 @@ from cavmarl.cli.output import JsonPath, about, print_error, with_world, write_j
 from cavmarl.config.env import ZONE_LAYOUTS
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError, NoAdmissibleWorkerError
+from cavmarl.core.progress import counting
 
 if TYPE_CHECKING:
     from cavmarl.balance.load_snapshot import LoadSnapshot
@@ -76,9 +77,11 @@ def plan(
     rule = BalanceRule(tolerance=tolerance)
     seen = _snapshot(snapshot, workers)
     console = Console()
-    with console.status("measuring"):
+    with counting(console, f"steps of {env}") as told:
         simulation = world_maker(world, layout=layout, seconds=LASTING_S)(zones)
-        measured = measure_shards(simulation, worlds, world.seed, steps=steps, before=before)
+        measured = measure_shards(
+            simulation, worlds, world.seed, steps=steps, before=before, told=told
+        )
     partition = simulation.partition
     try:
         made = make_plan(Problem(measured.costs, partition.side_neighbors, seen, rule))

@@ -21,6 +21,7 @@ from cavmarl.cli.output import (
 )
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ServiceError, require
+from cavmarl.core.progress import progress_bar
 
 if TYPE_CHECKING:
     from cavmarl.client import Client
@@ -105,8 +106,15 @@ def submit(
         )  # fmt: skip
         folder = out or Path("runs/submit") / job
         make_folder(folder)
-        with console.status(f"job {job}"):
-            client.wait(job, folder)
+        with progress_bar(console) as bar:
+            task = bar.add_task(job)
+
+            def show(found: dict[str, Any]) -> None:
+                done, total = found["progress"] or (0, None)
+                what = f"{job}: {found['state']}"
+                bar.update(task, description=what, completed=done, total=total)
+
+            client.wait(job, folder, told=show)
         told = "".join(json.dumps(event) + "\n" for event in client.events(job))
         (folder / "service_events.jsonl").write_text(told, encoding="utf-8")
     found = load_report(folder)

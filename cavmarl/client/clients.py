@@ -12,7 +12,7 @@ from typing import Any, Self, TypeVar
 
 import httpx
 
-from cavmarl.client.flows import Ask, Flow, Rest, ServiceFlows, check
+from cavmarl.client.flows import Ask, Flow, Rest, ServiceFlows, Told, check
 from cavmarl.client.world_flows import RECOVERY_S, WorldFlows
 from cavmarl.core.errors import ServiceError
 
@@ -131,10 +131,14 @@ class Client:
         return self.run(self.flows.submit(environment, keys, job))
 
     def wait(
-        self, job: str, folder: str | Path | None = None, timeout_s: float = 3600.0
+        self,
+        job: str,
+        folder: str | Path | None = None,
+        timeout_s: float = 3600.0,
+        told: Told = lambda _: None,
     ) -> dict[str, Any]:
-        """A job that is done; its files are put into `folder`."""
-        found = self.run(self.flows.wait(job, timeout_s))
+        """A job that is done; its files go to `folder`. Until then `told` what it is like."""
+        found = self.run(self.flows.wait(job, timeout_s, told))
         if folder is not None:
             _write(self.run(self.flows.results(job)), folder)
         return found
@@ -288,10 +292,14 @@ class AsyncClient:
         return await self.run(self.flows.submit(environment, keys, job))
 
     async def wait(
-        self, job: str, folder: str | Path | None = None, timeout_s: float = 3600.0
+        self,
+        job: str,
+        folder: str | Path | None = None,
+        timeout_s: float = 3600.0,
+        told: Told = lambda _: None,
     ) -> dict[str, Any]:
         """As `Client.wait`."""
-        found = await self.run(self.flows.wait(job, timeout_s))
+        found = await self.run(self.flows.wait(job, timeout_s, told))
         if folder is not None:
             _write(await self.run(self.flows.results(job)), folder)
         return found

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Generator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from typing import Any, NamedTuple, TypeVar
 
 import httpx
@@ -41,6 +41,8 @@ class Rest(NamedTuple):
 
 
 Flow = Generator[Ask | Rest, Any, T]
+Told = Callable[[dict[str, Any]], None]
+"""Told what the service says of a job."""
 
 
 class ServiceFlows:
@@ -120,11 +122,14 @@ class ServiceFlows:
             (yield from self.post_once("/jobs", {"configuration": found, **job}, RETRIED_S))["id"]
         )
 
-    def wait(self, job: str, timeout_s: float, poll_s: float = 0.25) -> Flow[dict[str, Any]]:
+    def wait(
+        self, job: str, timeout_s: float, told: Told = lambda _: None, poll_s: float = 0.25
+    ) -> Flow[dict[str, Any]]:
         """A job that is over; raises ServiceError if it has failed, or takes longer."""
         until_s = time.monotonic() + timeout_s
         while True:
             found: dict[str, Any] = yield from self.get(f"/sessions/{job}")
+            told(found)
             if found["state"] == "done":
                 return found
             if found["state"] in ("failed", "closed"):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 from rich.console import Console
@@ -31,7 +31,7 @@ class RateColumn(ProgressColumn):
 
 
 def progress_bar(console: Console) -> Progress:
-    """A bar that goes away when the work is done."""
+    """A bar that goes away when the work is done; without a terminal there is none."""
     return Progress(
         TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=24),
@@ -42,6 +42,7 @@ def progress_bar(console: Console) -> Progress:
         TimeRemainingColumn(),
         console=console,
         transient=True,
+        disable=not console.is_terminal,
     )
 
 
@@ -51,3 +52,11 @@ def counting(console: Console, what: str) -> Iterator[Callable[[int, int], None]
     with progress_bar(console) as bar:
         task = bar.add_task(what)
         yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+@contextmanager
+def in_stages(console: Console, stages: Sequence[str]) -> Iterator[Callable[[str], None]]:
+    """A bar while something is done stage by stage; it moves when it is told which one begins."""
+    with progress_bar(console) as bar:
+        task = bar.add_task("", total=len(stages))
+        yield lambda stage: bar.update(task, description=stage, completed=stages.index(stage))

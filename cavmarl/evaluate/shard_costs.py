@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import itertools
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,9 +43,14 @@ class MeasuredWorlds:
 
 
 def measure_rounds(
-    simulation: Simulation, rounds: int, steps: int, *, before: int
+    simulation: Simulation,
+    rounds: int,
+    steps: int,
+    *,
+    before: int,
+    stepped: Callable[[], None] = lambda: None,
 ) -> Iterator[MeasuredRound]:
-    """Drive one world on from its reset and measure its zones."""
+    """Drive one world on from its reset and measure its zones; `stepped` after each step."""
     for name, value in (("rounds", rounds), ("steps", steps), ("before", before)):
         if value < 1:
             raise ConfigError(f"{name} = {value}: must be at least 1")
@@ -53,10 +59,12 @@ def measure_rounds(
     ticks = steps * simulation.config.clock.ticks_per_step
     for _ in range(before):
         world.step(world.commands())
+        stepped()
     clock.take_s()
     for _ in range(rounds):
         for _ in range(steps):
             world.step(world.commands())
+            stepped()
         rows = simulation.vehicles()
         yield MeasuredRound(
             costs_s=clock.take_s() / ticks,
@@ -67,21 +75,34 @@ def measure_rounds(
 
 
 def measure_shards(
-    simulation: Simulation, worlds: int, seed: int, *, steps: int, before: int
+    simulation: Simulation,
+    worlds: int,
+    seed: int,
+    *,
+    steps: int,
+    before: int,
+    told: Callable[[int, int], None] = lambda done, total: None,
 ) -> MeasuredWorlds:
     """Costs of all zones of the first `worlds` worlds of a seed, one world after the other.
 
     Of each zone the median of `PARTS` parts of the steps counts: what happens once, as a kernel
-    that is loaded, is no cost of a zone.
+    that is loaded, is no cost of a zone. `told` how many steps of how many are done.
     """
     if steps < PARTS:
         raise ConfigError(f"steps = {steps}: must be at least {PARTS}")
     costs: list[ShardCost] = []
     places = []
+    done = itertools.count(1)
+    total = worlds * (before + steps // PARTS * PARTS)
+
+    def stepped() -> None:
+        told(next(done), total)
+
     for number in range(worlds):
         simulation.seed(seed, number)
         simulation.reset()
-        parts = list(measure_rounds(simulation, PARTS, steps // PARTS, before=before))
+        rounds = measure_rounds(simulation, PARTS, steps // PARTS, before=before, stepped=stepped)
+        parts = list(rounds)
         median_s = np.median([part.costs_s for part in parts], axis=0).tolist()
         costs += [ShardCost(number, zone, cost_s) for zone, cost_s in enumerate(median_s)]
         places.append(parts[-1].places)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 
 _CAR = 1 << VEHICLE_CLASSES.index("passenger")
 STEP_M = 0.1  # of height, between lanes of which one leads into the other
+SEARCHES = ("crossings", "signals", "lanes", "steps", "parts", "stop lines", "buildings")
 _DEEP_M = 1.0  # that a stop line may lie inside its junction
 
 Points = NDArray[np.float64]
@@ -36,32 +37,39 @@ class Defect:
         return asdict(self)
 
 
-def find_defects(network: RoadNetwork, path: Path, buildings: Path | None = None) -> list[Defect]:
+def find_defects(
+    network: RoadNetwork,
+    path: Path,
+    buildings: Path | None = None,
+    told: Callable[[str], None] = lambda stage: None,
+) -> list[Defect]:
     """Everything that looks wrong, kind by kind.
 
     Args:
         network: the map.
         path: its file, which has rules and shapes of junctions.
         buildings: OSM or SUMO polygons; None: they are not asked.
+        told: which of `SEARCHES` begins.
 
     Raises:
         MapError: a file cannot be read, or the buildings are of another map.
         MissingExtraError: buildings have to be projected, and pyproj is not installed.
     """
     document = NetDocument(path)
-    found = [
-        *_unruled_crossings(network, document),
-        *_idle_signals(network),
-        *_narrow_lanes(network),
-        *_steps(network),
-        *(
-            Defect("unreachable part", network.edge_ids[edge], *_middle(network, edge), "")
-            for edge in cut_off_edges(network)
-        ),
-        *_stop_lines_inside(network, document),
+    searches: list[Callable[[], Iterable[Defect]]] = [
+        lambda: _unruled_crossings(network, document),
+        lambda: _idle_signals(network),
+        lambda: _narrow_lanes(network),
+        lambda: _steps(network),
+        lambda: _unreachable_parts(network),
+        lambda: _stop_lines_inside(network, document),
     ]
     if buildings is not None:
-        found += _buildings_on_roads(with_buildings(network, buildings))
+        searches.append(lambda: _buildings_on_roads(with_buildings(network, buildings)))
+    found: list[Defect] = []
+    for name, search in zip(SEARCHES, searches, strict=False):  # the last one may be missing
+        told(name)
+        found += search()
     return found
 
 
@@ -89,6 +97,11 @@ def cut_off_edges(network: RoadNetwork) -> list[int]:
             near |= fresh
         joined |= near
     return [int(edge) for edge in edges if not joined[edge]]
+
+
+def _unreachable_parts(network: RoadNetwork) -> Iterator[Defect]:
+    for edge in cut_off_edges(network):
+        yield Defect("unreachable part", network.edge_ids[edge], *_middle(network, edge), "")
 
 
 def _middle(network: RoadNetwork, edge: int) -> tuple[float, float]:

@@ -189,6 +189,7 @@ class Session(_Answer):
     zone_nodes: int
     members: list[str]
     told_number: int
+    progress: list[int] | None  # of a job: steps done, and to be; null: its node has told none
 
 
 class SessionList(_Answer):

@@ -52,6 +52,11 @@ class BeatBody(_Body):
         dict[Word, Annotated[float, Field(allow_inf_nan=False)]],
         Field(max_length=32, json_schema_extra=NO_OTHERS),
     ] = {}
+    # of jobs: how many steps are done, and are to be
+    jobs: Annotated[
+        dict[Word, Annotated[list[Whole], Field(min_length=2, max_length=2)]],
+        Field(max_length=10_000, json_schema_extra=NO_OTHERS),
+    ] = {}
 
 
 class ConfigurationBody(_Body):

@@ -112,7 +112,7 @@ class Broker:
             self.log.record("node.up", name)
         live.heard_s, live.beat = self._clock_s(), body.sequence
         live.use = Utilisation(body.cpu, body.ram, body.gpu)
-        live.counters = dict(body.counters)
+        live.counters, live.jobs = dict(body.counters), dict(body.jobs)
         live.unheard.clear()
         live.refresh()
         resources = overloads(live.use)

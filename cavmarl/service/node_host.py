@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import signal
 import subprocess
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,6 +28,7 @@ from cavmarl.service.session_worlds import SessionWorlds
 from cavmarl.service.zone_processes import ZoneProcesses
 
 MOST_MESSAGE = 2000
+TELL_S = 0.5  # from telling how far a job is to telling it again
 DRAIN_S = 60.0  # after which a node that is drained ends, whatever it has
 
 
@@ -54,6 +57,7 @@ class _Host:
     worlds: SessionWorlds
     tell: Callable[[str], None]
     jobs: dict[str, asyncio.Task[None]] = field(default_factory=dict)
+    steps: dict[str, tuple[int, int]] = field(default_factory=dict)  # of jobs: done, and to be
     zones: ZoneProcesses = field(default_factory=ZoneProcesses)
     telling: asyncio.Task[None] | None = None
     failure: ServiceError | None = None
@@ -131,7 +135,7 @@ async def _beat_until_end(host: _Host) -> None:
         try:
             if host.is_ending and not link.is_draining:
                 await link.drain()
-            told = await link.beat(host.worlds.counters())
+            told = await link.beat(host.worlds.counters(), host.steps)
             pause_s = told["beat_s"]
             host.worlds.keep_only(link.own(told["sessions"]))
             _start_jobs(host, told["jobs"])
@@ -183,9 +187,13 @@ async def _run_job(host: _Host, job: dict[str, Any]) -> None:
             document = await link.configuration(job["configuration"])
             what = f"job {job['id']}"
             place = Path(folder) / "results"
+
+            def hear(done: int, total: int) -> None:
+                host.steps[job["id"]] = done, total
+
             await asyncio.to_thread(
                 call_in_fresh_process, what, run_evaluation, document, job, place,
-                began=started.append,
+                hear=hear, began=started.append,
             )  # fmt: skip
             for file in sorted(place.iterdir()):
                 await link.ask("PUT", f"{path}/results/{file.name}", content=file.read_bytes())
@@ -195,13 +203,29 @@ async def _run_job(host: _Host, job: dict[str, Any]) -> None:
             for process in started:
                 process.kill()
             raise
+        finally:
+            host.steps.pop(job["id"], None)
     # Where the service is away or the job is another's by now, it runs again elsewhere.
     with contextlib.suppress(ServiceError):
         await link.ask("POST", f"{path}/outcome", json={"status": status, "message": message})
 
 
-def run_evaluation(document: dict[str, Any], job: dict[str, Any], folder: Path) -> None:
-    """The work of a job."""
+def run_evaluation(
+    document: dict[str, Any], job: dict[str, Any], folder: Path, tell: Callable[[int, int], None]
+) -> None:
+    """The work of a job; `tell` how many steps of how many are done, twice a second."""
+    parts = job["repeats"] * len(job["policies"])
+    ended, last, told_s = 0, ("", 0), -math.inf
+
+    def progress(policy: str, steps: int, most: int) -> None:
+        nonlocal ended, last, told_s
+        if last[0] and (policy != last[0] or steps < last[1]):
+            ended += 1
+        last = policy, steps
+        if time.monotonic() - told_s >= TELL_S:
+            told_s = time.monotonic()
+            tell(ended * most + steps, parts * most)
+
     evaluate(
         document["environment"],
         job["policies"],
@@ -209,5 +233,6 @@ def run_evaluation(document: dict[str, Any], job: dict[str, Any], folder: Path) 
         repeats=job["repeats"],
         out=folder,
         seed=document["seed"],
+        progress=progress,
         **world_keywords(document),
     )

@@ -8,6 +8,7 @@ import os
 import secrets
 import socket
 import time
+from collections.abc import Mapping
 from importlib.metadata import version
 from typing import Any
 
@@ -63,8 +64,10 @@ class NodeLink:
         self.is_draining = found.json()["draining"]
         psutil.cpu_percent(None)  # from now on
 
-    async def beat(self, counters: dict[str, float]) -> dict[str, Any]:
-        """Say how busy this machine is; what the node has to do."""
+    async def beat(
+        self, counters: dict[str, float], jobs: Mapping[str, tuple[int, int]]
+    ) -> dict[str, Any]:
+        """Say how busy this machine is, and how far its jobs are; what the node has to do."""
         number = next(self._beats)
         load = {"cpu": 0.0, "ram": 0.0, "gpu": 0.0}
         if not self._is_supposed_idle:
@@ -79,6 +82,7 @@ class NodeLink:
             "sequence": number,
             "sent_s": time.time(),
             "counters": counters,
+            "jobs": dict(jobs),
         }
         answer = await self.ask("POST", f"/nodes/{self.name}/beat", json=body)
         told: dict[str, Any] = answer.json()

@@ -51,6 +51,7 @@ class LiveNode:
     unheard: set[str] = field(default_factory=set)  # of these, since its last beat
     zones_of: list[str] = field(default_factory=list)  # sessions, a time for each part that it has
     counters: dict[str, float] = field(default_factory=dict)  # that it tells for /metrics
+    jobs: dict[str, list[int]] = field(default_factory=dict)  # steps done, and to be, of its jobs
     candidate: Candidate | None = None  # as `select` takes it; None: to be made
 
     def refresh(self) -> None:

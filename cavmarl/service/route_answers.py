@@ -106,11 +106,13 @@ def node_answer(service: Service, node: NodeRecord) -> answers.NodeStatus:
     )
 
 
-def session_answer(session: SessionRecord) -> answers.Session:
+def session_answer(service: Service, session: SessionRecord) -> answers.Session:
     """A session or a job, without what only its node needs."""
     found = asdict(session)
     del found["saved_blob"], found["owners"]
-    return answers.Session(**found)
+    live = service.broker.live.get(session.node or "")
+    progress = None if live is None else live.jobs.get(session.id)
+    return answers.Session(**found, progress=progress)
 
 
 def event_answer(line: LogEvent) -> answers.EventLine:

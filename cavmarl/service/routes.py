@@ -175,13 +175,13 @@ async def list_sessions(identity: Readers, service: TheService) -> answers.Sessi
     """Sessions and jobs: a client's own, or all."""
     found = service.broker.log.state.sessions.values()
     own = [one for one in found if identity.role != "client" or one.owner == identity.id]
-    return answers.SessionList(sessions=list(map(session_answer, own)))
+    return answers.SessionList(sessions=[session_answer(service, one) for one in own])
 
 
 @worlds.get("/sessions/{number}")
 async def get_session(identity: Readers, service: TheService, number: SessionId) -> answers.Session:
     """A session or a job."""
-    return session_answer(service.broker.session(identity, number))
+    return session_answer(service, service.broker.session(identity, number))
 
 
 @worlds.delete("/sessions/{number}")
@@ -189,7 +189,7 @@ async def close_session(
     identity: Clients, service: TheService, number: SessionId
 ) -> answers.Session:
     """End a session or a job."""
-    return session_answer(service.broker.close(identity, number))
+    return session_answer(service, service.broker.close(identity, number))
 
 
 @worlds.get(
@@ -237,7 +237,7 @@ async def submit(
         wait_s=body.wait_s,
         key=key,
     )
-    return session_answer(session)
+    return session_answer(service, session)
 
 
 @worlds.post("/jobs/{number}/outcome")
@@ -247,7 +247,7 @@ async def finish(
     """A node has ended a job."""
     session = service.broker.hosted(identity, number)
     service.broker.finish(session, body.status, body.message)
-    return session_answer(session)
+    return session_answer(service, session)
 
 
 @worlds.put("/jobs/{number}/results/{name}", status_code=204, openapi_extra=CONTENT)

@@ -30,7 +30,11 @@ def test_a_clock_on_each_zone_changes_nothing(simulation: Simulation) -> None:
 
 
 def test_every_zone_takes_some_time(simulation: Simulation) -> None:
-    found = measure_shards(simulation, 2, 1, steps=10, before=2)
+    told: list[tuple[int, int]] = []
+    found = measure_shards(
+        simulation, 2, 1, steps=10, before=2, told=lambda *counts: told.append(counts)
+    )
+    assert told == [(done, 24) for done in range(1, 25)]
     costs = found.costs
     assert [(shard.world, shard.zone) for shard in costs] == [
         (world, zone) for world in (0, 1) for zone in range(4)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from pydantic import ValidationError
@@ -12,8 +14,10 @@ from pydantic import ValidationError
 from cavmarl.core.errors import ServiceError
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.event_store import EventStore
+from cavmarl.service.node_host import run_evaluation
 from cavmarl.service.node_selection import NoNodeError
 from cavmarl.service.rate_limit import RateLimit
+from cavmarl.service.route_answers import session_answer
 from tests.support.fleet import Fleet
 
 
@@ -42,6 +46,36 @@ def test_a_node_that_misses_its_beats_is_down_and_comes_back_with_the_next(fleet
     fleet.beat("a")
     assert fleet.open().node == "a"
     assert fleet.kinds()[-4:-2] == ["node.down", "node.up"]
+
+
+def test_nodes_tell_how_far_their_jobs_are(fleet: Fleet) -> None:
+    fleet.join("a")
+    job = fleet.open(job={"policies": ["idm"], "episodes": 1, "repeats": 1})
+    service = SimpleNamespace(broker=fleet.broker)
+    assert session_answer(service, job).progress is None
+    told = fleet.beat_of("a", jobs={job.id: [30, 400]})
+    fleet.broker.beat(fleet.nodes, "a", told)
+    assert session_answer(service, job).progress == [30, 400]
+    with pytest.raises(ValidationError):
+        fleet.beat_of("a", jobs={job.id: [30]})
+
+
+def test_the_steps_of_a_job_are_those_of_all_its_runs_and_drivers(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def drives(*_: Any, progress: Any, **more: Any) -> None:
+        for policy in ("idm", "random") * more["repeats"]:
+            for step in (1, 2):
+                progress(policy, step, 4)
+
+    told: list[tuple[int, int]] = []
+    monkeypatch.setattr("cavmarl.service.node_host.evaluate", drives)
+    monkeypatch.setattr("cavmarl.service.node_host.TELL_S", 0.0)
+    world = {"environment": "ring", "seed": 1, "overrides": {}}
+    world |= dict.fromkeys(("agents", "background", "max_cycles"))
+    job = {"policies": ["idm", "random"], "episodes": 1, "repeats": 2}
+    run_evaluation(world, job, tmp_path, lambda *counts: told.append(counts))
+    assert told == [(done, 16) for done in (1, 2, 5, 6, 9, 10, 13, 14)]
 
 
 def test_a_state_that_is_too_old_is_not_relied_upon(fleet: Fleet) -> None:

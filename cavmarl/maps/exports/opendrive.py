@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from xml.etree.ElementTree import Element, tostring
 
@@ -19,11 +19,17 @@ from cavmarl.maps.provenance import read_provenance
 from cavmarl.roads.sumo_net.reader import read_network
 
 _HEAD = b'<?xml version="1.0" encoding="UTF-8"?>\n'
+STAGES = ("reading", "netconvert writes", "ASAM's rules", "netconvert reads", "comparison")
 _MINOR = "8"  # OpenDRIVE 1.8, whose rules ASAM's checker asks for
 
 
-def write_opendrive(source: Path, target: Path, timeout_s: float | None = None) -> RoundTrip:
-    """Write a SUMO network as OpenDRIVE, and read that back.
+def write_opendrive(
+    source: Path,
+    target: Path,
+    timeout_s: float | None = None,
+    told: Callable[[str], None] = lambda stage: None,
+) -> RoundTrip:
+    """Write a SUMO network as OpenDRIVE, and read that back; `told` which of `STAGES` begins.
 
     The target is written where what came back differs, too: the result says so.
 
@@ -31,17 +37,22 @@ def write_opendrive(source: Path, target: Path, timeout_s: float | None = None) 
         MapError: netconvert refuses the network or its own export, or the target cannot be written.
         MissingExtraError: netconvert is not installed.
     """
+    told(STAGES[0])
     network = read_network(source)
     types = str(sumo_home() / "data" / "typemap" / "opendriveNetconvert.typ.xml")
     try:
         with tempfile.TemporaryDirectory(dir=target.parent, prefix=".build-") as folder:
             draft, back = Path(folder) / "map.xodr", Path(folder) / "back.net.xml"
             words = ["--sumo-net-file", str(source), "--opendrive-output", str(draft)]
+            told(STAGES[1])
             run_netconvert(words, source, timeout_s)
+            told(STAGES[2])
             root = _mended(draft, read_provenance(source))
             draft.write_bytes(_HEAD + tostring(root, "utf-8") + b"\n")
             words = ["--opendrive-files", str(draft), "-t", types, "-o", str(back)]
+            told(STAGES[3])
             run_netconvert([*words, *OPENDRIVE_OPTIONS], target, timeout_s)
+            told(STAGES[4])
             trip = RoundTrip(
                 roads_of_map(network), roads_of_file(root), roads_of_map(read_network(back))
             )

@@ -1,0 +1,36 @@
+"""Bars say what is done, how fast, and how long it takes yet; where nobody sees them, nothing."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+from rich.console import Console
+
+from cavmarl.core.progress import counting, in_stages
+
+
+def test_a_bar_names_the_stage_and_the_time_left() -> None:
+    console = Console(file=io.StringIO(), force_terminal=True, width=120, color_system=None)
+    with in_stages(console, ["reading", "netconvert", "checks"]) as told:
+        told("reading")
+        told("checks")
+    shown = console.file.getvalue()
+    assert "checks" in shown
+    assert "2/3" in shown
+    assert "left" in shown
+
+
+def test_a_stage_that_is_none_is_an_error() -> None:
+    with in_stages(Console(file=io.StringIO()), ["reading"]) as told:
+        with pytest.raises(ValueError, match="writing"):
+            told("writing")
+
+
+def test_without_a_terminal_nothing_is_written() -> None:
+    console = Console(file=io.StringIO(), width=120)
+    with in_stages(console, ["reading", "checks"]) as told:
+        told("checks")
+    with counting(console, "steps") as count:
+        count(1, 2)
+    assert console.file.getvalue() == ""
