@@ -118,9 +118,10 @@ class ZonesConfig(Section, key="zones"):
         max_deferred_ticks: ticks for which a vehicle that has crossed stays with its old zone, if
             the new one does not acknowledge it.
         policy: what follows: `force`: the change is forced at once; `extend`: after `grace_ticks`
-            more. `hold` (it waits at the border) and `reroute` (it turns away) are refused: a
-            divided world would not be the undivided one any more.
-        grace_ticks: that `extend` grants.
+            more. With `hold` a vehicle is stopped before the border if the zone behind it has not
+            acknowledged it for more than `grace_ticks`; a world in which that happens is not the
+            undivided one any more. `reroute` (it turns away) is refused.
+        grace_ticks: that `extend` grants behind a border, and `hold` before it.
         backoff_ticks: for which a zone that has refused a vehicle is not asked again.
         halo_m: how far zones see over their borders; default: as far as exactness needs, and less
             is refused.
@@ -165,14 +166,14 @@ class ZonesConfig(Section, key="zones"):
         )
         self.need(
             "policy",
-            self.policy not in ("hold", "reroute"),
-            "would change what vehicles do, and then the divided world is not the undivided one, "
-            "bit for bit; use extend, which lets them drive on, or force",
+            self.policy != "reroute",
+            "is not built; use hold, which stops vehicles before the border, extend, which lets "
+            "them drive on, or force",
         )
         self.need(
             "grace_ticks",
-            (self.policy == "extend") == (self.grace_ticks > 0),
-            "must be 1 or more with zones.policy = extend, and 0 with force",
+            (self.policy == "force") == (self.grace_ticks == 0),
+            "must be 1 or more with zones.policy = extend and hold, and 0 with force",
         )
         self.need(
             "repartition_steps",
@@ -180,6 +181,14 @@ class ZonesConfig(Section, key="zones"):
             "vehicles that change their zone must not be late: leave out zones.faults and "
             "zones.reproducers, or let zones stay",
         )
+
+    @property
+    def holds(self) -> bool:
+        """Whether vehicles are kept from borders whose other side does not answer.
+
+        A divided world in which that happens is not the undivided one.
+        """
+        return self.policy in ("hold", "reroute")
 
 
 @dataclass(frozen=True)

@@ -37,6 +37,7 @@ def describe_world(
         "kernels": kernel_cache_dir().name,
         "zones": partition.count,
         "zones_content_sha256": partition.content_hash,
+        "equals_undivided": not (partition.count > 1 and config.zones.holds),
         "channel": asdict(config.v2x.channel)
         if config.v2x.enabled
         else "none: there are no messages between vehicles",

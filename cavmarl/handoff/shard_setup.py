@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from cavmarl.config.env import EnvConfig, ZonesConfig
+from cavmarl.core.errors import ConfigError
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.memory import Zeros
 from cavmarl.core.records.arrays import Outputs
@@ -43,9 +44,15 @@ def divide(
     """One shard a zone, and the division that knows them all.
 
     Raises:
-        ConfigError: `zones.halo_m` is less than exactness needs.
+        ConfigError: `zones.halo_m` is less than exactness needs, or SUMO moves vehicles that a
+            policy would have to hold.
     """
     settings, dt = config.zones, config.clock.sim_dt_s
+    if settings.holds and traffic.sumo is not None:
+        raise ConfigError(
+            f"zones.policy = {settings.policy!r}: vehicles that SUMO moves cannot be held before a "
+            "border; use force or extend, or a demand that is driven here"
+        )
     radius_m = largest_radius_m(traffic.travel.types)
     sensing_m = max(
         terms_reach_m(config.terms),

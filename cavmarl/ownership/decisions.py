@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 
 from cavmarl.core.errors import ProtocolError
 from cavmarl.ownership.limits import Limits
-from cavmarl.ownership.messages import Birth, Deferral, Switch
+from cavmarl.ownership.messages import Birth, BorderWait, Deferral, Switch
 from cavmarl.ownership.readiness import Readiness
 from cavmarl.ownership.safeguards import Safeguards
 from cavmarl.ownership.table import Table
@@ -53,6 +53,11 @@ def refused(vehicle: int, source: int, target: int, near: Iterable[int]) -> str:
     )
 
 
+def _check_exist(table: Table, vehicle: int, zone: int) -> None:
+    if vehicle not in table.owners or zone not in table.hosts:
+        raise ProtocolError(f"vehicle {vehicle} in zone {zone}: one of them does not exist")
+
+
 class Decisions:
     """Decides for each vehicle outside its owner's zone: switch, wait, or be forced."""
 
@@ -80,8 +85,7 @@ class Decisions:
         """
         switches, deferred, teleports = [], [], []
         for vehicle, zone in sorted(movers):
-            if vehicle not in table.owners or zone not in table.hosts:
-                raise ProtocolError(f"vehicle {vehicle} in zone {zone}: one of them does not exist")
+            _check_exist(table, vehicle, zone)
             source, epoch = table.owners[vehicle]
             target = zone
             if not self._safeguards.target_by_position:
@@ -100,6 +104,20 @@ class Decisions:
                 switches.append(Switch(vehicle, source, target, epoch + 1, True))
         gone = {switch.vehicle for switch in switches}
         return tuple(switches), tuple(deferred), tuple(v for v in teleports if v in gone)
+
+    def waits(self, table: Table, approaching: Iterable[tuple[int, int]]) -> tuple[BorderWait, ...]:
+        """Which of (vehicle, zone that it would enter) wait for an acknowledgement, and how long.
+
+        Raises:
+            ProtocolError: a vehicle or a zone does not exist.
+        """
+        waiting = []
+        for vehicle, zone in sorted(approaching):
+            _check_exist(table, vehicle, zone)
+            if not self._ready(table, vehicle, zone, table.owners[vehicle][1]):
+                ticks = table.waiting.get(vehicle, 0) + 1
+                waiting.append(BorderWait(vehicle, ticks, ticks > self._limits.grace))
+        return tuple(waiting)
 
     def check_births(self, table: Table, births: Iterable[Birth]) -> None:
         """See that new vehicles are new."""

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from cavmarl.core.errors import JournalError, LostTickError, ProtocolError
 from cavmarl.ownership.decisions import CommittedStates, Decisions, Neighbours
 from cavmarl.ownership.ledger import world_digest
-from cavmarl.ownership.limits import DeadlinePolicy, Limits
+from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import (
     Ack,
     Begin,
@@ -166,6 +166,8 @@ class Directory:
         births: Iterable[Birth] = (),
         inputs: bytes = b"",  # digest of the actions
         payloads: Mapping[int, bytes] | None = None,  # zone → what rides with its STEP
+        # (vehicle, zone that it would enter) for vehicles before a border that the policy can hold
+        approaching: Iterable[tuple[int, int]] = (),
     ) -> Output:
         """Decide the way to the next tick: BEGIN, then a STEP for every zone."""
         table = self.table
@@ -174,9 +176,9 @@ class Directory:
         new = tuple(sorted(births))
         self.check_births(new)
         switches, deferred, teleports = self._decisions.switches(table, movers)
-        begun = self._logged(
-            Begin(table.episode, table.tick + 1, switches, deferred, new, inputs, teleports)
-        )
+        waiting = self._decisions.waits(table, approaching)
+        decided = (switches, deferred, new, inputs, teleports, waiting)
+        begun = self._logged(Begin(table.episode, table.tick + 1, *decided))
         records = begun.records if self._safeguards.log_before_send else ()
         return Output(records, self.resend(payloads=payloads or {}).messages)
 
@@ -216,11 +218,9 @@ class Directory:
 
     def overdue(self) -> tuple[int, ...]:
         """Vehicles that the policy HOLD or REROUTE asks the runtime to act upon in this tick."""
-        acts = self._limits.policy in (DeadlinePolicy.HOLD, DeadlinePolicy.REROUTE)
-        if self.table.plan is None or not acts:
+        if self.table.plan is None:
             return ()
-        deferred, bound = self.table.plan.record.deferred, self._limits.deferral
-        return tuple(vehicle for vehicle, ticks in deferred if ticks > bound)
+        return tuple(entry.vehicle for entry in self.table.plan.record.waiting if entry.held)
 
     def commit(
         self,

@@ -11,10 +11,12 @@ from cavmarl.core.errors import ConfigError
 class DeadlinePolicy(StrEnum):
     """What becomes of a vehicle whose target has not confirmed after D ticks.
 
-    FORCE hands it over with its state attached. The others leave it with the source for `grace`
-    more ticks first; HOLD and REROUTE also name it in the plan, so that the runtime can make it
-    wait at the border or turn away. These two change what vehicles do, so the divided world then
-    equals the undivided one only as long as no deadline passes.
+    FORCE hands it over with its state attached. EXTEND leaves it with the source for `grace` more
+    ticks first. HOLD and REROUTE act earlier: a vehicle that is still before the border is named in
+    the plan once its target has not confirmed for more than `grace` ticks, so that the runtime can
+    make it wait there or turn away; one that has crossed all the same is forced after D ticks.
+    These two change what vehicles do, so the divided world then equals the undivided one only as
+    long as none is named.
     """
 
     FORCE = "force"
@@ -34,7 +36,7 @@ class Limits:
     backoff: int = 4  # ticks without an offer to a target that refused
     capacity: int = 100_000  # replicas that one host keeps
     policy: DeadlinePolicy = DeadlinePolicy.FORCE  # what happens after the deadline
-    grace: int = 0  # further ticks that a policy other than FORCE grants
+    grace: int = 0  # ticks that a policy other than FORCE grants, behind the border or before it
     schema: int = 1  # version of the vehicles' states
 
     def __post_init__(self) -> None:
@@ -50,6 +52,11 @@ class Limits:
             )
 
     @property
+    def holds(self) -> bool:
+        """Whether vehicles are kept from a border whose other side does not answer."""
+        return self.policy in (DeadlinePolicy.HOLD, DeadlinePolicy.REROUTE)
+
+    @property
     def longest_deferral(self) -> int:
         """Ticks that a vehicle may be with a zone that does not contain it."""
-        return self.deferral + self.grace
+        return self.deferral if self.holds else self.deferral + self.grace

@@ -292,7 +292,6 @@ def test_zones_are_laid_out_by_name_or_by_a_file(tmp_path: Path, layout: str) ->
         ("grace_ticks", -1),
         ("grace_ticks", 1),
         ("policy", "wait"),
-        ("policy", "hold"),
         ("policy", "reroute"),
         ("backoff_ticks", 1001),
         ("halo_m", -1.0),
@@ -307,13 +306,15 @@ def test_settings_of_zones_are_checked(key: str, value: object) -> None:
 
 
 def test_a_policy_has_the_grace_that_it_needs() -> None:
-    grace = "must be 1 or more with zones.policy = extend, and 0 with force"
+    grace = "must be 1 or more with zones.policy = extend and hold, and 0 with force"
     with pytest.raises(ConfigError, match=rf"zones\.grace_ticks = 0: {grace}"):
         load_config("ring", overrides={"zones.policy": "extend"})
-    with pytest.raises(ConfigError, match=r"zones\.policy = 'hold': .* use extend"):
-        load_config("ring", overrides={"zones.policy": "hold", "zones.grace_ticks": 3})
-    extended = {"zones.policy": "extend", "zones.grace_ticks": 3}
-    assert load_config("ring", overrides=extended)[0].zones.grace_ticks == 3
+    with pytest.raises(ConfigError, match=r"zones\.policy = 'reroute': is not built; use hold"):
+        load_config("ring", overrides={"zones.policy": "reroute", "zones.grace_ticks": 3})
+    for policy, holds in (("extend", False), ("hold", True)):
+        patient = {"zones.policy": policy, "zones.grace_ticks": 3}
+        zones = load_config("ring", overrides=patient)[0].zones
+        assert (zones.grace_ticks, zones.holds) == (3, holds)
 
 
 def test_signal_programs_are_files_beside_the_map_and_choices(tmp_path: Path) -> None:

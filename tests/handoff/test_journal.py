@@ -271,7 +271,8 @@ def test_a_summary_counts_what_was_committed(written: Path) -> None:
     assert summary.to_dict() == {
         "run": bytes(range(16)).hex(), "lines": len(eventful().log), "episodes": 1,
         "ticks": 6, "first_tick": 1, "last_tick": 6, "births": 2, "removals": 1, "switches": 2,
-        "forced": 1, "deferrals": 2, "hosts": 3, "fences": 1, "unfinished": -1, "torn": "",
+        "forced": 1, "deferrals": 2, "held": 0, "hosts": 3, "fences": 1, "unfinished": -1,
+        "torn": "",
     }  # fmt: skip
     assert table.owners == {7: (1, 1)}
     assert table.hosts[1] == (1, 2)
@@ -351,6 +352,7 @@ MEANINGS = {
     "switches": "hand-offs, with the new epoch",
     "deferred": "vehicles that stay, and for how many ticks in a row",
     "births": "vehicles that enter, at epoch 0, with their state (hex)",
+    "waiting": "vehicles before a border, for how many ticks in a row, and whether held there",
     "zone": "number of the zone",
     "incarnation": "how often the zone has had a new process",
     "worker": "number of the process",

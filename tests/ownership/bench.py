@@ -67,11 +67,14 @@ class Bench:
         return self.host(zone)
 
     def begin(
-        self, movers: Iterable[tuple[int, int]] = (), births: Iterable[tuple[int, int]] = ()
+        self,
+        movers: Iterable[tuple[int, int]] = (),
+        births: Iterable[tuple[int, int]] = (),
+        approaching: Iterable[tuple[int, int]] = (),
     ) -> tuple[Step, ...]:
-        """BEGIN with vehicles in zones, and new vehicles in zones; the STEPs."""
+        """BEGIN with vehicles in zones, new ones in zones, and some before a zone; the STEPs."""
         new = [Birth(vehicle, zone, self.state(vehicle)) for vehicle, zone in births]
-        output = self.note(self.directory.begin(movers, new))
+        output = self.note(self.directory.begin(movers, new, approaching=approaching))
         return tuple(message for message in output.messages if isinstance(message, Step))
 
     def give(self, message: Message, removed: Sequence[int] = ()) -> tuple[Message, ...]:

@@ -78,6 +78,7 @@ FEATURES: dict[str, Callable[[Path], Keywords]] = {
     "invariant checks": _with(zones__check_invariants=True),
     "repartitions": _with(zones__repartition_steps=3),
     "planned faults": _faults,
+    "holding before borders": _with(zones__policy="hold", zones__grace_ticks=3),
 }
 PLACES: dict[str, Keywords] = {
     "zones": {"zones": 3},
@@ -88,7 +89,7 @@ PLACES: dict[str, Keywords] = {
 # What an undivided world, beside which others are run, does not know.
 ONLY_DIVIDED = (
     "zones.faults", "zones.journal", "zones.check_invariants", "zones.repartition_steps",
-    "workers.balance_steps",
+    "workers.balance_steps", "zones.policy", "zones.grace_ticks",
 )  # fmt: skip
 OF_ONE_WORLD = "of one world over"
 NOT_OVER_NODES = "worlds over nodes do not have it"
@@ -99,6 +100,7 @@ REFUSED = {
     ("sensor workers", "nodes"): NOT_OVER_NODES,
     ("repartitions", "nodes"): NOT_OVER_NODES,
     ("planned faults", "nodes"): NOT_OVER_NODES,
+    ("holding before borders", "nodes"): NOT_OVER_NODES,
 }
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import ZonesConfig
 from cavmarl.core.errors import ConfigError
+from cavmarl.handoff.border_holds import BorderHolds
 from cavmarl.handoff.coordinator.coordinator import Coordinator
 from cavmarl.handoff.coordinator.coordinators import Coordinators, RowStates
 from cavmarl.handoff.coordinator.handoff_log import HandoffLog
@@ -106,7 +107,8 @@ def make_coordinators(
     limits = limits_of(settings, division.codec.schema)
     faults, deaths = check_faults(settings, division.count, division.num_worlds)
     crashes = Crashes(faults) if faults is not None and deaths else None
-    states = [RowStates(division, w) for w in range(division.num_worlds)]
+    holds = BorderHolds(shards, division, limits.grace) if limits.holds else None
+    states = [RowStates(division, w, holds) for w in range(division.num_worlds)]
     transfers = tuple(TransferLog(limits.lifetime, known.borders) for known in states)
     coordinators = [
         _referee(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from hashlib import blake2b
 from typing import Protocol
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import ProtocolError
 from cavmarl.core.records.arrays import Gate
+from cavmarl.handoff.border_holds import Ahead, BorderHolds
 from cavmarl.handoff.coordinator.coordinator import ArrivingVehicle, Coordinator, Near
 from cavmarl.handoff.coordinator.invariant_monitor import InvariantMonitor
 from cavmarl.handoff.coordinator.row_digests import RowDigests
@@ -61,10 +62,13 @@ class NearBorders:
 class RowStates:
     """States of one world's vehicles at the committed tick, read from the rows of their owners."""
 
-    def __init__(self, division: Division, world: int) -> None:
+    def __init__(self, division: Division, world: int, holds: BorderHolds | None = None) -> None:
         self.borders = NearBorders(division, world)  # vehicles near a border when the tick began
+        # of them those before it that can be held there; none without a policy that holds
+        self.ahead: Sequence[Ahead] = ()
         self._division = division
         self._world = world
+        self._holds = holds
         self._known: dict[int, bytes] = {}
 
     def forget(self) -> None:
@@ -73,8 +77,17 @@ class RowStates:
     def look(self, everybody: bool) -> list[Near]:
         """Vehicles near a border; see `Division.near`."""
         found = self._division.near(self._world, everybody)
+        if self._holds is not None:
+            self.ahead = self._holds.ahead(self._world)
+            told = {(entry.vehicle, entry.target) for entry in found}
+            found += [e.near() for e in self.ahead if (e.vehicle, e.target) not in told]
         self.borders.near = found
         return found
+
+    def hold(self, vehicles: Collection[int]) -> None:
+        """Let these vehicles stop before the border in the tick on its way, and no others."""
+        if self._holds is not None:
+            self._holds.hold(self._world, self.ahead, vehicles)
 
     def change(self, entries: Sequence[ArrivingVehicle]) -> None:
         """Let rows change hands, of vehicles that `look` has found."""

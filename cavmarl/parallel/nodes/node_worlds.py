@@ -244,6 +244,11 @@ def check_nodes(world: World, nodes: int) -> None:
         ),
         "zones.faults": (config.zones.faults, PLANNED),
         "zones.reproducers": (config.zones.reproducers, PLANNED),
+        "zones.policy": (
+            config.zones.policy if config.zones.holds else "",
+            "a tick waits for all acknowledgements, and a node that does not answer is replaced, "
+            "so no vehicle has a cause to wait; use force or extend",
+        ),
         "zones.repartition_steps": (
             config.zones.repartition_steps,
             "to cut zones by their vehicles takes the places of all of them, which no process has; "
