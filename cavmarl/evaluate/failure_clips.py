@@ -11,10 +11,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.config.env import EnvConfig
 from cavmarl.engine.world_frame import WorldFrame
+from cavmarl.sensors.sensed_shapes import Shape, observed_shapes
 
 CLIP_S = 10.0
 REACH_M = 70.0  # from where the trip ended: what a clip shows
+MOST_KEPT_BYTES = 256 << 20  # of observations
+NO_SENSORS = "observes nothing that can be drawn"
+TOO_MANY = f"observations of ten seconds are more than {MOST_KEPT_BYTES >> 20} MB and were not kept"
+_DRAWN = ("rays", "links")  # kinds of shapes
 
 # Worst first.
 FATES = ("collision", "off_road", "red_light", "wrong_way", "stood", "blocked", "out_of_time")
@@ -36,16 +42,27 @@ class FailureClips:
 
     Args:
         most: how many failures are kept.
-        step_s: seconds a step.
+        config: of the worlds.
         about: what stands in each trip: policy, run, seed.
+        observations: (W, A, D) of their agents, as the last step left them.
     """
 
-    def __init__(self, most: int, step_s: float, about: Mapping[str, Any]) -> None:
+    def __init__(
+        self,
+        most: int,
+        config: EnvConfig,
+        about: Mapping[str, Any],
+        observations: NDArray[np.float32],
+    ) -> None:
         self._most = most
+        self._config = config
         self._about = dict(about)
-        self._step_s = step_s
+        self._step_s = step_s = config.clock.ctrl_dt_s
         self._length = max(2, math.ceil(CLIP_S / step_s) + 1)
-        self._recent: dict[int, deque[WorldFrame]] = {}
+        self._observations = observations
+        self._keeps = self._length * observations.nbytes <= MOST_KEPT_BYTES
+        # (frame, observations (A, D) if they are kept) of each world
+        self._recent: dict[int, deque[tuple[WorldFrame, NDArray[np.float32] | None]]] = {}
         self.failures: list[Failure] = []
 
     def begin(self) -> None:
@@ -56,7 +73,7 @@ class FailureClips:
         """Take the present moment of worlds."""
         for frame in frames:
             kept = self._recent.setdefault(frame.world, deque(maxlen=self._length))
-            kept.append(frame)
+            kept.append((frame, self._observations[frame.world].copy() if self._keeps else None))
 
     def take(self, trips: NDArray[np.void], first: int) -> None:
         """Look at trips that have ended in the step after the last frames.
@@ -72,8 +89,14 @@ class FailureClips:
         if len(self.failures) > 4 * self._most:
             self.failures = worst(self.failures, self._most)
 
-    def _failure(self, trip: np.void, recent: Sequence[WorldFrame], first: int) -> Failure:
-        last = recent[-1]
+    def _failure(
+        self,
+        trip: np.void,
+        recent: Sequence[tuple[WorldFrame, NDArray[np.float32] | None]],
+        first: int,
+    ) -> Failure:
+        frames = [frame for frame, _ in recent]
+        last = frames[-1]
         mine = last.vehicles[last.vehicles["agent"] == trip["agent"]]
         row = mine[0] if len(mine) else None
         speed = float(trip["mean_speed_mps"] if row is None else row["speed"])
@@ -95,7 +118,27 @@ class FailureClips:
             "step_s": self._step_s,
         }
         severity = float(trip["delay_s"]) if by_delay else abs(speed)
-        return Failure(cause, severity, told, clip_of(recent, (center[0], center[1])))
+        clip = clip_of(frames, (center[0], center[1]))
+        sensed = [self._sensed(*one, told["agent"], told["vehicle"]) for one in recent]
+        note = "" if any(sensed) else NO_SENSORS if self._keeps else TOO_MANY
+        clip |= {"sensors": sensed if any(sensed) else [], "sensors_note": note}
+        return Failure(cause, severity, told, clip)
+
+    def _sensed(
+        self, frame: WorldFrame, kept: NDArray[np.float32] | None, agent: int, vehicle: int
+    ) -> list[Shape]:
+        """What the agent observed at a moment, if it was in this vehicle: rays and others."""
+        mine = frame.vehicles[frame.vehicles["id"] == vehicle]
+        if kept is None or not len(mine) or int(mine["agent"][0]) != agent:
+            return []
+        shapes = observed_shapes(self._config, kept[agent])
+        return [_rounded(shape) for shape in shapes if shape["kind"] in _DRAWN]
+
+
+def _rounded(shape: Shape) -> Shape:
+    """The same with places to the decimetre: a page has thousands."""
+    names = {"rays": ("from", "ends"), "links": ("points",)}[shape["kind"]]
+    return shape | {name: [round(value, 1) for value in shape[name]] for name in names}
 
 
 def cause_of(trip: np.void) -> str:

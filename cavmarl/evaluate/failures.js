@@ -38,6 +38,8 @@ function list() {
 
 function choose(f) {
   chosen = f; at = 0; playing = true;
+  $("sensors-note").textContent = f.clip.sensors_note && `Sensors: ${f.policy} ${f.clip.sensors_note}.`;
+  $("sensors").disabled = Boolean(f.clip.sensors_note);
   $("seek").max = f.clip.frames.length - 1;
   $("told").textContent = `${f.cause.replaceAll("_", " ")}: agent ${f.agent} (vehicle ${f.vehicle}), ${f.policy}, ` +
     `run ${f.run}, episode ${f.episode}, seed ${f.seed}; it began at ${f.began_s} s and lasted ${f.duration_s} s`;
@@ -79,11 +81,32 @@ function draw() {
     if (lights & 4) pen.fillRect(-length * zoom / 2, width * zoom / 2 - 1, length * zoom, 2);
     pen.restore();
   }
+  const sensed = chosen.clip.sensors[Math.floor(at)] ?? [];
   const mine = rows.find((row) => row[0] === chosen.vehicle);
+  if (mine && $("sensors").checked) for (const shape of sensed) sense(shape, mine, px, py);
   $("now").textContent = `${((Math.floor(at) - chosen.clip.frames.length + 1) * chosen.step_s).toFixed(1)} s` +
     (mine ? `, ${mine[4]} m/s` : "");
   $("seek").value = Math.floor(at);
   canvas.dataset.tick = tick; canvas.dataset.shown = rows.length;
+  canvas.dataset.sensed = sensed.map((shape) => shape.name).join(" ");
+}
+
+// Rays of a sensor to what they met, or links to vehicles that were seen.
+function sense(shape, [, x, y, heading], px, py) {
+  const turn = shape.axes === "map" ? 0 : heading, cos = Math.cos(turn), sin = Math.sin(turn);
+  const at = (ax, ay) => [px(x + ax * cos - ay * sin), py(y + ax * sin + ay * cos)];
+  const ends = shape.ends ?? shape.points, from = shape.from ?? [0, 0];
+  pen.strokeStyle = pen.fillStyle = color(shape.kind === "rays" ? "--ray" : "--link"); pen.lineWidth = 1;
+  pen.beginPath();
+  for (let k = 0; k < ends.length; k += 2) {
+    pen.moveTo(...at(...from)); pen.lineTo(...at(ends[k], ends[k + 1]));
+  }
+  pen.stroke();
+  for (let k = 0; k < ends.length; k += 2) {
+    if (shape.hits && !shape.hits[k / 2]) continue;
+    const [hx, hy] = at(ends[k], ends[k + 1]);
+    pen.fillRect(hx - 2, hy - 2, 4, 4);
+  }
 }
 
 function run(now) {
@@ -106,6 +129,7 @@ for (const head of document.querySelectorAll("th button")) {
 }
 $("play").onclick = () => { playing = !playing; $("play").textContent = playing ? "Pause" : "Play"; };
 $("seek").oninput = () => { playing = false; $("play").textContent = "Play"; at = +$("seek").value; draw(); };
+$("sensors").onchange = draw;
 onresize = draw;
 const first = list();
 if (first.length) choose(first[0]);

@@ -45,7 +45,8 @@ class RunWatch:
         self._writer = None
         if record is not None:
             self._writer = WorldRecorder(record, vec.worlds, vec.simulation, **about)
-        self._clips = FailureClips(failures, vec.step_s, about) if failures else None
+        observations = vec.worlds.arrays.observations
+        self._clips = FailureClips(failures, vec.config, about, observations) if failures else None
 
     @property
     def failures(self) -> Sequence[Failure]:

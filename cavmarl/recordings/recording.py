@@ -62,7 +62,7 @@ class Recording:
         }
         self.worlds = sorted(self._parts)
         self._kept: tuple[Path | None, list[RecordedFrame]] = (None, [])
-        self._kept_extra: tuple[Path | None, Any] = (None, None)
+        self._kept_extras: dict[str, tuple[Path, Any]] = {}  # by table: its part that was read last
         self._indices: dict[int, NDArray[np.void]] = {}
 
     @classmethod
@@ -205,9 +205,11 @@ class Recording:
         """(episodes, rows) of the table of a part; the last one that was read is kept."""
         dtype = self._dtype(table)
         path = frames.parent.parent / table / frames.name
-        if self._kept_extra[0] != path:
-            self._kept_extra = path, extra_rows(path, read_table(path), dtype)
-        found: tuple[Any, NDArray[np.void]] = self._kept_extra[1]
+        kept = self._kept_extras.get(table)
+        if kept is None or kept[0] != path:
+            kept = path, extra_rows(path, read_table(path), dtype)
+            self._kept_extras[table] = kept
+        found: tuple[Any, NDArray[np.void]] = kept[1]
         return found
 
     def _paths(self, world: int) -> list[Path]:

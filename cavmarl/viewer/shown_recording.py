@@ -11,14 +11,10 @@ from cavmarl.core.errors import RecordingError
 from cavmarl.engine.world_frame import WorldFrame
 from cavmarl.recordings.recording import Recording
 from cavmarl.viewer.frame_publisher import ASKED, TIME_LINE, FramePublisher
+from cavmarl.viewer.recorded_sensors import RecordedSensors
 from cavmarl.viewer.run_clock import RunClock
 from cavmarl.viewer.stage import Stage, first_stage
-from cavmarl.viewer.vehicle_details import (
-    hello_of_map,
-    named_numbers,
-    named_terms,
-    vehicle_state,
-)
+from cavmarl.viewer.vehicle_details import hello_of_map, vehicle_state
 
 MOST_TOLD = 500  # events of an episode
 QUIET = frozenset({"arrived", "transferred"})  # left out first where there are more
@@ -42,6 +38,7 @@ class ShownRecording:
         self._recording = recording
         self._world, self._episode = world, episode
         self._ticks = recording.ticks(world, episode)
+        self._sensors = RecordedSensors(recording, world, episode)
         self._agents = list(stage.hello["agents"])
         self._audience = stage.audience
         self._place = 0
@@ -90,12 +87,8 @@ class ShownRecording:
 
     def _tell(self, frame: WorldFrame, vehicle: int, sensors: bool) -> dict[str, Any]:
         found = vehicle_state(self._recording.network, self._agents, frame, vehicle)
-        head = self._recording.head
-        if found["here"] and "observations" in self._recording.extras:
-            rows = self._recording.extra_at("observations", frame.tick, self._world, self._episode)
-            for row in rows[rows["vehicle"] == vehicle]:
-                found["terms"] = named_terms(head.terms, row["terms"])
-                found["observation"] = named_numbers(head.features, row["values"])
+        if found["here"] and found["agent"] >= 0:
+            found |= self._sensors.of(frame.tick, vehicle, sensors)
         return found
 
     def _tell_all_events(self) -> None:

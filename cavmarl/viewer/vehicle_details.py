@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from cavmarl.config.env import EnvConfig
 from cavmarl.core.records.codes import (
     DRIVER_AGENT,
     DRIVER_BACKGROUND,
@@ -18,10 +19,11 @@ from cavmarl.engine.spaces import sensed_observation
 from cavmarl.engine.world_frame import WorldFrame
 from cavmarl.env.parallel import CavEnv
 from cavmarl.env.vector import CavVectorEnv
+from cavmarl.parallel.step_arrays import StepArrays
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.sensors.observed import feature_names
+from cavmarl.sensors.sensed_shapes import Shape, observed_shapes, sampled_shapes
 from cavmarl.viewer.map_geometry import map_origin
-from cavmarl.viewer.sensed_shapes import sensed_shapes
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
 DRIVERS = {
@@ -130,6 +132,16 @@ def vehicle_details(
     if sensors:
         found["shapes"] = sensed_shapes(env.config, arrays, world, agent)
     return found
+
+
+def sensed_shapes(config: EnvConfig, arrays: StepArrays, world: int, agent: int) -> list[Shape]:
+    """Those of an agent's observation, then those of its rig: of the last sample, if it has one."""
+    shapes = observed_shapes(config, arrays.observations[world, agent])
+    for name, settings in config.rig.items():
+        frames = arrays.frames[name]
+        if not frames.lost[world, agent, -1]:
+            shapes += sampled_shapes(name, settings, np.asarray(frames.data[world, agent, -1]))
+    return shapes
 
 
 def _observed(env: Shown, world: int, agent: int) -> list[list[Any]]:

@@ -20,7 +20,7 @@ from cavmarl.render.canvas import load_pygame
 from cavmarl.render.topdown import TopDownRenderer
 from cavmarl.sensors.observed import feature_names
 from cavmarl.sensors.registry import sensor_names
-from cavmarl.viewer.sensed_shapes import sensed_shapes
+from cavmarl.viewer.vehicle_details import sensed_shapes
 
 if TYPE_CHECKING:
     from pygame import Surface

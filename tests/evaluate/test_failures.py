@@ -6,21 +6,26 @@ import json
 import re
 import shutil
 import subprocess
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from cavmarl import RecordingError
+from cavmarl import RecordingError, RecordOptions, make_vec
+from cavmarl.config.env import EnvConfig
+from cavmarl.config.io import validate
 from cavmarl.config.registry import find_entry
-from cavmarl.evaluate import evaluate
+from cavmarl.evaluate import evaluate, failure_clips
 from cavmarl.evaluate.evaluation import load_tables
-from cavmarl.evaluate.failure_clips import CAUSES, REACH_M, Failure, cause_of, worst
+from cavmarl.evaluate.failure_clips import CAUSES, REACH_M, Failure, FailureClips, cause_of, worst
 from cavmarl.evaluate.failure_page import write_failures
 from cavmarl.evaluate.tables import TRIP
 from cavmarl.recordings.recording import Recording
 from cavmarl.roads.cache import load_network
+from cavmarl.sensors.sensed_shapes import observed_shapes
+from tests.support.chromium import chromium
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 
@@ -34,7 +39,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ["random_actions", "idm"],
         episodes=2,
         out=room / "out",
-        record=record,
+        record=RecordOptions(record, ("observations",)),
         failures=6,
     )
     return room
@@ -86,6 +91,40 @@ def test_a_clip_shows_what_the_recording_has(folder: Path) -> None:
             assert (x, y) == (round(by_id[vehicle]["x"], 2), round(by_id[vehicle]["y"], 2))
 
 
+def test_a_clip_has_what_the_vehicle_observed(folder: Path) -> None:
+    failure = told(folder / "out" / "failures.html")["failures"][0]
+    recording = Recording.open(folder / "recordings" / failure["policy"] / "run-0")
+    config = validate(EnvConfig, recording.manifest["world"]["config"], "manifest")
+    clip, seen = failure["clip"], 0
+    assert clip["sensors_note"] == ""
+    assert len(clip["sensors"]) == len(clip["frames"])
+    for (tick, _), shapes in zip(clip["frames"], clip["sensors"], strict=True):
+        rows = recording.extra_at("observations", tick, failure["episode"])
+        for values in rows["values"][rows["vehicle"] == failure["vehicle"]]:
+            drawn = [one for one in observed_shapes(config, values) if one["kind"] == "links"]
+            assert [one["name"] for one in shapes] == [one["name"] for one in drawn]
+            for shape, one in zip(shapes, drawn, strict=True):
+                assert shape["points"] == [round(value, 1) for value in one["points"]]
+                seen += len(shape["points"])
+    assert seen > 0
+
+
+def test_observations_that_need_too_much_memory_are_not_kept(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(failure_clips, "MOST_KEPT_BYTES", 1000)
+    with closing(make_vec("merge", agents=2, background=4)) as vec:
+        vec.reset(seed=0)
+        clips = FailureClips(1, vec.config, {}, vec.worlds.arrays.observations)
+        clips.add(vec.world_frames([0], ghosts=False))
+        trip = np.zeros(1, dtype=TRIP)
+        trip["counted"] = trip["collision"] = True
+        clips.take(trip, 0)
+    clip = clips.failures[0].clip
+    assert clip["sensors"] == []
+    assert "were not kept" in clip["sensors_note"]
+
+
 def test_the_page_asks_nothing_of_other_hosts(folder: Path) -> None:
     text = (folder / "out" / "failures.html").read_text(encoding="utf-8")
     assert "http" not in text.replace("http-equiv", "")
@@ -109,10 +148,33 @@ def test_a_browser_shows_the_page(folder: Path) -> None:
     assert int(shown[2]) > 0
 
 
+def test_the_replay_shows_what_the_vehicle_observed(folder: Path) -> None:
+    with chromium() as browser:
+        page = browser.new_page()
+        problems: list[str] = []
+        page.on("pageerror", lambda error: problems.append(str(error)))
+        page.goto((folder / "out" / "failures.html").as_uri())
+        page.evaluate(
+            "(() => { const seek = document.querySelector('#seek'); seek.value = seek.max;"
+            "seek.dispatchEvent(new Event('input')); })()"
+        )
+        picture = "document.querySelector('#view').toDataURL()"
+        assert "neighbors" in page.get_attribute("#view", "data-sensed").split()
+        with_sensors = page.evaluate(picture)
+        page.uncheck("#sensors")
+        assert page.evaluate(picture) != with_sensors
+        assert not problems
+
+
 def test_names_of_files_cannot_end_the_script(tmp_path: Path) -> None:
     name = "</script><script>alert(1)</script>"
     trip = {"policy": name, "center_m": (0.0, 0.0), "agent": 0, "run": 0, "episode": 0}
-    failure = Failure("collision", 1.0, trip, {"vehicles": {}, "frames": [[0, []]]})
+    failure = Failure(
+        "collision",
+        1.0,
+        trip,
+        {"vehicles": {}, "frames": [[0, []]], "sensors": [], "sensors_note": ""},
+    )
     network = load_network(find_entry("ring") / "map" / "map.net.xml")
     write_failures(tmp_path / "page.html", [failure], 5, 1, network, name)
     text = (tmp_path / "page.html").read_text(encoding="utf-8")

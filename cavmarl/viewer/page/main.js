@@ -181,7 +181,7 @@ function takeVehicle(told) {
   showVehicle(told, name);
   page.shapes = new Shapes(told);
   showPictures(page.shapes.pictures);
-  $("sensors-label").hidden = !told.observation;
+  $("sensors-label").hidden = !told.observation && !told.shapes;
   $("seat").hidden = !may("seat") || (agent < 0 && seat.agent === null);
   dirty();
 }

@@ -34,6 +34,8 @@ export function showVehicle(told, name) {
   $("vehicle").hidden = false;
   $("vehicle-name").textContent = name;
   fillTable($("state"), told.here ? told.rows : [["state", "it has left the world"]]);
+  $("note").textContent = told.note ?? "";
+  $("note").hidden = !told.note;
   $("terms-box").hidden = !told.terms;
   $("observation-box").hidden = !told.observation;
   if (told.terms) fillTable($("terms"), told.terms.map(([term, value]) => [term, shown(value)]));

@@ -1,4 +1,4 @@
-// What the sensors of a vehicle see; cavmarl/viewer/sensed_shapes.py says what shapes there are.
+// What the sensors of a vehicle see; cavmarl/sensors/sensed_shapes.py says what shapes there are.
 
 import { $, element } from "./panels.js";
 

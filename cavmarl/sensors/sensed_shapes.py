@@ -25,10 +25,8 @@ from numpy.typing import NDArray
 from cavmarl.config.env import EnvConfig
 from cavmarl.config.rig import BevGridConfig, CameraConfig, LidarRigConfig, MountedConfig
 from cavmarl.config.sensors import OccupancyGridConfig
-from cavmarl.parallel.step_arrays import StepArrays
 from cavmarl.sensors.kernels.camera_picture import colours
 from cavmarl.sensors.kernels.panorama import LANE_LINE
-from cavmarl.sensors.mounted.frames import SensorFrames
 from cavmarl.sensors.mounted.lidar import azimuths
 from cavmarl.sensors.mounted.mount_transforms import mount_of, sensor_to_vehicle
 from cavmarl.sensors.observed import layout
@@ -43,21 +41,14 @@ Shape = dict[str, Any]
 Floats = NDArray[np.float64]
 
 
-def sensed_shapes(config: EnvConfig, arrays: StepArrays, world: int, agent: int) -> list[Shape]:
-    """Those of an agent's observation, then those of its rig."""
+def observed_shapes(config: EnvConfig, observation: NDArray[np.float32]) -> list[Shape]:
+    """Those of an agent's observation (D,); of a stack those of the newest frame."""
     shapes: list[Shape] = []
-    if config.observation.mode != "sensors":
-        frame = arrays.observations[world, agent]
-        frame = frame[-(len(frame) // config.sensors.stack) :].astype(np.float64)
-        shapes += _observed(config, {n: frame[p] for n, p in layout(config.sensors).items()})
-    for name, settings in config.rig.items():
-        shapes += _mounted(name, settings, arrays.frames[name], world, agent)
-    return shapes
-
-
-def _observed(config: EnvConfig, parts: dict[str, Floats]) -> list[Shape]:
+    if config.observation.mode == "sensors":
+        return shapes
     sensors = config.sensors
-    shapes = []
+    frame = observation[-(len(observation) // sensors.stack) :].astype(np.float64)
+    parts = {name: frame[part] for name, part in layout(sensors).items()}
     if "lidar" in parts:
         distances = parts["lidar"][: sensors.lidar.rays]
         angles = 2.0 * np.pi * np.arange(len(distances)) / len(distances)
@@ -151,13 +142,8 @@ def _grid(name: str, rgba: NDArray[np.uint8], corners: Floats, axes: str = "vehi
     }
 
 
-def _mounted(
-    name: str, settings: MountedConfig, frames: SensorFrames, world: int, agent: int
-) -> list[Shape]:
-    """What a sensor of the rig has got last; nothing of a sample that was lost."""
-    if frames.lost[world, agent, -1]:
-        return []
-    data = np.asarray(frames.data[world, agent, -1])
+def sampled_shapes(name: str, settings: MountedConfig, data: NDArray[Any]) -> list[Shape]:
+    """What a sensor of the rig has got in one sample."""
     if isinstance(settings, LidarRigConfig):
         return [_lidar(name, settings, data.astype(np.float64))]
     if settings.type == "radar":  # type: ignore[attr-defined]

@@ -1,0 +1,106 @@
+"""What a recording has of the sensors of an agent's vehicle, for pages."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config.env import EnvConfig
+from cavmarl.config.io import validate
+from cavmarl.core.errors import ConfigError
+from cavmarl.env.recorded_extras import SAMPLES
+from cavmarl.recordings.recording import Recording
+from cavmarl.sensors.sensed_shapes import Shape, observed_shapes, sampled_shapes
+from cavmarl.viewer.vehicle_details import named_numbers, named_terms
+
+OLDEST_S = 2.0  # of a sample that is still shown
+
+
+class RecordedSensors:
+    """Observations, terms and shapes of sensors of one episode, as far as they were recorded.
+
+    Args:
+        recording: of which it is.
+        world: its number.
+        episode: of that world.
+    """
+
+    def __init__(self, recording: Recording, world: int, episode: int) -> None:
+        self._recording = recording
+        self._world, self._episode = world, episode
+        self._ticks = recording.ticks(world, episode)
+        self._observes = "observations" in recording.extras
+        self._config, self._note = _settings_of(recording)
+
+    def of(self, tick: int, vehicle: int, sensors: bool) -> dict[str, Any]:
+        """What a page is told of an agent's vehicle: `terms`, `observation`, `shapes`, `note`.
+
+        Args:
+            tick: of which there is a frame.
+            vehicle: its id.
+            sensors: whether its sensors' shapes are wanted; `note` says why there are none.
+        """
+        head, found = self._recording.head, {}
+        rows = self._rows("observations", tick, vehicle) if self._observes else ()
+        shapes: list[Shape] = []
+        for row in rows:
+            found["terms"] = named_terms(head.terms, row["terms"])
+            found["observation"] = named_numbers(head.features, row["values"])
+            if self._config is not None:
+                shapes += observed_shapes(self._config, row["values"])
+        if not sensors:
+            return found
+        if self._config is not None:
+            for name, settings in self._config.rig.items():
+                sample = self._newest(SAMPLES + name, tick, vehicle)
+                if sample is not None:
+                    shapes += sampled_shapes(name, settings, sample)
+        return {**found, "shapes": shapes, "note": self._note}
+
+    def _rows(self, table: str, tick: int, vehicle: int) -> NDArray[np.void]:
+        rows = self._recording.extra_at(table, tick, self._world, self._episode)
+        mine: NDArray[np.void] = rows[rows["vehicle"] == vehicle]
+        return mine
+
+    def _newest(self, table: str, tick: int, vehicle: int) -> NDArray[Any] | None:
+        """The data of the last sample up to a tick; None: it is too old, lost, or not recorded."""
+        if table not in self._recording.extras:
+            return None
+        oldest = tick - OLDEST_S / self._recording.head.sim_dt_s
+        place = int(np.searchsorted(self._ticks, tick, side="right")) - 1
+        for earlier in reversed(self._ticks[: place + 1]):
+            if earlier < oldest:
+                break
+            rows = self._rows(table, earlier, vehicle)
+            if len(rows):
+                return None if rows["lost"][-1] else np.asarray(rows["data"][-1])
+        return None
+
+
+def _settings_of(recording: Recording) -> tuple[EnvConfig | None, str]:
+    """The environment that was recorded, if it can be read, and what a page says of sensors."""
+    try:
+        settings = recording.manifest["world"]["config"]
+        config = validate(EnvConfig, settings, f"{recording.path}")
+    except (ConfigError, KeyError, TypeError):
+        return None, "The settings of the sensors are not in the recording, or another version's."
+    missing: Sequence[str] = [
+        name
+        for name, is_missing in (
+            (
+                "observations",
+                config.observation.mode != "sensors" and "observations" not in recording.extras,
+            ),
+            ("samples", any(SAMPLES + name not in recording.extras for name in config.rig)),
+        )
+        if is_missing
+    ]
+    if not missing:
+        return config, ""
+    return config, (
+        f"Not in this recording: {' and '.join(missing)} of sensors; "
+        f"--record-also {','.join(missing)} records them."
+    )
