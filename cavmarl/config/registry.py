@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from cavmarl.config.env import BY_MAP, ZONE_LAYOUTS, EnvConfig, MapConfig
+from cavmarl.config.scenario import path_of_code
 from cavmarl.core.errors import (
     CavmarlError,
     ConfigError,
@@ -193,7 +194,7 @@ def _refuse_code(keys: object, where: str) -> None:
     """A folder of data does not run code: only the caller can name a file of it."""
     scenario = keys.get("scenario") if isinstance(keys, dict) else None
     name = scenario.get("name") if isinstance(scenario, dict) else None
-    if isinstance(name, str) and name.endswith(".py"):
+    if isinstance(name, str) and path_of_code(name):
         raise ConfigError(
             f"{where}: scenario.name = {name!r}: is code, which a folder of data does not run; if "
             f"you trust it, say so: overrides={{'scenario.name': {name!r}}}, or --set scenario.name"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from cavmarl.config.checks import Section
 
@@ -31,3 +32,9 @@ class ScenarioConfig(Section, key="scenario"):
             bool(self.name) or not (self.place or self.params),
             "must name a scenario where scenario.place or scenario.params is given",
         )
+
+
+def path_of_code(name: str) -> Path | None:
+    """The `.py` file that a scenario's name means, however its path is written; None: no path."""
+    path = Path(name)
+    return path if path.suffix == ".py" else None

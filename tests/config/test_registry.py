@@ -180,9 +180,11 @@ def test_agents_are_single_files_and_folders_with_weights(here: Path) -> None:
     assert {"idm", "merge_ippo"} <= agent_entries().keys()
 
 
-def test_a_folder_of_data_runs_no_code(here: Path) -> None:
+@pytest.mark.parametrize("written", ["play.py", "play.py/", "play.py/.", "./play.py//"])
+def test_a_folder_of_data_runs_no_code(here: Path, written: str) -> None:
+    name = f"cool/{written}"
     entry = make_entry(
-        here / "mine", "name: mine\nmap: {source: m.net.xml}\nscenario: {name: cool/play.py}\n"
+        here / "mine", f"name: mine\nmap: {{source: m.net.xml}}\nscenario: {{name: {name}}}\n"
     )
     with pytest.raises(ConfigError, match=r"mine/env\.yaml: scenario\.name.*is code.*overrides"):
         load_config(entry)

@@ -112,6 +112,53 @@ def test_what_is_damaged_is_compiled_anew(tmp_path: Path, harm: bytes | None) ->
     assert run() == [first[0], "1"]
 
 
+def _kept_of_one(folder: Path) -> kernels._CheckedFile:
+    return kernels._CheckedFile(str(folder), "kernel", "")
+
+
+def test_no_flipped_or_missing_byte_of_an_index_is_an_error(tmp_path: Path) -> None:
+    """Nor is any of it unpickled: a byte more in a length asks for terabytes."""
+    kept = _kept_of_one(tmp_path)
+    kept.save(("int64",), "machine code")
+    assert kept.load(("int64",)) == "machine code"
+    index = tmp_path / "kernel.nbi"
+    content = index.read_bytes()
+    for place, byte in enumerate(content):
+        for other in {byte ^ 1, byte ^ 128, 0, 255} - {byte}:
+            index.write_bytes(content[:place] + bytes([other]) + content[place + 1 :])
+            assert kept.load(("int64",)) is None, (place, other)
+        index.write_bytes(content[:place])
+        assert kept.load(("int64",)) is None, place
+
+
+def test_data_of_another_kernel_are_not_taken(tmp_path: Path) -> None:
+    kept = _kept_of_one(tmp_path)
+    kept.save("a", "code of a")
+    kept.save("b", "code of b")
+    one, other = tmp_path.glob("*.nbc")
+    one.write_bytes(other.read_bytes())
+    assert {kept.load("a"), kept.load("b")} in ({None, "code of a"}, {None, "code of b"})
+
+
+def test_processes_that_compile_a_kernel_at_once_keep_their_own_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The other one, for other arguments, has read the index before and writes it after."""
+    first, second = _kept_of_one(tmp_path), _kept_of_one(tmp_path)
+    save_index = first._save_index
+
+    def overtaken(overloads: dict[str, str]) -> None:
+        save_index(overloads)
+        with monkeypatch.context() as before:
+            before.setattr(second, "_load_index", dict)
+            second.save("float64", "code for float64")
+
+    monkeypatch.setattr(first, "_save_index", overtaken)
+    first.save("int64", "code for int64")
+    assert first.load("int64") in (None, "code for int64")
+    assert first.load("float64") == "code for float64"
+
+
 FIRST = """
 from cavmarl import parallel_env
 from cavmarl.core.math.bearings import rough_atan2

@@ -107,34 +107,44 @@ class _Impl(caching.CompileResultCacheImpl):  # type: ignore[misc]
 
 
 class _CheckedFile(caching.IndexDataCacheFile):  # type: ignore[misc]
-    """Numba's files of one kernel, each with a checksum before it."""
+    """Numba's files of one kernel: an index with a checksum before it, which names data by theirs.
 
-    def _dump(self, obj: Any) -> bytes:
-        data: bytes = super()._dump(obj)
-        return hashlib.sha256(data).digest() + data
+    Nothing is unpickled before its checksum is right. As a file of data is named by its content,
+    processes that compile one kernel for different arguments at once overwrite none of each other.
+    """
+
+    def save(self, key: Any, data: Any) -> None:
+        content = self._dump(data)
+        name = f"{self._index_name.removesuffix('.nbi')}.{_digest(content).hex()[:32]}.nbc"
+        with self._open_for_write(self._data_path(name)) as file:
+            file.write(content)
+        self._save_index({**self._load_index(), key: name})
+
+    def _save_index(self, overloads: dict[Any, str]) -> None:
+        content = self._dump((self._source_stamp, overloads))
+        with self._open_for_write(self._index_path) as file:
+            file.write(_digest(content) + content)
 
     def _load_index(self) -> dict[Any, str]:
         try:
-            with open(self._index_path, "rb") as file:
-                version, content = pickle.load(file), file.read()
-        except (OSError, pickle.UnpicklingError, EOFError, ValueError, AttributeError):
+            found = Path(self._index_path).read_bytes()
+        except OSError:
             return {}
-        checked = _checked(content) if version == self._version else None
-        if checked is None:
+        content = found[_DIGEST_BYTES:]
+        if _digest(content) != found[:_DIGEST_BYTES]:
             return {}
-        stamp, overloads = pickle.loads(checked)
+        stamp, overloads = pickle.loads(content)
         return overloads if stamp == self._source_stamp else {}
 
     def _load_data(self, name: str) -> Any:
-        checked = _checked(Path(self._data_path(name)).read_bytes())
-        if checked is None:
+        content = Path(self._data_path(name)).read_bytes()
+        if _digest(content).hex()[:32] != name.split(".")[-2]:
             raise OSError(f"{name}: damaged")  # Numba compiles it again
-        return pickle.loads(checked)
+        return pickle.loads(content)
 
 
-def _checked(content: bytes) -> bytes | None:
-    digest, data = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
-    return data if hashlib.sha256(data).digest() == digest else None
+def _digest(content: bytes) -> bytes:
+    return hashlib.sha256(content).digest()
 
 
 class KernelCache(caching.FunctionCache):  # type: ignore[misc]

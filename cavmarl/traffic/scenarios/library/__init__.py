@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from cavmarl.config.scenario import ScenarioConfig
+from cavmarl.config.scenario import ScenarioConfig, path_of_code
 from cavmarl.core.errors import ConfigError, ScenarioError
 from cavmarl.core.math.rng import STREAM_PLACE, below, world_key
 from cavmarl.roads.network import RoadNetwork
@@ -49,8 +49,8 @@ def load_scenario(name: str) -> Any:
     """
     if name in scenario_names():
         return importlib.import_module(f"{__name__}.{name}")
-    path = Path(name)
-    if path.suffix != ".py" or not path.is_file():
+    path = path_of_code(name)
+    if path is None or not path.is_file():
         close = get_close_matches(name, scenario_names(), n=1)
         hint = f"did you mean {close[0]}? " if close else ""
         raise ConfigError(
