@@ -152,7 +152,8 @@ def nodes(
 
 def sessions(
     page: Annotated[
-        str | None, about("Have a page served of the worlds of this session, on its node.")
+        str | None,
+        about("Have its node serve a page of this session, to watch and control it."),
     ] = None,
     service: Url = DEFAULT_URL,
     secret_file: SecretFile = None,
@@ -165,6 +166,7 @@ def sessions(
             told = client.take_up(page).page()
             _tell(f"viewer: {told['address']}")
             _tell(f"token: {told['token']}")
+            _tell(f"token to watch only: {told['watch_token']}")
             write_json(json_path, told)
             return
         found = client.get("/sessions")

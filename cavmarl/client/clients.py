@@ -234,7 +234,10 @@ class RemoteWorld:
         return str(self._client.run(self.flows.look("hash"))["hashes"][world])
 
     def page(self) -> dict[str, str]:
-        """`address` and `token` of a page that shows the worlds, on the machine of their node."""
+        """A page that shows the worlds, on the machine of their node: its `address`, and tokens.
+
+        `token` is to control them, `watch_token` only to watch.
+        """
         found: dict[str, str] = self._client.run(self.flows.look("page"))
         return found
 

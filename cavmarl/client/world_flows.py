@@ -156,6 +156,10 @@ class WorldFlows:
                 )
                 check(answer)
             except (httpx.TransportError, ServiceError) as error:
+                if isinstance(error, ServiceError) and error.problem == "paused":
+                    yield Rest(error.retry_s or AGAIN_S)
+                    until_s = time.monotonic() + self._recovery_s
+                    continue
                 if isinstance(error, ServiceError) and error.problem not in _FOUND_ELSEWHERE:
                     raise
                 if time.monotonic() > until_s:

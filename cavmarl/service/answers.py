@@ -302,10 +302,11 @@ class WorldHashes(_Answer):
 
 
 class WorldPage(_Answer):
-    """Where the worlds of a session can be watched, on the machine of their node."""
+    """Where the worlds of a session can be watched and controlled, on the machine of their node."""
 
     address: str
-    token: str  # that the page asks for
+    token: str  # that the page asks for, to control them; without a state to be saved, to watch
+    watch_token: str  # to watch alone
 
 
 class WorldTransfers(_Answer):

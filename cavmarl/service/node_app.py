@@ -29,9 +29,11 @@ from cavmarl.service.node_link import NodeLink
 from cavmarl.service.problems import serve_routes
 from cavmarl.service.refusals import problem
 from cavmarl.service.route_parts import OCTETS, PROBLEM
-from cavmarl.service.session_worlds import SAVED_EVERY, SessionWorlds
+from cavmarl.service.session_worlds import SAVED_EVERY, SessionWorld, SessionWorlds
 
 MAX_ACTIONS_BYTES = 16 * 1024 * 1024
+HOLD_S = 5.0  # that a command waits for a page which has paused its session; then it is asked again
+TEND_S = 0.1  # from look to look at what pages ask for
 
 router = APIRouter(
     prefix="/v1/worlds/{session}", route_class=StrictRoute, responses=PROBLEM, tags=["worlds"]
@@ -113,7 +115,7 @@ def make_node_app(link: NodeLink, worlds: SessionWorlds) -> ASGIApp:
         redirect_slashes=False,
         telemetry=NO_TELEMETRY,
     )
-    app.state.link, app.state.worlds = link, worlds
+    app.state.link, app.state.worlds, app.state.tended = link, worlds, {}
     serve_routes(app, [router])
     return GuardedRequests(app, body_bytes=MAX_ACTIONS_BYTES)
 
@@ -176,23 +178,55 @@ async def _command(
     content = await request.body()
     world = worlds[session]
     if number == world.number + 1:
-        due = world.number - world.saved >= SAVED_EVERY
-        if due or link.is_draining:
-            await _save(link, worlds, session)
-        if link.is_draining:
-            raise problem("lost", "this node is being drained: resolve the session again")
+        if not is_quiet:
+            await _hold(link, worlds, world)
 
     def act() -> bytes:
         return world.command(word, number, seed, content, is_quiet)
 
+    world.is_commanded = True  # what pages change now is neither in this command nor saved
     try:
+        if number == world.number + 1:
+            await _save_before(link, worlds, session)
         answer = await in_turn(worlds, act)
     except WorkerError as error:  # the nodes of its zones are gone: it begins from what is saved
         await asyncio.to_thread(worlds.close, session)
         raise problem("lost", f"its zones have no nodes: {error}") from error
+    finally:
+        world.is_commanded = False
     worlds.ended(session, word)
     headers = {SAVED_HEADER: str(world.saved)}
     return Response(answer, headers=headers, media_type=OCTETS)
+
+
+async def _hold(link: NodeLink, worlds: SessionWorlds, world: SessionWorld) -> None:
+    """Wait while pages have paused a session, or until its next step is due."""
+    until_s = time.monotonic() + HOLD_S
+    while not link.is_draining and (wait_s := await in_turn(worlds, world.tend)):
+        if time.monotonic() > until_s:
+            raise problem("paused", "a page has paused the session", retry_s=1.0)
+        await asyncio.sleep(min(wait_s, TEND_S))
+
+
+async def _save_before(link: NodeLink, worlds: SessionWorlds, session: str) -> None:
+    """Save the state before a command, if it is time, or pages have changed the worlds."""
+    world = worlds[session]
+    due = world.number - world.saved >= SAVED_EVERY
+    if due or world.is_changed or link.is_draining:
+        await _save(link, worlds, session)
+    if link.is_draining:
+        raise problem("lost", "this node is being drained: resolve the session again")
+    if world.is_changed:
+        detail = "what a page has changed is not saved yet: the service is away"
+        raise problem("paused", detail, retry_s=1.0)
+
+
+async def _tend(worlds: SessionWorlds, session: str) -> None:
+    """Heed the pages of a session as long as it is here."""
+    while session in worlds:
+        await asyncio.sleep(TEND_S)
+        if session in worlds and worlds[session].is_watched:
+            await in_turn(worlds, worlds[session].tend)
 
 
 @router.get("/hash")
@@ -220,7 +254,11 @@ async def get_transfers(request: Request, session: str, _: Opened) -> answers.Wo
 async def get_page(request: Request, session: str, _: Opened) -> answers.WorldPage:
     """A page of the viewer that shows the worlds; it is served on the node's machine alone."""
     worlds = _worlds(request)
-    return answers.WorldPage(**await in_turn(worlds, worlds[session].page))
+    told = await in_turn(worlds, worlds[session].page)
+    tended: dict[str, asyncio.Task[None]] = request.app.state.tended
+    if session not in tended or tended[session].done():
+        tended[session] = asyncio.create_task(_tend(worlds, session))
+    return answers.WorldPage(**told)
 
 
 @router.delete("", status_code=204)
@@ -232,7 +270,8 @@ async def close_worlds(request: Request, session: str, _: Opened) -> None:
 async def _save(link: NodeLink, worlds: SessionWorlds, session: str) -> None:
     world = worlds[session]
     number = world.number
-    if number == world.saved:
+    was_changed = world.is_changed
+    if number == world.saved and not was_changed:
         return
     state = await in_turn(worlds, world.state)
     if state is None:
@@ -240,6 +279,7 @@ async def _save(link: NodeLink, worlds: SessionWorlds, session: str) -> None:
     try:
         await link.save_state(session, number, state)
     except ServiceError as error:
+        world.is_changed |= was_changed
         if error.status:
             raise
         return  # the service is away: the client has the commands since the last state

@@ -33,6 +33,7 @@ PROBLEMS = {
     "too-large": (413, "the body is larger than is taken here"),
     "too-many": (429, "too many requests, or too many of a kind: wait, see Retry-After"),
     "broken": (500, "a fault of the service; its log has the traceback"),
+    "paused": (503, "a page holds the session: ask again after Retry-After"),
     "no-node": (503, "no node can take it now: try again after Retry-After"),
 }
 

@@ -12,7 +12,7 @@ import numpy as np
 from cavmarl.client.world_flows import flatten, pack
 from cavmarl.core.errors import CapacityError, ConfigError, MissingExtraError
 from cavmarl.env.vector import make_vec
-from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.local_worlds import LocalWorlds, kept_elsewhere
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.service.configurations import world_keywords
 from cavmarl.service.refusals import problem
@@ -35,6 +35,8 @@ class SessionWorld:
     Attributes:
         number: commands up to now.
         saved: those that the state includes which the service has.
+        is_changed: a page has changed the worlds since.
+        is_commanded: a command is under way: pages have to wait.
     """
 
     def __init__(
@@ -51,10 +53,14 @@ class SessionWorld:
         self._worlds: LocalWorlds | NodeWorlds = self._vec.worlds  # type: ignore[assignment]
         self._told = [0] * len(self._worlds.transfers)  # transfers that the service has of each
         self._last = b""  # the answer to the last command
+        self.is_changed = self.is_commanded = False
         self._page: ShownEnv | None = None  # that shows them
-        self._page_token = ""
+        self._tokens = secrets.token_urlsafe(24), secrets.token_urlsafe(24)
+        # (W,) which worlds a page has begun anew since the last command
+        self._anew = np.zeros(document["num_envs"], dtype=np.bool_)
         if state:
-            self._vec.load_state(state)
+            self._vec.load_state(state[: -len(self._anew)])
+            self._anew[:] = np.frombuffer(state[-len(self._anew) :], dtype=np.bool_)
 
     def describe(self) -> dict[str, Any]:
         """What a client has to know of them."""
@@ -76,9 +82,11 @@ class SessionWorld:
     def state(self) -> bytes | None:
         """Their state; None: it is partly elsewhere, in a SUMO or a journal."""
         try:
-            return self._vec.save_state() if self.number else b""
+            found = self._vec.save_state() + self._anew.tobytes() if self.number else b""
         except ConfigError:
             return None
+        self.is_changed = False
+        return found
 
     def command(
         self, word: str, number: int, seed: int | None, content: bytes, is_quiet: bool
@@ -90,10 +98,14 @@ class SessionWorld:
             raise problem("conflict", f"command {number} after {self.number}: count them up")
         answer = self._reset(seed) if word == "reset" else self._step(content)
         self.number, self._last = number, answer
+        if self._page is not None:
+            self._page.moved()
+            self._heed_pages(self._page)
         return b"" if is_quiet else answer
 
     def _reset(self, seed: int | None) -> bytes:
         observations, infos = self._vec.reset(seed=seed)
+        self._anew[:] = False
         return pack(flatten("observations", observations) | _flat(infos))
 
     def _step(self, content: bytes) -> bytes:
@@ -108,6 +120,9 @@ class SessionWorld:
         actions = np.frombuffer(content, dtype).reshape(form.shape)
         observations, rewards, ended, cut, infos = self._vec.step(actions)
         told = {"rewards": rewards, "terminations": ended, "truncations": cut}
+        if self._anew.any():
+            infos["begun_anew"] = self._anew.copy()
+            self._anew[:] = False
         return pack(flatten("observations", observations) | told | _flat(infos))
 
     def suggestion(self) -> bytes:
@@ -119,17 +134,46 @@ class SessionWorld:
         return [self._vec.state_hash(world) for world in range(self._vec.num_envs)]
 
     def page(self) -> dict[str, str]:
-        """Address and token of a page that shows them from now on; it may only watch."""
+        """Address of a page that shows them from now on; tokens to control them, and to watch.
+
+        What pages change has to be in the saved state: worlds that cannot be saved are only shown.
+        """
+        token, watch_token = self._tokens
         if self._page is None:
-            self._page_token = secrets.token_urlsafe(24)
-            options = WebOptions(port=0, token=self._page_token, control=False)
+            control = not kept_elsewhere(self._vec.config)
+            options = WebOptions(port=0, token=token, watch_token=watch_token, control=control)
+            forms: dict[str, Any] = {"title": "a client of the service", "looks_itself": False}
             try:
-                self._page = ShownEnv(self._vec, options, title="a client of the service")
+                reset = self._begin_anew if control else None
+                self._page = ShownEnv(self._vec, options, reset=reset, **forms)
                 if self._vec.is_ready:
                     self._page.refresh()
             except (ConfigError, MissingExtraError) as error:
                 raise problem("refused", str(error)) from error
-        return {"address": self._page.address, "token": self._page_token}
+        return {"address": self._page.address, "token": token, "watch_token": watch_token}
+
+    @property
+    def is_watched(self) -> bool:
+        """Whether a page of them is open."""
+        return self._page is not None and self._page.is_watched
+
+    def tend(self) -> float:
+        """Heed their pages, between commands; how long the next command has to wait, in s."""
+        if self._page is None or self.is_commanded:
+            return 0.0
+        return self._heed_pages(self._page)
+
+    def _heed_pages(self, page: ShownEnv) -> float:
+        before = page.changes
+        wait_s = page.turn()
+        self.is_changed |= page.changes > before
+        return wait_s
+
+    def _begin_anew(self, world: int) -> None:
+        """Begin the episode of one world anew, as a page wants it; the next answer says so."""
+        chosen = np.arange(len(self._anew)) == world
+        self._vec.reset(options={"reset_mask": chosen})
+        self._anew |= chosen
 
     def transfers(self) -> list[dict[str, Any]]:
         """The newest changes of owner of divided worlds."""
@@ -176,6 +220,7 @@ class SessionWorld:
         """Let go of their memory and processes."""
         if self._page is not None:
             self._page.close()
+            self._page = None
         self._vec.close()
 
 

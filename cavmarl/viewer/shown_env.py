@@ -10,8 +10,10 @@ from functools import partial
 from typing import Any
 
 from cavmarl.engine.world_frame import WorldFrame
+from cavmarl.viewer.audience import Audience
 from cavmarl.viewer.frame_publisher import FramePublisher
 from cavmarl.viewer.inserted_here import put_in
+from cavmarl.viewer.page_requests import PageRequest
 from cavmarl.viewer.run_clock import RunClock
 from cavmarl.viewer.run_loads import RunLoads
 from cavmarl.viewer.show_world import check_extra, serve_stages
@@ -31,11 +33,14 @@ class ShownEnv:
         env: which a program steps.
         options: of the server. Where pages may control it, a step waits while they have paused.
         title: what drives the worlds, in words.
-        looks_itself: whether it is called after each reset and step of `env`; else by `look`.
+        looks_itself: whether it is called after each reset and step of `env`; else by `look`, or
+            by `turn` and `moved`, where nothing may wait.
         tell: told the address, and a token that was made.
+        reset: begins the episode of a world anew, by its number; None: pages may not.
 
     Attributes:
         address: of the page.
+        changes: how often pages have asked for something that changes a world.
     """
 
     def __init__(
@@ -46,13 +51,18 @@ class ShownEnv:
         title: str = "",
         looks_itself: bool = True,
         tell: Callable[[str], None] = lambda _: None,
+        reset: Callable[[int], None] | None = None,
     ) -> None:
         check_extra()
         self._env = env
+        self._reset = reset
+        self.changes = 0
         self._controlled = options.control
         self._clock = RunClock(pace=0.0)
         count = len(env.worlds.arrays.mask)
-        first = first_stage("world 0", env.network, hello_of(env, title, is_driven_here=False))
+        hello = hello_of(env, title, is_driven_here=False)
+        hello["may"] += ["reset"] if reset is not None else []
+        first = first_stage("world 0", env.network, hello)
         stages = [first, *(first.named(f"world {k}") for k in range(1, count))]
         self._audiences = [stage.audience for stage in stages]
         self._publishers = [FramePublisher(stage.audience, stage.encoder) for stage in stages]
@@ -65,23 +75,47 @@ class ShownEnv:
 
     def look(self) -> None:
         """Show the present moment to pages; while they have paused it, wait."""
-        for publisher in self._publishers:
-            publisher.is_new = True
-        while True:
-            self._heed()
-            wait_s = self._clock.wait_s(time.monotonic()) if self._controlled else 0.0
-            self._publish()
-            if not wait_s:
-                break
+        self._renew()
+        while wait_s := self.turn():
             self._audiences[0].wait(wait_s)
         self._clock.tick(time.monotonic(), self._env.step_s)
+
+    def turn(self) -> float:
+        """Heed the pages and show them what is due; how long the next step has to wait, in s."""
+        self._heed()
+        wait_s = self._clock.wait_s(time.monotonic()) if self._controlled else 0.0
+        if self._env.is_ready:
+            self._publish()
+        return wait_s
+
+    def moved(self) -> None:
+        """The worlds have taken a step: the clock goes on, and there is something new to show."""
+        self._clock.tick(time.monotonic(), self._env.step_s)
+        self._renew()
+
+    @property
+    def is_watched(self) -> bool:
+        """Whether a page is open."""
+        return any(audience.wishes.watchers for audience in self._audiences)
+
+    def _renew(self) -> None:
+        for publisher in self._publishers:
+            publisher.is_new = True
 
     def _heed(self) -> None:
         for world, audience in enumerate(self._audiences):
             for number, request in audience.requests():
                 if not self._clock.heed(request) and self._controlled and self._env.is_ready:
-                    tick = int(self._env.worlds.arrays.ticks[world])
-                    put_in(self._env, world, audience, number, request, tick)
+                    self._change(world, audience, number, request)
+
+    def _change(self, world: int, audience: Audience, number: int, request: PageRequest) -> None:
+        tick = int(self._env.worlds.arrays.ticks[world])
+        if request.kind == "reset" and self._reset is not None:
+            self._reset(world)
+            self._renew()
+        elif not put_in(self._env, world, audience, number, request, tick):
+            return
+        self.changes += 1
 
     def _publish(self) -> None:
         for world, publisher in enumerate(self._publishers):

@@ -9,8 +9,11 @@ from __future__ import annotations
 import asyncio
 import itertools
 import json
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
@@ -22,6 +25,8 @@ import cavmarl
 from cavmarl.client import AsyncClient, Client, RemoteWorld
 from cavmarl.core.errors import ServiceError
 from cavmarl.evaluate import evaluate, load_report
+from cavmarl.viewer.inserted_here import lane_at
+from cavmarl.viewer.map_geometry import map_origin
 from tests.support.service import Cluster, running_service
 
 AGENTS = 4
@@ -229,10 +234,67 @@ def test_a_session_is_shown_on_a_page_of_its_node(client: Client) -> None:
         with connect(live, max_size=None, compression=None) as page:
             page.send(json.dumps({"kind": "hello", "token": told["token"]}))
             hello = json.loads(page.recv(timeout=10))
-            assert (hello["policy"], hello["control"]) == ("a client of the service", False)
+            assert (hello["policy"], hello["control"]) == ("a client of the service", True)
             for _ in range(3):
                 world.step(world.suggest_actions())
             messages = [page.recv(timeout=10) for _ in range(3)]
             assert 3 in [message[0] for message in messages if isinstance(message, bytes)]
+        with connect(live, max_size=None, compression=None) as page:
+            page.send(json.dumps({"kind": "hello", "token": told["watch_token"]}))
+            assert json.loads(page.recv(timeout=10))["control"] is False
     with pytest.raises(httpx.ConnectError):
         httpx.get(told["address"])
+
+
+def heard(page: Any, kind: str) -> None:
+    """Wait for an event of a kind."""
+    for _ in range(1000):
+        message = page.recv(timeout=20)
+        if isinstance(message, str) and (told := json.loads(message))["kind"] == "events":
+            if kind in [event[1] for event in told["events"]]:
+                return
+    raise AssertionError(kind)
+
+
+def test_what_a_page_changes_is_in_the_session_that_goes_on_elsewhere(
+    cluster: Cluster, client: Client
+) -> None:
+    keys: dict[str, Any] = {"agents": AGENTS, "background": 8}
+    keys["overrides"] = {"population.insertions": 4}
+    cluster.start("controlled")
+    remote = client.open("merge", node="controlled", wait_s=30.0, **keys)
+    local = cavmarl.make_vec("merge", **keys)
+    remote.reset(seed=5)
+    local.reset(seed=5)
+    assert_same(remote, local, range(3))
+    network = local.network
+    lane = int(np.flatnonzero(~network.lanes["internal"])[0])
+    x, y = (network.lane_polyline(lane)[0, :2] - map_origin(network)).tolist()
+    told = remote.page()
+    live = told["address"].replace("http", "ws") + "live"
+    with connect(live, max_size=None, compression=None) as page, ThreadPoolExecutor(1) as pool:
+        page.send(json.dumps({"kind": "hello", "token": told["token"]}))
+        page.send('{"kind": "pause"}')
+        time.sleep(0.5)
+        actions = local.suggest_actions()
+        held = pool.submit(remote.step, actions)
+        page.send(json.dumps({"kind": "insert", "x": x, "y": y}))
+        heard(page, "inserted")
+        assert not held.done()
+        page.send('{"kind": "play"}')
+        held.result(timeout=60)
+        row, place_m = lane_at(network, x, y)
+        local.insert_vehicle(network.lane_ids[row], place_m)
+        local.step(actions)
+        assert_same(remote, local, range(2))
+        page.send('{"kind": "reset"}')
+        heard(page, "episode")
+    local.reset(options={"reset_mask": np.array([True])})
+    actions = local.suggest_actions()
+    assert remote.step(actions)[4]["begun_anew"].tolist() == [True]
+    local.step(actions)
+    cluster.processes["controlled"].kill()
+    assert_same(remote, local, range(3))
+    assert remote.flows.moves == 1
+    remote.close()
+    local.close()
