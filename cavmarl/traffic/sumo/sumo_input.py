@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import lru_cache
 from io import BytesIO
 from os.path import isfile
 from pathlib import Path
@@ -53,6 +54,8 @@ _REPORTS = re.compile(
 )
 # A file without these names nothing that SUMO writes. A reference to a character may hide them.
 _MAY_WRITE = re.compile(rb"\bfile\b|dest|output|&#|include", re.IGNORECASE)
+_COMMENT = re.compile(rb"<!--.*?-->", re.DOTALL)
+_ELSEWHERE = re.compile(r",|\$\{")  # a list of files; a variable of the environment
 _READ_FILES = {"rerouter", "variableSpeedSign"}  # elements whose `file` is read
 _NOWHERE = "NUL"  # as SUMO calls it
 _ASCII_BELOW = {"utf-8", "utf8", "ascii", "us-ascii", "iso-8859-1", "latin-1", "windows-1252"}
@@ -99,16 +102,17 @@ def read_input(demand: Sequence[Path]) -> SumoInput:
 
 
 def without_outputs(path: Path, folder: Path) -> Path:
-    """A demand file by which SUMO writes nothing: a copy in `folder` where it would.
+    """A map or demand by which SUMO writes nothing: a copy in `folder` where the file would.
 
     Raises:
-        ConfigError: it includes another file, or its encoding cannot be searched.
+        ConfigError: it includes another file, its encoding cannot be searched, or SUMO would take
+            its name for that of another file.
     """
-    content = read_bytes(path)
-    encoding = declared_encoding(content).lower() or "utf-8"
-    if encoding not in _ASCII_BELOW or 0 in content[:4]:  # UTF-16 and 32 begin with such a byte
-        raise ConfigError(f"{path}: encoded as {encoding} or UTF-16: save it as UTF-8")
-    if not _MAY_WRITE.search(content):
+    if found := _ELSEWHERE.search(str(path)):
+        raise ConfigError(
+            f"{path}: SUMO takes a name with {found[0]!r} for that of another file: rename it"
+        )
+    if not _may_write(path, path.stat().st_mtime_ns):
         return path
     root = _root(path)
     changes = [_silence(element, path) for element in root.iter()]
@@ -117,6 +121,17 @@ def without_outputs(path: Path, folder: Path) -> Path:
     copy = folder / f"{len(list(folder.iterdir()))}_{path.name.removesuffix('.gz')}"
     copy.write_bytes(tostring(root, encoding="utf-8", xml_declaration=True))
     return copy
+
+
+@lru_cache(maxsize=64)  # SUMO is started for each episode
+def _may_write(path: Path, changed_ns: int) -> bool:
+    content = read_bytes(path)
+    encoding = declared_encoding(content).lower() or "utf-8"
+    if encoding not in _ASCII_BELOW or 0 in content[:4]:  # UTF-16 and 32 begin with such a byte
+        raise ConfigError(f"{path}: encoded as {encoding} or UTF-16: save it as UTF-8")
+    if b"<![CDATA[" not in content:  # which may hold what looks like a comment
+        content = _COMMENT.sub(b"", content)  # netconvert tells its options in one
+    return bool(_MAY_WRITE.search(content))
 
 
 def _silence(element: Element, path: Path) -> bool:
@@ -219,7 +234,7 @@ def command_words(
 ) -> list[str]:
     """The words behind the program's name.
 
-    `map_file`: a SUMO network. `folder`: for copies of additional files that write nothing. `seed`:
+    `map_file`: a SUMO network. `folder`: for copies of files that write nothing. `seed`:
     of SUMO's random numbers. `more`: options, which stand above those of the demand's
     configuration. `additional`: further additional files.
     """
@@ -228,7 +243,7 @@ def command_words(
     files = [str(without_outputs(path, copies)) for path in demand.additional_files]
     routes = [str(without_outputs(path, copies)) for path in demand.route_files]
     options = demand.options | {
-        "net-file": str(map_file),
+        "net-file": str(without_outputs(map_file, copies)),
         "route-files": ",".join(routes),
         "additional-files": ",".join([*files, *map(str, additional)]),
         "begin": str(demand.begin_s),
