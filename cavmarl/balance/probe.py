@@ -45,7 +45,8 @@ class Watch:
 
     def __init__(self, workers: Mapping[int, int | None]) -> None:
         self._watched = {number: _Watched(pid) for number, pid in workers.items()}
-        self._caller = _Watched(os.getpid())
+        own = os.getpid()
+        self._callers = () if own in workers.values() else (_Watched(own),)
         self._began_s = time.perf_counter()
         self._before = _busy_s()
 
@@ -56,7 +57,7 @@ class Watch:
             (after - before) / elapsed_s
             for before, after in zip(self._before, _busy_s(), strict=True)
         ]
-        for process in (*self._watched.values(), self._caller):
+        for process in (*self._watched.values(), *self._callers):
             share = (process.used_s() or 0.0) / elapsed_s / len(process.cores)
             for core in process.cores:
                 foreign[core] -= share

@@ -114,6 +114,15 @@ class JobOrder(_Answer):
     repeats: int
 
 
+class NodeScore(_Answer):
+    """A node as pages show it."""
+
+    name: str
+    state: str
+    score: float | None  # null: it has told no load
+    sessions: int
+
+
 class Duties(_Answer):
     """What a node has to do."""
 
@@ -123,6 +132,7 @@ class Duties(_Answer):
     zones_of: list[Door]
     without_door: list[str]
     jobs: list[JobOrder]
+    scores: list[NodeScore]  # of the first hundred nodes by name, if a page is open
 
 
 class Configuration(ConfigurationBody):

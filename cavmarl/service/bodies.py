@@ -52,6 +52,7 @@ class BeatBody(_Body):
         dict[Word, Annotated[float, Field(allow_inf_nan=False)]],
         Field(max_length=32, json_schema_extra=NO_OTHERS),
     ] = {}
+    watched: bool = False  # a page of a session is open: the answer has all nodes' LoadScores
     # of jobs: how many steps are done, and are to be
     jobs: Annotated[
         dict[Word, Annotated[list[Whole], Field(min_length=2, max_length=2)]],

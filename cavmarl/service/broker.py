@@ -24,11 +24,19 @@ from cavmarl.service.infrastructure import (
 )
 from cavmarl.service.job_queue import JobQueue
 from cavmarl.service.node_reports import NodeReports
-from cavmarl.service.node_selection import Chosen, LiveNode, NoNodeError, choose, overloads
+from cavmarl.service.node_selection import (
+    Chosen,
+    LiveNode,
+    NoNodeError,
+    choose,
+    overloads,
+    score_of,
+)
 from cavmarl.service.refusals import problem
 from cavmarl.service.zone_nodes import ZoneNodes
 
 SHOWN_EXCLUSIONS = 10  # in an event
+MOST_SCORES = 100  # that a node is told for its pages
 
 
 @dataclass(frozen=True)
@@ -129,7 +137,18 @@ class Broker:
             "without_door": self.zone_nodes.without_door(sorted(live.hosted)),
             "jobs": [self._job_of(one) for one in sorted(live.hosted)
                      if self.log.state.sessions[one].job is not None],
+            "scores": self._scores() if body.watched else [],
         }  # fmt: skip
+
+    def _scores(self) -> list[dict[str, Any]]:
+        """What pages show of the nodes that have not left."""
+        nodes = [one for _, one in sorted(self.log.state.nodes.items()) if one.state != "left"]
+        return [
+            {"name": one.name, "state": "draining" if one.draining else one.state,
+             "score": score_of(one, self.live[one.name]),
+             "sessions": len(self.live[one.name].hosted)}
+            for one in nodes[:MOST_SCORES]
+        ]  # fmt: skip
 
     def misreported(self, identity: IdentityRecord, name: str, detail: str) -> None:
         """Put on record that a node tells what cannot be, such as 85 for 0.85."""

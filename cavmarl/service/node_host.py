@@ -135,7 +135,8 @@ async def _beat_until_end(host: _Host) -> None:
         try:
             if host.is_ending and not link.is_draining:
                 await link.drain()
-            told = await link.beat(host.worlds.counters(), host.steps)
+            told = await link.beat(host.worlds.counters(), host.steps, host.worlds.is_watched)
+            host.worlds.tell_scores(told["scores"])
             pause_s = told["beat_s"]
             host.worlds.keep_only(link.own(told["sessions"]))
             _start_jobs(host, told["jobs"])

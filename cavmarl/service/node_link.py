@@ -65,9 +65,15 @@ class NodeLink:
         psutil.cpu_percent(None)  # from now on
 
     async def beat(
-        self, counters: dict[str, float], jobs: Mapping[str, tuple[int, int]]
+        self,
+        counters: dict[str, float],
+        jobs: Mapping[str, tuple[int, int]],
+        is_watched: bool,
     ) -> dict[str, Any]:
-        """Say how busy this machine is, and how far its jobs are; what the node has to do."""
+        """Say how busy this machine is, and how far its jobs are; what the node has to do.
+
+        With `is_watched` also the LoadScores of all nodes.
+        """
         number = next(self._beats)
         load = {"cpu": 0.0, "ram": 0.0, "gpu": 0.0}
         if not self._is_supposed_idle:
@@ -83,6 +89,7 @@ class NodeLink:
             "sent_s": time.time(),
             "counters": counters,
             "jobs": dict(jobs),
+            "watched": is_watched,
         }
         answer = await self.ask("POST", f"/nodes/{self.name}/beat", json=body)
         told: dict[str, Any] = answer.json()

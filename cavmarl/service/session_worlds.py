@@ -157,6 +157,11 @@ class SessionWorld:
         """Whether a page of them is open."""
         return self._page is not None and self._page.is_watched
 
+    def tell_scores(self, rows: list[dict[str, Any]]) -> None:
+        """Let its pages show these rows below those of what runs it."""
+        if self._page is not None:
+            self._page.tell_others(rows)
+
     def tend(self) -> float:
         """Heed their pages, between commands; how long the next command has to wait, in s."""
         if self._page is None or self.is_commanded:
@@ -276,6 +281,27 @@ class SessionWorlds:
             "wait_s": self.wait_s,
             "transfers": float(self._past_transfers + present),
         }
+
+    @property
+    def is_watched(self) -> bool:
+        """Whether a page of any session is open."""
+        return any(world.is_watched for world in list(self._worlds.values()))
+
+    def tell_scores(self, scores: list[dict[str, Any]]) -> None:
+        """Let pages show the LoadScores of the service's nodes; of none: those before stay."""
+        if not scores:
+            return
+        rows = [
+            {
+                "name": f"{one['name']}, node of the service",
+                "zones": f"{one['sessions']} sessions",
+                "score": one["score"],
+                "note": "no load told" if one["state"] == "up" else one["state"],
+            }
+            for one in scores
+        ]
+        for world in list(self._worlds.values()):
+            world.tell_scores(rows)
 
     def divided(self) -> list[str]:
         """Sessions whose worlds have zones."""

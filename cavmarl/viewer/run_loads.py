@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,6 +12,7 @@ from cavmarl.balance.balance_plan import Plan
 from cavmarl.balance.load_score import load_score
 from cavmarl.balance.load_snapshot import LoadSnapshot
 from cavmarl.balance.probe import Watch
+from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.parallel.step_arrays import SteppedWorlds
 from cavmarl.viewer.audience import Audience
 
@@ -20,19 +22,28 @@ EVERY_S = 2.0
 class RunLoads:
     """Measures in a thread of its own, while there are watchers; a context manager.
 
+    Nodes of other machines measure theirs, and are asked by `look`.
+
     Args:
         worlds: whose workers or nodes are watched; without any, this process.
         audience: is told.
+
+    Attributes:
+        others: rows of what runs no zones of these worlds, which pages are told, too.
     """
 
     def __init__(self, worlds: SteppedWorlds, audience: Audience) -> None:
         self._worlds = worlds
         self._audience = audience
+        self.others: list[dict[str, Any]] = []
+        self._apart = worlds if isinstance(worlds, NodeWorlds) and not worlds.worker_pids else None
+        self._looked_s = 0.0  # when nodes apart were asked last; 0: never
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="viewer loads", daemon=True)
 
     def __enter__(self) -> RunLoads:
-        self._thread.start()
+        if self._apart is None:
+            self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -47,8 +58,22 @@ class RunLoads:
             self._over.wait(EVERY_S)
             if watch is not None:
                 zones = self._worlds.world.partition.count
-                rows = load_rows(pids, watch.snapshot(), self._worlds.plans, zones)
-                self._audience.tell_all({"kind": "loads", "rows": rows})
+                self._tell(load_rows(pids, watch.snapshot(), self._worlds.plans, zones))
+
+    def look(self) -> None:
+        """Ask nodes of other machines, if it is time; the thread of the worlds calls it."""
+        nodes, now_s = self._apart, time.monotonic()
+        if nodes is None or not self._audience.wishes.watchers or now_s - self._looked_s < EVERY_S:
+            return
+        is_first, self._looked_s = not self._looked_s, now_s
+        snapshot = nodes.node_snapshot()
+        if is_first:  # their watches have only begun
+            return
+        pids = dict(enumerate(nodes.pids))
+        self._tell(load_rows(pids, snapshot, nodes.plans, nodes.world.partition.count))
+
+    def _tell(self, rows: list[dict[str, Any]]) -> None:
+        self._audience.tell_all({"kind": "loads", "rows": rows + self.others})
 
 
 def load_rows(

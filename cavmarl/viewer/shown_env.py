@@ -68,7 +68,7 @@ class ShownEnv:
         self._publishers = [FramePublisher(stage.audience, stage.encoder) for stage in stages]
         with ExitStack() as stack:
             self.address = serve_stages(stack, stages, options, tell)
-            stack.enter_context(RunLoads(env.worlds, first.audience))
+            self._loads = stack.enter_context(RunLoads(env.worlds, first.audience))
             if looks_itself:
                 stack.callback(env.watch(self.look))
             self._stack = stack.pop_all()
@@ -86,7 +86,12 @@ class ShownEnv:
         wait_s = self._clock.wait_s(time.monotonic()) if self._controlled else 0.0
         if self._env.is_ready:
             self._publish()
+            self._loads.look()
         return wait_s
+
+    def tell_others(self, rows: list[dict[str, Any]]) -> None:
+        """Say what else has a LoadScore, in rows as of `run_loads.load_rows`."""
+        self._loads.others = rows
 
     def moved(self) -> None:
         """The worlds have taken a step: the clock goes on, and there is something new to show."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import random
 import signal
+import time
 from pathlib import Path
 from threading import Timer
 from typing import Any
@@ -20,6 +21,8 @@ from cavmarl.handoff.coordinator.journal import JournalReader
 from cavmarl.parallel.nodes.node_actions import Actions, read_refusal, take_actions
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.parallel.step_arrays import StepArrays
+from cavmarl.viewer.audience import Audience, Wishes
+from cavmarl.viewer.run_loads import RunLoads
 from tests.support.actuated import actuated_grid
 from tests.support.forks import said_in_fork
 from tests.support.vec_runs import Make, drive, same
@@ -322,3 +325,31 @@ def test_nodes_tell_what_they_have_done(make: Make) -> None:
         assert load.memory_bytes > 1 << 26
         assert load.ghosts > 0
     assert all(load.ticks == 0 for load in over_nodes(vec).node_loads())
+
+
+def test_loads_of_the_nodes_machines_are_told_to_pages(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vec = make("grid4x4", zones=4, nodes=2, **WANTED)
+    drive(vec, steps=2)
+    nodes = over_nodes(vec)
+    assert sorted(nodes.worker_pids) == [0, 1]
+    assert os.getpid() not in nodes.worker_pids.values()
+    monkeypatch.setattr(NodeWorlds, "worker_pids", {})  # as of nodes of other machines
+    monkeypatch.setattr("cavmarl.viewer.run_loads.EVERY_S", 0.05)
+    audience = Audience()
+    told: list[Any] = []
+    monkeypatch.setattr(audience, "tell_all", told.append)
+    loads = RunLoads(nodes, audience)
+    loads.look()
+    assert not told  # none watches
+    audience.wishes = Wishes(watchers=1)
+    loads.look()
+    time.sleep(0.3)
+    before = vec.state_hash(0)
+    loads.others = [{"name": "another", "zones": "-", "score": 0.5, "note": ""}]
+    loads.look()
+    (found,) = told
+    assert [row["zones"] for row in found["rows"]] == ["0, 1", "2, 3", "-"]
+    assert all(0.0 < row["score"] <= 1.0 for row in found["rows"])
+    assert vec.state_hash(0) == before

@@ -60,6 +60,19 @@ def test_nodes_tell_how_far_their_jobs_are(fleet: Fleet) -> None:
         fleet.beat_of("a", jobs={job.id: [30]})
 
 
+def test_a_node_that_is_watched_is_told_all_scores(fleet: Fleet) -> None:
+    fleet.join("a", "b")
+    fleet.register("c")
+    session = fleet.open()
+    told = fleet.broker.beat(fleet.nodes, "a", fleet.beat_of("a", watched=True))
+    scores = {one["name"]: one for one in told["scores"]}
+    assert list(scores) == ["a", "b", "c"]
+    assert scores["c"]["score"] is None
+    assert scores["a"]["score"] == pytest.approx(0.6 * 0.1 + 0.2 * 0.1)
+    assert scores[session.node or ""]["sessions"] == 1
+    assert fleet.beat("a")["scores"] == []
+
+
 def test_the_steps_of_a_job_are_those_of_all_its_runs_and_drivers(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -239,6 +239,15 @@ def test_a_session_is_shown_on_a_page_of_its_node(client: Client) -> None:
                 world.step(world.suggest_actions())
             messages = [page.recv(timeout=10) for _ in range(3)]
             assert 3 in [message[0] for message in messages if isinstance(message, bytes)]
+            rows: list[Any] = []
+            for _ in range(20):
+                message = page.recv(timeout=10)
+                told_of = json.loads(message) if isinstance(message, str) else {}
+                rows = told_of.get("rows", rows)
+                if len(rows) > 1:
+                    break
+            assert "node of the service" in rows[-1]["name"]
+            assert rows[-1]["score"] is not None
         with connect(live, max_size=None, compression=None) as page:
             page.send(json.dumps({"kind": "hello", "token": told["watch_token"]}))
             assert json.loads(page.recv(timeout=10))["control"] is False

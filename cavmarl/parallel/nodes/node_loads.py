@@ -6,11 +6,16 @@ import os
 import resource
 import time
 from collections.abc import Sequence
+from dataclasses import astuple
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from cavmarl.balance.probe import Watch
 from cavmarl.engine.simulation import Simulation
 from cavmarl.parallel.nodes.links import Links
+
+OF_MACHINE = "machine"  # what a node is asked for, in the place of what it has done itself
 
 
 class NodeLoad(NamedTuple):
@@ -25,6 +30,28 @@ class NodeLoad(NamedTuple):
     memory_bytes: int  # resident now
     vehicles: int  # that it owns now, in all worlds
     ghosts: int  # copies of other zones' vehicles that it has now
+
+
+class MachineWatch:
+    """How busy others keep this machine."""
+
+    def __init__(self) -> None:
+        self._watch = Watch({0: os.getpid()})
+
+    def since(self) -> list[Any]:
+        """Shares as of `Utilisation`, and their source, since this was asked last, or first."""
+        found, self._watch = self._watch.snapshot(), Watch({0: os.getpid()})
+        return [astuple(found.workers[0].use), found.gpu_source]
+
+
+machine_watch = cache(MachineWatch)  # of this process
+
+
+def told_of(payload: Any, links: Links, simulation: Simulation, zones: Sequence[int]) -> list[Any]:
+    """What a node is asked for: of its machine, or of itself."""
+    if payload == OF_MACHINE:
+        return machine_watch().since()
+    return totals(links, simulation, zones)
 
 
 def totals(links: Links, simulation: Simulation, zones: Sequence[int]) -> list[Any]:

@@ -34,7 +34,7 @@ from cavmarl.parallel.nodes.meeting import call_node, calls_of
 from cavmarl.parallel.nodes.node_actions import refusal, take_actions
 from cavmarl.parallel.nodes.node_files import WorldFile, recipe_with
 from cavmarl.parallel.nodes.node_frames import cases_of, command_of, results_of, told_cases
-from cavmarl.parallel.nodes.node_loads import totals
+from cavmarl.parallel.nodes.node_loads import told_of
 from cavmarl.parallel.nodes.node_peers import NodePeers
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.nodes.zone_hosts import ZoneHosts
@@ -291,7 +291,7 @@ class NodeProgram:
                 spent_s = [] if self._clock is None else self._clock.take_s().tolist()
                 self._answer([json.dumps(list(zip(self.zones, spent_s, strict=False))).encode()])
             case Task.LOADS:
-                said = [self._number, *totals(self._links, worlds.simulation, self.zones)]
+                said = [self._number, *told_of(payload, self._links, worlds.simulation, self.zones)]
                 self._answer([json.dumps(said).encode()])
             case Task.SUGGEST:
                 worlds.suggest()

@@ -11,6 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.balance.balance_plan import Plan
+from cavmarl.balance.load_score import Candidate, Utilisation
+from cavmarl.balance.load_snapshot import NO_GPU, LoadSnapshot
+from cavmarl.balance.probe import MEASURED
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
@@ -26,9 +29,9 @@ from cavmarl.parallel.nodes.node_frames import (
     take_results,
     told_cases,
 )
-from cavmarl.parallel.nodes.node_loads import NodeLoad, since
+from cavmarl.parallel.nodes.node_loads import OF_MACHINE, NodeLoad, since
 from cavmarl.parallel.nodes.node_pool import NodePool
-from cavmarl.parallel.nodes.node_starters import Route, Start, start_nodes, straight
+from cavmarl.parallel.nodes.node_starters import LocalNodes, Route, Start, start_nodes, straight
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.step_arrays import Driven
 from cavmarl.parallel.worlds_job import Task
@@ -155,6 +158,15 @@ class NodeWorlds(NodePool):
             self._told[node] = now
         return sorted(found)
 
+    def node_snapshot(self) -> LoadSnapshot:
+        """How busy others keep the machine of each node, as it says, since it was asked last."""
+        found = [
+            json.loads(bytes(data)) for data in self.run(self._command(Task.LOADS, OF_MACHINE))
+        ]
+        states = tuple(Candidate(node, Utilisation(*shares)) for node, shares, _ in found)
+        source = next((source for *_, source in found if source != NO_GPU), NO_GPU)
+        return LoadSnapshot(states, source, MEASURED)
+
     def _asked(self, task: Task, payload: Any) -> Any:
         return json.loads(bytes(self.run(self._command(task, payload))[0]))
 
@@ -207,8 +219,9 @@ class NodeWorlds(NodePool):
 
     @property
     def worker_pids(self) -> dict[int, int]:
-        """None: nodes measure themselves, see `node_loads`."""
-        return {}
+        """Those of nodes of this machine; others measure their machines, see `node_snapshot`."""
+        is_here = isinstance(self._starter, LocalNodes)
+        return dict(enumerate(self.pids)) if is_here else {}
 
     @property
     def transfers(self) -> tuple[TransferLog, ...]:
