@@ -119,9 +119,9 @@ class ZonesConfig(Section, key="zones"):
             the new one does not acknowledge it.
         policy: what follows: `force`: the change is forced at once; `extend`: after `grace_ticks`
             more. With `hold` a vehicle is stopped before the border if the zone behind it has not
-            acknowledged it for more than `grace_ticks`; a world in which that happens is not the
-            undivided one any more. `reroute` (it turns away) is refused.
-        grace_ticks: that `extend` grants behind a border, and `hold` before it.
+            acknowledged it for more than `grace_ticks`; with `reroute` it takes a way around that
+            zone, if there is one. A world in which that happens is not the undivided one any more.
+        grace_ticks: that `extend` grants behind a border, `hold` and `reroute` before it.
         backoff_ticks: for which a zone that has refused a vehicle is not asked again.
         halo_m: how far zones see over their borders; default: as far as exactness needs, and less
             is refused.
@@ -165,15 +165,9 @@ class ZonesConfig(Section, key="zones"):
             f"must be {', '.join(ZONE_LAYOUTS)}, or a zone file ({', '.join(ZONE_FILE_SUFFIXES)})",
         )
         self.need(
-            "policy",
-            self.policy != "reroute",
-            "is not built; use hold, which stops vehicles before the border, extend, which lets "
-            "them drive on, or force",
-        )
-        self.need(
             "grace_ticks",
             (self.policy == "force") == (self.grace_ticks == 0),
-            "must be 1 or more with zones.policy = extend and hold, and 0 with force",
+            "must be 1 or more with extend, hold and reroute of zones.policy, and 0 with force",
         )
         self.need(
             "repartition_steps",

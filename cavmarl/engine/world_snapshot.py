@@ -87,7 +87,7 @@ def load(
 
 def share_of(parts: Parts, w: int) -> list[Array]:
     """What `save` would give if there were no world but one; some are views, to be copied."""
-    gate, rerouting = parts.gate, parts.traffic.rerouting
+    gate, rerouting = parts.gate, parts.traffic.found_ways
     waiting = gate.queue[w : w + 1, : gate.num_queue.item(w)]
     owned = [parts.division.owned(w, zone) for zone in range(parts.division.count)]
     if parts.sumo is not None:
@@ -109,7 +109,7 @@ def share_of(parts: Parts, w: int) -> list[Array]:
 
 def join(parts: Parts, shares: Sequence[Sequence[Array]]) -> list[Array]:
     """What `save` would give of worlds of which each share has been one."""
-    zones, rerouting = parts.division.count, parts.traffic.rerouting
+    zones, rerouting = parts.division.count, parts.traffic.found_ways
     if parts.sumo is not None:
         shares = [_shifted(parts, parts.sumo, share, w) for w, share in enumerate(shares)]
     fields = zip(*(share[:-zones] for share in shares), strict=True)
@@ -167,8 +167,8 @@ def committed(parts: Parts) -> Iterator[Array]:
 
 
 def _of_rerouting(parts: Parts) -> Iterator[Array]:
-    if parts.traffic.rerouting is not None:
-        yield from parts.traffic.rerouting.arrays()
+    if parts.traffic.found_ways is not None:
+        yield from parts.traffic.found_ways.arrays()
 
 
 def _put(target: Array, saved: Array) -> None:
@@ -179,7 +179,7 @@ def _put(target: Array, saved: Array) -> None:
 
 def digest_world(parts: Parts, world: int) -> str:
     """Hex digest of one world, whatever the order of rows; see `Simulation.state_hash`."""
-    worlds, gate, rerouting = parts.worlds, parts.gate, parts.traffic.rerouting
+    worlds, gate, rerouting = parts.worlds, parts.gate, parts.traffic.found_ways
     sumo = parts.sumo
     rows = parts.division.vehicles(world)
     rows = rows[np.argsort(rows["id"])]

@@ -20,6 +20,7 @@ from cavmarl.ownership.messages import (
     Ack,
     Begin,
     Birth,
+    BorderWait,
     Commit,
     Done,
     Fence,
@@ -216,11 +217,11 @@ class Directory:
             return ()
         return tuple(zone for zone in self.table.hosts if zone not in self.dones)
 
-    def overdue(self) -> tuple[int, ...]:
+    def overdue(self) -> tuple[BorderWait, ...]:
         """Vehicles that the policy HOLD or REROUTE asks the runtime to act upon in this tick."""
         if self.table.plan is None:
             return ()
-        return tuple(entry.vehicle for entry in self.table.plan.record.waiting if entry.held)
+        return tuple(entry for entry in self.table.plan.record.waiting if entry.held)
 
     def commit(
         self,

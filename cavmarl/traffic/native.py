@@ -25,6 +25,7 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN, make_plans
 from cavmarl.traffic.demand import STOP, DemandFile
 from cavmarl.traffic.departure_queue import with_room
+from cavmarl.traffic.found_ways import FoundWays
 from cavmarl.traffic.kernels.admission import accept, assign_lanes
 from cavmarl.traffic.kernels.demand_generator import call_orders, insert, populate, settle
 from cavmarl.traffic.map_trips import MapTrips, for_each_map, together
@@ -36,9 +37,10 @@ from cavmarl.traffic.schedule import Schedule
 from cavmarl.traffic.sumo.route_book import RouteBook, StopBook
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
 from cavmarl.traffic.turning_circle import TurningBody, with_tight_turns
-from cavmarl.traffic.way_search import WaySlots, way_slots
+from cavmarl.traffic.way_search import WaySlots, seekers, way_slots
 
 FAST_FACTOR = 1.5  # a speed over the limit that hardly any driver of the demand wants
+TURNED_STEPS = 256  # a third of the steps that the way of a vehicle may have that turns away
 JAM_GAP_M = 2.5  # between the bumpers of vehicles that stand in a queue
 
 
@@ -69,6 +71,7 @@ class NativeTraffic:
     zeros: Zeros = np.zeros
     scene: Scene | None = None  # what is played to the agents of each world
     sumo: SumoDemand | None = None  # in the place of a file: what SUMO runs beside these worlds
+    turns_away: bool = False  # any vehicle may look for a way that keeps away from some edges
 
     def __post_init__(self) -> None:
         # Trips that do not exist are refused when the world is made, not at its first reset.
@@ -84,6 +87,7 @@ class NativeTraffic:
             "_travel_of_others",
             "_slots",
             "rerouting",
+            "found_ways",
         ):  # each world has its part of them
             vars(other).pop(name, None)
         other._check_room()
@@ -168,15 +172,13 @@ class NativeTraffic:
         actors = types[:0] if self.cast is None else self.cast.types
         if self.file is None or self.schedule is None:
             types = np.concatenate([types, actors])
-            stops = self._barrier_stops
-            return Travel(types, steps, stops, 0, 0.0, VIEW_M, VIEW_M, len(steps), scripts)
+            stops, num_fixed = self._barrier_stops, len(steps)
+            steps = self._with_slots(steps)
+            return Travel(types, steps, stops, 0, 0.0, VIEW_M, VIEW_M, num_fixed, scripts)
         types = np.concatenate([types, self.file.types, actors])
         steps = np.concatenate([steps, self.schedule.steps])
         num_fixed = len(steps)
-        if self._slots is not None:
-            parts = (steps, self._slots.table())
-            steps = self.zeros(sum(map(len, parts)), dtype=steps.dtype)
-            np.concatenate(parts, out=steps)
+        steps = self._with_slots(steps)
         first_detour = self.plans.size + self.schedule.first_detour
         begin_s = self.file.begin_ms / 1000.0
         return Travel(
@@ -190,6 +192,14 @@ class NativeTraffic:
             num_fixed=num_fixed,
             scripts=scripts,
         )
+
+    def _with_slots(self, fixed: NDArray[np.void]) -> NDArray[np.void]:
+        """The table of ways, with room behind it where vehicles find some."""
+        if self._slots is None:
+            return fixed
+        steps = self.zeros(len(fixed) + self._slots.room, dtype=fixed.dtype)
+        steps[: len(fixed)] = fixed
+        return steps
 
     @property
     def _barrier_stops(self) -> NDArray[np.void]:
@@ -243,13 +253,25 @@ class NativeTraffic:
     @cached_property
     def _slots(self) -> WaySlots | None:
         """Room for the ways that vehicles find while the world runs, where some may."""
-        file, schedule = self.file, self.schedule
-        if file is None or schedule is None:
+        schedule, number, longest = self.schedule, 0, 0
+        first_step = self.plans.size
+        if schedule is not None:
+            longest = schedule.longest
+            first_step += len(schedule.steps)
+            if self._reroutes:
+                number = seekers(schedule, self.capacity, self.horizon_s)
+        if self.turns_away:
+            number, longest = self.capacity, max(longest, TURNED_STEPS)
+        if number == 0:
             return None
-        if not file.may_look and not len(file.rerouters.rules):
-            return None
-        first_step = self.plans.size + len(schedule.steps)
-        return way_slots(schedule, first_step, self.num_worlds, self.capacity, self.horizon_s)
+        lanes = self.network.lanes
+        return way_slots(lanes, longest, first_step, self.num_worlds, number)
+
+    @property
+    def _reroutes(self) -> bool:
+        """Whether the demand has vehicles that look for ways, or rerouters."""
+        file = self.file
+        return file is not None and (file.may_look or len(file.rerouters.rules) > 0)
 
     @property
     def ticks_per_s(self) -> int:
@@ -259,10 +281,17 @@ class NativeTraffic:
     @cached_property
     def rerouting(self) -> Rerouting | None:
         """Those ways; None where vehicles do not reroute."""
-        if self.schedule is None or self._slots is None:
+        if self.schedule is None or self._slots is None or not self._reroutes:
             return None
         first_type = len(generated_types())
         return Rerouting(self.schedule, self.travel, self._slots, first_type, self.dt)
+
+    @cached_property
+    def found_ways(self) -> FoundWays | None:
+        """What keeps ways that are found, of vehicles that reroute or have to turn away."""
+        if self.rerouting is not None or self._slots is None:
+            return self.rerouting
+        return FoundWays(self.network.arrays, self.travel, self._slots, self.schedule)
 
     @cached_property
     def capacity(self) -> int:
@@ -311,8 +340,8 @@ class NativeTraffic:
             gate = with_room(gate, len(orders))
             gate.orders[w, : len(orders)] = orders
             gate.num_orders[w] = len(orders)
-            if self.rerouting is not None:
-                self.rerouting.begin(int(w), int(worlds.keys[w]), self.horizon_s)
+            if self.found_ways is not None:
+                self.found_ways.begin(int(w), int(worlds.keys[w]), self.horizon_s)
         return gate
 
     def populate(self, gate: Gate, worlds: Worlds, chosen: NDArray[np.bool_]) -> None:

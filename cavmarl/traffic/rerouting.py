@@ -14,15 +14,14 @@ from numpy.typing import NDArray
 
 from cavmarl.core.math.rng import STREAM_REROUTER, uniform
 from cavmarl.core.records import record
-from cavmarl.core.records.arrays import Gate, RoadArrays, Travel, Worlds
+from cavmarl.core.records.arrays import Gate, Travel, Worlds
 from cavmarl.core.records.codes import COUNT_REROUTED
-from cavmarl.roads.routing import PLAN
 from cavmarl.traffic.demand import Choices
 from cavmarl.traffic.demand.rerouters import KEEP_DESTINATION
+from cavmarl.traffic.found_ways import FoundWays, plain
 from cavmarl.traffic.kernels.way_requests import (
     find_asking,
     limit_speeds,
-    mark_slots,
     sample_speeds,
 )
 from cavmarl.traffic.schedule import Schedule
@@ -41,7 +40,7 @@ LOOK = record(
 )
 
 
-class Rerouting:
+class Rerouting(FoundWays):
     """Vehicles that reroute, what is known of the traffic, and the ways that were found; W worlds.
 
     `travel`: types and ways, with room behind them. `slots`: that room. `first_type`: VTYPE row of
@@ -51,13 +50,11 @@ class Rerouting:
     def __init__(
         self, schedule: Schedule, travel: Travel, slots: WaySlots, first_type: int, dt: float
     ) -> None:
+        super().__init__(schedule.demand.network.arrays, travel, slots, schedule)
         self._schedule = schedule
-        self._travel = travel
-        self._slots = slots
         self._first_type = first_type
         self._dt = dt
         self._ticks_per_s = max(1, round(1.0 / dt))
-        self._roads: RoadArrays = schedule.demand.network.arrays
         demand, edges, lanes = schedule.demand, len(self._roads.edges), len(self._roads.lanes)
         self._measures = demand.may_look
         steps = demand.device.adaptation_steps if self._measures else 0
@@ -84,18 +81,16 @@ class Rerouting:
             self._looks = np.concatenate([self._looks, room], axis=1)
         looks = self._looks[world, : len(orders)]
         self._num_looks[world] = len(orders)
-        routes = self._schedule.demand.routes[orders["route"]]
         period = np.round(orders["reroute_period_ms"] / 1000.0 / self._dt).astype(np.int64)
         looks["period"] = np.where(period > 0, np.maximum(period, self._ticks_per_s), 0)
         looks["equipped"] = orders["reroute"]
         looks["next"] = np.where(orders["reroute"], 0, NEVER)
         looks["goal"] = self._schedule.last_edges(orders["route"])
         looks["seen"] = -1
-        looks["may_leave"] = routes["exact"] | (routes["num_edges"] <= 2)
+        super().begin(world, key, horizon_s)
+        looks["may_leave"] = self._may_leave[world]
         if self._measures:
             limit_speeds(self._roads, self._past[world], self._speed_sums[world])
-        first = self._slots.first_of(world)
-        self._travel.steps[first : first + self._slots.of_world] = np.zeros((), dtype=PLAN)
 
     def act(self, gate: Gate, worlds: Worlds) -> None:
         """Once a second, sample the speeds and let vehicles ask for ways; writes `next_rows`."""
@@ -104,14 +99,6 @@ class Rerouting:
                 self._sample(worlds, w, int(tick))
                 gate.counts[w, COUNT_REROUTED] += self._let_ask(worlds, w, int(tick))
 
-    def ways_of_first_world(self, ways: NDArray[np.int64], world: int) -> NDArray[np.int64]:
-        """VEHICLE["way"] (n,) of a world as it would be in the first one."""
-        return self._slots.ways_of_first_world(ways, world)
-
-    def ways_of_world(self, ways: NDArray[np.int64], world: int) -> NDArray[np.int64]:
-        """VEHICLE["way"] (n,) in a world, of ways as they are in the first one."""
-        return self._slots.ways_of_first_world(ways, -world)
-
     def state(self, world: int, rows: NDArray[np.void]) -> Iterator[NDArray[np.generic]]:
         """What of a world's state is kept here, as arrays without padding.
 
@@ -119,27 +106,19 @@ class Rerouting:
         """
         yield self._speed_sums[world]
         yield self._past[world]
-        slots = self._slots
-        used = np.zeros(slots.number, dtype=np.bool_)
-        first = slots.first_of(world)
-        mark_slots(self._roads, rows, len(rows), first, slots.steps, used)
-        steps = self._travel.steps[first : first + slots.of_world]
-        ways = steps.reshape(slots.number, slots.steps)[used]
-        for records in (self._looks[world, : self._num_looks[world]], ways):
-            for name in records.dtype.names or ():
-                yield np.ascontiguousarray(records[name])
+        yield from plain(self._looks[world, : self._num_looks[world]])
+        yield from super().state(world, rows)
 
     def arrays(self) -> Iterator[NDArray[np.generic]]:
         """What a tick changes here, of all worlds; to be copied and put back."""
         yield from (self._past, self._speed_sums, self._looks)
-        yield self._travel.steps[self._slots.first :]
+        yield from super().arrays()
 
     def arrays_of(self, world: int) -> Iterator[NDArray[np.generic]]:
         """`arrays` as they would be if there were no world but one."""
         for array in (self._past, self._speed_sums, self._looks):
             yield array[world : world + 1]
-        first = self._slots.first_of(world)
-        yield self._travel.steps[first : first + self._slots.of_world]
+        yield from super().arrays_of(world)
 
     def _sample(self, worlds: Worlds, w: int, tick: int) -> None:
         interval_ms = self._schedule.demand.device.adaptation_interval_ms

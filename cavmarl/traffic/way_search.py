@@ -45,9 +45,10 @@ class WaySlots:
     # others: a way is a step's row minus that of a lane.
     num_lanes: int
 
-    def table(self) -> NDArray[np.void]:
-        """PLAN, all steps of all slots, to be put behind the others."""
-        return np.zeros(self.num_lanes + self.num_worlds * self.of_world, dtype=PLAN)
+    @property
+    def room(self) -> int:
+        """PLAN rows that have to be put behind the others."""
+        return self.num_lanes + self.num_worlds * self.of_world
 
     @property
     def of_world(self) -> int:
@@ -67,29 +68,37 @@ class WaySlots:
         return ways - own * (world * self.of_world)
 
 
-def way_slots(
-    schedule: Schedule, first_step: int, num_worlds: int, capacity: int, horizon_s: float
-) -> WaySlots:
-    """The slots of a demand: one for each vehicle that may need one at a time.
+def seekers(schedule: Schedule, capacity: int, horizon_s: float) -> int:
+    """How many of the `capacity` vehicles of one world may look for a way at a time.
 
-    `first_step`: how many PLAN rows come before. `capacity`: vehicles of one world. `horizon_s`:
-    seconds an episode.
+    `horizon_s`: seconds an episode.
+    """
+    if len(schedule.demand.rerouters.rules):
+        return capacity
+    # With a device only: how many have it is drawn.
+    equipped = int(schedule.orders(0, horizon_s)["reroute"].sum())
+    return min(capacity, equipped + 6 * math.isqrt(equipped) + 16)
+
+
+def way_slots(
+    lanes: NDArray[np.void],  # LANE, of the map
+    longest: int,  # steps of the longest known way
+    first_step: int,  # how many PLAN rows come before
+    num_worlds: int,
+    number: int,  # slots of one world
+) -> WaySlots:
+    """Room for the ways of so many vehicles at a time.
 
     Raises CapacityError: they would take more than `MAX_STEPS`.
     """
-    number = capacity
-    if not len(schedule.demand.rerouters.rules):
-        # With a device only: how many have it is drawn.
-        equipped = int(schedule.orders(0, horizon_s)["reroute"].sum())
-        number = min(capacity, equipped + 6 * math.isqrt(equipped) + 16)
-    num_lanes = len(schedule.demand.network.lanes)
-    outside = int((~schedule.demand.network.lanes["internal"]).sum())
-    steps = min(outside, max(LEAST_STEPS, DETOUR_RATIO * schedule.longest))
+    num_lanes = len(lanes)
+    outside = int((~lanes["internal"]).sum())
+    steps = min(outside, max(LEAST_STEPS, DETOUR_RATIO * longest))
     if num_worlds * number * steps > MAX_STEPS:
         raise CapacityError(
             f"ways of {number} vehicles that look for their own, {steps} steps each, in "
             f"{num_worlds} worlds are over {MAX_STEPS} steps: fewer worlds, or fewer vehicles "
-            "with a rerouting device"
+            "with a rerouting device or with zones.policy = reroute"
         )
     return WaySlots(first_step + num_lanes, number, steps, num_worlds, num_lanes)
 

@@ -292,7 +292,6 @@ def test_zones_are_laid_out_by_name_or_by_a_file(tmp_path: Path, layout: str) ->
         ("grace_ticks", -1),
         ("grace_ticks", 1),
         ("policy", "wait"),
-        ("policy", "reroute"),
         ("backoff_ticks", 1001),
         ("halo_m", -1.0),
         ("halo_m", float("inf")),
@@ -306,12 +305,10 @@ def test_settings_of_zones_are_checked(key: str, value: object) -> None:
 
 
 def test_a_policy_has_the_grace_that_it_needs() -> None:
-    grace = "must be 1 or more with zones.policy = extend and hold, and 0 with force"
+    grace = "must be 1 or more with extend, hold and reroute of zones.policy, and 0 with force"
     with pytest.raises(ConfigError, match=rf"zones\.grace_ticks = 0: {grace}"):
         load_config("ring", overrides={"zones.policy": "extend"})
-    with pytest.raises(ConfigError, match=r"zones\.policy = 'reroute': is not built; use hold"):
-        load_config("ring", overrides={"zones.policy": "reroute", "zones.grace_ticks": 3})
-    for policy, holds in (("extend", False), ("hold", True)):
+    for policy, holds in (("extend", False), ("hold", True), ("reroute", True)):
         patient = {"zones.policy": policy, "zones.grace_ticks": 3}
         zones = load_config("ring", overrides=patient)[0].zones
         assert (zones.grace_ticks, zones.holds) == (3, holds)

@@ -419,7 +419,7 @@ def test_r29_a_policy_grants_ticks_behind_the_border_or_holds_before_it(
     overdue = []
     for _ in range(4 * holds):
         steps = bench.begin(approaching=[(7, 1)])
-        overdue.append(bench.directory.overdue())
+        overdue.append(tuple(wait.vehicle for wait in bench.directory.overdue()))
         bench.pass_on(steps)
         bench.commit()
     assert overdue == [(), (), (7,), (7,)] * holds

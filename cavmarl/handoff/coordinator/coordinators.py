@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from hashlib import blake2b
 from typing import Protocol
 
@@ -21,7 +21,7 @@ from cavmarl.handoff.fault_injection.committed_store import CommittedStore, Note
 from cavmarl.handoff.fault_injection.message_coordinator import MessageCoordinator
 from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.ledger import state_digest
-from cavmarl.ownership.messages import Record
+from cavmarl.ownership.messages import BorderWait, Record
 from cavmarl.shards.shard import Commands
 from cavmarl.zones.kernels.zone_lookup import zones_of
 
@@ -84,10 +84,10 @@ class RowStates:
         self.borders.near = found
         return found
 
-    def hold(self, vehicles: Collection[int]) -> None:
-        """Let these vehicles stop before the border in the tick on its way, and no others."""
+    def hold(self, held: Sequence[BorderWait]) -> None:
+        """Keep these vehicles from the border in the tick on its way, and no others."""
         if self._holds is not None:
-            self._holds.hold(self._world, self.ahead, vehicles)
+            self._holds.hold(self._world, self.ahead, held)
 
     def change(self, entries: Sequence[ArrivingVehicle]) -> None:
         """Let rows change hands, of vehicles that `look` has found."""

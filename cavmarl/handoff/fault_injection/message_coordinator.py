@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Protocol, TypeAlias
 
 from cavmarl.core.errors import ProtocolError
@@ -14,7 +14,16 @@ from cavmarl.ownership.decisions import Neighbours
 from cavmarl.ownership.directory import SILENCE, Directory
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.limits import Limits
-from cavmarl.ownership.messages import COORDINATOR, Begin, Message, Output, Prepare, Record, Removed
+from cavmarl.ownership.messages import (
+    COORDINATOR,
+    Begin,
+    BorderWait,
+    Message,
+    Output,
+    Prepare,
+    Record,
+    Removed,
+)
 from cavmarl.ownership.offers import Approach
 from cavmarl.ownership.reactions import Advance
 from cavmarl.ownership.safeguards import ALL_ON, Safeguards
@@ -58,8 +67,8 @@ class States(Protocol):
 
     def change(self, entries: Sequence[ArrivingVehicle]) -> None: ...
 
-    def hold(self, vehicles: Collection[int]) -> None:
-        """Let these vehicles stop before the border in the tick on its way, and no others."""
+    def hold(self, held: Sequence[BorderWait]) -> None:
+        """Keep these vehicles from the border in the tick on its way, and no others."""
         ...
 
 
@@ -154,7 +163,7 @@ class MessageCoordinator(Coordinator):
             states.state(switch.vehicle)  # a STEP may be repeated after rows moved
         states.change(entries)
         if self._limits.holds:
-            states.hold(frozenset(directory.overdue()))
+            states.hold(directory.overdue())
 
     def _approaching(self) -> list[tuple[int, int]]:
         """(vehicle, next zone) before a border: those that can stop there, or are held already."""

@@ -25,6 +25,7 @@ AHEAD = record(
     ("gap_m", np.float64),  # from its front to the border
     ("depth_m", np.float64),  # how far it has to go to the target, less than 0
     ("can_stop", np.bool_),  # in comfort, before the border
+    ("has_to_brake", np.bool_),  # about now, to do so
 )
 
 STRIDE_M = 1.0  # between the places of a way that are looked at
@@ -73,9 +74,30 @@ def find_ahead(
             entry["target"] = target
             entry["gap_m"] = gap
             entry["depth_m"] = -math.sqrt(squared_distance(zones.rects, target, row["x"], row["y"]))
+            entry["has_to_brake"] = inside <= look - more_m
             entry["can_stop"] = gap > 0.0 and speed * speed <= 2.0 * kind["decel"] * gap
             found += 1
     return found
+
+
+@kernel
+def close_edges(
+    zones: ZoneArrays,
+    roads: RoadArrays,
+    zone: int,
+    closed: NDArray[np.int64],  # (num_edges,) bits of classes; those of all are set
+) -> None:
+    """Close all edges of which any part lies in a zone."""
+    for lane in range(roads.lanes.shape[0]):
+        here = roads.lanes[lane]
+        s = 0.0
+        while True:
+            pose = lane_pose(roads.points, here["first_point"], here["num_points"], s)
+            if zone_of(zones, pose[0], pose[1]) == zone:
+                closed[here["edge"]] = -1
+            if s >= here["length_m"]:
+                break
+            s = min(s + STRIDE_M, here["length_m"])
 
 
 @kernel
