@@ -31,14 +31,16 @@ import numpy as np
 
 from cavmarl.config.io import read_yaml
 from cavmarl.config.world_spec import WorldSpec
-from cavmarl.core.errors import CavmarlError, ConfigError, require
+from cavmarl.core.errors import ConfigError, require
 from cavmarl.core.processes import dying_with_parent
 from cavmarl.evaluate import EvaluationReport, evaluate
 from cavmarl.evaluate.provenance.training_record import CHECKPOINT_FILE, is_trained
 from cavmarl.evaluate.statistics import Interval, mean_interval
+from cavmarl.learning.options import run_to_end
 from cavmarl.policies.policy import driver_keys
 
 PROGRAM = Path(__file__).with_name("ppo.py")
+GOES_ON = "the same command goes on from the last checkpoints"
 SCRIPTED = ("idm", "random_actions")
 ALONE = "alone"
 METRICS = {
@@ -292,16 +294,12 @@ def compare(args: Args) -> str:
 
 def main(words: Sequence[str] | None = None) -> int:
     """Train, evaluate, write; 0: done, 2: wrong use, 130: interrupted."""
-    try:
+
+    def run() -> None:
         for args in parse_args(words):
             print(compare(args), flush=True)
-    except CavmarlError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("interrupted: the same command goes on from the last checkpoints", file=sys.stderr)
-        return 130
-    return 0
+
+    return run_to_end(run, GOES_ON)
 
 
 if __name__ == "__main__":

@@ -17,12 +17,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from five_seeds import Args, Row, parse_args, train
+from five_seeds import GOES_ON, Args, Row, parse_args, train
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import CavmarlError, require
+from cavmarl.core.errors import require
 from cavmarl.evaluate import evaluate
 from cavmarl.evaluate.statistics import Interval, mean_interval
+from cavmarl.learning.options import run_to_end
 
 LOSS = "v2x.channel.loss"
 LOSSES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
@@ -132,16 +133,12 @@ def main(words: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if words is None else words)
     if "--config" not in given:
         given += ["--config", str(Path(__file__).parents[1] / "configs/train/blind_junction.yaml")]
-    try:
+
+    def run() -> None:
         (args,) = parse_args(given)
         print(compare(args))
-    except CavmarlError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("interrupted: the same command goes on from the last checkpoints", file=sys.stderr)
-        return 130
-    return 0
+
+    return run_to_end(run, GOES_ON)
 
 
 if __name__ == "__main__":

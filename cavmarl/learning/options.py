@@ -95,15 +95,25 @@ def run_program(train: Callable[[], Path], said: str = DRIVER) -> int:
 
     0: trained, 2: wrong use, or what stands in the way; 130: interrupted.
     """
+    return run_to_end(
+        lambda: print(said.format(folder=train())),
+        "--resume goes on from the last checkpoint",
+    )
+
+
+def run_to_end(act: Callable[[], None], goes_on: str) -> int:
+    """Do what a program is for; `goes_on` says how it goes on after Ctrl-C.
+
+    0: done, 2: wrong use, or what stands in the way; 130: interrupted.
+    """
     try:
-        folder = train()
+        act()
     except CavmarlError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("interrupted: --resume goes on from the last checkpoint", file=sys.stderr)
+        print(f"interrupted: {goes_on}", file=sys.stderr)
         return 130
-    print(said.format(folder=folder))
     return 0
 
 

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
-import time
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -18,6 +16,7 @@ from cavmarl import CavEnv, RecordingError, make_vec, parallel_env
 from cavmarl.engine.world_frame import WorldFrame
 from cavmarl.recordings.recording import Recording
 from tests.support.forks import said_in_fork
+from tests.support.killed_recordings import killed_recording
 
 
 def drive(env: CavEnv, steps: int) -> list[WorldFrame]:
@@ -139,19 +138,7 @@ while True:
 
 @pytest.mark.skipif(os.name != "posix", reason="kills with SIGKILL")
 def test_a_killed_run_leaves_all_that_was_committed(tmp_path: Path) -> None:
-    path = tmp_path / "run"
-    with subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, str(path)], stdout=subprocess.PIPE
-    ) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == b"begun\n"
-        until = time.monotonic() + 30.0
-        while len(list(path.glob("world-0/frames/0*.parquet"))) < 3 and time.monotonic() < until:
-            time.sleep(0.02)
-        process.send_signal(signal.SIGKILL)
-    recording = Recording.open(path)
-    assert not recording.is_whole
-    replayed = list(recording.frames())
+    replayed = list(killed_recording(tmp_path / "run", PROGRAM, parts=3).frames())
     assert len(replayed) > 3
     with closing(parallel_env("ring")) as env:
         for one, other in zip(replayed, drive(env, 20), strict=False):

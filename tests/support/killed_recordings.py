@@ -1,0 +1,35 @@
+"""Recordings of runs that were killed."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from cavmarl.recordings.recording import Recording
+
+
+def killed_recording(path: Path, program: str, parts: int) -> Recording:
+    """What a program has left that records into a path, killed once so many parts are there.
+
+    Args:
+        path: its first argument.
+        program: its text; it prints `begun`, and goes on for ever.
+        parts: of the first world.
+    """
+    with subprocess.Popen(
+        [sys.executable, "-c", program, str(path)], stdout=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"begun\n"
+        until = time.monotonic() + 30.0
+        while (
+            len(list(path.glob("world-0/frames/0*.parquet"))) < parts and time.monotonic() < until
+        ):
+            time.sleep(0.02)
+        process.send_signal(signal.SIGKILL)
+    recording = Recording.open(path)
+    assert not recording.is_whole
+    return recording
