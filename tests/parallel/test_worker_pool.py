@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -280,6 +281,35 @@ def test_a_start_that_is_killed_is_begun_again(tmp_path: Path) -> None:
         pool.run(ADD)
     assert gone(pids)
     assert len(os.listdir("/proc/self/fd")) < descriptors
+
+
+def test_a_start_that_is_stopped_is_begun_again(tmp_path: Path) -> None:
+    file = tmp_path / "a"
+    file.touch()
+    start = program(2, dies_while=[str(file)], dies_by=signal.SIGSTOP)
+    pool = in_time(lambda: Pool(start, 60.0, 2))
+    pool.run(ADD)
+    assert totals(pool) == [[3.0, MORE]] * 2
+    file.touch()
+    os.kill(pool.server_pid, signal.SIGKILL)
+    in_time(lambda: pool.run(ADD))
+    assert totals(pool) == [[6.0, 2 * MORE]] * 2
+    pool.close()
+
+
+def in_time(work: Callable[[], Any], limit_s: float = 20.0) -> Any:
+    """What `work` returns; SIGALRM ends it, where it waits for ever."""
+
+    def give_up(*_: object) -> None:
+        raise TimeoutError(f"not done after {limit_s:g} s")
+
+    before = signal.signal(signal.SIGALRM, give_up)
+    signal.setitimer(signal.ITIMER_REAL, limit_s)
+    try:
+        return work()
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
 
 
 def test_a_pool_of_another_thread_ends_with_the_process_and_not_before() -> None:

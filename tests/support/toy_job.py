@@ -100,7 +100,7 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Adder]:
     for file in recipe.get("dies_while", ()):
         with suppress(FileNotFoundError):  # each of these files ends one start
             os.unlink(file)
-            os.kill(os.getpid(), signal.SIGKILL)
+            os.kill(os.getpid(), recipe.get("dies_by", signal.SIGKILL))
     if "ends" in recipe:
         os._exit(recipe["ends"])
     return [Adder() for _ in range(recipe["workers"])]

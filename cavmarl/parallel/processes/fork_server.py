@@ -17,6 +17,7 @@ from typing import Any
 from cavmarl.core.errors import WorkerError, WorkerFailureError
 from cavmarl.core.processes import start_python
 from cavmarl.parallel.processes.process_barrier import WAKE
+from cavmarl.parallel.processes.watchdog import CHECK_S, STOPPED_CHECKS, is_stopped
 from cavmarl.parallel.processes.worker_loop import MAIL, MAX_MESSAGE
 
 ANSWER_MS = 2_000  # to fork or to reap; a server that takes longer is stopped or broken
@@ -85,7 +86,7 @@ class ForkServer:
     """Starts the process and asks it for workers.
 
     Raises:
-        ServerGoneError: it was killed before it was ready.
+        ServerGoneError: it was killed or stopped before it was ready.
         WorkerFailureError: an exception in it.
     """
 
@@ -156,6 +157,14 @@ class ForkServer:
             self._process.wait()
 
     def _greet(self) -> None:
+        """Wait until it is ready; that takes as long as its work, unless it is stopped."""
+        poll = select.poll()
+        poll.register(self._wire, select.POLLIN)
+        stopped = 0
+        while not poll.poll(1000.0 * CHECK_S):
+            stopped = stopped + 1 if is_stopped(self._process.pid) else 0
+            if stopped == STOPPED_CHECKS:
+                raise ServerGoneError("stopped (SIGSTOP)")
         message = self._wire.recv(MAX_MESSAGE)
         if not message:
             status = self._process.wait()
