@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks import balance, moving, profile, selection, sumo
+from benchmarks import balance, moving, profile, scope, selection, sumo
 from benchmarks.__main__ import KEPT, main, programs
 from benchmarks.harness import Report, run
 from cavmarl.cli.bench import app
@@ -53,6 +53,16 @@ def test_an_error_is_one_line_and_exit_code_2(capsys: pytest.CaptureFixture[str]
         run(balance.measure, ["grid4x4", "--workers", "0"])
     assert ended.value.code == 2
     assert "workers = 0: must be at least 1" in capsys.readouterr().err
+
+
+def test_what_is_in_scope_holds_and_stands_on_its_page() -> None:
+    found = scope.measure(steps=25, seed=0)
+    assert [row["what"] for row in found.rows if not row["holds"]] == []
+    page = (Path(__file__).parents[2] / "docs" / "papers.md").read_text(encoding="utf-8")
+    for row in found.rows:
+        assert f"| {row['what']} | {row['A']} | " in page
+    with pytest.raises(ConfigError, match="steps = 3"):
+        scope.measure(steps=3)
 
 
 def test_worlds_that_move_are_measured() -> None:
