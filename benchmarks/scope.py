@@ -50,7 +50,7 @@ def divided(steps: int, seed: int) -> tuple[Found, Found]:
                 once &= len(np.unique(ids)) == len(ids)
                 owners = len(ids)
             hashes.append(told)
-            transfers = sum(log.counts["switched"] for log in vec.worlds.transfers)
+            transfers = sum(one.switched for one in vec.simulation.coordinators)
     same = sum(one == other for one, other in zip(*hashes, strict=True))
     return (
         Found(f"{ZONES} zones: {same} of {steps} steps bit for bit the undivided world's",
