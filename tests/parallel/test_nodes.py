@@ -19,6 +19,7 @@ from cavmarl.core.errors import MessageError, WorkerDeathError, WorkerError
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.handoff.coordinator.journal import JournalReader
 from cavmarl.parallel.nodes.node_actions import Actions, read_refusal, take_actions
+from cavmarl.parallel.nodes.node_starters import LocalNodes
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.parallel.step_arrays import StepArrays
 from cavmarl.viewer.audience import Audience, Wishes
@@ -304,6 +305,29 @@ def test_a_node_that_cannot_begin_says_so(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr("cavmarl.parallel.nodes.node_starters.NODE", "cavmarl.nothing")
     with pytest.raises(WorkerError, match="before it had begun"):
         make_vec("grid4x4", zones=2, nodes=2)
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_node_that_is_killed_or_stopped_before_it_begins_is_replaced(
+    make: Make, monkeypatch: pytest.MonkeyPatch, how: signal.Signals
+) -> None:
+    whole = drive(make("grid4x4", **WANTED))
+    start, started = LocalNodes._start, []
+
+    def start_and_strike(self: LocalNodes, number: int) -> Any:
+        process = start(self, number)
+        started.append(number)
+        if len(started) <= 2:
+            os.kill(process.pid, how)
+        return process
+
+    monkeypatch.setattr(LocalNodes, "_start", start_and_strike)
+    vec = make("grid4x4", zones=4, nodes=2, overrides={"workers.join_timeout_s": 60.0}, **WANTED)
+    assert sorted(started) == [0, 0, 1, 1]
+    assert same(drive(vec), whole)
+    started.clear()
+    with pytest.raises(WorkerError, match="ended with -9 before it had begun"):
+        make("grid4x4", zones=4, nodes=2, overrides={"workers.max_retries": 1}, **WANTED)
 
 
 def test_nodes_tell_what_they_have_done(make: Make) -> None:

@@ -37,7 +37,7 @@ class NodeStarter(Protocol):
     """Starts nodes, and starts others in the place of those that are lost."""
 
     def trouble(self) -> str | None:
-        """Why a node does not come, in words."""
+        """Why a node does not come, in words; one that was killed before it began begins again."""
         ...
 
     def replace(self, number: int, is_silent: bool) -> None:
@@ -54,8 +54,16 @@ class NodeStarter(Protocol):
 class LocalNodes:
     """Processes of this machine, which end with this one."""
 
-    def __init__(self, nodes: int, listener: Listener, place: tuple[str, int]) -> None:
+    def __init__(
+        self,
+        nodes: int,
+        listener: Listener,
+        place: tuple[str, int],
+        max_retries: int,  # of nodes that are killed or stopped before they have begun
+    ) -> None:
         self._listener, self._place = listener, place
+        self._retries = max_retries
+        self._seen_stopped: set[int] = set()
         self._processes: list[subprocess.Popen[Any]] = []
         try:
             self._processes = [self._start(number) for number in range(nodes)]
@@ -72,8 +80,17 @@ class LocalNodes:
         return process
 
     def trouble(self) -> str | None:
+        stopped = self.stopped()
+        for number in stopped & self._seen_stopped:  # at two looks
+            self._processes[number].kill()
+            self._processes[number].wait()
+        self._seen_stopped = stopped
         for number, process in enumerate(self._processes):
             if process.poll() is not None:
+                if process.returncode < 0 and self._retries > 0:
+                    self._retries -= 1
+                    self._processes[number] = self._start(number)
+                    continue
                 return (
                     f"node {number} ended with {process.returncode} before it had begun; what it "
                     "printed stands on standard error"
@@ -158,7 +175,7 @@ def start_nodes(
     """
     if hosts == "":
         listener = Listener(LOCAL)
-        return LocalNodes(nodes, listener, route(listener.place)), listener
+        return LocalNodes(nodes, listener, route(listener.place), settings.max_retries), listener
     if hosts == RAY:
         actors = RayActors(run_on_ray, lambda workers: "", nodes, nodes)
         listener = Listener(actors.address)
