@@ -108,11 +108,11 @@ def test_without_messages_the_same_is_put_on_record_as_with_them(env: str, tmp_p
 
 
 def just_before_the_end_of(edge: str, path: Path) -> Path:
-    """A zone file with two strips of grid4x4: the right one begins 8 m before an edge ends."""
+    """A zone file with two strips of grid4x4: the right one begins 11 m before an edge ends."""
     roads = load_world("grid4x4").network
     lane = roads.lanes[int(roads.edges[roads.edge_ids.index(edge)]["first_lane"])]
     end_x = float(roads.points[int(lane["first_point"] + lane["num_points"]) - 1]["x"])
-    cut_x = end_x - 8.0
+    cut_x = end_x - 11.0
     low_x, low_y, high_x, high_y = roads.extent_m
     rects = [
         (low_x - 9.0, low_y - 9.0, cut_x, high_y + 9.0),
@@ -124,7 +124,7 @@ def just_before_the_end_of(edge: str, path: Path) -> Path:
 
 
 def test_who_leaves_in_the_tick_of_its_change_is_told_from_others(tmp_path: Path) -> None:
-    """With messages and without them: of 5.5 m to its end a car may go 2.8 in one tick."""
+    """With messages and without them: of 3.5 m to the end of its trip a car may go 2.8 in one tick."""
     demand = tmp_path / "grid.rou.xml"
     demand.write_text(
         '<routes><flow id="a" from="C3D3" to="D3right3" begin="0" end="60" period="2"/></routes>',
