@@ -93,8 +93,9 @@ def verify_nodes(
     check_count("steps", steps, MAX_STEPS)
     if not nodes or min(nodes) < 1:
         raise ConfigError(f"nodes = {list(nodes)}: name at least one number from 1 on")
-    if not 0 <= kills < steps - FIRST_STEPS:
-        raise ConfigError(f"kills = {kills}: {steps} steps can have up to {steps - FIRST_STEPS}")
+    most = max(steps - FIRST_STEPS, 0)
+    if not 0 <= kills <= most:
+        raise ConfigError(f"kills = {kills}: {steps} steps can have up to {most}")
     count = 2 * max(nodes) if zones is None else zones
     found = []
     for n, number in enumerate(nodes):
