@@ -199,6 +199,7 @@ def test_commands_that_are_alike_are_done_as_often_as_they_were_given(make: Make
 def test_an_interrupted_step_can_be_taken_again(
     make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("cavmarl.parallel.nodes.node_pool.KEEP_S", 0.0)  # before every step
     vecs = [make("grid4x4", **WANTED), make("grid4x4", zones=4, nodes=2, **WANTED)]
     for vec in vecs:
         vec.reset(seed=2)
@@ -221,6 +222,31 @@ def test_an_interrupted_step_can_be_taken_again(
             vec.step(actions)
         assert vecs[0].state_hash() == vecs[1].state_hash(), step
     assert over_nodes(vecs[1]).recoveries == 0
+
+
+def test_nodes_that_are_lost_while_states_are_kept(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A state that nodes have gone back beyond displaces none that they may go back to."""
+    monkeypatch.setattr("cavmarl.parallel.nodes.node_pool.KEEP_S", 0.0)
+    whole = drive(make("grid4x4", **WANTED))
+    vec = make("grid4x4", zones=4, nodes=4, **WANTED)
+    worlds = over_nodes(vec)
+    doomed = {5: worlds.pids[0], 6: worlds.pids[2]}
+    begin, ticks = worlds._coordinator.begin, [0, 0]
+
+    def begin_and_strike(timeout_s: float) -> None:
+        if ticks[1] == 1 and ticks[0] in doomed:  # all nodes have done the step's first tick
+            os.kill(doomed.pop(ticks[0]), signal.SIGKILL)
+        ticks[1] += 1
+        begin(timeout_s)
+
+    def strike(step: int) -> None:
+        ticks[:] = step, 0
+
+    monkeypatch.setattr(worlds._coordinator, "begin", begin_and_strike)
+    assert same(drive(vec, before=strike), whole)
+    assert (worlds.losses, worlds.recoveries) == (2, 2)
 
 
 def test_a_node_and_the_one_that_keeps_its_state_are_lost(make: Make) -> None:

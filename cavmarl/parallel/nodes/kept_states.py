@@ -61,9 +61,13 @@ class KeptStates:
     ) -> None:
         """Go back to a state, or go on from it if this node was not there.
 
+        What was kept after that state is void: else it would count as the newest.
+
         Raises:
             WorkerError: what a lost node had is not here.
         """
+        for states in (self._own, *self._others.values()):
+            _drop_later(states, state)
         like = self._worlds.save()
         own = self._own.get(state)
         saved = None if own is None else from_bytes(own, like)
@@ -126,3 +130,8 @@ def _add(states: dict[int, bytes], state: int, data: bytes) -> None:
     states[state] = data
     for old in sorted(states)[:-KEPT]:
         del states[old]
+
+
+def _drop_later(states: dict[int, bytes], state: int) -> None:
+    for later in [number for number in states if number > state]:
+        del states[later]
