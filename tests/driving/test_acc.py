@@ -14,7 +14,7 @@ import pytest
 
 from cavmarl.core.records.codes import MODEL_ACC
 from cavmarl.driving.kernels.acc import acc_acceleration
-from cavmarl.driving.kernels.following import behind, no_press, response
+from cavmarl.driving.kernels.following import behind, no_constraint, response
 from cavmarl.driving.vehicle_types import CLASS_DEFAULTS, VTYPE
 
 DT, STEPS, FOLLOWERS = 0.1, 1000, 5
@@ -87,8 +87,10 @@ def driven(places: np.ndarray, speeds: np.ndarray) -> np.ndarray:
         accels = []
         for k in range(1, FOLLOWERS + 1):
             gap = places[k - 1] - 5.0 - places[k]
-            press = max(no_press(kind), behind(kind, speeds[k], gap, speeds[k - 1], kind["decel"]))
-            accels.append(response(kind, speeds[k], LIMIT_MPS, press, 0.0, DT))
+            constraint = max(
+                no_constraint(kind), behind(kind, speeds[k], gap, speeds[k - 1], kind["decel"])
+            )
+            accels.append(response(kind, speeds[k], LIMIT_MPS, constraint, 0.0, DT))
         speeds[1:] = np.maximum(speeds[1:] + DT * np.array(accels), 0.0)
         speeds[0] = lead
         places = places + DT * speeds

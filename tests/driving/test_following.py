@@ -11,7 +11,7 @@ from cavmarl.driving.kernels.following import (
     accel_behind,
     before_line,
     behind,
-    no_press,
+    no_constraint,
     response,
     speed_behind,
     wish,
@@ -40,11 +40,11 @@ def krauss(sigma: float = 0.5) -> np.void:
 KINDS = {"IDM": IDM, "Krauss": krauss(0.0)}
 
 
-def pressed(kind: np.void, speed: float, leaders: list[tuple[float, float, float]]) -> float:
-    press = no_press(kind)
+def constraint_of(kind: np.void, speed: float, leaders: list[tuple[float, float, float]]) -> float:
+    constraint = no_constraint(kind)
     for gap, front_speed, front_decel in leaders:
-        press = max(press, behind(kind, speed, gap, front_speed, front_decel))
-    return press
+        constraint = max(constraint, behind(kind, speed, gap, front_speed, front_decel))
+    return constraint
 
 
 LEADERS = st.lists(st.tuples(GAPS, SPEEDS, DECELS), max_size=3)
@@ -54,9 +54,9 @@ LEADERS = st.lists(st.tuples(GAPS, SPEEDS, DECELS), max_size=3)
 def test_idms_response_equals_twin(
     speed: float, allowed: float, leaders: list[tuple[float, float, float]]
 ) -> None:
-    press = pressed(IDM, speed, leaders)
+    constraint = constraint_of(IDM, speed, leaders)
     twin = naive.idm_response(IDM, speed, allowed, [(gap, front) for gap, front, _ in leaders])
-    assert response(IDM, speed, allowed, press, 0.3, DT) == pytest.approx(twin, abs=1e-9)
+    assert response(IDM, speed, allowed, constraint, 0.3, DT) == pytest.approx(twin, abs=1e-9)
 
 
 @given(SPEEDS, st.floats(1.0, 40.0), LEADERS, SHARES, st.floats(0.0, 1.0))
@@ -68,9 +68,9 @@ def test_krauss_response_equals_twin(
     sigma: float,
 ) -> None:
     kind = krauss(sigma)
-    press = pressed(kind, speed, leaders)
+    constraint = constraint_of(kind, speed, leaders)
     twin = naive.krauss_response(kind, speed, allowed, leaders, share, DT)
-    assert response(kind, speed, allowed, press, share, DT) == pytest.approx(twin, abs=1e-6)
+    assert response(kind, speed, allowed, constraint, share, DT) == pytest.approx(twin, abs=1e-6)
 
 
 @given(SPEEDS, LEADERS, SHARES)
@@ -78,23 +78,23 @@ def test_krauss_never_brakes_below_a_stand(
     speed: float, leaders: list[tuple[float, float, float]], share: float
 ) -> None:
     kind = krauss()
-    accel = response(kind, speed, 30.0, pressed(kind, speed, leaders), share, DT)
+    accel = response(kind, speed, 30.0, constraint_of(kind, speed, leaders), share, DT)
     assert speed + accel * DT >= -1e-9
     assert accel >= -kind["emergency_decel"]
 
 
 @pytest.mark.parametrize("name", KINDS)
 @given(speed=SPEEDS, gap=GAPS, more=st.floats(0.1, 50.0), front=SPEEDS)
-def test_who_is_nearer_presses_no_less(
+def test_a_nearer_leader_constrains_no_less(
     name: str, speed: float, gap: float, more: float, front: float
 ) -> None:
     kind = KINDS[name]
     near, far = (behind(kind, speed, at, front, kind["decel"]) for at in (gap, gap + more))
-    # IDM's desired gap may be negative behind one that speeds away: its square still presses.
+    # IDM's desired gap may be negative behind one that speeds away: its square still constrains.
     desired = kind["tau"] * speed + speed * (speed - front) / 7.8
     if kind["model"] == MODEL_KRAUSS or desired > -kind["min_gap"]:
         assert near >= far
-    assert far >= no_press(kind)
+    assert far >= no_constraint(kind)
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -107,20 +107,20 @@ def test_at_the_speed_of_a_gap_a_driver_wants_just_that_gap(
     assert speed >= 0.0
     if speed < 1e-3:
         return
-    press = behind(kind, speed, gap, front, front_decel)
+    constraint = behind(kind, speed, gap, front, front_decel)
     if kind["model"] == MODEL_IDM:
         # The interaction at the desired gap is the largest acceleration.
-        assert press == pytest.approx(kind["accel"], rel=1e-6)
+        assert constraint == pytest.approx(kind["accel"], rel=1e-6)
     else:
-        assert -press == pytest.approx(speed)
+        assert -constraint == pytest.approx(speed)
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_a_wish_behind_one_leader_is_that_of_its_press(name: str) -> None:
+def test_a_wish_behind_one_leader_is_that_of_its_constraint(name: str) -> None:
     kind = KINDS[name]
-    press = behind(kind, 12.0, 20.0, 9.0, 4.0)
-    assert accel_behind(kind, 12.0, 15.0, 20.0, 9.0, 4.0) == wish(kind, 12.0, 15.0, press)
-    assert wish(kind, 12.0, 15.0, no_press(kind)) > wish(kind, 12.0, 15.0, press)
+    constraint = behind(kind, 12.0, 20.0, 9.0, 4.0)
+    assert accel_behind(kind, 12.0, 15.0, 20.0, 9.0, 4.0) == wish(kind, 12.0, 15.0, constraint)
+    assert wish(kind, 12.0, 15.0, no_constraint(kind)) > wish(kind, 12.0, 15.0, constraint)
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -147,8 +147,8 @@ def test_a_follower_comes_to_stand_behind_who_brakes_hard(name: str) -> None:
     speed = front_speed = 14.0
     gap = 25.0
     for tick in range(400):
-        press = behind(kind, speed, gap, front_speed, kind["decel"])
-        accel = response(kind, speed, 14.0, press, 0.0, DT)
+        constraint = behind(kind, speed, gap, front_speed, kind["decel"])
+        accel = response(kind, speed, 14.0, constraint, 0.0, DT)
         speed = max(speed + accel * DT, 0.0)
         if tick > 50:
             front_speed = max(front_speed - kind["decel"] * DT, 0.0)
@@ -164,8 +164,8 @@ def test_who_stands_close_behind_a_standing_leader_stays_whatever_lies_ahead(
 ) -> None:
     # `drivers` looks no further then.
     car = krauss()
-    press = behind(car, 0.0, gap, 0.0, 4.5)
-    assert press == 0.0
-    for whole in (press, max(press, further)):
+    constraint = behind(car, 0.0, gap, 0.0, 4.5)
+    assert constraint == 0.0
+    for whole in (constraint, max(constraint, further)):
         assert response(car, 0.0, allowed, whole, share, DT) == 0.0
-    assert wish(car, 0.0, allowed, press) == wish(car, 0.0, 0.0, press) == 0.0
+    assert wish(car, 0.0, allowed, constraint) == wish(car, 0.0, 0.0, constraint) == 0.0

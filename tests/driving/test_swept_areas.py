@@ -9,7 +9,7 @@ import pytest
 
 from cavmarl.core.records.codes import HOLD_NONE, HOLD_SIGNAL, HOLD_YIELD
 from cavmarl.driving.kernels.approach import APPROACH
-from cavmarl.driving.kernels.following import behind, no_press
+from cavmarl.driving.kernels.following import behind, no_constraint
 from cavmarl.driving.kernels.swept_areas import behind_fork, room_m, swept_stop, wait_place
 from cavmarl.driving.vehicle_types import generated_types
 from cavmarl.roads.network import RoadNetwork
@@ -174,7 +174,7 @@ def test_a_rear_over_the_end_of_a_lane_counts_for_one_that_has_to_leave_the_lane
     room.approach[0] = entry[0]
     room.link_start[link], room.link_end[link] = 0, 1
     kind = generated_types()[0]
-    press = behind_fork(network.arrays, kind, rows[0], lane, -1, 20.0, room)
-    assert press == behind(kind, 5.0, 20.0 + 1.0 - 2.5 - 6.0, 0.0, kind["decel"])
+    constraint = behind_fork(network.arrays, kind, rows[0], lane, -1, 20.0, room)
+    assert constraint == behind(kind, 5.0, 20.0 + 1.0 - 2.5 - 6.0, 0.0, kind["decel"])
     room.approach[0]["dist"] = -0.5 * BUS_M - 40.0  # its rear has left
-    assert behind_fork(network.arrays, kind, rows[0], lane, -1, 20.0, room) == no_press(kind)
+    assert behind_fork(network.arrays, kind, rows[0], lane, -1, 20.0, room) == no_constraint(kind)

@@ -124,7 +124,7 @@ def just_before_the_end_of(edge: str, path: Path) -> Path:
 
 
 def test_who_leaves_in_the_tick_of_its_change_is_told_from_others(tmp_path: Path) -> None:
-    """With messages and without them: of 3.5 m to the end of its trip a car may go 2.8 in one tick."""
+    """With messages and without: the trip ends in 3.5 m, and a tick takes the car up to 2.8 m."""
     demand = tmp_path / "grid.rou.xml"
     demand.write_text(
         '<routes><flow id="a" from="C3D3" to="D3right3" begin="0" end="60" period="2"/></routes>',

@@ -26,12 +26,17 @@ from cavmarl.driving.kernels.following import (
     LINE_MARGIN_M,
     before_line,
     behind,
-    no_press,
+    no_constraint,
     response,
     wish,
 )
 from cavmarl.driving.kernels.gaps import is_minor
-from cavmarl.driving.kernels.junctions import STOP_LINE_M, may_enter, press_inside, waits_inside
+from cavmarl.driving.kernels.junctions import (
+    STOP_LINE_M,
+    constraint_inside,
+    may_enter,
+    waits_inside,
+)
 from cavmarl.driving.kernels.lane_choice import (
     choose_lane,
     needed_change,
@@ -125,10 +130,10 @@ def _lane_end(
     merge_room_m: float,
     dt: float,
 ) -> float:
-    """How the end of a lane presses from which the way goes on only after a lane change."""
+    """The constraint of the end of a lane from which the way goes on only after a lane change."""
     step = travel.steps[way + lane]
     if step["to_go"] < math.inf and step["change"] == 0:
-        return no_press(kind)
+        return no_constraint(kind)
     # Stop with room enough to swing out, but on this lane and not before it.
     length = roads.lanes[lane]["length_m"]
     half = 0.5 * row["length"]
@@ -153,16 +158,18 @@ def _at_line(
     dt: float,
     scratch: Scratch,
 ) -> tuple[float, int, bool]:
-    """How the end of a lane presses, `distance` m ahead of row i: (press, HOLD_*, it stops)."""
+    """What the lane's end, `distance` m ahead of row i, asks: (constraint, HOLD_*, it stops)."""
     row = rows[i]
     speed = row["speed"]
     front = distance - 0.5 * row["length"]
     to_line = front - roads.lanes[roads.links[link]["from_lane"]]["stop_back_m"]
     if to_line <= 0.0:
         # Its front is over the line: it does not wait there any more.
-        press, hold = press_inside(roads, travel, rows, i, link, -distance, way, phase, dt, scratch)
+        constraint, hold = constraint_inside(
+            roads, travel, rows, i, link, -distance, way, phase, dt, scratch
+        )
         swept = before_swept(roads, rows, i, kind, link, front, hold, dt, scratch)
-        return max(press, swept), hold, False
+        return max(constraint, swept), hold, False
     hold = may_enter(roads, travel, rows, i, link, distance, way, phase, scratch)
     waits = HOLD_NONE
     if hold == HOLD_NONE:
@@ -181,7 +188,7 @@ def _at_line(
     if waits != HOLD_NONE:
         to_wait = front + wait_place(roads, link, 0.5 * row["length"])
         return before_line(kind, speed, to_wait, dt), HOLD_NONE, False
-    return no_press(kind), HOLD_NONE, False
+    return no_constraint(kind), HOLD_NONE, False
 
 
 @inlined_kernel
@@ -196,7 +203,7 @@ def _road_ahead(
     dt: float,
     scratch: Scratch,
 ) -> tuple[float, float, int, int]:
-    """Walk the way of entry k: (press, allowed speed, why it holds, link near its line).
+    """Walk the way of entry k: (constraint, allowed speed, why it holds, link near its line).
 
     `step` is its own one.
 
@@ -219,33 +226,33 @@ def _road_ahead(
     if queues and k + 1 < scratch.lane_end[lane] and distance >= half + NEXT_LINE_M:
         leader = scratch.entries[k + 1]
         gap = leader["s"] - row["s"] - half - leader["half"]
-        press = _behind_entry(kind, speed, gap, leader)
-        if press == 0.0:
-            return press, 0.0, HOLD_NONE, -1
+        constraint = _behind_entry(kind, speed, gap, leader)
+        if constraint == 0.0:
+            return constraint, 0.0, HOLD_NONE, -1
     limit = min(here["speed_mps"], kind["desired_max_speed"])
     allowed = min(limit * row["speed_factor"], kind["max_speed"])
     if steered:
         allowed = min(allowed, bend_speed(roads, lane, lane, -row["s"]))
-    press = no_press(kind)
+    constraint = no_constraint(kind)
     hold = HOLD_NONE
     link_ahead = -1
     if here["internal"]:
         place = here["link_offset_m"] + row["s"]
         before = roads.links[here["link"]]["from_lane"]
         fork = behind_fork(roads, kind, row, before, here["link"], -place, scratch)
-        press, hold = press_inside(
+        constraint, hold = constraint_inside(
             roads, travel, rows, i, here["link"], place, row["way"], phase, dt, scratch
         )
         swept = before_swept(roads, rows, i, kind, here["link"], -place - half, hold, dt, scratch)
-        press = max(press, fork, swept)
+        constraint = max(constraint, fork, swept)
     look = min(look_ahead_m(kind, speed), travel.view_m)
     see = min(see_line_m(kind, speed) + half, travel.see_m)
     # Behind a leader on its own lane a driver minds the next line only where it could not stop
     # any more once the leader has passed it.
     if k + 1 < scratch.lane_end[lane] and (scratch.entries[k + 1]["s"] - row["s"] <= travel.view_m):
         leader = scratch.entries[k + 1]
-        press = max(
-            press,
+        constraint = max(
+            constraint,
             _behind_entry(kind, speed, leader["s"] - row["s"] - half - leader["half"], leader),
         )
         look = min(look, half + NEXT_LINE_M + speed + 0.5 * speed * speed / kind["decel"])
@@ -263,7 +270,7 @@ def _road_ahead(
             )
             # A vehicle that has left that lane by any link may still have its rear over the end.
             leaving = behind_fork(roads, kind, row, before, -1, distance, scratch)
-            press = max(press, end, leaving)
+            constraint = max(constraint, end, leaving)
             break
         stops = False
         if link >= 0 and distance < see:
@@ -273,7 +280,7 @@ def _road_ahead(
             at_line, found, stops = _at_line(
                 roads, travel, rows, i, kind, link, distance, way, phase, dt, scratch
             )
-            press = max(press, fork, at_line)
+            constraint = max(constraint, fork, at_line)
             hold = found if found != HOLD_NONE else hold
         ahead = roads.lanes[lane]
         limit = ahead["speed_mps"] * row["speed_factor"]
@@ -287,18 +294,18 @@ def _road_ahead(
             gap = distance + leader["s"] - half - leader["half"]
             if gap < NEAR_M and _is_askew(row, rows[leader["row"]]):
                 gap -= ASKEW_M
-            press = max(press, _behind_entry(kind, speed, gap, leader))
+            constraint = max(constraint, _behind_entry(kind, speed, gap, leader))
         if j >= 0 or stops:
             break
         distance += ahead["length_m"]
-    return press, allowed, hold, link_ahead
+    return constraint, allowed, hold, link_ahead
 
 
 @kernel
 def _beside(
     roads: RoadArrays, travel: Travel, kind: np.void, row: np.void, lane: int, scratch: Scratch
 ) -> float:
-    """How the leader on a neighbour lane presses that the body covers, or is about to."""
+    """The constraint of the leader on a neighbour lane that the body covers, or is about to."""
     beside = roads.lanes[lane]
     s = beside_s(roads, row["lane"], lane, row["s"])
     half = 0.5 * row["length"]
@@ -307,7 +314,7 @@ def _beside(
         leader = scratch.entries[j]
         return _behind_entry(kind, row["speed"], leader["s"] - s - half - leader["half"], leader)
     # Beyond the end of that lane, whichever way others have gone there.
-    press = no_press(kind)
+    constraint = no_constraint(kind)
     for link in range(beside["first_link"], beside["first_link"] + beside["num_links"]):
         distance = beside["length_m"] - s
         beyond = roads.links[link]["next_lane"]
@@ -319,8 +326,8 @@ def _beside(
         if j >= 0:
             leader = scratch.entries[j]
             gap = distance + leader["s"] - half - leader["half"]
-            press = max(press, _behind_entry(kind, row["speed"], gap, leader))
-    return press
+            constraint = max(constraint, _behind_entry(kind, row["speed"], gap, leader))
+    return constraint
 
 
 @inlined_kernel
@@ -382,18 +389,20 @@ def decide(
         row = rows[i]
         kind = travel.types[row["vtype"]]
         speed = row["speed"]
-        press, allowed, hold, link_ahead = _road_ahead(
+        constraint, allowed, hold, link_ahead = _road_ahead(
             roads, travel, rows, k, step[i], phase, MERGE_ROOM_M, dt, scratch
         )
         to_stop = way_to_stop(roads, travel, row)
         if to_stop < math.inf:
-            press = max(press, before_line(kind, speed, to_stop + LINE_MARGIN_M, dt))
+            constraint = max(constraint, before_line(kind, speed, to_stop + LINE_MARGIN_M, dt))
         if row["side_lane"] >= 0:
-            press = max(press, _beside(roads, travel, kind, row, row["side_lane"], scratch))
+            constraint = max(
+                constraint, _beside(roads, travel, kind, row, row["side_lane"], scratch)
+            )
         needed = needed_change(roads, travel, row, step[i])
         change = 0
         if thinks_of_lanes(row, needed, tick, dt):
-            own_wish = wish(kind, speed, allowed, press)
+            own_wish = wish(kind, speed, allowed, constraint)
             if driver == DRIVER_AGENT:
                 own_wish = wish_on_lane(roads, travel, row, k, scratch)
             change = choose_lane(roads, travel, rows, i, tick, needed, own_wish, scratch)
@@ -401,15 +410,15 @@ def decide(
             # A steered vehicle on its way into a neighbour lane still minds its own lane, to the
             # very end, and already the leader in the other one. Standing, it could not steer.
             lane = roads.lanes[row["lane"]]
-            press, allowed, _, _ = _road_ahead(
+            constraint, allowed, _, _ = _road_ahead(
                 roads, travel, rows, k, step[i], phase, CHANGING_ROOM_M, dt, scratch
             )
             target = lane["left"] if change > 0 else lane["right"]
-            press = max(press, _beside(roads, travel, kind, row, target, scratch))
+            constraint = max(constraint, _beside(roads, travel, kind, row, target, scratch))
         share = 0.0
         if kind["sigma"] > 0.0:
             share = quick_uniform(row["rng_key"], row["id"], tick, STREAM_DRIVER)
-        accel = response(kind, speed, allowed, press, share, dt)
+        accel = response(kind, speed, allowed, constraint, share, dt)
         if needed != 0 and change == 0 and driver == DRIVER_BACKGROUND:
             lane = roads.lanes[row["lane"]]
             target = lane["left"] if needed > 0 else lane["right"]
@@ -430,7 +439,7 @@ def decide(
             if is_lost(rows[i]):
                 kind = travel.types[rows[i]["vtype"]]
                 speed = rows[i]["speed"]
-                scratch.accel[i] = response(kind, speed, RETURN_MPS, no_press(kind), 0.0, dt)
+                scratch.accel[i] = response(kind, speed, RETURN_MPS, no_constraint(kind), 0.0, dt)
                 scratch.lane_change[i] = 0
     for k in range(total):
         entry = scratch.entries[k]

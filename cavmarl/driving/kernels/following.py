@@ -1,9 +1,9 @@
 """What stands ahead, a leader or a line, and what a driver of each model makes of it.
 
-Every obstacle *presses*; of several the one that presses hardest decides. A press is comparable
-only between obstacles of one driver: for IDM it is the interaction that is taken off the free
-acceleration (m/s²), for Krauss the safe speed with its sign turned (-m/s), for all others the
-acceleration that the model asks for with its sign turned (-m/s²).
+Every obstacle *constrains* the acceleration; of several constraints the largest is the binding one.
+They are comparable only between obstacles of one driver: for IDM a constraint is the interaction
+that is taken off the free acceleration (m/s²), for Krauss the safe speed with its sign turned
+(-m/s), for all others the acceleration that the model asks for with its sign turned (-m/s²).
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ LINE_MARGIN_M = 1.0  # a driver stops with its front this far before a line
 
 
 @kernel
-def no_press(kind: np.void) -> float:
-    """What nothing ahead presses."""
+def no_constraint(kind: np.void) -> float:
+    """The constraint where nothing is ahead."""
     return 0.0 if kind["model"] == MODEL_IDM else -math.inf
 
 
@@ -57,9 +57,9 @@ def _asked_behind(
 
 
 @kernel
-def _asked_of_all(kind: np.void, speed: float, allowed: float, press: float) -> float:
-    """The same, the free road and all that presses counted."""
-    return min(_asked(kind, speed, allowed, math.inf, allowed, kind["decel"]), -press)
+def _asked_of_all(kind: np.void, speed: float, allowed: float, constraint: float) -> float:
+    """The same, the free road and all constraints counted."""
+    return min(_asked(kind, speed, allowed, math.inf, allowed, kind["decel"]), -constraint)
 
 
 @kernel
@@ -70,7 +70,7 @@ def behind(
     front_speed: float,  # of the leader, m/s
     front_decel: float,  # with which the leader can brake in comfort, m/s²
 ) -> float:
-    """How a leader presses."""
+    """The constraint of a leader."""
     if kind["model"] == MODEL_KRAUSS:
         room = gap - kind["min_gap"]
         return -safe_speed(room, front_speed, kind["decel"], front_decel, kind["tau"])
@@ -89,7 +89,7 @@ def behind(
 
 @kernel
 def before_line(kind: np.void, speed: float, gap: float, dt: float) -> float:
-    """How a line presses that is `gap` m ahead of the front."""
+    """The constraint of a line that is `gap` m ahead of the front."""
     if kind["model"] == MODEL_KRAUSS:
         return -safe_speed(gap - LINE_MARGIN_M, 0.0, kind["decel"], kind["decel"], dt)
     if kind["model"] != MODEL_IDM:
@@ -101,17 +101,17 @@ def before_line(kind: np.void, speed: float, gap: float, dt: float) -> float:
 
 
 @kernel
-def wish(kind: np.void, speed: float, allowed: float, press: float) -> float:
+def wish(kind: np.void, speed: float, allowed: float, constraint: float) -> float:
     """The acceleration in m/s² that a driver would like, as lane changes weigh it.
 
     Krauss's drivers reach their next speed within a reaction time, whatever the tick is.
     """
     if kind["model"] == MODEL_KRAUSS:
-        wanted = min(-press, allowed, speed + kind["accel"] * kind["tau"])
+        wanted = min(-constraint, allowed, speed + kind["accel"] * kind["tau"])
         return float((wanted - speed) / kind["tau"])
     if kind["model"] != MODEL_IDM:
-        return _asked_of_all(kind, speed, allowed, press)
-    return idm_free(speed, allowed, kind["accel"]) - press
+        return _asked_of_all(kind, speed, allowed, constraint)
+    return idm_free(speed, allowed, kind["accel"]) - constraint
 
 
 @kernel
@@ -148,17 +148,17 @@ def response(
     kind: np.void,  # VTYPE of the driver
     speed: float,  # m/s
     allowed: float,  # the speed that limits and the vehicle allow, m/s
-    press: float,  # of all that stands ahead
+    constraint: float,  # of all that stands ahead
     share: float,  # a random number in [0, 1), for Krauss's imperfection
     dt: float,  # seconds of the tick
 ) -> float:
     """The acceleration in m/s² of the coming tick."""
     if kind["model"] == MODEL_KRAUSS:
-        wanted = min(-press, allowed, speed + kind["accel"] * dt)
+        wanted = min(-constraint, allowed, speed + kind["accel"] * dt)
         wanted = dawdle(max(wanted, 0.0), kind["accel"], kind["sigma"], share, dt)
         return float(max((wanted - speed) / dt, -kind["emergency_decel"]))
     if kind["model"] != MODEL_IDM:
-        asked = _asked_of_all(kind, speed, allowed, press)
+        asked = _asked_of_all(kind, speed, allowed, constraint)
         return clamp(asked, -kind["emergency_decel"], kind["accel"])
-    accel = idm_free(speed, allowed, kind["accel"]) - press
+    accel = idm_free(speed, allowed, kind["accel"]) - constraint
     return clamp(accel, -ACCEL_LIMIT, ACCEL_LIMIT)

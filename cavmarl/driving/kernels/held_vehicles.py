@@ -57,7 +57,7 @@ def most_accel(
             kind = travel.types[row["vtype"]]
             limit = roads.lanes[row["lane"]]["speed_mps"] * row["speed_factor"]
             allowed = min(limit, kind["max_speed"])
-            press = before_line(kind, row["speed"], held[n]["gap_m"], dt)
-            accel = response(kind, row["speed"], allowed, press, 0.0, dt)
+            constraint = before_line(kind, row["speed"], held[n]["gap_m"], dt)
+            accel = response(kind, row["speed"], allowed, constraint, 0.0, dt)
             return float(max(accel, -row["speed"] / dt))  # and not back
     return math.inf

@@ -31,7 +31,7 @@ from cavmarl.core.records.codes import (
 )
 from cavmarl.core.records.rows import WAIT_SLACK_M
 from cavmarl.driving.kernels.announcing import STANDING_MPS
-from cavmarl.driving.kernels.following import LINE_MARGIN_M, before_line, behind, no_press
+from cavmarl.driving.kernels.following import LINE_MARGIN_M, before_line, behind, no_constraint
 from cavmarl.driving.kernels.gaps import (
     ROOM_M,
     STOP_SIGN_S,
@@ -216,7 +216,7 @@ def waits_inside(
 
 
 @kernel
-def press_inside(
+def constraint_inside(
     roads: RoadArrays,
     travel: Travel,
     rows: NDArray[np.void],  # VEHICLE (C,)
@@ -227,8 +227,8 @@ def press_inside(
     phase: NDArray[np.int32],  # (num_signals,) PHASE rows that are on
     dt: float,  # seconds a tick
     scratch: Scratch,  # with the lane and link indices of this tick
-) -> tuple[float, int]:  # press, and why it holds at the waiting position (HOLD_*)
-    """How foes on the same junction press row i, whose front is beyond its stop line.
+) -> tuple[float, int]:  # constraint, and why it holds at the waiting position (HOLD_*)
+    """The constraint of foes on the same junction on row i, whose front is beyond its stop line.
 
     Of two vehicles in conflict the one that is nearer to the shared area goes first; at equal
     distance the smaller id. Where both lead into one lane, the other follows it there. At a
@@ -238,13 +238,13 @@ def press_inside(
     kind = travel.types[row["vtype"]]
     half = 0.5 * row["length"]
     front = place + half
-    press, hold = no_press(kind), HOLD_NONE
+    constraint, hold = no_constraint(kind), HOLD_NONE
     target = roads.links[link]
     if front <= target["wait_m"] + WAIT_SLACK_M:
         hold = waits_inside(roads, travel, rows, i, link, -place, way, phase, scratch)
         if hold != HOLD_NONE:
             to_wait = wait_place(roads, link, half) - front
-            press = before_line(kind, row["speed"], to_wait, dt)
+            constraint = before_line(kind, row["speed"], to_wait, dt)
     first = target["first_conflict"]
     for c in range(first, first + target["num_conflicts"]):
         conflict = roads.conflicts[c]
@@ -253,12 +253,14 @@ def press_inside(
         for k in range(scratch.link_start[conflict["foe"]], scratch.link_end[conflict["foe"]]):
             foe = scratch.approach[k]
             if foe["row"] != i:
-                press = max(press, _press_of(roads, kind, row, conflict, foe, place, dt))
-    return press, hold
+                constraint = max(
+                    constraint, _constraint_of(roads, kind, row, conflict, foe, place, dt)
+                )
+    return constraint, hold
 
 
 @kernel
-def _press_of(
+def _constraint_of(
     roads: RoadArrays,
     kind: np.void,
     row: np.void,
@@ -267,7 +269,7 @@ def _press_of(
     place: float,
     dt: float,
 ) -> float:
-    """How one APPROACH presses a row on the same junction, `place` m beyond its stop line."""
+    """Constraint of one APPROACH on a row on the same junction, `place` m beyond its stop line."""
     half = 0.5 * row["length"]
     front = place + half
     foe_front = foe["half"] - foe["dist"]
@@ -279,22 +281,22 @@ def _press_of(
         and foe["speed"] < STANDING_MPS
     )
     if foe_front <= 0.0 or foe_rear > conflict["foe_leave_m"] or waits:
-        return no_press(kind)
+        return no_constraint(kind)
     to_area = conflict["enter_m"] - front
     foe_to_area = conflict["foe_enter_m"] - foe_front
     # How much further the one has to go to be out of the shared area than the other's rear.
     gap = (conflict["leave_m"] - front) - (conflict["foe_leave_m"] - foe_rear)
     if to_area >= 0.0:
         if foe_to_area > to_area or (foe_to_area == to_area and foe["id"] > row["id"]):
-            return no_press(kind)
+            return no_constraint(kind)
         if conflict["merging"] and gap > to_area:
             return behind(kind, row["speed"], gap, foe["speed"], kind["decel"])
         return before_line(kind, row["speed"], to_area, dt)
     # Both are in it side by side: the one nearer to its end goes on, the other stays behind.
     if foe_to_area > 0.0:
-        return no_press(kind)
+        return no_constraint(kind)
     rest = conflict["leave_m"] - front
     foe_rest = conflict["foe_leave_m"] - foe_front
     if foe_rest > rest or (foe_rest == rest and foe["id"] > row["id"]):
-        return no_press(kind)
+        return no_constraint(kind)
     return behind(kind, row["speed"], gap, foe["speed"], kind["decel"])

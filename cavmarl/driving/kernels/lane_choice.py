@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
 from cavmarl.core.records.codes import DRIVER_AGENT
-from cavmarl.driving.kernels.following import accel_behind, no_press, wish
+from cavmarl.driving.kernels.following import accel_behind, no_constraint, wish
 from cavmarl.driving.kernels.lane_change import (
     LANE_CHANGE_DELAY_S,
     MAX_BRAKING_IMPOSED,
@@ -77,7 +77,7 @@ def wish_on_lane(
     kind = travel.types[row["vtype"]]
     desired = _desired(roads, kind, row, lane)
     if k + 1 == scratch.lane_end[lane]:
-        return wish(kind, row["speed"], desired, no_press(kind))
+        return wish(kind, row["speed"], desired, no_constraint(kind))
     leader = scratch.entries[k + 1]
     gap = leader["s"] - row["s"] - 0.5 * row["length"] - leader["half"]
     return accel_behind(kind, row["speed"], desired, gap, leader["speed"], leader["decel"])
@@ -133,7 +133,7 @@ def _change_is_safe(
             beyond, way, _ = next_step(roads, travel, beyond, way)
         if _is_left_slowly(scratch, lane, lane["length_m"] - s - half):
             return False
-    after = wish(kind, speed, desired, no_press(kind))
+    after = wish(kind, speed, desired, no_constraint(kind))
     if j >= 0:
         leader = scratch.entries[j]
         net = ahead - half - leader["half"]
@@ -151,7 +151,7 @@ def _change_is_safe(
         theirs = travel.types[other["vtype"]]
         pace = follower["speed"]
         limit = _desired(roads, theirs, other, target)
-        follower_before = wish(theirs, pace, limit, no_press(theirs))
+        follower_before = wish(theirs, pace, limit, no_constraint(theirs))
         if j >= 0:
             leader = scratch.entries[j]
             net = gap + ahead - follower["half"] - leader["half"]
@@ -216,7 +216,7 @@ def _may_change(
         # Not even an empty lane would be worth it.
         kind = travel.types[row["vtype"]]
         desired = _desired(roads, kind, row, target)
-        if wish(kind, row["speed"], desired, no_press(kind)) - own_wish < MIN_ACCEL_GAIN:
+        if wish(kind, row["speed"], desired, no_constraint(kind)) - own_wish < MIN_ACCEL_GAIN:
             return False
         beyond = travel.steps[row["way"] + target]
         if beyond["to_go"] == math.inf:

@@ -17,7 +17,7 @@ from cavmarl.core.records.arrays import RoadArrays, Scratch
 from cavmarl.core.records.codes import HOLD_NONE, MODEL_KRAUSS
 from cavmarl.core.records.rows import SIZE_BODIES_M, SIZE_LENGTHS_M
 from cavmarl.driving.kernels.announcing import APPROACH_STANDING_M, STANDING_MPS
-from cavmarl.driving.kernels.following import before_line, behind, no_press
+from cavmarl.driving.kernels.following import before_line, behind, no_constraint
 
 VAN_M, BUS_M = SIZE_LENGTHS_M
 CAR_BODY_M, VAN_BODY_M, BUS_BODY_M = SIZE_BODIES_M
@@ -172,25 +172,27 @@ def before_swept(
     dt: float,
     scratch: Scratch,
 ) -> float:
-    """How a swept area presses row i, whose front is `front` m before the stop line of a link.
+    """Constraint of a swept area on row i, whose front is `front` m before the stop line of a link.
 
     `hold`: why it waits inside anyway, HOLD_*.
     """
     if roads.links[link]["num_sweeps"] == 0:
-        return no_press(kind)
+        return no_constraint(kind)
     stop = swept_stop(roads, rows, i, link, -front, room_m(HOLD_NONE, hold), scratch)
     return (
-        no_press(kind) if stop == math.inf else before_line_gently(kind, rows[i], stop + front, dt)
+        no_constraint(kind)
+        if stop == math.inf
+        else before_line_gently(kind, rows[i], stop + front, dt)
     )
 
 
 @inlined_kernel
 def before_line_gently(kind: np.void, row: np.void, gap: float, dt: float) -> float:
     """The constraint of a line before which no vehicle brakes harder than those behind can."""
-    press = before_line(kind, row["speed"], gap, dt)
+    constraint = before_line(kind, row["speed"], gap, dt)
     if kind["model"] == MODEL_KRAUSS:
-        return float(min(press, kind["decel"] * dt - row["speed"]))
-    return float(min(press, kind["accel"] + kind["decel"]))
+        return float(min(constraint, kind["decel"] * dt - row["speed"]))
+    return float(min(constraint, kind["accel"] + kind["decel"]))
 
 
 @kernel
@@ -203,8 +205,8 @@ def behind_fork(
     distance: float,
     scratch: Scratch,
 ) -> float:
-    """How vehicles press that have just turned off from the same lane into another link."""
-    press = no_press(kind)
+    """The constraint of vehicles that have just turned off from the same lane into another link."""
+    constraint = no_constraint(kind)
     first = roads.lanes[lane]["first_link"]
     for link in range(first, first + roads.lanes[lane]["num_links"]):
         if link == chosen:
@@ -216,5 +218,7 @@ def behind_fork(
             fork_m = roads.links[link]["fork_m"] + (LONG_FORK_M if longest > VAN_M else 0.0)
             if place > max(-distance, 0.0) and place - other["half"] < fork_m:
                 gap = distance + place - 0.5 * row["length"] - other["half"]
-                press = max(press, behind(kind, row["speed"], gap, other["speed"], kind["decel"]))
-    return press
+                constraint = max(
+                    constraint, behind(kind, row["speed"], gap, other["speed"], kind["decel"])
+                )
+    return constraint
