@@ -35,7 +35,6 @@ LONG_FILES = {
 FUNCTION_LINES = 70
 LONG_FUNCTIONS = {
     "benchmarks/v2x.py:measure",
-    "cavmarl/cli/verify/__init__.py:verify",
     "cavmarl/driving/kernels/drivers.py:_road_ahead",
     "cavmarl/driving/kernels/drivers.py:decide",
     "cavmarl/driving/kernels/lane_choice.py:_change_is_safe",
@@ -61,7 +60,7 @@ SHARED_CLASS_NAMES = set(
 
 # Persons where the field says vehicle, zone, worker. These numbers may only fall.
 PERSONS = re.compile(r"\b(who|whoever|nobody|somebody)\b", re.IGNORECASE)
-PERSONS_AT_MOST = {"cavmarl": 2, "docs": 6}
+PERSONS_AT_MOST = {"cavmarl": 0, "docs": 2}
 
 
 def sources(*folders: str) -> Iterator[tuple[str, str]]:

@@ -16,7 +16,7 @@ from cavmarl.core.extensions import extension_modules, load_extensions
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.memory import Zeros
 from cavmarl.core.numba.specialized import specialized
-from cavmarl.engine.kernels.step_results import Results, keep_last, report, report_who_goes_on
+from cavmarl.engine.kernels.step_results import Results, keep_last, report, report_continuation
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.spaces import global_state, state_space, write_sensed
 from cavmarl.engine.world_setup import World
@@ -79,11 +79,11 @@ class LocalWorlds:
         self._waiting = np.zeros(num_worlds, dtype=np.bool_)  # over, and not begun anew yet
         self._results = Results(*(getattr(arrays, name) for name in Results._fields))
         self._report = specialized(report)
-        self._report_who_goes_on = specialized(report_who_goes_on)
+        self._report_continuation = specialized(report_continuation)
         self._keep_last = specialized(keep_last)
         if warm:
             self._write_results()
-            self._write_who_goes_on()
+            self._write_continuation()
             self._keep_observations()
             self._steps[:] = 0
 
@@ -124,7 +124,7 @@ class LocalWorlds:
         some_ended = self._write_results()
         if some_ended:
             simulation.retire_agents()
-        some_over = self._write_who_goes_on()
+        some_over = self._write_continuation()
         if some_over or some_ended:
             self._end(arrays.episode_over, some_over)
         arrays.ticks[:] = simulation.ticks()
@@ -134,10 +134,10 @@ class LocalWorlds:
         outputs = self.simulation.outputs
         return self._report(outputs, self._steps, self._horizon, self._results)
 
-    def _write_who_goes_on(self) -> bool:
+    def _write_continuation(self) -> bool:
         """Write which agents act next and what is over; whether an episode is."""
         simulation = self.simulation
-        return self._report_who_goes_on(
+        return self._report_continuation(
             simulation.outputs, simulation.gate, self._steps, self._horizon, self._results
         )
 

@@ -38,7 +38,7 @@ class FramePublisher:
         self._encoder = encoder
         self._tells_events = tells_events
         self._last: WorldFrame | None = None
-        self._shown: tuple[Wishes, bool, float] | None = None  # for whom, and how
+        self._shown: tuple[Wishes, bool, float] | None = None  # with its pause and pace
         self._published_s = self._detailed_s = 0.0
         self.is_new = True
         self.published = 0

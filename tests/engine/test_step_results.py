@@ -11,7 +11,7 @@ from cavmarl.core.records.codes import (
     NUM_COUNTS,
 )
 from cavmarl.driving.vehicles import blank_vehicle
-from cavmarl.engine.kernels.step_results import Results, keep_last, report, report_who_goes_on
+from cavmarl.engine.kernels.step_results import Results, keep_last, report, report_continuation
 from cavmarl.engine.world_setup import load_world
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.traffic.departure_queue import make_gate
@@ -76,8 +76,8 @@ def test_report_is_that_of_one_array_after_the_other(seed: int, network: RoadNet
     expected_steps, found, expected = steps.copy(), results_of(), results_of()
     ended = report(outputs, steps, HORIZON, found)
     assert ended == naive.report(outputs, expected_steps, HORIZON, expected)
-    over = report_who_goes_on(outputs, gate, steps, HORIZON, found)
-    assert over == naive.report_who_goes_on(outputs, gate, expected_steps, HORIZON, expected)
+    over = report_continuation(outputs, gate, steps, HORIZON, found)
+    assert over == naive.report_continuation(outputs, gate, expected_steps, HORIZON, expected)
     np.testing.assert_array_equal(steps, expected_steps)
     for name in Results._fields:
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), name)

@@ -22,7 +22,7 @@ def report(outputs: Outputs, steps: NDArray[np.int64], horizon: int, results: Re
     return bool(outputs.terminated.any())
 
 
-def report_who_goes_on(
+def report_continuation(
     outputs: Outputs, gate: Gate, steps: NDArray[np.int64], horizon: int, results: Results
 ) -> bool:
     results.arrivals[:] = gate.counts[:, COUNT_ARRIVED]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Any
 
 import typer
 from rich.console import Console
@@ -14,13 +14,13 @@ from rich.table import Table
 from cavmarl.cli.output import (
     JsonPath,
     PolicyName,
-    about,
     grid,
     make_folder,
     say_difference,
     with_world,
     write_json,
 )
+from cavmarl.cli.verify import options
 from cavmarl.cli.verify.faults import check_campaign, print_figures, verify_campaign
 from cavmarl.cli.verify.kills import verify_with_kills
 from cavmarl.cli.verify.nodes import (
@@ -29,7 +29,6 @@ from cavmarl.cli.verify.nodes import (
     verify_node_campaign,
     verify_over_nodes,
 )
-from cavmarl.config.env import ZONE_LAYOUTS
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError, LostTickError
 from cavmarl.core.progress import counting
@@ -43,79 +42,21 @@ __all__ = ["verify"]
 @with_world()
 def verify(
     world: WorldSpec,
-    env: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="[ENV]",
-            help="Name, folder or map file of an environment; of a campaign, default: a busy grid.",
-        ),
-    ] = None,
-    zones: Annotated[
-        str | None,
-        about(
-            "Numbers of zones; default: 1,2,4,9, or what a zone file has; of a campaign 4,9.",
-            metavar="K,K,…",
-        ),
-    ] = None,
-    steps: Annotated[
-        int | None, about("Compared steps; default: 200, of a campaign 40 a run.")
-    ] = None,
-    layout: Annotated[
-        str | None, about(f"{', '.join(ZONE_LAYOUTS)}, or a zone file; default: the environment's.")
-    ] = None,
+    env: options.Env = None,
+    zones: options.Zones = None,
+    steps: options.Steps = None,
+    layout: options.Layout = None,
     policy: PolicyName = "idm",
-    worlds: Annotated[
-        int | None, about("Number of parallel worlds; default: 1, with --kill two a worker.")
-    ] = None,
-    faults: Annotated[
-        str | None,
-        about(
-            "JSON file of faults in the divided worlds, see docs/faults.md; `campaign`: "
-            "the whole matrix.",
-            metavar="PLAN",
-        ),
-    ] = None,
-    seeds: Annotated[
-        int,
-        about(
-            "Of a campaign: runs in which any process dies at any time; over nodes, of each fault."
-        ),
-    ] = 12,
-    kill: Annotated[
-        int | None,
-        about(
-            "Kill or stop N workers at random times instead of dividing worlds, and compare.",
-            metavar="N",
-        ),
-    ] = None,
-    nodes: Annotated[
-        str | None,
-        about(
-            "Numbers of nodes, processes that share nothing; with --kill N of them are killed, "
-            "with --faults campaign connections and nodes fail, simulated ones and processes; "
-            "with --faults simulated only the former.",
-            metavar="N,N,…",
-        ),
-    ] = None,
-    workers: Annotated[int, about("With --kill: workers that run the worlds.")] = 2,
-    hosts: Annotated[
-        str | None,
-        about(
-            "With --kill: the workers are actors of a Ray cluster on this machine.", metavar="ray"
-        ),
-    ] = None,
-    check: Annotated[bool, about("Check the invariants of ownership, too.", "--check")] = False,
-    journal: Annotated[
-        Path | None, about("Folder for the journals of the divided worlds.", metavar="DIR")
-    ] = None,
-    replay: Annotated[
-        Path | None,
-        about(
-            "Run a tick again that every host of a zone died of, see docs/faults.md; beside "
-            "it goes ENV only, where the map is found.",
-            metavar="FILE",
-        ),
-    ] = None,
+    worlds: options.Worlds = None,
+    faults: options.Faults = None,
+    seeds: options.Seeds = 12,
+    kill: options.Kill = None,
+    nodes: options.Nodes = None,
+    workers: options.Workers = 2,
+    hosts: options.Hosts = None,
+    check: options.Check = False,
+    journal: options.Journal = None,
+    replay: options.Replay = None,
     json_path: JsonPath = None,
 ) -> None:
     """Drive divided worlds beside the undivided one; exit code 1 and where one first differs.
@@ -129,8 +70,7 @@ def verify(
         shadows = (world.agents, world.background, world.overrides or None)
         if check or any(value is not None for value in (*given, *shadows)):
             raise ConfigError("--replay: all else stands in the file; beside it goes ENV only")
-        _run_again(replay, env, json_path)
-        return
+        return _run_again(replay, env, json_path)
     counts = None if zones is None else _counts(zones)
     console = Console()
     checked = {"zones.check_invariants": True} if check else {}
@@ -140,80 +80,49 @@ def verify(
         plan = None if known else faults
         others = {"--faults": plan, "--layout": layout, "--journal": journal}
         _refuse_with_kill("--kill" if nodes is None else "--nodes", env, counts, others)
+    run: dict[str, Any] = {"steps": steps, "policy": policy}
+    one = None if counts is None else counts[0]
     if nodes is not None and faults is not None:
         if worlds is not None:
             raise ConfigError(f"--worlds {worlds}: a campaign has one world; leave it out")
-        verify_node_campaign(
-            console,
-            strict,
-            _counts(nodes),
-            json_path,
-            faults=faults,
-            zones=None if counts is None else counts[0],
-            steps=steps,
-            seeds=seeds,
-            policy=policy,
-        )
-        return
+        run |= {"faults": faults, "zones": one, "seeds": seeds}
+        return verify_node_campaign(console, strict, _counts(nodes), json_path, **run)
+    if kill is not None and nodes is None:
+        run |= {"zones": one, "worlds": worlds, "workers": workers, "hosts": hosts}
+        return verify_with_kills(console, strict, kill, json_path, **run)
+    run |= {"worlds": 1 if worlds is None else worlds}
+    if nodes is None and faults == CAMPAIGN:
+        check_campaign(layout, run.pop("worlds"), journal)
+        run |= {"zones": counts, "steps": 40 if steps is None else steps, "seeds": seeds}
+        return verify_campaign(console, strict, json_path, **run)
+    run |= {"steps": 200 if steps is None else steps}
     if nodes is not None:
-        verify_over_nodes(
-            console,
-            strict,
-            _counts(nodes),
-            json_path,
-            kills=kill or 0,
-            zones=None if counts is None else counts[0],
-            worlds=1 if worlds is None else worlds,
-            steps=200 if steps is None else steps,
-            policy=policy,
-        )
-        return
-    if kill is not None:
-        verify_with_kills(
-            console,
-            strict,
-            kill,
-            json_path,
-            workers=workers,
-            hosts=hosts,
-            worlds=worlds,
-            steps=steps,
-            policy=policy,
-            zones=None if counts is None else counts[0],
-        )
-        return
-    if faults == CAMPAIGN:
-        check_campaign(layout, 1 if worlds is None else worlds, journal)
-        runs = {
-            "zones": counts,
-            "steps": 40 if steps is None else steps,
-            "seeds": seeds,
-            "policy": policy,
-        }
-        verify_campaign(console, strict, json_path, **runs)
-        return
+        run |= {"kills": kill or 0, "zones": one}
+        return verify_over_nodes(console, strict, _counts(nodes), json_path, **run)
     if env is None:
         raise ConfigError("verify: name an environment; without one goes --faults campaign only")
-    if journal is not None:
-        make_folder(journal)
+    run |= {"layout": layout, "faults": faults, "check": check, "journals": journal}
+    return _verify_zones(console, world, env, counts, json_path, **run)
+
+
+def _verify_zones(
+    console: Console,
+    world: WorldSpec,
+    env: str,
+    counts: list[int] | None,
+    json_path: Path | None,
+    **run: Any,
+) -> None:
+    """Divided worlds beside the undivided one: a table, and where one first differs."""
+    if run["journals"] is not None:
+        make_folder(run["journals"])
     from cavmarl.verify.equivalence import verify_zones
 
-    with counting(console, f"{policy} drives {env}, undivided and divided") as progress:
-        found = verify_zones(
-            world,
-            counts,
-            steps=200 if steps is None else steps,
-            layout=layout,
-            policy=policy,
-            worlds=1 if worlds is None else worlds,
-            faults=faults,
-            check=check,
-            journals=journal,
-            progress=progress,
-        )
+    with counting(console, f"{run['policy']} drives {env}, undivided and divided") as progress:
+        found = verify_zones(world, counts, progress=progress, **run)
     write_json(json_path, found.to_dict())
     console.print(_table(found, world.seed))
-    if faults is not None:
+    if run["faults"] is not None:
         print_figures(console, found)
     for result in found.results:
         if result.difference is not None:

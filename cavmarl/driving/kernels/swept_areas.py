@@ -91,7 +91,7 @@ def _must_yield(roads: RoadArrays, link: int, other: int) -> bool:
 
 @inlined_kernel
 def room_m(at_line: int, inside: int) -> float:
-    """For whom a vehicle leaves room that waits at its line or inside, see `swept_stop`."""
+    """How near to their lines foes are that a waiting vehicle leaves room for, see `swept_stop`."""
     if at_line != HOLD_NONE:
         return APPROACH_STANDING_M
     return math.inf if inside != HOLD_NONE else -math.inf

@@ -61,7 +61,7 @@ def report(
 
 
 @kernel
-def report_who_goes_on(
+def report_continuation(
     outputs: Outputs,  # of the step
     gate: Gate,  # vehicles that wait, and how many have arrived
     steps: NDArray[np.int64],  # (W,) since each world's reset

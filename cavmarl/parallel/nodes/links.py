@@ -70,7 +70,7 @@ class FrameKind(IntEnum):
     REFUSED = 19  # C → N: why it is of no use
     END = 20  # C → N: it is needed no more
     GIVE = 21  # N → N: the state of zones that another node hosts from now on
-    NOT_MINE = 22  # N → C: agents whose actions have come to the wrong node, and who owns them
+    NOT_MINE = 22  # N → C: agents whose actions have come to the wrong node, and their owners
     ACTIONS = 23  # C → N: those
 
 
@@ -278,7 +278,7 @@ class Links:
 
     def take(
         self,
-        wanted: Iterable[int],  # of whom a frame is awaited
+        wanted: Iterable[int],  # numbers of the nodes whose frames are awaited
         timeout_s: float | None = None,  # None: as long as it takes
     ) -> dict[int, NodeFrame]:
         """The next frame of each.

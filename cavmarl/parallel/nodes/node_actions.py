@@ -1,8 +1,8 @@
 """`Actions`: what agents do in a step, which goes to the nodes that own their vehicles.
 
-The caller knows who sensed for an agent last. After nodes were lost, or zones moved, that may be
-another one: a node that is told what an agent of another one does refuses it, with the owner's
-number, and the caller sends it there. A node waits until it knows what all of its agents do.
+The caller knows which node sensed for an agent last. After nodes were lost, or zones moved, that
+may be another one: a node that is told what an agent of another one does refuses it, with the
+owner's number, and the caller sends it there. A node waits until it knows what all its agents do.
 """
 
 from __future__ import annotations

@@ -91,7 +91,7 @@ class NodeWatch:
             raise SilenceError(f"nothing has come for {timeout_s:g} s") from silence
 
     def _ask(self, living: Sequence[int]) -> None:
-        """Ask all whether they live, and for whom they wait."""
+        """Ask all nodes whether they live, and which nodes they wait for."""
         links = self._links
         self._pings += 1
         self._answered.clear()

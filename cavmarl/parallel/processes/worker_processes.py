@@ -149,7 +149,7 @@ class WorkerProcesses:
     ) -> dict[int, Process]:  # the dead, by worker
         """Sleep until one of those is done, or one is dead, but not for ever."""
         ready: list[tuple[int, int]] = []
-        if self._hears_nobody(pending) if is_lying else self._lie_down(pending):
+        if self._hears_no_worker(pending) if is_lying else self._lie_down(pending):
             ready = self._poll.poll(1000.0 * limit_s)
         for k in pending:
             self._meetings[k].get_up()
@@ -175,7 +175,7 @@ class WorkerProcesses:
                 self.processes[k].take()
         self._heard.clear()
 
-    def _hears_nobody(self, pending: Sequence[int]) -> bool:
+    def _hears_no_worker(self, pending: Sequence[int]) -> bool:
         """Forget also calls that came while this side was about to get up; False: one is through.
 
         Only once they have their command, so that none waits for it: of a call that is forgotten
