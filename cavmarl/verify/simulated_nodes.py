@@ -77,6 +77,10 @@ class SimulatedNodes:
     def trouble(self) -> str | None:
         return None
 
+    def retry(self, number: int, pid: int, is_silent: bool) -> str | None:
+        self.replace(number, is_silent)
+        return None
+
     def replace(self, number: int, is_silent: bool) -> None:
         if not self._ghosts:
             self._machine.end(self._processes[number])

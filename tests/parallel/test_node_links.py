@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import socket
 import zlib
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 
 import pytest
 
@@ -19,7 +21,9 @@ from cavmarl.parallel.nodes.links import (
     NodeFrame,
     said_by,
 )
+from cavmarl.parallel.nodes.meeting import call_node, calls_of
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
+from cavmarl.parallel.nodes.node_system import MACHINE
 from cavmarl.parallel.nodes.zone_hosts import packed
 from tests.parallel.test_node_joining import WAIT_S
 
@@ -129,3 +133,30 @@ def test_machines_that_vanish_are_missed() -> None:
     assert connection.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
     assert asked_s <= 25
     links.close()
+
+
+def test_a_call_of_an_earlier_attempt_is_turned_away() -> None:
+    listener = MACHINE.listen("127.0.0.1", b"secret")
+
+    def call(generation: int) -> bytes:
+        with call_node(MACHINE, listener.place, b"secret", 2, generation, of=1) as connection:
+            return connection.recv(1)
+
+    with closing(listener), ThreadPoolExecutor() as callers:
+        earlier = callers.submit(call, 6)
+        (found,) = calls_of(MACHINE, listener, [2], 6, WAIT_S, lambda: None).values()
+        found.close()  # the attempt has come to nothing
+        assert earlier.result() == b""
+        earlier = callers.submit(call, 6)
+        present: list[object] = []
+
+        def check() -> None:
+            if earlier.done() and not present:
+                present.append(callers.submit(call, 7))
+
+        found_now = calls_of(MACHINE, listener, [2], 7, WAIT_S, check)
+        assert earlier.result() == b""
+        assert list(found_now) == [2]
+        found_now[2].close()
+        with pytest.raises(LinkLostError, match="node 3"):
+            calls_of(MACHINE, listener, [3], 7, 0.0, lambda: None)

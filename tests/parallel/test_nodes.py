@@ -19,6 +19,7 @@ from cavmarl.core.errors import MessageError, WorkerDeathError, WorkerError
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.handoff.coordinator.journal import JournalReader
 from cavmarl.parallel.nodes.node_actions import Actions, read_refusal, take_actions
+from cavmarl.parallel.nodes.node_pool import NodePool
 from cavmarl.parallel.nodes.node_starters import LocalNodes
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.parallel.step_arrays import StepArrays
@@ -354,6 +355,43 @@ def test_a_node_that_is_killed_or_stopped_before_it_begins_is_replaced(
     started.clear()
     with pytest.raises(WorkerError, match="ended with -9 before it had begun"):
         make("grid4x4", zones=4, nodes=2, overrides={"workers.max_retries": 1}, **WANTED)
+
+
+@pytest.mark.parametrize(
+    ("nodes", "how", "is_told"),
+    [
+        (1, signal.SIGKILL, True),
+        (3, signal.SIGKILL, False),
+        (3, signal.SIGKILL, True),
+        (3, signal.SIGSTOP, True),
+    ],
+)
+def test_a_node_that_is_lost_while_zones_are_given_out_is_replaced(
+    make: Make, monkeypatch: pytest.MonkeyPatch, nodes: int, how: signal.Signals, is_told: bool
+) -> None:
+    whole = drive(make("grid4x4", **WANTED))
+    tell, struck = NodePool._tell_zones, list[int]()  # processes
+
+    def tell_and_strike(self: NodePool, *told: Any, **more: Any) -> None:
+        process = psutil.Process(self.pids[-1 if struck else 0])
+        if is_told:
+            tell(self, *told, **more)
+        if len(struck) < 2:
+            struck.append(process.pid)
+            process.send_signal(how)
+            if how == signal.SIGKILL:
+                process.wait()
+        if not is_told:
+            tell(self, *told, **more)
+
+    monkeypatch.setattr(NodePool, "_tell_zones", tell_and_strike)
+    vec = make("grid4x4", zones=4, nodes=nodes, **WANTED)
+    assert len(set(struck)) == 2
+    assert same(drive(vec), whole)
+    assert (over_nodes(vec).losses, over_nodes(vec).recoveries) == (2, 0)
+    struck.clear()
+    with pytest.raises(WorkerError, match=f"node {nodes - 1} ended with -9 before it had begun"):
+        make("grid4x4", zones=4, nodes=nodes, overrides={"workers.max_retries": 1}, **WANTED)
 
 
 def test_nodes_tell_what_they_have_done(make: Make) -> None:

@@ -6,27 +6,35 @@ import select
 import socket
 from collections.abc import Callable, Iterable
 
-from cavmarl.core.errors import MessageError, WorkerError
+from cavmarl.core.errors import MessageError
 from cavmarl.parallel.nodes.links import LinkLostError
 from cavmarl.parallel.nodes.node_system import NodeListener, NodeSystem, Place
 
 LOOK_MS = 50.0  # so often it is looked whether those that are awaited still live
 ANSWER_S = 5.0  # for a node to answer a call
+_MOST = 1 << 16  # nodes, and generations that are told apart
+
+
+def call_number(number: int, generation: int) -> int:
+    """What a node says when it calls another one: which it is, and for which attempt to begin."""
+    return number + generation % _MOST * _MOST
 
 
 def calls_of(
     system: NodeSystem,
     listener: NodeListener,
     wanted: Iterable[int],  # numbers of those that are to call
+    generation: int,  # how often nodes have come and gone; calls of other times count no more
     timeout_s: float,
     check: Callable[[], None],  # raises if one will never call
 ) -> dict[int, socket.socket]:
     """The connections of all that are awaited; other callers are turned away.
 
     Raises:
-        WorkerError: one has not called in time.
+        LinkLostError: one has not called in time.
     """
-    missing, found = set(wanted), dict[int, socket.socket]()
+    missing = {call_number(number, generation): number for number in wanted}
+    found: dict[int, socket.socket] = {}
     until_s = system.now_s() + timeout_s
     poll = system.poll()
     poll.register(listener, select.POLLIN)
@@ -34,12 +42,11 @@ def calls_of(
         while missing:
             check()
             if system.now_s() > until_s:
-                raise WorkerError(f"nodes {sorted(missing)} have not called within {timeout_s:g} s")
+                raise LinkLostError(min(missing.values()))
             poll.poll(LOOK_MS)
-            for number, connection in listener.admit():
-                if number in missing:
-                    found[number] = connection
-                    missing.remove(number)
+            for said, connection in listener.admit():
+                if said in missing:
+                    found[missing.pop(said)] = connection
                 else:
                     connection.close()
     except BaseException:
@@ -50,7 +57,7 @@ def calls_of(
 
 
 def call_node(
-    system: NodeSystem, place: Place, secret: bytes, number: int, of: int
+    system: NodeSystem, place: Place, secret: bytes, number: int, generation: int, of: int
 ) -> socket.socket:
     """A connection to node `of` of node `number`.
 
@@ -58,6 +65,6 @@ def call_node(
         LinkLostError: it cannot be reached.
     """
     try:
-        return system.call(place, secret, number, ANSWER_S)
+        return system.call(place, secret, call_number(number, generation), ANSWER_S)
     except (OSError, EOFError, MessageError) as error:
         raise LinkLostError(of) from error

@@ -36,7 +36,6 @@ from cavmarl.parallel.nodes.links import (
     LinkLostError,
     Links,
     NodeFrame,
-    SilenceError,
     said_by,
 )
 from cavmarl.parallel.nodes.newcomers import Newcomer, Newcomers
@@ -46,7 +45,7 @@ from cavmarl.parallel.nodes.node_files import files_of
 from cavmarl.parallel.nodes.node_starters import Route, Start, start_nodes, straight
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.nodes.node_watch import NodeWatch, SilentNodeError
-from cavmarl.parallel.nodes.zone_hosts import read_report
+from cavmarl.parallel.nodes.zone_hosts import read_report, told_hostings
 from cavmarl.parallel.nodes.zone_moves import ZoneMoves, moves_of, name_of
 from cavmarl.parallel.recipe import recipe_of
 from cavmarl.parallel.step_arrays import StepArrays, layout_of
@@ -149,25 +148,35 @@ class NodePool:
         self._newcomers = Newcomers(listener, job, files, self._room, system)
         try:
             self._begin(nodes)
-        except (LinkLostError, SilenceError) as error:
-            self.close()
-            raise WorkerError(f"{error} before it had begun; see standard error") from error
         except BaseException:
             self.close()
             raise
 
     def _begin(self, nodes: int) -> None:
-        """Wait until so many nodes have joined, and give them their zones."""
+        """Wait until so many nodes have joined, and give them their zones, again if one is lost."""
         join_timeout_s = self.world.config.workers.join_timeout_s
-        self._newcomers.await_ready(nodes, join_timeout_s, self._starter.trouble)
-        self._seat()
         self._owner = np.full(self.arrays.mask.size, UNOWNED, dtype=np.int32)
-        neighbours = self._nodes[0].neighbours
-        assert neighbours is not None
-        hostings = self._coordinator.host(neighbours)
-        self._tell_zones(hostings, ZoneMoves(self.zones, {}, []), begins=True)
-        self._commit()
-        self._new.clear()
+        hostings: list[list[Hosting]] = []
+        while self._new or len(self._nodes) < nodes:
+            try:
+                missing = nodes - len(self._nodes)
+                self._newcomers.await_ready(missing, join_timeout_s, self._trouble)
+                self._seat()
+                neighbours = self._nodes[0].neighbours
+                assert neighbours is not None
+                hostings = hostings or self._coordinator.host(neighbours)
+                self._tell_zones(hostings, ZoneMoves(self.zones, {}, []), begins=True)
+                self._commit()
+                self._new.clear()
+            except LinkLostError as lost:
+                self._lose(lost, has_begun=False)
+                self._generation += 1  # what nodes say of this attempt counts no more
+        self._is_torn = False
+
+    def _trouble(self) -> str | None:
+        """Why nodes that are awaited do not come. Raises LinkLostError: one that had is lost."""
+        self._links.pump(0.0)
+        return self._starter.trouble()
 
     @property
     def pids(self) -> list[int]:
@@ -247,10 +256,8 @@ class NodePool:
                     for one in self._log[: -1 if changes else None]:
                         self._perform(one)
                 return [] if command is None else self._perform(command)
-            except SilentNodeError as silent:
-                self._lose(silent, is_silent=True)
             except LinkLostError as lost:
-                self._lose(self._watch.most_missed(lost))
+                self._lose(lost)
 
     def _replace_lost(self) -> bool:  # whether the worlds go back for that
         """Let nodes that have joined meanwhile host what lost ones had.
@@ -325,8 +332,14 @@ class NodePool:
             pieces = self._performed.actions.some(agents)
             self._links.send(owner, FrameKind.ACTIONS, self._generation, pieces)
 
-    def _lose(self, lost: LinkLostError, is_silent: bool = False) -> None:
-        """A node is gone: nothing of it counts any more."""
+    def _lose(self, lost: LinkLostError, has_begun: bool = True) -> None:
+        """A node is gone: nothing of it counts any more.
+
+        Raises:
+            WorkerError: it had not begun, and too many were lost like that.
+        """
+        is_silent = isinstance(lost, SilentNodeError)
+        lost = lost if is_silent else self._watch.most_missed(lost)
         number = lost.peer
         self._is_torn = True
         self._watch.forget_missed()
@@ -337,14 +350,12 @@ class NodePool:
             return
         self._lost.append(number)
         self.losses += 1
-        log.warning(
-            "node %d on %s (%s) is lost: %s",
-            number,
-            node.machine,
-            name_of(self._homes[number]),
-            lost,
-        )
-        self._starter.replace(node.asked, is_silent)
+        zones = name_of(self._homes[number])
+        log.warning("node %d on %s (%s) is lost: %s", number, node.machine, zones, lost)
+        if has_begun:
+            self._starter.replace(node.asked, is_silent)
+        elif why := self._starter.retry(node.asked, node.pid, is_silent):
+            raise WorkerError(why) from lost
 
     def _recover(self) -> None:
         """Let the living nodes host the zones of the lost ones, as of the newest state they have.
@@ -385,7 +396,7 @@ class NodePool:
             "first": self._first_teller(),
             "state": self._state.number,
             "runs": self._runs,
-            "hostings": _told(hostings),
+            "hostings": told_hostings(hostings),
         }
         for number in self._living:
             data = json.dumps({**told, "number": number}).encode()
@@ -432,11 +443,6 @@ class NodePool:
         self._newcomers.close()
         self._coordinator.close()
         self._starter.close()
-
-
-def _told(hostings: Sequence[Sequence[Hosting]]) -> list[list[list[int]]]:
-    """What hosts have to know, as JSON does."""
-    return [[[h.episode, h.tick, h.zone, h.incarnation] for h in some] for some in hostings]
 
 
 def _nothing(number: int, frame: NodeFrame) -> None:

@@ -17,7 +17,6 @@ from cavmarl.core.errors import CavmarlError, ConfigError, MessageError, NodeRef
 from cavmarl.engine.shard_clock import ShardClock
 from cavmarl.handoff.shard_setup import limits_of, neighbours_of
 from cavmarl.ownership.messages import COORDINATOR
-from cavmarl.ownership.reactions import Hosting
 from cavmarl.parallel.hosts.host_process import code_stamp
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.nodes.kept_states import KeptStates
@@ -37,7 +36,7 @@ from cavmarl.parallel.nodes.node_frames import cases_of, command_of, results_of,
 from cavmarl.parallel.nodes.node_loads import told_of
 from cavmarl.parallel.nodes.node_peers import NodePeers
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
-from cavmarl.parallel.nodes.zone_hosts import ZoneHosts
+from cavmarl.parallel.nodes.zone_hosts import ZoneHosts, hosting_of
 from cavmarl.parallel.worlds_job import Task, commands_of
 from cavmarl.shards.executor import Executor, SerialExecutor
 from cavmarl.shards.shard import Shard
@@ -131,7 +130,7 @@ class NodeProgram:
             for zone in some:
                 node_of[zone] = node
         told = [
-            [_hosting(bytes.fromhex(run), some[zone]) for zone in mine]
+            [hosting_of(bytes.fromhex(run), some[zone]) for zone in mine]
             for run, some in zip(runs, hostings, strict=True)
         ]
         self._peers = NodePeers(simulation, self._links, zones, self._number, generation << 32)
@@ -222,7 +221,7 @@ class NodeProgram:
             links.drop(number)
         zones = told["zones"]
         others = [node for node, some in enumerate(zones) if some and node != self._number]
-        self._meet(dict(told["places"]), others)
+        self._meet({node: (host, port) for node, (host, port) in told["places"]}, others)
         self._share(zones, told["runs"], told["hostings"], frame.number)
         for node in others:
             links.send(node, FrameKind.SYNC, frame.number)
@@ -249,18 +248,18 @@ class NodeProgram:
             LinkLostError: one cannot be reached.
             RecoveryOrderedError: the coordinator knows of more by now.
         """
-        links, number = self._links, self._number
+        links, number, times = self._links, self._number, self._generation
         is_new = number in places
         for other in others if is_new else places:
             links.drop(other)  # of an attempt that came to nothing
         for other in others:
             if other in places and (not is_new or other < number):
-                host, port = places[other]
-                links.add(other, call_node(self._system, (host, port), self._secret, number, other))
+                found = call_node(self._system, places[other], self._secret, number, times, other)
+                links.add(other, found)
         if is_new:
             callers = [node for node in others if node not in places or node > number]
-            found = calls_of(self._system, self._listener, callers, MEETING_S, self._check)
-            for other, connection in found.items():
+            called = calls_of(self._system, self._listener, callers, times, MEETING_S, self._check)
+            for other, connection in called.items():
                 links.add(other, connection)
 
     def _check(self) -> None:
@@ -442,8 +441,3 @@ def _refusal(worlds: LocalWorlds, cases: Sequence[bytes]) -> str:
     except ConfigError as error:
         return str(error)
     return ""
-
-
-def _hosting(run: bytes, numbers: Sequence[int]) -> Hosting:
-    episode, tick, zone, incarnation = numbers
-    return Hosting(run, episode, tick, zone, incarnation, {})

@@ -40,6 +40,10 @@ class NodeStarter(Protocol):
         """Why a node does not come, in words; one that was killed before it began begins again."""
         ...
 
+    def retry(self, number: int, pid: int, is_silent: bool) -> str | None:
+        """Start one again that was lost before it had begun; else why not, in words."""
+        ...
+
     def replace(self, number: int, is_silent: bool) -> None:
         """One is lost, or silent, and may still run."""
         ...
@@ -87,15 +91,28 @@ class LocalNodes:
         self._seen_stopped = stopped
         for number, process in enumerate(self._processes):
             if process.poll() is not None:
-                if process.returncode < 0 and self._retries > 0:
-                    self._retries -= 1
-                    self._processes[number] = self._start(number)
-                    continue
-                return (
-                    f"node {number} ended with {process.returncode} before it had begun; what it "
-                    "printed stands on standard error"
-                )
+                is_killed = process.returncode < 0
+                why = self.retry(number, process.pid, False) if is_killed else self._ended(number)
+                if why is not None:
+                    return why
         return None
+
+    def retry(self, number: int, pid: int, is_silent: bool) -> str | None:
+        if self._processes[number].pid != pid:  # another one has been started already
+            return None
+        if self._retries == 0:
+            return self._ended(number)
+        self._retries -= 1
+        self.replace(number, is_silent)
+        return None
+
+    def _ended(self, number: int) -> str:
+        process = self._processes[number]
+        process.kill()
+        return (
+            f"node {number} ended with {process.wait()} before it had begun; what it printed "
+            "stands on standard error"
+        )
 
     def replace(self, number: int, is_silent: bool) -> None:
         self._processes[number].kill()
@@ -117,12 +134,25 @@ class LocalNodes:
 class RayNodes:
     """Actors of a Ray cluster."""
 
-    def __init__(self, actors: Launcher, listener: Listener) -> None:
+    def __init__(
+        self,
+        actors: Launcher,
+        listener: Listener,
+        max_retries: int,  # of nodes that are lost while they are given their zones
+    ) -> None:
         self._actors = actors
+        self._retries = max_retries
         actors.start(listener.place, listener.secret)
 
     def trouble(self) -> str | None:
         return self._actors.trouble()
+
+    def retry(self, number: int, pid: int, is_silent: bool) -> str | None:
+        if self._retries == 0:
+            return f"node {number}, an actor of Ray, was lost before it had begun"
+        self._retries -= 1
+        self.replace(number, is_silent)
+        return None
 
     def replace(self, number: int, is_silent: bool) -> None:
         if is_silent:
@@ -141,6 +171,10 @@ class JoinedNodes:
     """Nodes that are started by hand: `cavmarl node --join`."""
 
     def trouble(self) -> str | None:
+        return None
+
+    def retry(self, number: int, pid: int, is_silent: bool) -> str | None:
+        """Another one is awaited."""
         return None
 
     def replace(self, number: int, is_silent: bool) -> None:
@@ -179,7 +213,7 @@ def start_nodes(
     if hosts == RAY:
         actors = RayActors(run_on_ray, lambda workers: "", nodes, nodes)
         listener = Listener(actors.address)
-        return RayNodes(actors, listener), listener
+        return RayNodes(actors, listener, settings.max_retries), listener
     host, port = place_of(hosts)
     if not settings.key_file:
         raise ConfigError(

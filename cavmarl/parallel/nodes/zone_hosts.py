@@ -284,6 +284,17 @@ class ZoneHosts:
             self._come[w, vehicle] = frame.data[_LENGTH.size + 8 :]
 
 
+def told_hostings(hostings: Sequence[Sequence[Hosting]]) -> list[list[list[int]]]:
+    """What hosts have to know, as JSON does; by worlds and zones."""
+    return [[[h.episode, h.tick, h.zone, h.incarnation] for h in some] for some in hostings]
+
+
+def hosting_of(run: bytes, numbers: Sequence[int]) -> Hosting:
+    """One of them, read."""
+    episode, tick, zone, incarnation = numbers
+    return Hosting(run, episode, tick, zone, incarnation, {})
+
+
 def packed(messages: Sequence[tuple[int, Message]]) -> bytes:
     """Messages with the world of each, one after the other."""
     parts: list[bytes] = []
