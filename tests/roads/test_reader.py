@@ -325,3 +325,35 @@ def test_points_of_a_lane_are_limited(crossing: Crossing, monkeypatch: pytest.Mo
     monkeypatch.setenv("CAVMARL_MAX_LANE_POINTS", "none")
     with pytest.raises(ConfigError, match="CAVMARL_MAX_LANE_POINTS = 'none': must be a whole"):
         read_network(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "before"), [("edge", '<edge id="w" '), ("junction", 'id="E" type="dead_end" ')]
+)
+def test_points_of_edges_and_junctions_are_limited(
+    crossing: Crossing, name: str, before: str
+) -> None:
+    many = f'shape="{" ".join(["0,0"] * 100_001)}"'
+    path = crossing((' shape=""/>', "/>"), (before, f"{before}{many} "))
+    with pytest.raises(MapError, match=rf"line \d+: <{name} .* 100001 points, more than 100000"):
+        read_network(path)
+
+
+@pytest.mark.parametrize("coordinate", ["2e8", "-1e300"])
+def test_points_beyond_the_earth_are_refused(crossing: Crossing, coordinate: str) -> None:
+    path = crossing(('shape="5,0,0 ', f'shape="{coordinate},0,0 '))
+    with pytest.raises(MapError, match=rf"<lane .* the point '{coordinate},.*', beyond 1e\+08 m"):
+        read_network(path)
+
+
+def test_a_path_over_a_junction_is_limited(
+    crossing: Crossing, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    far = crossing(('shape="5,0,0 ', 'shape="9005,0,0 '))
+    with pytest.raises(
+        MapError, match=r"from lane 'w_1' to lane 'e_0' are .* m over the junction, more than 2000"
+    ):
+        read_network(far)
+    monkeypatch.setenv("CAVMARL_MAX_CROSSING_M", "1")
+    with pytest.raises(MapError, match=r"more than 1 \(CAVMARL_MAX_CROSSING_M\): mend the shapes"):
+        read_network(crossing())

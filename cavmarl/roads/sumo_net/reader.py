@@ -35,11 +35,14 @@ from cavmarl.roads.sumo_net.detectors import DetectorRoads, place_detectors
 from cavmarl.roads.sumo_net.selection import Movement, NetworkSelection, permission_bits, select
 from cavmarl.roads.sumo_net.signal_rows import SignalRows, read_signals
 from cavmarl.roads.sumo_net.sweeps import AHEAD_M, Movements, sweep_rows
+from cavmarl.roads.sumo_net.xml_source import limit
 
 if TYPE_CHECKING:
     from cavmarl.roads.sumo_net.sumo_xml import ParsedNet
 
 APPROACH_M = 12.0  # before a junction, where bodies still stand askew to vehicles that wait
+MAX_CROSSING_M = 2000  # paths are compared point by point: memory goes by its square
+MOST_CROSSING = "CAVMARL_MAX_CROSSING_M"  # the environment's variable with another limit
 _ENDINGS = (".gz", ".xml", ".net", ".osm", ".xodr")
 
 
@@ -279,6 +282,7 @@ def _link_rows(
     node_row: dict[int, int],
     signals: SignalRows,
 ) -> NDArray[np.void]:
+    most_m = limit(MOST_CROSSING, MAX_CROSSING_M)
     links = np.zeros(len(movements), LINK)
     for link, movement in zip(links, movements, strict=True):
         connection = movement.connection
@@ -288,6 +292,12 @@ def _link_rows(
         link["first_internal"] = chain[0] if chain else -1
         link["next_lane"] = chain[0] if chain else link["to_lane"]
         link["length_m"] = lanes["length_m"][chain].sum()
+        if not link["length_m"] <= most_m:
+            raise MapError(
+                f"from lane '{connection.getFromLane().getID()}' to lane "
+                f"'{connection.getToLane().getID()}' are {link['length_m']:.6g} m over the "
+                f"junction, more than {most_m} ({MOST_CROSSING}): mend the shapes of both"
+            )
         # netconvert cuts a path in two where drivers wait inside the junction.
         link["wait_m"] = lanes["length_m"][chain[0]] if len(chain) > 1 else np.inf
         link["junction"] = node_row[id(movement.node)]

@@ -21,6 +21,7 @@ from cavmarl.roads.sumo_net.xml_source import limit, read_xml
 
 MAX_LANE_POINTS = 100_000
 MOST_POINTS = "CAVMARL_MAX_LANE_POINTS"  # the environment's variable with another limit
+_MAX_COORDINATE_M = 1e8  # more than twice around the Earth
 
 _REQUIRED = {
     "edge": ("id",),
@@ -90,6 +91,8 @@ class _CheckedReader(ContentHandler):
                 self._check_number(name, key, attrs)
         if name in ("edge", "junction"):
             self._check_unique(name, attrs)
+        if name in ("edge", "junction", "lane"):
+            self._check_size(name, attrs)
         if name == "edge":
             self._edge, self._next_lane = attrs["id"], 0
         elif name == "lane":
@@ -131,20 +134,21 @@ class _CheckedReader(ContentHandler):
         if attrs["id"] != expected:
             raise self._error("lane", attrs, f"stands where '{expected}' should")
         self._next_lane += 1
-        points = attrs["shape"].split()
-        if len(points) > self._most_points:
-            raise self._error(
-                "lane",
-                attrs,
-                f"has {len(points)} points, more than {self._most_points} ({MOST_POINTS})",
-            )
-        for point in points:
+        for point in attrs["shape"].split():
             try:
                 numbers = [float(part) for part in point.split(",")]
             except ValueError:
                 numbers = [math.nan]
             if len(numbers) not in (2, 3) or not all(map(math.isfinite, numbers)):
                 raise self._error("lane", attrs, f"has the point '{point}', not finite x,y[,z]")
+            if max(map(abs, numbers)) > _MAX_COORDINATE_M:
+                problem = f"has the point '{point}', beyond {_MAX_COORDINATE_M:g} m"
+                raise self._error("lane", attrs, problem)
+
+    def _check_size(self, name: str, attrs: Mapping[str, str]) -> None:
+        if (count := len(attrs.get("shape", "").split())) > self._most_points:
+            problem = f"has {count} points, more than {self._most_points} ({MOST_POINTS})"
+            raise self._error(name, attrs, problem)
 
 
 class ParsedNet(NamedTuple):

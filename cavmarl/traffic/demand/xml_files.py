@@ -12,7 +12,7 @@ from cavmarl.roads.sumo_net.xml_source import read_xml
 from cavmarl.traffic.demand.element import DemandReport, Element, near
 
 MAX_INCLUDES = 16  # files inside files
-MAX_CHILDREN = 100_000  # of one definition
+MAX_INSIDE = 100_000  # elements of one definition, at any depth
 
 _ROOTS = frozenset(("routes", "additional", "add", "trips", "flows", "vtypes", "vTypes"))
 STOPPING_PLACES = frozenset(
@@ -55,6 +55,7 @@ class _Handler(ContentHandler):
         self._depth = 0  # of the element around the next one
         self._skipping = 0  # depth of the element whose inside is of no interest
         self._tree: list[Element] = []  # from the definition to the innermost open element
+        self._inside = 0  # elements of this definition so far
         self._interval: dict[str, str] = {}
         self._locator: Any = None
 
@@ -75,6 +76,7 @@ class _Handler(ContentHandler):
             if name == "flow" and self._interval:
                 element.attrs = {**self._interval, **element.attrs}
             self._tree.append(element)
+            self._inside = 0
         else:
             self._skip(element)
 
@@ -92,10 +94,10 @@ class _Handler(ContentHandler):
         self._depth -= 1
 
     def _add(self, element: Element) -> None:
-        parent = self._tree[-1]
-        if len(parent.children) >= MAX_CHILDREN:
-            raise parent.error(f"holds more than {MAX_CHILDREN} elements", "split it")
-        parent.children.append(element)
+        self._inside += 1
+        if self._inside > MAX_INSIDE:
+            raise self._tree[0].error(f"holds more than {MAX_INSIDE} elements", "split it")
+        self._tree[-1].children.append(element)
         self._tree.append(element)
 
     def _open_root(self, element: Element) -> None:

@@ -254,3 +254,11 @@ def test_what_is_no_demand_is_counted(demand: Reader) -> None:
         "vehicle that departs 'triggered' is left out": 1,
     }
     assert "<person> is not read (first: " in file.to_report()
+
+
+def test_elements_of_a_definition_are_limited_at_any_depth(demand: Reader) -> None:
+    route = f'<route edges="AB BC">{"<param/>" * 999}</route>'
+    body = (
+        f'<vehicle id="a" depart="0"><routeDistribution>{route * 101}</routeDistribution></vehicle>'
+    )
+    refused(demand, body, '<vehicle id="a">', "holds more than 100000 elements", "split it")
