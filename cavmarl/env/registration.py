@@ -9,9 +9,10 @@ from pettingzoo.utils import parallel_to_aec, wrappers
 from pettingzoo.utils.env import AECEnv
 
 from cavmarl.env.parallel import CavEnv, parallel_env
+from cavmarl.env.world_copies import OwnWorlds
 
 
-class CheckedActions(wrappers.OrderEnforcingWrapper):  # type: ignore[misc] # not typed
+class CheckedActions(OwnWorlds, wrappers.OrderEnforcingWrapper):  # type: ignore[misc] # not typed
     """The AEC form that refuses a wrong action at once: kept for later, it would spoil the step.
 
     Args:

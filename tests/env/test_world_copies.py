@@ -111,21 +111,27 @@ def test_a_batch_of_worlds(how: str, copied: bool) -> None:
     assert not np.shares_memory(other.worlds.arrays.observations, vec.worlds.arrays.observations)
 
 
-def test_one_vehicle_and_agents_in_turn() -> None:
+@pytest.mark.parametrize("how", COPIES)
+def test_agents_in_turn(how: str) -> None:
+    turns = cavmarl.env("ring", agents=2)
+    turns.reset(seed=4)
+    turns.step(np.zeros(2))
+    later = COPIES[how](turns)
+    seen = []
+    for env in (turns, later):
+        for _ in range(5):
+            env.step(np.full(2, 0.3))
+            seen.append((env.agent_selection, flat(env.last())))
+    assert seen[5:] == seen[:5]
+
+
+def test_one_vehicle() -> None:
     one = gymnasium.make("cavmarl/merge-v2")
     one.reset(seed=4)
     one.step(np.zeros(2, np.float32))
     other = copy.deepcopy(one)
     for _ in range(5):
         assert flat(other.step(np.zeros(2, np.float32))) == flat(one.step(np.zeros(2, np.float32)))
-    turns = cavmarl.env("ring", agents=2)
-    turns.reset(seed=4)
-    turns.step(np.zeros(2))
-    later = copy.deepcopy(turns)
-    for _ in range(5):
-        for env in (turns, later):
-            env.step(np.zeros(2))
-        assert flat(later.last()) == flat(turns.last())
 
 
 def test_a_world_that_is_sent_to_another_process() -> None:
