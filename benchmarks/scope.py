@@ -53,11 +53,15 @@ def divided(steps: int, seed: int) -> tuple[Found, Found]:
             transfers = sum(one.switched for one in vec.simulation.coordinators)
     same = sum(one == other for one, other in zip(*hashes, strict=True))
     return (
-        Found(f"{ZONES} zones: {same} of {steps} steps bit for bit the undivided world's",
-              same == steps),
-        Found(f"{transfers} in {steps} steps; of {owners} vehicles none twice or lost",
-              transfers > 0 and once and same == steps),
-    )  # fmt: skip
+        Found(
+            f"{ZONES} zones: {same} of {steps} steps bit for bit the undivided world's",
+            same == steps,
+        ),
+        Found(
+            f"{transfers} in {steps} steps; of {owners} vehicles none twice or lost",
+            transfers > 0 and once and same == steps,
+        ),
+    )
 
 
 def placed() -> Found:
@@ -66,8 +70,10 @@ def placed() -> Found:
     fleet = [*busy, Candidate(3, Utilisation(0.5, 0.5)), Candidate(4, Utilisation(0.2, 0.1))]
     found = select(fleet)
     out = len(found.rejections)
-    return Found(f"{out} workers above a threshold left out; of 2 others the idler one", 
-                 out == len(THRESHOLDS) and found.worker == 4)  # fmt: skip
+    return Found(
+        f"{out} workers above a threshold left out; of 2 others the idler one",
+        out == len(THRESHOLDS) and found.worker == 4,
+    )
 
 
 def told(steps: int, seed: int) -> Found:
@@ -81,8 +87,10 @@ def told(steps: int, seed: int) -> Found:
         sent = vec.simulation.messages.statistics(0).sent
     counts = {name: int(sent[kind]) for kind, name in NAMES.items()}
     shown = ", ".join(f"{count} {name}" for name, count in counts.items())
-    return Found(f"{shown} in {steps} steps, over a channel that can lose and delay them", 
-                 min(counts.values()) > 0)  # fmt: skip
+    return Found(
+        f"{shown} in {steps} steps, over a channel that can lose and delay them",
+        min(counts.values()) > 0,
+    )
 
 
 def pictured(seed: int) -> Found:

@@ -79,8 +79,8 @@ class Args:
     opponents: Annotated[str, "drivers of some seats, not learnt from: names, by commas"] = ""
     opponent_share: Annotated[float, "share of the seats that each opponent drives"] = 0.1
     max_gradient_norm: Annotated[float, "longer gradients are shortened"] = 0.5
-    throttle_std: Annotated[float, "standard deviation of the throttle at the start"] = 0.3
-    steering_std: Annotated[float, "standard deviation of the steering at the start"] = 0.1
+    throttle_std: Annotated[float, "standard deviation of throttle at first; not --start's"] = 0.3
+    steering_std: Annotated[float, "standard deviation of steering at first; not --start's"] = 0.1
     mappo: Annotated[bool, "the critic sees the state of the whole world"] = False
     hidden: Annotated[int, "width of the two hidden layers"] = 128
     shared: Annotated[bool, "one body with LayerNorm for actor and critic"] = False

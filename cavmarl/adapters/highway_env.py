@@ -8,6 +8,7 @@ decision-making", 2018.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from types import SimpleNamespace
 from typing import Any, cast
@@ -295,12 +296,15 @@ def _clock(config: Mapping[str, Any]) -> dict[str, Any]:
             f"policy_frequency = {policy:g}, simulation_frequency = {ticks:g}: must be above 0, "
             "and the second one not below the first"
         )
+    duration = float(config["duration"])
+    if not 0.0 < duration < math.inf:
+        raise ConfigError(f"duration = {duration:g}: must be above 0, in s")
     per_step = max(1, round(ticks / policy))
     step_s = 1.0 / policy
     return {
         "clock.sim_dt_s": step_s / per_step,
         "clock.ctrl_dt_s": step_s,
-        "horizon_s": max(1, round(float(config["duration"]) * policy)) * step_s,
+        "horizon_s": max(1, round(duration * policy)) * step_s,
     }
 
 
@@ -327,4 +331,6 @@ def _half(name: str, settings: Mapping[str, Any], usual: float) -> float:
 def _refuse_unknown(where: str, given: Mapping[str, Any], known: Iterable[str]) -> None:
     for key in given:
         if key not in known:
-            raise ConfigError(f"{where}.{key}: no such key; there are {', '.join(sorted(known))}")
+            raise ConfigError(
+                f"{where}.{key}: no such key; there are {', '.join(sorted(set(known)))}"
+            )

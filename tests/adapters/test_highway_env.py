@@ -134,6 +134,7 @@ def test_faster_drives_faster_and_is_rewarded(make: Any) -> None:
         ({"controlled_vehicles": 2}, "drives many"),
         ({"lanes_count": 7}, "maps of 3, 4 lanes"),
         ({"policy_frequency": 20}, "not below the first"),
+        ({"duration": -1}, "duration = -1: must be above 0"),
         ({"action": {"type": "ContinuousAction", "steering_range": [-1, 2]}}, "symmetric"),
     ],
 )

@@ -9,7 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_BACKGROUND, HOLD_YIELD, SIGNAL_NONE
+from cavmarl.core.records.codes import (
+    DRIVER_AGENT,
+    DRIVER_BACKGROUND,
+    HOLD_NONE,
+    HOLD_YIELD,
+    SIGNAL_NONE,
+    SIGNAL_OFF_BLINKING,
+)
 from cavmarl.driving.kernels.approach import APPROACH
 from cavmarl.driving.kernels.gaps import foe_blocks, ignores
 from cavmarl.roads.network import RoadNetwork
@@ -144,6 +151,18 @@ def test_a_road_comes_first_while_it_waits_itself_but_not_for_ever(
 ) -> None:
     row, foe = waiting_pair(id=[5, 3], wait_s=[wait_s, 9.0], speed=0.0)
     assert ignores(row, foe, 0, 1, SIGNAL_NONE, MINOR, MINOR) == goes
+
+
+@pytest.mark.parametrize(
+    ("own_wait_s", "foe_hold", "goes"),
+    [(9.0, HOLD_YIELD, True), (1.0, HOLD_YIELD, False), (9.0, HOLD_NONE, False)],
+)
+def test_where_signals_blink_of_two_that_give_way_the_one_goes_that_has_stood_longer(
+    own_wait_s: float, foe_hold: int, goes: bool
+) -> None:
+    row, foe = waiting_pair(id=[5, 3], wait_s=[own_wait_s, 2.0], speed=0.0)
+    foe["hold"] = foe_hold  # HOLD_NONE: it is about to go
+    assert ignores(row, foe, 0, 1, SIGNAL_OFF_BLINKING, MINOR, MINOR) == goes
 
 
 @pytest.mark.parametrize(("stopped_at", "goes"), [(1, True), (2, False)])

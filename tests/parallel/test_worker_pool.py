@@ -8,6 +8,7 @@ import random
 import resource
 import select
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -25,6 +26,7 @@ from cavmarl.core.errors import (
     WorkerError,
     WorkerFailureError,
 )
+from cavmarl.parallel.processes import worker_loop
 from cavmarl.parallel.processes.shared_memory import Segment
 from cavmarl.parallel.processes.worker_pool import Pool, Program
 from tests.support.forks import said_in_fork
@@ -262,6 +264,15 @@ def test_the_process_that_forks_may_die_or_be_stopped(make: Make) -> None:
     os.kill(pool.pids[0], signal.SIGKILL)
     pool.run(ADD)
     assert totals(pool) == [[9.0, 3 * MORE]] * 2
+
+
+def test_a_server_whose_pool_has_gone_says_nothing() -> None:
+    """Ctrl-C ends the pool while the server starts: no traceback of it is shown."""
+    pool, server = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    pool.close()
+    worker_loop._say(server, {"ready": 1})
+    assert server.recv(10) == b""  # by which the server ends
+    server.close()
 
 
 def test_a_start_that_is_killed_is_begun_again(tmp_path: Path) -> None:

@@ -67,7 +67,9 @@ FALL_IN_M = 100.0  # before the place where a lane change must be made
 # length further back to change left: two that want to swap do not stand side by side for ever.
 MERGE_ROOM_M = 2.0
 SWAP_ROOM_M = 3.0
-CHANGING_ROOM_M = -0.8  # of a steered one on its way into the other lane: to the very end
+# The same of a steered vehicle on its way into the other lane: its front comes to 0.2 m before the
+# end, nearer than to a line.
+CHANGING_ROOM_M = -0.8
 MERGE_ROOM_SHARE = 0.25  # to the right at most this share of the lane's length
 ROW_LINES = 3  # of a VEHICLE row that drivers ask for
 RETURN_MPS = 5.0  # at which a lost vehicle looks for its lane

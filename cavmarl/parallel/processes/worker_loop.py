@@ -99,12 +99,12 @@ def serve(make_jobs: MakeJobs) -> NoReturn:
         images.load_kernels()
         _refuse_threads()
     except Exception as error:
-        pool.send(_failure(error))
+        _say(pool, describe(error))
         os._exit(1)
     gc.collect()
     gc.freeze()  # what is ready is not moved around by workers
     collapse_heap()
-    pool.send(json.dumps({"ready": len(jobs)}).encode())
+    _say(pool, {"ready": len(jobs)})
     _fork_on_demand(pool, parent, jobs, start)
 
 
@@ -127,8 +127,10 @@ def describe(error: BaseException) -> dict[str, str]:
     return {"kind": type(error).__name__, "text": message, "traceback": text}
 
 
-def _failure(error: BaseException) -> bytes:
-    return json.dumps(describe(error)).encode()
+def _say(pool: socket.socket, what: Mapping[str, Any]) -> None:
+    """Tell the pool; that it is gone (Ctrl-C) is seen when its socket is read."""
+    with suppress(BrokenPipeError, ConnectionResetError):
+        pool.send(json.dumps(what).encode())
 
 
 def _fork_on_demand(
@@ -149,7 +151,7 @@ def _fork_on_demand(
             pid = order["reap"]
             _, status = os.waitpid(pid, 0)
             alive.discard(pid)
-            pool.send(json.dumps({"status": os.waitstatus_to_exitcode(status)}).encode())
+            _say(pool, {"status": os.waitstatus_to_exitcode(status)})
             continue
         number, (wire,) = order["fork"], descriptors
         jobs[number].prepare()
@@ -164,7 +166,7 @@ def _fork_on_demand(
             _work(number, jobs[number], socket.socket(fileno=wire), start)
         os.close(wire)
         alive.add(pid)
-        pool.send(json.dumps({"pid": pid}).encode())
+        _say(pool, {"pid": pid})
 
 
 def _end(alive: set[int]) -> NoReturn:
@@ -218,7 +220,7 @@ def _obey(job: Job, meeting: Meeting, slots: Sequence[Image]) -> NoReturn:
             os._exit(OUT_OF_MEMORY)
         except Exception as error:
             mine[ANSWER] = FAILED
-            meeting.wire.send(MAIL + _failure(error))
+            meeting.wire.send(MAIL + json.dumps(describe(error)).encode())
         else:
             mine[ANSWER] = SILENT if answer is None else ANSWERED
             if answer is not None:
