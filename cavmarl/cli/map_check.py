@@ -32,7 +32,7 @@ def check(
         Path | None, about("OSM or SUMO polygons: those on roads are told.", exists=True)
     ] = None,
     fix: Annotated[
-        Path | None, about("Write a mended network here (.net.xml), and list what was done.")
+        Path | None, about_file("Write a mended network here (.net.xml), and list what was done.")
     ] = None,
     page: Annotated[Path | None, about_file("Write a page with a picture, places marked.")] = None,
     json_path: JsonPath = None,

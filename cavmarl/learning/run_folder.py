@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, ClassVar, Protocol, Self, TypeVar
 from cavmarl.balance.balance_plan import Plan
 from cavmarl.config.io import validate
 from cavmarl.core.errors import ConfigError, TrainingError
-from cavmarl.core.whole_file import remove_drafts
+from cavmarl.core.whole_file import remove_dead_drafts
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
 from cavmarl.evaluate.provenance.manifest import MANIFEST_FILE
@@ -119,8 +119,7 @@ class RunFolder:
             self.began = self._read() if resumes else RunState(settings.program, {}, "")
             if not resumes:
                 self._refuse_begun()
-            for name in (CHECKPOINT_FILE, WEIGHTS_FILE, CONFIG_FILE, MANIFEST_FILE):
-                remove_drafts(path / name)
+            remove_dead_drafts(path)
             with writing(path / MANIFEST_FILE):
                 if resumes:
                     cut_logs(path, self.began.logs)

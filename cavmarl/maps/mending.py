@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 from cavmarl.core.errors import MapError
+from cavmarl.core.whole_file import draft_folder
 from cavmarl.maps.defects import Defect, cut_off_edges, find_defects
 from cavmarl.maps.net_document import NetDocument
 from cavmarl.maps.netconvert_process import run_netconvert
@@ -36,8 +36,8 @@ def mend(source: Path, target: Path, before: Sequence[Defect]) -> tuple[list[str
     arguments = ["--sumo-net-file", str(source)]
     if cut:
         arguments += ["--remove-edges.explicit", ",".join(cut)]
-    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".build-") as folder:
-        draft = Path(folder) / "mended.net.xml"
+    with draft_folder(target.parent) as folder:
+        draft = folder / "mended.net.xml"
         run_netconvert([*arguments, "-o", str(draft)], source, _TIMEOUT_S)
         facts = read_provenance(source) | {"mended": f"{len(cut)} edges removed"}
         draft.write_bytes(NetDocument(draft).content(head_of(facts)))

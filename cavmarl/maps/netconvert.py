@@ -12,9 +12,6 @@ import hashlib
 import math
 import os
 import re
-import shutil
-import tempfile
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
@@ -23,6 +20,7 @@ from typing import Any
 
 from cavmarl.core.cache_folder import cache_dir
 from cavmarl.core.errors import ConfigError, MapError, require
+from cavmarl.core.whole_file import draft_folder
 from cavmarl.maps.heights.draping import HeightOptions, HeightReport, drape
 from cavmarl.maps.map_kinds import MapKind, map_kind
 from cavmarl.maps.net_document import NetDocument
@@ -68,7 +66,6 @@ _TYPE_MAP = {"osm": "osmNetconvert.typ.xml", "opendrive": "opendriveNetconvert.t
 _OPTIONS = {"sumo": (), "osm": OSM_OPTIONS, "opendrive": OPENDRIVE_OPTIONS}
 
 _COMMENT = re.compile(rb"<!-- generated on .*?-->\s*", re.DOTALL)
-_LEFT_S = 86_400.0  # a build that is older than this was killed
 _FAR_M = 100_000.0  # from the origin: the projection is no longer true to scale
 
 Origin = tuple[float, float]  # latitude and longitude, degrees
@@ -244,11 +241,9 @@ class _Build:
         if place.exists() and place.samefile(self.source):
             raise MapError(f"{place}: the target is the source: give another target")
         place.parent.mkdir(parents=True, exist_ok=True)
-        for left in place.parent.glob(".build-*"):  # by a process that was killed
-            if time.time() - left.stat().st_mtime > _LEFT_S:
-                shutil.rmtree(left, ignore_errors=True)
-        with tempfile.TemporaryDirectory(dir=place.parent, prefix=".build-") as folder:
-            draft = Path(folder) / f"{map_name(place)}.net.xml"
+        cache = cache_dir() / "maps"  # all builds there share it, so that one clears after another
+        with draft_folder(cache if place.is_relative_to(cache) else place.parent) as folder:
+            draft = folder / f"{map_name(place)}.net.xml"
             self.told(STAGES[0])
             if self.options:
                 self.log = _convert(self.kind, self.source, draft, self.options, self.timeout_s)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import os
-import tempfile
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -15,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.cache_folder import cache_dir, tell_unwritable
+from cavmarl.core.whole_file import write_whole
 from cavmarl.roads.kernels.backdrop_pieces import WALL
 from cavmarl.roads.network import (
     CONFLICT,
@@ -137,12 +136,9 @@ def _restore(entry: Path, name: str, digest: str) -> RoadNetwork | None:
 
 
 def _store(entry: Path, network: RoadNetwork) -> None:
-    """Write an entry whole or not at all: other processes may read it at any time."""
     content = pack_network(network)
     entry.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=entry.parent, suffix=".tmp", delete=False) as target:
-        target.write(content)
-    os.replace(target.name, entry)
+    write_whole(entry, content)  # other processes may read it at any time
 
 
 def _text(value: object) -> NDArray[np.uint8]:

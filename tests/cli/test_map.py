@@ -53,6 +53,13 @@ def test_build_lists_what_was_dropped(shared_maps: Path, tmp_path: Path) -> None
     assert "dropped: In laneLink-element" in tolerated.output
 
 
+def test_a_mended_network_that_cannot_be_written_is_refused_at_once(tmp_path: Path) -> None:
+    place = tmp_path / "none" / "out.net.xml"
+    refused = runner.invoke(app, ["check", "ring", "--fix", str(place)])
+    assert isinstance(refused.exception, ConfigError)
+    assert f"--fix {place}: cannot be written (there is no folder" in str(refused.exception)
+
+
 @pytest.mark.parametrize("name", ["net/mcity/mcity.net.xml", "osm/berlin_siegessaeule.osm.gz"])
 def test_check_takes_networks_and_sources(shared_maps: Path, tmp_path: Path, name: str) -> None:
     report = tmp_path / "report.json"

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import gzip
-import os
 import signal
 import subprocess
 import sys
@@ -12,6 +11,7 @@ import pytest
 
 from cavmarl.config.registry import find_entry
 from cavmarl.core.errors import ConfigError, MapError
+from cavmarl.core.whole_file import draft_folder
 from cavmarl.maps import netconvert_process
 from cavmarl.maps.netconvert import OSM_OPTIONS, build_network, map_file
 from cavmarl.roads.sumo_net.reader import read_network
@@ -281,11 +281,20 @@ def _runs(pid: int) -> bool:
         return False
 
 
-def test_what_a_killed_build_has_left_is_removed(tmp_path: Path) -> None:
-    left, fresh = tmp_path / ".build-old", tmp_path / ".build-new"
-    for folder in (left, fresh):
-        folder.mkdir()
-    os.utime(left, (0, 0))
-    build_network(find_entry("ring") / "map" / "map.net.xml", tmp_path / "copy.net.xml")
-    assert not left.exists()
-    assert fresh.exists(), "another process may be at it"
+def test_what_a_killed_build_has_left_goes_with_the_next_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CAVMARL_CACHE_DIR", str(tmp_path / "cache"))
+    place, cached = tmp_path / "place", tmp_path / "cache" / "maps"
+    left = [place / ".build-left", cached / ".build-left"]
+    for folder in left:
+        folder.mkdir(parents=True)
+        (folder / "half.net.xml").write_text("<net")
+    ring = find_entry("ring") / "map" / "map.net.xml"
+    with draft_folder(place) as living:
+        build_network(ring, place / "copy.net.xml")
+        assert living.exists(), "another process may be at it"
+    assert [folder.exists() for folder in left] == [False, True]
+    made = build_network(ring, options=["--no-turnarounds"]).path
+    assert made.is_relative_to(cached)
+    assert not list(cached.rglob(".build-*"))

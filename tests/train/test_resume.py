@@ -120,7 +120,9 @@ def test_a_run_that_is_killed_goes_on_bit_for_bit(
     assert state.updates == 4
     rows = (here / "runs" / "cut" / "progress.csv").read_text().splitlines()
     assert len(rows) == 1 + CUT_AFTER
-    (here / "runs" / "cut" / f".{CHECKPOINT_FILE}.1").touch()  # killed while it was written
+    left = here / "runs" / "cut" / ".build-left"  # killed while it was written
+    left.mkdir()
+    (left / CHECKPOINT_FILE).touch()
     # The driver is for others: a run does not go on from it.
     (here / "runs" / "cut" / "model.safetensors").write_bytes(b"of another step")
     assert ippo.main(["--resume", "runs/cut"]) == 0
@@ -216,7 +218,7 @@ def test_a_full_disk_leaves_the_last_checkpoint_whole(
         said = refusal(*words, "--name", "cut")
     assert f"runs/cut/{full}: cannot be written (No space left on device): make room" in said
     assert "go on from the last checkpoint: --resume runs/cut" in said
-    assert not list((here / "runs" / "cut").glob(".checkpoint*"))
+    assert not list((here / "runs" / "cut").glob(".build-*"))
     assert read_checkpoint(here / "runs" / "cut").updates == 0
     assert ippo.main(["--resume", "runs/cut"]) == 0
     assert learnt(here / "runs" / "cut") == whole

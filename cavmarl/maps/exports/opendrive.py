@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from xml.etree.ElementTree import Element, tostring
@@ -11,6 +10,7 @@ from xml.etree.ElementTree import Element, tostring
 import defusedxml.ElementTree
 
 from cavmarl.core.errors import MapError
+from cavmarl.core.whole_file import draft_folder
 from cavmarl.maps.exports.opendrive_curves import mend_curves
 from cavmarl.maps.exports.opendrive_trip import RoundTrip, roads_of_file, roads_of_map
 from cavmarl.maps.netconvert import OPENDRIVE_OPTIONS
@@ -41,8 +41,8 @@ def write_opendrive(
     network = read_network(source)
     types = str(sumo_home() / "data" / "typemap" / "opendriveNetconvert.typ.xml")
     try:
-        with tempfile.TemporaryDirectory(dir=target.parent, prefix=".build-") as folder:
-            draft, back = Path(folder) / "map.xodr", Path(folder) / "back.net.xml"
+        with draft_folder(target.parent) as folder:
+            draft, back = folder / "map.xodr", folder / "back.net.xml"
             words = ["--sumo-net-file", str(source), "--opendrive-output", str(draft)]
             told(STAGES[1])
             run_netconvert(words, source, timeout_s)

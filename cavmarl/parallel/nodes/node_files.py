@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import re
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +18,7 @@ from cavmarl.config.registry import (
 )
 from cavmarl.core.cache_folder import cache_dir
 from cavmarl.core.errors import MessageError, WorkerError
+from cavmarl.core.whole_file import write_whole
 
 _DIGEST = re.compile("[0-9a-f]{64}")
 
@@ -56,10 +55,8 @@ class WorldFile(NamedTuple):
         if hashlib.sha256(content).hexdigest() != self.digest:
             raise MessageError(f"what has come for {self.path} is something else")
         try:
-            self.kept.parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.NamedTemporaryFile(dir=self.kept.parent, delete=False) as target:
-                target.write(content)
-            os.replace(target.name, self.kept)
+            self.kept.parent.mkdir(mode=0o700, parents=True, exist_ok=True)  # a caller's: private
+            write_whole(self.kept, content)
         except OSError as error:
             raise WorkerError(
                 f"{self.kept}: {error}; set CAVMARL_CACHE_DIR to a folder with room"
