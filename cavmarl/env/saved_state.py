@@ -13,7 +13,7 @@ from cavmarl.core.errors import ConfigError, EpisodeError
 from cavmarl.env.actions import ActionDecoder
 from cavmarl.env.declared_events import DeclaredEvents
 from cavmarl.env.insertions import Insertions
-from cavmarl.parallel.checkpoint.world_cases import from_bytes, to_bytes
+from cavmarl.parallel.checkpoint.world_bytes import from_bytes, to_bytes
 from cavmarl.parallel.local_worlds import every_array, kept_elsewhere
 from cavmarl.parallel.step_arrays import SteppedWorlds
 
@@ -45,9 +45,9 @@ class SavedState:
             )
         if not self._ready:
             raise EpisodeError("save_state() before reset(): call vec.reset(seed=…) first")
-        cases = self.worlds.save_worlds()
-        sizes = np.array([len(case) for case in cases], dtype=np.int64)
-        joined = np.frombuffer(b"".join(cases), dtype=np.uint8)
+        saved = self.worlds.save_worlds()
+        sizes = np.array([len(one) for one in saved], dtype=np.int64)
+        joined = np.frombuffer(b"".join(saved), dtype=np.uint8)
         content = to_bytes([*self._memory(), sizes, joined])
         return hashlib.sha256(content).digest() + content
 
@@ -72,8 +72,8 @@ class SavedState:
                 "the state is one of other worlds, or of another number of them: make the "
                 "environment as it was when it was saved"
             )
-        cases = np.split(joined, np.cumsum(sizes)[:-1])
-        self.worlds.load_worlds([case.tobytes() for case in cases])
+        contents = np.split(joined, np.cumsum(sizes)[:-1])
+        self.worlds.load_worlds([one.tobytes() for one in contents])
         for array, before in zip(memory, arrays, strict=True):
             array[...] = before
         self._events.memory = arrays[1]

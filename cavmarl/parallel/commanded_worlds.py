@@ -111,7 +111,7 @@ class OrderedWorlds(ABC):
     def save_worlds(self) -> list[bytes]:
         raise unsaved()
 
-    def load_worlds(self, cases: Sequence[bytes]) -> None:
+    def load_worlds(self, saved: Sequence[bytes]) -> None:
         raise unsaved()
 
     def ticks(self) -> NDArray[np.int64]:

@@ -13,7 +13,7 @@ from cavmarl.parallel.checkpoint.action_log import ActionLog, ActionLogJob
 from cavmarl.parallel.checkpoint.checkpoint_job import CheckpointJob
 from cavmarl.parallel.checkpoint.checkpoint_log import CheckpointLog
 from cavmarl.parallel.checkpoint.moving_job import MovingJob
-from cavmarl.parallel.checkpoint.world_cases import WorldCases
+from cavmarl.parallel.checkpoint.world_bytes import SavedWorlds
 from cavmarl.parallel.journaled_worlds import runs_of, unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.processes.shared_huge_pages import huge_shared_zeros
@@ -62,18 +62,18 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
     spent_s = None
     if mover is not None:
         spent_s = arrays_in(Segment(mover["spent"], 0).map(), mover["layout"])["spent_s"]
-        cases = [Image(Segment(fd, 0)) for fd in mover["cases"]]
-        if cases:
+        outboxes = [Image(Segment(fd, 0)) for fd in mover["outboxes"]]
+        if outboxes:
             bounds = [part.first for part in parts] + [parts[-1].last]
             whole_s = spent_s[:, 0]
-            moving = [MovingJob(make, bounds, k, cases, whole_s) for k in range(len(parts))]
-            for mover_job, fd in zip(moving, recipe["cases"], strict=True):
-                mover_job.case = WorldCases(Segment(fd, 0))
+            moving = [MovingJob(make, bounds, k, outboxes, whole_s) for k in range(len(parts))]
+            for mover_job, fd in zip(moving, recipe["saved_worlds"], strict=True):
+                mover_job.saved_worlds = SavedWorlds(Segment(fd, 0))
             return list(moving)
     jobs: list[Job] = []
     job: CheckpointJob
     logs = recipe["checkpoint_logs"]
-    for part, descriptors, case in zip(parts, logs, recipe["cases"], strict=True):
+    for part, descriptors, fd in zip(parts, logs, recipe["saved_worlds"], strict=True):
         if recipe["runs"]:
             (actions,) = descriptors
             commands = commands_of(arrays.part(part.first, part.last))
@@ -93,7 +93,7 @@ def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:
             sensed = with_sensors(make(part.first, part.last), part)
             job = CheckpointJob(sensed, part.first, checkpoint_log)
             jobs.append(job)
-        job.case = WorldCases(Segment(case, 0))
+        job.saved_worlds = SavedWorlds(Segment(fd, 0))
     return jobs
 
 

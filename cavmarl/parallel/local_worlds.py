@@ -23,7 +23,7 @@ from cavmarl.engine.world_setup import World
 from cavmarl.handoff.coordinator.coordinator_setup import WorldRun
 from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.transfers import TransferLog
-from cavmarl.parallel.checkpoint.world_cases import from_bytes, to_bytes
+from cavmarl.parallel.checkpoint.world_bytes import from_bytes, to_bytes
 from cavmarl.parallel.sensor_workers.sensor_pool import SensorWorkers
 from cavmarl.parallel.step_arrays import Driven, StepArrays, layout_of
 from cavmarl.sensors.registry import frame_layout
@@ -287,19 +287,19 @@ class LocalWorlds:
         shares = (self.share_of(world) for world in range(len(self._steps)))
         return [to_bytes([*share[:-zones], np.concatenate(share[-zones:])]) for share in shares]
 
-    def load_worlds(self, cases: Sequence[bytes]) -> None:
+    def load_worlds(self, saved: Sequence[bytes]) -> None:
         """Go on from what `save_worlds` gave; `arrays` stay as they are.
 
         Raises:
             ConfigError: it is of other worlds.
         """
-        self.load(self.read_worlds(cases))
+        self.load(self.read_worlds(saved))
 
-    def read_worlds(self, cases: Sequence[bytes]) -> list[NDArray[Any]]:
+    def read_worlds(self, saved: Sequence[bytes]) -> list[NDArray[Any]]:
         """What `load` takes, of what `save_worlds` gave; errors as of `load_worlds`."""
         zones = self.world.partition.count
         like = self.share_of(0)
-        shares = [from_bytes(case, [*like[:-zones], like[-1]]) for case in cases]
+        shares = [from_bytes(one, [*like[:-zones], like[-1]]) for one in saved]
         return self.join([[*share, *[share[-1][:0]] * (zones - 1)] for share in shares])
 
     @property

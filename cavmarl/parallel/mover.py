@@ -15,7 +15,7 @@ from cavmarl.parallel.step_placement import StepPlacement
 from cavmarl.parallel.work_shares import Part, parts_of
 from cavmarl.parallel.worlds_job import Task
 
-_CASE_BYTES = 1 << 12  # of what a worker leaves for others; it grows
+_OUTBOX_BYTES = 1 << 12  # of what a worker leaves for others; it grows
 
 Run = Callable[[Task, Any, bool], None]
 
@@ -76,7 +76,7 @@ class Mover:
 
 
 class MovingMemory:
-    """What shards have cost, and a case for each worker that may give whole worlds away.
+    """What shards have cost, and an outbox for each worker that may give whole worlds away.
 
     Attributes:
         recipe: what workers are told about it.
@@ -90,16 +90,16 @@ class MovingMemory:
         self,
         num_worlds: int,  # W
         num_zones: int,  # of each world, as they are placed; whole worlds count as one
-        cases: int,
+        outboxes: int,
     ) -> None:
         layout = {"spent_s": ("<f8", (num_worlds, num_zones))}
         self.segments = [Segment.make(size_of(layout))]  # the memory
         try:
-            self.segments += [Segment.make(_CASE_BYTES) for _ in range(cases)]
+            self.segments += [Segment.make(_OUTBOX_BYTES) for _ in range(outboxes)]
             self.spent_s = arrays_in(self.segments[0].map(), layout)["spent_s"]
         except WorkerError:
             for segment in self.segments:
                 segment.close()
             raise
         spent, *others = (segment.fd for segment in self.segments)
-        self.recipe = {"spent": spent, "layout": layout, "cases": others}
+        self.recipe = {"spent": spent, "layout": layout, "outboxes": others}

@@ -13,7 +13,7 @@ from cavmarl.engine.compilation import compiled_before
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
 from cavmarl.parallel.checkpoint.checkpoint_log import make_segments
-from cavmarl.parallel.checkpoint.world_cases import WorldCases
+from cavmarl.parallel.checkpoint.world_bytes import SavedWorlds
 from cavmarl.parallel.commanded_worlds import OrderedWorlds, own_error
 from cavmarl.parallel.journaled_worlds import check_watched, is_watched, runs_as_text, unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
@@ -92,7 +92,7 @@ class PooledWorlds(OrderedWorlds):
             else make_segments(config, part.last - part.first)
             for part in parts
         ]
-        cases = [Segment.make(0) for _ in parts]
+        saved = [Segment.make(0) for _ in parts]
         recipe = recipe_of(
             world,
             base_dir,
@@ -104,7 +104,7 @@ class PooledWorlds(OrderedWorlds):
             checkpoint_logs=[
                 [one.fd for one in checkpoint_log] for checkpoint_log in checkpoint_logs
             ],
-            cases=[case.fd for case in cases],
+            saved_worlds=[one.fd for one in saved],
             runs=runs_as_text(config.zones, num_worlds),
             mover=None if memory is None else memory.recipe,
         )
@@ -115,7 +115,7 @@ class PooledWorlds(OrderedWorlds):
             segment,
             *(one for checkpoint_log in checkpoint_logs for one in checkpoint_log),
             *moving,
-            *cases,
+            *saved,
         )
         pins = config.workers.pin
         what = Program(program or PROGRAM, recipe, _names(parts), segments, TASK_NAMES, pins, teams)
@@ -123,7 +123,7 @@ class PooledWorlds(OrderedWorlds):
             self.pool = Pool(what, config.workers.timeout_s, config.workers.max_retries)
         except WorkerFailureError as failure:
             raise own_error(failure) from failure
-        self._cases = [WorldCases(case) for case in cases]
+        self._saved = [SavedWorlds(one) for one in saved]
         self._parts = parts
         self._asked = _leaders(parts)
         self.placement.watch(self._pids())
@@ -145,11 +145,11 @@ class PooledWorlds(OrderedWorlds):
 
     def save_worlds(self) -> list[bytes]:
         self._order(Task.SAVE, commits=False)
-        return [world for case in self._cases for world in case.take()]
+        return [world for part in self._saved for world in part.take()]
 
-    def load_worlds(self, cases: Sequence[bytes]) -> None:
-        for case, part in zip(self._cases, self._parts, strict=True):
-            case.put(cases[part.first : part.last])
+    def load_worlds(self, saved: Sequence[bytes]) -> None:
+        for memory, part in zip(self._saved, self._parts, strict=True):
+            memory.put(saved[part.first : part.last])
         self._order(Task.LOAD)
 
     def _settle(self, parts: list[Part]) -> None:

@@ -162,7 +162,7 @@ class SteppedWorlds(Protocol):
         """The state of each world, for `load_worlds` of any number of zones and workers."""
         ...
 
-    def load_worlds(self, cases: Sequence[bytes]) -> None:
+    def load_worlds(self, saved: Sequence[bytes]) -> None:
         """Go on from what `save_worlds` gave; `arrays` stay as they are."""
         ...
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.parallel.checkpoint.world_cases import WorldCases
+from cavmarl.parallel.checkpoint.world_bytes import SavedWorlds
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.processes.worker_loop import Job
 from cavmarl.parallel.step_arrays import StepArrays
@@ -42,7 +42,7 @@ TASK_NAMES = tuple(task.name.lower().replace("_", " ") for task in Task)
 class WorldsJob(Job):
     """Some of the worlds, next to each other."""
 
-    case: WorldCases  # where they are left, and found, as bytes
+    saved_worlds: SavedWorlds  # where they are left, and found, as bytes
 
     def __init__(self, worlds: LocalWorlds, first: int) -> None:
         self._take(worlds, first)
@@ -71,9 +71,9 @@ class WorldsJob(Job):
         elif task == Task.SIGNAL_PHASES:
             return worlds.signal_phases(payload - self._first).tolist()
         elif task == Task.SAVE:
-            self.case.put(worlds.save_worlds())
+            self.saved_worlds.put(worlds.save_worlds())
         elif task == Task.LOAD:
-            worlds.load_worlds(self.case.take())
+            worlds.load_worlds(self.saved_worlds.take())
         return None
 
     def timed_step(self) -> NDArray[np.float64]:

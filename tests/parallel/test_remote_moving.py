@@ -183,8 +183,8 @@ def test_a_case_that_is_not_what_was_packed(
     unpack = RemoteWorlds._unpack
 
     def spoil(self: RemoteWorlds, bounds: Any) -> None:
-        for case in self._cases.values():
-            case[case.size // 2] ^= 1
+        for one in self._leaving.values():
+            one[one.size // 2] ^= 1
         unpack(self, bounds)
 
     monkeypatch.setattr(RemoteWorlds, "_unpack", spoil)

@@ -1,9 +1,10 @@
 """`MovingJob`: the job of a worker whose worlds may move to other workers.
 
 Worlds go from worker to worker between two commands. A worker that gives some away puts them into
-its case, which all workers can read (PACK); then each begins anew with what it has kept and what it
-finds in the others' cases (UNPACK). Both say the same as often as they are asked, so a worker that
-dies on the way is replaced as ever; where the worlds are is part of the state that is committed.
+its outbox, which all workers can read (PACK); then each begins anew with what it has kept and what
+it finds in the others' outboxes (UNPACK). Both say the same as often as they are asked, so a worker
+that dies on the way is replaced as ever; where the worlds are is part of the state that is
+committed.
 """
 
 from __future__ import annotations
@@ -32,12 +33,12 @@ class MovingJob(WorldsJob):
         make: MakeWorlds,  # worlds from a number to before another one
         bounds: Sequence[int],  # the first world of each worker, and the end of the last one's
         number: int,  # of this worker
-        cases: Sequence[Image],  # of all workers, in which they leave worlds for others
+        outboxes: Sequence[Image],  # of all workers, in which they leave worlds for others
         spent_s: NDArray[np.float64],  # (W,) where the processor time of each world is added up
     ) -> None:
         self._make = make
         self._number = number
-        self._cases = cases
+        self._outboxes = outboxes
         self._spent_s = spent_s
         self._bounds = np.array(bounds, dtype=np.int64)
         super().__init__(make(*self._range), self._range[0])
@@ -59,12 +60,12 @@ class MovingJob(WorldsJob):
         return None
 
     def _pack(self, bounds: Sequence[int]) -> None:
-        """Leave the worlds that are to be another's in the case."""
+        """Leave the worlds that are to be another's in its outbox."""
         first = self._range[0]
         leaving = _leaving(self._bounds, bounds, self._number)
         if leaving:
             shares = (self._worlds.share_of(world - first) for world in leaving)
-            self._cases[self._number].write([array for share in shares for array in share])
+            self._outboxes[self._number].write([array for share in shares for array in share])
 
     def _unpack(self, bounds: Sequence[int]) -> None:
         first, last = bounds[self._number : self._number + 2]
@@ -73,20 +74,20 @@ class MovingJob(WorldsJob):
             return
         own = self._range[0]
         found = {world: self._worlds.share_of(world - own) for world in range(*self._range)}
-        found |= self._found_in_cases(bounds, range(first, last))
+        found |= self._found_in_outboxes(bounds, range(first, last))
         worlds = self._make(first, last)
         worlds.load(worlds.join([found[world] for world in range(first, last)]))
         self._bounds[:] = bounds
         self._take(worlds, first)
 
-    def _found_in_cases(self, bounds: Sequence[int], wanted: range) -> dict[int, Share]:
+    def _found_in_outboxes(self, bounds: Sequence[int], wanted: range) -> dict[int, Share]:
         dtypes = [array.dtype for array in self._worlds.share_of(0)]
         found = {}
-        for number, case in enumerate(self._cases):
+        for number, outbox in enumerate(self._outboxes):
             leaving = _leaving(self._bounds, bounds, number)
             if number == self._number or not set(leaving) & set(wanted):
                 continue
-            arrays = iter(case.read(dtypes * len(leaving)))
+            arrays = iter(outbox.read(dtypes * len(leaving)))
             for world in leaving:
                 found[world] = [next(arrays) for _ in dtypes]
         return found

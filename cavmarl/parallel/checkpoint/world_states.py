@@ -1,4 +1,4 @@
-"""Cases: worlds that one host leaves for another, as bytes, and what the caller says of them."""
+"""Worlds that one host leaves for another, as bytes, and what the caller says of them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class WorldMove(NamedTuple):
     last: int  # the one after the last that it keeps
     before: int = 0  # how many come that stand before those
     coming: int = 0  # how many come
-    bytes: int = 0  # of their cases
+    bytes: int = 0  # of those that come
 
 
 def moves_of(
@@ -44,18 +44,18 @@ def moves_of(
 
 
 def buffers(count: int, size: int) -> tuple[NDArray[np.int64], Bytes]:
-    """Room for some cases: the bytes of each, and all of them one behind the other."""
+    """Room for some packed worlds: the bytes of each, and all of them one behind the other."""
     return np.empty(count, dtype=np.int64), np.empty(size, dtype=np.uint8)
 
 
 def pack(image: Image, worlds: Sequence[Sequence[Array]]) -> tuple[NDArray[np.int64], Bytes]:
-    """Cases of some worlds, as `buffers` has room for."""
-    cases = []
+    """Some worlds as bytes, as `buffers` has room for."""
+    packed = []
     for arrays in worlds:
         image.write(arrays)
-        cases.append(image.content().copy())
-    sizes = np.array([case.size for case in cases], dtype=np.int64)
-    return sizes, np.concatenate([np.empty(0, dtype=np.uint8), *cases])
+        packed.append(image.content().copy())
+    sizes = np.array([one.size for one in packed], dtype=np.int64)
+    return sizes, np.concatenate([np.empty(0, dtype=np.uint8), *packed])
 
 
 def unpack(
@@ -63,7 +63,7 @@ def unpack(
 ) -> list[list[Array]]:
     """The arrays of each of some worlds. Raises WorkerError: they are not what was packed."""
     worlds = []
-    for case in np.split(content, np.cumsum(sizes)[:-1]) if sizes.size else []:
-        image.put(case)
+    for one in np.split(content, np.cumsum(sizes)[:-1]) if sizes.size else []:
+        image.put(one)
         worlds.append([array.copy() for array in image.read(dtypes)])
     return worlds

@@ -23,7 +23,7 @@ from cavmarl.sensors.mounted.frames import Frames
 
 Array = NDArray[Any]
 
-_CASE_BYTES = 1 << 12
+_IMAGE_BYTES = 1 << 12
 
 # Fields of `StepArrays` that every step writes.
 _STEPPED = ("observations", "ticks", *Results._fields)
@@ -81,7 +81,7 @@ class HostedWorlds(RemoteJob):
         self._in_next_step: bool = recipe["in_next_step"]
         self._measures: bool = recipe["measures"]
         self._one = LocalWorlds(self._world, 1, warm=True)
-        self._case = Image(Segment.make(_CASE_BYTES))
+        self._image = Image(Segment.make(_IMAGE_BYTES))
         self._make(recipe["size"])
 
     def fit(self, size: int) -> None:
@@ -99,7 +99,7 @@ class HostedWorlds(RemoteJob):
         """Do a task.
 
         The answer to a step is in which worlds something ended; to PACK, how many worlds leave, and
-        the bytes of their cases.
+        their bytes.
         """
         if task == Task.PACK:
             return self._pack(WorldMove(*payload))
@@ -122,10 +122,10 @@ class HostedWorlds(RemoteJob):
         return TaskOutcome(answer, [*results_of(Task.STEP, arrays, answer), *spent_s])
 
     def _pack(self, move: WorldMove) -> TaskOutcome:
-        """The cases of all worlds that it does not keep."""
+        """The bytes of all worlds that it does not keep."""
         kept = range(move.first, move.last)
         leaving = [w for w in range(len(self._worlds.arrays.mask)) if w not in kept]
-        sizes, content = pack(self._case, [self._share_of(w) for w in leaving])
+        sizes, content = pack(self._image, [self._share_of(w) for w in leaving])
         return TaskOutcome([len(sizes), content.size], [sizes, content])
 
     def _unpack(self, move: WorldMove) -> None:
@@ -134,7 +134,7 @@ class HostedWorlds(RemoteJob):
         if not move.coming and len(kept) == len(self._worlds.arrays.mask):
             return
         dtypes = [array.dtype for array in self._share_of(0)]
-        coming = unpack(self._case, *self._coming, dtypes)
+        coming = unpack(self._image, *self._coming, dtypes)
         mine = map(self._share_of, kept)
         shares = [*coming[: move.before], *mine, *coming[move.before :]]
         worlds = self._new(len(shares))

@@ -93,7 +93,7 @@ class RemoteWorlds(OrderedWorlds):
             )
         except WorkerFailureError as failure:
             raise own_error(failure) from failure
-        self._cases: dict[int, Array] = {}  # worlds that are on their way
+        self._leaving: dict[int, Array] = {}  # worlds that are on their way
         self._look()
 
     @property
@@ -149,14 +149,14 @@ class RemoteWorlds(OrderedWorlds):
 
         nothing: list[Arrays] = [()] * len(moves)
         self.pool.run(Task.PACK, moves, nothing, outputs, commits=False)
-        self._cases = {}
+        self._leaving = {}
         for move, (first, last), (sizes, content) in zip(
             moves, pairwise(self._bounds), found, strict=True
         ):
             kept = range(first + move.first, first + move.last)
             leaving = [world for world in range(first, last) if world not in kept]
-            cases = np.split(content, np.cumsum(sizes)[:-1]) if leaving else []
-            self._cases.update(zip(leaving, cases, strict=True))
+            contents = np.split(content, np.cumsum(sizes)[:-1]) if leaving else []
+            self._leaving.update(zip(leaving, contents, strict=True))
 
     def _unpack(self, bounds: Sequence[int]) -> None:
         """Let hosts go on with the worlds that are theirs from now on."""
@@ -166,13 +166,13 @@ class RemoteWorlds(OrderedWorlds):
             own = range(*self._bounds[k : k + 2])
             kept = own[move.first : move.last]
             wanted = range(*bounds[k : k + 2])
-            cases = [self._cases[world] for world in wanted if world not in kept]
-            sizes = np.array([case.size for case in cases], dtype=np.int64)
+            contents = [self._leaving[world] for world in wanted if world not in kept]
+            sizes = np.array([one.size for one in contents], dtype=np.int64)
             moves.append(move._replace(bytes=int(sizes.sum())))
-            inputs.append([sizes, *cases])
+            inputs.append([sizes, *contents])
         after = [last - first for first, last in pairwise(bounds)]
         self.pool.run(Task.UNPACK, moves, inputs, lambda k, answer: (), sizes=after)
-        self._cases = {}
+        self._leaving = {}
         self._look()
 
     def _ask(self, task: Task, world: int, more: Any = None) -> Any:

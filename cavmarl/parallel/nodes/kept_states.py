@@ -14,7 +14,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import WorkerError
-from cavmarl.parallel.checkpoint.world_cases import from_bytes, to_bytes
+from cavmarl.parallel.checkpoint.world_bytes import from_bytes, to_bytes
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.nodes.links import FrameKind, Links, NodeFrame
 

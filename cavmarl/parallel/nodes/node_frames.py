@@ -112,13 +112,13 @@ def take_results(
     return own
 
 
-def told_cases(cases: Sequence[bytes], only_reads: bool = False) -> dict[str, Any]:
+def worlds_payload(saved: Sequence[bytes], only_reads: bool = False) -> dict[str, Any]:
     """Worlds as bytes, as a payload; see `LocalWorlds.save_worlds`."""
-    return {"cases": [b64encode(case).decode() for case in cases], "only_reads": only_reads}
+    return {"saved_worlds": [b64encode(one).decode() for one in saved], "only_reads": only_reads}
 
 
-def cases_of(payload: Mapping[str, Any]) -> list[bytes]:
-    return [b64decode(case) for case in payload["cases"]]
+def saved_of(payload: Mapping[str, Any]) -> list[bytes]:
+    return [b64decode(one) for one in payload["saved_worlds"]]
 
 
 def _flat(array: NDArray[Any]) -> NDArray[np.uint8]:

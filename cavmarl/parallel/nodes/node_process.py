@@ -32,7 +32,7 @@ from cavmarl.parallel.nodes.links import (
 from cavmarl.parallel.nodes.meeting import call_node, calls_of
 from cavmarl.parallel.nodes.node_actions import refusal, take_actions
 from cavmarl.parallel.nodes.node_files import WorldFile, recipe_with
-from cavmarl.parallel.nodes.node_frames import cases_of, command_of, results_of, told_cases
+from cavmarl.parallel.nodes.node_frames import command_of, results_of, saved_of, worlds_payload
 from cavmarl.parallel.nodes.node_loads import told_of
 from cavmarl.parallel.nodes.node_peers import NodePeers
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
@@ -284,7 +284,7 @@ class NodeProgram:
                 worlds.reset(payload["seed"], payload["first_world"])
                 self._hosts.report(self._results(chosen, stepped=False))
             case Task.LOAD if not payload["only_reads"]:
-                worlds.load_worlds(cases_of(payload))
+                worlds.load_worlds(saved_of(payload))
                 self._hosts.report()
             case Task.HOST:
                 spent_s = [] if self._clock is None else self._clock.take_s().tolist()
@@ -349,9 +349,9 @@ class NodeProgram:
         if task == Task.STATE_HASH:
             found = worlds.state_hash(payload)
         elif task == Task.SAVE:
-            found = told_cases(worlds.save_worlds())
+            found = worlds_payload(worlds.save_worlds())
         elif task == Task.LOAD:
-            found = _refusal(worlds, cases_of(payload))
+            found = _refusal(worlds, saved_of(payload))
         elif task == Task.TRAFFIC_STATS:
             found = worlds.traffic_stats(payload)
         elif task == Task.DRIVEN:
@@ -434,10 +434,10 @@ def run_on_ray(recipe: str, place: tuple[str, int], secret: bytes, number: int) 
         os._exit(1)
 
 
-def _refusal(worlds: LocalWorlds, cases: Sequence[bytes]) -> str:
+def _refusal(worlds: LocalWorlds, saved: Sequence[bytes]) -> str:
     """Why worlds cannot go on from these; empty: they can."""
     try:
-        worlds.read_worlds(cases)
+        worlds.read_worlds(saved)
     except ConfigError as error:
         return str(error)
     return ""

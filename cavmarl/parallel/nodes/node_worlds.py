@@ -23,11 +23,11 @@ from cavmarl.parallel.commanded_worlds import uncopied
 from cavmarl.parallel.mover import Mover
 from cavmarl.parallel.nodes.node_actions import UNOWNED, Actions, NodeCommand
 from cavmarl.parallel.nodes.node_frames import (
-    cases_of,
     clear_sensed,
     pieces_of,
+    saved_of,
     take_results,
-    told_cases,
+    worlds_payload,
 )
 from cavmarl.parallel.nodes.node_loads import OF_MACHINE, NodeLoad, since
 from cavmarl.parallel.nodes.node_pool import NodePool
@@ -196,17 +196,17 @@ class NodeWorlds(NodePool):
         return range(len(self.arrays.mask))[world]
 
     def save_worlds(self) -> list[bytes]:
-        return cases_of(self._asked(Task.SAVE, None))
+        return saved_of(self._asked(Task.SAVE, None))
 
-    def load_worlds(self, cases: Sequence[bytes]) -> None:
+    def load_worlds(self, saved: Sequence[bytes]) -> None:
         """Go on from what `save_worlds` gave; `arrays` stay as they are.
 
         Raises:
             ConfigError: it is of other worlds.
         """
-        if refusal := self._asked(Task.LOAD, told_cases(cases, only_reads=True)):
+        if refusal := self._asked(Task.LOAD, worlds_payload(saved, only_reads=True)):
             raise ConfigError(refusal)
-        self.run(self._command(Task.LOAD, told_cases(cases)))
+        self.run(self._command(Task.LOAD, worlds_payload(saved)))
 
     @property
     def simulation(self) -> Simulation:

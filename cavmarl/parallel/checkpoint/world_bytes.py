@@ -47,18 +47,18 @@ def from_bytes(content: bytes, like: Sequence[Array]) -> list[Array]:
     return found
 
 
-class WorldCases:
+class SavedWorlds:
     """Some worlds as bytes, in memory that processes share."""
 
     def __init__(self, segment: Segment) -> None:
         self._image = Image(segment)
 
-    def put(self, cases: Sequence[bytes]) -> None:
-        sizes = np.array([len(case) for case in cases], dtype=np.int64)
-        self._image.write([sizes, np.frombuffer(b"".join(cases), dtype=np.uint8)])
+    def put(self, saved: Sequence[bytes]) -> None:
+        sizes = np.array([len(one) for one in saved], dtype=np.int64)
+        self._image.write([sizes, np.frombuffer(b"".join(saved), dtype=np.uint8)])
 
     def take(self) -> list[bytes]:
         """Raises WorkerError: it is not what was put there."""
         dtypes: list[np.dtype[Any]] = [np.dtype(np.int64), np.dtype(np.uint8)]
         sizes, content = self._image.read(dtypes)
-        return [case.tobytes() for case in np.split(content, np.cumsum(sizes)[:-1])]
+        return [one.tobytes() for one in np.split(content, np.cumsum(sizes)[:-1])]
