@@ -17,7 +17,7 @@ from benchmarks.harness import Report, Say, about, check_range, run, silent
 from benchmarks.load_traces import LoadTrace, generated_trace, recorded_trace
 from cavmarl.balance.problem import BalanceRule
 from cavmarl.cli.output import Seed, Settings, parse_settings
-from cavmarl.config.env import ZONE_LAYOUTS
+from cavmarl.config.zones import ZONE_LAYOUTS
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import find_map
 from cavmarl.evaluate.driven_worlds import world_maker

@@ -21,7 +21,7 @@ import typer
 from benchmarks.harness import Report, Say, about, check_range, numbers_of, one_core, run, silent
 from benchmarks.sharding_turns import Pair, Turn, TwinWorlds
 from cavmarl.cli.output import Agents, Background, Seed, Settings, parse_settings
-from cavmarl.config.env import MAX_ZONES, ZONE_LAYOUTS
+from cavmarl.config.zones import MAX_ZONES, ZONE_LAYOUTS
 from cavmarl.core.errors import ConfigError, EvaluationError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.evaluate.driven_worlds import world_maker

@@ -15,9 +15,10 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from cavmarl.config.env import TERMS, EnvConfig
+from cavmarl.config.env import EnvConfig
 from cavmarl.config.library_names import register_all
 from cavmarl.config.registry import entries
+from cavmarl.config.terms import TERMS
 from cavmarl.core.errors import (
     ActionError,
     CapacityError,

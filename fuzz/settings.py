@@ -16,9 +16,11 @@ from cavmarl.balance.plan_file import read_plan
 from cavmarl.balance.plan_text import describe_plan
 from cavmarl.balance.problem import Problem, equal_costs
 from cavmarl.cli.output import parse_settings
-from cavmarl.config.env import ActionConfig, EnvConfig, SensorsConfig
+from cavmarl.config.action import ActionConfig
+from cavmarl.config.env import EnvConfig
 from cavmarl.config.io import read_yaml, validate
 from cavmarl.config.registry import load_config
+from cavmarl.config.sensors import SensorsConfig
 from cavmarl.evaluate.provenance.manifest import (
     MANIFEST_FILE,
     close_manifest,

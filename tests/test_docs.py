@@ -16,9 +16,10 @@ import pytest
 import typer
 
 from cavmarl.cli import app
-from cavmarl.config.env import TERMS, EnvConfig
+from cavmarl.config.env import EnvConfig
 from cavmarl.config.io import dotted_keys
 from cavmarl.config.rig import CollisionConfig, SampledConfig
+from cavmarl.config.terms import TERMS
 from cavmarl.core.errors import missing
 from cavmarl.sensors.registry import TYPES
 from tests.support.generated import check_block, table

@@ -27,7 +27,7 @@ from rich.console import Console
 from torch import Tensor, nn
 
 from cavmarl.cli.output import parse_settings
-from cavmarl.config.env import TERMS
+from cavmarl.config.terms import TERMS
 from cavmarl.core.errors import ConfigError
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.learning import options

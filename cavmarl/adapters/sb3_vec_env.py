@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.adapters.observations import ObservationForm, Observations, WithSpec, refuse_decided
-from cavmarl.config.env import TERMS
+from cavmarl.config.terms import TERMS
 from cavmarl.core.errors import missing
 from cavmarl.env.vector import make_vec
 from cavmarl.env.world_copies import OwnWorlds

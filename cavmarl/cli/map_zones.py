@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from cavmarl.cli.output import Environment, JsonPath, about, about_file, write_json
-from cavmarl.config.env import ZONE_LAYOUTS
+from cavmarl.config.zones import ZONE_LAYOUTS
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import find_map
 from cavmarl.roads.cache import load_network

@@ -9,8 +9,8 @@ import typer
 from rich.console import Console
 
 from cavmarl.cli.output import JsonPath, about, print_error, with_world, write_json
-from cavmarl.config.env import ZONE_LAYOUTS
 from cavmarl.config.world_spec import WorldSpec
+from cavmarl.config.zones import ZONE_LAYOUTS
 from cavmarl.core.errors import ConfigError, NoAdmissibleWorkerError
 from cavmarl.core.progress import counting
 

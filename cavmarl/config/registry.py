@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from cavmarl.config.env import BY_MAP, ZONE_LAYOUTS, EnvConfig, MapConfig
+from cavmarl.config.env import BY_MAP, EnvConfig, MapConfig
 from cavmarl.config.scenario import path_of_code
+from cavmarl.config.zones import ZONE_LAYOUTS
 from cavmarl.core.errors import (
     CavmarlError,
     ConfigError,

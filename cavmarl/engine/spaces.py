@@ -11,8 +11,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import DTypeLike, NDArray
 
-from cavmarl.config.env import ActionConfig, EnvConfig, SensorsConfig
+from cavmarl.config.action import ActionConfig
+from cavmarl.config.env import EnvConfig
 from cavmarl.config.rig import samples_per_step
+from cavmarl.config.sensors import SensorsConfig
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.mounted.frames import Frames
 from cavmarl.sensors.observed import layout, sensors_of

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cavmarl.config.env import BY_MAP, ZONE_LAYOUTS, EnvConfig
+from cavmarl.config.env import BY_MAP, EnvConfig
 from cavmarl.config.registry import (
     entries,
     load_config,
@@ -20,6 +20,7 @@ from cavmarl.config.registry import (
     resolve_programs,
     resolve_zones,
 )
+from cavmarl.config.zones import ZONE_LAYOUTS
 from cavmarl.core.errors import ConfigError, MapError
 from cavmarl.maps.buildings import with_buildings
 from cavmarl.maps.netconvert import map_file

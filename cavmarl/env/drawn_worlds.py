@@ -9,7 +9,8 @@ import numpy as np
 from gymnasium import logger
 from numpy.typing import NDArray
 
-from cavmarl.config.env import TERMS, EnvConfig
+from cavmarl.config.env import EnvConfig
+from cavmarl.config.terms import TERMS
 from cavmarl.core.errors import ConfigError, EpisodeError
 from cavmarl.core.records.codes import (
     EVENT_ARRIVED,

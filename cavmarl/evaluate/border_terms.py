@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config.env import TERMS
+from cavmarl.config.terms import TERMS
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
 NEAR_M = 25.0  # of another zone: a vehicle is near its border

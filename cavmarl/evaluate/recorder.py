@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config.env import TERMS
+from cavmarl.config.terms import TERMS
 from cavmarl.evaluate.statistics import gini_coefficient, jain_index
 from cavmarl.evaluate.tables import EPISODE, TRIP, reward_column
 from cavmarl.rewards.kernels.terms import TTC_HORIZON_S

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config.env import TERMS
+from cavmarl.config.terms import TERMS
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 
 Rows = NDArray[np.void]

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from cavmarl.config.env import EnvConfig, ZonesConfig
+from cavmarl.config.env import EnvConfig
+from cavmarl.config.zones import ZonesConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.memory import Zeros

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from cavmarl.config.env import TERMS
+from cavmarl.config.terms import TERMS
 from cavmarl.core.errors import TrainingError, require
 from cavmarl.learning.checkpoint import Parts, writing
 

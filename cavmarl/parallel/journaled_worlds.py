@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from cavmarl.config.env import ZonesConfig
+from cavmarl.config.zones import ZonesConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import World
 from cavmarl.handoff.coordinator.coordinator_setup import WorldRun, check_faults, prepare_runs

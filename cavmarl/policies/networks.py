@@ -20,8 +20,9 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
-from cavmarl.config.env import ActionConfig, SensorsConfig
+from cavmarl.config.action import ActionConfig
 from cavmarl.config.io import validate
+from cavmarl.config.sensors import SensorsConfig
 from cavmarl.core.errors import ConfigError, PolicyError
 from cavmarl.core.whole_file import write_whole
 

@@ -20,8 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
-from cavmarl.config.env import EnvConfig, SensorsConfig
+from cavmarl.config.env import EnvConfig
 from cavmarl.config.registry import agent_entries, agent_here
+from cavmarl.config.sensors import SensorsConfig
 from cavmarl.core.errors import PolicyError, require
 from cavmarl.engine.spaces import flat_observation, flat_observation_space, observation_parts
 from cavmarl.env.parallel import CavEnv

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 from numpy.typing import ArrayLike
 
-from cavmarl.config.env import TERMS, TermsConfig
 from cavmarl.config.renamed import OLD_TERMS
+from cavmarl.config.terms import TERMS, TermsConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.extensions import REGISTERED_TERMS
 from cavmarl.driving.agent_view import AgentView, BatchView

@@ -13,8 +13,9 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cavmarl.config.env import EnvConfig, SensorsConfig
+from cavmarl.config.env import EnvConfig
 from cavmarl.config.rig import MountedConfig, samples_per_step
+from cavmarl.config.sensors import SensorsConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.extensions import REGISTERED_SENSORS
 from cavmarl.driving.agent_view import AgentView, BatchView

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config.env import TERMS, EnvConfig
+from cavmarl.config.env import EnvConfig
+from cavmarl.config.terms import TERMS
 from cavmarl.core.extensions import REGISTERED_SENSORS, REGISTERED_TERMS
 from cavmarl.core.records.arrays import Outputs, Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT

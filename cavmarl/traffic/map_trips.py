@@ -10,7 +10,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config.env import TrafficConfig
+from cavmarl.config.traffic import TrafficConfig
 from cavmarl.core.errors import CavmarlError, ConfigError, RouteError
 from cavmarl.core.records.arrays import TripTable
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork

@@ -11,7 +11,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config.env import ActionConfig, PopulationConfig, TrafficConfig
+from cavmarl.config.action import ActionConfig
+from cavmarl.config.population import PopulationConfig
+from cavmarl.config.traffic import TrafficConfig
 from cavmarl.core.errors import CapacityError
 from cavmarl.core.memory import Zeros
 from cavmarl.core.numba.specialized import specialized

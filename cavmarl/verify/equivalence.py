@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.checks import check_count
-from cavmarl.config.env import MAX_ZONES, ZONE_FILE_SUFFIXES
 from cavmarl.config.registry import load_config
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
+from cavmarl.config.zones import MAX_ZONES, ZONE_FILE_SUFFIXES
 from cavmarl.core.errors import ConfigError, ProtocolError
 from cavmarl.env.vector import make_vec
 from cavmarl.handoff.fault_injection.fault_plan import read_faults

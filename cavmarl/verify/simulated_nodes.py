@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any, Unpack
 
 from cavmarl.config.checks import check_count
-from cavmarl.config.env import WorkersConfig
 from cavmarl.config.registry import load_config
+from cavmarl.config.workers import WorkersConfig
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError, NodeRefusedError, WorkerDeathError
 from cavmarl.engine.world_setup import World, make_world

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cavmarl.config.env import ActionConfig
+from cavmarl.config.action import ActionConfig
 from cavmarl.core.records.codes import (
     ACTION_FASTER,
     ACTION_IDLE,

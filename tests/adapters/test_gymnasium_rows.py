@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import vector as wrappers
 from numpy.typing import NDArray
 
-from cavmarl.config.env import TERMS
+from cavmarl.config.terms import TERMS
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.spaces import flat_observation
 from cavmarl.env.vector import make_vec

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cavmarl.config.env import TERMS
+from cavmarl.config.terms import TERMS
 from cavmarl.core.errors import ActionError, ConfigError
 from cavmarl.engine.spaces import flat_observation, observation_parts
 from cavmarl.env.vector import make_vec

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import cavmarl
-from cavmarl.config.env import TERMS
+from cavmarl.config.terms import TERMS
 from cavmarl.core.records.codes import DRIVER_AGENT
 from tests.support.netgenerate import netgenerate
 

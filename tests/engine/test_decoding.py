@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cavmarl.config.env import ActionConfig
+from cavmarl.config.action import ActionConfig
 from cavmarl.core.errors import ActionError
 from cavmarl.env.actions import ActionDecoder
 

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cavmarl.config.env import EnvConfig, ZonesConfig
+from cavmarl.config.env import EnvConfig
 from cavmarl.config.registry import load_config
+from cavmarl.config.zones import ZonesConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import load_roads, load_world, load_zones
 from cavmarl.env.vector import make_vec

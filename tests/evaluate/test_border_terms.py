@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cavmarl.config.env import TERMS
+from cavmarl.config.terms import TERMS
 from cavmarl.evaluate import evaluate
 from cavmarl.evaluate.border_terms import NEAR_M, BorderTerms, place_rows
 from cavmarl.evaluate.evaluation import load_places, load_tables

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cavmarl.config.env import TERMS
 from cavmarl.config.registry import agent_entries
+from cavmarl.config.terms import TERMS
 from cavmarl.core.errors import MissingExtraError, PolicyError
 from cavmarl.cosim.stack.stack import REFERENCE_RIG
 from cavmarl.env.parallel import CavEnv, parallel_env

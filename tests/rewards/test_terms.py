@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from cavmarl.config.env import TERMS
+from cavmarl.config.terms import TERMS
 from cavmarl.core.math.neighbors import fill_grid, make_grid
 from cavmarl.core.records.codes import (
     EVENT_ARRIVED,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import cavmarl
-from cavmarl.config.env import TERMS
+from cavmarl.config.terms import TERMS
 
 PROGRESS = TERMS.index("progress")
 

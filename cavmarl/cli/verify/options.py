@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from cavmarl.cli.output import about
-from cavmarl.config.env import ZONE_LAYOUTS
+from cavmarl.config.zones import ZONE_LAYOUTS
 
 Env = Annotated[
     str | None,

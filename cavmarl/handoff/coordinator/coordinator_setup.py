@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
-from cavmarl.config.env import ZonesConfig
+from cavmarl.config.zones import ZonesConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.handoff.border_holds import BorderHolds
 from cavmarl.handoff.coordinator.coordinator import Coordinator

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config.env import WorkersConfig
+from cavmarl.config.workers import WorkersConfig
 from cavmarl.core.errors import ConfigError, WorkerFailureError
 from cavmarl.engine.compilation import compiled_before
 from cavmarl.engine.simulation import Simulation

@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
-from cavmarl.config.env import WorkersConfig
+from cavmarl.config.workers import WorkersConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.processes import start_python
 from cavmarl.parallel.hosts.host_registry import Launcher

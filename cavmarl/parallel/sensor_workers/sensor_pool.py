@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config.env import WorkersConfig
+from cavmarl.config.workers import WorkersConfig
 from cavmarl.core.errors import WorkerError
 from cavmarl.core.numba.specialized import specialized
 from cavmarl.parallel.processes.shared_memory import Segment, size_of

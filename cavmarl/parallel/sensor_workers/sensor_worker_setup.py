@@ -8,7 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from cavmarl.config.env import WorkersConfig, ZonesConfig
+from cavmarl.config.workers import WorkersConfig
+from cavmarl.config.zones import ZonesConfig
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
 from cavmarl.parallel.local_worlds import LocalWorlds

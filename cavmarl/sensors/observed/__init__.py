@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config.env import SensorsConfig
+from cavmarl.config.sensors import SensorsConfig
 from cavmarl.core.extensions import REGISTERED_SENSORS
 from cavmarl.core.math.walls import make_walls
 from cavmarl.core.records.arrays import Sensors

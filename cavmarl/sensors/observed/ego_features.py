@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from cavmarl.config.env import SensorsConfig
+from cavmarl.config.sensors import SensorsConfig
 from cavmarl.sensors.kernels.observing_lanes import HALF_M
 from cavmarl.sensors.observed.feature import Feature
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
-from cavmarl.config.env import SensorsConfig
+from cavmarl.config.sensors import SensorsConfig
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config.env import SensorsConfig
+from cavmarl.config.sensors import SensorsConfig
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.kernels.kinematics_observation import PERCEPTION_M
 from cavmarl.sensors.kernels.sensor_arrays import KinematicsSensor

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cavmarl.config.env import SensorsConfig
+from cavmarl.config.sensors import SensorsConfig
 from cavmarl.sensors.kernels.lidar_cells import cell_directions
 from cavmarl.sensors.kernels.lidar_fan import ECHO
 from cavmarl.sensors.kernels.sensor_arrays import LidarCells

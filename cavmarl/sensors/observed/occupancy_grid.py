@@ -7,8 +7,7 @@ import math
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from cavmarl.config.env import SensorsConfig
-from cavmarl.config.sensors import OccupancyGridConfig
+from cavmarl.config.sensors import OccupancyGridConfig, SensorsConfig
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.kernels.sensor_arrays import OccupancyGrid
 from cavmarl.sensors.observed.feature import Feature

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config.env import SensorsConfig
+from cavmarl.config.sensors import SensorsConfig
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.kernels.nearest_road_points import (
     NUM_RINGS,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cavmarl.config.env import SensorsConfig
+from cavmarl.config.sensors import SensorsConfig
 from cavmarl.sensors.kernels.observing_conflicts import (
     CONFLICT_FEATURES,
     GAP_HALF_M,

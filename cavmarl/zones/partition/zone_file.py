@@ -18,7 +18,7 @@ from typing import Literal
 
 import numpy as np
 
-from cavmarl.config.env import MAX_ZONES, ZONE_FILE_SUFFIXES, ZONE_LAYOUTS
+from cavmarl.config.zones import MAX_ZONES, ZONE_FILE_SUFFIXES, ZONE_LAYOUTS
 from cavmarl.core.errors import ConfigError
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.zones.partition.zone_layouts import cut_map

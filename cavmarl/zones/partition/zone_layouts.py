@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config.env import MAX_ZONES, ZONE_LAYOUTS
+from cavmarl.config.zones import MAX_ZONES, ZONE_LAYOUTS
 from cavmarl.core.errors import ConfigError
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.zones.partition.zone_partition import Bounds, ZonePartition

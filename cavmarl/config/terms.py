@@ -1,0 +1,79 @@
+"""`TermsConfig`: the named terms of a reward and their weights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+from cavmarl.config.checks import Section, Within, check, check_finite
+from cavmarl.core.extensions import REGISTERED_TERMS
+
+# The named terms of one step, in the order of every terms array (`rewards/kernels/terms.py`).
+TERMS = (
+    "progress",
+    "speeding",
+    "jerk",
+    "ttc_risk",
+    "collision",
+    "off_road",
+    "wrong_way",
+    "red_light",
+    "arrival",
+    "delay",
+)
+
+
+@dataclass(frozen=True)
+class TermsConfig(Section, key="terms"):
+    """Reward = Σ weight · term; see `TERMS` and docs/environments.md for what each term is.
+
+    Attributes:
+        weights: weight of each named term; terms that are not named weigh 0.
+        team_share: share of the reward that is the mean over all live agents: 0 individual, 1 team.
+        team_range_m: only agents that are so near count in that mean, as the local coordination of
+            CoPO has it (Peng et al. 2021); 0: all do.
+    """
+
+    weights: dict[str, float] = field(
+        default_factory=lambda: {
+            "progress": 0.1,
+            "speeding": -1.0,
+            "jerk": -0.01,
+            "ttc_risk": -0.1,
+            "collision": -10.0,
+            "off_road": -10.0,
+            "wrong_way": -1.0,
+            "red_light": -5.0,
+            "arrival": 10.0,
+        }
+    )
+    team_share: Annotated[float, Within(0.0, 1.0)] = 0.0
+    team_range_m: Annotated[float, Within(0.0, 1e6)] = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, weight in self.weights.items():
+            known = (*TERMS, *REGISTERED_TERMS.names)
+            check(
+                name in known,
+                "terms.weights",
+                name,
+                f"no such term; there are {', '.join(known)}, or add one with "
+                "cavmarl.register_term",
+            )
+            check_finite(f"terms.weights.{name}", weight, -1e6, 1e6)
+
+    @property
+    def registered(self) -> tuple[str, ...]:
+        """The weighted terms that are not of the package."""
+        return tuple(name for name in self.weights if name not in TERMS)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All terms of the world, in the order of every terms array."""
+        return (*TERMS, *self.registered)
+
+    @property
+    def weight_of_each(self) -> tuple[float, ...]:
+        """Their weights, in the same order."""
+        return tuple(self.weights.get(name, 0.0) for name in self.names)

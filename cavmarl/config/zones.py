@@ -1,0 +1,93 @@
+"""`ZonesConfig`: how a map is divided."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from cavmarl.config.checks import Section, Whole, Within
+
+MAX_ZONES = 256  # of one map
+ZONE_LAYOUTS = ("grid", "strips", "bisection")
+ZONE_FILE_SUFFIXES = (".json", ".yaml", ".yml")
+
+
+@dataclass(frozen=True)
+class ZonesConfig(Section, key="zones"):
+    """How the map is divided; see docs/zones.md.
+
+    Attributes:
+        layout: how zones are cut: `grid`, `strips`, `bisection`, or a zone file named as
+            `map.source` is.
+        count: number of zones; of a zone file, as many as it has.
+        avoid_junctions: move cuts aside where that keeps junctions whole.
+        weight: what `bisection` shares out evenly: length of lanes, or area.
+        hysteresis_m: how far behind a border a vehicle changes its zone.
+        max_deferred_ticks: ticks for which a vehicle that has crossed stays with its old zone, if
+            the new one does not acknowledge it.
+        policy: what follows: `force`: the change is forced at once; `extend`: after `grace_ticks`
+            more. With `hold` a vehicle is stopped before the border if the zone behind it has not
+            acknowledged it for more than `grace_ticks`; with `reroute` it takes a way around that
+            zone, if there is one. A world in which that happens is not the undivided one any more.
+        grace_ticks: that `extend` grants behind a border, `hold` and `reroute` before it.
+        backoff_ticks: for which a zone that has refused a vehicle is not asked again.
+        halo_m: how far zones see over their borders; default: as far as exactness needs, and less
+            is refused.
+        approach_ticks: so many ticks before a vehicle is there at its present speed, the zone that
+            it drives to is told.
+        journal: file for the coordinator's log; empty: none. It must not exist.
+        check_invariants: watch the invariants of ownership at run time.
+        faults: a plan of faults to inject, as JSON or a file of it; empty: none.
+        reproducers: folder for ticks that every host of a zone died of, from which they can be run
+            again. With it, what a zone's code raises is the death of its host. Empty: only where
+            faults kill hosts, and then the system's folder for temporary files.
+        repartition_steps: every so many steps zones become others by bisection of where the
+            vehicles are,
+            if that shares them out better; results do not depend on it. 0: they stay.
+        repartition_tolerance: by which share of the mean the fullest zone has to become emptier.
+    """
+
+    layout: str = "bisection"
+    count: Annotated[int, Whole(1, MAX_ZONES)] = 1
+    avoid_junctions: bool = False
+    weight: Literal["lane_length", "uniform"] = "lane_length"
+    hysteresis_m: Annotated[float, Within(0.0, 100.0)] = 2.0
+    max_deferred_ticks: Annotated[int, Whole(0, 1000)] = 2
+    policy: Literal["force", "extend", "hold", "reroute"] = "force"
+    grace_ticks: Annotated[int, Whole(0, 1000)] = 0
+    backoff_ticks: Annotated[int, Whole(0, 1000)] = 4
+    halo_m: Annotated[float | None, Within(0.0, 1e6)] = None
+    approach_ticks: Annotated[int, Whole(1, 1000)] = 2
+    journal: str = ""
+    check_invariants: bool = False
+    faults: str = ""
+    reproducers: str = ""
+    repartition_steps: Annotated[int, Whole(0, 1_000_000)] = 0
+    repartition_tolerance: Annotated[float, Within(0.0, 100.0)] = 0.1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.need(
+            "layout",
+            self.layout in ZONE_LAYOUTS or self.layout.endswith(ZONE_FILE_SUFFIXES),
+            f"must be {', '.join(ZONE_LAYOUTS)}, or a zone file ({', '.join(ZONE_FILE_SUFFIXES)})",
+        )
+        self.need(
+            "grace_ticks",
+            (self.policy == "force") == (self.grace_ticks == 0),
+            "must be 1 or more with extend, hold and reroute of zones.policy, and 0 with force",
+        )
+        self.need(
+            "repartition_steps",
+            not (self.repartition_steps and (self.faults or self.reproducers)),
+            "vehicles that change their zone must not be late: leave out zones.faults and "
+            "zones.reproducers, or let zones stay",
+        )
+
+    @property
+    def holds(self) -> bool:
+        """Whether vehicles are kept from borders whose other side does not answer.
+
+        A divided world in which that happens is not the undivided one.
+        """
+        return self.policy in ("hold", "reroute")
