@@ -10,8 +10,9 @@ its own manifest. A seed that is trained already is not trained again, and one t
 goes on from its checkpoint. Trainings end with this program, however it ends.
 
 Of the trained drivers the interval is that of the mean over training seeds; of a scripted one, that
-of the mean over evaluation runs; both 95 %, by Student's t. `alone` is `idm` without any other
-vehicle: the ceiling, as long as what is missing to it is not the driver's fault.
+of the mean over evaluation runs; both 95 %, by Student's t, and of shares within 0 and 100 %.
+`alone` is `idm` without any other vehicle: the ceiling, as long as what is missing to it is not the
+driver's fault.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from pathlib import Path
 from threading import Lock
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cavmarl.config.io import read_yaml
 from cavmarl.config.world_spec import WorldSpec
@@ -35,7 +37,7 @@ from cavmarl.core.errors import ConfigError, require
 from cavmarl.core.processes import dying_with_parent
 from cavmarl.evaluate import EvaluationReport, evaluate
 from cavmarl.evaluate.provenance.training_record import CHECKPOINT_FILE, is_trained
-from cavmarl.evaluate.statistics import Interval, mean_interval
+from cavmarl.evaluate.statistics import Interval, bounded_interval, mean_interval
 from cavmarl.learning.options import run_to_end
 from cavmarl.policies.policy import driver_keys
 
@@ -181,6 +183,11 @@ class Children:
                 child.kill()
 
 
+def interval_of(means: NDArray[np.float64], are_shares: bool) -> Interval | None:
+    """Interval of the mean over training seeds; of shares (0 to 1) it stays within these."""
+    return bounded_interval(means, 0.0) if are_shares else mean_interval(means)
+
+
 def summarise(
     report: EvaluationReport, alone: EvaluationReport, args: Args
 ) -> dict[str, dict[str, Row]]:
@@ -191,7 +198,7 @@ def summarise(
         means = [driver[metric].mean for driver in trained]
         known = np.array([mean for mean in means if mean is not None])
         mean = float(known.mean()) if known.size else None
-        found["trained"][metric] = Row(mean, mean_interval(known), means)
+        found["trained"][metric] = Row(mean, interval_of(known, metric in PERCENT), means)
     scripted = {name: report[name] for name in SCRIPTED} | {ALONE: alone["idm"]}
     for name, driver in scripted.items():
         found[name] = {

@@ -5,7 +5,8 @@
 Trains both arms with each seed as `five_seeds.py` does, `on` with all messages and `off` with none
 (`v2x.channel.loss=1`: observations keep their shape), and lets them drive the same episodes, `on`
 with more and more loss. Writes into the folder: `table.md`, `result.json`, `loss.svg` and the runs.
-All intervals are 95 %, by Student's t over the training seeds; the arms are paired by seed.
+All intervals are 95 %, by Student's t over the training seeds, of shares within 0 and 100 %; the
+arms are paired by seed.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from five_seeds import GOES_ON, Args, Row, parse_args, train
+from five_seeds import GOES_ON, Args, Row, interval_of, parse_args, train
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import require
 from cavmarl.evaluate import evaluate
-from cavmarl.evaluate.statistics import Interval, mean_interval
+from cavmarl.evaluate.statistics import Interval
 from cavmarl.learning.options import run_to_end
 
 LOSS = "v2x.channel.loss"
@@ -53,8 +54,12 @@ def drive(args: Args, folders: Mapping[int, Path], loss: float, out: Path) -> Fi
     }
 
 
-def row(values: NDArray[np.float64]) -> Row:
-    return Row(float(values.mean()), mean_interval(values), values.tolist())
+def row(values: NDArray[np.float64], percent: bool = False) -> Row:
+    """Mean and interval of one value a seed (S,); `percent`: these are shares, from 0 to 100."""
+    found = interval_of(values / 100.0 if percent else values, percent)
+    if found and percent:
+        found = Interval(100.0 * found.low, 100.0 * found.high)
+    return Row(float(values.mean()), found, values.tolist())
 
 
 def table(arms: Mapping[str, Figures], args: Args) -> str:
@@ -67,9 +72,8 @@ def table(arms: Mapping[str, Figures], args: Args) -> str:
         "| --- |" + " ---: |" * len(METRICS),
     ]
     for name, figures in arms.items():
-        lines.append(
-            f"| {name} | " + " | ".join(_cell(row(figures[key])) for key in METRICS) + " |"
-        )
+        rows = [row(figures[key], scale == 100.0) for key, (_, scale) in METRICS.items()]
+        lines.append(f"| {name} | " + " | ".join(map(_cell, rows)) + " |")
     apart = {key: arms["on"][key] - arms["off"][key] for key in METRICS}
     lines.append("| on minus off | " + " | ".join(_cell(row(apart[key])) for key in METRICS) + " |")
     return "\n".join(lines) + "\n"
