@@ -320,6 +320,29 @@ class Simulation(WorldViews):
         """From now on host the zones that `executor` runs, and leave the others to `peers`."""
         tick = self._tick
         tick.peers, tick.coordination, tick.executor = peers, coordination, executor
+        self._recutter = None  # no process has the places of all vehicles
+
+    def divide(self, partition: ZonePartition) -> None:
+        """Say where zones are from now on, before zones have their vehicles; see `share`."""
+        if partition.content_hash != self.partition.content_hash:
+            self.partition = partition
+            self._tick.division.divide(partition)
+
+    def cut(
+        self,
+        partition: ZonePartition,
+        vehicles: Sequence[NDArray[np.void]],  # VEHICLE (n,) of each world, of all zones
+        contacts: NDArray[np.int64],  # (W,) that all zones have counted
+    ) -> None:
+        """Divide the plane otherwise, where others hold zones; then `share` has to follow."""
+        tick = self._tick
+        assert tick.peers is not None
+        assert tick.coordination is not None
+        self.divide(partition)
+        tick.division.place(vehicles, contacts)
+        tick.peers.keep_own(self.everywhere)
+        tick.coordination.reset(self.everywhere)
+        tick.peers.take_up(tick.gate, tick.division.side)
 
     def time_shards(self, every: int = 1) -> ShardClock:
         """From now on run phases zone by zone, with a clock on each."""

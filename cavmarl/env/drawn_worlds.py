@@ -27,6 +27,7 @@ from cavmarl.env.recorded_worlds import Record, WorldRecorder
 from cavmarl.parallel.backends import shows_state
 from cavmarl.parallel.journaled_worlds import unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds, kept_elsewhere
+from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.parallel.step_arrays import SteppedWorlds
 from cavmarl.recordings.extra_tables import RecordOptions
 from cavmarl.render.topdown import WorldView
@@ -220,6 +221,8 @@ class DrawnWorlds(InsertedWorlds):
         """The worlds, or a copy of them as they are now where they live in other processes."""
         simulation = self._standing()
         if self._copied is not None:
+            if isinstance(self.worlds, NodeWorlds):
+                simulation.divide(self.worlds.partition)
             self._copied.load_worlds(self.worlds.save_worlds())
         return simulation
 

@@ -123,11 +123,7 @@ class Division:
 
         A vehicle in another zone than its owner's changes its owner as at any border.
         """
-        zones, halo = partition.arrays, self._sight.halo(partition)
-        self.zones, self._halo, self._rects = zones, halo, zones.rects.tolist()
-        self.neighbours = partition.within(self._sight.outside_m)
-        for shard in self._shards:
-            shard.cut(zones, halo)
+        self.divide(partition)
         self._zoned.num_outer[...] = -1
         book = self.book
         tick = book.tick.copy()
@@ -135,6 +131,14 @@ class Division:
             self._forget_offers(w)
         self._exchange(self._shards[0].worlds.rows, 0, self.num_worlds)
         book.tick[:] = tick  # of the rows that have been looked at once more
+
+    def divide(self, partition: ZonePartition) -> None:
+        """Say where zones are from now on; owners and ghosts are to be told anew."""
+        zones, halo = partition.arrays, self._sight.halo(partition)
+        self.zones, self._halo, self._rects = zones, halo, zones.rects.tolist()
+        self.neighbours = partition.within(self._sight.outside_m)
+        for shard in self._shards:
+            shard.cut(zones, halo)
 
     def settle_newborn(self, w: int, births: Sequence[Birth]) -> list[Birth]:
         """Give vehicles that are not on record yet to the zones that they are in now."""
@@ -193,16 +197,9 @@ class Division:
     def _exchange(self, rows: NDArray[np.void], first: int, last: int) -> None:
         """Renew the ghosts of some worlds; `rows` are the first shard's rows or next ones."""
         self._call_exchange(
-            self.zones,
-            self._halo,
-            self._touching_m,
-            self.borders,
-            self._zoned,
-            self._side(rows),
-            first,
-            last,
-            self.book,
-        )
+            self.zones, self._halo, self._touching_m, self.borders, self._zoned,
+            self._side(rows), first, last, self.book,
+        )  # fmt: skip
 
     def _side(self, rows: NDArray[np.void]) -> int:
         return 0 if rows is self._first_side else 1

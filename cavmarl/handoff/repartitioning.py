@@ -14,7 +14,7 @@ import numpy as np
 
 from cavmarl.handoff.coordinator.coordinators import Coordinators
 from cavmarl.handoff.division import Division
-from cavmarl.handoff.repartition_plan import propose_zones
+from cavmarl.handoff.repartition_plan import Proposal, propose_zones
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
@@ -27,6 +27,20 @@ class Recut(NamedTuple):
     after: float  # the same in the new zones
     moved: int  # vehicles that are in a zone of another number
     ms: float  # that it took; handing them over is part of the next tick
+
+
+def propose_cut(
+    network: RoadNetwork,
+    division: Division,  # with the vehicles of all zones
+    partition: ZonePartition,  # its zones now
+    tolerance: float,  # by which share of the mean the fullest zone has to become emptier
+) -> Proposal | None:
+    """Zones that share out the vehicles of all worlds better; None: they would gain too little."""
+    rows = [division.vehicles(w) for w in range(division.num_worlds)]
+    places = np.concatenate([np.column_stack([own["x"], own["y"]]) for own in rows])
+    owners = np.concatenate([own["owner"] for own in rows])
+    counts = np.bincount(owners, minlength=partition.count)
+    return propose_zones(network, partition, places, counts.tolist(), tolerance=tolerance)
 
 
 class Recutter:
@@ -58,13 +72,7 @@ class Recutter:
         if self._steps == 1 or (self._steps - 1) % self._every:
             return None
         began = time.perf_counter()
-        division = self._division
-        rows = [division.vehicles(w) for w in range(division.num_worlds)]
-        places = np.concatenate([np.column_stack([own["x"], own["y"]]) for own in rows])
-        counts = division.loads().owned.sum(axis=1)
-        proposal = propose_zones(
-            self._network, partition, places, counts.tolist(), tolerance=self._tolerance
-        )
+        proposal = propose_cut(self._network, self._division, partition, self._tolerance)
         if proposal is None:
             return None
         self.cut(proposal.partition)

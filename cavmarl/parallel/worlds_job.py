@@ -34,6 +34,8 @@ class Task(IntEnum):
     SAVE = 11
     LOAD = 12
     LOADS = 13
+    PROPOSE = 14
+    CUT = 15
 
 
 TASK_NAMES = tuple(task.name.lower().replace("_", " ") for task in Task)

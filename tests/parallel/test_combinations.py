@@ -98,7 +98,6 @@ REFUSED = {
     ("planned faults", "zones over workers"): OF_ONE_WORLD,
     ("repartitions", "zones over workers"): "needs zones that stay",
     ("sensor workers", "nodes"): NOT_OVER_NODES,
-    ("repartitions", "nodes"): NOT_OVER_NODES,
     ("planned faults", "nodes"): NOT_OVER_NODES,
     ("holding before borders", "nodes"): NOT_OVER_NODES,
 }

@@ -14,6 +14,7 @@ from cavmarl.ownership.decisions import Neighbours
 from cavmarl.parallel.commanded_worlds import own_error
 from cavmarl.parallel.hosts.host_process import code_stamp
 from cavmarl.parallel.nodes.links import FrameKind, Link, LinkLostError, Links, NodeFrame
+from cavmarl.parallel.nodes.node_cuts import read_neighbours
 from cavmarl.parallel.nodes.node_files import WorldFile
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeListener, NodeSystem
 
@@ -126,7 +127,7 @@ class Newcomers:
                 case FrameKind.READY if newcomer.is_let_in:
                     host, port, near, may_teleport = json.loads(bytes(frame.data))
                     newcomer.place = str(host), int(port)
-                    newcomer.neighbours = Neighbours(tuple(map(frozenset, near)), may_teleport)
+                    newcomer.neighbours = read_neighbours([near, may_teleport])
                     self.ready.append(number)
                 case FrameKind.FAILED:
                     name, text, trace = json.loads(bytes(frame.data))

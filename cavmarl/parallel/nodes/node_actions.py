@@ -19,6 +19,9 @@ from cavmarl.parallel.step_arrays import StepArrays
 Agents = NDArray[np.int64]
 """Some, counted over all worlds."""
 
+ZoneRects = list[list[float]]
+"""Zones as `node_cuts.told_zones` gives them."""
+
 UNOWNED = -1  # owns an agent that has no vehicle
 
 
@@ -58,6 +61,7 @@ class NodeCommand(NamedTuple):
     changes: bool  # what the worlds are
     ticks: int  # of the worlds
     actions: Actions | None = None  # of a step
+    cut: ZoneRects | None = None  # zones that the worlds have from then on
 
     def of_node(self, number: int, owner: NDArray[np.int32]) -> list[Bytes]:
         """The pieces of the frame that a node gets."""

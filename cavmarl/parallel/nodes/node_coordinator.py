@@ -113,12 +113,17 @@ class NodeCoordinator:
 
     def host(self, neighbours: Neighbours) -> list[list[Hosting]]:
         """Begin; what the hosts of all zones have to know, by worlds."""
+        self.know(neighbours)
         for world in self._worlds:
-            world.directory.know(neighbours)
             world.write(world.directory.reset())
             for zone, node in enumerate(self._node_of):
                 world.write(world.directory.host(zone, worker=node))
         return self._hostings()
+
+    def know(self, neighbours: Neighbours) -> None:
+        """From now on let vehicles change between these zones only."""
+        for world in self._worlds:
+            world.directory.know(neighbours)
 
     def recover(self, node_of: Sequence[int], switched: int) -> list[list[Hosting]]:
         """Nodes are lost, and others host their zones; what is under way is void.

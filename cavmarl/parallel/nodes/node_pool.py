@@ -10,7 +10,6 @@ import struct
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +26,7 @@ from cavmarl.engine.world_setup import World
 from cavmarl.handoff.coordinator.coordinator_setup import prepare_runs
 from cavmarl.handoff.coordinator.journal import Journal
 from cavmarl.handoff.shard_setup import limits_of
+from cavmarl.ownership.decisions import Neighbours
 from cavmarl.ownership.reactions import Hosting
 from cavmarl.parallel.commanded_worlds import own_error
 from cavmarl.parallel.journaled_worlds import unwatched
@@ -41,12 +41,13 @@ from cavmarl.parallel.nodes.links import (
 from cavmarl.parallel.nodes.newcomers import Newcomer, Newcomers
 from cavmarl.parallel.nodes.node_actions import UNOWNED, NodeCommand, read_refusal
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
+from cavmarl.parallel.nodes.node_cuts import PoolState, ZoneCut, read_neighbours, told_zones
 from cavmarl.parallel.nodes.node_files import files_of
 from cavmarl.parallel.nodes.node_starters import Route, Start, start_nodes, straight
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.nodes.node_watch import NodeWatch, SilentNodeError
 from cavmarl.parallel.nodes.zone_hosts import read_report, told_hostings
-from cavmarl.parallel.nodes.zone_moves import ZoneMoves, moves_of, name_of
+from cavmarl.parallel.nodes.zone_moves import ZoneMoves, moves_of, name_of, nodes_of
 from cavmarl.parallel.recipe import recipe_of
 from cavmarl.parallel.step_arrays import StepArrays, layout_of
 from cavmarl.parallel.step_placement import StepPlacement
@@ -57,14 +58,6 @@ log = logging.getLogger("cavmarl.nodes")
 KEEP_S = 0.2  # so much of work may have to be done again
 END_S = 1.0  # for nodes to hear that they are needed no more
 SPARES = 1  # nodes more than are wanted that may wait for another one's end
-
-
-class _State(NamedTuple):
-    """What nodes have kept before a command."""
-
-    number: int
-    zones: list[list[int]]  # that each node hosted
-    switched: int  # vehicles that had changed their owner
 
 
 class NodePool:
@@ -109,8 +102,9 @@ class NodePool:
         self._homes = self.zones
         self._generation = 0
         self._teller = 0
-        self._state = _State(1, self.zones, 0)  # that all nodes can go back to
-        self._opened: _State | None = None  # that they keep before the next command
+        self._cut = ZoneCut(told_zones(world.partition), Neighbours(()))
+        self._state = PoolState(1, self.zones, 0, self._cut)  # that all nodes can go back to
+        self._opened: PoolState | None = None  # that they keep before the next command
         self._next_state = 2
         self._keep_again_s = -math.inf  # by the clock of `_links`
         self._log: list[NodeCommand] = []  # since that state
@@ -128,7 +122,7 @@ class NodePool:
         journals = [None if r.journal is None else Journal(r.journal, anew=True) for r in runs]
         self._coordinator = NodeCoordinator(
             [run.run for run in runs],
-            self._node_of(),
+            nodes_of(self.zones),
             limits_of(config.zones),
             self._links,
             journals,
@@ -164,6 +158,8 @@ class NodePool:
                 self._seat()
                 neighbours = self._nodes[0].neighbours
                 assert neighbours is not None
+                self._cut = self._cut._replace(neighbours=neighbours)
+                self._state = self._state._replace(cut=self._cut)
                 hostings = hostings or self._coordinator.host(neighbours)
                 self._tell_zones(hostings, ZoneMoves(self.zones, {}, []), begins=True)
                 self._commit()
@@ -279,7 +275,8 @@ class NodePool:
 
     def _begin_state(self) -> None:
         """Let all nodes keep what they have before the next command."""
-        self._opened = _State(self._next_state, self.zones, self._coordinator.switched)
+        switched = self._coordinator.switched
+        self._opened = PoolState(self._next_state, self.zones, switched, self._cut)
         self._next_state += 1
 
     def _perform(self, command: NodeCommand) -> list[memoryview]:
@@ -296,7 +293,12 @@ class NodePool:
         for _ in range(command.ticks):
             self._watch.wait(self._living, self._timeout_s, self._coordinator.begin)
             results = self._commit()
-        return results if command.ticks else self._commit()
+        if not command.ticks:
+            results = self._commit()
+        if command.cut is not None:
+            self._cut = ZoneCut(command.cut, read_neighbours(json.loads(bytes(results[0]))))
+            self._coordinator.know(self._cut.neighbours)
+        return results
 
     def _hear(self, number: int, frame: NodeFrame) -> None:
         """Take an urgent frame; an error of a node is raised here."""
@@ -371,7 +373,9 @@ class NodePool:
         moves = moves_of(state.zones, self._homes, self._lost, self._nodes, state.number)
         self.zones = moves.zones
         self._generation += 1
-        hostings = self._coordinator.recover(self._node_of(), state.switched)
+        self._cut = state.cut
+        self._coordinator.know(state.cut.neighbours)
+        hostings = self._coordinator.recover(nodes_of(self.zones), state.switched)
         self._tell_zones(hostings, moves, begins=False)
         self._commit()
         self._new.clear()
@@ -393,6 +397,7 @@ class NodePool:
             "donors": moves.donors,
             "places": list(self._new.items()),
             "zones": moves.zones,
+            "partition": self._cut.partition,
             "first": self._first_teller(),
             "state": self._state.number,
             "runs": self._runs,
@@ -427,13 +432,6 @@ class NodePool:
         self._coordinator.commit({n: (messages, said) for n, (messages, said, _) in read.items()})
         self._tellers = list(read)
         return [more for _, _, more in read.values()]
-
-    def _node_of(self) -> list[int]:
-        found = [0] * self.world.partition.count
-        for node, some in enumerate(self.zones):
-            for zone in some:
-                found[zone] = node
-        return found
 
     def close(self) -> None:
         """End the nodes; a fork of the pool's process has no right to."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from cavmarl.core.errors import CavmarlError, ConfigError, MessageError, NodeRefusedError
 from cavmarl.engine.shard_clock import ShardClock
-from cavmarl.handoff.shard_setup import limits_of, neighbours_of
+from cavmarl.handoff.shard_setup import limits_of
 from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.parallel.hosts.host_process import code_stamp
 from cavmarl.parallel.local_worlds import LocalWorlds
@@ -31,35 +31,20 @@ from cavmarl.parallel.nodes.links import (
 )
 from cavmarl.parallel.nodes.meeting import call_node, calls_of
 from cavmarl.parallel.nodes.node_actions import refusal, take_actions
+from cavmarl.parallel.nodes.node_cuts import cut_worlds, proposal_of, read_zones, told_neighbours
+from cavmarl.parallel.nodes.node_executor import NodeExecutor
 from cavmarl.parallel.nodes.node_files import WorldFile, recipe_with
 from cavmarl.parallel.nodes.node_frames import command_of, results_of, saved_of, worlds_payload
 from cavmarl.parallel.nodes.node_loads import told_of
 from cavmarl.parallel.nodes.node_peers import NodePeers
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.nodes.zone_hosts import ZoneHosts, hosting_of
+from cavmarl.parallel.nodes.zone_moves import nodes_of
 from cavmarl.parallel.worlds_job import Task, commands_of
-from cavmarl.shards.executor import Executor, SerialExecutor
-from cavmarl.shards.shard import Shard
 
 MEASURED_TICKS = 10  # one of so many shows what zones cost
 MEETING_S = 60.0  # for the other nodes to call
 DIFFERENT = "are read as something else on this machine: {} is the caller's folder"
-
-
-class NodeExecutor:
-    """Runs phases on the shards of this node; the other shards' rows stay on the same side."""
-
-    def __init__(
-        self, own: Sequence[Shard], foreign: Sequence[Shard], clock: ShardClock | None
-    ) -> None:
-        self._executor: Executor = clock or SerialExecutor(own)
-        self._first, self._foreign = own[0], foreign
-
-    def each(self, phase: str, *arguments: Any) -> None:
-        self._executor.each(phase, *arguments)
-        if phase in ("advance", "commit"):
-            for shard in self._foreign:
-                shard.face(self._first.side, self._first.next_side)
 
 
 class NodeProgram:
@@ -97,8 +82,7 @@ class NodeProgram:
         self._commands = commands_of(worlds.arrays)
         worlds.keep_logs()
         self._listener = self._system.listen(self._address, self._secret)
-        near, may_teleport = neighbours_of(worlds.simulation.division)
-        said = [*self._listener.place, list(map(sorted, near)), may_teleport]
+        said = [*self._listener.place, *told_neighbours(worlds.simulation)]
         links.send(COORDINATOR, FrameKind.READY, 0, [json.dumps(said).encode()])
 
     def _fetch(self, files: Sequence[WorldFile]) -> None:
@@ -125,10 +109,6 @@ class NodeProgram:
         simulation, mine = self._worlds.simulation, zones[self._number]
         self.zones = tuple(mine)
         self._living = [node for node, some in enumerate(zones) if some]
-        node_of = [0] * simulation.partition.count
-        for node, some in enumerate(zones):
-            for zone in some:
-                node_of[zone] = node
         told = [
             [hosting_of(bytes.fromhex(run), some[zone]) for zone in mine]
             for run, some in zip(runs, hostings, strict=True)
@@ -140,12 +120,16 @@ class NodeProgram:
         carried = [arrays.controls, arrays.meta_actions]
         carried += [] if mounted is None else mounted.arrays()
         self._hosts = ZoneHosts(
-            simulation.division, mine, node_of, told, limits, self._links, carried, generation,
-            simulation.config.zones.check_invariants,
+            simulation.division, mine, nodes_of(zones), told, limits, self._links, carried,
+            generation, simulation.config.zones.check_invariants,
         )  # fmt: skip
-        shards = simulation.shards
-        own = [shards[zone] for zone in mine]
-        foreign = [shard for shard in shards if shard.zone not in mine]
+        self._run_own()
+
+    def _run_own(self) -> None:
+        """Run the phases of this node's zones from now on."""
+        simulation = self._worlds.simulation
+        own = [simulation.shards[zone] for zone in self.zones]
+        foreign = [shard for shard in simulation.shards if shard.zone not in self.zones]
         every = simulation.config.workers.balance_steps
         self._clock = ShardClock(own, MEASURED_TICKS) if every else None
         simulation.share(self._peers, self._hosts, NodeExecutor(own, foreign, self._clock))
@@ -222,6 +206,7 @@ class NodeProgram:
         zones = told["zones"]
         others = [node for node, some in enumerate(zones) if some and node != self._number]
         self._meet({node: (host, port) for node, (host, port) in told["places"]}, others)
+        self._worlds.simulation.divide(read_zones(told["partition"]))
         self._share(zones, told["runs"], told["hostings"], frame.number)
         for node in others:
             links.send(node, FrameKind.SYNC, frame.number)
@@ -286,6 +271,11 @@ class NodeProgram:
             case Task.LOAD if not payload["only_reads"]:
                 worlds.load_worlds(saved_of(payload))
                 self._hosts.report()
+            case Task.CUT:
+                cut_worlds(worlds.simulation, peers, payload)
+                self._run_own()
+                said = told_neighbours(worlds.simulation)
+                self._hosts.report([json.dumps(said).encode()])
             case Task.HOST:
                 spent_s = [] if self._clock is None else self._clock.take_s().tolist()
                 self._answer([json.dumps(list(zip(self.zones, spent_s, strict=False))).encode()])
@@ -356,6 +346,8 @@ class NodeProgram:
             found = worlds.traffic_stats(payload)
         elif task == Task.DRIVEN:
             found = worlds.driven(*payload)
+        elif task == Task.PROPOSE:
+            found = proposal_of(worlds.simulation)
         else:
             found = worlds.signal_phases(payload).tolist()
         return [json.dumps(found).encode()]

@@ -17,11 +17,13 @@ from cavmarl.balance.probe import MEASURED
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
+from cavmarl.handoff.repartitioning import Recut
 from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.parallel.commanded_worlds import uncopied
 from cavmarl.parallel.mover import Mover
 from cavmarl.parallel.nodes.node_actions import UNOWNED, Actions, NodeCommand
+from cavmarl.parallel.nodes.node_cuts import read_zones
 from cavmarl.parallel.nodes.node_frames import (
     clear_sensed,
     pieces_of,
@@ -36,6 +38,7 @@ from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.step_arrays import Driven
 from cavmarl.parallel.worlds_job import Task
 from cavmarl.shards.shard import Commands
+from cavmarl.zones.partition.zone_partition import ZonePartition
 
 PLANNED = (
     "a plan loses messages and hosts within one process; cavmarl verify ENV --nodes 2 --faults "
@@ -48,6 +51,7 @@ class NodeWorlds(NodePool):
 
     Attributes:
         mover: has zones change their node by what they cost; None: they stay.
+        recuts: when worlds have been cut anew.
 
     Raises:
         ConfigError: a setting that such worlds cannot have, or more nodes than zones.
@@ -73,6 +77,8 @@ class NodeWorlds(NodePool):
         count, every = world.partition.count, world.config.workers.balance_steps
         self._spent_s = np.zeros((1, count))
         self._ticks_done = self._ticks_told = 0
+        self.recuts: list[Recut] = []
+        self._steps = 0
         self._told: dict[int, list[Any]] = {}  # what nodes have said of themselves last
         self.mover = Mover(self._placement, count, every, self._spent_s) if every else None
 
@@ -90,6 +96,7 @@ class NodeWorlds(NodePool):
         if commands.controls is not arrays.controls:
             arrays.controls[:] = commands.controls
             arrays.meta_actions[:] = commands.meta_actions
+        self._cut_anew()
         if self.mover is not None:
             self.mover.before_step(self._move, self._measured)
         arrays.declared[:] = commands.declared if commands.declared.size else 0
@@ -98,6 +105,16 @@ class NodeWorlds(NodePool):
         self._ticks_done += self._ticks_per_step
         clear_sensed(arrays, np.ones(len(arrays.chosen), dtype=np.bool_))
         self._write(results, of_step=True)
+
+    def _cut_anew(self) -> None:
+        """Every so many steps cut the zones by their vehicles; see `zones.repartition_steps`."""
+        every, self._steps = self.world.config.zones.repartition_steps, self._steps + 1
+        if not every or self._steps == 1 or (self._steps - 1) % every:
+            return
+        if proposal := self._asked(Task.PROPOSE, None):
+            zones, *figures = proposal
+            self.run(self._command(Task.CUT, zones))
+            self.recuts.append(Recut(self._steps - 1, *figures))
 
     def _measured(self) -> dict[int, int]:
         """Ask what zones have cost, before they are balanced by it; a number for each node."""
@@ -120,10 +137,10 @@ class NodeWorlds(NodePool):
 
     def _command(self, task: Task, payload: Any = None) -> NodeCommand:
         loads = task == Task.LOAD and not payload["only_reads"]
-        changes = loads or task in (Task.STEP, Task.RESET)
+        changes = loads or task in (Task.STEP, Task.RESET, Task.CUT)
         pieces = [bytes(piece) for piece in pieces_of(task, payload, self.arrays)]
         if task != Task.STEP:
-            return NodeCommand(pieces, changes, 0)
+            return NodeCommand(pieces, changes, 0, cut=payload if task == Task.CUT else None)
         return NodeCommand(pieces, changes, self._ticks_per_step, Actions.of(self.arrays))
 
     def _write(self, results: Sequence[memoryview], of_step: bool) -> None:
@@ -209,6 +226,11 @@ class NodeWorlds(NodePool):
         self.run(self._command(Task.LOAD, worlds_payload(saved)))
 
     @property
+    def partition(self) -> ZonePartition:
+        """The zones as they are now; a cut gives the worlds others."""
+        return read_zones(self._cut.partition)
+
+    @property
     def simulation(self) -> Simulation:
         """Refused: the worlds live elsewhere."""
         raise ConfigError("the worlds live in nodes: use workers=0 to look into them")
@@ -261,11 +283,6 @@ def check_nodes(world: World, nodes: int) -> None:
             config.zones.policy if config.zones.holds else "",
             "a tick waits for all acknowledgements, and a node that does not answer is replaced, "
             "so no vehicle has a cause to wait; use force or extend",
-        ),
-        "zones.repartition_steps": (
-            config.zones.repartition_steps,
-            "to cut zones by their vehicles takes the places of all of them, which no process has; "
-            "workers.balance_steps moves whole zones",
         ),
         "workers.sensors": (
             config.workers.sensors,

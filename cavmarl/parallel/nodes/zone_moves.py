@@ -58,6 +58,12 @@ def moves_of(
     return ZoneMoves(after, heirs, donors)
 
 
+def nodes_of(zones: Sequence[Sequence[int]]) -> list[int]:
+    """Zone → the node that hosts it."""
+    pairs = ((zone, node) for node, some in enumerate(zones) for zone in some)
+    return [node for _, node in sorted(pairs)]
+
+
 def name_of(zones: Sequence[int]) -> str:
     """A node's part, in words."""
     return f"zones {', '.join(map(str, zones))}"

@@ -1,0 +1,169 @@
+"""Worlds over nodes whose zones are cut anew are the undivided ones, whichever node is lost."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cavmarl.env.vector import CavVectorEnv
+from cavmarl.handoff.coordinator.journal import JournalReader
+from cavmarl.ownership.messages import Reset
+from cavmarl.parallel.nodes import node_process
+from cavmarl.parallel.nodes.node_cuts import read_neighbours, read_zones, told_zones
+from cavmarl.parallel.nodes.node_worlds import NodeWorlds
+from cavmarl.verify.simulated_nodes import verify_simulated_nodes
+from cavmarl.zones.partition.zone_layouts import cut_map
+from tests.support.rerouting import CARS, DEVICE, FLOW, make_map, write_demand
+from tests.support.vec_runs import Make, drive, same
+
+WANTED: dict[str, Any] = {"agents": 8, "background": 40, "max_cycles": 10}
+OFTEN = {
+    "zones.repartition_steps": 3,
+    "zones.repartition_tolerance": 0.0,
+    "zones.check_invariants": True,
+}
+
+
+def over_nodes(vec: CavVectorEnv) -> NodeWorlds:
+    assert isinstance(vec.worlds, NodeWorlds)
+    return vec.worlds
+
+
+@pytest.mark.parametrize(
+    ("arguments", "nodes"),
+    [
+        ({"env": "grid4x4", "num_envs": 2}, 3),
+        ({"env": "merge", "autoreset_mode": "NextStep"}, 2),
+        ({"env": "town", "overrides": {"rig": "ten_sensors", "clock.control_latency_ticks": 2}}, 4),
+        ({"env": "town", "overrides": {"v2x.enabled": True, "sensors.stack": 3}}, 2),
+    ],
+)
+def test_zones_that_are_cut_anew_change_nothing(
+    make: Make, arguments: dict[str, Any], nodes: int
+) -> None:
+    wanted = WANTED | arguments
+    overrides = wanted.pop("overrides", {})
+    whole = drive(make(**wanted, overrides=overrides), steps=24)
+    vec = make(**wanted, zones=4, nodes=nodes, overrides=overrides | OFTEN)
+    assert same(drive(vec, steps=24), whole)
+    worlds = over_nodes(vec)
+    assert len(worlds.recuts) > 2
+    assert all(cut.before > cut.after and cut.moved > 0 for cut in worlds.recuts)
+    assert worlds.recoveries == 0
+
+
+def test_vehicles_that_look_for_their_way_are_where_they_were(make: Make, tmp_path: Path) -> None:
+    files = write_demand(tmp_path, CARS.format(device=DEVICE) + FLOW)
+    named = {
+        "traffic.demand": [str(path) for path in files],
+        "clock.sim_dt_s": 0.2,
+        "clock.ctrl_dt_s": 1.0,
+    }
+    wanted = {"env": make_map(tmp_path), "agents": 2, "background": 0, "max_cycles": 40}
+    whole = drive(make(**wanted, overrides=named), steps=30)
+    vec = make(**wanted, zones=3, nodes=2, overrides=named | OFTEN)
+    assert same(drive(vec, steps=30), whole)
+    assert over_nodes(vec).recuts
+
+
+def test_nodes_that_are_lost_before_and_after_a_cut(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All go back to the zones that there were when the state was kept, and cut them again."""
+    monkeypatch.setattr("cavmarl.parallel.nodes.node_pool.KEEP_S", 1e6)  # only at the beginning
+    wanted = {**WANTED, "max_cycles": 40}
+    whole = drive(make("grid4x4", **wanted), steps=24)
+    vec = make("grid4x4", zones=4, nodes=4, overrides=OFTEN, **wanted)
+    worlds = over_nodes(vec)
+    first = worlds.zones
+
+    def strike(step: int) -> None:
+        if step in (5, 7, 18):
+            os.kill(worlds.pids[step % len(worlds.pids)], signal.SIGKILL)
+
+    assert same(drive(vec, steps=24, before=strike), whole)
+    assert (worlds.losses, worlds.recoveries > 2) == (3, True)
+    assert len(worlds.recuts) > 1
+    assert worlds.zones != first or worlds.replacements
+
+
+def test_a_cut_that_is_interrupted_is_as_if_it_had_not_been(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vecs = [make("grid4x4", **WANTED), make("grid4x4", zones=4, nodes=2, overrides=OFTEN, **WANTED)]
+    for vec in vecs:
+        vec.reset(seed=2)
+    worlds = over_nodes(vecs[1])
+    know, interrupted = worlds._coordinator.know, []
+
+    def interrupt(neighbours: Any) -> None:
+        if not interrupted:
+            interrupted.append(worlds._steps)
+            raise KeyboardInterrupt
+        know(neighbours)
+
+    monkeypatch.setattr(worlds._coordinator, "know", interrupt)
+    for step in range(10):
+        actions = vecs[0].suggest_actions()
+        vecs[0].step(actions)
+        try:
+            vecs[1].step(actions)
+        except KeyboardInterrupt:
+            vecs[1].step(actions)
+        assert vecs[0].state_hash() == vecs[1].state_hash(), step
+    assert interrupted == [4]
+    assert worlds.recuts
+
+
+def test_the_journal_begins_anew_with_each_cut(make: Make, tmp_path: Path) -> None:
+    path = tmp_path / "run.jsonl"
+    overrides = OFTEN | {"zones.journal": str(path)}
+    vec = make("grid4x4", zones=4, nodes=2, overrides=overrides, **{**WANTED, "max_cycles": 40})
+    drive(vec, steps=20)
+    cuts = len(over_nodes(vec).recuts)
+    vec.close()
+    episodes = [record.episode for record in JournalReader(path) if isinstance(record, Reset)]
+    assert episodes == sorted(set(episodes))
+    assert len(episodes) == cuts + 2  # before the first reset, and with it
+    assert cuts > 1
+
+
+def test_pictures_have_the_zones_of_now(make: Make) -> None:
+    vec = make("grid4x4", zones=4, nodes=2, overrides=OFTEN, render_mode="rgb_array", **WANTED)
+    drive(vec, steps=8)
+    before, now = vec.worlds.world.partition, over_nodes(vec).partition
+    assert over_nodes(vec).recuts
+    vec.render()
+    assert vec._shown().partition.content_hash == now.content_hash != before.content_hash
+
+
+def test_zones_are_told_to_the_last_bit(make: Make) -> None:
+    vec = make("grid4x4", agents=1, background=0)
+    partition = cut_map(vec.simulation.network, "bisection", 7)
+    assert read_zones(told_zones(partition)).content_hash == partition.content_hash
+    assert read_neighbours([[[0, 1], [1]], True]).near == (frozenset({0, 1}), frozenset({1}))
+
+
+@pytest.mark.parametrize("mix", ["kill", "kill_in_recovery"])
+def test_simulated_nodes_fail_while_zones_are_cut_anew(
+    monkeypatch: pytest.MonkeyPatch, mix: str
+) -> None:
+    cuts, ran = [0], node_process.cut_worlds
+
+    def counted(*told: Any) -> None:
+        cuts[0] += 1
+        ran(*told)
+
+    monkeypatch.setattr(node_process, "cut_worlds", counted)
+    found = verify_simulated_nodes(
+        "merge", [3], mixes=[mix], seeds=2, agents=3, background=20, zones=3, steps=10,
+        overrides={"zones.repartition_steps": 2, "zones.repartition_tolerance": 0.0},
+    )  # fmt: skip
+    (line,) = found.lines
+    assert found.holds, line.wrong
+    assert line.lost > 1
+    assert cuts[0] > 6
