@@ -333,3 +333,19 @@ def test_ghosts_that_are_handed_out_cannot_be_written(simulation: Simulation) ->
         ghosts["x"][0] = 0.0
     with pytest.raises(ValueError, match="read-only"):
         ghosts[0]["x"] = 0.0
+
+
+def test_worlds_go_on_from_a_saved_state(simulation: Simulation) -> None:
+    """The monitor's clock is then that of the state; a zone at another tick is still found."""
+    saved = [array.copy() for array in simulation.save()]
+    hashes = []
+    for _ in range(2):
+        simulation.load(saved)
+        for _ in range(3):
+            drive(simulation)
+        hashes.append(simulation.state_hash())
+    assert hashes[0] == hashes[1]
+    for shard in simulation.shards[1:]:
+        shard.worlds.ticks[0] += 1
+    with pytest.raises(ProtocolError):
+        drive(simulation)

@@ -161,8 +161,12 @@ class InvariantMonitor:
         self._watch = specialized(watch)
 
     def begin(self, w: int, births: Sequence[Birth]) -> None:
-        """Look at a world that has been reset. Raises ProtocolError: an invariant does not hold."""
-        self._ticks[w] = 0
+        """Look at a world that has been reset, or goes on from a state that was saved.
+
+        Raises:
+            ProtocolError: an invariant does not hold.
+        """
+        self._ticks[w] = self._division.ticks(w)[0]
         self._kept[w][0].num[:] = 0
         self._vehicles[w].clear()
         self._look(w, births, new_late=0)
