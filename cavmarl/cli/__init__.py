@@ -122,7 +122,9 @@ def main(words: Sequence[str] | None = None) -> None:
     except CavmarlError as error:
         print_error(str(error))
         sys.exit(2)
-    except Exception as error:
+    except (KeyboardInterrupt, SystemExit):
+        raise
+    except BaseException as error:
         print_traceback(error)
         sys.exit(1)
 

@@ -19,12 +19,28 @@ _FOREIGN = tuple(
 
 
 def print_traceback(error: BaseException) -> None:
-    """Print an exception on standard error, from the first line on that is a user's.
+    """Print `traceback_text` on standard error."""
+    print(traceback_text(error), end="", file=sys.stderr, flush=True)
 
-    Where none is, all of it is printed: the fault is that of the program.
+
+def traceback_text(error: BaseException) -> str:
+    """An exception as Python prints it, from the first line on that is a user's.
+
+    Where none is, all of it: the fault is that of the program.
     """
     shown = _from_users_code(error.__traceback__) or error.__traceback__
-    traceback.print_exception(type(error), error, shown)
+    return "".join(traceback.format_exception(type(error), error, shown))
+
+
+def fault_in(file: Path, error: Exception) -> str:
+    """What a file of a user has raised while it was read, and in which line of whose file."""
+    said = f"{type(error).__name__}: {error}"
+    if isinstance(error, SyntaxError):
+        place = f"{error.filename or file}, line {error.lineno}"
+        return f"{place}: {type(error).__name__}: {error.msg}"
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if not _is_foreign(frame.filename)]
+    return f"{own[-1].filename}, line {own[-1].lineno}: {said}" if own else f"{file}: {said}"
 
 
 def _from_users_code(frames: TracebackType | None) -> TracebackType | None:

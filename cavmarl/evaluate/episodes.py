@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.world_spec import WorldSpec
+from cavmarl.core.errors import ActionError, PolicyError
 from cavmarl.engine.shard_clock import ShardClock
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
@@ -120,7 +121,10 @@ def _drive(
                 progress(name, before * most + steps, count * most)
 
         part = _Part(vec, watch, min(vec.num_envs, job.episodes - first), tracked=k == 0)
-        part.drive(driver, job.seed, first, derived_seed(job.seed, k), step_done)
+        try:
+            part.drive(driver, job.seed, first, derived_seed(job.seed, k), step_done)
+        except ActionError as error:
+            raise PolicyError(f"driver {name}: {error}") from error
         parts.append(part)
     watch.close()
     trips, episodes, transfers = (

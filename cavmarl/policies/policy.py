@@ -24,6 +24,7 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.config.registry import agent_entries, agent_here
 from cavmarl.config.sensors import SensorsConfig
 from cavmarl.core.errors import PolicyError, require
+from cavmarl.core.tracebacks import fault_in
 from cavmarl.engine.spaces import flat_observation, flat_observation_space, observation_parts
 from cavmarl.env.parallel import CavEnv
 from cavmarl.env.vector import CavVectorEnv
@@ -255,7 +256,7 @@ def _load_script(path: Path, env: Environment) -> Policy:
     try:
         spec.loader.exec_module(module)
     except Exception as error:  # the file is the user's: it may raise anything
-        raise PolicyError(f"{path}: {type(error).__name__}: {error}") from error
+        raise PolicyError(fault_in(path, error)) from error
     make_policy = getattr(module, "make_policy", None)
     if not inspect.isfunction(make_policy):
         raise PolicyError(f"{path}: defines no function make_policy(env)")

@@ -16,6 +16,7 @@ import numpy as np
 
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core import errors
+from cavmarl.core.tracebacks import print_traceback
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.parallel.local_worlds import LocalWorlds
@@ -29,6 +30,9 @@ def _main() -> None:
             print(json.dumps(told), flush=True)
     except errors.CavmarlError as error:
         print(json.dumps({"error": type(error).__name__, "message": str(error)}), flush=True)
+    except Exception as error:
+        print_traceback(error)
+        sys.exit(1)
 
 
 def _steps(job: dict[str, Any]) -> Iterator[dict[str, Any]]:

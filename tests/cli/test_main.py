@@ -414,22 +414,3 @@ def test_train_runs_a_program_with_its_own_options(
     settings = str(ROOT / "configs" / "train" / "demo.yaml")
     wanted = [config[0], settings] if len(config) == 2 else [f"--config={settings}"]
     assert ran[1:] == [str(ROOT / "train" / "ppo_sb3.py"), "--seed", "3", "--help", *wanted]
-
-
-def test_a_fault_of_a_policy_shows_the_lines_of_the_policy(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    script = tmp_path / "mine.py"
-    script.write_text(
-        "from cavmarl import Policy\n\n"
-        "class Mine(Policy):\n"
-        "    def act_batch(self, observations, mask):\n"
-        "        return 1 / 0\n\n"
-        "def make_policy(env):\n    return Mine(env)\n"
-    )
-    words = ("evaluate", "ring", "--policy", str(script), "--episodes", "1", *QUICK)
-    assert run(*words, "--out", str(tmp_path / "out")) == 1
-    told = capsys.readouterr().err
-    assert told.count('  File "') == 1
-    assert 'mine.py", line 5, in act_batch' in told
-    assert "ZeroDivisionError" in told

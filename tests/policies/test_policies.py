@@ -166,16 +166,16 @@ def test_an_unknown_name_is_told_the_nearest_and_all() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("def make_policy(env: object) ->", "SyntaxError"),
-        ("import nowhere_to_be_found", "ModuleNotFoundError"),
-        ("x = 1", r"no function make_policy\(env\)"),
-        ("def make_policy(env): return 3", "returned a int, not a"),
+        ("def make_policy(env: object) ->", ", line 1: SyntaxError"),
+        ("\n\nimport nowhere_to_be_found", ", line 3: ModuleNotFoundError"),
+        ("x = 1", r": .*no function make_policy\(env\)"),
+        ("def make_policy(env): return 3", ": .*returned a int, not a"),
     ],
 )
 def test_a_broken_script_is_named(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "mine.py"
     path.write_text(text)
-    with pytest.raises(PolicyError, match=rf"mine\.py: .*{message}"):
+    with pytest.raises(PolicyError, match=rf"mine\.py{message}"):
         load_policy(path, small_vec())
 
 

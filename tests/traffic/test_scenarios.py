@@ -288,7 +288,7 @@ def test_anybody_can_add_one_in_a_file(tmp_path: Path) -> None:
     assert (found.verdict, found.min_ttc_s, found.pet_s) == ("passed", None, None)
     path = tmp_path / "broken.py"
     path.write_text("NEEDS = 1 / 0", encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"broken\.py: ZeroDivisionError"):
+    with pytest.raises(ConfigError, match=r"broken\.py, line 1: ZeroDivisionError"):
         make_scenario(str(path))
     path = tmp_path / "half.py"
     path.write_text("NEEDS = 'a road'", encoding="utf-8")

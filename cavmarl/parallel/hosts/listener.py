@@ -13,6 +13,7 @@ A caller of another version is told which one is spoken here.
 
 from __future__ import annotations
 
+import errno
 import hmac
 import secrets
 import selectors
@@ -39,6 +40,7 @@ GREETING_S = 5.0  # for a caller to prove its identity
 CALL_S = 5.0  # for the system to connect
 MAX_CALLERS = 64  # not authenticated yet
 BACKLOG = 1024  # callers that the system holds until they are accepted
+NO_DESCRIPTORS_S = 0.05  # until the next attempt to have a descriptor
 _SPOKEN = struct.Struct("<4sH")
 _HELLO = struct.Struct(f"<4sHI{NONCE}s")
 
@@ -144,6 +146,7 @@ class Listener:
             self._listener.close()
             raise
         self._callers: list[PendingConnection] = []
+        self._spare = socket.socket()  # a descriptor for a caller that is hung up on
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listener, selectors.EVENT_READ)
 
@@ -175,12 +178,13 @@ class Listener:
         for _ in range(MAX_CALLERS):
             try:
                 connection, _ = self._listener.accept()
-            except OSError:
-                return
+            except OSError as error:
+                if error.errno not in (errno.EMFILE, errno.ENFILE):
+                    return
+                self._find_descriptor()
+                continue
             if len(self._callers) == MAX_CALLERS:
-                self._disconnect(
-                    min(self._callers, key=lambda each: (each.number >= 0, each.until_s))
-                )
+                self._disconnect_the_first()
             try:
                 caller = PendingConnection(connection, self.secret)
             except OSError:  # it is gone already
@@ -201,6 +205,26 @@ class Listener:
             self._selector.unregister(caller)
             admitted.append((caller.number, connection))
 
+    def _find_descriptor(self) -> None:
+        """This process has none left: the next caller gets that of another one, or is hung up on.
+
+        If it were left to wait, the listener would wake this process again at once.
+        """
+        if self._callers:
+            self._disconnect_the_first()
+            return
+        self._spare.close()
+        with suppress(OSError):
+            self._listener.accept()[0].close()
+        try:
+            self._spare = socket.socket()
+        except OSError:  # a thread has taken it meanwhile
+            time.sleep(NO_DESCRIPTORS_S)
+
+    def _disconnect_the_first(self) -> None:
+        """Of the silent ones that which has waited longest; where all have spoken, of all."""
+        self._disconnect(min(self._callers, key=lambda each: (each.number >= 0, each.until_s)))
+
     def _disconnect(self, caller: PendingConnection) -> None:
         self._callers.remove(caller)
         self._selector.unregister(caller)
@@ -208,6 +232,7 @@ class Listener:
 
     def close(self) -> None:
         self._selector.close()
+        self._spare.close()
         for caller in self._callers:
             caller.close()
         self._listener.close()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import socket
-import traceback
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -14,6 +13,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from cavmarl.core.errors import CavmarlError, ConfigError, MessageError, NodeRefusedError
+from cavmarl.core.tracebacks import traceback_text
 from cavmarl.engine.shard_clock import ShardClock
 from cavmarl.handoff.shard_setup import limits_of
 from cavmarl.ownership.messages import COORDINATOR
@@ -408,7 +408,7 @@ def run_node(
         said = [
             type(error).__name__,
             str(error),
-            "" if isinstance(error, CavmarlError) else traceback.format_exc(),
+            "" if isinstance(error, CavmarlError) else traceback_text(error),
         ]
         with suppress(LinkLostError, NeededNoMoreError):
             links.send(COORDINATOR, FrameKind.FAILED, node.generation, [json.dumps(said).encode()])

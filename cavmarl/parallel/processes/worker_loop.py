@@ -20,7 +20,6 @@ import socket
 import sys
 import threading
 import time
-import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, NoReturn
@@ -28,6 +27,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from cavmarl.core.processes import die_with_parent
+from cavmarl.core.tracebacks import traceback_text
 from cavmarl.parallel.processes import process_barrier as barrier
 from cavmarl.parallel.processes import state_image as images
 from cavmarl.parallel.processes.process_barrier import NUMBER, WAKE, WORDS, Meeting, present_core
@@ -122,7 +122,7 @@ def _read(fd: int, size: int) -> Any:
 
 def describe(error: BaseException) -> dict[str, str]:
     """An exception in words, not too many: its class, its message, its traceback."""
-    text = "".join(traceback.format_exception(error))[-MAX_TRACEBACK:]
+    text = traceback_text(error)[-MAX_TRACEBACK:]
     message = str(error)[: MAX_TRACEBACK // 4]
     return {"kind": type(error).__name__, "text": message, "traceback": text}
 

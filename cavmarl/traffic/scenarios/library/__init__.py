@@ -25,6 +25,7 @@ import numpy as np
 from cavmarl.config.scenario import ScenarioConfig, path_of_code
 from cavmarl.core.errors import ConfigError, ScenarioError
 from cavmarl.core.math.rng import STREAM_PLACE, below, world_key
+from cavmarl.core.tracebacks import fault_in
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.traffic.scenarios.scene import Scene, checked
 from cavmarl.traffic.scenarios.streets import Streets
@@ -72,7 +73,7 @@ def _run(path: Path) -> ModuleType:
         spec.loader.exec_module(module)
     except Exception as error:  # the file is the user's: it may raise anything
         del sys.modules[spec.name]
-        raise ConfigError(f"{path}: {type(error).__name__}: {error}") from error
+        raise ConfigError(fault_in(path, error)) from error
     return module
 
 

@@ -1,0 +1,75 @@
+"""Exceptions in the code of users: each comes with its own place, and without frames of ours."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from io import StringIO
+from pathlib import Path
+
+import pytest
+
+from cavmarl.config.world_spec import WorldSpec
+from cavmarl.verify import lockstep
+from tests.cli.test_main import QUICK, refusal, run
+
+pytestmark = pytest.mark.integration  # a manifest asks git for the commit
+
+
+def policy_that(folder: Path, body: str) -> Path:
+    """A policy whose `act_batch`, in line 5, does something."""
+    script = folder / "mine.py"
+    script.write_text(
+        "from cavmarl import Policy\n\n"
+        "class Mine(Policy):\n"
+        "    def act_batch(self, observations, mask):\n"
+        f"        {body}\n\n"
+        "def make_policy(env):\n    return Mine(env)\n"
+    )
+    return script
+
+
+def _see_the_one_line(told: str) -> None:
+    assert told.count('  File "') == 1
+    assert 'mine.py", line 5, in act_batch' in told
+    assert "ZeroDivisionError" in told
+
+
+def test_a_fault_of_a_policy_shows_the_lines_of_the_policy(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    script = policy_that(tmp_path, "return 1 / 0")
+    words = ("evaluate", "ring", "--policy", str(script), "--episodes", "1", *QUICK)
+    assert run(*words, "--out", str(tmp_path / "out")) == 1
+    _see_the_one_line(capsys.readouterr().err)
+
+
+def test_one_that_is_no_common_exception_does_too(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    script = policy_that(tmp_path, "raise BaseException('ZeroDivisionError')")
+    words = ("evaluate", "ring", "--policy", str(script), "--episodes", "1", *QUICK)
+    assert run(*words, "--out", str(tmp_path / "out")) == 1
+    _see_the_one_line(capsys.readouterr().err)
+
+
+def test_a_fault_of_a_policy_in_a_process_of_verify_determinism_does_too(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    script = policy_that(tmp_path, "return 1 / 0")
+    spec = WorldSpec.of("ring", agents=2, background=2)
+    job = {"spec": asdict(spec), "policy": str(script), "steps": 1}
+    monkeypatch.setattr("sys.stdin", StringIO(json.dumps(job) + "\n\n"))
+    with pytest.raises(SystemExit) as ended:
+        lockstep._main()
+    assert ended.value.code == 1
+    _see_the_one_line(capsys.readouterr().err)
+
+
+def test_actions_that_cannot_be_taken_name_their_driver(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    script = policy_that(tmp_path, "return observations[0]")
+    words = ("evaluate", "ring", "--policy", str(script), "--episodes", "1", *QUICK)
+    said = refusal(capsys, *words, "--out", str(tmp_path / "out"))
+    assert "mine.py: actions have shape" in said
