@@ -101,7 +101,7 @@ class Simulation(WorldViews):
         )
         self._shards = self._tick.shards
         if warm:
-            with compiling_all():
+            with compiling_all(), self.unheard():
                 self._call_every_kernel()
         self._add_sumo()
         self._add_coordinators(runs)

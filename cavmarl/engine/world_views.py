@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import numpy as np
@@ -67,6 +68,11 @@ class WorldViews:
             if isinstance(part, Messaging):
                 return part.bus
         raise ConfigError("no messages are sent here: set v2x.enabled to true")
+
+    def unheard(self) -> AbstractContextManager[None]:
+        """The time in which no network simulator is asked; see `Bus.unheard`."""
+        buses = (part.bus for part in self._tick.attached if isinstance(part, Messaging))
+        return next((bus.unheard() for bus in buses), nullcontext())
 
     @property
     def gate(self) -> Gate:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 import cavmarl.core.errors
 from cavmarl.balance.balance_plan import Plan
 from cavmarl.balance.plan_text import describe_plan
+from cavmarl.config.v2x import V2xConfig
 from cavmarl.core.errors import CavmarlError, ConfigError, WorkerDeathError, WorkerFailureError
 from cavmarl.parallel.hosts.host_pool import HostPool
 from cavmarl.parallel.mover import Mover
@@ -22,6 +23,7 @@ from cavmarl.parallel.step_placement import StepPlacement
 from cavmarl.parallel.work_shares import Part
 from cavmarl.parallel.worlds_job import Task
 from cavmarl.shards.shard import Commands
+from cavmarl.v2x.v2x_messages import NetworkSimulator
 
 ASKED_AT_ONCE = 500  # agents: an answer is one message
 
@@ -114,6 +116,9 @@ class OrderedWorlds(ABC):
     def load_worlds(self, saved: Sequence[bytes]) -> None:
         raise unsaved()
 
+    def connect_network(self, network: NetworkSimulator) -> None:
+        raise unconnected()
+
     def ticks(self) -> NDArray[np.int64]:
         return self.arrays.ticks.copy()
 
@@ -157,6 +162,20 @@ def unsaved() -> ConfigError:
     """What saving worlds on other machines ends in."""
     return ConfigError(
         "hosts: worlds on the machines of a cluster are not saved; use workers of this machine"
+    )
+
+
+def refuse_external(v2x: V2xConfig) -> None:
+    """Refuse what asks a part of the caller's process in each tick."""
+    if v2x.enabled and v2x.channel.external:
+        raise unconnected()
+
+
+def unconnected() -> ConfigError:
+    """What connecting a network simulator to worlds in workers ends in."""
+    return ConfigError(
+        "v2x.channel.external: a network simulator is in the caller's process, and worlds over "
+        "workers do not ask it; use workers=0, or nodes"
     )
 
 

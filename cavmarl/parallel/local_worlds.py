@@ -29,6 +29,7 @@ from cavmarl.parallel.step_arrays import Driven, StepArrays, layout_of
 from cavmarl.sensors.registry import frame_layout
 from cavmarl.shards.shard import Commands
 from cavmarl.traffic.sumo.sumo_history import ToldLog
+from cavmarl.v2x.v2x_messages import NetworkSimulator
 
 
 class LocalWorlds:
@@ -265,6 +266,10 @@ class LocalWorlds:
         make, parts = self.__reduce__()
         copied: LocalWorlds = make(*parts)
         return copied
+
+    def connect_network(self, network: NetworkSimulator) -> None:
+        """From now on let a network simulator decide receptions; errors as of `Bus.connect`."""
+        self.simulation.messages.connect(network)
 
     def keep_logs(self) -> tuple[ToldLog, ...]:
         """Keep what SUMO is told, which `load` needs: one log a world; see `SumoTraffic`."""

@@ -14,7 +14,7 @@ from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
 from cavmarl.parallel.checkpoint.checkpoint_log import make_segments
 from cavmarl.parallel.checkpoint.world_bytes import SavedWorlds
-from cavmarl.parallel.commanded_worlds import OrderedWorlds, own_error
+from cavmarl.parallel.commanded_worlds import OrderedWorlds, own_error, refuse_external
 from cavmarl.parallel.journaled_worlds import check_watched, is_watched, runs_as_text, unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.mover import Mover, MovingMemory
@@ -52,6 +52,7 @@ class PooledWorlds(OrderedWorlds):
         self.world = world
         self.in_next_step = in_next_step
         config = world.config
+        refuse_external(config.v2x)
         self.placement = StepPlacement(world, num_worlds, workers)
         parts = parts_of(self.placement.plans, world.partition.count)
         may_change = bool(config.workers.balance_steps) and workers > 1 and self.placement.in_row

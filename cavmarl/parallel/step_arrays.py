@@ -17,6 +17,7 @@ from cavmarl.parallel.processes.shared_memory import Layout
 from cavmarl.sensors.mounted.frames import Frames
 from cavmarl.sensors.registry import frame_layout, frames_in
 from cavmarl.shards.shard import Commands
+from cavmarl.v2x.v2x_messages import NetworkSimulator
 
 FINAL_FRAMES = "final_rig."  # begins their names in a layout
 
@@ -164,6 +165,10 @@ class SteppedWorlds(Protocol):
 
     def load_worlds(self, saved: Sequence[bytes]) -> None:
         """Go on from what `save_worlds` gave; `arrays` stay as they are."""
+        ...
+
+    def connect_network(self, network: NetworkSimulator) -> None:
+        """From now on let a network simulator decide receptions (`v2x.channel.external`)."""
         ...
 
     def close(self) -> None: ...

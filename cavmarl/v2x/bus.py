@@ -8,6 +8,7 @@ is divided.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,9 +49,11 @@ from cavmarl.v2x.kernels.v2x_records import (
     V2xScratch,
 )
 from cavmarl.v2x.v2x_messages import (
+    RECEPTION,
     Exchange,
     NetworkSimulator,
     cause_code,
+    check_external,
     check_receptions,
     make_units,
 )
@@ -111,9 +114,17 @@ class Bus:
 
         Raises ConfigError: the channel is one of our own.
         """
-        if not self._config.channel.external:
-            raise ConfigError("the channel is our own: set v2x.channel.external to connect another")
+        check_external(self._config)
         self._network = network
+
+    @contextmanager
+    def unheard(self) -> Iterator[None]:
+        """The time in which no network simulator is asked, and no station receives anything."""
+        before, self._network = self._network, _Silence()
+        try:
+            yield
+        finally:
+            self._network = before
 
     def watch(self, watch: Watch) -> None:
         """Tell one more, from now on, what is sent in each tick; again in a tick begun again."""
@@ -218,6 +229,13 @@ class Bus:
     def statistics(self, world: int = 0) -> V2xStatistics:
         """What has become of the messages of a world since its reset."""
         return statistics_of(self.mail, world, self._dt_s)
+
+
+class _Silence:
+    """A network simulator by which nothing is received."""
+
+    def exchange(self, sent: Exchange) -> NDArray[np.void]:
+        return np.zeros(0, RECEPTION)
 
 
 def _make_sending(v2x: V2xConfig, dt: float) -> Sending:

@@ -31,7 +31,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config.v2x import EVERY_SIGNAL, RoadsideConfig
+from cavmarl.config.v2x import EVERY_SIGNAL, RoadsideConfig, V2xConfig
 from cavmarl.core.errors import ConfigError, MessageError
 from cavmarl.core.records import record
 from cavmarl.roads.network import RoadNetwork
@@ -243,6 +243,12 @@ class NetworkSimulator(Protocol):
         Returns RECEPTION (n,): what is received now, of this tick's packets or of earlier ones.
         """
         ...
+
+
+def check_external(v2x: V2xConfig) -> None:
+    """Refuse to connect a network simulator where none is asked."""
+    if not (v2x.enabled and v2x.channel.external):
+        raise ConfigError("the channel is our own: set v2x.channel.external to connect another")
 
 
 def check_receptions(

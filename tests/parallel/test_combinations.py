@@ -6,14 +6,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from cavmarl import CavVectorEnv
 from cavmarl.core.errors import ConfigError
+from cavmarl.v2x.v2x_messages import RECEPTION, Exchange
 from tests.support.actuated import actuated_grid
 from tests.support.generated import check_block, table
 from tests.support.rerouting import CARS, DEVICE, FLOW, make_map, write_demand
 from tests.support.sumo_worlds import write_stops
-from tests.support.vec_runs import Make, drive, same
+from tests.support.vec_runs import Make, Run, drive, same
 
 pytestmark = pytest.mark.filterwarnings("ignore:workers = ")
 
@@ -61,6 +65,9 @@ FEATURES: dict[str, Callable[[Path], Keywords]] = {
     "delayed commands": _with(clock__control_latency_ticks=2),
     "mounted sensors": _with(rig="ten_sensors", observation__mode="sensors"),
     "messages": _with(v2x__enabled=True),
+    "a network simulator": _with(
+        v2x__enabled=True, v2x__channel__external=True, sensors__messages__objects=4
+    ),
     "a scenario": lambda folder: {
         **_with(scenario__name="unprotected_left_turn")(folder),
         "agents": 1,
@@ -79,6 +86,7 @@ FEATURES: dict[str, Callable[[Path], Keywords]] = {
     "repartitions": _with(zones__repartition_steps=3),
     "planned faults": _faults,
     "holding before borders": _with(zones__policy="hold", zones__grace_ticks=3),
+    "turning away from borders": _with(zones__policy="reroute", zones__grace_ticks=3),
 }
 PLACES: dict[str, Keywords] = {
     "zones": {"zones": 3},
@@ -92,15 +100,33 @@ ONLY_DIVIDED = (
     "workers.balance_steps", "zones.policy", "zones.grace_ticks",
 )  # fmt: skip
 OF_ONE_WORLD = "of one world over"
+OF_THE_CALLER = "a network simulator is in the caller's process"
 NOT_OVER_NODES = "worlds over nodes do not have it"
 REFUSED = {
+    ("a network simulator", "workers"): OF_THE_CALLER,
+    ("a network simulator", "zones over workers"): OF_THE_CALLER,
     ("a journal", "zones over workers"): OF_ONE_WORLD,
     ("planned faults", "zones over workers"): OF_ONE_WORLD,
     ("repartitions", "zones over workers"): "needs zones that stay",
     ("sensor workers", "nodes"): NOT_OVER_NODES,
     ("planned faults", "nodes"): NOT_OVER_NODES,
-    ("holding before borders", "nodes"): NOT_OVER_NODES,
 }
+
+
+class _Odd:
+    """A network simulator: receivers hear vehicles of odd ids."""
+
+    def exchange(self, sent: Exchange) -> NDArray[np.void]:
+        odd = np.flatnonzero(sent.packets["sender"] % 2).tolist()
+        pairs = [(sent.tick, n, r) for n in odd for r in range(len(sent.receivers))]
+        return np.array(pairs, dtype=RECEPTION)
+
+
+def _run(vec: CavVectorEnv) -> Run:
+    v2x = vec.config.v2x
+    if v2x.enabled and v2x.channel.external:
+        vec.worlds.connect_network(_Odd())
+    return drive(vec, steps=8)
 
 
 def check(make: Make, folder: Path, feature: str, place: str) -> None:
@@ -114,8 +140,8 @@ def check(make: Make, folder: Path, feature: str, place: str) -> None:
     plain = {name: value for name, value in overrides.items() if name not in ONLY_DIVIDED}
     alone = {**keywords, "overrides": plain, "num_envs": where.get("num_envs", 1)}
     alone.pop("sensor_workers", None)
-    whole = drive(make(**alone), steps=8)
-    assert same(drive(make(**keywords, **where), steps=8), whole)
+    whole = _run(make(**alone))
+    assert same(_run(make(**keywords, **where)), whole)
 
 
 @pytest.mark.parametrize("feature", FEATURES)

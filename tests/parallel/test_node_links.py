@@ -46,14 +46,14 @@ def frame(kind: FrameKind, data: bytes) -> bytes:
 
 def head(kind: int, size: int) -> bytes:
     """The head of a first frame."""
-    found = b"cavN\x03\x00" + kind.to_bytes(2, "little") + bytes(8) + size.to_bytes(8, "little")
+    found = b"cavN\x04\x00" + kind.to_bytes(2, "little") + bytes(8) + size.to_bytes(8, "little")
     found += bytes(4)
     return found + zlib.crc32(found, 1).to_bytes(4, "little")
 
 
 def test_the_bytes_of_a_frame() -> None:
     assert frame(FrameKind.PING, b"abc").hex() == (
-        "6361764e03000d0007000000000000000300000000000000c2412435" + "0a522abc" + b"abc".hex()
+        "6361764e04000d0007000000000000000300000000000000c2412435" + "7d65328d" + b"abc".hex()
     )
 
 

@@ -18,7 +18,7 @@ from cavmarl.engine.compilation import compiled_before
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
 from cavmarl.parallel.checkpoint.world_states import WorldMove, buffers, moves_of
-from cavmarl.parallel.commanded_worlds import OrderedWorlds, own_error
+from cavmarl.parallel.commanded_worlds import OrderedWorlds, own_error, refuse_external
 from cavmarl.parallel.hosts.host_commands import Arrays, HostProgram
 from cavmarl.parallel.hosts.host_pool import HostPool
 from cavmarl.parallel.hosts.host_process import code_stamp
@@ -59,6 +59,7 @@ class RemoteWorlds(OrderedWorlds):
         self.world = world
         self.in_next_step = in_next_step
         config = world.config
+        refuse_external(config.v2x)
         refuse_watched(
             config.zones, "of worlds on hosts", "run them on this machine; leave out hosts"
         )

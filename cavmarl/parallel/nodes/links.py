@@ -28,7 +28,7 @@ from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 
 MAGIC = b"cavN"
-VERSION = 3
+VERSION = 4
 MAX_FRAME = 1 << 32
 _ALL = (1 << 32) - 1
 _HEAD = struct.Struct("<4sHHQQI")
@@ -72,6 +72,8 @@ class FrameKind(IntEnum):
     GIVE = 21  # N → N: the state of zones that another node hosts from now on
     NOT_MINE = 22  # N → C: agents whose actions have come to the wrong node, and their owners
     ACTIONS = 23  # C → N: those
+    EXCHANGE = 24  # N → C: messages that are sent, for a network simulator
+    RECEPTIONS = 25  # C → N: which of them are received where
 
 
 class NodeFrame(NamedTuple):
@@ -94,6 +96,8 @@ URGENT = frozenset(
         FrameKind.GIVE,
         FrameKind.NOT_MINE,
         FrameKind.ACTIONS,
+        FrameKind.EXCHANGE,
+        FrameKind.RECEPTIONS,
     }
 )
 Urgent: TypeAlias = Callable[[int, NodeFrame], None]

@@ -62,6 +62,7 @@ class NodeCommand(NamedTuple):
     ticks: int  # of the worlds
     actions: Actions | None = None  # of a step
     cut: ZoneRects | None = None  # zones that the worlds have from then on
+    receptions: list[bytes] | None = None  # what a network simulator has said so far, in a step
 
     def of_node(self, number: int, owner: NDArray[np.int32]) -> list[Bytes]:
         """The pieces of the frame that a node gets."""

@@ -36,6 +36,7 @@ from cavmarl.parallel.nodes.node_executor import NodeExecutor
 from cavmarl.parallel.nodes.node_files import WorldFile, recipe_with
 from cavmarl.parallel.nodes.node_frames import command_of, results_of, saved_of, worlds_payload
 from cavmarl.parallel.nodes.node_loads import told_of
+from cavmarl.parallel.nodes.node_network import AskedNetwork
 from cavmarl.parallel.nodes.node_peers import NodePeers
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.nodes.zone_hosts import ZoneHosts, hosting_of
@@ -59,6 +60,7 @@ class NodeProgram:
         self._system, self._links = system, links
         self._address = address  # of this machine, as the caller reaches it
         self._secret = secret
+        self._network: AskedNetwork | None = None
         self._number = -1  # until the caller has said it
         self._generation = 0
         self._actions: deque[NodeFrame] = deque()  # that have been sent here after all
@@ -81,6 +83,9 @@ class NodeProgram:
         )
         self._commands = commands_of(worlds.arrays)
         worlds.keep_logs()
+        v2x = worlds.world.config.v2x
+        if v2x.enabled and v2x.channel.external:
+            self._network = AskedNetwork(links, worlds.simulation.messages)
         self._listener = self._system.listen(self._address, self._secret)
         said = [*self._listener.place, *told_neighbours(worlds.simulation)]
         links.send(COORDINATOR, FrameKind.READY, 0, [json.dumps(said).encode()])
@@ -142,6 +147,8 @@ class NodeProgram:
             self._hosts.keep_agent(frame)
         elif frame.kind is FrameKind.ACTIONS:
             self._actions.append(frame)
+        elif frame.kind is FrameKind.RECEPTIONS and self._network is not None:
+            self._network.hear(frame)
         elif frame.kind is FrameKind.GIVE:
             self._kept.take_given(number, frame)
         elif frame.kind is FrameKind.PING:
@@ -201,6 +208,8 @@ class NodeProgram:
             self._kept = KeptStates(self._worlds, links, self._number)
             links.urgent = self._hear
         self._tells = told["first"] == self._number
+        if self._network is not None:
+            self._network.begin(frame.number, self._tells)
         for number in told["lost"]:
             links.drop(number)
         zones = told["zones"]

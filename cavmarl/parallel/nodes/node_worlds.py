@@ -14,7 +14,7 @@ from cavmarl.balance.balance_plan import Plan
 from cavmarl.balance.load_score import Candidate, Utilisation
 from cavmarl.balance.load_snapshot import NO_GPU, LoadSnapshot
 from cavmarl.balance.probe import MEASURED
-from cavmarl.core.errors import ConfigError
+from cavmarl.core.errors import ConfigError, MessageError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
 from cavmarl.handoff.repartitioning import Recut
@@ -22,6 +22,7 @@ from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.parallel.commanded_worlds import uncopied
 from cavmarl.parallel.mover import Mover
+from cavmarl.parallel.nodes.links import FrameKind, NodeFrame
 from cavmarl.parallel.nodes.node_actions import UNOWNED, Actions, NodeCommand
 from cavmarl.parallel.nodes.node_cuts import read_zones
 from cavmarl.parallel.nodes.node_frames import (
@@ -32,12 +33,14 @@ from cavmarl.parallel.nodes.node_frames import (
     worlds_payload,
 )
 from cavmarl.parallel.nodes.node_loads import OF_MACHINE, NodeLoad, since
+from cavmarl.parallel.nodes.node_network import NetworkFailedError, answer_of, read_asked
 from cavmarl.parallel.nodes.node_pool import NodePool
 from cavmarl.parallel.nodes.node_starters import LocalNodes, Route, Start, start_nodes, straight
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.step_arrays import Driven
 from cavmarl.parallel.worlds_job import Task
 from cavmarl.shards.shard import Commands
+from cavmarl.v2x.v2x_messages import NetworkSimulator, check_external
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
 PLANNED = (
@@ -79,6 +82,8 @@ class NodeWorlds(NodePool):
         self._ticks_done = self._ticks_told = 0
         self.recuts: list[Recut] = []
         self._steps = 0
+        self._network: NetworkSimulator | None = None
+        self._exchanged = 0  # answers of it that nodes have got in the present command
         self._told: dict[int, list[Any]] = {}  # what nodes have said of themselves last
         self.mover = Mover(self._placement, count, every, self._spent_s) if every else None
 
@@ -116,6 +121,45 @@ class NodeWorlds(NodePool):
             self.run(self._command(Task.CUT, zones))
             self.recuts.append(Recut(self._steps - 1, *figures))
 
+    def connect_network(self, network: NetworkSimulator) -> None:
+        """From now on let a network simulator of this process decide receptions.
+
+        Raises:
+            ConfigError: the channel is one of our own.
+        """
+        check_external(self.world.config.v2x)
+        self._network = network
+
+    def run(self, command: NodeCommand) -> list[memoryview]:
+        try:
+            return super().run(command)
+        except NetworkFailedError as failed:
+            raise failed.error from None
+
+    def _perform(self, command: NodeCommand) -> list[memoryview]:
+        self._exchanged = 0
+        return super()._perform(command)
+
+    def _hear(self, number: int, frame: NodeFrame) -> None:
+        if frame.kind is not FrameKind.EXCHANGE:
+            super()._hear(number, frame)
+        elif frame.number == self._generation:
+            self._exchange(frame)
+
+    def _exchange(self, frame: NodeFrame) -> None:
+        """Tell all nodes what stations receive; of a step that is done again, what they did."""
+        known = None if self._performed is None else self._performed.receptions
+        if known is None:
+            raise MessageError("messages are sent where no step is taken")
+        if self._exchanged == len(known):
+            latency = self.world.config.v2x.channel.latency_ticks
+            asked = read_asked(frame.data, len(self.arrays.mask), latency)
+            known.append(answer_of(self._network, asked))
+        for node in self._living:
+            answer = known[self._exchanged]
+            self._links.send(node, FrameKind.RECEPTIONS, self._generation, [answer])
+        self._exchanged += 1
+
     def _measured(self) -> dict[int, int]:
         """Ask what zones have cost, before they are balanced by it; a number for each node."""
         for data in self.run(self._command(Task.HOST)):
@@ -141,7 +185,8 @@ class NodeWorlds(NodePool):
         pieces = [bytes(piece) for piece in pieces_of(task, payload, self.arrays)]
         if task != Task.STEP:
             return NodeCommand(pieces, changes, 0, cut=payload if task == Task.CUT else None)
-        return NodeCommand(pieces, changes, self._ticks_per_step, Actions.of(self.arrays))
+        actions = Actions.of(self.arrays)
+        return NodeCommand(pieces, changes, self._ticks_per_step, actions, receptions=[])
 
     def _write(self, results: Sequence[memoryview], of_step: bool) -> None:
         arrays = self.arrays
@@ -272,18 +317,8 @@ def check_nodes(world: World, nodes: int) -> None:
             "more zones or fewer nodes"
         )
     refused = {
-        "v2x.channel.external": (
-            config.v2x.enabled and config.v2x.channel.external,
-            "the channel is a function of the caller's process, and messages are worked out at the "
-            "nodes",
-        ),
         "zones.faults": (config.zones.faults, PLANNED),
         "zones.reproducers": (config.zones.reproducers, PLANNED),
-        "zones.policy": (
-            config.zones.policy if config.zones.holds else "",
-            "a tick waits for all acknowledgements, and a node that does not answer is replaced, "
-            "so no vehicle has a cause to wait; use force or extend",
-        ),
         "workers.sensors": (
             config.workers.sensors,
             "each node senses for its own vehicles; use more nodes in place of sensor workers",

@@ -1,0 +1,123 @@
+"""A network simulator of the caller that decides what messages stations of nodes receive.
+
+All nodes work out alike which packets are sent. In each tick the one that tells what all know alike
+asks the caller, which asks the simulator and sends the answer to all. It is kept with the command:
+nodes that go back and do a step again get it once more, and the simulator is not asked again.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import ConfigError, MessageError
+from cavmarl.ownership.messages import COORDINATOR
+from cavmarl.parallel.nodes.links import Bytes, FrameKind, Links, NodeFrame
+from cavmarl.v2x.bus import Bus
+from cavmarl.v2x.kernels.v2x_records import PACKET, RECEIVER
+from cavmarl.v2x.v2x_messages import RECEPTION, Exchange, NetworkSimulator, check_receptions
+
+_HEAD = struct.Struct("<QQQQ")
+
+
+class NetworkFailedError(Exception):
+    """The simulator has failed, or answers what cannot be; no node is at fault.
+
+    Attributes:
+        error: what the caller of a step gets.
+    """
+
+    def __init__(self, error: Exception) -> None:
+        super().__init__(str(error))
+        self.error = error
+
+
+class AskedNetwork:
+    """The simulator as the bus of a node sees it; a `NetworkSimulator`."""
+
+    def __init__(self, links: Links, bus: Bus) -> None:
+        self._links, self._bus = links, bus
+        self._generation = 0
+        self._tells = False
+        self._heard: deque[NodeFrame] = deque()
+        bus.connect(self)
+
+    def begin(self, generation: int, tells: bool) -> None:
+        """Go on after nodes have come or gone; one of them asks for all."""
+        self._generation, self._tells = generation, tells
+
+    def hear(self, frame: NodeFrame) -> None:
+        self._heard.append(frame)
+
+    def exchange(self, sent: Exchange) -> NDArray[np.void]:
+        """See `NetworkSimulator.exchange`.
+
+        Raises:
+            RecoveryOrderedError: the coordinator wants something else by now.
+        """
+        links = self._links
+        if self._tells:
+            asked = asked_of(sent, self._bus.mail.num_packets[sent.world])
+            links.send(COORDINATOR, FrameKind.EXCHANGE, self._generation, asked)
+        while True:
+            while self._heard:
+                frame = self._heard.popleft()
+                if frame.number == self._generation:
+                    return np.frombuffer(frame.data, RECEPTION)
+            links.heed()
+            links.pump(None)
+
+
+class Asked(NamedTuple):
+    """What a simulator is asked, and what its answer is checked by."""
+
+    exchange: Exchange
+    num_packets: NDArray[np.int64]  # in flight, as `check_receptions` has it
+
+
+def asked_of(sent: Exchange, num_packets: NDArray[np.int64]) -> list[Bytes]:
+    """The same as the pieces of a frame."""
+    arrays = (num_packets, sent.packets, sent.receivers)
+    head = _HEAD.pack(sent.world, sent.tick, len(sent.packets), len(sent.receivers))
+    return [head, *(np.ascontiguousarray(array).tobytes() for array in arrays)]
+
+
+def read_asked(data: memoryview, num_worlds: int, latency_ticks: int) -> Asked:
+    """The same, read. Raises MessageError: it is none."""
+    slots, at = latency_ticks + 1, _HEAD.size + 8 * (latency_ticks + 1)
+    if len(data) < at:
+        raise MessageError(f"an exchange of {len(data)} bytes is none")
+    world, tick, packets, receivers = _HEAD.unpack_from(data)
+    size = at + packets * PACKET.itemsize + receivers * RECEIVER.itemsize
+    if world >= num_worlds or len(data) != size:
+        raise MessageError(f"an exchange of {len(data)} bytes about world {world} is none")
+    sent = Exchange(
+        world,
+        tick,
+        np.frombuffer(data, PACKET, packets, at),
+        np.frombuffer(data, RECEIVER, receivers, at + packets * PACKET.itemsize),
+    )
+    return Asked(sent, np.frombuffer(data, np.int64, slots, _HEAD.size))
+
+
+def answer_of(network: NetworkSimulator | None, asked: Asked) -> bytes:
+    """What the simulator says.
+
+    Raises:
+        NetworkFailedError: there is none, or it fails, or answers what cannot be.
+    """
+    sent = asked.exchange
+    try:
+        if network is None:
+            raise ConfigError(
+                "v2x.channel.external: connect a network simulator before the first step "
+                "(worlds.connect_network)"
+            )
+        latency = len(asked.num_packets) - 1
+        return check_receptions(network.exchange(sent), sent, latency, asked.num_packets).tobytes()
+    except Exception as error:
+        raise NetworkFailedError(error) from error

@@ -1,0 +1,158 @@
+"""A network simulator of the caller beside worlds over nodes gives the bytes of one process."""
+
+from __future__ import annotations
+
+import os
+import signal
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cavmarl import ConfigError, make_vec
+from cavmarl.core.errors import MessageError
+from cavmarl.env.vector import CavVectorEnv
+from cavmarl.parallel.nodes.node_network import asked_of, read_asked
+from cavmarl.parallel.nodes.node_worlds import NodeWorlds
+from cavmarl.v2x.kernels.v2x_records import PACKET, RECEIVER
+from cavmarl.v2x.v2x_messages import RECEPTION, Exchange
+from tests.support.vec_runs import Make, drive, same
+
+EXTERNAL = {"v2x.enabled": True, "v2x.channel.external": True, "v2x.channel.latency_ticks": 2}
+WANTED: dict[str, Any] = {"env": "grid4x4", "agents": 6, "background": 30, "max_cycles": 10}
+
+
+class Delayed:
+    """Delivers packets after 0 to 2 ticks, by its own memory of what was sent; counts calls."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+        self._due: dict[tuple[int, int], list[tuple[int, int, int]]] = {}
+
+    def exchange(self, sent: Exchange) -> NDArray[np.void]:
+        self.calls += 1
+        if sent.tick == 1:
+            self._due = {key: due for key, due in self._due.items() if key[0] != sent.world}
+        for n, packet in enumerate(sent.packets):
+            for r in np.flatnonzero(sent.receivers["id"] >= 0).tolist():
+                late = int(packet["sender"] + r + sent.tick) % 4
+                if late < 3:
+                    due = self._due.setdefault((sent.world, sent.tick + late), [])
+                    due.append((sent.tick, n, r))
+        return np.array(self._due.pop((sent.world, sent.tick), []), dtype=RECEPTION)
+
+
+def with_network(make: Make, network: Any, **more: Any) -> CavVectorEnv:
+    vec = make(**{**WANTED, **more, "overrides": EXTERNAL | more.get("overrides", {})})
+    vec.worlds.connect_network(network)
+    return vec
+
+
+def over_nodes(vec: CavVectorEnv) -> NodeWorlds:
+    assert isinstance(vec.worlds, NodeWorlds)
+    return vec.worlds
+
+
+@pytest.mark.parametrize("more", [{"num_envs": 2}, {"overrides": {"zones.repartition_steps": 3}}])
+def test_what_is_received_is_what_one_process_receives(make: Make, more: dict[str, Any]) -> None:
+    here, there = Delayed(), Delayed()
+    alone = {**more, "overrides": {}}
+    whole = drive(with_network(make, here, **alone))
+    assert same(drive(with_network(make, there, zones=4, nodes=3, **more)), whole)
+    assert here.calls == there.calls > 20
+    silent = drive(with_network(make, Nothing(), **alone))
+    assert not same(silent, whole)
+
+
+class Nothing:
+    """No station receives anything."""
+
+    def exchange(self, sent: Exchange) -> NDArray[np.void]:
+        return np.zeros(0, RECEPTION)
+
+
+def test_a_step_that_is_done_again_is_not_asked_again(make: Make) -> None:
+    here, there = Delayed(), Delayed()
+    whole = drive(with_network(make, here), steps=20)
+    vec = with_network(make, there, zones=4, nodes=3)
+    worlds = over_nodes(vec)
+
+    def strike(step: int) -> None:
+        if step in (4, 11):
+            os.kill(worlds.pids[0 if step == 4 else 1], signal.SIGKILL)
+
+    assert same(drive(vec, steps=20, before=strike), whole)
+    assert worlds.losses == 2
+    assert here.calls == there.calls
+
+
+class Failing(Delayed):
+    """Fails at one call, and goes on as if it had not been called."""
+
+    def __init__(self, at: int, how: Exception | NDArray[Any]) -> None:
+        super().__init__()
+        self._at, self._how = at, how
+
+    def exchange(self, sent: Exchange) -> NDArray[np.void]:
+        if self.calls == self._at:
+            self._at = -1
+            if isinstance(self._how, Exception):
+                raise self._how
+            return self._how
+        return super().exchange(sent)
+
+
+@pytest.mark.parametrize(
+    ("how", "error", "words"),
+    [
+        (OSError("it is gone"), OSError, "it is gone"),
+        (KeyError("a bug"), KeyError, "a bug"),
+        (np.array([(9, 0, 0)], RECEPTION), MessageError, "another tick than those"),
+        (np.zeros(3), MessageError, "dtype RECEPTION"),
+    ],
+)
+def test_a_simulator_that_fails_is_no_loss_of_nodes(
+    make: Make, how: Any, error: type[Exception], words: str
+) -> None:
+    vec = with_network(make, Failing(0, how), zones=2, nodes=2)
+    alone = with_network(make, Delayed())
+    for one in (vec, alone):
+        one.reset(seed=3)
+    actions = alone.suggest_actions()
+    with pytest.raises(error, match=words):
+        vec.step(actions)
+    for _ in range(4):
+        actions = alone.suggest_actions()
+        for one in (vec, alone):
+            one.step(actions)
+        assert vec.state_hash() == alone.state_hash()
+    assert over_nodes(vec).losses == 0
+
+
+def test_what_cannot_be_connected_is_refused(make: Make) -> None:
+    vec = make(**WANTED, zones=2, nodes=2, overrides=EXTERNAL)
+    vec.reset(seed=1)
+    with pytest.raises(ConfigError, match="connect a network simulator before the first step"):
+        vec.step(vec.suggest_actions())
+    vec.worlds.connect_network(Delayed())
+    vec.step(vec.suggest_actions())
+    own = make(**WANTED, zones=2, nodes=2, overrides={"v2x.enabled": True})
+    with pytest.raises(ConfigError, match="the channel is our own"):
+        own.worlds.connect_network(Delayed())
+    with pytest.raises(ConfigError, match="use workers=0, or nodes"):
+        make_vec("grid4x4", workers=1, overrides=EXTERNAL)
+
+
+def test_what_is_asked_goes_over_whole() -> None:
+    packets, receivers = np.zeros(3, PACKET), np.zeros(2, RECEIVER)
+    packets["sender"], receivers["id"] = [4, 5, 6], [7, -1]
+    pieces = asked_of(Exchange(1, 12, packets, receivers), np.array([3, 0, 2]))
+    data = memoryview(b"".join(map(bytes, pieces)))
+    sent, num_packets = read_asked(data, 2, 2)
+    assert (sent.world, sent.tick, num_packets.tolist()) == (1, 12, [3, 0, 2])
+    assert sent.packets.tobytes() == packets.tobytes()
+    assert sent.receivers.tobytes() == receivers.tobytes()
+    for worlds, cut in ((1, len(data)), (2, len(data) - 1), (2, 20)):
+        with pytest.raises(MessageError, match="an exchange"):
+            read_asked(data[:cut], worlds, 2)
