@@ -13,8 +13,8 @@ SITE := .venv-docs
 OLDEST_WARNINGS := -W default::DeprecationWarning -W default::PendingDeprecationWarning
 OLDEST_TESTS := tests/core tests/driving tests/engine tests/handoff tests/rewards tests/roads tests/sensors \
     tests/traffic tests/v2x tests/zones tests/config tests/env/test_registration.py \
-    tests/env/test_parallel_env.py tests/env/test_vector_env.py tests/parallel/test_worker_pool.py \
-    tests/test_bad_input.py tests/test_public_api.py tests/adapters
+    tests/env/test_parallel_env.py tests/env/test_vector_env.py tests/parallel/test_worker_pool.py tests/parallel/test_pool_resources.py \
+    tests/test_bad_input.py tests/test_bad_input_files.py tests/test_public_api.py tests/adapters
 LIBRARIES_TESTS := tests/adapters tests/train/test_programs.py
 # Compiled by one process before two of them run tests.
 KERNELS := -c 'from cavmarl import make_vec; make_vec("grid4x4", workers=1).close()'

@@ -18,6 +18,7 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import load_world
 from cavmarl.evaluate.driven_worlds import DrivenWorld
+from cavmarl.v2x.bus import V2xStatistics
 
 # As exponent and spread that of Cheng et al. (JSAC 2007) in a suburb; the air as of IEEE 802.11p.
 CHANNELS: Mapping[str, Mapping[str, Any]] = {
@@ -81,17 +82,7 @@ def measure(
         {"name": "the world's own tick", "median_ms": median(world_ms[warmup:])}
     ]
     for name, (bus, _) in buses.items():
-        found, taken = bus.statistics(), bus_ms[name][warmup:]
-        rows.append(
-            {
-                "name": name,
-                "tick_ms": taken,
-                "median_ms": median(taken),
-                "reachable": found.reachable / (warmup + ticks),
-                "reception_ratio": found.reception_ratio,
-                "busy_ratio": found.busy_mean,
-            }
-        )
+        rows.append(_row(name, bus.statistics(), bus_ms[name], warmup))
     mean, rate_hz = fmean(running[warmup:]), config.v2x.cam.rate_hz
     return Report(
         f"{env}: {mean:,.0f} vehicles at {rate_hz:g} Hz, up to {receivers:,} of them receive; "
@@ -107,6 +98,18 @@ def measure(
         facts={"env": env, "vehicles": mean, "receivers": receivers, "rate_hz": rate_hz},
         holds=at_most is None or max(row["median_ms"] for row in rows[1:]) <= at_most,
     )
+
+
+def _row(name: str, found: V2xStatistics, every_ms: list[float], warmup: int) -> dict[str, Any]:
+    taken = every_ms[warmup:]
+    return {
+        "name": name,
+        "tick_ms": taken,
+        "median_ms": median(taken),
+        "reachable": found.reachable / len(every_ms),
+        "reception_ratio": found.reception_ratio,
+        "busy_ratio": found.busy_mean,
+    }
 
 
 def _timed_ms(step: Callable[[], None]) -> float:

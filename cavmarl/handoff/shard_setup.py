@@ -50,10 +50,7 @@ def divide(
     """
     settings, dt = config.zones, config.clock.sim_dt_s
     if settings.holds and traffic.sumo is not None:
-        raise ConfigError(
-            f"zones.policy = {settings.policy!r}: vehicles that SUMO moves cannot be held before a "
-            "border; use force or extend, or a demand that is driven here"
-        )
+        raise _not_held(settings)
     radius_m = largest_radius_m(traffic.travel.types)
     sensing_m = max(
         terms_reach_m(config.terms),
@@ -104,6 +101,13 @@ def divide(
         may_teleport=traffic.sumo is not None,
     )
     return shards, division
+
+
+def _not_held(zones: ZonesConfig) -> ConfigError:
+    return ConfigError(
+        f"zones.policy = {zones.policy!r}: vehicles that SUMO moves cannot be held before a "
+        "border; use force or extend, or a demand that is driven here"
+    )
 
 
 def halo_m(

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from itertools import accumulate, pairwise
+from itertools import accumulate, chain, pairwise
 from pathlib import Path
 from typing import Any
 
+from cavmarl.config.env import EnvConfig
+from cavmarl.config.workers import WorkersConfig
 from cavmarl.core.errors import ConfigError, WorkerError, WorkerFailureError
 from cavmarl.engine.compilation import compiled_before
 from cavmarl.engine.simulation import Simulation
@@ -57,14 +59,7 @@ class PooledWorlds(OrderedWorlds):
         parts = parts_of(self.placement.plans, world.partition.count)
         may_change = bool(config.workers.balance_steps) and workers > 1 and self.placement.in_row
         check_watched(world, parts, may_change)
-        cores = len(usable_cores())
-        if workers > cores:
-            warnings.warn(
-                f"workers = {workers}: there are {cores} cores; more workers than cores do not "
-                "make it faster",
-                RuntimeWarning,
-                stacklevel=4,
-            )
+        _warn_of_few_cores(workers)
         if not compiled_before():
             LocalWorlds(unwatched(world), 1, warm=True)
         capacity = world.capacity
@@ -79,20 +74,9 @@ class PooledWorlds(OrderedWorlds):
         may_change = self.mover is not None and self.placement.in_row
         if may_change and config.workers.sensors:
             segment.close()
-            raise ConfigError(
-                f"workers.balance_steps = {config.workers.balance_steps} with workers.sensors = "
-                f"{config.workers.sensors}: sensor workers belong to the worlds of one worker, "
-                "which would change; leave one of the two 0"
-            )
+            raise _sensors_belong_to_a_worker(config.workers)
         warn_if_crowded(config.workers.sensors, len(parts))
-        checkpoint_logs = [
-            []
-            if may_change
-            else [Segment.make(0)]
-            if is_watched(config.zones)
-            else make_segments(config, part.last - part.first)
-            for part in parts
-        ]
+        logs = [_log_segments(config, part, may_change) for part in parts]
         saved = [Segment.make(0) for _ in parts]
         recipe = recipe_of(
             world,
@@ -102,9 +86,7 @@ class PooledWorlds(OrderedWorlds):
             arrays=segment.fd,
             in_next_step=in_next_step,
             parts=parts,
-            checkpoint_logs=[
-                [one.fd for one in checkpoint_log] for checkpoint_log in checkpoint_logs
-            ],
+            checkpoint_logs=[[one.fd for one in log] for log in logs],
             saved_worlds=[one.fd for one in saved],
             runs=runs_as_text(config.zones, num_worlds),
             mover=None if memory is None else memory.recipe,
@@ -112,12 +94,7 @@ class PooledWorlds(OrderedWorlds):
         leaders = [0, *accumulate(len(part.zones) for part in parts)]
         teams = tuple(tuple(range(*bounds)) for bounds in pairwise(leaders))
         moving = () if memory is None else memory.segments
-        segments = (
-            segment,
-            *(one for checkpoint_log in checkpoint_logs for one in checkpoint_log),
-            *moving,
-            *saved,
-        )
+        segments = (segment, *chain.from_iterable(logs), *moving, *saved)
         pins = config.workers.pin
         what = Program(program or PROGRAM, recipe, _names(parts), segments, TASK_NAMES, pins, teams)
         try:
@@ -168,6 +145,34 @@ class PooledWorlds(OrderedWorlds):
         number = range(len(self.arrays.mask))[world]
         payload = number if more is None else [number, more]
         return self.pool.ask(self._asked[number], task, payload)
+
+
+def _warn_of_few_cores(workers: int) -> None:
+    cores = len(usable_cores())
+    if workers > cores:
+        warnings.warn(
+            f"workers = {workers}: there are {cores} cores; more workers than cores do not make "
+            "it faster",
+            RuntimeWarning,
+            stacklevel=5,
+        )
+
+
+def _sensors_belong_to_a_worker(workers: WorkersConfig) -> ConfigError:
+    return ConfigError(
+        f"workers.balance_steps = {workers.balance_steps} with workers.sensors = "
+        f"{workers.sensors}: sensor workers belong to the worlds of one worker, which would "
+        "change; leave one of the two 0"
+    )
+
+
+def _log_segments(config: EnvConfig, part: Part, may_change: bool) -> list[Segment]:
+    """Memory for the checkpoints of a worker."""
+    if may_change:
+        return []
+    if is_watched(config.zones):
+        return [Segment.make(0)]
+    return make_segments(config, part.last - part.first)
 
 
 def _names(parts: list[Part]) -> tuple[str, ...]:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,106 +15,17 @@ from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.driving.kernels.announcing import STANDING_MPS
 from cavmarl.driving.kernels.junctions import _exit_blocked
 from cavmarl.driving.kernels.lane_index import index_lanes
-from cavmarl.engine.simulation import Simulation
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network
-from tests.support.driving import drive, make_traffic, start
+from tests.support.junction_scenes import Scene, build_crossing
 from tests.support.traffic import network as network_of
 from tests.support.traffic import on_lane, scratch, travel
-
-sumo = pytest.importorskip("sumo", reason="crossings are made by netconvert of the extra 'sumo'")
-
-ARM_M = 150
-NODES = {"W": (-ARM_M, 0), "E": (ARM_M, 0), "S": (0, -ARM_M), "N": (0, ARM_M)}
 
 
 @pytest.fixture(scope="module")
 def crossing(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """A west-east main road and a south-north side road that cross, by SUMO's type of the node."""
-    folder = tmp_path_factory.mktemp("crossings")
-
-    def build(kind: str) -> Path:
-        target = folder / f"{kind}.net.xml"
-        if target.exists():
-            return target
-        nodes = "".join(f'<node id="{n}" x="{x}" y="{y}"/>' for n, (x, y) in NODES.items())
-        edges = "".join(
-            f'<edge id="{arm}_{way}" from="{start}" to="{end}" speed="14" priority="{priority}"/>'
-            for arm, priority in (("W", 9), ("E", 9), ("S", 1), ("N", 1))
-            for way, start, end in (("in", arm, "c"), ("out", "c", arm))
-        )
-        (folder / "c.nod.xml").write_text(
-            f'<nodes>{nodes}<node id="c" x="0" y="0" type="{kind}"/></nodes>'
-        )
-        (folder / "c.edg.xml").write_text(f"<edges>{edges}</edges>")
-        binary = Path(sumo.SUMO_HOME) / "bin" / "netconvert"
-        command = [str(binary), "-n", "c.nod.xml", "-e", "c.edg.xml", "-o", target.name]
-        subprocess.run([*command, "--no-turnarounds"], cwd=folder, check=True, capture_output=True)
-        return target
-
-    return build
-
-
-class Scene:
-    """A crossing with the cars that were put on it; goes on tick by tick."""
-
-    def __init__(self, path: Path) -> None:
-        self.simulation: Simulation = make_traffic(
-            path, background=12, renewed=False, overrides={"clock.ctrl_dt_s": 0.05}
-        )
-        traffic = self.simulation._tick.traffic
-        vars(traffic)["demand"] = traffic.demand._replace(num_background=0)
-        start(self.simulation, seed=0)
-        self.names: list[str] = []
-
-    def put(self, name: str, lane: str, to_line_m: float, goal: str, **fields: Any) -> None:
-        """A car whose front is `to_line_m` before a lane's end and that drives to edge `goal`."""
-        network, worlds = self.simulation.network, self.simulation._shard.worlds
-        row = network.lane_ids.index(lane)
-        s = float(network.lanes[row]["length_m"]) - to_line_m - 2.5
-        goals = [network.edge_ids[edge] for edge in self.simulation.goal_edges[0]]
-        travel = self.simulation._tick.traffic.travel
-        car = on_lane(network, row, s, travel, goal=goals.index(goal), **fields)
-        plan = self.simulation._tick.traffic.plans[car[0]["goal"], row]
-        car["to_go"] = plan["to_go"] - s
-        car["id"] = self.simulation.gate.next_id[0]
-        self.simulation.gate.next_id[0] += 1
-        worlds.rows[0, worlds.num_owned[0]] = car[0]
-        worlds.num_owned[0] += 1
-        worlds.num_rows[0] += 1
-        self.names.append(name)
-
-    def clear(self) -> None:
-        """Take all cars out."""
-        worlds = self.simulation._shard.worlds
-        worlds.num_owned[0] = worlds.num_rows[0] = self.simulation.gate.next_id[0] = 0
-        self.names.clear()
-
-    def __getitem__(self, name: str) -> Any:
-        """The record of a car that is still there."""
-        vehicles = self.simulation.vehicles()
-        return vehicles[vehicles["id"] == self.names.index(name)][0]
-
-    def run(self, seconds: float) -> Iterator[float]:
-        """Yields the time after each tick; nobody may touch anybody."""
-        for _ in range(round(seconds / 0.05)):
-            drive(self.simulation)
-            vehicles = self.simulation.vehicles()
-            assert (vehicles["hit"] < 0).all(), "a crash"
-            yield float(self.simulation.ticks()[0]) * 0.05
-
-    def entries(self, seconds: float) -> dict[str, float]:
-        """When each car's front crossed its line."""
-        times: dict[str, float] = {}
-        network = self.simulation.network
-        for time in self.run(seconds):
-            for car in self.simulation.vehicles():
-                name = self.names[car["id"]]
-                lane = network.lanes[car["lane"]]
-                front_is_over = car["s"] + 2.5 > lane["length_m"] and lane["num_links"] > 0
-                if name not in times and (front_is_over or lane["internal"]):
-                    times[name] = time
-        return times
+    """The map of a crossing, by SUMO's type of the node."""
+    return partial(build_crossing, tmp_path_factory.mktemp("crossings"))
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ import pytest
 from cavmarl import CavEnv, ConfigError, parallel_env
 from cavmarl.core.errors import WorkerError
 from cavmarl.parallel.pooled_worlds import PooledWorlds
-from tests.parallel.test_worker_pool import alive
+from tests.support.pools import alive
 
 SMALL = {"zones": 4, "agents": 4, "background": 12, "max_cycles": 20}
 

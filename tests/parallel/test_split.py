@@ -18,8 +18,8 @@ from cavmarl.core.errors import WorkerFailureError
 from cavmarl.engine.world_setup import load_world
 from cavmarl.parallel import pooled_worlds as pooled
 from cavmarl.parallel.work_shares import share_out
-from tests.parallel.test_worker_pool import alive
 from tests.support.actuated import actuated_grid
+from tests.support.pools import alive
 from tests.support.rerouting import CARS, DEVICE, FLOW, make_map, write_demand
 from tests.support.vec_runs import STEPS, Make, drive, pool_of, same
 

@@ -2,21 +2,13 @@
 
 from __future__ import annotations
 
-import gc
 import os
 import random
-import resource
-import select
 import signal
 import socket
-import subprocess
-import sys
-import tempfile
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -27,22 +19,20 @@ from cavmarl.core.errors import (
     WorkerFailureError,
 )
 from cavmarl.parallel.processes import worker_loop
-from cavmarl.parallel.processes.shared_memory import Segment
-from cavmarl.parallel.processes.worker_pool import Pool, Program
-from tests.support.forks import said_in_fork
+from cavmarl.parallel.processes.worker_pool import Pool
+from tests.support.pools import (
+    MORE,
+    Make,
+    alive,
+    gone,
+    gone_soon,
+    in_time,
+    program,
+    totals,
+    toy_pools,
+)
 from tests.support.toiling import toiling
 from tests.support.toy_job import ADD, DIE, DOZE, FAIL, FALL, POINTS, RUN_OUT, TASKS, TOIL, TOTAL
-
-MODULE = "tests.support.toy_job"
-ROOT = Path(__file__).resolve().parents[2]
-MORE = 1000  # numbers that each task adds
-
-Make = Callable[..., Pool]
-
-
-def program(workers: int = 2, teams: tuple[tuple[int, ...], ...] = (), **recipe: object) -> Program:
-    names = tuple(f"part {k}" for k in range(workers))
-    return Program(MODULE, {"workers": workers, **recipe}, names, (), TASKS, teams=teams)
 
 
 @pytest.fixture
@@ -55,40 +45,12 @@ def interruptible() -> Iterator[None]:
 
 @pytest.fixture
 def make() -> Iterator[Make]:
-    pools: list[Pool] = []
-
-    def call(
-        workers: int = 2,
-        timeout_s: float = 60.0,
-        repeats: int = 3,
-        teams: tuple[tuple[int, ...], ...] = (),
-    ) -> Pool:
-        pools.append(Pool(program(workers, teams), timeout_s, repeats))
-        return pools[-1]
-
-    yield call
-    for pool in pools:
-        pool.close()
+    with toy_pools() as make_pool:
+        yield make_pool
 
 
 def interrupt() -> None:
     signal.raise_signal(signal.SIGINT)
-
-
-def totals(pool: Pool) -> list[list[float]]:
-    return pool.run(TOTAL, commits=False)
-
-
-def alive(pids: list[int]) -> list[int]:
-    """Those that are there, and be it as a zombie of ours."""
-    return [pid for pid in pids if Path(f"/proc/{pid}").exists()]
-
-
-def gone(pids: list[int], limit_s: float = 60.0) -> bool:
-    end = time.monotonic() + limit_s
-    while alive(pids) and time.monotonic() < end:
-        time.sleep(0.01)
-    return not alive(pids)
 
 
 def test_all_work_and_answer(make: Make) -> None:
@@ -308,51 +270,6 @@ def test_a_start_that_is_stopped_is_begun_again(tmp_path: Path) -> None:
     pool.close()
 
 
-def in_time(work: Callable[[], Any], limit_s: float = 20.0) -> Any:
-    """What `work` returns; SIGALRM ends it, where it waits for ever."""
-
-    def give_up(*_: object) -> None:
-        raise TimeoutError(f"not done after {limit_s:g} s")
-
-    before = signal.signal(signal.SIGALRM, give_up)
-    signal.setitimer(signal.ITIMER_REAL, limit_s)
-    try:
-        return work()
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
-
-
-def test_a_pool_of_another_thread_ends_with_the_process_and_not_before() -> None:
-    text = LONER.format(root=str(ROOT), then="").replace(
-        "pool = Pool(program(2), 60.0, 3)",
-        "from concurrent.futures import Future\nfrom threading import Thread\nmade = Future()\n"
-        "maker = Thread(target=lambda: made.set_result(Pool(program(2), 60.0, 3)))\n"
-        "maker.start()\nmaker.join()\npool = made.result()",
-    )
-    text += "import os\nos.kill(pool.server_pid, signal.SIGSTOP)\npool.run(ADD)\n"
-    text += "os.kill(os.getpid(), signal.SIGKILL)\n"
-    loner = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True)
-    pids = [int(word) for word in loner.stdout.split()]
-    assert loner.returncode == -signal.SIGKILL, loner.stderr
-    assert len(pids) == 3
-    assert gone_soon(pids)  # also the one that was stopped
-
-
-def gone_soon(pids: list[int]) -> bool:
-    """Whether all have ended, buried or not."""
-    for pid in pids:
-        try:
-            pidfd = os.pidfd_open(pid)
-        except ProcessLookupError:
-            continue
-        ended = bool(select.select([pidfd], [], [], 60.0)[0])
-        os.close(pidfd)
-        if not ended:
-            return False
-    return True
-
-
 def test_no_call_to_wake_up_is_missed(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(barrier, "SHORT_S", 0.0)
     monkeypatch.setattr(barrier, "LONG_S", 0.0)
@@ -383,176 +300,3 @@ def ticks(pid: int) -> int:
 def stat_of(pid: int) -> list[str]:
     """Of a process: state, parent and so on."""
     return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-
-
-def maps(pid: int) -> list[str]:
-    return Path(f"/proc/{pid}/maps").read_text().splitlines()
-
-
-@pytest.mark.parametrize("way", ["close", "forget"])
-def test_nothing_is_left_behind(way: str) -> None:
-    gc.collect()  # what other tests have left
-    files = len(os.listdir("/proc/self/fd"))
-    pool = Pool(program(3), 60.0, 3)
-    pool.run(ADD)
-    pids = [*pool.pids, pool.server_pid]
-    shared = [line for pid in pids for line in maps(pid) if "rw-s" in line]
-    assert shared
-    assert all("/memfd:cavmarl (deleted)" in line for line in shared)
-    if way == "close":
-        pool.close()
-        pool.close()
-    del pool
-    gc.collect()
-    assert not alive(pids)
-    assert len(os.listdir("/proc/self/fd")) == files
-
-
-def test_a_stopped_pool_is_closed() -> None:
-    pool = Pool(program(2), 60.0, 3)
-    pids = [*pool.pids, pool.server_pid]
-    for pid in pids:
-        os.kill(pid, signal.SIGSTOP)
-    pool.close()
-    assert gone(pids)
-
-
-def test_a_program_that_does_not_come_up() -> None:
-    gc.collect()
-    files = len(os.listdir("/proc/self/fd"))
-    with pytest.raises(WorkerFailureError, match="no jobs today") as caught:
-        Pool(program(2, fails="no jobs today"), 60.0, 3)
-    assert "make_jobs" in caught.value.traceback
-    with pytest.raises(WorkerError, match="ended with 3"):
-        Pool(program(2, ends=3), 60.0, 3)
-    del caught
-    gc.collect()
-    assert len(os.listdir("/proc/self/fd")) == files
-
-
-def test_memory_that_cannot_be_had() -> None:
-    with pytest.raises(WorkerError, match=r"GB of shared memory .* num_envs"):
-        Segment.make(1 << 50)
-
-
-def test_memory_where_there_is_no_memfd(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.delattr(os, "memfd_create")
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    segment = Segment.make(5000)
-    memory = segment.map()
-    assert len(memory) == 5000
-    assert not any(tmp_path.iterdir())
-    segment.close()
-    memory[4999] = 7
-
-
-@pytest.mark.usefixtures("fresh_processes")
-@pytest.mark.parametrize("room", [0, 3, 12, 16, 20])
-def test_descriptors_that_cannot_be_had(room: int) -> None:
-    gc.collect()
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    used = {int(name) for name in os.listdir("/proc/self/fd")}
-    free = [number for number in range(len(used) + 100) if number not in used]
-    resource.setrlimit(resource.RLIMIT_NOFILE, (free[room], hard))
-    try:
-        with pytest.raises(WorkerError, match="Too many open files"):
-            Pool(program(3), 60.0, 3)
-    finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-    gc.collect()
-    assert len(os.listdir("/proc/self/fd")) == len(used)
-
-
-LONER = """
-import signal, sys, time
-signal.signal(signal.SIGINT, signal.default_int_handler)
-sys.path.insert(0, {root!r})
-from tests.parallel.test_worker_pool import program
-from tests.support.toy_job import ADD, TOIL
-from cavmarl.parallel.processes.worker_pool import Pool
-pool = Pool(program(2), 60.0, 3)
-pool.run(ADD)
-print(*pool.pids, pool.server_pid, flush=True)
-{then}
-"""
-
-
-@pytest.mark.parametrize("then", ["time.sleep(60)", "pool.run(TOIL, PLACE)"])
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
-def test_no_process_outlives_the_pools(how: signal.Signals, then: str, tmp_path: Path) -> None:
-    text = LONER.format(root=str(ROOT), then=then.replace("PLACE", repr(str(tmp_path))))
-    loner = subprocess.Popen(
-        [sys.executable, "-c", text], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-    )
-    assert loner.stdout is not None
-    if "PLACE" in then:
-        with toiling(tmp_path, 2, lambda: loner.send_signal(how), ends=False):
-            loner.wait()
-    pids = [int(word) for word in loner.stdout.readline().split()]
-    assert len(pids) == 3
-    loner.send_signal(how)
-    loner.wait()
-    loner.stdout.close()
-    assert gone_soon(pids)
-
-
-def test_a_pool_without_compiled_loops() -> None:
-    text = LONER.format(root=str(ROOT), then="print(pool.run(1, commits=False), pool.deaths)")
-    done = subprocess.run(
-        [sys.executable, "-c", text],
-        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert f"[[3.0, {MORE}], [3.0, {MORE}]] []" in done.stdout
-
-
-def test_a_fork_of_the_pools_process_leaves_the_workers_alone(make: Make) -> None:
-    pool = make(workers=1)
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(os, "getpid", lambda: 1)
-        pool._processes.release()
-    pool.run(ADD)
-    assert totals(pool) == [[3.0, MORE]]
-
-
-def test_a_fork_of_the_pools_process_cannot_order_its_workers(make: Make) -> None:
-    pool = make(workers=1)
-    said = said_in_fork(lambda: pool.run(ADD))
-    assert f"process {os.getpid()}" in said
-    assert "make the environment here" in said
-    pool.run(ADD)
-    assert totals(pool) == [[3.0, MORE]]
-
-
-def test_more_descriptors_than_select_takes(make: Make) -> None:
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if hard != resource.RLIM_INFINITY and hard < 1300:
-        pytest.skip(f"the system allows {hard} open files")
-    resource.setrlimit(resource.RLIMIT_NOFILE, (1300, hard))
-    taken = [os.open("/dev/null", os.O_RDONLY) for _ in range(1030)]
-    try:
-        pool = make(workers=2)
-        pool.run(ADD)
-        os.kill(pool.pids[0], signal.SIGKILL)
-        pool.run(ADD)
-        assert totals(pool) == [[6.0, 2 * MORE]] * 2
-        pids = [*pool.pids, pool.server_pid]
-        pool.close()
-        assert gone(pids)
-    finally:
-        for descriptor in taken:
-            os.close(descriptor)
-        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-
-
-def test_a_thread_may_start_workers_and_end(make: Make) -> None:
-    pools: list[Pool] = []
-    thread = threading.Thread(target=lambda: pools.append(make(workers=1)))
-    thread.start()
-    thread.join()
-    while Path(f"/proc/self/task/{thread.native_id}").exists():
-        time.sleep(0.001)  # the system ends it a little later
-    pools[0].run(ADD)
-    assert pools[0].deaths == []

@@ -23,7 +23,8 @@ __all__ = ["ALONE_FILES", "ProcessWatch", "mark", "skip_if_late"]
 
 _OF_PROCESSES = re.compile(
     r"^import (subprocess|multiprocessing|libsumo)\b"
-    r"|^from tests\.support\.(sumo_worlds|netgenerate|toy_hosts|toy_job|world_hosts|service) import"
+    r"|^from tests\.support\.(sumo_worlds|netgenerate|junction_scenes|toy_hosts|toy_job) import"
+    r"|^from tests\.support\.(world_hosts|service) import"
     r"|^from tests\.support\.chromium import"
     r"|importorskip\(\"(libsumo|ray)\""
     r"|\bworkers=(?!0\b)|\bhosts=|\bnodes=",
@@ -39,6 +40,7 @@ RAY_FILES = ("tests/parallel/test_remote_start.py", "tests/parallel/test_remote_
 ALONE_FILES: tuple[str, ...] = (
     "tests/bench/test_core_ceiling.py",
     "tests/parallel/test_core_placement.py",
+    "tests/parallel/test_pool_resources.py",
     "tests/parallel/test_shared_huge_pages.py",
     "tests/parallel/test_watchdog.py",
     "tests/parallel/test_worker_pool.py",

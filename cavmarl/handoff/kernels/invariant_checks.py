@@ -200,8 +200,7 @@ def watch(
     count = zones.rects.shape[0]
     for zone in range(count):
         tallies[zone]["due"] = 0
-    missing = 0
-    moved = 0
+    missing = moved = 0
     for zone in range(count):
         rows = zoned.rows[side, zone, w]
         own_words = words[side, zone, w]

@@ -1,0 +1,147 @@
+"""One test for each numbered rule of docs/ownership.md on borders, deadlines and neighbours."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from cavmarl.core.errors import (
+    ConfigError,
+    ProtocolError,
+)
+from cavmarl.ownership.decisions import Neighbours
+from cavmarl.ownership.distances import Distances, check_coverage, needed_overlap_m
+from cavmarl.ownership.limits import DeadlinePolicy, Limits
+from cavmarl.ownership.messages import (
+    Begin,
+    Switch,
+)
+from cavmarl.ownership.offers import Approach
+from cavmarl.ownership.safeguards import ALL_ON
+from cavmarl.ownership.trace import LOG, TraceEntry
+from cavmarl.ownership.trace_check import TraceChecker
+from tests.ownership.bench import Bench, version
+from tests.ownership.scenarios import prepared
+
+
+def test_r06_the_target_is_where_the_vehicle_is() -> None:
+    bench = Bench(4)
+    bench.tick(births=[(7, 0)], offers=[(7, 1), (7, 2), (7, 3)])
+    bench.tick(movers=[(7, 3)])
+    assert bench.owner(7) == 3
+
+
+def test_r08_the_source_goes_on_for_d_ticks_and_then_the_hand_off_is_forced() -> None:
+    bench = Bench(limits=Limits(deferral=2))
+    bench.tick(births=[(7, 0)])
+    for ticks in (1, 2):
+        bench.tick(movers=[(7, 1)])
+        assert bench.directory.table.deferred == {7: ticks}
+        assert bench.owner(7) == 0
+    (_, step) = bench.begin(movers=[(7, 1)])
+    assert step.enter[0].forced
+    assert step.enter[0].state == version(7, 3)
+
+
+def test_r28_who_comes_back_before_the_switch_has_not_waited() -> None:
+    bench = Bench()
+    bench.tick(births=[(7, 0)])
+    bench.tick(movers=[(7, 1)])
+    bench.tick()
+    assert not bench.directory.table.deferred
+    bench.tick(movers=[(7, 1)])
+    assert bench.directory.table.deferred == {7: 1}
+
+
+@pytest.mark.parametrize("policy", [p for p in DeadlinePolicy if p is not DeadlinePolicy.FORCE])
+def test_r29_a_policy_grants_ticks_behind_the_border_or_holds_before_it(
+    policy: DeadlinePolicy,
+) -> None:
+    bench = Bench(limits=Limits(deferral=1, policy=policy, grace=2))
+    holds = policy is not DeadlinePolicy.EXTEND
+    bench.tick(births=[(7, 0)])
+    overdue = []
+    for _ in range(4 * holds):
+        steps = bench.begin(approaching=[(7, 1)])
+        overdue.append(tuple(wait.vehicle for wait in bench.directory.overdue()))
+        bench.pass_on(steps)
+        bench.commit()
+    assert overdue == [(), (), (7,), (7,)] * holds
+    assert not bench.directory.overdue()
+    for _ in range(bench.limits.longest_deferral):
+        assert bench.owner(7) == 0
+        bench.tick(movers=[(7, 1)])
+    assert bench.directory.table.deferred[7] == (1 if holds else 3)
+    assert not bench.directory.table.waiting, "only ticks in a row count"
+    bench.tick(movers=[(7, 1)])
+    assert bench.owner(7) == 1
+
+
+def test_r29_what_is_acknowledged_does_not_wait() -> None:
+    bench = Bench(limits=Limits(policy=DeadlinePolicy.HOLD, grace=1))
+    bench.tick(births=[(7, 0)])
+    for _ in range(2):
+        bench.pass_on(bench.begin(approaching=[(7, 1)]))
+        bench.commit()
+    assert bench.directory.table.waiting == {7: 2}
+    bench.pass_on(bench.offer(0, (7, 1)))
+    bench.begin(approaching=[(7, 1)])
+    assert not bench.directory.table.planned.record.waiting
+    assert not bench.directory.overdue()
+
+
+def test_r30_an_overlap_that_does_not_cover_is_refused_with_the_numbers() -> None:
+    limits = Limits(deferral=2)
+    assert needed_overlap_m(100.0, 2.0, limits, 40.0, 0.05) == 108.0
+    fits = Distances(approach_m=10.0, hysteresis_m=2.0, overlap_m=108.0)
+    check_coverage(fits, limits, reach_m=100.0, v_max_mps=40.0, dt_s=0.05)
+    with pytest.raises(ConfigError, match=r"107\.9 m is too narrow: 108 m = reach 100 m"):
+        check_coverage(
+            replace(fits, overlap_m=107.9), limits, reach_m=100.0, v_max_mps=40.0, dt_s=0.05
+        )
+    with pytest.raises(ConfigError, match="approach of 1 m is shorter than the way of a tick"):
+        check_coverage(
+            replace(fits, approach_m=1.0), limits, reach_m=100.0, v_max_mps=40.0, dt_s=0.05
+        )
+
+
+def test_r31_offering_switching_and_releasing_have_distances_of_their_own() -> None:
+    distances = Distances(approach_m=10.0, hysteresis_m=2.0, overlap_m=100.0)
+    rows = [
+        (distances.offers(depth), distances.switches(depth), distances.releases(depth))
+        for depth in (-10.0, -9.0, 0.5, 2.0, 2.5, 100.0, 101.0)
+    ]
+    assert [sum(row) for row in rows] == [0, 1, 1, 1, 2, 2, 3]
+
+
+def test_r35_offers_name_vehicles_of_their_own() -> None:
+    bench, _ = prepared(ALL_ON)
+    with pytest.raises(ProtocolError, match="offers vehicle 8"):
+        bench.endpoints[0].offer([Approach(8, 1, b"")])
+
+
+def test_r36_a_change_to_a_zone_that_is_no_neighbour_is_refused() -> None:
+    in_a_row = tuple(map(frozenset, ({0, 1}, {0, 1, 2}, {1, 2})))
+    for may_teleport in (False, True):
+        bench = Bench(zones=3)
+        bench.directory.know(Neighbours(in_a_row, may_teleport))
+        bench.tick(births=[(7, 0), (8, 1)], offers=[(7, 2), (8, 2)])
+        if may_teleport:
+            bench.begin([(7, 2), (8, 2)])
+            begun = bench.log[-1]
+            assert isinstance(begun, Begin)
+            assert [switch.vehicle for switch in begun.switches] == [7, 8]
+            assert begun.teleports == (7,)
+            continue
+        with pytest.raises(ProtocolError, match=r"vehicle 7 of zone 0 .* zone 2, .* to zones 1 in"):
+            bench.begin([(7, 2)])
+        bench.begin([(8, 2)])
+        checker = TraceChecker(2, 16, near=in_a_row)
+        *before, begun = bench.trace.entries
+        assert isinstance(begun.item, Begin)
+        for entry in before:
+            checker.take(entry)
+        wrong = Begin(0, begun.item.tick, (Switch(7, 0, 2, 1, False),))
+        with pytest.raises(ProtocolError, match="v7 goes to no neighbour"):
+            checker.take(TraceEntry(LOG, wrong))

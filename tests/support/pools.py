@@ -1,0 +1,103 @@
+"""Pools of toy jobs, and whether their processes have gone."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from cavmarl.parallel.processes.worker_pool import Pool, Program
+from tests.support.toy_job import TASKS, TOTAL
+
+MODULE = "tests.support.toy_job"
+ROOT = Path(__file__).resolve().parents[2]
+MORE = 1000  # numbers that each task adds
+Make = Callable[..., Pool]
+
+
+def program(workers: int = 2, teams: tuple[tuple[int, ...], ...] = (), **recipe: object) -> Program:
+    names = tuple(f"part {k}" for k in range(workers))
+    return Program(MODULE, {"workers": workers, **recipe}, names, (), TASKS, teams=teams)
+
+
+@contextmanager
+def toy_pools() -> Iterator[Make]:
+    """Makes pools of toy jobs, and closes them at the end."""
+    pools: list[Pool] = []
+
+    def call(
+        workers: int = 2,
+        timeout_s: float = 60.0,
+        repeats: int = 3,
+        teams: tuple[tuple[int, ...], ...] = (),
+    ) -> Pool:
+        pools.append(Pool(program(workers, teams), timeout_s, repeats))
+        return pools[-1]
+
+    yield call
+    for pool in pools:
+        pool.close()
+
+
+def totals(pool: Pool) -> list[list[float]]:
+    return pool.run(TOTAL, commits=False)
+
+
+def alive(pids: list[int]) -> list[int]:
+    """Those that are there, and be it as a zombie of ours."""
+    return [pid for pid in pids if Path(f"/proc/{pid}").exists()]
+
+
+def gone(pids: list[int], limit_s: float = 60.0) -> bool:
+    end = time.monotonic() + limit_s
+    while alive(pids) and time.monotonic() < end:
+        time.sleep(0.01)
+    return not alive(pids)
+
+
+def in_time(work: Callable[[], Any], limit_s: float = 20.0) -> Any:
+    """What `work` returns; SIGALRM ends it, where it waits for ever."""
+
+    def give_up(*_: object) -> None:
+        raise TimeoutError(f"not done after {limit_s:g} s")
+
+    before = signal.signal(signal.SIGALRM, give_up)
+    signal.setitimer(signal.ITIMER_REAL, limit_s)
+    try:
+        return work()
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def gone_soon(pids: list[int]) -> bool:
+    """Whether all have ended, buried or not."""
+    for pid in pids:
+        try:
+            pidfd = os.pidfd_open(pid)
+        except ProcessLookupError:
+            continue
+        ended = bool(select.select([pidfd], [], [], 60.0)[0])
+        os.close(pidfd)
+        if not ended:
+            return False
+    return True
+
+
+LONER = """
+import signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)
+sys.path.insert(0, {root!r})
+from tests.support.pools import program
+from tests.support.toy_job import ADD, TOIL
+from cavmarl.parallel.processes.worker_pool import Pool
+pool = Pool(program(2), 60.0, 3)
+pool.run(ADD)
+print(*pool.pids, pool.server_pid, flush=True)
+{then}
+"""
