@@ -62,7 +62,13 @@ class LogChain:
             raise JournalError(f"line {self.sequence + 1} of the log: {error}") from error
         if not isinstance(content, dict):
             raise JournalError(f"line {self.sequence + 1} of the log is no JSON object")
-        return self.from_dict(content)
+        record = self.from_dict(content)
+        text = line if isinstance(line, str) else line.decode("utf-8", "replace")
+        if text.removesuffix("\n") != _json(content):  # white space, a key twice, other escapes
+            raise JournalError(
+                f"line {self.sequence} of the log is not as it was written: it is damaged"
+            )
+        return record
 
     def from_dict(self, line: dict[str, Any]) -> Record:
         where = f"line {self.sequence + 1} of the log"

@@ -72,6 +72,21 @@ def test_every_changed_letter_of_a_line_is_noticed(log: str) -> None:
                     records_from_lines("".join(log.splitlines(keepends=True)[:8]) + damaged)
 
 
+def test_every_added_byte_is_noticed_where_json_means_the_same(log: str) -> None:
+    lines = log.splitlines(keepends=True)
+    line, before = lines[8], lines[:8]
+    for at in range(len(line)):
+        for more in (" ", "\t", "\r", "\n"):
+            with pytest.raises(JournalError):
+                records_from_lines("".join(before) + line[:at] + more + line[at:])
+    twice = line.replace('"kind":', '"kind":"RESET","kind":', 1)
+    escaped = line.replace('"kind"', '"\\u006bind"', 1)
+    for same in (twice, escaped):
+        assert json.loads(same) == json.loads(line)
+        with pytest.raises(JournalError, match=r"line 9 .* not as it was written"):
+            records_from_lines("".join(before) + same)
+
+
 def test_a_missing_doubled_or_swapped_line_is_noticed(log: str) -> None:
     lines = log.splitlines(keepends=True)
     for wrong in (lines[:5] + lines[6:], lines[:5] + lines[4:], [*lines[:5], lines[6], lines[5]]):
