@@ -93,6 +93,8 @@ PLACES: dict[str, Keywords] = {
     "workers": {"num_envs": 2, "workers": 2},
     "zones over workers": {"zones": 2, "workers": 2},
     "nodes": {"zones": 3, "nodes": 2},
+    "worlds on Ray": {"num_envs": 2, "workers": 2, "hosts": "ray"},
+    "nodes on Ray": {"zones": 3, "nodes": 2, "hosts": "ray"},
 }
 # What an undivided world, beside which others are run, does not know.
 ONLY_DIVIDED = (
@@ -101,6 +103,7 @@ ONLY_DIVIDED = (
 )  # fmt: skip
 OF_ONE_WORLD = "of one world over"
 OF_THE_CALLER = "a network simulator is in the caller's process"
+NOT_ON_HOSTS = "leave out hosts"
 NOT_OVER_NODES = "worlds over nodes do not have it"
 REFUSED = {
     ("a network simulator", "workers"): OF_THE_CALLER,
@@ -110,6 +113,12 @@ REFUSED = {
     ("repartitions", "zones over workers"): "needs zones that stay",
     ("sensor workers", "nodes"): NOT_OVER_NODES,
     ("planned faults", "nodes"): NOT_OVER_NODES,
+    ("a network simulator", "worlds on Ray"): OF_THE_CALLER,
+    ("a journal", "worlds on Ray"): NOT_ON_HOSTS,
+    ("planned faults", "worlds on Ray"): NOT_ON_HOSTS,
+    ("sensor workers", "worlds on Ray"): "leave out the hosts",
+    ("sensor workers", "nodes on Ray"): NOT_OVER_NODES,
+    ("planned faults", "nodes on Ray"): NOT_OVER_NODES,
 }
 
 

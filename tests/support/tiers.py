@@ -34,7 +34,11 @@ _STARTS = {"subprocess.Popen", "os.fork", "os.posix_spawn", "os.system"}
 _MAP_FIXTURES = {"shared_maps", "built_map", "town", "town_file"}
 _DEAR_FOLDERS = ("tests/cosim/", "tests/train/")
 
-RAY_FILES = ("tests/parallel/test_remote_start.py", "tests/parallel/test_remote_worlds.py")
+RAY_FILES = (
+    "tests/parallel/test_ray_combinations.py",
+    "tests/parallel/test_remote_start.py",
+    "tests/parallel/test_remote_worlds.py",
+)
 
 # They measure time, memory or cores, or count on being let run at once.
 ALONE_FILES: tuple[str, ...] = (
