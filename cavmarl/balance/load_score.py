@@ -4,8 +4,8 @@
     worker*     = arg min LoadScore_i over the admissible   eq. (2)
 
 after "Distributed CARLA architecture for multi-agent CAV simulation: design and preliminary
-multi-GPU evaluation", section 3.5. A worker one of whose resources is used above its threshold
-(CPU 0.85, RAM 0.90, GPU 0.95) is excluded before scoring, so that free resources cannot
+multi-GPU evaluation", section 3.5. A worker that uses one resource above its threshold (CPU 0.85,
+RAM 0.90, GPU 0.95) is excluded before scoring, so that free resources cannot
 hide a critical one. All utilisations are shares from 0 to 1.
 """
 

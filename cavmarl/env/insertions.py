@@ -194,7 +194,7 @@ class Insertions:
 
 
 class InsertedWorlds:
-    """Base of an environment into whose running worlds vehicles can be put."""
+    """Base of an environment: vehicles can be put into its running worlds."""
 
     config: EnvConfig
     network: RoadNetwork

@@ -76,11 +76,12 @@ class Recorder:
 
         Args:
             step: its number in the episode, from 0.
-            acted: (W, A) whose trip this step belongs to; none in worlds that are through.
+            acted: (W, A) agents with a trip that this step is part of; none in worlds that are
+                through.
             rewards: (W, A).
             terms: (W, A, T).
-            done: (W, A) whose trip ended in it.
-            over: (W,) whose episode ended in it, which cuts the trips still under way.
+            done: (W, A) agents with a trip that ended in it.
+            over: (W,) worlds with an episode that ended in it, which cuts trips still under way.
             arrivals: (W,) vehicles that have arrived so far, agents included.
         """
         self._began[acted & (self._steps == 0)] = step

@@ -105,7 +105,7 @@ def extra_rows(path: Path, table: Any, dtype: np.dtype[Any]) -> tuple[Any, NDArr
 def take_rows(extras: Mapping[str, NDArray[np.void]], episode: int, tick: int) -> Any:
     """(table, `ExtraRows`) of a frame; rows of later ticks than its own are of the episode before.
 
-    They were sent in the step in whose end the world began anew.
+    They were sent in the step before the world began anew.
     """
     for name, rows in extras.items():
         late = rows["tick"] > tick

@@ -63,7 +63,7 @@ class RecordingWriter:
         terms: names of the reward terms, likewise.
 
     Attributes:
-        memory: that frames may lie in whose rows are read here alone.
+        memory: for frames; only this writer reads their rows.
 
     Raises:
         RecordingError: there is something at `path`, or it cannot be written.

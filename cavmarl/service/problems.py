@@ -46,7 +46,7 @@ def answer(
 
 
 def serve_routes(app: FastAPI, routers: Sequence[APIRouter]) -> None:
-    """Add routes to an application, each of whose errors is answered as a problem."""
+    """Add routes to an application; each of their errors is answered as a problem."""
     app.state.rejected = Counter()
     app.state.on_misreport = None  # told of beats that say what cannot be
     app.state.routes = [one for router in routers for one in router.routes]

@@ -99,7 +99,7 @@ class Shard:
         zone: int,
         zones: ZoneArrays,
         halo: Halo,  # how far it sees over its borders
-        # the first shard of this process, whose clock, keys, signals and room to work in this one
+        # the first shard of this process, whose clock, keys, signals and scratch memory this one
         # shares; None: this is it
         first: Shard | None = None,
         zeros: Zeros = np.zeros,  # makes what all zones have in common

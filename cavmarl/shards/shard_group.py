@@ -41,7 +41,7 @@ class ShardGroup:
 
     def __init__(
         self,
-        shards: Sequence[Shard],  # of one process, by rising zones; they share clock and room
+        shards: Sequence[Shard],  # of one process, by rising zones; they share clock and scratch
     ) -> None:
         self._shards = tuple(shards)
         first = shards[0]
@@ -52,7 +52,7 @@ class ShardGroup:
         self._scratch = first.scratch
         grids = [shard.grid for shard in shards]
         largest = max(grids, key=lambda grid: grid.newest.size)
-        self._room = largest._replace(corner=largest.corner.copy())
+        self._grid = largest._replace(corner=largest.corner.copy())
         frames = [
             (*grid.corner.tolist(), grid.cells_per_m, grid.num_x, grid.num_y) for grid in grids
         ]
@@ -154,7 +154,7 @@ class ShardGroup:
 
     def resolve(self) -> None:
         first = self._first
-        self._resolve(self._members, first.side, first.next_side, self._scratch, self._room)
+        self._resolve(self._members, first.side, first.next_side, self._scratch, self._grid)
 
     def choose_goals(self, demand: Demand, num_goals: int, gate: Gate) -> None:
         """Give the vehicles of the next rows that need it another goal."""
@@ -207,7 +207,7 @@ class ShardGroup:
         """Write observations and terms of the chosen worlds' owned agents into the outputs."""
         first, clock = self._first, self._config.clock
         self._sense(
-            self._members, first.side, self._roads, first.plans, self._travel, self._room,
+            self._members, first.side, self._roads, first.plans, self._travel, self._grid,
             first.sensors, clock.sim_dt_s, clock.ticks_per_step, chosen, first.outputs,
         )  # fmt: skip
         for shard in self._shards:

@@ -64,6 +64,6 @@ class TripWays:
         if key not in self._plans:
             self._plans[key] = np.zeros(len(self._network.lanes), dtype=PLAN)
             self.plan(goal, mask, 1.0, turning, self._plans[key])
-        room = np.zeros(MAX_EDGES, dtype=np.int32)
-        number = trace_edges(self._network.arrays, self._plans[key], start, room)
-        return room[1:number].copy() if number > 0 else None
+        scratch = np.zeros(MAX_EDGES, dtype=np.int32)
+        number = trace_edges(self._network.arrays, self._plans[key], start, scratch)
+        return scratch[1:number].copy() if number > 0 else None

@@ -101,7 +101,7 @@ class Bus:
         num_worlds, capacity = zoned.rows.shape[2:]
         num_receivers = self._num_agents + len(self.units)
         self.mail = _make_mail(v2x, num_worlds, capacity, num_receivers, len(self.units), zeros)
-        self._room = _make_room(network, self.mail, zoned, num_receivers)
+        self._scratch = _make_scratch(network, self.mail, zoned, num_receivers)
         self._network: NetworkSimulator | None = None
         self._watchers: tuple[Watch, ...] = ()
         self._exchange = specialized(exchange_messages)
@@ -166,7 +166,7 @@ class Bus:
     def _run(self, side: int, first: int, last: int) -> None:
         self._exchange(
             self._sending, self._channel, self._roads, self._types, self.units, self._common,
-            self._zoned, side, first, last, self.mail, self._room,
+            self._zoned, side, first, last, self.mail, self._scratch,
         )  # fmt: skip
         if self._watchers:
             self._show(first, last)
@@ -186,10 +186,10 @@ class Bus:
         tick = self._common.ticks.item(world)
         slot = tick % (latency + 1)
         packets = mail.packets[world, slot, : mail.num_packets[world, slot]]
-        sent = Exchange(world, tick, packets, self._room.receivers)
+        sent = Exchange(world, tick, packets, self._scratch.receivers)
         answer = network.exchange(sent)
         receptions = check_receptions(answer, sent, latency, mail.num_packets[world])
-        self._hand_out(receptions, tick, latency, mail, world, self._room)
+        self._hand_out(receptions, tick, latency, mail, world, self._scratch)
 
     def arrays(self) -> Iterator[NDArray[Any]]:
         """All that outlives a tick, (W, …)."""
@@ -293,7 +293,7 @@ def _make_mail(
     )
 
 
-def _make_room(network: RoadNetwork, mail: Mail, zoned: Zoned, num_receivers: int) -> V2xScratch:
+def _make_scratch(network: RoadNetwork, mail: Mail, zoned: Zoned, num_receivers: int) -> V2xScratch:
     capacity, most = zoned.rows.shape[3], mail.packets.shape[2]
     largest = max(box.shape[2] for box in (mail.objects, mail.events, mail.signals))
 

@@ -114,7 +114,7 @@ def verify_zones(
         )
 
     whole = run(1, plain)
-    # A world of one zone is as plain as the first: whose hosts die has to be divided.
+    # A world of one zone is as plain as the first: only a divided one has hosts that die.
     compared = [
         _Compared(run(count, divided | _journal(journals, count) if count > 1 else plain))
         for count in _counts(zones, divided)

@@ -9,7 +9,7 @@ import numpy as np
 from cavmarl.core.huge_pages import huge_copy
 from cavmarl.core.records.arrays import Travel
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.zones.kernels.visibility_tests import AT_LINE_M, farthest_m, find_looks, make_room
+from cavmarl.zones.kernels.visibility_tests import AT_LINE_M, farthest_m, find_looks, make_scratch
 from cavmarl.zones.kernels.zone_lookup import LOOK, Halo
 from cavmarl.zones.partition.zone_halo import inner_parts, lane_watchers, zone_halo
 from cavmarl.zones.partition.zone_partition import ZonePartition
@@ -31,7 +31,7 @@ class Visibility:
         if partition.count == 1 or self.sure_m >= self.halo_m:
             return halo
         roads = self.network.arrays
-        room = make_room(len(roads.lanes), len(roads.links))
+        scratch = make_scratch(len(roads.lanes), len(roads.links))
         half_m = 0.5 * float(self.travel.types["length"].max())
         aside_m = off_lane_m(self.network, self.travel)
         wide_m = self.outside_m + aside_m  # its place on its lane is not further away
@@ -39,7 +39,7 @@ class Visibility:
         looks = np.zeros((partition.count, len(roads.lanes)), dtype=LOOK)
         seen_m = self.sure_m
         for zone, (rect, own) in enumerate(zip(rects, looks, strict=True)):
-            find_looks(roads, rect, self.travel.view_m, self.travel.see_m, half_m, room, own)
+            find_looks(roads, rect, self.travel.view_m, self.travel.see_m, half_m, scratch, own)
             seen_m = max(seen_m, aside_m + farthest_m(roads, partition.arrays.rects, zone, own))
         seen_m = min(seen_m, self.halo_m)
         start, watchers = lane_watchers(partition, roads.lanes, looks, self.sure_m + aside_m)

@@ -15,7 +15,7 @@ from cavmarl.driving.kernels.motion import LATERAL_MPS, MAX_SPEED_MPS
 from cavmarl.engine.world_setup import find_map
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.zones.kernels.visibility_tests import farthest_m, find_looks, make_room
+from cavmarl.zones.kernels.visibility_tests import farthest_m, find_looks, make_scratch
 from cavmarl.zones.kernels.zone_lookup import LOOK
 from cavmarl.zones.partition.zone_layouts import cut_map
 from cavmarl.zones.reach import (
@@ -200,11 +200,11 @@ def test_zones_see_who_is_off_a_lane_that_matters(tmp_path: Path) -> None:
     # A zone's own drivers, too: they may be late, and as far off their lanes.
     wide_m = 8.0 + aside_m
     half_m = 0.5 * float(kinds.types["length"].max())
-    room = make_room(len(roads.lanes), len(roads.links))
+    scratch = make_scratch(len(roads.lanes), len(roads.links))
     for zone, rect in enumerate(partition.reaching):
         looks = np.zeros(len(roads.lanes), dtype=LOOK)
         wide = rect + np.array([-wide_m, -wide_m, wide_m, wide_m])
-        find_looks(roads.arrays, wide, kinds.view_m, kinds.see_m, half_m, room, looks)
+        find_looks(roads.arrays, wide, kinds.view_m, kinds.see_m, half_m, scratch, looks)
         assert asked[zone].tolist() == looks.tolist()
 
 

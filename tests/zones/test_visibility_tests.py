@@ -14,7 +14,7 @@ from cavmarl.zones.kernels.visibility_tests import (
     ROUNDING_M,
     farthest_m,
     find_looks,
-    make_room,
+    make_scratch,
 )
 from cavmarl.zones.kernels.zone_lookup import LOOK
 from tests.naive.looks import STEP_M, Looks
@@ -44,9 +44,9 @@ EDGE = """<edge id="e{n}" from="j{n}" to="j{end}">
 
 def looks_of(roads: RoadNetwork, rect: tuple[float, float, float, float]) -> NDArray[np.void]:
     looks = np.zeros(len(roads.lanes), dtype=LOOK)
-    room = make_room(len(roads.lanes), len(roads.links))
-    for _ in range(2):  # what the room held before does not matter
-        find_looks(roads.arrays, np.array(rect), VIEW_M, SEE_M, HALF_M, room, looks)
+    scratch = make_scratch(len(roads.lanes), len(roads.links))
+    for _ in range(2):  # what the scratch held before does not matter
+        find_looks(roads.arrays, np.array(rect), VIEW_M, SEE_M, HALF_M, scratch, looks)
     return looks
 
 

@@ -71,7 +71,7 @@ class Obstacle(NamedTuple):
 class Mission(NamedTuple):
     """What the vehicle is to do, and what it is."""
 
-    goal_edge: int  # EDGE row at whose end it is to be
+    goal_edge: int  # EDGE row; the vehicle is to go to the end of that edge
     vclass: str  # SUMO's
     length_m: float
     width_m: float

@@ -30,7 +30,7 @@ class Crash:
     Attributes:
         tick: which the world is on its way to; the run's, which never begins anew.
         point: of the tick, in ZONE_POINTS or COORDINATOR_POINTS.
-        zone: whose host; None: the coordinator.
+        zone: the zone of the host that dies; None: the coordinator.
         lives_on: it only hangs, is given up, and goes on with what it was doing.
         times: how often it dies there, each new host again; of a zone.
     """

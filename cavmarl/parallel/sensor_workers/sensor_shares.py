@@ -65,7 +65,7 @@ class Shares:
 
     @property
     def divided(self) -> dict[int, list[tuple[int, tuple[int, int]]]]:
-        """Worker and lines of each part of sensors all of whose agents' frames are divided alike.
+        """Worker and lines of each part of the sensors that are divided alike for all agents.
 
         Of others it cannot be told what a worker has spent on which lines.
         """

@@ -5,7 +5,7 @@ by zone it announces to the others, the followers, runs it on its own zones, and
 have run it on theirs. What is in between, gate, signals and owners, it does alone.
 
 All arrays that shards write are shared (`shared_huge_pages`), and each row has one writer at a
-time. A follower keeps nothing from one phase to the next but room to work in: what a phase needs to
+time. A follower keeps nothing from one phase to the next but scratch memory: what a phase needs to
 know beside the arrays stands in the leader's line.
 """
 

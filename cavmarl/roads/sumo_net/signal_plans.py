@@ -55,7 +55,7 @@ def with_programs(
 
 
 def with_outages(network: RoadNetwork, outages: Mapping[str, float]) -> RoadNetwork:
-    """A network some of whose signals go dark while the world runs, and stay so.
+    """A network with signals that go dark while the world runs, and stay so.
 
     They change to their program `off`: links that must give way anyway blink.
 

@@ -34,8 +34,8 @@ class CameraPose(NamedTuple):
     mount: NDArray[np.float64]  # (3, 4) axes (ahead, left, up) and place in the vehicle's frame
     focal: float  # pixels
     range_m: float  # of depths
-    edges: NDArray[np.float64]  # (5, 4) room for those of one face
-    face: NDArray[np.float64]  # (4, 3) room for its corners in the camera's frame
+    edges: NDArray[np.float64]  # (5, 4) scratch: those of one face
+    face: NDArray[np.float64]  # (4, 3) scratch: its corners in the camera's frame
 
 
 class Faces(NamedTuple):

@@ -203,8 +203,8 @@ def observe_kinematics(
 
     Where two vehicles are equally far along the lane, the one with the smaller id comes first.
 
-    `sensor`: settings and room; ranges in the frame of `vehicle_features`. `out`: an observation,
-    zeros from `sensor.at` on.
+    `sensor`: settings and scratch; ranges in the frame of `vehicle_features`. `out`: an
+    observation, zeros from `sensor.at` on.
     """
     ego = rows[i]
     vehicle_features(roads.lanes, roads.points, ego, sensor.destinations, True, sensor.values)

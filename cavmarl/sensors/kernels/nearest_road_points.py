@@ -124,7 +124,7 @@ def nearest_points(x: float, y: float, z: float, sensor: RoadgraphSensor) -> int
     """The nearest road points around a place, by distance, then by index, into `sorted_point`.
 
     `z`: m; points more than `LEVEL_HEIGHT_M` above or below are not seen. `sensor`: settings,
-    points and room.
+    points and scratch.
 
     Returns how many were found, at most `sensor.num_points`.
     """
@@ -151,7 +151,7 @@ def nearest_points(x: float, y: float, z: float, sensor: RoadgraphSensor) -> int
 def observe_roadgraph(row: np.void, sensor: RoadgraphSensor, out: NDArray[np.float32]) -> None:
     """Write the nearest points in the ego frame, nearest first; what is left stays as it is.
 
-    `sensor`: settings, points and room. `out`: an observation, zeros from `sensor.at` on.
+    `sensor`: settings, points and scratch. `out`: an observation, zeros from `sensor.at` on.
     """
     cos = math.cos(row["heading"])
     sin = math.sin(row["heading"])

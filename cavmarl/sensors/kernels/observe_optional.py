@@ -36,8 +36,8 @@ def observe_optional(
 ) -> None:
     """Write these sensors' parts of every agent's newest frame in the chosen worlds.
 
-    `further`: settings and room; sensors that are off write nothing. `observations`: (W, A, D), the
-    parts 0 before.
+    `further`: settings and scratch; sensors that are off write nothing. `observations`: (W, A, D),
+    the parts 0 before.
     """
     kinematics, occupancy, lidar_cells, roadgraph, path, conflicts, history = further
     for w in range(chosen.size):

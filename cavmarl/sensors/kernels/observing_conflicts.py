@@ -160,7 +160,7 @@ def _rank(
     i: int,
     sensor: ConflictsSensor,
 ) -> int:
-    """Put those that count most into the sensor's room, first by their approach, then by id."""
+    """Put those that count most into the sensor's scratch, first by their approach, then by id."""
     row = rows[i]
     limit = sensor.range_m * sensor.range_m
     first_column, last_column = cell_columns(grid, row["x"], sensor.range_m)

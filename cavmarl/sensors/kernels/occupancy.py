@@ -158,7 +158,7 @@ def observe_occupancy(
 ) -> None:
     """Write the layers of one vehicle, each by columns along x; empty cells are left as they are.
 
-    `sensor`: settings and room; cells and ranges in the frame of `vehicle_features`. `out`: an
+    `sensor`: settings and scratch; cells and ranges in the frame of `vehicle_features`. `out`: an
     observation, zeros from `sensor.at` on.
     """
     ego = rows[i]

@@ -42,7 +42,7 @@ from cavmarl.sensors.kernels.rig_frames import Due, Noise, error_of, sensor_key
 
 
 class BirdsEye(NamedTuple):
-    """Where the grid lies in the vehicle's frame, and room."""
+    """Where the grid lies in the vehicle's frame, and scratch."""
 
     x: float  # of the sensor, m
     y: float
@@ -203,8 +203,8 @@ def take_pictures(
     camera: CameraPose,
     panorama: Panorama,
     picture: PixelRows,
-    room: NDArray[np.float32] | None,
-    room_bits: NDArray[np.uint32] | None,
+    scratch: NDArray[np.float32] | None,
+    scratch_bits: NDArray[np.uint32] | None,
     palette: NDArray[np.float64] | None,
     classes: bool | None,
     data: NDArray[np.unsignedinteger],
@@ -212,8 +212,9 @@ def take_pictures(
     """Write the pictures that are due of the owned agents: depths, colours, or classes.
 
     `lines`: (W, agents, 2) rows [first, last) of each agent's picture that are written. `noise`: of
-    depths, what is as far as the range has none. `room`: (rows of `picture`, W), and `room_bits`,
-    the same memory, for depths only. `palette`: for colours only. `classes`: True for them only.
+    depths, what is as far as the range has none. `scratch`: (rows of `picture`, W), and
+    `scratch_bits`, the same memory, for depths only. `palette`: for colours only. `classes`: True
+    for them only.
     `data`: (W, agents, S, H, W) float16 as bits, m; or uint8, (…, 3) for colours.
 
     Numba leaves out the branches of what is None.
@@ -238,12 +239,12 @@ def take_pictures(
                 last = min(first + band, end)
                 look(camera, picture, num, first, last)
                 out = shown[first:last]
-                if room is not None and room_bits is not None:
-                    depths = room[: last - first]
+                if scratch is not None and scratch_bits is not None:
+                    depths = scratch[: last - first]
                     measure_depths(camera, picture, first, depths)
                     if noisy:
                         _add_noise(noise, row, worlds.ticks[w], camera.range_m, first, depths)
-                    write_halves(room_bits, out)
+                    write_halves(scratch_bits, out)
                 if palette is not None:
                     write_colours(camera, picture, first, palette, out)
                     if noisy:

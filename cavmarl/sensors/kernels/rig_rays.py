@@ -135,8 +135,8 @@ def measure_lidar(
     """Write what is due of the owned agents.
 
     `lines`: (W, agents, 2) columns [first, last) of each agent's rays that are written. `noise`: of
-    the sensor; what meets nothing has none. `hits`: HIT (A, E), room. `data`: (W, agents, S, E, A)
-    distances in m.
+    the sensor; what meets nothing has none. `hits`: HIT (A, E), scratch. `data`: (W, agents, S, E,
+    A) distances in m.
     """
     reach_m = reach_of(fan)
     noisy = noise.noise[0] > 0.0 or noise.bias[0] > 0.0
@@ -204,9 +204,9 @@ def measure_radar(
 ) -> None:
     """Write what is due of the owned agents.
 
-    `fan`: its rays, of one channel. `hits`: HIT (A, 1), room. `targets`: TARGET (A,), room.
-    `order`: (A,), room. `data`: (W, agents, S, targets, 3) range in m, azimuth in rad, radial speed
-    in m/s.
+    `fan`: its rays, of one channel. `hits`: HIT (A, 1), scratch. `targets`: TARGET (A,), scratch.
+    `order`: (A,), scratch. `data`: (W, agents, S, targets, 3) range in m, azimuth in rad, radial
+    speed in m/s.
     """
     reach_m = reach_of(fan)
     for w in range(worlds.ticks.size):

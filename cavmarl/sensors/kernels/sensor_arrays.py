@@ -1,4 +1,4 @@
-"""Settings, room and tables of the sensors that environments switch on for agents.
+"""Settings, scratch and tables of the sensors that environments switch on for agents.
 
 Each one's kernel says what the fields mean; `at` is where the sensor writes in a frame.
 """
@@ -26,9 +26,9 @@ class KinematicsSensor(NamedTuple):
     see_behind: bool
     observe_intentions: bool
     destinations: NDArray[np.float64]  # (M, G, 2) where each goal of each map is, m
-    near_body: NDArray[np.int64]  # (vehicles,) room
+    near_body: NDArray[np.int64]  # (vehicles,) scratch
     near_key: NDArray[np.float64]
-    values: NDArray[np.float64]  # (NUM_VEHICLE_FEATURES,) room
+    values: NDArray[np.float64]  # (NUM_VEHICLE_FEATURES,) scratch
 
 
 class OccupancyGrid(NamedTuple):
@@ -48,9 +48,9 @@ class OccupancyGrid(NamedTuple):
     clip: bool
     as_image: bool
     destinations: NDArray[np.float64]  # (M, G, 2) where each goal of each map is, m
-    cell_body: NDArray[np.int64]  # (num_x * num_y,) room
-    lane_seen: NDArray[np.int64]  # (L + 1,) room: when each lane was drawn last, and the time
-    values: NDArray[np.float64]  # (NUM_VEHICLE_FEATURES,) room
+    cell_body: NDArray[np.int64]  # (num_x * num_y,) scratch
+    lane_seen: NDArray[np.int64]  # (L + 1,) scratch: when each lane was drawn last, and the time
+    values: NDArray[np.float64]  # (NUM_VEHICLE_FEATURES,) scratch
 
 
 class LidarCells(NamedTuple):
@@ -61,7 +61,7 @@ class LidarCells(NamedTuple):
     range_m: float
     scale: float  # what distances and speeds are divided by
     directions: NDArray[np.float64]  # (cells, 2) cosine and sine of the middle of each cell
-    echoes: NDArray[np.void]  # ECHO (cells,) room
+    echoes: NDArray[np.void]  # ECHO (cells,) scratch
 
 
 class RoadPoints(NamedTuple):
@@ -83,11 +83,11 @@ class RoadgraphSensor(NamedTuple):
     num_points: int  # 0: off
     range_m: float
     road_map: RoadPoints
-    near_point: NDArray[np.int64]  # (N,) room
+    near_point: NDArray[np.int64]  # (N,) scratch
     near_squared: NDArray[np.float64]
-    sorted_point: NDArray[np.int64]  # (N,) room; the answer
+    sorted_point: NDArray[np.int64]  # (N,) scratch; the answer
     sorted_squared: NDArray[np.float64]
-    ring_start: NDArray[np.int64]  # (NUM_RINGS + 1,) room
+    ring_start: NDArray[np.int64]  # (NUM_RINGS + 1,) scratch
 
 
 RANKED = record(
@@ -114,8 +114,8 @@ class ConflictsSensor(NamedTuple):
     at: int
     most: int  # vehicles that are told; 0: off
     range_m: float
-    looks: NDArray[np.float64]  # (NUM_LOOKS, 4) room
-    ranked: NDArray[np.void]  # RANKED (count,) room
+    looks: NDArray[np.float64]  # (NUM_LOOKS, 4) scratch
+    ranked: NDArray[np.void]  # RANKED (count,) scratch
 
 
 class HistorySensor(NamedTuple):

@@ -50,7 +50,7 @@ def put_first(
         rows: VEHICLE (W, C), agents before the others.
         num_agents: (W,) how many agents.
         lines: (W, A, 2) [first, last) that it writes of each agent's frame; none: others do.
-        spare: VEHICLE (1,), room.
+        spare: VEHICLE (1,), scratch.
         num_owned: (W,) overwritten with how many are first.
 
     Returns:

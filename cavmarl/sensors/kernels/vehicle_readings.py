@@ -74,12 +74,13 @@ def measure_inertia(
     tick_s: float,
     due: Due,
     noise: Noise,
-    room: NDArray[np.float64],
+    scratch: NDArray[np.float64],
     data: NDArray[np.float32],
 ) -> None:
     """Write what is due of the owned agents.
 
-    `before`: POSE (W, A) of the tick before. `room`: (6,). `data`: (W, A, S, 6) as `feel` gives it.
+    `before`: POSE (W, A) of the tick before. `scratch`: (6,). `data`: (W, A, S, 6) as `feel` gives
+    it.
     """
     for w in range(worlds.ticks.size):
         num = due.num[w]
@@ -91,10 +92,10 @@ def measure_inertia(
                 continue
             agent = row["agent"]
             for k in range(num):
-                feel(row, before[w, agent], (k + 1) / num, tick_s, mount, room)
-                add_errors(noise, row, worlds.ticks[w], k, room)
-                for channel in range(room.size):
-                    data[w, agent, due.slot[w] + k, channel] = room[channel]
+                feel(row, before[w, agent], (k + 1) / num, tick_s, mount, scratch)
+                add_errors(noise, row, worlds.ticks[w], k, scratch)
+                for channel in range(scratch.size):
+                    data[w, agent, due.slot[w] + k, channel] = scratch[channel]
 
 
 @kernel
@@ -103,14 +104,14 @@ def measure_places(
     mount: Mount,
     due: Due,
     noise: Noise,
-    room: NDArray[np.float64],
+    scratch: NDArray[np.float64],
     places: NDArray[np.float64],
     measured: NDArray[np.bool_],
 ) -> None:
     """Write where the antennas are of the owned agents that are due.
 
     `due`: in this tick, one sample at most. `noise`: of the sensor, along the axes of the map.
-    `room`: (2, 3, 3), overwritten. `places`: (W, A, 3) x, y, z in m. `measured`: (W, A) set for
+    `scratch`: (2, 3, 3), overwritten. `places`: (W, A, 3) x, y, z in m. `measured`: (W, A) set for
     those that are written.
     """
     for w in range(worlds.ticks.size):
@@ -121,7 +122,7 @@ def measure_places(
             if row["driver"] != DRIVER_AGENT:
                 continue
             place = places[w, row["agent"]]
-            place[0], place[1], place[2] = sensor_pose(row, mount, room[0], room[1])
+            place[0], place[1], place[2] = sensor_pose(row, mount, scratch[0], scratch[1])
             add_errors(noise, row, worlds.ticks[w], 0, place)
             measured[w, row["agent"]] = True
 
@@ -132,7 +133,7 @@ def measure_odometry(
     before: NDArray[np.void],
     due: Due,
     noise: Noise,
-    room: NDArray[np.float64],
+    scratch: NDArray[np.float64],
     data: NDArray[np.float32],
 ) -> None:
     """Write what is due of the owned agents.
@@ -140,8 +141,8 @@ def measure_odometry(
     Of n samples in a tick, the k-th lies a share of k / n on the straight line from the state
     before the tick to that after it; one that entered in this tick was before as it is now.
 
-    `before`: POSE (W, A) of the tick before. `room`: (3,). `data`: (W, A, S, 3) speed in m/s, yaw
-    rate in rad/s, distance in m since departure.
+    `before`: POSE (W, A) of the tick before. `scratch`: (3,). `data`: (W, A, S, 3) speed in m/s,
+    yaw rate in rad/s, distance in m since departure.
     """
     for w in range(worlds.ticks.size):
         count = due.num[w]
@@ -156,12 +157,12 @@ def measure_odometry(
             was_there = pose["id"] == row["id"]
             for k in range(count):
                 left = 1.0 - (k + 1) / count if was_there else 0.0
-                room[0] = row["speed"] + left * (pose["speed"] - row["speed"])
-                room[1] = row["yaw_rate"] + left * (pose["yaw_rate"] - row["yaw_rate"])
-                room[2] = row["distance_m"] + left * (pose["distance_m"] - row["distance_m"])
-                add_errors(noise, row, worlds.ticks[w], k, room)
+                scratch[0] = row["speed"] + left * (pose["speed"] - row["speed"])
+                scratch[1] = row["yaw_rate"] + left * (pose["yaw_rate"] - row["yaw_rate"])
+                scratch[2] = row["distance_m"] + left * (pose["distance_m"] - row["distance_m"])
+                add_errors(noise, row, worlds.ticks[w], k, scratch)
                 for channel in range(3):
-                    data[w, agent, due.slot[w] + k, channel] = room[channel]
+                    data[w, agent, due.slot[w] + k, channel] = scratch[channel]
 
 
 _WINDOW_M = 15.0  # around the vehicle's place on its lane, where the sensor's is looked for
@@ -209,14 +210,14 @@ def measure_lane_boundary(
     due: Due,
     noise: Noise,
     axes: NDArray[np.float64],
-    room: NDArray[np.float64],
+    scratch: NDArray[np.float64],
     data: NDArray[np.float32],
 ) -> None:
     """Write what is due of the owned agents.
 
-    `lookahead_m`: length of the way that the curvature is that of. `axes`: (2, 3, 3), room. `room`:
-    (5,), room. `data`: (W, A, S, 5) to the left boundary, to the right one, and the lane's width in
-    m; direction of the sensor from that of the lane in rad; curvature in 1/m.
+    `lookahead_m`: length of the way that the curvature is that of. `axes`: (2, 3, 3), scratch.
+    `scratch`: (5,). `data`: (W, A, S, 5) to the left boundary, to the right one, and the lane's
+    width in m; direction of the sensor from that of the lane in rad; curvature in 1/m.
     """
     for w in range(worlds.ticks.size):
         if due.num[w] == 0:
@@ -234,14 +235,14 @@ def measure_lane_boundary(
             x0, y0 = _way_ahead(roads, plans, row, 0.0)
             x1, y1 = _way_ahead(roads, plans, row, 0.5 * lookahead_m)
             x2, y2 = _way_ahead(roads, plans, row, lookahead_m)
-            room[0] = 0.5 * lane["width_m"] - offset
-            room[1] = 0.5 * lane["width_m"] + offset
-            room[2] = lane["width_m"]
-            room[3] = wrap_angle(looks - math.atan2(sin, cos))
-            room[4] = bend(x0, y0, x1, y1, x2, y2)
-            add_errors(noise, row, worlds.ticks[w], 0, room)
-            for channel in range(room.size):
-                data[w, row["agent"], due.slot[w], channel] = room[channel]
+            scratch[0] = 0.5 * lane["width_m"] - offset
+            scratch[1] = 0.5 * lane["width_m"] + offset
+            scratch[2] = lane["width_m"]
+            scratch[3] = wrap_angle(looks - math.atan2(sin, cos))
+            scratch[4] = bend(x0, y0, x1, y1, x2, y2)
+            add_errors(noise, row, worlds.ticks[w], 0, scratch)
+            for channel in range(scratch.size):
+                data[w, row["agent"], due.slot[w], channel] = scratch[channel]
 
 
 @kernel

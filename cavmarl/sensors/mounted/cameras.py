@@ -43,7 +43,7 @@ class _Camera(ImagingSensor[C]):
 
     kernel = take_pictures
     written_as: ClassVar[DTypeLike] = np.uint8
-    _own: tuple[Any, ...]  # what is for its kind alone: room, the same as bits, palette, classes
+    _own: tuple[Any, ...]  # what is for its kind alone: scratch, the same as bits, palette, classes
 
     def __init__(self, name: str, config: C, platform: Platform) -> None:
         super().__init__(name, config, platform)
@@ -74,8 +74,8 @@ class DepthCamera(_Camera[DepthCameraConfig]):
 
     def __init__(self, name: str, config: DepthCameraConfig, platform: Platform) -> None:
         super().__init__(name, config, platform)
-        room = np.zeros(self._picture.face.shape, np.float32)
-        self._own = (room, room.view(np.uint32), None, None)
+        scratch = np.zeros(self._picture.face.shape, np.float32)
+        self._own = (scratch, scratch.view(np.uint32), None, None)
 
     @staticmethod
     def bounds(config: DepthCameraConfig) -> Bounds:

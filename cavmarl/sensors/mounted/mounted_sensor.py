@@ -34,7 +34,7 @@ class SensedScene(NamedTuple):
     plans: NDArray[np.void]
     travel: Travel  # types of vehicles
     worlds: Worlds  # the committed rows: first the zone's own, then ghosts
-    grid: Grid  # room for the spatial index of one world; callers that ask it fill it
+    grid: Grid  # scratch: the spatial index of one world; callers that ask it fill it
     before: NDArray[np.void]  # POSE (W, A) of all agents in the tick before
 
 

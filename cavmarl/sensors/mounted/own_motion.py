@@ -41,10 +41,10 @@ class Odometry(MountedSensor[OdometryConfig]):
 
     def __init__(self, name: str, config: OdometryConfig, platform: Platform) -> None:
         super().__init__(name, config, platform)
-        self._room = np.zeros(3)
+        self._scratch = np.zeros(3)
 
     def arguments(self, scene: SensedScene, due: Due, frames: SensorFrames) -> tuple[Any, ...]:
-        return scene.worlds, scene.before, due, self.noise, self._room, frames.data
+        return scene.worlds, scene.before, due, self.noise, self._scratch, frames.data
 
 
 class Imu(MountedSensor[ImuConfig]):
@@ -56,11 +56,11 @@ class Imu(MountedSensor[ImuConfig]):
     def __init__(self, name: str, config: ImuConfig, platform: Platform) -> None:
         super().__init__(name, config, platform)
         self._tick_s = platform.sim_dt_s
-        self._room = np.zeros(6)
+        self._scratch = np.zeros(6)
 
     def arguments(self, scene: SensedScene, due: Due, frames: SensorFrames) -> tuple[Any, ...]:
         moved = (scene.worlds, scene.before, self.mount, self._tick_s)
-        return (*moved, due, self.noise, self._room, frames.data)
+        return (*moved, due, self.noise, self._scratch, frames.data)
 
 
 class LaneBoundary(MountedSensor[LaneBoundaryConfig]):
@@ -75,11 +75,11 @@ class LaneBoundary(MountedSensor[LaneBoundaryConfig]):
     def __init__(self, name: str, config: LaneBoundaryConfig, platform: Platform) -> None:
         super().__init__(name, config, platform)
         self._axes = np.zeros((2, 3, 3))
-        self._room = np.zeros(5)
+        self._scratch = np.zeros(5)
 
     def arguments(self, scene: SensedScene, due: Due, frames: SensorFrames) -> tuple[Any, ...]:
         seen = (scene.roads, scene.plans, scene.worlds, self.mount, self.config.lookahead_m)
-        return (*seen, due, self.noise, self._axes, self._room, frames.data)
+        return (*seen, due, self.noise, self._axes, self._scratch, frames.data)
 
 
 class Gnss(MountedSensor[GnssConfig]):
@@ -98,7 +98,7 @@ class Gnss(MountedSensor[GnssConfig]):
         agents = (platform.num_worlds, platform.num_agents)
         self._places = np.zeros((*agents, 3))
         self._measured = np.zeros(agents, dtype=np.bool_)
-        self._room = np.zeros((2, 3, 3))
+        self._scratch = np.zeros((2, 3, 3))
 
     @staticmethod
     def bounds(config: GnssConfig) -> Bounds:
@@ -107,7 +107,7 @@ class Gnss(MountedSensor[GnssConfig]):
 
     def arguments(self, scene: SensedScene, due: Due, frames: SensorFrames) -> tuple[Any, ...]:
         measured = (self._places, self._measured)
-        return (scene.worlds, self.mount, due, self.noise, self._room, *measured)
+        return (scene.worlds, self.mount, due, self.noise, self._scratch, *measured)
 
     def sense(self, scenes: Sequence[SensedScene], due: Due, frames: SensorFrames) -> None:
         """Measure places on the map, then take all of them to the earth together."""

@@ -47,7 +47,7 @@ class Rig:
     """The sensors of all agents of W worlds.
 
     `settings`: of the sensors, by name. `frames`: where their samples go. `ids`: (W, A) int64, the
-    vehicle whose samples each agent's are; kept from tick to tick.
+    vehicle that each agent's samples are of; kept from tick to tick.
 
     Attributes:
         sense: senses what is due.

@@ -145,7 +145,7 @@ def _starts(config: SensorsConfig) -> dict[str, int]:
 
 
 def sensor_arrays(config: SensorsConfig, network: RoadNetwork) -> Sensors:
-    """The settings and the room that `sense` takes."""
+    """The settings and the scratch memory that `sense` takes."""
     hides = not config.neighbors.through_walls
     walls = network.walls if hides else network.walls[:0]
     near = MAX_NEIGHBORS_TRIED if len(walls) else config.neighbors.count

@@ -92,23 +92,23 @@ def _worlds(members: Members, zone: int, side: int, next_side: int) -> Worlds:
 
 
 @inlined_kernel
-def _grid(frame: np.void, room: Grid) -> Grid:
-    """A zone's spatial index, in the room of the largest one."""
+def _grid(frame: np.void, scratch_grid: Grid) -> Grid:
+    """A zone's spatial index, in the scratch of the largest one."""
     cells = frame["num_x"] * frame["num_y"]
-    room.corner[0] = frame["corner_x"]
-    room.corner[1] = frame["corner_y"]
+    scratch_grid.corner[0] = frame["corner_x"]
+    scratch_grid.corner[1] = frame["corner_y"]
     return Grid(
-        corner=room.corner,
-        floating=room.floating,
+        corner=scratch_grid.corner,
+        floating=scratch_grid.floating,
         cells_per_m=frame["cells_per_m"],
         num_x=frame["num_x"],
         num_y=frame["num_y"],
-        start=room.start[: cells + 1],
-        bodies=room.bodies,
-        cell=room.cell,
-        largest=room.largest,
-        newest=room.newest[:cells],
-        spots=room.spots,
+        start=scratch_grid.start[: cells + 1],
+        bodies=scratch_grid.bodies,
+        cell=scratch_grid.cell,
+        largest=scratch_grid.largest,
+        newest=scratch_grid.newest[:cells],
+        spots=scratch_grid.spots,
     )
 
 
@@ -161,10 +161,12 @@ def gather_each(members: Members, side: int, touching_m: float, border_m: float)
 
 
 @kernel
-def resolve_each(members: Members, side: int, next_side: int, scratch: Scratch, room: Grid) -> None:
+def resolve_each(
+    members: Members, side: int, next_side: int, scratch: Scratch, scratch_grid: Grid
+) -> None:
     for n in range(members.numbers.size):
         worlds = _worlds(members, members.numbers[n], side, next_side)
-        resolve(worlds, scratch, _grid(members.frames[n], room))
+        resolve(worlds, scratch, _grid(members.frames[n], scratch_grid))
 
 
 @kernel
@@ -211,7 +213,7 @@ def sense_each(
     roads: RoadArrays,
     plans: NDArray[np.void],
     travel: Travel,
-    room: Grid,
+    scratch_grid: Grid,
     sensors: Sensors,
     tick_s: float,
     ticks_per_step: int,
@@ -220,7 +222,7 @@ def sense_each(
 ) -> None:
     for n in range(members.numbers.size):
         worlds = _worlds(members, members.numbers[n], side, side)
-        grid = _grid(members.frames[n], room)
+        grid = _grid(members.frames[n], scratch_grid)
         sense(roads, plans, travel, worlds, grid, sensors, tick_s, ticks_per_step, chosen, outputs)
 
 

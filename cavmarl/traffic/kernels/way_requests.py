@@ -91,7 +91,7 @@ def find_way(
         permission: bits of the class that drives.
         edges: room for EDGE rows.
         steps: PLAN, room for the steps; those of the lane's edge come first.
-        cost: room, as long as `steps`.
+        cost: scratch, as long as `steps`.
 
     Returns:
         how many steps were written; 0 where there is no way or it is too long for the room.
@@ -285,7 +285,7 @@ def sample_speeds(
     a script do not count.
 
     `number`: of the sample, since the reset. `past`: (N, num_edges) the last samples in mm/s.
-    `speed_sums`: (num_edges,) their sums. `lane_counts`: (L,) room. `lane_sums`: (L,) room.
+    `speed_sums`: (num_edges,) their sums. `lane_counts`: (L,) scratch. `lane_sums`: (L,) scratch.
     """
     lane_counts[:] = 0
     lane_sums[:] = 0

@@ -81,10 +81,10 @@ def count_within(air: Air, x: float, y: float, radius_m: float) -> int:
 
 
 @inlined_kernel
-def load_around(channel: Channel, room: V2xScratch, x: float, y: float) -> float:
+def load_around(channel: Channel, scratch: V2xScratch, x: float, y: float) -> float:
     """Share of the tick that all packets take that one hears there; above 1, they do not fit."""
-    count = count_within(room.cams, x, y, channel.sensing_m)
-    count += count_within(room.others, x, y, channel.sensing_m)
+    count = count_within(scratch.cams, x, y, channel.sensing_m)
+    count += count_within(scratch.others, x, y, channel.sensing_m)
     return channel.load * count
 
 
@@ -96,12 +96,12 @@ def _place_of(sender: int, slots: int) -> int:
 
 
 @kernel
-def list_cams(room: V2xScratch, packets: NDArray[np.void], num: int) -> None:
-    """Make `room.cam_of` the table of the CAMs that are on the air, by sender."""
-    table = room.cam_of
+def list_cams(scratch: V2xScratch, packets: NDArray[np.void], num: int) -> None:
+    """Make `scratch.cam_of` the table of the CAMs that are on the air, by sender."""
+    table = scratch.cam_of
     table[:] = -1
     for p in range(num):
-        if room.access[p] and packets[p]["kind"] == KIND_CAM:
+        if scratch.access[p] and packets[p]["kind"] == KIND_CAM:
             place = _place_of(packets[p]["sender"], table.size)
             while table[place] >= 0:
                 place = (place + 1) & (table.size - 1)
@@ -109,8 +109,8 @@ def list_cams(room: V2xScratch, packets: NDArray[np.void], num: int) -> None:
 
 
 @inlined_kernel
-def find_cam(room: V2xScratch, packets: NDArray[np.void], sender: int) -> int:
-    table = room.cam_of
+def find_cam(scratch: V2xScratch, packets: NDArray[np.void], sender: int) -> int:
+    table = scratch.cam_of
     place = _place_of(sender, table.size)
     while table[place] >= 0 and packets[table[place]]["sender"] != sender:
         place = (place + 1) & (table.size - 1)
@@ -119,27 +119,27 @@ def find_cam(room: V2xScratch, packets: NDArray[np.void], sender: int) -> int:
 
 @kernel
 def let_on_the_air(
-    channel: Channel, mail: Mail, w: int, slot: int, key: np.uint64, room: V2xScratch
+    channel: Channel, mail: Mail, w: int, slot: int, key: np.uint64, scratch: V2xScratch
 ) -> None:
     """Sort the packets of a tick by place; where the air is too busy, not all of them get on it."""
     packets = mail.packets[w, slot]
     num = mail.num_packets[w, slot]
-    room.access[:num] = True
-    _fill_air(room.cams, packets, num, True, room.access)
-    _fill_air(room.others, packets, num, False, room.access)
+    scratch.access[:num] = True
+    _fill_air(scratch.cams, packets, num, True, scratch.access)
+    _fill_air(scratch.others, packets, num, False, scratch.access)
     if channel.load == 0.0:
         return
     are_all_on = True
     for p in range(num):
         packet = packets[p]
-        load = load_around(channel, room, packet["x"], packet["y"])
+        load = load_around(channel, scratch, packet["x"], packet["y"])
         if not gets_access(key, packet["sender"], packet["tick"], packet["kind"], load):
-            room.access[p] = False
+            scratch.access[p] = False
             are_all_on = False
             mail.counts[w, COUNT_NO_ACCESS] += 1
     if not are_all_on:
-        _fill_air(room.cams, packets, num, True, room.access)
-        _fill_air(room.others, packets, num, False, room.access)
+        _fill_air(scratch.cams, packets, num, True, scratch.access)
+        _fill_air(scratch.others, packets, num, False, scratch.access)
 
 
 @inlined_kernel
@@ -166,14 +166,14 @@ def refresh_by_cams(
     level: int,
     packets: NDArray[np.void],
     reports: NDArray[np.void],
-    room: V2xScratch,
+    scratch: V2xScratch,
     box: NDArray[np.void],
     num: int,
 ) -> None:
     """Let those that a receiver knows tell the newest of themselves."""
     limit = channel.reach_m * channel.reach_m
     for k in range(num):
-        p = find_cam(room, packets, box[k]["subject"])
+        p = find_cam(scratch, packets, box[k]["subject"])
         if p < 0:
             continue
         packet = packets[p]
@@ -213,15 +213,15 @@ def _list_within(
 
 
 @inlined_kernel
-def _drop_lost(channel: Channel, me: np.void, level: int, room: V2xScratch, num: int) -> int:
-    """Of the first `num` in `room.heard` keep those that are received; returns how many."""
-    air = room.cams
-    place = room.heard.place
-    squared = room.heard.squared
-    words = room.heard.word
-    distances = room.heard.distance
-    numbers = room.heard.number
-    tally = room.tally
+def _drop_lost(channel: Channel, me: np.void, level: int, scratch: V2xScratch, num: int) -> int:
+    """Of the first `num` in `scratch.heard` keep those that are received; returns how many."""
+    air = scratch.cams
+    place = scratch.heard.place
+    squared = scratch.heard.squared
+    words = scratch.heard.word
+    distances = scratch.heard.distance
+    numbers = scratch.heard.number
+    tally = scratch.tally
     of_receiver = me["word"]
     x = me["x"]
     y = me["y"]
@@ -258,12 +258,12 @@ def let_in_cams(
     level: int,
     packets: NDArray[np.void],
     reports: NDArray[np.void],
-    room: V2xScratch,
+    scratch: V2xScratch,
     box: NDArray[np.void],
     num: int,
 ) -> int:
     """Let the nearest of those in that a receiver did not know; returns how many it knows then."""
-    air = room.cams
+    air = scratch.cams
     reach_m = channel.reach_m
     limit = reach_m * reach_m
     x = me["x"]
@@ -271,28 +271,28 @@ def let_in_cams(
     own = me["id"]
     if channel.sure:
         reachable = count_within(air, x, y, reach_m)
-        p = find_cam(room, packets, own)
+        p = find_cam(scratch, packets, own)
         if p >= 0:
             dx = packets[p]["x"] - x
             dy = packets[p]["y"] - y
             reachable -= dx * dx + dy * dy <= limit
         if num == box.size:
             # Stations further away than all that it knows are left out.
-            limit = min(limit, room.squared[num - 1])
+            limit = min(limit, scratch.squared[num - 1])
             reach_m = math.sqrt(limit)
-        heard = _list_within(air, own, x, y, reach_m, limit, room.heard)
+        heard = _list_within(air, own, x, y, reach_m, limit, scratch.heard)
         received = reachable
     else:
-        reachable = _list_within(air, own, x, y, reach_m, limit, room.heard)
-        heard = _drop_lost(channel, me, level, room, reachable)
+        reachable = _list_within(air, own, x, y, reach_m, limit, scratch.heard)
+        heard = _drop_lost(channel, me, level, scratch, reachable)
         received = heard
     mail.counts[w, COUNT_REACHABLE] += reachable
     mail.counts[w, COUNT_RECEIVED] += received
     for k in range(heard):
-        if num < box.size or room.heard.squared[k] <= room.squared[num - 1]:
-            b = room.heard.place[k]
+        if num < box.size or scratch.heard.squared[k] <= scratch.squared[num - 1]:
+            b = scratch.heard.place[k]
             # A CAM tells of its sender.
             if find(box, num, air.sender[b]) < 0:
                 report = reports[packets[air.which[b]]["first"]]
-                num = insert(box, num, room.squared, report, x, y)
+                num = insert(box, num, scratch.squared, report, x, y)
     return num

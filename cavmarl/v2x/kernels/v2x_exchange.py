@@ -51,14 +51,14 @@ def _take_others(
     level: int,
     packets: NDArray[np.void],
     reports: NDArray[np.void],
-    room: V2xScratch,
+    scratch: V2xScratch,
     kind: int,
     box: NDArray[np.void],
     num: int,
     new: bool,
 ) -> int:
     """Take the reports of packets of one kind: of subjects that are known, or of new ones."""
-    air = room.others
+    air = scratch.others
     cells = air.cells
     limit = channel.reach_m * channel.reach_m
     first_column, last_column = cell_columns(cells, me["x"], channel.reach_m)
@@ -80,7 +80,7 @@ def _take_others(
                 mail.counts[w, COUNT_REACHABLE] += 1
                 mail.counts[w, COUNT_RECEIVED] += is_received
                 if not channel.sure:
-                    room.tally[2 * band_of(math.sqrt(squared)) + is_received] += 1
+                    scratch.tally[2 * band_of(math.sqrt(squared)) + is_received] += 1
             if not is_received:
                 continue
             for k in range(packet["first"], packet["first"] + packet["count"]):
@@ -90,7 +90,7 @@ def _take_others(
                     continue
                 place = find(box, num, report["subject"])
                 if place < 0 and new:
-                    num = insert(box, num, room.squared, report, me["x"], me["y"])
+                    num = insert(box, num, scratch.squared, report, me["x"], me["y"])
                 elif place >= 0 and is_better(report, box[place]):
                     box[place] = report
     return num
@@ -105,21 +105,23 @@ def _receive_objects(
     me: np.void,
     level: int,
     with_seen: bool,
-    room: V2xScratch,
+    scratch: V2xScratch,
     box: NDArray[np.void],
     num: int,
 ) -> int:
     """Take what is told of vehicles, by themselves and by stations that see them."""
     packets = mail.packets[w, slot]
     reports = mail.reports[w, slot]
-    refresh_by_cams(channel, me, level, packets, reports, room, box, num)
+    refresh_by_cams(channel, me, level, packets, reports, scratch, box, num)
     if with_seen:
-        _take_others(channel, mail, w, me, level, packets, reports, room, KIND_CPM, box, num, False)
-    sort_by_distance(box, num, room.squared, me["x"], me["y"])
-    num = let_in_cams(channel, mail, w, me, level, packets, reports, room, box, num)
+        _take_others(
+            channel, mail, w, me, level, packets, reports, scratch, KIND_CPM, box, num, False
+        )
+    sort_by_distance(box, num, scratch.squared, me["x"], me["y"])
+    num = let_in_cams(channel, mail, w, me, level, packets, reports, scratch, box, num)
     if with_seen:
         num = _take_others(
-            channel, mail, w, me, level, packets, reports, room, KIND_CPM, box, num, True
+            channel, mail, w, me, level, packets, reports, scratch, KIND_CPM, box, num, True
         )
     return num
 
@@ -133,16 +135,18 @@ def _receive_others(
     me: np.void,
     level: int,
     kind: int,
-    room: V2xScratch,
+    scratch: V2xScratch,
     box: NDArray[np.void],
     num: int,
 ) -> int:
     """Take what is told of events, or of signals."""
     packets = mail.packets[w, slot]
     reports = mail.reports[w, slot]
-    _take_others(channel, mail, w, me, level, packets, reports, room, kind, box, num, False)
-    sort_by_distance(box, num, room.squared, me["x"], me["y"])
-    return _take_others(channel, mail, w, me, level, packets, reports, room, kind, box, num, True)
+    _take_others(channel, mail, w, me, level, packets, reports, scratch, kind, box, num, False)
+    sort_by_distance(box, num, scratch.squared, me["x"], me["y"])
+    return _take_others(
+        channel, mail, w, me, level, packets, reports, scratch, kind, box, num, True
+    )
 
 
 @inlined_kernel
@@ -154,12 +158,12 @@ def _receive(
     r: int,
     tick: int,
     kinds: NDArray[np.int64],
-    room: V2xScratch,
+    scratch: V2xScratch,
 ) -> None:
-    me = room.receivers[r]
+    me = scratch.receivers[r]
     level = 0
     if channel.load > 0.0:
-        busy = min(load_around(channel, room, me["x"], me["y"]), 1.0)
+        busy = min(load_around(channel, scratch, me["x"], me["y"]), 1.0)
         mail.busy[w, 0] += busy
         mail.busy[w, 1] += 1.0
         mail.busy[w, 2] = max(mail.busy[w, 2], busy)
@@ -167,17 +171,17 @@ def _receive(
     objects = mail.objects[w, r]
     num = forget(objects, tick)
     with_seen = kinds[KIND_CPM] > 0
-    num = _receive_objects(channel, mail, w, slot, me, level, with_seen, room, objects, num)
+    num = _receive_objects(channel, mail, w, slot, me, level, with_seen, scratch, objects, num)
     empty(objects, num)
     events = mail.events[w, r]
     num = forget(events, tick)
     if num > 0 or kinds[KIND_DENM] > 0:
-        num = _receive_others(channel, mail, w, slot, me, level, KIND_DENM, room, events, num)
+        num = _receive_others(channel, mail, w, slot, me, level, KIND_DENM, scratch, events, num)
     empty(events, num)
     signals = mail.signals[w, r]
     num = forget(signals, tick)
     if num > 0 or kinds[KIND_SPAT] > 0:
-        num = _receive_others(channel, mail, w, slot, me, level, KIND_SPAT, room, signals, num)
+        num = _receive_others(channel, mail, w, slot, me, level, KIND_SPAT, scratch, signals, num)
     empty(signals, num)
 
 
@@ -190,28 +194,28 @@ def deliver(
     key: np.uint64,
     tick: int,
     latency: int,
-    room: V2xScratch,
+    scratch: V2xScratch,
 ) -> None:
     """Let all receivers of a world receive the packets of one slot.
 
     `mail`: inboxes and counts are written. `slot`: of the packets that are received now. `latency`:
-    how many ticks ago they were sent. `room`: `receivers` filled.
+    how many ticks ago they were sent. `scratch`: `receivers` filled.
     """
-    kinds = room.kinds
+    kinds = scratch.kinds
     kinds[:] = 0
     for p in range(mail.num_packets[w, slot]):
         kinds[mail.packets[w, slot, p]["kind"]] += 1
-    let_on_the_air(channel, mail, w, slot, key, room)
-    list_cams(room, mail.packets[w, slot], mail.num_packets[w, slot])
+    let_on_the_air(channel, mail, w, slot, key, scratch)
+    list_cams(scratch, mail.packets[w, slot], mail.num_packets[w, slot])
     before = mail.counts[w, COUNT_RECEIVED]
-    room.tally[:] = 0
-    for r in range(room.receivers.size):
-        if room.receivers[r]["id"] >= 0:
-            _receive(channel, mail, w, slot, r, tick, kinds, room)
+    scratch.tally[:] = 0
+    for r in range(scratch.receivers.size):
+        if scratch.receivers[r]["id"] >= 0:
+            _receive(channel, mail, w, slot, r, tick, kinds, scratch)
     mail.delays[w, latency] += mail.counts[w, COUNT_RECEIVED] - before
     for band in range(NUM_BANDS):
-        received = room.tally[2 * band + 1]
-        mail.bands[w, band, 0] += room.tally[2 * band] + received
+        received = scratch.tally[2 * band + 1]
+        mail.bands[w, band, 0] += scratch.tally[2 * band] + received
         mail.bands[w, band, 1] += received
 
 
@@ -226,22 +230,22 @@ def _put_in_order(
 
 
 @kernel
-def age(mail: Mail, w: int, r: int, tick: int, room: V2xScratch) -> None:
+def age(mail: Mail, w: int, r: int, tick: int, scratch: V2xScratch) -> None:
     """Take out of a receiver's inboxes what is too old, and put the rest in order."""
-    me = room.receivers[r]
-    _put_in_order(mail.objects[w, r], tick, room.squared, me["x"], me["y"])
-    _put_in_order(mail.events[w, r], tick, room.squared, me["x"], me["y"])
-    _put_in_order(mail.signals[w, r], tick, room.squared, me["x"], me["y"])
+    me = scratch.receivers[r]
+    _put_in_order(mail.objects[w, r], tick, scratch.squared, me["x"], me["y"])
+    _put_in_order(mail.events[w, r], tick, scratch.squared, me["x"], me["y"])
+    _put_in_order(mail.signals[w, r], tick, scratch.squared, me["x"], me["y"])
 
 
 @kernel
-def learn(mail: Mail, w: int, slot: int, p: int, r: int, delay: int, room: V2xScratch) -> None:
+def learn(mail: Mail, w: int, slot: int, p: int, r: int, delay: int, scratch: V2xScratch) -> None:
     """Deliver one packet to one receiver, as a network simulator has decided.
 
     `mail`: inboxes and counts are written. `r`: the receiver, which is there. `delay`: ticks since
-    it was sent. `room`: `receivers` filled.
+    it was sent. `scratch`: `receivers` filled.
     """
-    me = room.receivers[r]
+    me = scratch.receivers[r]
     packet = mail.packets[w, slot, p]
     if packet["kind"] == KIND_CAM or packet["kind"] == KIND_CPM:
         box = mail.objects[w, r]
@@ -250,17 +254,17 @@ def learn(mail: Mail, w: int, slot: int, p: int, r: int, delay: int, room: V2xSc
     else:
         box = mail.signals[w, r]
     tick = packet["tick"] + delay
-    num = _put_in_order(box, tick, room.squared, me["x"], me["y"])
+    num = _put_in_order(box, tick, scratch.squared, me["x"], me["y"])
     for k in range(packet["first"], packet["first"] + packet["count"]):
         report = mail.reports[w, slot, k]
         if report["subject"] == me["id"] or report["expires"] < tick:
             continue
         place = find(box, num, report["subject"])
         if place < 0:
-            num = insert(box, num, room.squared, report, me["x"], me["y"])
+            num = insert(box, num, scratch.squared, report, me["x"], me["y"])
         elif is_better(report, box[place]):
             box[place] = report
-            sort_by_distance(box, num, room.squared, me["x"], me["y"])
+            sort_by_distance(box, num, scratch.squared, me["x"], me["y"])
     mail.counts[w, COUNT_RECEIVED] += 1
     mail.delays[w, delay] += 1
 
@@ -274,15 +278,15 @@ def _place_receivers(
     key: np.uint64,
     units: NDArray[np.void],
     mail: Mail,
-    room: V2xScratch,
+    scratch: V2xScratch,
 ) -> None:
     """Note where the agents and the roadside units are; new ones have empty inboxes."""
-    receivers = room.receivers
+    receivers = scratch.receivers
     num_agents = receivers.size - units.size
     for r in range(num_agents):
         receivers[r]["id"] = -1
     for k in range(num):
-        station = room.stations[k]
+        station = scratch.stations[k]
         row = zoned.rows[side, station["zone"], w, station["row"]]
         if row["driver"] == DRIVER_AGENT:
             me = receivers[row["agent"]]
@@ -318,7 +322,7 @@ def exchange_messages(
     first: int,
     last: int,
     mail: Mail,
-    room: V2xScratch,
+    scratch: V2xScratch,
 ) -> None:
     """Send what is due in the present tick of some worlds, and receive what arrives in it.
 
@@ -334,46 +338,48 @@ def exchange_messages(
         first: of the worlds.
         last: the one after the last.
         mail: what outlives the tick; written.
-        room: to work in.
+        scratch: overwritten.
     """
     for w in range(first, last):
         tick = common.ticks[w]
         key = common.keys[w]
-        num = gather(zoned, side, w, room.stations, room.spare)
+        num = gather(zoned, side, w, scratch.stations, scratch.spare)
         if sending.cpm_period > 0 or sending.unit_cpm_period > 0:
             for k in range(num):
-                station = room.stations[k]
-                room.everybody[k] = zoned.rows[side, station["zone"], w, station["row"]]
-            fill_grid(room.everybody, num, room.bodies)
+                station = scratch.stations[k]
+                scratch.everybody[k] = zoned.rows[side, station["zone"], w, station["row"]]
+            fill_grid(scratch.everybody, num, scratch.bodies)
         slots = sending.latency + 1
         slot = tick % slots
         mail.num_packets[w, slot] = 0
         mail.num_reports[w, slot] = 0
         send_from_vehicles(
-            sending, mail, w, slot, zoned, side, num, key, tick, types, channel.walls, room
+            sending, mail, w, slot, zoned, side, num, key, tick, types, channel.walls, scratch
         )
-        send_from_units(sending, mail, w, slot, roads, common, units, types, channel.walls, room)
+        send_from_units(sending, mail, w, slot, roads, common, units, types, channel.walls, scratch)
         mail.declared[w] = 0
-        _place_receivers(zoned, side, w, num, key, units, mail, room)
+        _place_receivers(zoned, side, w, num, key, units, mail, scratch)
         if not channel.external:
             arriving = (tick - sending.latency) % slots
-            deliver(channel, mail, w, arriving, key, tick, sending.latency, room)
+            deliver(channel, mail, w, arriving, key, tick, sending.latency, scratch)
 
 
 @kernel
 def hand_out(
-    receptions: NDArray[np.void], tick: int, latency: int, mail: Mail, w: int, room: V2xScratch
+    receptions: NDArray[np.void], tick: int, latency: int, mail: Mail, w: int, scratch: V2xScratch
 ) -> None:
     """Let receivers have what a network simulator says that they receive in this tick.
 
     `receptions`: RECEPTION (n,), of packets that are in flight, by receivers that are there.
-    `latency`: the longest delay, in ticks. `mail`: inboxes and counts are written. `room`:
+    `latency`: the longest delay, in ticks. `mail`: inboxes and counts are written. `scratch`:
     `receivers` as `exchange_messages` has left them.
     """
-    for r in range(room.receivers.size):
-        if room.receivers[r]["id"] >= 0:
-            age(mail, w, r, tick, room)
+    for r in range(scratch.receivers.size):
+        if scratch.receivers[r]["id"] >= 0:
+            age(mail, w, r, tick, scratch)
     for k in range(receptions.size):
         sent = receptions[k]["tick"]
         slot = sent % (latency + 1)
-        learn(mail, w, slot, receptions[k]["packet"], receptions[k]["receiver"], tick - sent, room)
+        learn(
+            mail, w, slot, receptions[k]["packet"], receptions[k]["receiver"], tick - sent, scratch
+        )

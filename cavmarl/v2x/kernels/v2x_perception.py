@@ -29,7 +29,7 @@ def _stands_between(body: np.void, x: float, y: float, cos: float, sin: float, f
 
 @kernel
 def visible(
-    room: V2xScratch,
+    scratch: V2xScratch,
     own: int,
     x: float,
     y: float,
@@ -44,7 +44,7 @@ def visible(
     One is hidden if the body of a nearer one or a wall stands on the straight line to its centre.
 
     Args:
-        room: `bodies` filled; `seen` gets rows of `everybody`, nearest first.
+        scratch: `bodies` filled; `seen` gets rows of `everybody`, nearest first.
         own: row of the station itself; -1: it is no vehicle.
         x: m, its place.
         y: likewise.
@@ -57,16 +57,16 @@ def visible(
     Returns:
         how many.
     """
-    bodies = room.bodies.bodies
+    bodies = scratch.bodies.bodies
     near = nearest_bodies(
-        room.bodies, own, x, y, z, range_m, MAX_NEAR, room.near, room.near_squared
+        scratch.bodies, own, x, y, z, range_m, MAX_NEAR, scratch.near, scratch.near_squared
     )
     found = 0
     for i in range(near):
         if found == most:
             break
-        body = bodies[room.near[i]]
-        far = math.sqrt(room.near_squared[i])
+        body = bodies[scratch.near[i]]
+        far = math.sqrt(scratch.near_squared[i])
         is_hidden = is_cut(walls, x, y, body["x"], body["y"])
         if not over_bodies and far > 0.0:
             cos = (body["x"] - x) / far
@@ -74,8 +74,8 @@ def visible(
             for k in range(i):
                 if is_hidden:
                     break
-                is_hidden = _stands_between(bodies[room.near[k]], x, y, cos, sin, far)
+                is_hidden = _stands_between(bodies[scratch.near[k]], x, y, cos, sin, far)
         if not is_hidden:
-            room.seen[found] = body["row"]
+            scratch.seen[found] = body["row"]
             found += 1
     return found

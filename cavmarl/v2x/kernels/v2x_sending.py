@@ -224,7 +224,7 @@ def _send_seen(
     y: float,
     num: int,
     types: NDArray[np.void],
-    room: V2xScratch,
+    scratch: V2xScratch,
     tick: int,
 ) -> None:
     if num == 0:
@@ -233,7 +233,7 @@ def _send_seen(
     if first < 0:
         return
     for k in range(num):
-        row = room.everybody[room.seen[k]]
+        row = scratch.everybody[scratch.seen[k]]
         report = mail.reports[w, slot, first + k]
         vclass = types[row["vtype"]]["vclass"]
         _tell(report, row, sender, KIND_CPM, vclass, tick, tick + sending.memory_ticks)
@@ -252,13 +252,13 @@ def send_from_vehicles(
     tick: int,
     types: NDArray[np.void],
     walls: Walls,
-    room: V2xScratch,
+    scratch: V2xScratch,
 ) -> None:
     """What is due of all vehicles, by id."""
     known = 0
     num_next = 0
     for k in range(num):
-        station = room.stations[k]
+        station = scratch.stations[k]
         row = zoned.rows[side, station["zone"], w, station["row"]]
         is_agent = row["driver"] == DRIVER_AGENT
         if not is_agent and not is_equipped(key, row["id"], sending.equipped):
@@ -272,10 +272,10 @@ def send_from_vehicles(
                 last = mail.last_cams[w, known]
                 is_due = is_due and _has_changed(row, last, tick, sending.dt_s)
                 if not is_due:
-                    room.next_cams[num_next] = last
+                    scratch.next_cams[num_next] = last
                     num_next += 1
             if is_due:
-                _note_cam(room.next_cams[num_next], row, tick)
+                _note_cam(scratch.next_cams[num_next], row, tick)
                 num_next += 1
         if is_due:
             _send_cam(sending, mail, w, slot, row, types[row["vtype"]]["vclass"], tick)
@@ -288,14 +288,14 @@ def send_from_vehicles(
             _send_event(sending, mail, w, slot, row, cause, tick)
         if _is_due(tick, row["id"], sending.cpm_period):
             seen = visible(
-                room, k, row["x"], row["y"], row["z"],
+                scratch, k, row["x"], row["y"], row["z"],
                 sending.cpm_range_m, sending.cpm_objects, walls, False,
             )  # fmt: skip
             _send_seen(
-                sending, mail, w, slot, row["id"], row["x"], row["y"], seen, types, room, tick
+                sending, mail, w, slot, row["id"], row["x"], row["y"], seen, types, scratch, tick
             )
     for k in range(num_next):
-        mail.last_cams[w, k] = room.next_cams[k]
+        mail.last_cams[w, k] = scratch.next_cams[k]
     mail.num_last[w] = num_next
 
 
@@ -310,7 +310,7 @@ def send_from_units(
     units: NDArray[np.void],
     types: NDArray[np.void],
     walls: Walls,
-    room: V2xScratch,
+    scratch: V2xScratch,
 ) -> None:
     """What is due of the roadside units."""
     tick = common.ticks[w]
@@ -330,11 +330,11 @@ def send_from_units(
                 report["expires"] = tick + sending.denm_ticks
         if _is_due(tick, k, sending.unit_cpm_period):
             seen = visible(
-                room, -1, unit["x"], unit["y"], unit["z"],
+                scratch, -1, unit["x"], unit["y"], unit["z"],
                 sending.unit_range_m, sending.cpm_objects, walls, True,
             )  # fmt: skip
             _send_seen(
-                sending, mail, w, slot, sender, unit["x"], unit["y"], seen, types, room, tick
+                sending, mail, w, slot, sender, unit["x"], unit["y"], seen, types, scratch, tick
             )
         if _is_due(tick, k, sending.spat_period):
             first = _open(mail, w, slot, sender, tick, unit["x"], unit["y"], KIND_SPAT, 1)

@@ -46,7 +46,7 @@ class VisibilityScratch(NamedTuple):
     following: NDArray[np.int32]  # (L,) which lane is to be looked at then
 
 
-def make_room(num_lanes: int, num_links: int) -> VisibilityScratch:
+def make_scratch(num_lanes: int, num_links: int) -> VisibilityScratch:
     first, last, ahead, behind, to_line, beyond = np.full((6, num_lanes), np.inf)
     asked, foe = np.zeros((2, num_links), dtype=np.bool_)
     waits, following = np.zeros(num_lanes, dtype=np.bool_), np.zeros(num_lanes, dtype=np.int32)
@@ -79,11 +79,11 @@ def _within(
 
 
 @kernel
-def _find_own(roads: RoadArrays, rect: NDArray[np.float64], room: VisibilityScratch) -> None:
+def _find_own(roads: RoadArrays, rect: NDArray[np.float64], scratch: VisibilityScratch) -> None:
     """Which part of each lane lies in a rectangle; lanes beside each other have the same."""
     for lane in range(roads.lanes.shape[0]):
-        room.first[lane] = math.inf
-        room.last[lane] = -math.inf
+        scratch.first[lane] = math.inf
+        scratch.last[lane] = -math.inf
         begin = roads.lanes[lane]["first_point"]
         for k in range(begin, begin + roads.lanes[lane]["num_points"] - 1):
             point = roads.points[k]
@@ -91,22 +91,22 @@ def _find_own(roads: RoadArrays, rect: NDArray[np.float64], room: VisibilityScra
             low, high = _within(rect, point["x"], point["y"], after["x"], after["y"])
             if low <= high:
                 long = after["s"] - point["s"]
-                room.first[lane] = min(room.first[lane], point["s"] + low * long)
-                room.last[lane] = max(room.last[lane], point["s"] + high * long)
+                scratch.first[lane] = min(scratch.first[lane], point["s"] + low * long)
+                scratch.last[lane] = max(scratch.last[lane], point["s"] + high * long)
     for edge in range(roads.edges.shape[0]):
         begin = roads.edges[edge]["first_lane"]
         end = begin + roads.edges[edge]["num_lanes"]
         first = math.inf
         last = -math.inf
         for lane in range(begin, end):
-            first = min(first, room.first[lane])
-            last = max(last, room.last[lane])
+            first = min(first, scratch.first[lane])
+            last = max(last, scratch.last[lane])
         if first > last:
             continue
         for lane in range(begin, end):
             length = roads.lanes[lane]["length_m"]
-            room.first[lane] = min(max(first - ASIDE_M, 0.0), length)
-            room.last[lane] = min(last + ASIDE_M, length)
+            scratch.first[lane] = min(max(first - ASIDE_M, 0.0), length)
+            scratch.last[lane] = min(last + ASIDE_M, length)
 
 
 @inlined_kernel
@@ -147,7 +147,7 @@ def _spread(
     limit_m: float,  # of a way
     # (L,) m, finite where ways begin, inf elsewhere; those that are longer are left as they are
     ways: NDArray[np.float64],
-    room: VisibilityScratch,  # `waits` and `following` are used
+    scratch: VisibilityScratch,  # `waits` and `following` are used
 ) -> None:
     """Shortest ways along the roads, from where they begin to all lanes within a limit."""
     head = -1
@@ -155,16 +155,16 @@ def _spread(
     for lane in range(ways.size):
         if ways[lane] > limit_m:
             continue
-        room.waits[lane] = True
+        scratch.waits[lane] = True
         if head < 0:
             head = lane
         else:
-            room.following[tail] = lane
+            scratch.following[tail] = lane
         tail = lane
     while head >= 0:
         lane = head
-        head = room.following[lane] if lane != tail else -1
-        room.waits[lane] = False
+        head = scratch.following[lane] if lane != tail else -1
+        scratch.waits[lane] = False
         way = ways[lane] + roads.lanes[lane]["length_m"]
         if way > limit_m:
             continue
@@ -173,13 +173,13 @@ def _spread(
             if way >= ways[other]:
                 continue
             ways[other] = way
-            if room.waits[other]:
+            if scratch.waits[other]:
                 continue
-            room.waits[other] = True
+            scratch.waits[other] = True
             if head < 0:
                 head = other
             else:
-                room.following[tail] = other
+                scratch.following[tail] = other
             tail = other
 
 
@@ -206,27 +206,31 @@ def _see(roads: RoadArrays, lane: int, first: float, last: float, looks: NDArray
 
 @kernel
 def _look_along(
-    roads: RoadArrays, view_m: float, see_m: float, room: VisibilityScratch, looks: NDArray[np.void]
+    roads: RoadArrays,
+    view_m: float,
+    see_m: float,
+    scratch: VisibilityScratch,
+    looks: NDArray[np.void],
 ) -> None:
     """Leaders ahead, and followers: on own lanes, and over their starts."""
     view_m = max(view_m, see_m, LOOK_BACK_M)
     for lane in range(roads.lanes.shape[0]):
-        room.ahead[lane] = math.inf
-        room.behind[lane] = math.inf
+        scratch.ahead[lane] = math.inf
+        scratch.behind[lane] = math.inf
     for lane in range(roads.lanes.shape[0]):
-        if room.first[lane] <= room.last[lane]:
-            left = roads.lanes[lane]["length_m"] - room.last[lane]
-            _begin(roads, lane, True, left, room.ahead)
-            _begin(roads, lane, False, room.first[lane], room.behind)
-            _see(roads, lane, room.first[lane] - view_m, room.last[lane] + view_m, looks)
-    _spread(roads, True, view_m, room.ahead, room)
+        if scratch.first[lane] <= scratch.last[lane]:
+            left = roads.lanes[lane]["length_m"] - scratch.last[lane]
+            _begin(roads, lane, True, left, scratch.ahead)
+            _begin(roads, lane, False, scratch.first[lane], scratch.behind)
+            _see(roads, lane, scratch.first[lane] - view_m, scratch.last[lane] + view_m, looks)
+    _spread(roads, True, view_m, scratch.ahead, scratch)
     for lane in range(roads.lanes.shape[0]):
-        if room.ahead[lane] <= view_m:
-            _see(roads, lane, 0.0, view_m - room.ahead[lane], looks)
-    _spread(roads, False, BACK_M, room.behind, room)
+        if scratch.ahead[lane] <= view_m:
+            _see(roads, lane, 0.0, view_m - scratch.ahead[lane], looks)
+    _spread(roads, False, BACK_M, scratch.behind, scratch)
     for lane in range(roads.lanes.shape[0]):
-        if room.behind[lane] <= BACK_M:
-            back = room.behind[lane] + roads.lanes[lane]["length_m"] - ROUNDING_M
+        if scratch.behind[lane] <= BACK_M:
+            back = scratch.behind[lane] + roads.lanes[lane]["length_m"] - ROUNDING_M
             edge = roads.edges[roads.lanes[lane]["edge"]]
             for other in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
                 place = back if other == lane else back - ASIDE_M
@@ -234,51 +238,51 @@ def _look_along(
 
 
 @kernel
-def _find_lines(roads: RoadArrays, see_m: float, room: VisibilityScratch) -> None:
+def _find_lines(roads: RoadArrays, see_m: float, scratch: VisibilityScratch) -> None:
     """Which links the zone's drivers may ask about, and which are the foes of these."""
     for link in range(roads.links.shape[0]):
-        room.asked[link] = False
-        room.foe[link] = False
+        scratch.asked[link] = False
+        scratch.foe[link] = False
     for lane in range(roads.lanes.shape[0]):
         row = roads.lanes[lane]
-        own = room.first[lane] <= room.last[lane]
+        own = scratch.first[lane] <= scratch.last[lane]
         if row["internal"]:
             if own:
-                _ask(roads, roads.links[row["link"]]["from_lane"], room)
-        elif (own and row["length_m"] - room.last[lane] <= see_m) or (
-            room.ahead[lane] + row["length_m"] <= see_m
+                _ask(roads, roads.links[row["link"]]["from_lane"], scratch)
+        elif (own and row["length_m"] - scratch.last[lane] <= see_m) or (
+            scratch.ahead[lane] + row["length_m"] <= see_m
         ):
-            _ask(roads, lane, room)
+            _ask(roads, lane, scratch)
     for link in range(roads.links.shape[0]):
-        if room.asked[link]:
+        if scratch.asked[link]:
             first = roads.links[link]["first_conflict"]
             for c in range(first, first + roads.links[link]["num_conflicts"]):
-                room.foe[roads.conflicts[c]["foe"]] = True
+                scratch.foe[roads.conflicts[c]["foe"]] = True
             first = roads.links[link]["first_sweep"]
             for k in range(first, first + roads.links[link]["num_sweeps"]):
-                room.foe[roads.sweeps[k]["foe"]] = True
+                scratch.foe[roads.sweeps[k]["foe"]] = True
 
 
 @kernel
-def _ask(roads: RoadArrays, lane: int, room: VisibilityScratch) -> None:
+def _ask(roads: RoadArrays, lane: int, scratch: VisibilityScratch) -> None:
     """All links that lead on from the edge of a lane."""
     edge = roads.edges[roads.lanes[lane]["edge"]]
     for other in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
         first = roads.lanes[other]["first_link"]
         for link in range(first, first + roads.lanes[other]["num_links"]):
-            room.asked[link] = True
+            scratch.asked[link] = True
 
 
 @kernel
 def _look_at_junctions(
-    roads: RoadArrays, half_m: float, room: VisibilityScratch, looks: NDArray[np.void]
+    roads: RoadArrays, half_m: float, scratch: VisibilityScratch, looks: NDArray[np.void]
 ) -> None:
     """Vehicles that come to the lines of foes, are on a junction, or stand behind it."""
     for lane in range(roads.lanes.shape[0]):
-        room.to_line[lane] = math.inf
-        room.beyond[lane] = math.inf
+        scratch.to_line[lane] = math.inf
+        scratch.beyond[lane] = math.inf
     for link in range(roads.links.shape[0]):
-        if not (room.asked[link] or room.foe[link]):
+        if not (scratch.asked[link] or scratch.foe[link]):
             continue
         row = roads.links[link]
         lane = row["next_lane"]
@@ -286,21 +290,21 @@ def _look_at_junctions(
             _see(roads, lane, 0.0, roads.lanes[lane]["length_m"], looks)
             lane = roads.lanes[lane]["successor"]
         _see(roads, lane, 0.0, SWEPT_BEYOND_M + half_m, looks)
-        if room.asked[link] and row["num_conflicts"] > 0:
-            room.beyond[lane] = 0.0
-        if room.foe[link]:
+        if scratch.asked[link] and row["num_conflicts"] > 0:
+            scratch.beyond[lane] = 0.0
+        if scratch.foe[link]:
             edge = roads.edges[roads.lanes[row["from_lane"]]["edge"]]
             for other in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
-                room.to_line[other] = 0.0
-    _spread(roads, False, APPROACH_M, room.to_line, room)
-    _spread(roads, True, EXIT_LOOK_M, room.beyond, room)
+                scratch.to_line[other] = 0.0
+    _spread(roads, False, APPROACH_M, scratch.to_line, scratch)
+    _spread(roads, True, EXIT_LOOK_M, scratch.beyond, scratch)
     for lane in range(roads.lanes.shape[0]):
-        if room.beyond[lane] <= EXIT_LOOK_M:
-            _see(roads, lane, 0.0, EXIT_LOOK_M - room.beyond[lane], looks)
-        if room.to_line[lane] <= APPROACH_M:
+        if scratch.beyond[lane] <= EXIT_LOOK_M:
+            _see(roads, lane, 0.0, EXIT_LOOK_M - scratch.beyond[lane], looks)
+        if scratch.to_line[lane] <= APPROACH_M:
             edge = roads.edges[roads.lanes[lane]["edge"]]
             for other in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
-                line = room.to_line[lane] + roads.lanes[other]["length_m"]
+                line = scratch.to_line[lane] + roads.lanes[other]["length_m"]
                 looks[other]["line"] = min(looks[other]["line"], line - ROUNDING_M)
 
 
@@ -313,7 +317,7 @@ def find_looks(
     view_m: float,  # how far any driver looks for others along the road
     see_m: float,  # how far before a line its centre is when a driver first asks about the junction
     half_m: float,  # half the length of the longest vehicle
-    room: VisibilityScratch,  # see `make_room`
+    scratch: VisibilityScratch,  # see `make_scratch`
     looks: NDArray[np.void],  # LOOK (L,), overwritten
 ) -> None:
     """Say for each lane where vehicles are that matter to the drivers of one zone."""
@@ -322,10 +326,10 @@ def find_looks(
         looks[lane]["tail"] = math.inf
         looks[lane]["back"] = math.inf
         looks[lane]["line"] = math.inf
-    _find_own(roads, rect, room)
-    _look_along(roads, view_m, see_m, room, looks)
-    _find_lines(roads, see_m, room)
-    _look_at_junctions(roads, half_m, room, looks)
+    _find_own(roads, rect, scratch)
+    _look_along(roads, view_m, see_m, scratch, looks)
+    _find_lines(roads, see_m, scratch)
+    _look_at_junctions(roads, half_m, scratch, looks)
 
 
 @kernel
