@@ -25,6 +25,7 @@ from cavmarl.driving.kernels import bicycle as kinematics
 from cavmarl.driving.kernels import car_following as idm
 from cavmarl.driving.kernels import highway_control as control
 from cavmarl.driving.kernels import lane_change
+from tests.naive.kinematics import clip_control
 
 IDM_DEFAULTS = (idm.ACCEL_MAX, idm.DECEL_COMFORT, idm.JAM_DISTANCE_M, idm.TIME_HEADWAY_S)
 
@@ -60,7 +61,7 @@ def test_bicycle_follows_their_vehicle(seed: int) -> None:
         theirs.crashed = tick > 350
         theirs.act({"acceleration": command[0], "steering": command[1]})
         theirs.step(0.05)
-        accel, steering = kinematics.clip_control(speed, *command, theirs.crashed, *limits)
+        accel, steering = clip_control(speed, *command, theirs.crashed, *limits)
         x, y, heading, speed, _ = kinematics.bicycle_step(
             x, y, heading, speed, accel, steering, Vehicle.LENGTH, 0.05
         )
@@ -110,9 +111,9 @@ def our_acceleration(car: IDMVehicle | None, front: IDMVehicle | None) -> float:
         return idm.idm_free(car.speed, target_speed, idm.ACCEL_MAX)
     front_speed = float(front.velocity @ car.direction)
     # Their car's own speed is projected too, which is exact only up to its last bit.
-    return idm.idm_acceleration(
-        car.speed, target_speed, car.lane_distance_to(front), front_speed, *IDM_DEFAULTS
-    )
+    distance = car.lane_distance_to(front)
+    taken = idm.idm_interaction(car.speed, distance, front_speed, *IDM_DEFAULTS)
+    return idm.idm_free(car.speed, target_speed, idm.ACCEL_MAX) - taken
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -118,11 +118,6 @@ def records_from_lines(text: str) -> tuple[Record, ...]:
     return tuple(records)
 
 
-def whole_lines(text: str) -> str:
-    """A log without what follows its last whole line: a torn record was never acted upon."""
-    return text[: text.rfind("\n") + 1]
-
-
 def replay(records: Iterable[Record]) -> Table:
     """The table that a log leads to, for any number of zones."""
     log = tuple(records)

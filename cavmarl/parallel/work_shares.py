@@ -71,11 +71,6 @@ def make_plans(
     ]
 
 
-def share_out(world: World, num_worlds: int, workers: int) -> list[Part]:
-    """What idle workers run; arguments and errors as of `make_plans`."""
-    return parts_of(make_plans(world, num_worlds, workers), world.partition.count)
-
-
 def parts_of(plans: Sequence[Plan], num_zones: int) -> list[Part]:
     """What the workers of each team run."""
     parts = []

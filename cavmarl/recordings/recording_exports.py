@@ -22,7 +22,6 @@ from cavmarl.roads.network import VEHICLE_CLASSES
 Track = Callable[[Iterator[WorldFrame]], Iterable[WorldFrame]]
 """Is given the frames and hands them on, to show how far they are."""
 Export = Callable[[Recording, Path, int, int, Track], int]
-_ENTITIES = "cavmarl.SceneEntities"
 _EVENT = "cavmarl.Event"
 
 

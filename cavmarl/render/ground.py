@@ -23,7 +23,7 @@ from cavmarl.render.canvas import (
 )
 from cavmarl.render.shapes import RoadShapes, level_of
 from cavmarl.render.viewport import Viewport
-from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
+from cavmarl.roads.network import RoadNetwork
 
 if TYPE_CHECKING:
     from pygame import Surface
@@ -49,12 +49,6 @@ def signal_codes(network: RoadNetwork, signal_phases: NDArray[np.int32]) -> NDAr
     first = network.phases["first_state"][signal_phases[links["signal"]]]
     codes[signalled] = network.phase_states[first + links["signal_index"]]
     return codes
-
-
-def signal_letter(network: RoadNetwork, link: int, signal_phases: NDArray[np.int32]) -> str:
-    """The SUMO letter that a link's signal shows; empty without a signal."""
-    code = int(signal_codes(network, signal_phases)[link])
-    return "" if code == SIGNAL_NONE else SIGNAL_STATES[code]
 
 
 def draw_ground(shapes: RoadShapes, camera: Viewport, detail: int) -> Surface:

@@ -54,19 +54,6 @@ def sensor_names() -> tuple[str, ...]:
     return (*_OBSERVED, *REGISTERED_SENSORS.names, *_MOUNTED)
 
 
-def find_sensor(name: str) -> Sensor | MountedType:
-    """The sensor of a name.
-
-    Raises ConfigError: there is none.
-    """
-    if name in _OBSERVED:
-        return _OBSERVED[name]
-    if name in _MOUNTED:
-        return _MOUNTED[name]
-    sensor: Sensor = REGISTERED_SENSORS[name]
-    return sensor
-
-
 def register_sensor(
     name: str,
     sense: Callable[[AgentView], ArrayLike] | Callable[[BatchView], ArrayLike],

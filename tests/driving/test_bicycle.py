@@ -29,14 +29,6 @@ def test_bicycle_step_equals_twin(
     assert abs(wrap_angle(turned - twin[2])) < 1e-12
 
 
-@given(SPEEDS, ACCELS, STEERINGS, st.booleans())
-def test_clip_control_equals_twin(
-    speed: float, accel: float, steering: float, crashed: bool
-) -> None:
-    control = kinematics.clip_control(speed, accel, steering, crashed, -40.0, 40.0)
-    assert control == naive.clip_control(speed, accel, steering, crashed, -40.0, 40.0)
-
-
 def test_a_circle_closes() -> None:
     # tan(slip) = tan(steering) / 2 and radius = (length / 2) / sin(slip).
     slip = math.atan(math.tan(0.3) / 2.0)

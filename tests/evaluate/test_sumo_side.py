@@ -12,10 +12,11 @@ from cavmarl.core.errors import ConfigError, MissingExtraError
 from cavmarl.evaluate.traffic.sumo_side import (
     SumoJob,
     _VehicleReader,
-    run_sumo,
+    run_seeds,
     start_sumo,
     sumo_process,
 )
+from cavmarl.evaluate.traffic.traffic_metrics import TrafficRun
 from cavmarl.roads.sumo_net.reader import read_network
 from cavmarl.traffic.sumo.sumo_input import SumoInput, read_input, without_outputs
 
@@ -29,6 +30,10 @@ ROUTES = GAME / "kuehne" / "kuehne.rou.xml"
 
 def job(demand: SumoInput, map_file: Path = MAP, seconds: int = 60, seed: int = 1) -> SumoJob:
     return SumoJob(map_file, demand, seconds, dt_s=0.5, seed=seed)
+
+
+def run_sumo(job: SumoJob) -> TrafficRun:
+    return run_seeds(job, ())[0]
 
 
 def one_car(tmp_path: Path) -> SumoInput:

@@ -18,7 +18,6 @@ from cavmarl.ownership.log_records import (
     records_from_lines,
     replay,
     sealed,
-    whole_lines,
 )
 from cavmarl.ownership.messages import Begin, Birth, Commit, Host, Removed, Reset
 from tests.ownership.bench import Bench
@@ -59,7 +58,7 @@ def test_a_torn_last_line_is_named_and_what_precedes_it_is_whole(log: str) -> No
     torn = log[:-7]
     with pytest.raises(JournalError, match=f"line {len(log.splitlines())} "):
         records_from_lines(torn)
-    assert records_from_lines(whole_lines(torn)) == records_from_lines(log)[:-1]
+    assert records_from_lines(torn[: torn.rfind("\n") + 1]) == records_from_lines(log)[:-1]
 
 
 def test_every_changed_letter_of_a_line_is_noticed(log: str) -> None:

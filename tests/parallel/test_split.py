@@ -17,7 +17,7 @@ from cavmarl import ConfigError, make_vec
 from cavmarl.core.errors import WorkerFailureError
 from cavmarl.engine.world_setup import load_world
 from cavmarl.parallel import pooled_worlds as pooled
-from cavmarl.parallel.work_shares import share_out
+from cavmarl.parallel.work_shares import make_plans, parts_of
 from tests.support.actuated import actuated_grid
 from tests.support.pools import alive
 from tests.support.rerouting import CARS, DEVICE, FLOW, make_map, write_demand
@@ -215,7 +215,7 @@ def test_what_only_one_process_can(name: str) -> None:
 @pytest.mark.parametrize(("worlds", "workers"), [(1, 2), (2, 3), (3, 7), (4, 2), (5, 5), (1, 9)])
 def test_everything_has_one_worker(worlds: int, workers: int) -> None:
     world = load_world("town", zones=9)
-    parts = share_out(world, worlds, workers)
+    parts = parts_of(make_plans(world, worlds, workers), world.partition.count)
     assert [w for part in parts for w in range(part.first, part.last)] == list(range(worlds))
     assert sum(len(part.zones) for part in parts) == workers
     assert sum(len(part.names) for part in parts) == workers

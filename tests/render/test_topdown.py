@@ -13,7 +13,7 @@ from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.render import canvas as palette
 from cavmarl.render.canvas import load_pygame
 from cavmarl.render.cars import BRAKING_MPS2
-from cavmarl.render.ground import signal_codes, signal_letter
+from cavmarl.render.ground import signal_codes
 from cavmarl.render.topdown import TopDownRenderer
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
 
@@ -119,7 +119,7 @@ def test_signal_letters_are_those_of_the_phase(grid: RoadNetwork) -> None:
         phase = grid.phases[grid.programs["first_phase"][signal["program"]]]
         states = grid.phase_states[phase["first_state"] :][: signal["num_links"]]
         letter = SIGNAL_STATES[states[grid.links[link]["signal_index"]]]
-        assert signal_letter(grid, int(link), phases) == letter
+        assert SIGNAL_STATES[codes[link]] == letter
 
 
 def test_stop_lines_switch_with_their_signal(grid: RoadNetwork) -> None:
@@ -138,7 +138,7 @@ def test_stop_lines_switch_with_their_signal(grid: RoadNetwork) -> None:
         near = renderer.frame(
             np.zeros(0, dtype=VEHICLE), phases, center=(float(end["x"]), float(end["y"]))
         )
-        letter = signal_letter(grid, link, phases)
+        letter = SIGNAL_STATES[signal_codes(grid, phases)[link]]
         around = near[115:125, 155:165]
         if letter in "rG":
             seen.add(letter)

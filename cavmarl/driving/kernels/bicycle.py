@@ -54,27 +54,3 @@ def bicycle_step(
         speed + accel * dt,
         yaw_rate,
     )
-
-
-@kernel
-def clip_control(
-    speed: float,  # m/s
-    accel: float,  # commanded, m/s²
-    steering: float,  # commanded, rad
-    crashed: bool,  # whether the car has collided
-    min_speed: float,  # m/s, negative; `MIN_SPEED_MPS` in highway-env
-    max_speed: float,  # m/s; `MAX_SPEED_MPS` in highway-env
-) -> tuple[float, float]:  # acceleration in m/s² and steering in rad
-    """The control that a car obeys: highway-env's `Vehicle.clip_actions`.
-
-    A crashed car comes to rest with straight wheels, with a time constant of 1 s. A car beyond
-    what its engine can do falls back to that with the same time constant.
-    """
-    if crashed:
-        steering = 0.0
-        accel = -speed
-    if speed > max_speed:
-        accel = min(accel, max_speed - speed)
-    elif speed < min_speed:
-        accel = max(accel, min_speed - speed)
-    return accel, steering

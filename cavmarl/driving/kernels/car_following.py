@@ -58,20 +58,3 @@ def idm_interaction(
     )
     ratio = gap / not_zero(distance)
     return accel_max * (ratio * ratio)
-
-
-@kernel
-def idm_acceleration(
-    speed: float,
-    target_speed: float,
-    distance: float,
-    front_speed: float,
-    accel_max: float,
-    decel_comfort: float,
-    jam_distance: float,
-    time_headway: float,
-) -> float:
-    """Acceleration behind one leader in m/s², not limited; arguments as in the two parts of it."""
-    return idm_free(speed, target_speed, accel_max) - idm_interaction(
-        speed, distance, front_speed, accel_max, decel_comfort, jam_distance, time_headway
-    )

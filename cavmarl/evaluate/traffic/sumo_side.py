@@ -53,11 +53,6 @@ class SumoJob:
         return vehicle in self.shared or vehicle.rpartition(".")[0] in self.shared
 
 
-def run_sumo(job: SumoJob) -> TrafficRun:
-    """Run and measure it in a process of its own."""
-    return run_seeds(job, ())[0]
-
-
 def run_seeds(job: SumoJob, more_seeds: Sequence[int]) -> tuple[TrafficRun, list[TrafficRun]]:
     """Run it in a process of its own, then again with more seeds; contacts of those: 0."""
     with sumo_process(job) as process:

@@ -53,10 +53,6 @@ class Alignment:
         skew = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
         return float(np.degrees(np.arctan2(np.linalg.norm(skew), np.trace(turn) - 1.0)))
 
-    @property
-    def shift_m(self) -> float:
-        return float(np.linalg.norm(self.transform[:3, 3]))
-
 
 def moved(points: Points, transform: Points) -> Points:
     """Points (n, 3) by a motion (4, 4)."""

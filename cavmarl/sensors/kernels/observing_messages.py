@@ -22,7 +22,6 @@ from cavmarl.v2x.kernels.v2x_records import (
 
 OBJECT_FEATURES = 11
 EVENT_FEATURES = 8
-SIGNAL_FEATURES = 4
 SPEED_SCALE = 40.0  # m/s
 ACCEL_SCALE = 10.0  # m/s²
 LENGTH_SCALE = 20.0  # m

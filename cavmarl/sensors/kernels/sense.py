@@ -39,7 +39,6 @@ from cavmarl.sensors.kernels.output_reset import has_entered, newest_frame, shif
 
 EGO_FEATURES = 13
 NEIGHBOR_FEATURES = 7
-SIGNAL_FEATURES = 6
 
 SPEED_SCALE = 40.0  # m/s
 ACCEL_SCALE = 10.0  # m/s²

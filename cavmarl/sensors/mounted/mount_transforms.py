@@ -11,8 +11,6 @@ from cavmarl.config.rig import MountedConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.sensors.kernels.rig_frames import Mount, rotation
 
-WORLD_FRAME = "map"  # x east, y north, z up, as in `roads.network`
-VEHICLE_FRAME = "vehicle"
 SENSOR_FRAME = "vehicle/{name}"
 
 Points = NDArray[np.float64]

@@ -82,10 +82,6 @@ class ZonePartition:
         zones_of(self.arrays, places, len(places), zones)
         return zones
 
-    def shortest_sides_m(self) -> NDArray[np.float64]:
-        """The shorter side of each zone's part of `bounds`, (k,)."""
-        return np.asarray((self.rects[:, 2:] - self.rects[:, :2]).min(axis=1))
-
     @cached_property
     def neighbors(self) -> tuple[tuple[Neighbor, ...], ...]:
         """For each zone those that touch it, by number; a shared corner counts."""
