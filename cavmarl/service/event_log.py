@@ -24,6 +24,9 @@ class EventLog:
     Args:
         store: where events are kept; what it has is replayed.
         wall_s: the wall clock.
+
+    Raises:
+        ServiceError: what the store has was changed.
     """
 
     def __init__(self, store: EventStore, wall_s: Callable[[], float] = time.time) -> None:
@@ -40,7 +43,7 @@ class EventLog:
         self._in_flight: dict[str, bytes] = {}  # content that is being written
         self._writing = asyncio.Lock()
         self.durable = 0  # the last event on disk
-        for line in store.read():
+        for line in store.read_checked():
             self.state.apply(line)
             self.sequence, self._digest = line.sequence, line.digest
         self.durable = self.sequence

@@ -178,22 +178,21 @@ class EventStore:
             found = self._connection.execute(query).scalar()
         return None if found is None else bytes(found)
 
-    def check_chain(self) -> int:
-        """How many lines there are, if each follows from the one before.
+    def read_checked(self) -> Iterator[LogEvent]:
+        """All lines; each has to follow from the one before.
 
         Raises:
             ServiceError: a line was changed, removed or put in.
         """
-        last, count = "", 0
-        for line in self.read():
-            count += 1
+        last = ""
+        for count, line in enumerate(self.read(), start=1):
             if line.sequence != count or line.digest != digest_of(last, line):
                 raise ServiceError(
                     f"store {self.where}: event {line.sequence} does not follow from the one "
                     "before: the log was changed; take a copy from before that"
                 )
             last = line.digest
-        return count
+            yield line
 
     def close(self) -> None:
         """Let another service have it."""

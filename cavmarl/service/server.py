@@ -50,7 +50,7 @@ def serve(options: ServerOptions, tell: Callable[[str], None]) -> None:
 
     Raises:
         ServiceError: an address without TLS that others can reach, a port that is taken, a store
-            that cannot be opened or written.
+            that cannot be opened or written, or that was changed.
     """
     check_transport(options.host, options.certificate, options.key)
     store = EventStore(options.store)

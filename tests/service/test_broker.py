@@ -277,7 +277,7 @@ def test_a_replay_of_the_log_gives_the_same(fleet: Fleet, tmp_path: Path) -> Non
     again = EventLog(EventStore(tmp_path / "store.sqlite"))
     assert again.state == known
     assert again.content(sessions[0].saved_blob or "") == b"content"
-    assert again.store.check_chain() == again.sequence
+    assert len(list(again.store.read_checked())) == again.sequence
     fleet.log.store = again.store
 
 
