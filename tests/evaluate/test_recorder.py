@@ -100,6 +100,15 @@ def test_a_seat_makes_one_trip_after_the_other() -> None:
     assert np.isnan(trips["least_pet_s"][1:]).all()
 
 
+def test_trips_of_less_than_a_metre_do_not_share_in_how_even_delays_are() -> None:
+    worlds = Worlds()
+    worlds.add(done=(True, True), delay=(1.0, 1.0), progress=(10.0, 10.0))
+    worlds.add(done=(True, True), over=(True, True), delay=(1.0, 1.0), progress=(0.9, 1.1))
+    even, uneven = worlds.recorder.episodes()["gini_delay"]
+    assert even == 0.0
+    assert uneven > 0.1
+
+
 def test_a_meeting_after_ten_seconds_is_none() -> None:
     worlds = Worlds()
     worlds.recorder.least_pet_s[:, 0] = 9.9, 10.1

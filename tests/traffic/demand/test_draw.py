@@ -17,6 +17,7 @@ from cavmarl.traffic.demand.demand_records import (
     UNTIL_FLOW,
     Options,
 )
+from cavmarl.traffic.demand.drawing import departures_ms
 from tests.traffic.demand.conftest import Reader
 
 KEY = int(world_key(7, 0, 0))
@@ -64,6 +65,19 @@ def test_flows_have_the_rate_that_they_state(demand: Reader, rate: str) -> None:
     assert len(orders) == pytest.approx(5000, abs=4 * 5000**0.5)
     assert orders["number"].tolist() == list(range(len(orders)))
     assert file.vehicle_id(orders[3]) == "f.3"
+
+
+@pytest.mark.parametrize("rate", ['period="2"', 'period="exp(0.5)"', 'probability="0.5"'])
+def test_a_departure_at_the_border_of_two_spans_is_in_the_later_one(
+    demand: Reader, rate: str
+) -> None:
+    file = demand(f'<flow id="f" end="100" {rate}><route edges="AB BC"/></flow>')
+    *_, times = departures_ms(file.elements, KEY, 0, 100_000)
+    border = int(times[len(times) // 2])
+    *_, early = departures_ms(file.elements, KEY, 0, border)
+    *_, late = departures_ms(file.elements, KEY, border, 100_000)
+    assert early.tolist() + late.tolist() == times.tolist()
+    assert late[0] == border
 
 
 def test_distributions_are_drawn_with_their_weights(demand: Reader) -> None:
