@@ -101,6 +101,16 @@ def test_worlds_of_a_vector_have_folders_of_their_own_and_episodes_are_counted(
         next(recording.frames(7))
 
 
+def test_an_episode_without_a_step_is_one(tmp_path: Path) -> None:
+    with closing(make_vec("ring", record=tmp_path / "run", agents=1, background=0)) as vec:
+        for seed in (1, 2):
+            vec.reset(seed=seed)
+        vec.step(vec.suggest_actions())
+    recording = Recording.open(tmp_path / "run")
+    assert recording.episodes(0) == [0, 1]
+    assert [len(recording.ticks(0, episode)) for episode in (0, 1)] == [1, 2]
+
+
 def test_an_end_in_the_step_that_begins_the_world_anew_is_an_event(tmp_path: Path) -> None:
     """Of autoreset's last step there is no frame; what ended in it is told all the same."""
     arguments: dict[str, Any] = {"agents": 2, "background": 0, "max_cycles": 40}
