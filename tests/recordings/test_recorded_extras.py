@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from cavmarl import ConfigError, RecordingError, RecordOptions, make_vec, parallel_env
+from cavmarl.recordings.extra_tables import take_rows
 from cavmarl.recordings.recording import Recording
 from cavmarl.v2x.kernels.v2x_records import KIND_CAM, NUM_KINDS
 from tests.support.killed_recordings import killed_recording
@@ -157,3 +158,10 @@ def test_a_killed_run_leaves_whole_tables(tmp_path: Path) -> None:
         part.write_bytes(part.read_bytes()[:-30])
     with pytest.raises(RecordingError, match=r"observations/0+\.parquet: is damaged"):
         Recording.open(path).extra("observations")
+
+
+def test_rows_of_the_frames_own_tick_are_of_its_episode() -> None:
+    rows = np.array([(0, 1), (3, 2), (4, 3)], dtype=[("tick", np.int64), ("id", np.int64)])
+    (_, before), (_, own) = take_rows({"messages": rows}, 2, 3)
+    assert (before.episode, before.rows["id"].tolist()) == (1, [3])
+    assert (own.episode, own.rows["id"].tolist()) == (2, [1, 2])

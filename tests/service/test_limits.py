@@ -86,7 +86,7 @@ def test_an_identity_has_so_many_streams_at_most(service: RunningService) -> Non
 def test_a_world_that_no_node_could_hold_is_refused(
     service: RunningService, tokens: dict[str, Any]
 ) -> None:
-    body = {"environment": "merge", "agents": 100_000, "num_envs": 1024}
+    body = {"environment": "merge", "agents": 100_000, "num_envs": 2}
     answer = ask(service, tokens["client"], "POST", "/configurations", json=body)
     assert problem_of(answer) == "refused"
     assert "at most 200000" in answer.json()["detail"]
