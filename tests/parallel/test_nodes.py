@@ -374,9 +374,12 @@ def test_a_node_that_is_lost_while_zones_are_given_out_is_replaced(
 
     def tell_and_strike(self: NodePool, *told: Any, **more: Any) -> None:
         process = psutil.Process(self.pids[-1 if struck else 0])
+        strikes = len(struck) < 2
         if is_told:
+            if strikes:
+                process.suspend()  # else it may have answered before it is struck
             tell(self, *told, **more)
-        if len(struck) < 2:
+        if strikes:
             struck.append(process.pid)
             process.send_signal(how)
             if how == signal.SIGKILL:
