@@ -141,7 +141,8 @@ def test_every_driver_of_the_folder_loads_where_it_belongs() -> None:
     for name, path in agent_entries().items():
         config = path / "config.json"
         home = json.loads(config.read_text())["environment"] if path.is_dir() else "merge"
-        policy = load_policy(name, make_vec(home, overrides=NEEDED.get(name)))
+        keys = driver_keys(name) if path.is_dir() else NEEDED.get(name)
+        policy = load_policy(name, make_vec(home, overrides=keys))
         assert isinstance(policy, Policy)
 
 
