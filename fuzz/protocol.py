@@ -79,7 +79,7 @@ def _log(content: bytes) -> object:
             found = json.loads(line)
             if isinstance(found, dict):
                 found = sealed(found, last)
-                lines[-1], last = json.dumps(found) + "\n", found["checksum"]
+                lines[-1], last = json.dumps(found, separators=(",", ":")) + "\n", found["checksum"]
     return replay(records_from_lines("".join(lines)))
 
 
