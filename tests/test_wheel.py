@@ -110,7 +110,7 @@ def test_a_wheel_carries_the_data_folders_whole(site: Path, kind: str) -> None:
 def test_a_wheel_finds_its_own_entries(site: Path) -> None:
     code = (
         "import json; from cavmarl.config.registry import *; "
-        "maps = [str(resolve_map(*load_config(name))) for name in entries()]; "
+        "maps = [str(m) for name in entries() for m in resolve_maps(*load_config(name))]; "
         "print(json.dumps([[*entries()], [*agent_entries()], maps]))"
     )
     command = [sys.executable, "-c", code]
