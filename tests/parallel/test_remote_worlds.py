@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -238,7 +239,7 @@ from cavmarl import make_vec
 if __name__ == "__main__":
     vec = make_vec("ring", num_envs=2, workers=2, hosts="ray")
     vec.reset(seed=0)
-    print(*vec.worlds.pool.pids, flush=True)
+    print("pids", *vec.worlds.pool.pids, flush=True)
     os.kill(os.getpid(), signal.SIGKILL)
 """
 
@@ -252,8 +253,9 @@ def test_nothing_is_left_behind_by_a_program_that_is_killed(cluster: Any) -> Non
         text=True,
         timeout=120,
     )
-    pids = [int(word) for word in done.stdout.split()]
-    assert len(pids) == 2, done.stderr
+    said = re.search(r"^pids (\d+) (\d+)$", done.stdout, re.MULTILINE)  # beside Ray's own lines
+    assert said, done.stderr
+    pids = [int(word) for word in said.groups()]
     await_true(lambda: not any(psutil.pid_exists(pid) for pid in pids))
     await_true(lambda: ray.available_resources().get("CPU") == 3.0)
 
