@@ -33,7 +33,7 @@ def traceback_text(error: BaseException) -> str:
 
 
 def fault_in(file: Path, error: Exception) -> str:
-    """What a file of a user has raised while it was read, and in which line of whose file."""
+    """What a file of a user has raised while it was read, with the file and line."""
     said = f"{type(error).__name__}: {error}"
     if isinstance(error, SyntaxError):
         place = f"{error.filename or file}, line {error.lineno}"

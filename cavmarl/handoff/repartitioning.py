@@ -43,6 +43,11 @@ def propose_cut(
     return propose_zones(network, partition, places, counts.tolist(), tolerance=tolerance)
 
 
+def is_due(step: int, every: int) -> bool:
+    """Whether zones are looked at before a step (counted from 1); `every` 0: never."""
+    return every > 0 and step > 1 and (step - 1) % every == 0
+
+
 class Recutter:
     """Looks every so many steps whether other zones would share out the vehicles better."""
 
@@ -69,7 +74,7 @@ class Recutter:
         owners may be far away from them.
         """
         self._steps += 1
-        if self._steps == 1 or (self._steps - 1) % self._every:
+        if not is_due(self._steps, self._every):
             return None
         began = time.perf_counter()
         proposal = propose_cut(self._network, self._division, partition, self._tolerance)

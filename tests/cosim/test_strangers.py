@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import os
-import resource
 import socket
 import threading
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -32,6 +29,7 @@ from cavmarl.cosim.followers.follower_messages import (
 from cavmarl.parallel.hosts.framed_socket import FramedSocket
 from tests.cosim.conftest import hashes, make_env, seated
 from tests.cosim.test_followed_world import reference
+from tests.support.descriptors import without_descriptors
 
 
 def call(address: Path) -> socket.socket:
@@ -141,25 +139,14 @@ def test_a_world_without_descriptors_lets_the_oldest_caller_go(address: Path) ->
         first = call(address)
         world._admit(0.0)
         later, words = call(address), hello_in(1)
-        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-        used = max(int(name) for name in os.listdir("/proc/self/fd"))
-        filling = []
-        resource.setrlimit(resource.RLIMIT_NOFILE, (used + 2, hard))
-        try:
-            with suppress(OSError):
-                while True:
-                    filling.append(os.open(os.devnull, os.O_RDONLY))
+        with without_descriptors():
             world._admit(0.0)
             assert "no descriptors" in refusal(first)
             world._admit(0.0)
             later.sendall(words)
             world._admit(0.0)
             assert [follower.name for follower in world.master.followers] == ["x"]
-        finally:
-            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-            for descriptor in filling:
-                os.close(descriptor)
-            later.close()
+        later.close()
 
 
 @pytest.mark.parametrize(

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import gc
 import os
-import resource
 import select
 import signal
 import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -23,6 +21,7 @@ from cavmarl.core.errors import WorkerDeathError, WorkerError, WorkerFailureErro
 from cavmarl.parallel.hosts.host_commands import HostProgram
 from cavmarl.parallel.hosts.host_pool import HostPool
 from cavmarl.parallel.hosts.listener import MAX_CALLERS, Listener
+from tests.support.descriptors import without_descriptors
 from tests.support.forks import said_in_fork
 from tests.support.toy_hosts import ADD, DOZE, FAIL, FALL, TASKS, TOIL, TOTAL, WRITE, Processes
 
@@ -218,20 +217,9 @@ def test_a_crowd_at_the_door_does_not_keep_a_successor_out(
 def test_a_door_without_descriptors_hangs_up_and_is_not_readable_for_ever() -> None:
     door = Listener("127.0.0.1")
     waiting = [socket.create_connection(door.place) for _ in range(2)]
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    used = max(int(name) for name in os.listdir("/proc/self/fd"))
-    filling = []
-    resource.setrlimit(resource.RLIMIT_NOFILE, (used + 2, hard))
-    try:
-        with suppress(OSError):
-            while True:
-                filling.append(os.open(os.devnull, os.O_RDONLY))
+    with without_descriptors():
         assert door.admit() == []
         assert not select.select([door], [], [], 0.05)[0]
-    finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-        for descriptor in filling:
-            os.close(descriptor)
     for caller in waiting:
         caller.settimeout(5.0)
         assert caller.recv(1) == b""

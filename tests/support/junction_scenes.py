@@ -82,7 +82,7 @@ class Scene:
         return vehicles[vehicles["id"] == self.names.index(name)][0]
 
     def run(self, seconds: float) -> Iterator[float]:
-        """Yields the time after each tick; nobody may touch anybody."""
+        """Yields the time after each tick; no two vehicles may touch."""
         for _ in range(round(seconds / 0.05)):
             drive(self.simulation)
             vehicles = self.simulation.vehicles()

@@ -17,7 +17,7 @@ from cavmarl.balance.probe import MEASURED
 from cavmarl.core.errors import ConfigError, MessageError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
-from cavmarl.handoff.repartitioning import Recut
+from cavmarl.handoff.repartitioning import Recut, is_due
 from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.parallel.commanded_worlds import uncopied
@@ -113,8 +113,8 @@ class NodeWorlds(NodePool):
 
     def _cut_anew(self) -> None:
         """Every so many steps cut the zones by their vehicles; see `zones.repartition_steps`."""
-        every, self._steps = self.world.config.zones.repartition_steps, self._steps + 1
-        if not every or self._steps == 1 or (self._steps - 1) % every:
+        self._steps += 1
+        if not is_due(self._steps, self.world.config.zones.repartition_steps):
             return
         if proposal := self._asked(Task.PROPOSE, None):
             zones, *figures = proposal
