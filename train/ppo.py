@@ -33,7 +33,6 @@ from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.learning import options
 from cavmarl.learning.checkpoint import Parts, bytes_of, tensor_of
 from cavmarl.learning.log import Trips, describe, progress_bar
-from cavmarl.learning.options import check_above_zero, check_at_least, check_shares
 from cavmarl.learning.run_folder import RunFolder, parse_run
 from cavmarl.learning.scales import Scales
 from cavmarl.parallel.local_worlds import kept_elsewhere
@@ -85,6 +84,7 @@ class Args:
     hidden: Annotated[int, "width of the two hidden layers"] = 128
     shared: Annotated[bool, "one body with LayerNorm for actor and critic"] = False
     threads: Annotated[int, "of torch"] = 1
+    device: Annotated[str, "where the network is: cpu, or cuda on a machine with a GPU"] = "cpu"
     checkpoint_updates: Annotated[int, "updates between two checkpoints"] = 20
     runs: Annotated[str, "folder of all runs"] = "runs"
     name: Annotated[str, "folder of this run; empty: ENV_ALGORITHM_SEED"] = ""
@@ -95,10 +95,11 @@ class Args:
         ones = "num_envs total_agent_steps num_steps epochs minibatches hidden threads"
         zeros = "agents zones workers seed minutes entropy_weight value_weight imitation_weight"
         above = "keep learning_rate clip max_gradient_norm throttle_std steering_std"
-        check_at_least(self, dict.fromkeys(f"{ones} checkpoint_updates".split(), 1))
-        check_at_least(self, {"background": -1, **dict.fromkeys(zeros.split(), 0)})
-        check_above_zero(self, [*above.split(), "imitation_share"])
-        check_shares(self, ("gamma", "gae_lambda", "keep", "opponent_share"))
+        options.check_at_least(self, dict.fromkeys(f"{ones} checkpoint_updates".split(), 1))
+        options.check_at_least(self, {"background": -1, **dict.fromkeys(zeros.split(), 0)})
+        options.check_above_zero(self, [*above.split(), "imitation_share"])
+        options.check_shares(self, ("gamma", "gae_lambda", "keep", "opponent_share"))
+        options.check_device(self.device)
         if self.shared and self.mappo:
             raise ConfigError("--shared: not with --mappo, whose critic sees more than the actor")
 
@@ -147,15 +148,15 @@ class Collector:
     """
 
     def __init__(self, vec: CavVectorEnv, network: ActorCritic, args: Args, seed: int) -> None:
-        self.vec, self.network, self._args = vec, network, args
+        self.vec, self.network, self._args, self._device = vec, network, args, args.device
         self.trips = Trips(vec.num_envs, vec.num_agents)
         self.spent_s = dict.fromkeys(PHASES, 0.0)
-        self._mask = torch.from_numpy(vec.reset(seed=seed)[1]["mask"])
+        self._mask = vec.reset(seed=seed)[1]["mask"]
         # Worlds write here what is seen: it is copied once, into a batch.
         self._observations = torch.from_numpy(vec.worlds.arrays.observations)
         self._opponents = [load_policy(name, vec) for name in args.opponents.split(",") if name]
-        drawn = torch.from_numpy(np.random.default_rng(args.seed).random(self._mask.shape))
-        self._seats = torch.floor(drawn / max(args.opponent_share, 1e-9)).long()  # whose they are
+        drawn = np.random.default_rng(args.seed).random(self._mask.shape)
+        self._seats = np.floor(drawn / max(args.opponent_share, 1e-9))  # which driver has each
         self._seats[self._seats >= len(self._opponents)] = -1  # the network's
 
     @contextmanager
@@ -184,17 +185,18 @@ class Collector:
     def _empty(self, with_suggested: bool) -> Batch:
         shape = (self._args.num_steps, *self._mask.shape)
         continuous = self.network.continuous
-        actions = torch.zeros((*shape, 2)) if continuous else torch.zeros(shape, dtype=torch.int64)
         numbers = ("log_probs", "values", "rewards", "next_values")
-        return Batch(
-            observations=torch.empty((*shape, self._observations.shape[-1])),
-            states=torch.zeros((*shape[:2], self.network.state_size)),
-            actions=actions,
-            acted=torch.zeros(shape, dtype=torch.bool),
-            goes_on=torch.zeros(shape, dtype=torch.bool),
-            suggested=torch.zeros_like(actions) if with_suggested else None,
-            **{name: torch.zeros(shape) for name in numbers},
-        )
+        with torch.device(self._device):
+            actions = torch.zeros((*shape, 2)) if continuous else torch.zeros(shape).long()
+            return Batch(
+                observations=torch.empty((*shape, self._observations.shape[-1])),
+                states=torch.zeros((*shape[:2], self.network.state_size)),
+                actions=actions,
+                acted=torch.zeros(shape, dtype=torch.bool),
+                goes_on=torch.zeros(shape, dtype=torch.bool),
+                suggested=torch.zeros_like(actions) if with_suggested else None,
+                **{name: torch.zeros(shape) for name in numbers},
+            )
 
     def _step(self, batch: Batch, t: int) -> None:
         """Let the network decide, and write down what is entry `t` of a batch."""
@@ -207,30 +209,27 @@ class Collector:
             output, values = self._heads(batch.observations[t], batch.states[t])
             actions, batch.log_probs[t] = self.network.draw(output)
             batch.values[t], batch.actions[t] = values, actions
-        given = (actions.clamp(-1.0, 1.0) if self.network.continuous else actions).numpy()
-        seen, mask = self._observations.numpy(), self._mask.numpy()
+            given = (actions.clamp(-1.0, 1.0) if self.network.continuous else actions).cpu().numpy()
         for k, opponent in enumerate(self._opponents):
-            theirs = (self._seats == k).numpy()
-            given[theirs] = opponent.act_batch(seen, mask & theirs)[theirs]
+            seen, theirs = self._observations.numpy(), self._seats == k
+            given[theirs] = opponent.act_batch(seen, self._mask & theirs)[theirs]
         _, reward, ended, cut, infos = self.vec.step(given)
-        terms = infos["terms"]
         if self._args.end_at_red:
-            ended = ended | (terms[..., RED_LIGHT] > 0.0)
-        ours = self._seats < 0
-        self._mask = torch.from_numpy(infos["mask"])
+            ended = ended | (infos["terms"][..., RED_LIGHT] > 0.0)
+        ours, self._mask = self._seats < 0, infos["mask"]
+        acted = infos["acted"] & ours
         batch.rewards[t] = torch.from_numpy(reward)
-        batch.acted[t] = torch.from_numpy(infos["acted"]) & ours
-        batch.goes_on[t] = batch.acted[t] & torch.from_numpy(infos["mask"] & ~ended & ~cut)
-        if cut.any():
-            last = torch.from_numpy(infos["final_observations"])
-            expected = self._heads(last, self._look())[1]
-            batch.next_values[t] = expected * torch.from_numpy(cut & ~ended)
-        self.trips.add(reward, infos["vehicle_done"] & ours.numpy(), cut, terms)
+        batch.acted[t] = torch.from_numpy(acted)
+        batch.goes_on[t] = torch.from_numpy(acted & self._mask & ~ended & ~cut)
+        if len((rows := (cut & ~ended).nonzero())[0]):
+            last = torch.from_numpy(infos["final_observations"][rows]).to(self._device)
+            batch.next_values[t][rows] = self.network.value(last, self._look()[rows[0]])
+        self.trips.add(reward, infos["vehicle_done"] & ours, cut, infos["terms"])
 
     def _expect(self, batch: Batch) -> None:
         """What was to be expected after each step of a vehicle that goes on."""
         with self.phase("inference"):
-            after = self._heads(self._observations, self._look())[1]
+            after = self._heads(self._observations.to(self._device), self._look())[1]
         following = torch.cat([batch.values[1:], after[None]])
         batch.next_values = torch.where(batch.goes_on, following, batch.next_values)
 
@@ -242,29 +241,30 @@ class Collector:
     def _look(self) -> Tensor:
         """States (W, S) of the worlds; S is 0 where the critic does not see them."""
         if not self.network.state_size:
-            return torch.zeros((self.vec.num_envs, 0))
-        return torch.from_numpy(self.vec.state())
+            return torch.zeros((self.vec.num_envs, 0), device=self._device)
+        return torch.from_numpy(self.vec.state()).to(self._device)
 
     def save(self) -> Parts:
         """Where worlds and trips stand."""
         kept: Parts = {"trips": self.trips.save()}
-        if kept_elsewhere(self.vec.config):
-            return kept
-        return {**kept, "worlds": tensor_of(self.vec.save_state()), "mask": self._mask.clone()}
+        if not kept_elsewhere(self.vec.config):
+            kept["worlds"] = tensor_of(self.vec.save_state())
+            kept["mask"] = torch.from_numpy(self._mask)
+        return kept
 
     def load(self, saved: Parts) -> None:
         """Go on from what `save` gave; worlds that it could not save have begun new episodes."""
         self.trips.load(saved["trips"])
         if "worlds" in saved:
             self.vec.load_state(bytes_of(saved["worlds"]))
-            self._mask = saved["mask"]
+            self._mask = saved["mask"].numpy()
 
 
 class Learner:
     """The network, its optimiser, and PPO's update (Schulman et al. 2017)."""
 
     def __init__(self, network: ActorCritic, args: Args) -> None:
-        self.network, self._args = network, args
+        self.network, self._args = network.to(args.device), args
         self.optimizer = torch.optim.Adam(network.parameters(), lr=args.learning_rate, eps=1e-5)
         self.scales = Scales(network)
 
@@ -288,7 +288,7 @@ class Learner:
 
         found: list[Tensor] = []
         for _ in range(args.epochs):
-            order = chosen[torch.randperm(len(chosen))]
+            order = chosen[torch.randperm(len(chosen), device=chosen.device)]
             for rows in order.tensor_split(args.minibatches):
                 if rows.numel() < 2:  # one decision has no advantage over others
                     continue

@@ -71,7 +71,7 @@ def read_checkpoint(folder: Path) -> RunState:
     if raw != sealed(content):
         raise _broken(path, "its checksum is not that of its content")
     try:
-        return RunState(**torch.load(io.BytesIO(content), weights_only=True))
+        return RunState(**torch.load(io.BytesIO(content), "cpu", weights_only=True))
     except Exception as error:  # torch's reader raises what it meets
         raise _broken(path, str(error).partition("\n")[0]) from error
 

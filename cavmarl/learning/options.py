@@ -82,6 +82,20 @@ def check_shares(settings: object, names: Iterable[str]) -> None:
             raise ConfigError(f"{_option(name)} {value}: must be from 0 to 1")
 
 
+def check_device(name: str) -> None:
+    """Refuse what torch cannot compute on here; CPUs and NVIDIA's GPUs are supported."""
+    import torch  # of its extra; settings that name no device do without
+
+    cure = "give cpu, or cuda on a machine with an NVIDIA GPU and a torch that is built for it"
+    if name.partition(":")[0] not in ("cpu", "cuda"):
+        raise ConfigError(f"--device {name}: no such device: {cure}")
+    try:
+        torch.zeros(1, device=name)
+    except (RuntimeError, AssertionError) as error:  # torch without CUDA asserts
+        reason = str(error).partition("\n")[0].rstrip(".")
+        raise ConfigError(f"--device {name}: cannot be used ({reason}): {cure}") from error
+
+
 def run_folder(runs: str, name: str, env: str, program: str, seed: int, resume: str = "") -> Path:
     """Where a run lies: RUNS/NAME, without a name RUNS/ENV_PROGRAM_SEED; or RESUME."""
     if resume:

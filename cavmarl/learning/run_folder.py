@@ -66,7 +66,8 @@ DRIVER_FILES = (WEIGHTS_FILE, CONFIG_FILE, CSV_FILE)
 
 # Settings that a resumed run may be given anew.
 CAN_CHANGE = frozenset(
-    "total_agent_steps minutes resume threads zones workers tensorboard checkpoint_updates".split()
+    "total_agent_steps minutes resume threads device zones workers tensorboard "
+    "checkpoint_updates".split()
 )
 
 S = TypeVar("S", bound="RunSettings")

@@ -52,4 +52,4 @@ class Scales:
         return {"count": self._count, "squares": self._squares}
 
     def load(self, saved: Parts) -> None:
-        self._count, self._squares = saved["count"], saved["squares"]
+        self._count, self._squares = saved["count"], saved["squares"].to(self._squares.device)

@@ -86,7 +86,7 @@ def test_seats_of_opponents_teach_nothing_and_drive_as_they_do() -> None:
     collector = PPO.Collector(vec, ActorCritic(config), args, seed=0)
     batch = collector.collect(with_suggested=False)
     theirs = collector._seats >= 0
-    assert 0 < int(theirs.sum()) < theirs.numel()
+    assert 0 < int(theirs.sum()) < theirs.size
     assert not batch.acted[:, theirs].any()
     assert not batch.goes_on[:, theirs].any()
     assert batch.acted[:, ~theirs].float().mean() > 0.5

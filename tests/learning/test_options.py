@@ -9,7 +9,13 @@ from typing import Annotated
 import pytest
 
 from cavmarl.core.errors import ConfigError
-from cavmarl.learning.options import check_at_least, parse_settings, run_folder, run_program
+from cavmarl.learning.options import (
+    check_at_least,
+    check_device,
+    parse_settings,
+    run_folder,
+    run_program,
+)
 
 
 @dataclass(frozen=True)
@@ -63,3 +69,10 @@ def test_wrong_use_is_said_without_a_traceback(capsys: pytest.CaptureFixture[str
     assert capsys.readouterr().err == "error: no such world\n"
     assert run_program(lambda: Path("here"), "run: {folder}") == 0
     assert capsys.readouterr().out == "run: here\n"
+
+
+@pytest.mark.parametrize("name", ["gpu", "meta", "cuda:99", ""])
+def test_a_device_that_is_not_there_is_refused_with_a_cure(name: str) -> None:
+    check_device("cpu")
+    with pytest.raises(ConfigError, match=f"--device {name}: .*give cpu, or cuda"):
+        check_device(name)
