@@ -19,6 +19,7 @@ from cavmarl.evaluate.traffic.world_rows import (
     is_delay_near,
     is_near,
     summary,
+    sumo_beside_itself,
     worst,
 )
 from cavmarl.evaluate.traffic.world_runs import (
@@ -86,6 +87,19 @@ def test_a_lock_counts_where_sumo_has_none() -> None:
     assert not has_own_lock(a_row(longest_lock_s=120.0))
     both = a_row(longest_lock_s=200.0) | {"sumo_spread": SPREAD | {"longest_lock_s": [9.0, 121.0]}}
     assert not has_own_lock(both)
+
+
+def test_sumos_seeds_are_set_beside_one_another_as_ours_are_beside_them() -> None:
+    row = a_row() | {"sumo_spread": SPREAD | {"arrived": [100, 104, 120]}}
+    peers = sumo_beside_itself(row)
+    assert [peer["ours"]["arrived"] for peer in peers] == [100, 104, 120]
+    assert [peer["sumo_spread"]["arrived"] for peer in peers] == [
+        [104, 120],
+        [100, 120],
+        [100, 104],
+    ]
+    assert [is_near(peer, "arrived", 0.05) for peer in peers] == [False, True, False]
+    assert summary([row])["arrived"]["sumo_near"] == pytest.approx(1 / 3)
 
 
 def test_the_summary_of_hand_made_rows() -> None:

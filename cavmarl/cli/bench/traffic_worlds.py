@@ -55,17 +55,18 @@ def _shares(found: Row, which: str = "") -> Table:
             ("departed", "departed"),
             ("mean delay", "mean_delay"),
         )
-        for keys in [("median", "median_size", "size_90", "share_near")]
+        for keys in [("median", "median_size", "size_90", "share_near", "sumo_near")]
     ]
     contacts, queue = found.get("contacts", {}), found.get("queue", {})
     caption = (
-        f"near: within 15 % (speed), 5 % (arrived, departed), 25 % or 3 s (delay), or SUMO's own "
-        f"spread; contacts: {contacts.get('ours')} in {contacts.get('worlds')} worlds "
+        "near: within 15 % (speed), 5 % (arrived, departed), 25 % or 3 s (delay), or SUMO's own "
+        "spread; SUMO near: each of its seeds, beside the others; contacts: "
+        f"{contacts.get('ours')} in {contacts.get('worlds')} worlds "
         f"(SUMO {contacts.get('sumo')}); locks above 120 s that SUMO has not: "
         f"{found.get('own_locks')}; queue: {queue.get('ours', 0.0):.1f} "
         f"(SUMO {queue.get('sumo', 0.0):.1f})"
     )
-    heads = ("ours over SUMO's mean, less 1", "median", "median size", "90 % below", "near")
+    heads = ("ours over SUMO's", "median", "median size", "90 % below", "near", "SUMO near")
     return make_table(title, heads, rows, caption)
 
 

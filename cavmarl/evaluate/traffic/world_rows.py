@@ -76,6 +76,18 @@ def has_own_lock(row: Mapping[str, Any]) -> bool:
     return bool(row["ours"]["longest_lock_s"] > LOCK_S >= theirs)
 
 
+def sumo_beside_itself(row: Mapping[str, Any]) -> list[Row]:
+    """A row for each of SUMO's seeds, which is in the place of ours, beside the others."""
+    spread = row["sumo_spread"]
+    return [
+        {
+            "ours": {figure: values[k] for figure, values in spread.items()},
+            "sumo_spread": {name: values[:k] + values[k + 1 :] for name, values in spread.items()},
+        }
+        for k in range(len(spread["arrived"]))
+    ]
+
+
 def badness(row: Mapping[str, Any]) -> float:
     """By what the worst worlds are chosen: failed, then contacts and locks, then mean speed."""
     if "error" in row:
@@ -97,17 +109,24 @@ def summary(rows: Sequence[Row]) -> Row:
     found: Row = {"worlds": len(rows), "failed": len(rows) - len(good)}
     if not good:
         return found
+    peers = [peer for row in good for peer in sumo_beside_itself(row)]
     speeds = [off for row in good if (off := deviation(row, "mean_speed_mps")) is not None]
     found["mean_speed"] = {
         **_sizes(speeds),
         "share_near": _share(is_near(row, "mean_speed_mps", SPEED_SHARE) for row in good),
         "share_in_spread": _share(in_spread(row, "mean_speed_mps") for row in good),
+        "sumo_near": _share(is_near(peer, "mean_speed_mps", SPEED_SHARE) for peer in peers),
     }
     for figure in ("arrived", "departed"):
         offs = [off for row in good if (off := deviation(row, figure)) is not None]
-        near = _share(is_near(row, figure, COUNT_SHARE) for row in good)
-        found[figure] = _sizes(offs) | {"share_near": near}
-    found["mean_delay"] = {"share_near": _share(map(is_delay_near, good))}
+        near, sumo_near = (
+            _share(is_near(row, figure, COUNT_SHARE) for row in of) for of in (good, peers)
+        )
+        found[figure] = _sizes(offs) | {"share_near": near, "sumo_near": sumo_near}
+    found["mean_delay"] = {
+        "share_near": _share(map(is_delay_near, good)),
+        "sumo_near": _share(map(is_delay_near, peers)),
+    }
     found["queue"] = {
         side: float(np.mean([row[side]["queue"] for row in good])) for side in ("ours", "sumo")
     }
