@@ -12,6 +12,7 @@ import json
 import re
 from collections.abc import Hashable, Mapping
 from dataclasses import fields, is_dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
@@ -119,6 +120,7 @@ def validate(kind: type[T], raw: object, where: str) -> T:
         ConfigError: an unknown key, a missing key, a wrong type or a value that `kind` refuses; the
             message names the key, the value and the cure, one line each.
     """
+    hashable: Any = kind  # as mypy takes no class of a type variable to be
     if not isinstance(raw, Mapping):
         raise ConfigError(f"{where}: must be a mapping of keys, not {raw!r}")
     try:
@@ -129,7 +131,7 @@ def validate(kind: type[T], raw: object, where: str) -> T:
     except (TypeError, ValueError, RecursionError) as error:
         raise ConfigError(f"{where}: holds what no configuration can hold ({error})") from error
     try:
-        checked: T = _adapter(kind).validate_json(text)
+        checked: T = _adapter(hashable).validate_json(text)
     except ValidationError as error:
         lines = [_explain(kind, details) for details in error.errors(include_url=False)]
         raise ConfigError("\n".join(f"{where}: {line}" for line in lines)) from error
@@ -154,6 +156,7 @@ def dotted_keys(kind: type[Any], prefix: str = "") -> list[str]:
     return keys
 
 
+@cache  # it takes longer to make than a small world
 def _adapter(kind: type[Any]) -> TypeAdapter[Any]:
     """Pydantic's view of `kind`, strict and closed.
 

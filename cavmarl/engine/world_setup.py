@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
+from weakref import WeakValueDictionary
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from cavmarl.roads.cache import load_network
 from cavmarl.roads.horizon import horizon_of
 from cavmarl.roads.joined_maps import join
 from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.sumo_net.reader import map_name, source_hash
 from cavmarl.roads.sumo_net.signal_plans import with_outages, with_programs
 from cavmarl.traffic.demand import DemandFile, read_demand
 from cavmarl.traffic.native import capacity_of
@@ -37,6 +39,9 @@ from cavmarl.traffic.sumo.sumo_input import read_input
 from cavmarl.zones.partition.zone_file import zones_for
 from cavmarl.zones.partition.zone_layouts import cut_map
 from cavmarl.zones.partition.zone_partition import ZonePartition
+
+# Networks of this process that something still uses, by the names and hashes of their files.
+_LOADED: WeakValueDictionary[tuple[tuple[str, str], ...], RoadNetwork] = WeakValueDictionary()
 
 
 class World(NamedTuple):
@@ -115,7 +120,7 @@ def load_roads(config: EnvConfig, base_dir: Path) -> RoadNetwork:
     Raises:
         MapError: the map or a file of buildings or programs cannot be read, or they do not fit.
     """
-    network = join(_each_map(resolve_maps(config, base_dir)))
+    network = _joined(resolve_maps(config, base_dir))
     if len(network.maps) > 1:
         _refuse_of_one_map(config)
     buildings = resolve_buildings(config, base_dir)
@@ -124,21 +129,33 @@ def load_roads(config: EnvConfig, base_dir: Path) -> RoadNetwork:
     return with_programs(network, resolve_programs(config, base_dir), config.map.program)
 
 
-def _each_map(paths: Sequence[Path]) -> list[RoadNetwork]:
-    """The networks of map files.
+def _joined(paths: Sequence[Path]) -> RoadNetwork:
+    """The network of map files; worlds of one process that are made of the same files share it.
 
     Raises MapError: what is wrong with any of them, all together.
     """
-    found: list[RoadNetwork] = []
+    files: list[Path] = []
+    contents: list[tuple[str, str]] = []
     refused: list[str] = []
     for path in paths:
         try:
-            found.append(load_network(map_file(path)))
+            file = map_file(path)
+            contents.append((map_name(file), source_hash(file)))
+            files.append(file)
+        except MapError as error:
+            refused.append(str(error))
+    found = None if refused else _LOADED.get(tuple(contents))
+    if found is not None:
+        return found
+    networks: list[RoadNetwork] = []
+    for file in files:
+        try:
+            networks.append(load_network(file))
         except MapError as error:
             refused.append(str(error))
     if refused:
         raise MapError("\n".join(refused))
-    return found
+    return _LOADED.setdefault(tuple(contents), join(networks))
 
 
 def _refuse_of_one_map(config: EnvConfig) -> None:

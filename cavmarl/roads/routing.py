@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,26 +85,59 @@ def lane_grid(network: RoadNetwork, cell_m: float = 25.0) -> LaneGrid:
     min_x, min_y = min_x - margin, min_y - margin
     num_x = int((max_x + margin - min_x) // cell_m) + 1
     num_y = int((max_y + margin - min_y) // cell_m) + 1
-    members: list[set[int]] = [set() for _ in range(num_x * num_y)]
-    for lane, row in enumerate(network.lanes):
-        line = network.lane_polyline(lane)
-        for (x0, y0, _), (x1, y1, _) in pairwise(line):
-            # Pieces no longer than a cell: the boxes of long diagonal segments would cover the map.
-            pieces = int(np.hypot(x1 - x0, y1 - y0) // cell_m) + 1
-            xs = np.linspace(x0, x1, pieces + 1)
-            ys = np.linspace(y0, y1, pieces + 1)
-            reach = 0.5 * float(row["width_m"]) + 2.0
-            for k in range(pieces):
-                left = int((min(xs[k], xs[k + 1]) - reach - min_x) // cell_m)
-                right = int((max(xs[k], xs[k + 1]) + reach - min_x) // cell_m)
-                low = int((min(ys[k], ys[k + 1]) - reach - min_y) // cell_m)
-                high = int((max(ys[k], ys[k + 1]) + reach - min_y) // cell_m)
-                for line_ in range(max(low, 0), min(high, num_y - 1) + 1):
-                    for column in range(max(left, 0), min(right, num_x - 1) + 1):
-                        members[line_ * num_x + column].add(lane)
-    start = np.zeros(num_x * num_y + 1, dtype=np.int32)
-    start[1:] = np.cumsum([len(cell) for cell in members])
-    lanes = np.array([lane for cell in members for lane in sorted(cell)], dtype=np.int32)
+    lanes, xs, ys = _pieces(network, cell_m)
+    reach = 0.5 * network.lanes["width_m"][lanes] + 2.0
+    left, right = _cells_along(xs, reach, min_x, cell_m, num_x)
+    low, high = _cells_along(ys, reach, min_y, cell_m, num_y)
+    piece, row = _counted(low, high)
+    part, column = _counted(left[piece], right[piece])
+    cells = row[part].astype(np.int64) * num_x + column
+    # Sorted by cell, in a cell by lane, each once.
+    cell, member = np.divmod(
+        np.unique(cells * len(network.lanes) + lanes[piece[part]]), len(network.lanes)
+    )
+    start = np.searchsorted(cell, np.arange(num_x * num_y + 1)).astype(np.int32)
+    members = member.astype(np.int32)
     start.setflags(write=False)
-    lanes.setflags(write=False)
-    return LaneGrid(min_x, min_y, cell_m, num_x, num_y, start, lanes)
+    members.setflags(write=False)
+    return LaneGrid(min_x, min_y, cell_m, num_x, num_y, start, members)
+
+
+def _pieces(
+    network: RoadNetwork, most_m: float
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """The centre lines in straight pieces no longer than `most_m`: LANE row, x and y of both ends.
+
+    Boxes around long diagonal segments would cover the map.
+    """
+    rows = network.lanes
+    owner, first = _counted(rows["first_point"], rows["first_point"] + rows["num_points"] - 2)
+    ends = [[network.points[axis][first], network.points[axis][first + 1]] for axis in ("x", "y")]
+    (x0, x1), (y0, y1) = ends
+    number = (np.hypot(x1 - x0, y1 - y0) // most_m).astype(np.int64) + 1
+    segment, k = _counted(np.zeros_like(number), number - 1)
+    along = []
+    for a, b in ends:
+        step = ((b - a) / number)[segment]
+        until = np.where(k + 1 == number[segment], b[segment], (k + 1) * step + a[segment])
+        along.append(np.stack([k * step + a[segment], until], axis=1))
+    return owner[segment], along[0], along[1]
+
+
+def _cells_along(
+    ends: NDArray[np.float64], reach: NDArray[np.float64], least: float, cell_m: float, most: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The first and the last cell of an axis that pieces (N, 2) reach into, to both sides."""
+    first = ((ends.min(axis=1) - reach - least) // cell_m).astype(np.int64)
+    last = ((ends.max(axis=1) + reach - least) // cell_m).astype(np.int64)
+    return np.maximum(first, 0), np.minimum(last, most - 1)
+
+
+def _counted(
+    first: NDArray[Any], last: NDArray[Any]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Each number of each range, both ends included: the range's row, and the number."""
+    counts = np.maximum(last - first + 1, 0).astype(np.int64)
+    owner = np.repeat(np.arange(len(counts)), counts)
+    before = np.cumsum(counts) - counts
+    return owner, np.arange(counts.sum()) - before[owner] + first[owner]

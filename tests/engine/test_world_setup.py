@@ -54,6 +54,22 @@ def test_zones_are_read_from_a_file_beside_the_entry(tmp_path: Path) -> None:
         load_zones(config, tmp_path, network)
 
 
+def test_worlds_of_the_same_files_share_their_map(tmp_path: Path) -> None:
+    network, other = (load_roads(*load_config("merge")) for _ in range(2))
+    assert other is network
+    # The name and the content of a file count, not its place.
+    source = load_config("merge")[1] / "map" / "map.net.xml"
+    copied, renamed = tmp_path / source.name, tmp_path / "other.net.xml"
+    copied.write_bytes(source.read_bytes())
+    assert load_world(copied).network is network
+    renamed.write_bytes(source.read_bytes())
+    assert load_world(renamed).network.name == "other"
+    copied.write_bytes(source.read_bytes() + b"\n")
+    changed = load_world(copied).network
+    assert changed.source_hash != network.source_hash
+    assert (load_world("merge").network, load_world(renamed).network.name) == (network, "other")
+
+
 def test_a_bare_maps_horizon_follows_its_size(grid: Path) -> None:
     # 4 · 200 m wide and as high, at SUMO's 13.89 m/s: 115.2 s across, and three times that.
     worlds = [load_world(grid, agents=2, background=3, zones=zones) for zones in (1, 4)]
