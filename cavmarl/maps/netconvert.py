@@ -21,7 +21,7 @@ from typing import Any
 from cavmarl.core.cache_folder import cache_dir
 from cavmarl.core.errors import ConfigError, MapError, require
 from cavmarl.core.whole_file import draft_folder
-from cavmarl.maps.heights.draping import HeightOptions, HeightReport, drape
+from cavmarl.maps.heights.draping import HeightOptions, HeightReport, drape, raise_levels
 from cavmarl.maps.map_kinds import MapKind, map_kind
 from cavmarl.maps.net_document import NetDocument
 from cavmarl.maps.netconvert_process import (
@@ -95,6 +95,7 @@ class BuildResult:
     provenance: dict[str, str]  # what the file says of its own origin
     defaults: tuple[RoadDefaults, ...] = ()  # what OSM does not say and the type map gave
     heights: HeightReport | None = None
+    levels: int = 0  # lanes that cross one another on a bridge or in a tunnel, without `heights`
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self) | {"path": str(self.path), "source": str(self.source)}
@@ -125,7 +126,8 @@ def build_network(
             OSM, else metres in the source's own frame.
         origin: latitude and longitude of the map's x = y = 0, OSM only; by default the corner of
             the roads, in UTM.
-        heights: models of the ground, laid under the roads; nothing moves in the plane.
+        heights: models of the ground, laid under the roads; nothing moves in the plane. Without
+            them the ground is flat, and bridges and tunnels of OSM leave it where they cross roads.
         licences: of the source and of the models of heights, where the map is to say others.
         tolerant: let netconvert leave out what it cannot use instead of giving up.
         timeout_s: how long netconvert may take; None: `CAVMARL_MAX_NETCONVERT_S`, or 600 s.
@@ -136,7 +138,7 @@ def build_network(
         MapError: the source is broken, hostile or no map, netconvert refuses it (its own lines are
             in the message), nothing in the result can be driven, the heights cannot be laid under
             it, or the target cannot be written.
-        MissingExtraError: netconvert, or what heights need, is not installed.
+        MissingExtraError: netconvert, or what heights and levels need, is not installed.
     """
     source = Path(source)
     kind = map_kind(source)
@@ -164,6 +166,7 @@ def build_network(
         provenance=read_provenance(place),
         defaults=made.defaults,
         heights=made.report,
+        levels=made.levels,
     )
 
 
@@ -187,7 +190,9 @@ def _cache_entry(
 ) -> Path:
     require("sumo", "sumo")
     words = [source_hash(source), version("eclipse-sumo"), *options]
-    if heights is not None:
+    if heights is None:
+        words.append("levels")  # of bridges and tunnels: maps without them were cached before
+    else:
         words += [*map(source_hash, heights.models), repr(heights)]
     digest = hashlib.sha256("\0".join(words).encode())
     return cache_dir() / "maps" / digest.hexdigest()[:32] / f"{map_name(source)}.net.xml"
@@ -234,6 +239,7 @@ class _Build:
     log: BuildLog = field(default_factory=BuildLog)
     defaults: tuple[RoadDefaults, ...] = ()
     report: HeightReport | None = None
+    levels: int = 0
 
     def run(self) -> None:
         """Make the network beside its place, and put it there when it is whole."""
@@ -268,6 +274,9 @@ class _Build:
         if self.heights is not None:
             self.told(STAGES[2])
             self.report = drape(document, self.heights, roads, self.source)
+        elif roads is not None:
+            self.levels = raise_levels(document, roads, self.source)
+        if self.report is not None or self.levels:
             return document.content(head_of(self._facts(document)))
         facts = head_of(self._facts(document))
         content = _COMMENT.sub(b"", draft.read_bytes(), count=1)
@@ -290,6 +299,8 @@ class _Build:
             facts["origin"] = f"latitude {self.origin[0]!r}, longitude {self.origin[1]!r}"
         if self.defaults:
             facts["defaults"] = defaults_text(self.defaults)
+        if self.levels:
+            facts["levels"] = f"{self.levels} crossings of lanes on bridges and in tunnels"
         if self.heights is not None and self.report is not None:
             sums = [f"{path.name} (sha256 {source_hash(path)})" for path in self.heights.models]
             facts["heights"] = ", ".join(sums)

@@ -56,7 +56,7 @@ def test_narrow_lanes(town: Path) -> None:
 def test_steps_in_height(town: Path) -> None:
     lane = re.search(r'<lane id="10#1_0"[^>]*? shape="([^"]*)"', town.read_text())
     assert lane
-    raised = " ".join(f"{place},2.0" for place in lane[1].split())
+    raised = " ".join(f"{x},{y},2.0" for x, y, *_ in (one.split(",") for one in lane[1].split()))
     town.write_text(town.read_text().replace(lane[1], raised))
 
     steps = [defect for defect in found(town) if defect.kind == "step in height"]

@@ -129,6 +129,34 @@ def drape(
     )
 
 
+def raise_levels(document: NetDocument, roads: OsmRoads, source: Path) -> int:
+    """Give a network without a model of the ground the levels that its crossings need.
+
+    The ground is at 0. Only bridges and tunnels that cross another road, and their ramps, leave it.
+
+    Args:
+        document: a projected network without heights, which is changed where roads cross so.
+        roads: where bridges and tunnels are.
+        source: where the map is from, for messages.
+
+    Returns:
+        How many lanes cross one another on two levels.
+
+    Raises:
+        MapError: an end of a bridge or tunnel cannot be projected.
+        MissingExtraError: pyproj is not installed.
+    """
+    if document.geo is None or not any(way.level for way in roads.ways.values()):
+        return 0
+    stations = stations_of(document)
+    levels = levels_of(stations, roads, document.geo, source)
+    crossed = crossings(stations, levels)
+    if len(crossed):
+        ground = np.zeros(len(stations.plane_m) + len(stations.hubs_m))
+        _write(document, stations, _cleared(stations, ground, levels, crossed))
+    return len(crossed)
+
+
 def _at_hubs(stations: Stations, ground: Heights) -> Heights:
     """A junction lies where the lanes that meet there do, in the mean."""
     base = int(stations.first[-1])

@@ -52,8 +52,8 @@ def stations_of(document: NetDocument) -> Stations:
             raise MapError(f"{document.path}: lane {lane.id} has no shape: build the map again")
         if shape.shape[1] > 2 and shape[:, 2].any():
             raise MapError(
-                f"{document.path}: has heights already (lane {lane.id}): leave out --dem, or build "
-                "it again without them"
+                f"{document.path}: has heights already (lane {lane.id}): leave out --dem, or give "
+                "it with the source that the map was built from"
             )
         places, s_m, own = laid(shape[:, :2])
         parts.append(places)

@@ -67,7 +67,11 @@ def test_heights_are_the_models_and_nothing_moves(town: Path, tmp_path: Path) ->
         tmp_path / "ground.tif",
         lambda lon, lat: rolling(lon, lat) + 3.0 * np.sin((lon + lat) * 2e3),
     )
+    town.write_text(TOWN.replace('<tag k="bridge" v="yes"/>', ""))
     flat = build_network(town, tmp_path / "flat.net.xml")
+    assert flat.levels == 0
+    assert not read_network(flat.path).points["z"].any()
+    town.write_text(TOWN)
     result = built(town, model)
 
     network = read_network(result.path)
@@ -181,6 +185,7 @@ def test_an_origin_is_kept_and_read_back(town: Path, tmp_path: Path) -> None:
 
 
 def test_heights_go_under_a_network_too(town: Path, tmp_path: Path) -> None:
+    town.write_text(TOWN.replace('<tag k="bridge" v="yes"/>', ""))
     flat = build_network(town, tmp_path / "flat.net.xml").path
     model = write_hgt(tmp_path / "N48E011.hgt", plane(0.0, 0.05))
     result = built(flat, model)
@@ -189,6 +194,42 @@ def test_heights_go_under_a_network_too(town: Path, tmp_path: Path) -> None:
     assert "ODbL" in result.provenance["licence"]
     with pytest.raises(MapError, match="has heights already"):
         build_network(result.path, tmp_path / "x.net.xml", heights=HeightOptions((model,)))
+
+
+def test_without_a_model_bridges_and_tunnels_leave_flat_ground_where_they_cross_roads(
+    town: Path, tmp_path: Path
+) -> None:
+    """Vehicles on the bridge and below it do not touch: their lanes lie on two levels."""
+    over = build_network(town, tmp_path / "over.net.xml")
+    town.write_text(TOWN.replace('"bridge" v="yes"', '"tunnel" v="yes"').replace('v="1"', 'v="-1"'))
+    under = build_network(town, tmp_path / "under.net.xml")
+
+    assert over.levels > 0
+    assert over.levels == under.levels
+    assert over.provenance["levels"].startswith(f"{over.levels} crossings")
+    assert plane_of(over.path) == plane_of(under.path)
+    for result, sign in ((over, 1.0), (under, -1.0)):
+        network = read_network(result.path)
+        z_m = sign * network.points["z"]
+        assert z_m.max() == pytest.approx(CLEARANCE_M, abs=0.01)
+        assert z_m.min() == 0.0
+        assert np.abs(network.points["slope"]).max() <= 0.081
+        crossed = [n for n, name in enumerate(network.lane_ids) if re.match(r"-?14_", name)]
+        assert crossed
+        assert not any(network.lane_polyline(lane)[:, 2].any() for lane in crossed)
+    with pytest.raises(MapError, match="give it with the source"):
+        built(over.path, write_hgt(tmp_path / "N48E011.hgt", plane(0.0, 0.05)))
+
+
+def test_a_bridge_that_crosses_no_road_stays_on_flat_ground(town: Path, tmp_path: Path) -> None:
+    way = '<way id="14"><nd ref="7"/><nd ref="8"/>'
+    assert way in TOWN
+    town.write_text(TOWN.replace(way, '<way id="14"><nd ref="7"/><nd ref="1"/>'))
+    result = build_network(town, tmp_path / "flat.net.xml")
+
+    assert result.levels == 0
+    assert "levels" not in result.provenance
+    assert not read_network(result.path).points["z"].any()
 
 
 def test_a_map_without_a_projection_takes_no_heights(tmp_path: Path) -> None:
