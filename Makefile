@@ -18,7 +18,7 @@ OLDEST_TESTS := tests/core tests/driving tests/engine tests/handoff tests/reward
 LIBRARIES_TESTS := tests/adapters tests/train/test_programs.py
 # Compiled by one process before two of them run tests.
 KERNELS := -c 'from cavmarl import make_vec; make_vec("grid4x4", workers=1).close()'
-TWO := -n 2 --dist loadfile
+TWO := -n 2 --dist loadfile --no-loadscope-reorder
 FUZZ_SECONDS ?= 60
 FUZZ_TARGETS ?= network programs buildings map cached zones demand sumocfg entry overrides driver manifest \
     plan message log follower

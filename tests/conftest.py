@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from tests.support.cpu_time import CpuTimes, argued, known_costs, rare_tests
-from tests.support.tiers import ProcessWatch, mark, skip_if_late
+from tests.support.cpu_time import CpuTimes, argued, costs_of_files, known_costs, rare_tests
+from tests.support.tiers import ProcessWatch, is_needed, mark, skip_if_late
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -23,13 +23,22 @@ def pytest_configure(config: pytest.Config) -> None:
     settings.load_profile("python" if os.environ.get("NUMBA_DISABLE_JIT") == "1" else "compiled")
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark each test with its tier."""
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave files unread that have no test of the tier which `-m` asks for."""
+    return None if is_needed(collection_path, config.rootpath, config.option.markexpr) else True
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark each test with its tier; of two processes neither begins a long file at the end."""
     rare = rare_tests((item.nodeid for item in items), known_costs(), argued())
     for item in items:
         mark(item)
         if item.nodeid in rare:
             item.add_marker(pytest.mark.slow)
+    if hasattr(config, "workerinput"):
+        often = (item.nodeid for item in items if not any(item.iter_markers("slow")))
+        costs = costs_of_files(often, known_costs())
+        items.sort(key=lambda item: -costs[item.nodeid.partition("::")[0]])
 
 
 def _let_start(patch: pytest.MonkeyPatch, start: Callable[..., object]) -> None:

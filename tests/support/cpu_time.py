@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-__all__ = ["CpuTimes", "argued", "known_costs", "rare_tests"]
+__all__ = ["CpuTimes", "argued", "costs_of_files", "known_costs", "rare_tests"]
 
 LISTED_AT_END_S = 2.0  # a test that costs more is listed at the end of a run
 ARGUED_S = 3.0  # one that costs more is slow, but for those of the file of argued tests
@@ -25,6 +25,7 @@ LISTED_S = 0.5  # a test that costs less is not in the file of costs
 OFTEN_S = (
     3.0  # of the variants of a test, so many seconds are in every run, and one of them at least
 )
+CHEAP_S = 0.05  # what one costs that is not in the file of costs
 COSTS = Path(__file__).resolve().parents[1] / "costs.txt"
 ARGUED = COSTS.with_name("argued.txt")
 
@@ -63,6 +64,14 @@ def rare_tests(
         else:
             spent[test] = spent.get(test, 0.0) + cost_s
     return rare
+
+
+def costs_of_files(names: Iterable[str], costs: Mapping[str, float]) -> dict[str, float]:
+    """Seconds of processor by file, of tests that are in every run; a cheap test counts, too."""
+    found: dict[str, float] = defaultdict(float)
+    for name in names:
+        found[name.partition("::")[0]] += costs.get(name, CHEAP_S)
+    return found
 
 
 class CpuTimes:

@@ -19,7 +19,7 @@ from typing import Any
 
 import pytest
 
-__all__ = ["ALONE_FILES", "ProcessWatch", "mark", "skip_if_late"]
+__all__ = ["ALONE_FILES", "ProcessWatch", "is_needed", "mark", "skip_if_late"]
 
 _OF_PROCESSES = re.compile(
     r"^import (subprocess|multiprocessing|libsumo)\b"
@@ -39,6 +39,8 @@ RAY_FILES = (
     "tests/parallel/test_remote_start.py",
     "tests/parallel/test_remote_worlds.py",
 )
+
+_IN_RAY = "test_in_an_actor_of_ray"  # begins the name of a test that starts a cluster
 
 # They measure time, memory or cores, or count on being let run at once.
 ALONE_FILES: tuple[str, ...] = (
@@ -70,8 +72,28 @@ def mark(item: pytest.Item) -> None:
         item.add_marker(pytest.mark.twin)
     if path in ALONE_FILES:
         item.add_marker(pytest.mark.alone)
-    if path in RAY_FILES or item.name.startswith("test_in_an_actor_of_ray"):
+    if path in RAY_FILES or item.name.startswith(_IN_RAY):
         item.add_marker(pytest.mark.ray)
+    for tier in {"alone", "ray", "twin"} & {found.name for found in item.own_markers}:
+        assert is_needed(item.path, item.config.rootpath, tier), f"-m {tier} would not read {path}"
+
+
+def is_needed(path: Path, root: Path, expression: str) -> bool:
+    """Whether a file may have tests that `-m` asks for; most need not be read for a small tier.
+
+    `expression`: of `-m`, as `twin and not slow`; if it has another form, any file may.
+    """
+    if path.suffix != ".py" or not path.name.startswith("test_"):
+        return True
+    name = path.relative_to(root).as_posix()
+    match expression.split(" and ")[0]:
+        case "alone":
+            return name in ALONE_FILES
+        case "ray":
+            return name in RAY_FILES or _IN_RAY in path.read_text(encoding="utf-8")
+        case "twin":
+            return _has_twin(path) and not name.startswith(_COMPILED_ONLY)
+    return True
 
 
 @cache

@@ -11,6 +11,7 @@ for them, so that they brake for actors about to step onto their lane.
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -18,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.math.geometry import project
 from cavmarl.core.records import record
 from cavmarl.core.records.arrays import Scripts
 from cavmarl.core.records.codes import CLASS_PEDESTRIAN, MODEL_IDM
@@ -28,6 +30,7 @@ from cavmarl.traffic.scenarios.motions import Act, Pose
 
 SAMPLE_M = 0.5  # between the points of a body that are looked at
 LEVEL_M = 4.0  # lanes that differ by more in height are one above the other
+BESIDE_M = 1.0  # so far beside a lane nothing covers it, however numbers are rounded
 FARTHEST_M = 200.0  # from an actor to a lane
 ON_ROAD = (1 << len(VEHICLE_CLASSES)) - 1
 
@@ -50,16 +53,26 @@ class Shadows:
     def __init__(self, network: RoadNetwork) -> None:
         self._network = network
         self._grid = lane_grid(network)
+        self._found: dict[bytes, Mapping[int, Shadow]] = {}
 
-    def of(self, pose: Pose, length: float, width: float) -> dict[int, Shadow]:
+    def of(self, pose: Pose, length: float, width: float) -> Mapping[int, Shadow]:
         """By LANE row, what a body of this size covers in its place."""
+        place = (pose.x, pose.y, pose.heading, pose.speed, pose.beside)
+        key = struct.pack("7d", *place, length, width)  # with the signs of zeros
+        found = self._found.get(key)
+        if found is None:  # bodies stand in one place for many ticks
+            found = self._found[key] = self._covered(pose, length, width)
+        return found
+
+    def _covered(self, pose: Pose, length: float, width: float) -> dict[int, Shadow]:
         points = _outline(pose, length, width)
         found = {}
         for lane in self._near(points):
             row = self._network.lanes[lane]
             if not self._is_level(lane, pose.beside):
                 continue
-            places = [self._network.beside(lane, x, y)[:2] for x, y in points]
+            line = self._network.points, row["first_point"], row["num_points"]
+            places = [project(*line, x, y)[:2] for x, y in points]
             reach = 0.5 * float(row["width_m"])
             length_m = float(row["length_m"])
             covered = [s for s, d in places if abs(d) < reach and 0.0 <= s <= length_m]
@@ -98,8 +111,16 @@ class Shadows:
         return bool(abs(z[0] - z[1]) < LEVEL_M)
 
     def _near(self, points: NDArray[np.float64]) -> list[int]:
+        """Lanes that may reach below some of the points, by rising rows."""
         cells = {self._cell(x, y) for x, y in points}
-        return sorted({lane for cell in cells for lane in self._members(cell)})
+        near = np.array(sorted({lane for cell in cells for lane in self._members(cell)}), np.int64)
+        rows = self._network.lanes[near]
+        reach = 0.5 * rows["width_m"] + BESIDE_M
+        (left, low), (right, high) = points.min(axis=0), points.max(axis=0)
+        is_across = (rows["min_x"] - reach <= right) & (left <= rows["max_x"] + reach)
+        is_along = (rows["min_y"] - reach <= high) & (low <= rows["max_y"] + reach)
+        found: list[int] = near[is_across & is_along].tolist()
+        return found
 
     def _around(self, x: float, y: float) -> list[int]:
         """Lanes of the nearest cells that have any, by rising rows."""
@@ -314,7 +335,7 @@ def _write(
 
 
 def _foreseen(
-    own: list[dict[int, Shadow]], poses: list[Pose], k: int, ahead: int
+    own: list[Mapping[int, Shadow]], poses: list[Pose], k: int, ahead: int
 ) -> dict[int, Shadow]:
     """What an actor covers now or soon, as far as it does not wait for a cue before."""
     seen = dict(own[k])
