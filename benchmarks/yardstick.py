@@ -2,14 +2,17 @@
 
 Every trip counts, those that the end of the run cuts, too. A vehicle stands without a cause if it
 has stood for `STANDS_S`, its signal is not red, no other vehicle is near ahead of it or behind the
-junction, and none is on a way or near a line where it has to give way.
+junction, and none is on a way or near a line where it has to give way. What touches on ground that
+the map gives two roads is counted apart (`maps.shared_ground`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
@@ -27,16 +30,21 @@ from cavmarl.env.vector import CavVectorEnv
 from cavmarl.evaluate.recorder import Recorder
 from cavmarl.evaluate.traffic.world_draw import draw_world
 from cavmarl.evaluate.traffic.world_files import cut_maps, make_net
+from cavmarl.maps.shared_ground import LEVEL_M, shared_ground
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.render.ground import signal_codes
-from cavmarl.roads.network import SIGNAL_STATES
+from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
+from cavmarl.roads.sumo_net.reader import map_name
 
 MOST_SHARE = 0.0005  # of the trips that may end off the road, and with a collision
 STANDS_S = 120.0
 NEAR_AHEAD_M = 20.0  # another vehicle whose centre is so near ahead is a cause to stand
 COMES_M = 100.0  # as is one so near to a line that has the right of way
 TOGETHER = 100  # vehicles that are stepped at once, about
-FAULTS = ("off_road", "collision", "wrong_way", "red_light", "stands")
+RECORDED = ("off_road", "collision", "wrong_way", "red_light")
+OF_TRIPS = (*RECORDED, "shared_ground")  # the last are collisions, counted apart
+FAULTS = (*OF_TRIPS, "stands")
+HEADS = {"collision": "colli-\nsion"}  # all columns have room on a terminal of 80
 SHOWN = 12  # faults named below the table
 GREEN = [SIGNAL_STATES.index(letter) for letter in "gGoOs"] + [SIGNAL_NONE]
 
@@ -64,8 +72,9 @@ class Drive:
         return rare and not (self.counts["wrong_way"] or self.counts["stands"])
 
     def row(self, name: str, model: str, agents: int) -> dict[str, Any]:
-        shares = {fault: 100.0 * self.counts[fault] / max(self.trips, 1) for fault in FAULTS}
+        shares = {fault: 100.0 * self.counts[fault] / max(self.trips, 1) for fault in OF_TRIPS}
         own = {"map": name, "model": model, "agents": agents, "trips": self.trips}
+        own["driver"] = f"{model} {agents}"
         arrived = {"arrived": 100.0 * self.arrived / max(self.trips, 1)}
         return own | arrived | shares | {"stands": self.counts["stands"], "faults": self.faults}
 
@@ -89,17 +98,18 @@ def measure(
     chosen = [name.strip() for name in models.split(",")]
     if not maps and not worlds:
         raise ConfigError("no map: name some, or draw nets with --worlds")
+    named = _labels(maps or [])
     rows: list[dict[str, Any]] = []
     notes: list[str] = []
     sums = {(model, crowd): Drive() for model in chosen for crowd in crowds}
     with TemporaryDirectory() as folder:
-        for name, make in _maps(maps or [], range(first_seed, first_seed + worlds), Path(folder)):
+        for name, make in _maps(named, range(first_seed, first_seed + worlds), Path(folder)):
             say(name)
             try:
                 path = make()
                 found = {key: drive(path, *key, seconds, seed) for key in sums}
             except CavmarlError as error:
-                if name in (maps or []):
+                if name in named.values():
                     raise
                 notes.append(f"{name} is left out: {error}")
                 continue
@@ -108,28 +118,35 @@ def measure(
                 rows.append(driven.row(name, *key))
                 notes += [_told(name, *key, fault) for fault in driven.faults]
     total = [drive.row("all", *key) | {"faults": []} for key, drive in sums.items()]
-    columns = {"map": "map", "model": "model", "agents": "agents", "trips": "trips"}
-    columns |= {"arrived, %": "arrived:.1f"}
-    columns |= {f"{name.replace('_', ' ')}, %": f"{name}:.3f" for name in FAULTS[:-1]}
-    columns |= {f"stand {STANDS_S:.0f} s": "stands"}
-    shown = [row for row in rows if not worlds or row["faults"] or row["map"] in (maps or [])]
+    columns = {"map": "map", "driver": "driver", "trips": "trips"}
+    columns |= {HEADS.get(name, name.replace("_", "\n")): f"{name}:.2f" for name in OF_TRIPS}
+    columns |= {"stand": "stands"}
+    shown = [row for row in rows if not worlds or row["faults"] or row["map"] in named.values()]
     more = [f"and {len(notes) - SHOWN} more"] if len(notes) > SHOWN else []
     return Report(
-        f"the built-in driver in agents' seats, {seconds} s",
+        f"the built-in driver in agents' seats, {seconds} s: trips, shares of them in %, vehicles "
+        f"that stand {STANDS_S:.0f} s without a cause",
         columns,
         [*shown, *total],
         notes[:SHOWN] + more,
-        {"notes": notes, "seconds": seconds, "seed": seed},
+        {"notes": notes, "seconds": seconds, "seed": seed, "maps": named},
         all(drive.holds for drive in sums.values()),
     )
 
 
+def _labels(maps: Sequence[str]) -> dict[str, str]:
+    """A short name of each map: of a file its own without folders, where no other has the same."""
+    short = {name: map_name(Path(name)) or name for name in maps}
+    number = Counter(short.values())
+    return {name: label if number[label] == 1 else name for name, label in short.items()}
+
+
 def _maps(
-    named: Sequence[str], seeds: Sequence[int], folder: Path
+    named: Mapping[str, str], seeds: Sequence[int], folder: Path
 ) -> Iterator[tuple[str, Callable[[], str]]]:
     """Label and maker of each map."""
-    for name in named:
-        yield name, lambda name=name: name  # type: ignore[misc]
+    for name, label in named.items():
+        yield label, lambda name=name: name  # type: ignore[misc]
     cuts = cut_maps(None) if seeds else ()
     for seed in seeds:
         draw = draw_world(seed)
@@ -155,7 +172,7 @@ def drive(env: str, model: str, agents: int, seconds: int, seed: int) -> Drive:
     vec = CavVectorEnv(LocalWorlds(world, max(1, min(16, TOGETHER // (5 * agents)))))
     weights = np.array(vec.config.terms.weight_of_each)
     recorder = Recorder(vec.num_envs, vec.num_agents, vec.max_cycles, vec.step_s, weights)
-    watch = _Standing(vec)
+    watch, ground = _Standing(vec), _SharedGround(vec.network)
     found = Drive()
     _, infos = vec.reset(seed=seed)
     running = np.ones(vec.num_envs, dtype=np.bool_)
@@ -171,22 +188,19 @@ def drive(env: str, model: str, agents: int, seconds: int, seed: int) -> Drive:
         found.trips += len(ended)
         found.arrived += int(ended["arrived"].sum())
         for trip in ended:
-            for what in FAULTS[:-1]:
+            for what in RECORDED:
                 if trip[what]:
-                    found.counts[what] += 1
-                    found.faults.append(_fault(vec, what, trip, before, step))
+                    rows = before[trip["episode"]]
+                    own = rows[rows["agent"] == trip["agent"]][0]
+                    shared = what == "collision" and ground.holds(own, rows)
+                    named = "shared_ground" if shared else what
+                    found.counts[named] += 1
+                    found.faults.append(_place(vec, named, int(trip["episode"]), own, step))
         running &= ~over
         for number, row in watch.look(np.flatnonzero(running).tolist()):
             found.counts["stands"] += 1
             found.faults.append(_place(vec, "stands", number, row, step))
     return found
-
-
-def _fault(
-    vec: CavVectorEnv, what: str, trip: np.void, before: list[NDArray[np.void]], step: int
-) -> dict[str, Any]:
-    rows = before[trip["episode"]]
-    return _place(vec, what, int(trip["episode"]), rows[rows["agent"] == trip["agent"]][0], step)
 
 
 def _place(vec: CavVectorEnv, what: str, world: int, row: np.void, step: int) -> dict[str, Any]:
@@ -198,6 +212,25 @@ def _place(vec: CavVectorEnv, what: str, world: int, row: np.void, step: int) ->
         "y": float(row["y"]),
         "lane": vec.network.lane_ids[row["lane"]],
     }
+
+
+class _SharedGround:
+    """Which collisions are between two roads that a map draws on the same ground."""
+
+    def __init__(self, network: RoadNetwork) -> None:
+        self._network = network
+
+    @cached_property
+    def _pairs(self) -> frozenset[tuple[int, int]]:
+        return frozenset(shared_ground(self._network))
+
+    def holds(self, row: np.void, rows: NDArray[np.void]) -> bool:
+        """Whether the vehicle next to one that collided is on a lane that shares its ground."""
+        others = rows[rows["id"] != row["id"]]
+        apart = np.hypot(others["x"] - row["x"], others["y"] - row["y"])
+        apart += np.where(np.abs(others["z"] - row["z"]) < LEVEL_M, 0.0, np.inf)
+        pair = sorted((int(row["lane"]), int(others["lane"][apart.argmin()])))
+        return (pair[0], pair[1]) in self._pairs
 
 
 class _Standing:

@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass
 from statistics import median
 from typing import Any, ClassVar, TypeVar
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -129,10 +130,16 @@ def make_table(
     rows: Iterable[Sequence[str] | None],
     caption: str | None = None,
 ) -> Table:
-    """A table whose first column is text and whose others are numbers; row None: a line between."""
-    table = Table(title=escape(title), caption=caption)
+    """A table whose first column is text and whose others are numbers; row None: a line between.
+
+    Where the terminal is too narrow, the text is folded and the numbers stay whole.
+    """
+    close = (0, 1, 0, 0)  # so that ten columns have room on a terminal of 80
+    table = Table(
+        title=escape(title), caption=caption, box=SIMPLE_HEAD, pad_edge=False, padding=close
+    )
     for place, column in enumerate(columns):
-        table.add_column(column, justify="right" if place else "left", no_wrap=not place)
+        table.add_column(column, justify="right" if place else "left", overflow="fold")
     for row in rows:
         if row is None:
             table.add_section()

@@ -191,7 +191,7 @@ def _cache_entry(
     require("sumo", "sumo")
     words = [source_hash(source), version("eclipse-sumo"), *options]
     if heights is None:
-        words.append("levels")  # of bridges and tunnels: maps without them were cached before
+        words.append("levels 4")  # of bridges and tunnels; the number counts the ways to find them
     else:
         words += [*map(source_hash, heights.models), repr(heights)]
     digest = hashlib.sha256("\0".join(words).encode())

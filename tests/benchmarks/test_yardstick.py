@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from rich.console import Console
 
 from benchmarks import yardstick
+from benchmarks.harness import Report
 from cavmarl.core.errors import ConfigError
+from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.roads.sumo_net.reader import read_network
+from tests.support.netgenerate import netgenerate
 
 
 def test_trips_on_a_good_map_hold() -> None:
@@ -20,6 +27,41 @@ def test_trips_on_a_good_map_hold() -> None:
     assert total["map"] == "all"
     assert own["trips"] == total["trips"] >= 2
     assert own["off_road"] == own["collision"] == own["stands"] == 0
+
+
+def test_maps_have_their_names_without_folders_unless_two_are_alike() -> None:
+    here, there = "/some/long/folder/Town01.xodr", "/another/Town01.net.xml"
+    assert yardstick._labels(["town", here]) == {"town": "town", here: "Town01"}
+    assert yardstick._labels([here, there]) == {here: here, there: there}
+
+
+def test_the_table_has_room_for_all_columns_on_a_narrow_terminal(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(yardstick, "drive", lambda *_: yardstick.Drive(trips=1234))
+    name = "/maps/of/a/far/folder/bologna_buslanes.net.xml"
+    found = yardstick.measure([name], agents="100", models="Krauss")
+    console = Console(width=80, record=True)
+    Report(found.title, found.columns, found.rows).show(console)
+    lines = console.export_text().splitlines()
+    assert max(map(len, lines)) <= 80
+    (own,) = (line.split() for line in lines if line.split()[:1] == ["bologna_buslanes"])
+    assert own == ["bologna_buslanes", "Krauss", "100", "1234", *["0.00"] * 5, "0"]
+
+
+def test_what_touches_on_shared_ground_is_counted_apart(tmp_path: Path) -> None:
+    options = ("--grid", "--grid.number=3", "--grid.length=80", "--default.spreadtype=center")
+    network = read_network(netgenerate(tmp_path / "bidi.net.xml", *options))
+    ground = yardstick._SharedGround(network)
+    one, other = yardstick.shared_ground(network)[0]
+    rows = np.zeros(3, dtype=VEHICLE)
+    rows["id"], rows["lane"], rows["x"] = [0, 1, 2], [one, other, one], [0.0, 4.0, 50.0]
+    assert ground.holds(rows[0], rows)
+    assert ground.holds(rows[1], rows)
+    rows["x"] = [0.0, 50.0, 4.0]  # one behind the other on one lane
+    assert not ground.holds(rows[0], rows)
+    rows["x"], rows["z"] = [0.0, 4.0, 50.0], [0.0, 5.0, 0.0]  # one on a bridge
+    assert not ground.holds(rows[0], rows)
 
 
 def test_a_bound_that_is_broken_is_told() -> None:

@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 from cavmarl.cli import main
+from cavmarl.cli.bench.traffic_worlds import _worst
 from cavmarl.core.errors import ConfigError, MissingExtraError
 from cavmarl.evaluate.traffic import world_runs
 from cavmarl.evaluate.traffic.world_rows import (
@@ -122,6 +124,21 @@ def test_the_worst_are_failed_ones_then_contacts_then_speeds() -> None:
     rows = [a_row(0), a_row(1, mean_speed_mps=6.0), a_row(2, contacts=1)]
     rows.append({"seed": 3, "features": [], "error": "x"})
     assert [row["seed"] for row in worst(rows, 3)] == [3, 2, 1]
+
+
+def test_the_table_of_the_worst_keeps_its_words_whole_on_a_narrow_terminal(
+    tmp_path: Path,
+) -> None:
+    features = ["grid", "right_before_left", "turn_lanes", "random_priority", "near_capacity"]
+    row = a_row(7, mean_speed_mps=9.0, contacts=3) | {"features": features}
+    console = Console(width=80, record=True)
+    console.print(_worst([row, {"seed": 8, "features": [], "error": "no net\nmore"}], tmp_path))
+    text = console.export_text()
+    lines = [line.split() for line in text.splitlines() if line.split()[:1] == ["world_000007"]]
+    assert lines[0][1:4] == ["grid,", "right_before_left,", "turn_lanes,"]
+    assert lines[0][-1] == "3"
+    assert "no net" in text
+    assert str(tmp_path) in "".join(text.split())
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Maps made by SUMO's netgenerate."""
+"""Maps made by SUMO's netgenerate, and by its netconvert of drawn roads."""
 
 from __future__ import annotations
 
@@ -7,15 +7,26 @@ from pathlib import Path
 
 import pytest
 
-__all__ = ["netgenerate", "random_map"]
+__all__ = ["netconvert", "netgenerate", "random_map"]
 
 JUNCTIONS = ("priority", "traffic_light", "right_before_left", "allway_stop")
 
 
 def netgenerate(path: Path, *options: str) -> Path:
     """Make a network with these options in a file; the test is skipped where SUMO is absent."""
+    return _made("netgenerate", path, *options)
+
+
+def netconvert(folder: Path, name: str) -> Path:
+    """The network of `NAME.nod.xml`, `NAME.edg.xml` and `NAME.con.xml`, beside them."""
+    kinds = {"node": "nod", "edge": "edg", "connection": "con"}
+    files = [f"--{kind}-files={folder / name}.{end}.xml" for kind, end in kinds.items()]
+    return _made("netconvert", folder / f"{name}.net.xml", *files)
+
+
+def _made(program: str, path: Path, *options: str) -> Path:
     sumo = pytest.importorskip("sumo", reason="needs the extra: sumo")
-    tool = Path(sumo.SUMO_HOME) / "bin" / "netgenerate"
+    tool = Path(sumo.SUMO_HOME) / "bin" / program
     command = [tool, *options, "--xml-validation", "never", "--output-file", str(path)]
     subprocess.run(command, check=True, capture_output=True)
     return path

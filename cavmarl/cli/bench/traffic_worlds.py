@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from cavmarl.bench.harness import make_table
-from cavmarl.cli.output import write_json
+from cavmarl.cli.output import grid, write_json
 from cavmarl.core.progress import counting
 
 if TYPE_CHECKING:
@@ -92,14 +93,14 @@ def _worst(rows: list[Row], out: Path) -> Table:
 
     cells = []
     for row in rows:
-        name = str(world_folder(out, row["seed"]))
+        name = world_folder(out, row["seed"]).name
         if "error" in row:
-            cells.append((name, "failed", "-", row["error"].splitlines()[0]))
+            cells.append((name, row["error"].splitlines()[0], "failed", "-"))
         else:
             off, contacts = deviation(row, "mean_speed_mps"), row["ours"]["contacts"]
-            cells.append((name, _percent(off), str(contacts), ", ".join(row["features"])))
-    heads = ("worst worlds: files, commands, pictures", "mean speed", "contacts", "features")
-    return make_table("the worst", heads, cells)
+            cells.append((name, ", ".join(row["features"]), _percent(off), str(contacts)))
+    title = f"the worst; files, commands and pictures are in {escape(str(out))}"
+    return grid(("world", "features", "mean speed", "contacts"), cells, title, lefts=2)
 
 
 def _percent(value: Any) -> str:

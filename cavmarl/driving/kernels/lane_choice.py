@@ -221,6 +221,10 @@ def _may_change(
         beyond = travel.steps[row["way"] + target]
         if beyond["to_go"] == math.inf:
             return False
+        # What is won is not worth a turn that a steered car cannot take.
+        turns = travel.steps[row["way"] + row["lane"]]["turnarounds"]
+        if row["driver"] == DRIVER_AGENT and beyond["turnarounds"] > turns:
+            return False
         early = (CHANGE_EARLY_M + CHANGE_EARLY_S * row["speed"]) * beyond["changes"]
         if beyond["change"] != 0 and beyond["room"] - row["s"] < 2.0 * early:
             return False

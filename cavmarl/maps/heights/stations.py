@@ -13,6 +13,7 @@ from cavmarl.maps.heights.profile_graph import ProfileGraph
 from cavmarl.maps.net_document import DocumentLane, NetDocument, Points
 
 STEP_M = 1.0
+_BESIDE = 40  # places before and behind the same share of a lane beside, where the nearest is
 _OFF_M = 0.01  # between what is written and what was found
 
 Rows = NDArray[np.int64]
@@ -61,7 +62,7 @@ def stations_of(document: NetDocument) -> Stations:
         written.append(own)
     first = np.concatenate([[0], np.cumsum([len(part) for part in parts])]).astype(np.int64)
     plane = np.concatenate(parts)
-    hubs, ids, links = _links(document, lanes, first)
+    hubs, ids, links = _links(document, lanes, plane, first)
     places = np.concatenate([plane, hubs])
     lengths = np.hypot(*(places[links[:, 0]] - places[links[:, 1]]).T)
     graph = ProfileGraph(len(places), links, lengths)
@@ -87,7 +88,7 @@ def laid(shape: Points) -> tuple[Points, NDArray[np.float64], NDArray[np.bool_]]
 
 
 def _links(
-    document: NetDocument, lanes: tuple[DocumentLane, ...], first: Rows
+    document: NetDocument, lanes: tuple[DocumentLane, ...], plane_m: Points, first: Rows
 ) -> tuple[Points, tuple[str, ...], Rows]:
     """Junctions' places and ids, and pairs of places between which vehicles go."""
     row_of = {lane.id: row for row, lane in enumerate(lanes)}
@@ -115,9 +116,25 @@ def _links(
                 hub = ids.get(lane.edge.get(end, ""))
                 if hub is not None:
                     joints.append((place, base + hub))
+    pairs += _beside(lanes, plane_m, first)
     if joints:
         pairs.append(np.array(joints, dtype=np.int64))
     return np.array(hubs).reshape(-1, 2), tuple(ids), np.concatenate(pairs)
+
+
+def _beside(lanes: tuple[DocumentLane, ...], plane_m: Points, first: Rows) -> list[Rows]:
+    """Pairs of places on lanes of one edge that lie beside one another: they are one road."""
+    pairs = []
+    window = np.arange(-_BESIDE, _BESIDE + 1)
+    for lane, (one, other) in enumerate(pairwise(lanes)):
+        if one.edge is other.edge:
+            here, there = np.arange(*first[lane : lane + 2]), np.arange(*first[lane + 1 : lane + 3])
+            along = np.rint(np.linspace(0, len(there) - 1, len(here))).astype(np.int64)
+            near = there[np.clip(along[:, None] + window, 0, len(there) - 1)]
+            apart = plane_m[here, None] - plane_m[near]
+            nearest = np.hypot(apart[..., 0], apart[..., 1]).argmin(axis=1)
+            pairs.append(np.stack([here, near[np.arange(len(here)), nearest]], axis=1))
+    return pairs
 
 
 def kept_rows(s_m: NDArray[np.float64], z_m: NDArray[np.float64], own: NDArray[np.bool_]) -> Rows:

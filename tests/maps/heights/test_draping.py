@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -230,6 +231,26 @@ def test_a_bridge_that_crosses_no_road_stays_on_flat_ground(town: Path, tmp_path
     assert result.levels == 0
     assert "levels" not in result.provenance
     assert not read_network(result.path).points["z"].any()
+
+
+def test_lanes_of_one_road_climb_to_a_bridge_together(built_map: Callable[[str], Path]) -> None:
+    """Where only one of them leads there, the other comes along, in steps of the ramp's grade."""
+    network = read_network(built_map("osm/monaco.osm.gz"))
+    assert network.points["z"].max() > 4.9
+    compared = 0
+    for lane in np.flatnonzero((network.lanes["left"] >= 0) & ~network.lanes["internal"]).tolist():
+        left = int(network.lanes["left"][lane])
+        if network.lanes["edge"][left] != network.lanes["edge"][lane]:
+            continue
+        one, points = network.lane_polyline(lane), network.lane_points(left)
+        s_m = np.arange(0.0, points["s"][-1], 0.2)
+        x_m, y_m, z_m = (np.interp(s_m, points["s"], points[axis]) for axis in "xyz")
+        for x, y, z in one:
+            apart = np.hypot(x_m - x, y_m - y)
+            if apart.min() < 3.5:
+                assert abs(z_m[apart.argmin()] - z) < 0.5
+                compared += 1
+    assert compared > 100
 
 
 def test_a_map_without_a_projection_takes_no_heights(tmp_path: Path) -> None:
