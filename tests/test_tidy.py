@@ -13,7 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.cpu_time import ARGUED_S, argued, known_costs, rare_tests
+from tests.support.cpu_time import ARGUED_S, argued, costs_of_files, known_costs, rare_tests
+from tests.support.tiers import ALONE_FILES, is_needed
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("cavmarl", "tests", "train", "agents", "fuzz", "docs", "examples", "benchmarks")
@@ -114,6 +115,17 @@ def test_dear_tests_are_slow_but_for_those_that_are_argued_for() -> None:
     assert rare_tests(costs, costs) == {"a[3]", "c"}
     assert rare_tests(costs, costs, frozenset({"c"})) == {"a[3]"}
     assert rare_tests([*costs, "b[3]"], costs | {"b[3]": 0.5}) == {"a[3]", "b[3]", "c"}
+
+
+def test_long_files_come_first_and_small_tiers_read_only_their_own() -> None:
+    costs = costs_of_files(["a.py::b", "a.py::c[1]", "d.py::e"], {"a.py::b": 2.0, "d.py::e": 9.0})
+    assert costs == {"a.py": pytest.approx(2.05), "d.py": 9.0}
+    files = [*(ROOT / "tests").rglob("test_*.py")]
+    for tier, fewest in (("alone", len(ALONE_FILES)), ("ray", 3), ("twin", 20)):
+        read = [path for path in files if is_needed(path, ROOT, f"{tier} and not slow")]
+        assert fewest <= len(read) < 0.2 * len(files)
+    for expression in ("", "slow", "not alone and not slow", "twin or slow"):
+        assert all(is_needed(path, ROOT, expression) for path in files)
 
 
 def test_tests_that_are_argued_for_are_dear() -> None:

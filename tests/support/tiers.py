@@ -135,7 +135,7 @@ class ProcessWatch:
 
     def pytest_runtest_logreport(self, report: Any) -> None:
         """The report of a phase has come."""
-        if report.is_no_unit:
+        if getattr(report, "is_no_unit", False):  # not of a process that has crashed
             self.found.add(report.nodeid)
 
     def pytest_terminal_summary(self, terminalreporter: Any) -> None:
