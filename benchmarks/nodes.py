@@ -56,7 +56,7 @@ def measure(
     samples: list[NodeSample] = []
     with tempfile.TemporaryDirectory() as folder:
         for size in sizes:
-            net = _city(Path(folder), size)
+            net = make_city(Path(folder), size)
             say(f"a city of {size:,} vehicles")
             samples += _turns(net, size, counts, 0.0, steps, repeats)
             for latency_s in added if size == sizes[0] else []:
@@ -123,7 +123,7 @@ def _predictions(costs: NodeCosts, cores: int) -> list[str]:
     return lines
 
 
-def _city(folder: Path, vehicles: int) -> Path:
+def make_city(folder: Path, vehicles: int) -> Path:
     """A grid with room for so many."""
     require("sumo", "sumo")
     import sumo

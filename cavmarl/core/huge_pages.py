@@ -54,14 +54,32 @@ def huge_zeros(shape: int | tuple[int, ...], dtype: DTypeLike = np.float64) -> N
 
 
 def huge_copy(array: NDArray[Any]) -> NDArray[Any]:
-    """The same array in huge pages, as writable as it was; a small one is not copied."""
-    if array.nbytes < LEAST:
+    """The same array in huge pages, as writable as it was; a small one is not copied.
+
+    Nor is one that lies in them.
+    """
+    if array.nbytes < LEAST or _lies_in_pages(array):
         return array
     copy = huge_zeros(array.shape, array.dtype)
     # Byte for byte: an assignment would leave out the padding of records, which hashes read.
-    copy.reshape(-1).view(np.uint8)[:] = np.frombuffer(array.tobytes(), dtype=np.uint8)
+    copy.reshape(-1).view(np.uint8)[:] = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
     copy.setflags(write=array.flags.writeable)
     return copy
+
+
+def _lies_in_pages(array: NDArray[Any]) -> bool:
+    """Whether it has come out of `huge_zeros`, by the memory that its base is of."""
+    base: Any = array
+    while isinstance(base, np.ndarray):
+        base = base.base
+    return isinstance(getattr(base, "obj", base), mmap.mmap)
+
+
+def trim() -> None:
+    """Give memory of the C library that is free back to the system; glibc alone can."""
+    give_back = getattr(_LIBC, "malloc_trim", None)
+    if give_back is not None:
+        give_back(ctypes.c_size_t(0))
 
 
 def _map(size: int) -> NDArray[np.uint8]:

@@ -23,6 +23,7 @@ from cavmarl.config.registry import (
 )
 from cavmarl.config.zones import ZONE_LAYOUTS
 from cavmarl.core.errors import ConfigError, MapError
+from cavmarl.core.huge_pages import trim
 from cavmarl.maps.buildings import with_buildings
 from cavmarl.maps.netconvert import map_file
 from cavmarl.roads.cache import load_network
@@ -111,6 +112,7 @@ def make_world(config: EnvConfig, base_dir: Path) -> World:
     scene = plan_scene(config.scenario, network)
     if scene is not None and scene.outages:
         network = with_outages(network, dict(scene.outages))
+    trim()  # what files were read into
     return World(config, network, demand, load_zones(config, base_dir, network))
 
 

@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import fields
-from enum import IntEnum
+from itertools import groupby
 from typing import Any, get_args, get_origin, get_type_hints
 
 from cavmarl.core.errors import MessageError
@@ -27,14 +27,13 @@ KINDS: tuple[type[Message], ...] = (Step, Done, Prepare, Ack, Nack, Abort, Need)
 _HEADER = struct.Struct("<4sHBB")
 _CRC = struct.Struct("<I")
 _LENGTH = struct.Struct("<I")
-_NUMBER = struct.Struct("<q")
 _WIDE = frozenset({"rows", "digest"})  # sums of hashes: up to 16 bytes
 
 
 def encode(message: Message) -> bytes:
-    parts = [_HEADER.pack(MAGIC, VERSION, KINDS.index(type(message)), 0)]
-    for name, hint in _HINTS[type(message)]:
-        _write(parts, name, hint, getattr(message, name))
+    number = _NUMBER_OF[type(message)]
+    parts = [_HEADER.pack(MAGIC, VERSION, number, 0)]
+    _FORMS[number].write(parts, message)
     body = b"".join(parts)
     return body + _CRC.pack(zlib.crc32(body))
 
@@ -56,81 +55,176 @@ def decode(
         raise MessageError(f"the checksum of a message of {len(data)} bytes is wrong")
     if kind >= len(KINDS) or zero:
         raise MessageError(f"kind {kind} of message does not exist")
-    reader = _Reader(body)
-    values = {name: reader.value(name, hint) for name, hint in _HINTS[KINDS[kind]]}
-    if reader.at != len(body):
-        raise MessageError(f"{len(body) - reader.at} bytes follow after the message")
-    if run is not None and values["run"] != run:
-        raise MessageError(f"a message of run {values['run'].hex()}; this is {run.hex()}")
-    message: Message = KINDS[kind](**values)
+    message: Message
+    message, at = _FORMS[kind].read(body, _HEADER.size)
+    if at != len(body):
+        raise MessageError(f"{len(body) - at} bytes follow after the message")
+    if run is not None and message.run != run:
+        raise MessageError(f"a message of run {message.run.hex()}; this is {run.hex()}")
     return message
 
 
-def _write(parts: list[bytes], name: str, hint: Any, value: Any) -> None:
+class _Numbers:
+    """Fields that follow each other and have a fixed size: whole numbers, flags, wide digests."""
+
+    def __init__(self, hints: Sequence[tuple[str, Any]]) -> None:
+        self._names = [name for name, _ in hints]
+        self._whole = struct.Struct("<" + "".join(_letter(*hint) for hint in hints))
+        self._wide = [n for n, hint in enumerate(hints) if _letter(*hint) == "16s"]
+        self._few: list[tuple[int, Any, tuple[int, ...]]] = [
+            (n, kind, (0, 1) if kind is bool else tuple(kind))
+            for n, (_, kind) in enumerate(hints)
+            if kind is not int
+        ]
+
+    def write(self, parts: list[bytes], value: Any) -> None:
+        found = [getattr(value, name) for name in self._names]
+        for n in self._wide:
+            found[n] = found[n].to_bytes(16, "little")
+        parts.append(self._whole.pack(*found))
+
+    def read(self, body: bytes, at: int, values: list[Any]) -> int:
+        """Add the fields to `values`; where they end."""
+        end = at + self._whole.size
+        if end > len(body):
+            raise MessageError(f"a message ends inside fields of {self._whole.size} bytes")
+        found = list(self._whole.unpack_from(body, at))
+        for n in self._wide:
+            found[n] = int.from_bytes(found[n], "little")
+        for n, kind, known in self._few:
+            if found[n] not in known:
+                raise MessageError(f"{found[n]} is none of {[int(value) for value in known]}")
+            found[n] = kind(found[n])
+        values += found
+        return end
+
+
+def _letter(name: str, kind: type[Any]) -> str:
+    if kind is bool:
+        return "B"
+    return "16s" if kind is int and name in _WIDE else "q"
+
+
+class _Bytes:
+    """A field of bytes."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def write(self, parts: list[bytes], value: Any) -> None:
+        data = getattr(value, self._name)
+        parts += (_LENGTH.pack(len(data)), data)
+
+    def read(self, body: bytes, at: int, values: list[Any]) -> int:
+        size, at = _length(body, at)
+        values.append(body[at : at + size])
+        return at + size
+
+
+class _List:
+    """A field of entries of one class."""
+
+    def __init__(self, name: str, kind: type[Any]) -> None:
+        self._name = name
+        self._form = _Form(kind, _entry_hints(kind))
+
+    def write(self, parts: list[bytes], value: Any) -> None:
+        entries = getattr(value, self._name)
+        parts.append(_LENGTH.pack(len(entries)))
+        for entry in entries:
+            self._form.write(parts, entry)
+
+    def read(self, body: bytes, at: int, values: list[Any]) -> int:
+        number, at = _length(body, at)
+        found = []
+        for _ in range(number):
+            entry, at = self._form.read(body, at)
+            found.append(entry)
+        values.append(tuple(found))
+        return at
+
+
+class _ListOfNumbers:
+    """A field of whole numbers."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def write(self, parts: list[bytes], value: Any) -> None:
+        numbers = getattr(value, self._name)
+        parts += (_LENGTH.pack(len(numbers)), struct.pack(f"<{len(numbers)}q", *numbers))
+
+    def read(self, body: bytes, at: int, values: list[Any]) -> int:
+        number, at = _length(body, at)
+        if at + 8 * number > len(body):
+            raise MessageError(f"a message ends inside a field of {8 * number} bytes")
+        values.append(struct.unpack_from(f"<{number}q", body, at))
+        return at + 8 * number
+
+
+class _Entry:
+    """A field of a class of its own."""
+
+    def __init__(self, name: str, kind: type[Any]) -> None:
+        self._name = name
+        self._form = _Form(kind, _entry_hints(kind))
+
+    def write(self, parts: list[bytes], value: Any) -> None:
+        self._form.write(parts, getattr(value, self._name))
+
+    def read(self, body: bytes, at: int, values: list[Any]) -> int:
+        entry, at = self._form.read(body, at)
+        values.append(entry)
+        return at
+
+
+class _Form:
+    """The fields of a class, in their order; made once, for a tick has several messages."""
+
+    def __init__(self, kind: type[Any], hints: Sequence[tuple[str, Any]]) -> None:
+        self._kind = kind
+        self._parts: list[Any] = []
+        for is_plain, some in groupby(hints, lambda hint: _is_plain(hint[1])):
+            of_them = list(some)
+            self._parts += [_Numbers(of_them)] if is_plain else [_part(*hint) for hint in of_them]
+
+    def write(self, parts: list[bytes], value: Any) -> None:
+        for part in self._parts:
+            part.write(parts, value)
+
+    def read(self, body: bytes, at: int) -> tuple[Any, int]:
+        values: list[Any] = []
+        for part in self._parts:
+            at = part.read(body, at, values)
+        return self._kind(*values), at
+
+
+def _is_plain(hint: Any) -> bool:
+    return isinstance(hint, type) and issubclass(hint, int)
+
+
+def _part(name: str, hint: Any) -> Any:
     if hint is bytes:
-        parts += (_LENGTH.pack(len(value)), value)
-    elif hint is bool:
-        parts.append(b"\1" if value else b"\0")
-    elif hint is int and name in _WIDE:
-        parts.append(value.to_bytes(16, "little"))
-    elif isinstance(hint, type) and issubclass(hint, int):
-        parts.append(_NUMBER.pack(value))
-    elif get_origin(hint) is tuple:
-        parts.append(_LENGTH.pack(len(value)))
-        for entry in value:
-            _write(parts, name, get_args(hint)[0], entry)
-    else:
-        for field, inner in _entry_hints(hint):
-            _write(parts, field, inner, getattr(value, field))
+        return _Bytes(name)
+    if get_origin(hint) is not tuple:
+        return _Entry(name, hint)
+    kind = get_args(hint)[0]
+    return _ListOfNumbers(name) if kind is int else _List(name, kind)
 
 
-class _Reader:
-    """Reads fields from the body of a message, from its header on."""
-
-    def __init__(self, body: bytes) -> None:
-        self.at = _HEADER.size
-        self._body = body
-
-    def value(self, name: str, hint: Any) -> Any:
-        if hint is bytes:
-            return self._take(self._length())
-        if hint is bool:
-            return self._one_of(self._take(1)[0], (0, 1), bool)
-        if hint is int and name in _WIDE:
-            return int.from_bytes(self._take(16), "little")
-        if isinstance(hint, type) and issubclass(hint, int):
-            number = _NUMBER.unpack(self._take(_NUMBER.size))[0]
-            return self._one_of(number, tuple(hint), hint) if issubclass(hint, IntEnum) else number
-        if get_origin(hint) is tuple:
-            inner = get_args(hint)[0]
-            return tuple(self.value(name, inner) for _ in range(self._length()))
-        return hint(*(self.value(field, inner) for field, inner in _entry_hints(hint)))
-
-    def _length(self) -> int:
-        length: int = _LENGTH.unpack(self._take(_LENGTH.size))[0]
-        if length > len(self._body) - self.at:
-            raise MessageError(f"a field of {length} bytes or entries is cut short")
-        return length
-
-    def _take(self, size: int) -> bytes:
-        if self.at + size > len(self._body):
-            raise MessageError(f"a message ends inside a field of {size} bytes")
-        self.at += size
-        return self._body[self.at - size : self.at]
-
-    def _one_of(self, number: int, known: tuple[int, ...], make: Callable[[int], Any]) -> Any:
-        if number not in known:
-            raise MessageError(f"{number} is none of {[int(value) for value in known]}")
-        return make(number)
-
-
-_ENTRIES: dict[type[Any], tuple[tuple[str, Any], ...]] = {}
+def _length(body: bytes, at: int) -> tuple[int, int]:
+    """How many bytes or entries a field has, and where they begin."""
+    begin = at + _LENGTH.size
+    if begin > len(body):
+        raise MessageError(f"a message ends inside a field of {_LENGTH.size} bytes")
+    length: int = _LENGTH.unpack_from(body, at)[0]
+    if length > len(body) - begin:
+        raise MessageError(f"a field of {length} bytes or entries is cut short")
+    return length, begin
 
 
 def _entry_hints(kind: type[Any]) -> tuple[tuple[str, Any], ...]:
-    if kind not in _ENTRIES:
-        _ENTRIES[kind] = tuple(get_type_hints(kind).items())
-    return _ENTRIES[kind]
+    return tuple(get_type_hints(kind).items())
 
 
 def _message_hints(kind: type[Message]) -> tuple[tuple[str, Any], ...]:
@@ -138,4 +232,5 @@ def _message_hints(kind: type[Message]) -> tuple[tuple[str, Any], ...]:
     return tuple((field.name, hints[field.name]) for field in fields(kind))
 
 
-_HINTS = {kind: _message_hints(kind) for kind in KINDS}
+_FORMS = [_Form(kind, _message_hints(kind)) for kind in KINDS]
+_NUMBER_OF = {kind: number for number, kind in enumerate(KINDS)}

@@ -211,6 +211,12 @@ MAP = record(
     ("num_programs", np.int32),
 )
 
+# Fields of a network that kernels take, in the order of `RoadArrays`.
+_TABLES = (
+    "points", "lanes", "edges", "links", "conflicts", "sweeps", "into", "signals", "programs",
+    "phases", "phase_states", "switches", "detectors", "phase_detectors",
+)  # fmt: skip
+
 
 @dataclass(frozen=True)
 class GeoReference:
@@ -270,25 +276,12 @@ class RoadNetwork:
 
     @cached_property
     def arrays(self) -> RoadArrays:
-        own = (
-            self.points,
-            self.lanes,
-            self.edges,
-            self.links,
-            self.conflicts,
-            self.sweeps,
-            self.into,
-            self.signals,
-            self.programs,
-            self.phases,
-            self.phase_states,
-            self.switches,
-            self.detectors,
-            self.phase_detectors,
-            *self._places,
-            self.maps,
-        )
-        return RoadArrays(*map(huge_copy, own))
+        """The tables as kernels take them, in huge pages; from then on the fields are these."""
+        for name in _TABLES:
+            object.__setattr__(self, name, huge_copy(getattr(self, name)))
+        own = (getattr(self, name) for name in _TABLES)
+        found = (*own, *map(huge_copy, self._places), self.maps)
+        return RoadArrays(*found)
 
     @cached_property
     def maps(self) -> NDArray[np.void]:

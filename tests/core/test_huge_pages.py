@@ -45,6 +45,15 @@ def test_a_copy_has_every_byte_and_may_be_written_as_before() -> None:
     assert huge_copy(small) is small
 
 
+@pytest.mark.skipif(not hasattr(mmap, "MADV_HUGEPAGE"), reason="there are no huge pages")
+def test_what_lies_in_huge_pages_is_not_copied() -> None:
+    """A map that is changed in one table shares the others."""
+    array = huge_zeros(2 * LEAST // 8)
+    assert huge_copy(array) is array
+    part = array[1:]
+    assert huge_copy(part) is part
+
+
 def test_memory_goes_with_its_arrays() -> None:
     """Nothing but the arrays holds their pages."""
     array = huge_zeros(4 * PAGE // 8)

@@ -7,11 +7,14 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from numba.core import config
 
 from cavmarl.core.cache_folder import cache_dir
+from cavmarl.core.math.bearings import rough_atan2
+from cavmarl.core.numba import kernel
 from cavmarl.core.numba import kernel_cache as kernels
 
 SOURCES = kernels._sources()
@@ -110,6 +113,19 @@ def test_what_is_damaged_is_compiled_anew(tmp_path: Path, harm: bytes | None) ->
         )
     assert run() == [first[0], "1" if harm is None else "0"]
     assert run() == [first[0], "1"]
+
+
+@pytest.mark.skipif(config.DISABLE_JIT, reason="nothing is compiled")
+def test_of_a_kernel_that_was_kept_there_is_machine_code_alone() -> None:
+    """LLVM's would stay in memory; no kernel links it, and to try is an error."""
+    known: Any = rough_atan2
+    expected = known(1.0, 2.0)
+    again: Any = kernel(known.py_func)
+    assert again(1.0, 2.0) == expected
+    assert sum(again.stats.cache_hits.values()) == 1
+    (result,) = again.overloads.values()
+    with pytest.raises(RuntimeError, match="unfit for linking"):
+        result.library._get_module_for_linking()
 
 
 def _kept_of_one(folder: Path) -> kernels._CheckedFile:

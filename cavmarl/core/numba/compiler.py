@@ -6,7 +6,8 @@ leaving that comparison out makes a tick of traffic a tenth faster (decision 008
 that is written out, as in `a[-1]`, keeps its meaning. With `NUMBA_BOUNDSCHECK=1` every index
 outside of its array, negative ones included, is an `IndexError`: `make bounds` runs the tests so.
 
-Three changes shorten the first compilation (decision 002):
+What is kept of a kernel on disk is machine code without LLVM's, which a process would keep in
+memory. Three changes shorten the first compilation (decision 002):
 
 - A kernel that is called by another one is a part of it: it is not made callable from Python, not
   kept on disk, and optimised once, together with its caller. Numba does all of that for each.
@@ -25,7 +26,7 @@ from functools import cache
 from typing import Any
 
 from llvmlite import ir
-from llvmlite.binding import ModuleRef
+from llvmlite.binding import Linkage, ModuleRef, parse_assembly
 from numba.core.cgutils import alloca_once_value, gep_inbounds
 from numba.core.codegen import CodeLibrary, JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder, Flags
@@ -194,6 +195,7 @@ class _KernelLower(_Lower):  # type: ignore[misc]
 
 
 _Library: Any = JITCodeLibrary
+_LOCAL = (Linkage.internal, Linkage.private)  # what other modules do not see
 
 
 class _Whole(_Library):  # type: ignore[misc]
@@ -226,6 +228,26 @@ class _Whole(_Library):  # type: ignore[misc]
             if function.name not in self._own:
                 function.linkage = "internal"
         super()._optimize_final_module()
+
+    def serialize_using_object_code(self) -> tuple[str, str, tuple[bytes, bytes]]:
+        """For the disk: the machine code, and in the place of LLVM's the names that it defines.
+
+        Numba keeps both, and has both in memory as long as the process lives; but no kernel links
+        one that was kept (`call_as_part`).
+        """
+        module = self._final_module
+        names = [
+            f'define void @"{function.name}"() {{ unreachable }}'
+            for function in self.get_defined_functions()
+            if function.linkage not in _LOCAL
+        ]
+        names += [
+            f'@"{value.name}" = global i8 0'
+            for value in module.global_variables
+            if not value.is_declaration and value.linkage not in _LOCAL
+        ]
+        stub: Any = parse_assembly("\n".join(names))
+        return self.name, "object", (self._get_compiled_object(), stub.as_bitcode())
 
 
 class _Part(_Library):  # type: ignore[misc]

@@ -105,6 +105,12 @@ class _Locator(caching._CacheLocator):  # type: ignore[misc]
 class _Impl(caching.CompileResultCacheImpl):  # type: ignore[misc]
     _locator_classes = (_Locator,)
 
+    def rebuild(self, target_context: Any, payload: Any) -> Any:
+        """What was kept, to be called; to link it is an error of Numba's."""
+        result = super().rebuild(target_context, payload)
+        result.library._shared_module = None  # names alone, see `compiler._Whole`
+        return result
+
 
 class _CheckedFile(caching.IndexDataCacheFile):  # type: ignore[misc]
     """Numba's files of one kernel: an index with a checksum before it, which names data by theirs.
