@@ -38,8 +38,12 @@ from cavmarl.driving.kernels.junctions import (
     waits_inside,
 )
 from cavmarl.driving.kernels.lane_choice import (
+    MERGE_ROOM_M,
+    MERGE_ROOM_SHARE,
+    SWAP_ROOM_M,
     choose_lane,
     needed_change,
+    room_for_more,
     thinks_of_lanes,
     wish_on_lane,
 )
@@ -63,14 +67,9 @@ ASKEW_M = 2.5  # which takes this off the gap
 NEXT_LINE_M = 5.0  # and braking way: so near a line is minded by a vehicle with a leader
 LIMIT_LEAD_S = 1.0  # to be down this time before it, as the model lags behind what is allowed
 FALL_IN_M = 100.0  # before the place where a lane change must be made
-# A driver that has to leave a lane waits this far before its end to change right, and a vehicle's
-# length further back to change left: two that want to swap do not stand side by side for ever.
-MERGE_ROOM_M = 2.0
-SWAP_ROOM_M = 3.0
-# The same of a steered vehicle on its way into the other lane: its front comes to 0.2 m before the
-# end, nearer than to a line.
+# `MERGE_ROOM_M` of a steered vehicle on its way into the other lane: its front comes to 0.2 m
+# before the end, nearer than to a line.
 CHANGING_ROOM_M = -0.8
-MERGE_ROOM_SHARE = 0.25  # to the right at most this share of the lane's length
 ROW_LINES = 3  # of a VEHICLE row that drivers ask for
 RETURN_MPS = 5.0  # at which a lost vehicle looks for its lane
 
@@ -207,12 +206,9 @@ def _road_ahead(
 ) -> tuple[float, float, int, int]:
     """Walk the way of entry k: (constraint, allowed speed, why it holds, link near its line).
 
-    `step` is its own one.
-
-    A vehicle that stands close behind its leader, too far from the line to look at it, need not:
-        nothing that
-    lies further ahead could make it stay more. Before the end of a lane that its way does not
-    follow it stops `merge_room_m` early.
+    `step` is its own one. A vehicle that stands close behind its leader, too far from the line to
+    look at it, need not: nothing that lies further ahead could make it stay more. Before the end of
+    a lane that its way does not follow it stops `merge_room_m` early.
     """
     own = scratch.entries[k]
     i = own["row"]
@@ -391,8 +387,11 @@ def decide(
         row = rows[i]
         kind = travel.types[row["vtype"]]
         speed = row["speed"]
+        further_m = 0.0
+        if driver == DRIVER_AGENT and step[i]["changes"] > 1:
+            further_m = room_for_more(roads.lanes[row["lane"]], row, step[i])
         constraint, allowed, hold, link_ahead = _road_ahead(
-            roads, travel, rows, k, step[i], phase, MERGE_ROOM_M, dt, scratch
+            roads, travel, rows, k, step[i], phase, MERGE_ROOM_M + further_m, dt, scratch
         )
         to_stop = way_to_stop(roads, travel, row)
         if to_stop < math.inf:
@@ -413,7 +412,7 @@ def decide(
             # very end, and already the leader in the other one. Standing, it could not steer.
             lane = roads.lanes[row["lane"]]
             constraint, allowed, _, _ = _road_ahead(
-                roads, travel, rows, k, step[i], phase, CHANGING_ROOM_M, dt, scratch
+                roads, travel, rows, k, step[i], phase, CHANGING_ROOM_M + further_m, dt, scratch
             )
             target = lane["left"] if change > 0 else lane["right"]
             constraint = max(constraint, _beside(roads, travel, kind, row, target, scratch))

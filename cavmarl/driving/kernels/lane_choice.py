@@ -34,6 +34,11 @@ CREEP_MPS = 1.0  # so slow, a driver that has to change does so to the very end 
 SIDEWAYS_S = 2.5  # a lane change takes about this long, and has to end before the lane does
 BRAKE_TIME_S = 0.5  # a braking that ends within this time is not felt
 SIDE_GAP_M = 1.0  # m between bumpers, the least with which a lane change starts
+# A driver that has to leave a lane waits this far before its end to change right, and a vehicle's
+# length further back to change left: two that want to swap do not stand side by side for ever.
+MERGE_ROOM_M = 2.0
+SWAP_ROOM_M = 3.0
+MERGE_ROOM_SHARE = 0.25  # to the right at most this share of the lane's length
 
 
 @inlined_kernel
@@ -52,6 +57,13 @@ def needed_change(roads: RoadArrays, travel: Travel, row: np.void, step: np.void
         return 0
     early = (CHANGE_EARLY_M + CHANGE_EARLY_S * row["speed"]) * step["changes"]
     return int(step["change"]) if step["room"] - row["s"] <= early else 0
+
+
+@inlined_kernel
+def room_for_more(lane: np.void, row: np.void, step: np.void) -> float:
+    """Where a steered vehicle changes lanes more than once, room for all changes but the first."""
+    further = (step["changes"] - 1) * (row["length"] + SWAP_ROOM_M)
+    return float(min(further, max(MERGE_ROOM_SHARE * lane["length_m"] - MERGE_ROOM_M, 0.0)))
 
 
 @inlined_kernel
