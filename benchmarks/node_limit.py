@@ -24,6 +24,7 @@ from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.shards.shard import Commands
 
 GO = "go\n"  # one turn
+SERVES = "import sys; from benchmarks.node_limit import serve; serve(*sys.argv[1:])"
 
 
 def measure(
@@ -82,7 +83,7 @@ class _World:
     def __init__(self, net: Path, vehicles: int, steps: int) -> None:
         told = [str(net), str(vehicles), str(steps)]
         self.process: subprocess.Popen[Any] = start_python(
-            ["-m", "benchmarks.node_limit", "--serve", *told],
+            ["-c", SERVES, *told],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -114,8 +115,10 @@ def _turn(worlds: list[_World]) -> tuple[float, float]:
     return max(wall_s for wall_s, _ in found), max(cpu_s for _, cpu_s in found)
 
 
-def _serve(net: Path, vehicles: int, steps: int) -> None:
-    config, base_dir = load_config(net, agents=1, background=vehicles - 1, max_cycles=1_000_000)
+def serve(net: str, vehicles: str, steps: str) -> None:
+    """Step an undivided world, so many steps for each line that comes in; tell the times."""
+    others = int(vehicles) - 1
+    config, base_dir = load_config(net, agents=1, background=others, max_cycles=1_000_000)
     worlds = LocalWorlds(make_world(config, base_dir), 1, warm=True)
     worlds.arrays.chosen[:] = True
     worlds.reset(1, 0)
@@ -123,17 +126,14 @@ def _serve(net: Path, vehicles: int, steps: int) -> None:
     for _ in range(WARM_STEPS):
         worlds.step(commands)
     print(0.0, 0.0, flush=True)
-    ticks = steps * config.clock.ticks_per_step
+    ticks = int(steps) * config.clock.ticks_per_step
     while sys.stdin.readline() == GO:
         wall_s, cpu_s = time.perf_counter(), time.process_time()
-        for _ in range(steps):
+        for _ in range(int(steps)):
             worlds.step(commands)
         wall_s, cpu_s = time.perf_counter() - wall_s, time.process_time() - cpu_s
         print(wall_s / ticks, cpu_s / ticks, flush=True)
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["--serve"]:
-        _serve(Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]))
-    else:
-        run(measure)
+    run(measure)
