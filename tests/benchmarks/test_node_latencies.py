@@ -6,6 +6,7 @@ import pytest
 
 from benchmarks import node_latencies, node_limit
 from benchmarks.__main__ import programs
+from benchmarks.nodes import PER_JUNCTION
 from cavmarl.core.errors import ConfigError
 
 
@@ -26,7 +27,7 @@ def test_one_node_alone_is_refused() -> None:
 
 
 def test_two_halves_run_beside_one_another() -> None:
-    least = node_limit.PER_JUNCTION * 32
+    least = PER_JUNCTION * 32
     found = node_limit.measure(vehicles=least, steps=1, repeats=1)
     assert [row["world"] for row in found.rows] == [
         f"{least:,} vehicles",
