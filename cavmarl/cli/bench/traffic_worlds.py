@@ -67,7 +67,7 @@ def _shares(found: Row, which: str = "") -> Table:
         f"{found.get('own_locks')}; queue: {queue.get('ours', 0.0):.1f} "
         f"(SUMO {queue.get('sumo', 0.0):.1f})"
     )
-    heads = ("ours over SUMO's", "median", "median size", "90 % below", "near", "SUMO near")
+    heads = ("over SUMO's mean, less 1", "median", "median size", "90 % below", "near", "SUMO near")
     return make_table(title, heads, rows, caption)
 
 
