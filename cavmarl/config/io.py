@@ -11,8 +11,9 @@ import difflib
 import json
 import re
 from collections.abc import Hashable, Mapping
+from copy import deepcopy
 from dataclasses import fields, is_dataclass
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
@@ -97,7 +98,7 @@ def read_yaml(path: Path) -> object:
     if len(data) > MAX_BYTES:
         raise ConfigError(f"{path}: more than {MAX_BYTES // 1024} KiB; is this a configuration?")
     try:
-        loaded: object = yaml.load(data.decode(), Loader=_CoreLoader)
+        return deepcopy(_parsed(data.decode()))
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: not UTF-8 at byte {error.start}") from error
     except yaml.MarkedYAMLError as error:
@@ -105,6 +106,11 @@ def read_yaml(path: Path) -> object:
         raise ConfigError(f"{path}: {line}{error.problem}") from error
     except yaml.YAMLError as error:
         raise ConfigError(f"{path}: {error}") from error
+
+
+@lru_cache(maxsize=32)  # a world that is made again has the same settings
+def _parsed(text: str) -> object:
+    loaded: object = yaml.load(text, Loader=_CoreLoader)
     return loaded
 
 

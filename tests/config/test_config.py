@@ -53,6 +53,18 @@ terms: {weights: {progress: 1}, team_share: 1}
     assert config.terms.weights == {"progress": 1.0}
 
 
+def test_a_file_that_is_read_again_is_read_as_it_stands(tmp_path: Path) -> None:
+    path = tmp_path / "x.yaml"
+    path.write_text("a: [1, 2]")
+    first = read_yaml(path)
+    assert isinstance(first, dict)
+    first["a"].append(3)
+    first["b"] = 4
+    assert read_yaml(path) == {"a": [1, 2]}
+    path.write_text("a: [1, 5]")
+    assert read_yaml(path) == {"a": [1, 5]}
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [

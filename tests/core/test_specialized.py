@@ -2,13 +2,17 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numba
 import numba.core.config
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from cavmarl.core.numba import kernel
-from cavmarl.core.numba.specialized import specialized
+from cavmarl.core.numba import specialized as specialized_calls
+from cavmarl.core.numba.specialized import _kind, specialized
+
+_typeof: Any = numba.typeof
 
 settings: Any = numba.core.config
 compiled_only = pytest.mark.skipif(
@@ -38,15 +42,49 @@ def test_it_does_what_the_kernel_does_with_other_arrays_of_the_same_types() -> N
 
 @compiled_only
 def test_types_are_looked_at_in_the_first_call_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    import numba
-
     looked = []
-    typeof: Any = numba.typeof
-    monkeypatch.setattr(numba, "typeof", lambda value: looked.append(value) or typeof(value))
+    monkeypatch.setattr(
+        specialized_calls, "_kind", lambda value: looked.append(value) or _kind(value)
+    )
     call = specialized(rise)
     for _ in range(3):
         call(Pair(np.arange(2), 0.5), 1)
-    assert len(looked) == 2
+    assert len(looked) == 4  # the bundle, what is in it, and the number
+
+
+RECORDS = np.zeros(3, dtype=[("x", np.float64), ("at", np.int64)])
+TURNED = np.asfortranarray(np.zeros((2, 3)))
+CONSTANT = np.zeros(3)
+CONSTANT.flags.writeable = False
+ARGUMENTS = [
+    RECORDS,
+    RECORDS[::2],
+    RECORDS["x"],
+    RECORDS.astype(np.dtype(RECORDS.dtype.descr, align=True)),
+    RECORDS.view([("x", np.float64), ("by", np.int64)]),
+    np.zeros(3),
+    np.zeros(3, dtype=np.float32),
+    np.zeros((2, 3)),
+    TURNED,
+    CONSTANT,
+    3,
+    True,
+    0.5,
+    None,
+    (1, 2.0),
+    (1, 2),
+    (),
+    Pair(np.arange(2), 0.5),
+    Pair(np.arange(2), 1),  # type: ignore[arg-type]
+    (Pair(np.arange(2), 0.5), RECORDS),
+]
+
+
+@pytest.mark.parametrize("argument", ARGUMENTS, ids=lambda argument: repr(_typeof(argument)))
+def test_types_that_are_kept_are_numbas(argument: Any) -> None:
+    for value in (argument, *ARGUMENTS, argument):
+        assert _kind(value) == _typeof(value)
+    assert _kind(argument) is _kind(argument)
 
 
 @pytest.mark.parametrize("setting", ["DISABLE_JIT", "BOUNDSCHECK"])

@@ -134,7 +134,7 @@ def test_what_there_is_not_is_refused(
 
 
 PROGRAM = """
-import sys
+import sys, time
 from cavmarl import RecordOptions, parallel_env
 options = RecordOptions(sys.argv[1], ("observations", "messages"))
 env = parallel_env("grid4x4", agents=2, background=6, record=options,
@@ -143,6 +143,7 @@ env.reset(seed=5)
 print("begun", flush=True)
 while True:
     env.step(env.suggest_actions())
+    time.sleep(0.01)  # parts are made by the clock: agents are to be there for long enough
 """
 
 

@@ -134,13 +134,14 @@ def test_copies_do_not_record(tmp_path: Path) -> None:
 
 
 PROGRAM = """
-import sys
+import sys, time
 from cavmarl import parallel_env
 env = parallel_env("ring", record=sys.argv[1])
 env.reset(seed=5)
 print("begun", flush=True)
 while True:
     env.step(env.suggest_actions())
+    time.sleep(0.01)
     if not env.agents:
         env.reset()
 """

@@ -25,11 +25,12 @@ def killed_recording(path: Path, program: str, parts: int) -> Recording:
         assert process.stdout is not None
         assert process.stdout.readline() == b"begun\n"
         until = time.monotonic() + 30.0
-        while (
-            len(list(path.glob("world-0/frames/0*.parquet"))) < parts and time.monotonic() < until
-        ):
+        while len(found := list(path.glob("world-0/frames/0*.parquet"))) < parts:
+            if time.monotonic() > until:
+                break
             time.sleep(0.02)
         process.send_signal(signal.SIGKILL)
+    assert len(found) >= parts
     recording = Recording.open(path)
     assert not recording.is_whole
     return recording

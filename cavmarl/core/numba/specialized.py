@@ -119,9 +119,33 @@ class _Form:
         )
 
 
+# By what decides it, the type of an array or of a bundle. An entry of bundles keeps the types of
+# its parts, since their addresses are its key.
+_arrays: dict[tuple[Any, ...], Any] = {}
+_bundles: dict[tuple[Any, ...], tuple[Any, tuple[Any, ...]]] = {}
+
+
 def _kind(argument: Any) -> Any:
+    """Numba's type of an argument.
+
+    Numba puts the type of an array of records together from its fields each time. A world has
+    hundreds of such arrays, and a few types of them.
+    """
     typeof: Any = numba.typeof
-    return typeof(argument)
+    if type(argument) is np.ndarray:
+        dtype = argument.dtype
+        form = (dtype, dtype.isalignedstruct, argument.ndim, argument.flags.num)
+        kind = _arrays.get(form)
+        if kind is None:
+            kind = _arrays[form] = typeof(argument)
+        return kind
+    if not isinstance(argument, tuple):
+        return typeof(argument)
+    kinds = tuple(map(_kind, argument))
+    parts = (type(argument), *map(id, kinds))
+    if parts not in _bundles:
+        _bundles[parts] = typeof(argument), kinds
+    return _bundles[parts][0]
 
 
 def _flags_of(array: np.ndarray[Any, Any]) -> int:
