@@ -29,11 +29,12 @@ class ForkedProcess:
         self,
         module: str,
         arguments: Sequence[str],
-        descriptors: Sequence[int],  # that it gets, by the same numbers
-        variables: Mapping[str, str],  # of its environment
-        with_stdin: bool,
+        descriptors: Sequence[int] = (),  # that it gets, by the same numbers
+        variables: Mapping[str, str] | None = None,  # of its environment; None: those here
+        with_stdin: bool = False,
     ) -> None:
         self.stdin: IO[str] | None = None
+        variables = dict(os.environ if variables is None else variables)
         stdin = os.open(os.devnull, os.O_RDONLY)
         if with_stdin:
             os.close(stdin)
@@ -43,7 +44,7 @@ class ForkedProcess:
         passed = {number: DupFd(there) for number, there in given.items()}
         self._process = FORKS.Process(
             target=_run,
-            args=(module, list(arguments), passed, dict(variables), os.getpid()),
+            args=(module, list(arguments), passed, variables, os.getpid()),
             daemon=True,
         )
         self._process.start()

@@ -4,24 +4,22 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import sys
 import time
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.parallel.hosts.host_process import TaskOutcome, serve
+from tests.support.forked_processes import ForkedProcess
 
 __all__ = ["ADD", "DOZE", "FAIL", "FALL", "TASKS", "TOIL", "TOTAL", "WRITE", "Processes", "ToyJob"]
 
 TASKS = ("add", "write", "total", "fail", "fall", "doze", "toil")
 ADD, WRITE, TOTAL, FAIL, FALL, DOZE, TOIL = range(len(TASKS))
-ROOT = Path(__file__).resolve().parents[2]
 
 
 class ToyJob:
@@ -76,16 +74,16 @@ class Processes:
     def __init__(self, count: int, **recipe: Any) -> None:
         self._recipe = recipe
         self._count = count
-        self.processes: list[subprocess.Popen[bytes]] = []
+        self.processes: list[ForkedProcess] = []
         self.words: str | None = None
 
     def start(self, place: tuple[str, int], secret: bytes) -> None:
         self.place, self.secret = place, secret
         self.processes = [self._start(number) for number in range(self._count)]
 
-    def _start(self, number: int) -> subprocess.Popen[bytes]:
+    def _start(self, number: int) -> ForkedProcess:
         told = json.dumps([self.place, self.secret.hex(), number, self._recipe])
-        return subprocess.Popen([sys.executable, "-m", __name__, told], cwd=ROOT)
+        return ForkedProcess(__name__, [told])
 
     def restart(self, number: int) -> None:
         self.processes[number].kill()
