@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -34,25 +33,43 @@ BARE_MAPS = ("net/Town10HD.net.xml", "xodr/Town01.xodr", "osm/laufamholz.osm.xml
 Make = Callable[..., Any]
 
 
-@pytest.fixture(params=[*sorted(entries()), *BARE_MAPS])
-def source(request: pytest.FixtureRequest) -> str | Path:
-    """The name of an entry, or a map file."""
-    if request.param in BARE_MAPS:
-        folder: Path = request.getfixturevalue("shared_maps")
-        return folder / str(request.param)
-    return str(request.param)
+def worlds(*often: str, modes: tuple[str, ...] = MODES, bare: tuple[str, ...] = BARE_MAPS) -> Any:
+    """A test of every entry in each population; `often`: entries whose others are in every run.
+
+    Every entry is in every run in its first population: the others behave alike on all maps, which
+    `test_parallel_api` shows on each.
+    """
+    return pytest.mark.parametrize(
+        "arguments",
+        [
+            pytest.param(
+                (source, mode),
+                id=f"{mode}-{source}",
+                marks=[] if mode == modes[0] or source in often else pytest.mark.slow,
+            )
+            for source in (*sorted(entries()), *bare)
+            for mode in modes
+        ],
+        indirect=True,
+    )
 
 
-@pytest.fixture(params=MODES)
-def arguments(request: pytest.FixtureRequest, source: str | Path) -> dict[str, Any]:
+in_few_worlds = worlds("grid4x4", "merge")
+
+
+@pytest.fixture
+def arguments(request: pytest.FixtureRequest) -> dict[str, Any]:
     """What `parallel_env` is called with: a small population of each kind, short episodes."""
+    source, mode = request.param
+    if source in BARE_MAPS:
+        source = request.getfixturevalue("shared_maps") / source
     return {
         "env": source,
         "agents": 1 if source == "ring22" else 3,  # there is room for one among 21
         "background": 6,
         "seed": 0,
         "max_cycles": STEPS,
-        "overrides": {"population.mode": request.param, "population.budget": 6},
+        "overrides": {"population.mode": mode, "population.budget": 6},
     }
 
 
@@ -69,16 +86,19 @@ def make_aec(arguments: dict[str, Any]) -> Make:
 
 # An episode ends at its horizon also when some of the declared agents never got to enter.
 @pytest.mark.filterwarnings("ignore:No agents present but not all possible_agents")
+@worlds(*sorted(entries()), *BARE_MAPS)
 def test_parallel_api(make: Make) -> None:
     parallel_api_test(make(), num_cycles=STEPS)
 
 
 # A seat that waits for a vehicle observes nothing.
 @pytest.mark.filterwarnings("ignore:Observation numpy array is all zeros")
+@in_few_worlds
 def test_aec_api(make_aec: Make) -> None:
     api_test(make_aec(), num_cycles=STEPS)
 
 
+@in_few_worlds
 def test_max_cycles(arguments: dict[str, Any], make: Make, make_aec: Make) -> None:
     # It wants most of the possible agents to act until the end, so none may be left to come, and
     # random ones must not leave the road in a few steps.
@@ -91,16 +111,12 @@ def test_max_cycles(arguments: dict[str, Any], make: Make, make_aec: Make) -> No
     )
 
 
+@in_few_worlds
 def test_state(make: Make, make_aec: Make) -> None:
     state_test(make_aec(), make(), num_cycles=STEPS)
 
 
-@pytest.mark.parametrize("source", sorted(entries()), indirect=True)
-@pytest.mark.parametrize(
-    "arguments",  # frames are drawn alike, whatever the population
-    ["closed", *(pytest.param(mode, marks=pytest.mark.slow) for mode in ("open", "respawn"))],
-    indirect=True,
-)
+@worlds(bare=())  # frames are drawn alike, whatever the population
 def test_render(make_aec: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pygame", reason="frames need the extra 'render'")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
@@ -133,6 +149,7 @@ def assert_equal(one: Step, other: Step, where: str) -> None:
     assert mine[1:] == theirs[1:], f"{where}: rewards, terminations, truncations, infos"
 
 
+@in_few_worlds
 def test_the_seed_decides_every_step(make: Make) -> None:
     fresh, used = make(), make()
     for _ in episode(used, seed=99, actions_seed=1):
@@ -150,6 +167,7 @@ def test_the_seed_decides_every_step(make: Make) -> None:
     assert not set(hashes) & set(others), "another seed gives another world"
 
 
+@in_few_worlds
 def test_resets_without_a_seed_go_on_and_repeat(make: Make) -> None:
     env = make()
     runs = []

@@ -237,7 +237,7 @@ def default_text(value: object) -> str:
 def test_commands_of_pages_are_understood(page: Path) -> None:
     """Each command is there, and has the options that it is given."""
     for line in commands_of(page.read_text(encoding="utf-8")):
-        command: Any = typer.main.get_command(app)
+        command = whole_command()
         context = command.make_context("cavmarl", [], resilient_parsing=True)
         words = shlex.split(line.replace("…", ""), comments=True)[1:]
         while hasattr(command, "get_command") and words and not words[0].startswith("-"):
@@ -252,6 +252,11 @@ def test_commands_of_pages_are_understood(page: Path) -> None:
                 raise
             left = []
         assert not left or context.ignore_unknown_options, line
+
+
+@cache
+def whole_command() -> Any:
+    return typer.main.get_command(app)
 
 
 def commands_of(text: str) -> list[str]:

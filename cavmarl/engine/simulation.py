@@ -74,6 +74,7 @@ class Simulation(WorldViews):
         runs: Sequence[WorldRun] | None = None,
     ) -> None:
         self.config = config
+        self._carried_from = carried_from(config.sensors)
         self.network = network
         self.demand = demand
         self.num_worlds = num_worlds
@@ -430,7 +431,7 @@ class Simulation(WorldViews):
             traffic=tick.traffic,
             outputs=self.outputs,
             coordination=tick.coordination,
-            has_past=carried_from(self.config.sensors) < self.outputs.observations.shape[2],
+            has_past=self._carried_from < self.outputs.observations.shape[2],
             attached=tick.attached,
             sumo=tick.sumo,
         )

@@ -34,7 +34,7 @@ def busy() -> Recorded:
 
 @pytest.fixture(scope="module")
 def campaign() -> Campaign:
-    return run_campaign(None, (ZONES,), steps=24, seeds=2, overrides={"clock.ctrl_dt_s": 0.4})
+    return run_campaign(None, (ZONES,), steps=12, seeds=1, overrides={"clock.ctrl_dt_s": 0.4})
 
 
 def line(campaign: Campaign, name: str) -> LineResult:
