@@ -42,16 +42,17 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def _let_start(patch: pytest.MonkeyPatch, start: Callable[..., object]) -> None:
+    from cavmarl.evaluate import fresh
     from cavmarl.parallel.nodes import node_starters
     from cavmarl.parallel.processes import fork_server
 
-    for module in (fork_server, node_starters):
+    for module in (fork_server, node_starters, fresh):
         patch.setattr(module, "start_python", start)
 
 
 @pytest.fixture(scope="session", autouse=True)
 def forked_processes() -> Iterator[None]:
-    """Pools get their processes as forks of one that has loaded the kernels."""
+    """Pools and evaluations get their processes as forks of one that has loaded the kernels."""
     from tests.support.forked_processes import start_forked
 
     with pytest.MonkeyPatch.context() as patch:
@@ -61,7 +62,7 @@ def forked_processes() -> Iterator[None]:
 
 @pytest.fixture
 def fresh_processes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let pools start Pythons of their own, as they do outside of the tests."""
+    """Let Pythons of their own be started, as outside of the tests."""
     from cavmarl.core.processes import start_python
 
     _let_start(monkeypatch, start_python)

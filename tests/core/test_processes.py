@@ -30,6 +30,7 @@ def test_an_interrupt_is_left_to_the_caller() -> None:
     assert process.returncode == 0
 
 
+@pytest.mark.usefixtures("fresh_processes")
 def test_code_of_the_working_directory_is_not_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from cavmarl.core.errors import ConfigError, PolicyError, UnknownEnvironmentError
-from cavmarl.evaluate import EvaluationReport, episodes, evaluate, load_report
+from cavmarl.core.processes import start_python
+from cavmarl.evaluate import EvaluationReport, episodes, evaluate, fresh, load_report
 from cavmarl.evaluate.episodes import worlds_at_once
 from cavmarl.evaluate.evaluation import load_tables, run_seeds
 from cavmarl.evaluate.metrics import METRICS
@@ -32,10 +33,12 @@ def by_chance() -> EvaluationReport:
 
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of two policies in three runs."""
+    """The folder of two policies in three runs, each in a Python of its own."""
     folder = tmp_path_factory.mktemp("compared")
     policies = {"driver": "idm", "chance": "random_actions"}
-    evaluate("merge", policies, seed=4, repeats=3, out=folder, **SMALL)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fresh, "start_python", start_python)  # no fork, as elsewhere in the tests
+        evaluate("merge", policies, seed=4, repeats=3, out=folder, **SMALL)
     return folder
 
 

@@ -1,4 +1,4 @@
-"""Processes of pools as forks of one that has loaded the kernels: each starts in milliseconds.
+"""Processes as forks of one that has loaded the kernels: each starts in milliseconds.
 
 Elsewhere each begins as a Python of its own, which takes more than a second. Tests that look at
 that ask for the fixture `fresh_processes`.
@@ -17,38 +17,42 @@ from multiprocessing.reduction import DupFd
 from typing import IO, Any
 
 from cavmarl.core.processes import start_python
+from cavmarl.evaluate.fresh import PROGRAM
 from tests.support.world_hosts import FORKS
 
 __all__ = ["ForkedProcess", "start_forked"]
 
 
 class ForkedProcess:
-    """What of `subprocess.Popen` pools use."""
+    """What of `subprocess.Popen` pools and tests use.
+
+    `words` are those of a Python: `-m` and a module, or `-c` and a program, and arguments. Of its
+    environment, `env` are variables; None: those here.
+    """
 
     def __init__(
         self,
-        module: str,
-        arguments: Sequence[str],
-        descriptors: Sequence[int] = (),  # that it gets, by the same numbers
-        variables: Mapping[str, str] | None = None,  # of its environment; None: those here
-        with_stdin: bool = False,
+        words: Sequence[str],
+        *,
+        env: Mapping[str, str] | None = None,
+        stdin: int | None = None,
+        stdout: int | None = None,
+        pass_fds: Sequence[int] = (),
+        text: bool = False,
     ) -> None:
-        self.stdin: IO[str] | None = None
-        variables = dict(os.environ if variables is None else variables)
-        stdin = os.open(os.devnull, os.O_RDONLY)
-        if with_stdin:
-            os.close(stdin)
-            stdin, ours = os.pipe()
-            self.stdin = os.fdopen(ours, "w")
-        given = {0: stdin, 1: 1, 2: 2} | {number: number for number in descriptors}
+        self.stdin, read = _pipe_to(text) if stdin == subprocess.PIPE else (None, _nothing())
+        self.stdout, write = _pipe_from(text) if stdout == subprocess.PIPE else (None, os.dup(1))
+        if stdout == subprocess.DEVNULL:
+            os.dup2(_nothing(), write)
+        given = {0: read, 1: write, 2: 2} | {number: number for number in pass_fds}
         passed = {number: DupFd(there) for number, there in given.items()}
+        variables = dict(os.environ if env is None else env)
         self._process = FORKS.Process(
-            target=_run,
-            args=(module, list(arguments), passed, variables, os.getpid()),
-            daemon=True,
+            target=_run, args=(list(words), passed, variables, os.getpid()), daemon=True
         )
         self._process.start()
-        os.close(stdin)
+        os.close(read)
+        os.close(write)
 
     @property
     def pid(self) -> int:
@@ -72,26 +76,28 @@ class ForkedProcess:
         self._process.kill()
 
 
-def start_forked(words: Sequence[str], **options: Any) -> Any:
-    """In the place of `start_python`; words that run no module of ours go there."""
-    if words[0] != "-m" or not words[1].startswith("cavmarl."):
-        return start_python(words, **options)
-    return ForkedProcess(
-        words[1],
-        words[2:],
-        options.get("pass_fds", ()),
-        {**os.environ, **(options.get("env") or {})},
-        options.get("stdin") == subprocess.PIPE,
-    )
+def start_forked(words: Sequence[str], env: Mapping[str, str] | None = None, **options: Any) -> Any:
+    """In the place of `start_python`; words that run nothing of ours go there."""
+    if (words[0] == "-m" and words[1].startswith("cavmarl.")) or words == ["-c", PROGRAM]:
+        return ForkedProcess(words, env={**os.environ, **(env or {})}, **options)
+    return start_python(words, env=env, **options)
 
 
-def _run(
-    module: str,
-    arguments: list[str],
-    passed: dict[int, Any],
-    variables: dict[str, str],
-    caller: int,
-) -> None:
+def _nothing() -> int:
+    return os.open(os.devnull, os.O_RDWR)
+
+
+def _pipe_to(text: bool) -> tuple[IO[Any], int]:
+    read, write = os.pipe()
+    return os.fdopen(write, "w" if text else "wb"), read
+
+
+def _pipe_from(text: bool) -> tuple[IO[Any], int]:
+    read, write = os.pipe()
+    return os.fdopen(read, "r" if text else "rb"), write
+
+
+def _run(words: list[str], passed: dict[int, Any], variables: dict[str, str], caller: int) -> None:
     free = max(passed) + 1
     moved = {}
     for number, descriptor in passed.items():
@@ -106,8 +112,14 @@ def _run(
     own, asked = os.getpid(), os.getppid
     # Between the two is the process that has forked this one.
     os.getppid = lambda: caller if os.getpid() == own else asked()
-    sys.argv = [module, *arguments]
     sys.stdin = open(0, closefd=False)
+    sys.stdout = sys.__stdout__ = open(1, "w", closefd=False)  # type: ignore[misc]
+    how, what, *arguments = words
+    if how == "-c":
+        sys.argv = [how, *arguments]
+        exec(what, {"__name__": "__main__"})
+        return
+    sys.argv = [what, *arguments]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # it has been imported before
-        runpy.run_module(module, run_name="__main__")
+        runpy.run_module(what, run_name="__main__")

@@ -83,7 +83,7 @@ class Processes:
 
     def _start(self, number: int) -> ForkedProcess:
         told = json.dumps([self.place, self.secret.hex(), number, self._recipe])
-        return ForkedProcess(__name__, [told])
+        return ForkedProcess(["-m", __name__, told])
 
     def restart(self, number: int) -> None:
         self.processes[number].kill()
