@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from cavmarl.client import Client
+from tests.support.forked_processes import ForkedProcess
 
 __all__ = ["Cluster", "RunningService", "running_service"]
 
@@ -66,10 +66,10 @@ def running_service(store: str | Path, *options: str) -> Iterator[RunningService
 
 @dataclass
 class Cluster:
-    """Node processes of a running service, by name."""
+    """Node processes of a running service, by name; forks of one that has loaded the kernels."""
 
     service: RunningService
-    processes: dict[str, subprocess.Popen[str]] = field(default_factory=dict)
+    processes: dict[str, ForkedProcess] = field(default_factory=dict)
 
     def start(self, *names: str, secret: str = "") -> None:
         for name in names:
@@ -80,16 +80,16 @@ class Cluster:
             assert name in stdout.readline()
 
     def _begin(self, name: str, secret: str) -> None:
-        words = [sys.executable, "-m", "cavmarl", "node", "--service", self.service.url]
+        words = ["-m", "cavmarl", "node", "--service", self.service.url]
         words += ["--name", name, "--snapshot", "idle"]
         environment = {**os.environ, "CAVMARL_SECRET": secret}
-        self.processes[name] = subprocess.Popen(
+        self.processes[name] = ForkedProcess(
             words, env=environment, stdout=subprocess.PIPE, text=True
         )
 
     def stop(self) -> None:
         for process in self.processes.values():
-            process.send_signal(signal.SIGKILL)
+            process.kill()
             process.wait()
             if process.stdout is not None:
                 process.stdout.close()
