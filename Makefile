@@ -16,9 +16,11 @@ OLDEST_TESTS := tests/core tests/driving tests/engine tests/handoff tests/reward
     tests/env/test_parallel_env.py tests/env/test_vector_env.py tests/parallel/test_worker_pool.py tests/parallel/test_pool_resources.py \
     tests/test_bad_input.py tests/test_bad_input_files.py tests/test_public_api.py tests/adapters
 LIBRARIES_TESTS := tests/adapters tests/train/test_programs.py
-# Compiled by one process before two of them run tests.
+# Compiled by one process before several run tests.
 KERNELS := -c 'from cavmarl import make_vec; make_vec("grid4x4", workers=1).close()'
-TWO := -n 2 --dist loadfile --no-loadscope-reorder
+SIDE_BY_SIDE := --dist loadfile --no-loadscope-reorder
+# Three on two cores: while one waits for a process that it has started, two others work.
+THREE := -n 3 $(SIDE_BY_SIDE)
 FUZZ_SECONDS ?= 60
 FUZZ_TARGETS ?= network programs buildings map cached zones demand sumocfg entry overrides driver manifest \
     plan message log follower
@@ -37,9 +39,9 @@ demo: $(READY) ## adapt a driver to merge, evaluate, drive through town, leave a
 
 test: $(READY) ## the tests but the slow ones; those of kernels that have a twin also without the compiler
 	$(BIN)/python $(KERNELS)
-	$(BIN)/pytest $(TWO) -m "not slow and not alone and not ray"
+	$(BIN)/pytest $(THREE) -m "not slow and not alone and not ray"
 	$(BIN)/pytest -m "alone and not slow"
-	NUMBA_DISABLE_JIT=1 $(BIN)/pytest $(TWO) -m "twin and not slow"
+	NUMBA_DISABLE_JIT=1 $(BIN)/pytest -n 2 $(SIDE_BY_SIDE) -m "twin and not slow"
 
 quick: $(READY) ## unit tests of what has changed since main, the nearest first, for a minute
 	$(BIN)/python $(KERNELS)
@@ -60,7 +62,7 @@ bench: $(READY) ## run a benchmark, as NAME=step ARGS='--agents 10'; without a N
 
 bounds: $(READY) ## the tests with every index of the kernels checked
 	NUMBA_BOUNDSCHECK=1 $(BIN)/python $(KERNELS)
-	NUMBA_BOUNDSCHECK=1 $(BIN)/pytest $(TWO) -m "not slow and not alone and not ray"
+	NUMBA_BOUNDSCHECK=1 $(BIN)/pytest $(THREE) -m "not slow and not alone and not ray"
 	NUMBA_BOUNDSCHECK=1 $(BIN)/pytest -m "alone and not slow"
 
 soak: $(READY) ## the slow tests: long episodes, memory, the wheel

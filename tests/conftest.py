@@ -29,7 +29,7 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark each test with its tier; of two processes neither begins a long file at the end."""
+    """Mark each test with its tier; of several processes none begins a long file at the end."""
     rare = rare_tests((item.nodeid for item in items), known_costs(), argued())
     for item in items:
         mark(item)

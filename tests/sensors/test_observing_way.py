@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numba.core import config
 from numpy.typing import NDArray
 
 import cavmarl
@@ -162,6 +163,7 @@ def test_history_is_what_was_observed_before_and_begins_with_the_first() -> None
     vec.close()
 
 
+@pytest.mark.skipif(config.DISABLE_JIT, reason="compares no twin")
 @pytest.mark.parametrize("zones", [4])
 def test_a_divided_world_observes_the_same(zones: int) -> None:
     whole, divided = made(), made(**{"zones.count": zones})

@@ -3,7 +3,7 @@
 Seconds of processor say the same on a busy machine as on a quiet one; seconds of a clock do not.
 `tests/costs.txt` has those of dear tests, as they were when it was made:
 
-    CAVMARL_TEST_COSTS=tests/costs.txt pytest -n 2 --dist loadfile -m "not alone"
+    CAVMARL_TEST_COSTS=tests/costs.txt pytest -n 3 --dist loadfile -m "not alone"
 """
 
 from __future__ import annotations
@@ -22,9 +22,7 @@ __all__ = ["CpuTimes", "argued", "costs_of_files", "known_costs", "rare_tests"]
 LISTED_AT_END_S = 2.0  # a test that costs more is listed at the end of a run
 ARGUED_S = 3.0  # one that costs more is slow, but for those of the file of argued tests
 LISTED_S = 0.5  # a test that costs less is not in the file of costs
-OFTEN_S = (
-    3.0  # of the variants of a test, so many seconds are in every run, and one of them at least
-)
+OFTEN_S = 2.0  # of a test's variants, so many seconds are in every run, and one of them at least
 CHEAP_S = 0.05  # what one costs that is not in the file of costs
 COSTS = Path(__file__).resolve().parents[1] / "costs.txt"
 ARGUED = COSTS.with_name("argued.txt")
