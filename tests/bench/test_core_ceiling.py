@@ -12,11 +12,12 @@ from cavmarl.core.errors import WorkerError
 
 
 def test_all_programs_step_and_end() -> None:
+    before = {*multiprocessing.active_children()}
     found = measure_ceiling("ring", worlds=3, programs=2, steps=2, repeats=2, agents=2, alike=True)
     assert found.programs == 2
     assert len(found.alone_ms) == len(found.together_ms) == 2
     assert min(found.alone_ms + found.together_ms) > 0.0
-    assert multiprocessing.active_children() == []
+    assert {*multiprocessing.active_children()} <= before
     assert found.to_dict()["ratio"] == found.ratio
 
 
@@ -30,7 +31,8 @@ def test_more_programs_than_worlds() -> None:
 
 
 def test_a_program_that_cannot_begin(capfd: pytest.CaptureFixture[str]) -> None:
+    before = {*multiprocessing.active_children()}
     with pytest.raises(WorkerError, match="has ended"):
         measure_ceiling("no such place", worlds=2)
     assert "no such place" in capfd.readouterr().err
-    assert multiprocessing.active_children() == []
+    assert {*multiprocessing.active_children()} <= before

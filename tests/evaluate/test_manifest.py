@@ -15,6 +15,7 @@ import pytest
 from cavmarl.core.errors import ManifestError
 from cavmarl.evaluate import evaluate, load_report
 from cavmarl.evaluate.provenance.manifest import MANIFEST_FILE, hash_of_file, read_closed
+from tests.support.forked_processes import ForkedProcess
 
 SMALL: dict[str, Any] = {"episodes": 1, "agents": 2, "background": 2, "max_cycles": 5}
 
@@ -127,8 +128,7 @@ def test_who_is_killed_leaves_an_open_one(tmp_path: Path, repeats: int) -> None:
         f"evaluate('merge', 'idm', episodes=100_000, repeats={repeats}, out=Path(sys.argv[1]), "
         "progress=lambda *_: print('.', flush=True))"
     )
-    command = [sys.executable, "-c", code, str(out)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+    with ForkedProcess(["-c", code, str(out)], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         process.stdout.readline()  # the first step is done
         process.send_signal(signal.SIGKILL)

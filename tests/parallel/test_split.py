@@ -99,8 +99,8 @@ def test_a_worker_that_dies_between_steps(make: Make, worker: int, how: signal.S
 
 @pytest.mark.parametrize("env", ["merge", "town"])
 def test_workers_that_die_at_any_time(make: Make, env: str) -> None:
-    wanted = {"agents": 6, "background": 40, "max_cycles": 30}
-    whole = drive(make(env, **wanted), steps=60)
+    wanted = {"agents": 6, "background": 40, "max_cycles": 18}
+    whole = drive(make(env, **wanted), steps=36)
     vec = make(env, zones=4, workers=3, **wanted)
     pids: set[int] = set()
     timers: list[Timer] = []
@@ -115,7 +115,7 @@ def test_workers_that_die_at_any_time(make: Make, env: str) -> None:
         elif timers:
             timers[-1].join()
 
-    assert same(drive(vec, steps=60, before=strike), whole)
+    assert same(drive(vec, steps=36, before=strike), whole)
     assert len(pool_of(vec).deaths) == len(timers)
     left = pool_of(vec).pids
     vec.close()

@@ -75,6 +75,19 @@ class ForkedProcess:
     def kill(self) -> None:
         self._process.kill()
 
+    def send_signal(self, number: int) -> None:
+        if self.returncode is None:
+            os.kill(self.pid, number)
+
+    def __enter__(self) -> ForkedProcess:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for pipe in (self.stdin, self.stdout):
+            if pipe is not None:
+                pipe.close()
+        self.wait()
+
 
 def start_forked(words: Sequence[str], env: Mapping[str, str] | None = None, **options: Any) -> Any:
     """In the place of `start_python`; words that run nothing of ours go there."""

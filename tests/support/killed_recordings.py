@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 from cavmarl.recordings.recording import Recording
+from tests.support.forked_processes import ForkedProcess
 
 
 def killed_recording(path: Path, program: str, parts: int) -> Recording:
@@ -19,9 +19,7 @@ def killed_recording(path: Path, program: str, parts: int) -> Recording:
         program: its text; it prints `begun`, and goes on for ever.
         parts: of the first world.
     """
-    with subprocess.Popen(
-        [sys.executable, "-c", program, str(path)], stdout=subprocess.PIPE
-    ) as process:
+    with ForkedProcess(["-c", program, str(path)], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == b"begun\n"
         until = time.monotonic() + 30.0

@@ -44,7 +44,6 @@ _IN_RAY = "test_in_an_actor_of_ray"  # begins the name of a test that starts a c
 
 # They measure time, memory or cores, or count on being let run at once.
 ALONE_FILES: tuple[str, ...] = (
-    "tests/bench/test_core_ceiling.py",
     "tests/parallel/test_core_placement.py",
     "tests/parallel/test_pool_resources.py",
     "tests/parallel/test_shared_huge_pages.py",

@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -29,6 +28,7 @@ from cavmarl.parallel.recipe import fingerprint
 from cavmarl.parallel.worlds_job import Task
 from cavmarl.traffic.sumo.sumo_input import free_libsumo
 from tests.support.driving import drive, start
+from tests.support.forked_processes import ForkedProcess
 from tests.support.rerouting import make_map
 from tests.support.sumo_worlds import MODES, alone, coupled, demand_of, tiny_file
 
@@ -62,12 +62,12 @@ def settings(demand: Path, source: str) -> dict[str, object]:
     }
 
 
-def run(demand: Path, source: str, what: str) -> subprocess.Popen[str]:
-    words = [sys.executable, "-c", RUN, str(demand), source, what]
-    return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+def run(demand: Path, source: str, what: str) -> ForkedProcess:
+    words = ["-c", RUN, str(demand), source, what]
+    return ForkedProcess(words, stdout=subprocess.PIPE, text=True)
 
 
-def answer(process: subprocess.Popen[str]) -> list[str]:
+def answer(process: ForkedProcess) -> list[str]:
     assert process.stdout is not None
     return process.stdout.readline().split()
 
