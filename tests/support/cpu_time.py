@@ -1,4 +1,4 @@
-"""What tests cost: seconds of processor, of their process and of the children it has waited for.
+"""What tests cost: seconds of processor, with those of children and forks that have ended.
 
 Seconds of processor say the same on a busy machine as on a quiet one; seconds of a clock do not.
 `tests/costs.txt` has those of dear tests, as they were when it was made:
@@ -12,9 +12,11 @@ import os
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
+from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 __all__ = ["CpuTimes", "argued", "costs_of_files", "known_costs", "rare_tests"]
@@ -117,5 +119,13 @@ class CpuTimes:
 
 
 def _used_s() -> float:
-    times = os.times()
-    return times.user + times.system + times.children_user + times.children_system
+    return sum(os.times()[:4]) + _forks_s()
+
+
+def _forks_s() -> float:
+    """Of the process whose forks tests start, and of those forks that have ended."""
+    server: Any = forkserver._forkserver  # type: ignore[attr-defined]
+    try:
+        return sum(psutil.Process(server._forkserver_pid).cpu_times()[:4])
+    except (psutil.Error, TypeError):  # there is none
+        return 0.0
