@@ -12,6 +12,7 @@ from cavmarl.core.errors import ConfigError, MapError
 from cavmarl.maps.map_kinds import map_kind
 from cavmarl.roads.network import SIGNAL_STATES, VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network
+from tests.support.borders import write_roads
 
 Crossing = Callable[..., Path]
 
@@ -357,3 +358,13 @@ def test_a_path_over_a_junction_is_limited(
     monkeypatch.setenv("CAVMARL_MAX_CROSSING_M", "1")
     with pytest.raises(MapError, match=r"more than 1 \(CAVMARL_MAX_CROSSING_M\): mend the shapes"):
         read_network(crossing())
+
+
+def test_extents_come_from_roads_and_not_from_stray_nodes(tmp_path: Path) -> None:
+    path = write_roads(tmp_path / "road.net.xml", [((0.0, 0.0), (100.0, 50.0))], 10.0)
+    stray = '<junction id="far" type="dead_end" x="0" y="-9000" incLanes="" intLanes="" shape=""/>'
+    text = path.read_text().replace('Boundary="0.0,0.0', 'Boundary="0.0,-9000.0')
+    path.write_text(text.replace("</net>", f"{stray}</net>"))
+    assert 'convBoundary="0.0,-9000.0,100.0,50.0"' in path.read_text()
+
+    assert read_network(path).extent_m == pytest.approx((0.0, 0.0, 100.0, 50.0), abs=5.0)

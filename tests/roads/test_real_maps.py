@@ -226,6 +226,7 @@ def test_a_network_without_roads_is_refused(name: str) -> None:
         read_network(game(name))
 
 
+@pytest.mark.slow  # test_reader.py says the same of a small map
 def test_extents_come_from_roads_and_not_from_stray_nodes(built_map: BuiltMap) -> None:
     # Monaco has a node 25 km to the south.
     min_x, min_y, max_x, max_y = read_network(built_map("osm/monaco.osm.gz")).extent_m
