@@ -30,6 +30,8 @@ from tests.support.vec_runs import Make, drive, pool_of, same
 
 pytestmark = pytest.mark.filterwarnings("ignore:workers = :RuntimeWarning")
 
+# The small ones are first, and so in every run.
+SMALL_FIRST = sorted(entries(), key=lambda env: (env not in ("grid4x4", "merge", "ring"), env))
 RESTLESS = {"workers.balance_steps": 2, "workers.imbalance_tolerance": 0.0, "workers.max_moves": 64}
 
 
@@ -50,7 +52,7 @@ def uneven(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return moved
 
 
-@pytest.mark.parametrize(("number", "env"), list(enumerate(sorted(entries()))))
+@pytest.mark.parametrize(("number", "env"), list(enumerate(SMALL_FIRST)))
 def test_worlds_that_move_are_the_same(
     make: Make, uneven: list[int], number: int, env: str
 ) -> None:

@@ -18,7 +18,11 @@ from tests.support.vec_runs import STEPS, Make, drive, pool_of, same
 pytestmark = pytest.mark.filterwarnings("ignore:workers = 3:RuntimeWarning")
 
 
-@pytest.mark.parametrize(("number", "env"), list(enumerate(sorted(entries()))))
+# The small ones are first, and so in every run.
+SMALL_FIRST = sorted(entries(), key=lambda env: (env not in ("grid4x4", "merge", "ring"), env))
+
+
+@pytest.mark.parametrize(("number", "env"), list(enumerate(SMALL_FIRST)))
 def test_workers_change_nothing(make: Make, number: int, env: str) -> None:
     """Their number takes turns over the entries; all are there with zones, too."""
     wanted = {"num_envs": 5, "max_cycles": 8}
