@@ -114,6 +114,7 @@ def test_dear_tests_are_slow_but_for_those_that_are_argued_for() -> None:
     costs = {"a[1]": 1.2, "a[2]": 0.7, "a[3]": 0.2, "b[1]": 2.9, "b[2]": 0.0, "c": 9.0}
     assert rare_tests(costs, costs) == {"a[3]", "c"}
     assert rare_tests(costs, costs, frozenset({"c"})) == {"a[3]"}
+    assert rare_tests(costs, costs, frozenset({"a[*]"})) == {"c"}
     assert rare_tests([*costs, "b[3]"], costs | {"b[3]": 0.5}) == {"a[3]", "b[3]", "c"}
 
 
@@ -129,11 +130,12 @@ def test_long_files_come_first_and_small_tiers_read_only_their_own() -> None:
 
 
 def test_tests_that_are_argued_for_are_dear() -> None:
-    assert [name for name in argued() if known_costs().get(name, 0.0) <= ARGUED_S] == []
+    alone = [name for name in argued() if not name.endswith("[*]")]
+    assert [name for name in alone if known_costs().get(name, 0.0) <= ARGUED_S] == []
 
 
-def test_the_file_of_costs_names_tests_that_are_there() -> None:
-    for name in known_costs():
+def test_the_files_of_costs_and_of_argued_ones_name_tests_that_are_there() -> None:
+    for name in (*known_costs(), *argued()):
         path, test, *_ = name.split("::")
         function = test.split("[", 1)[0]
         assert re.search(rf"\b{function}\b", (ROOT / path).read_text(encoding="utf-8")), name

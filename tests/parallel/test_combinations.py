@@ -158,17 +158,27 @@ def test_in_zones(make: Make, tmp_path: Path, feature: str) -> None:
     check(make, tmp_path, feature, "zones")
 
 
-@pytest.mark.parametrize("feature", FEATURES)
+# SUMO over workers: `tests/traffic/test_sumo_processes.py`; over nodes: `test_node_parts.py`.
+hosted = pytest.mark.parametrize(
+    "feature",
+    [
+        pytest.param(feature, marks=pytest.mark.slow) if feature.startswith("SUMO") else feature
+        for feature in FEATURES
+    ],
+)
+
+
+@hosted
 def test_over_workers(make: Make, tmp_path: Path, feature: str) -> None:
     check(make, tmp_path, feature, "workers")
 
 
-@pytest.mark.parametrize("feature", FEATURES)
+@hosted
 def test_zones_over_workers(make: Make, tmp_path: Path, feature: str) -> None:
     check(make, tmp_path, feature, "zones over workers")
 
 
-@pytest.mark.parametrize("feature", FEATURES)
+@hosted
 def test_over_nodes(make: Make, tmp_path: Path, feature: str) -> None:
     check(make, tmp_path, feature, "nodes")
 

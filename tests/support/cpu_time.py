@@ -39,7 +39,7 @@ def known_costs() -> dict[str, float]:
 
 @cache
 def argued() -> frozenset[str]:
-    """Dear tests that are in every run."""
+    """Dear tests that are in every run, and with `[*]` those whose variants all are."""
     lines = ARGUED.read_text(encoding="utf-8").splitlines()
     return frozenset(line for line in lines if line and not line.startswith("#"))
 
@@ -52,13 +52,14 @@ def rare_tests(
     Args:
         names: of all tests, in their order; variants of one test differ behind the bracket.
         costs: seconds of processor by name, of those that are known.
-        kept: of dear ones, those that are in every run.
+        kept: of dear ones, those that are in every run; `[*]` after a test: all its variants.
     """
     spent: dict[str, float] = {}
     rare = set()
     for name in names:
         test, cost_s = name.split("[", 1)[0], costs.get(name, 0.0)
         another = test in spent and spent[test] + cost_s > OFTEN_S and cost_s > 0.0
+        another = another and f"{test}[*]" not in kept
         if name not in kept and (cost_s > ARGUED_S or another):
             rare.add(name)
         else:
