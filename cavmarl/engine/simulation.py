@@ -68,10 +68,9 @@ class Simulation(WorldViews):
         frames: Frames | None = None,
         warm: bool = False,  # call every kernel now, so that none is loaded in a step
         zeros: Zeros = huge_zeros,  # makes the arrays that shards write
-        # worlds of the same environment, whose tables are used; None: they are made
-        like: Simulation | None = None,
-        # what coordinators are to go by, one a world; None: as `config.zones` says
-        runs: Sequence[WorldRun] | None = None,
+        like: Simulation | None = None,  # of the same environment, whose tables are used
+        runs: Sequence[WorldRun] | None = None,  # what coordinators go by; None: `config.zones`
+        late_ticks: int = 0,  # for so many more a vehicle that has crossed may stay with its zone
     ) -> None:
         self.config = config
         self._carried_from = carried_from(config.sensors)
@@ -99,6 +98,7 @@ class Simulation(WorldViews):
             self.frames,
             zeros,
             None if like is None else like._tick.traffic.for_worlds(num_worlds),
+            late_ticks,
         )
         self._shards = self._tick.shards
         if warm:

@@ -34,6 +34,7 @@ def make_tick(
     zeros: Zeros,  # where large arrays lie
     # of other worlds of the same environment, as many as these; None: it is made
     traffic: NativeTraffic | None,
+    late_ticks: int = 0,  # see `divide`
 ) -> Tick:
     """The phases of a tick, over shards that are made here."""
     num_worlds = shared.outputs.present.shape[0]
@@ -54,7 +55,7 @@ def make_tick(
             turns_away=config.zones.policy == "reroute",
         )
     shards, division = divide(
-        config, network, partition, traffic, shared.outputs, num_worlds, zeros
+        config, network, partition, traffic, shared.outputs, num_worlds, zeros, late_ticks
     )
     attached = attach(
         ComponentContext(

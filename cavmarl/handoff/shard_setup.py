@@ -41,6 +41,7 @@ def divide(
     outputs: Outputs,  # where all agents get what they sense
     num_worlds: int,  # how many worlds are stepped together
     zeros: Zeros = huge_zeros,  # makes the arrays that shards write
+    late_ticks: int = 0,  # for so many more a vehicle that has crossed may stay with its zone
 ) -> tuple[list[Shard], Division]:
     """One shard a zone, and the division that knows them all.
 
@@ -59,17 +60,18 @@ def divide(
     )
     reach_m = max(driving_reach_m(network, traffic.travel), sensing_m)
     fastest_mps = longest_move_m(network, traffic.travel, dt) / dt
-    wide_m = halo_m(config, reach_m, partition.count, fastest_mps)
-    touching_m = _needed_m(config, 2.0 * radius_m, fastest_mps)
+    wide_m = halo_m(config, reach_m, partition.count, fastest_mps, late_ticks)
+    touching_m = _needed_m(config, 2.0 * radius_m, fastest_mps, late_ticks)
     # Agents alone sense.
-    sensed_m = _needed_m(config, sensing_m, fastest_mps) if config.population.agents else 0.0
+    has_agents = config.population.agents > 0
+    sensed_m = _needed_m(config, sensing_m, fastest_mps, late_ticks) if has_agents else 0.0
     near_m = max(touching_m, sensed_m, _approach_m(config, fastest_mps))
     sight = Visibility(
         network,
         traffic.travel,
         wide_m,
         near_m if _goes_by_roads(config, traffic) else wide_m,
-        _needed_m(config, 0.0, fastest_mps),
+        _needed_m(config, 0.0, fastest_mps, late_ticks),
     )
     halo = sight.halo(partition)
     zoned = make_zoned(partition.count, num_worlds, traffic.capacity, zeros)
@@ -116,6 +118,7 @@ def halo_m(
     zones: int,  # how many there are
     # the way of a tick over its length, with what vehicles jump on the map
     fastest_mps: float = MAX_SPEED_MPS,
+    late_ticks: int = 0,  # see `divide`
 ) -> float:
     """How far zones see over their borders.
 
@@ -125,11 +128,11 @@ def halo_m(
     settings, dt = config.zones, config.clock.sim_dt_s
     wide_m = settings.halo_m
     if wide_m is None:
-        wide_m = _needed_m(config, reach_m, fastest_mps)
+        wide_m = _needed_m(config, reach_m, fastest_mps, late_ticks)
     if zones > 1:
         check_coverage(
             Distances(_approach_m(config, fastest_mps), settings.hysteresis_m, wide_m),
-            _limits_at_borders(settings),
+            _limits_at_borders(settings, late_ticks),
             reach_m=reach_m,
             v_max_mps=fastest_mps,
             dt_s=dt,
@@ -163,13 +166,13 @@ def limits_of(settings: ZonesConfig, schema: int = 1) -> Limits:
     )
 
 
-def _limits_at_borders(settings: ZonesConfig) -> Limits:
-    """Deadlines of hand-overs; where nothing is lost none is late (decision 013)."""
+def _limits_at_borders(settings: ZonesConfig, late_ticks: int) -> Limits:
+    """Deadlines of hand-overs; where nothing is lost they are those of leases (decision 013)."""
     limits = limits_of(settings)
     may_be_late = settings.faults or settings.reproducers
     if may_be_late:
         return limits
-    return replace(limits, deferral=0, policy=DeadlinePolicy.FORCE, grace=0)
+    return replace(limits, deferral=late_ticks, policy=DeadlinePolicy.FORCE, grace=0)
 
 
 def _approach_m(config: EnvConfig, fastest_mps: float) -> float:
@@ -178,8 +181,8 @@ def _approach_m(config: EnvConfig, fastest_mps: float) -> float:
     return max(config.zones.approach_ticks * MAX_SPEED_MPS * dt, fastest_mps * dt)
 
 
-def _needed_m(config: EnvConfig, reach_m: float, fastest_mps: float) -> float:
-    limits = _limits_at_borders(config.zones)
+def _needed_m(config: EnvConfig, reach_m: float, fastest_mps: float, late_ticks: int) -> float:
+    limits = _limits_at_borders(config.zones, late_ticks)
     needed_m = needed_overlap_m(
         reach_m, config.zones.hysteresis_m, limits, fastest_mps, config.clock.sim_dt_s
     )

@@ -50,6 +50,7 @@ class LocalWorlds:
         # worlds of the same environment, whose tables are used; None: they are made
         like: LocalWorlds | None = None,
         runs: Sequence[WorldRun] | None = None,  # see `Simulation`
+        late_ticks: int = 0,  # likewise
     ) -> None:
         self.world = world
         self.in_next_step = in_next_step  # when worlds begin anew
@@ -69,6 +70,7 @@ class LocalWorlds:
             zeros=zeros,
             like=None if like is None else like.simulation,
             runs=runs,
+            late_ticks=late_ticks,
         )
         if arrays is None:
             arrays = _own_arrays(self.simulation, num_worlds)

@@ -20,6 +20,7 @@ from typing import Any, cast
 from cavmarl.core.errors import MessageError
 from cavmarl.engine.world_setup import World
 from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.nodes.leases import late_ticks
 from cavmarl.parallel.nodes.node_system import NodeListener, NodeSystem, Place, Poll
 
 ADDRESS = "node"
@@ -376,4 +377,6 @@ class _System:
     def worlds_of(
         self, recipe: Mapping[str, Any], trouble: str, num_worlds: int, in_next_step: bool
     ) -> LocalWorlds:
-        return LocalWorlds(self._machine.world, num_worlds, in_next_step=in_next_step)
+        world = self._machine.world
+        late = late_ticks(world.config.clock.ticks_per_step)
+        return LocalWorlds(world, num_worlds, in_next_step=in_next_step, late_ticks=late)

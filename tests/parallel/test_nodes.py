@@ -85,7 +85,9 @@ def test_a_node_is_told_what_its_own_agents_do() -> None:
     actions = Actions.of(arrays._replace(meta_actions=np.arange(4)[None]))
     owner = np.array([1, 0, -1, 1], np.int32)
     there = StepArrays(*(array.copy() for array in arrays[:-2]), {}, {})
-    data = memoryview(b"".join(map(bytes, actions.of_node(1, owner))))
+    ((number, pieces),) = actions.of_nodes([1], owner)
+    assert number == 1
+    data = memoryview(b"".join(map(bytes, pieces)))
     there = there._replace(meta_actions=np.zeros((1, 4), np.int64))
     there.controls[...] = -1.0
     told, at = take_actions(data, 0, there)
@@ -234,19 +236,18 @@ def test_nodes_that_are_lost_while_states_are_kept(
     vec = make("grid4x4", zones=4, nodes=4, **WANTED)
     worlds = over_nodes(vec)
     doomed = {5: worlds.pids[0], 6: worlds.pids[2]}
-    begin, ticks = worlds._coordinator.begin, [0, 0]
+    commit, steps = worlds._commit, [0]
 
-    def begin_and_strike(timeout_s: float) -> None:
-        if ticks[1] == 1 and ticks[0] in doomed:  # all nodes have done the step's first tick
-            os.kill(doomed.pop(ticks[0]), signal.SIGKILL)
-        ticks[1] += 1
-        begin(timeout_s)
+    def strike_and_commit() -> list[memoryview]:
+        if steps[0] in doomed:  # all nodes have been told to keep a state, and are in the step
+            os.kill(doomed.pop(steps[0]), signal.SIGKILL)
+        return commit()
 
-    def strike(step: int) -> None:
-        ticks[:] = step, 0
+    def note(step: int) -> None:
+        steps[0] = step
 
-    monkeypatch.setattr(worlds._coordinator, "begin", begin_and_strike)
-    assert same(drive(vec, before=strike), whole)
+    monkeypatch.setattr(worlds, "_commit", strike_and_commit)
+    assert same(drive(vec, before=note), whole)
     assert (worlds.losses, worlds.recoveries) == (2, 2)
 
 

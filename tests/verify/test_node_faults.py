@@ -15,6 +15,7 @@ from cavmarl.cli import app
 from cavmarl.core.errors import ConfigError
 from cavmarl.verify.faulty_network import FaultyNetwork, NetworkFault
 from cavmarl.verify.node_faults import STOP, verify_node_faults
+from cavmarl.verify.simulated_nodes import MIXES
 
 SMALL: dict[str, Any] = {"agents": 4, "background": 20}
 
@@ -120,7 +121,7 @@ def test_the_command(tmp_path: Path) -> None:
     words = ("verify", "merge", "--nodes", "2,3", "--faults", "campaign", "--seeds", "2")
     result = CliRunner().invoke(app, [*words, "--json", str(tmp_path / "found.json")])
     assert result.exit_code == 0, result.output
-    assert result.output.count("equal") == 14
+    assert result.output.count("equal") == 2 * len(MIXES) + 14, "simulated, and real"
 
 
 @pytest.mark.parametrize(

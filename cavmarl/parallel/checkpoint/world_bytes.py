@@ -24,7 +24,7 @@ def to_bytes(arrays: Sequence[Array]) -> bytes:
     return file.getvalue()
 
 
-def from_bytes(content: bytes, like: Sequence[Array]) -> list[Array]:
+def from_bytes(content: bytes | bytearray | memoryview, like: Sequence[Array]) -> list[Array]:
     """What `to_bytes` was given, of the types and numbers of axes of others.
 
     Raises:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import WorkerError
 from cavmarl.parallel.checkpoint.world_bytes import from_bytes, to_bytes
 from cavmarl.parallel.local_worlds import LocalWorlds
-from cavmarl.parallel.nodes.links import FrameKind, Links, NodeFrame
+from cavmarl.parallel.nodes.links import Bytes, FrameKind, Links, NodeFrame
 
 Array = NDArray[Any]
 KEPT = 2  # so many states: the newest may not have come everywhere
@@ -29,9 +29,16 @@ class KeptStates:
         self._worlds = worlds
         self._links = links
         self._number = number
-        self._own: dict[int, bytes] = {}  # by numbers of states
-        self._others: dict[int, dict[int, bytes]] = {}  # node → the same
+        self._own: dict[int, Bytes] = {}  # by numbers of states
+        self._others: dict[int, dict[int, Bytes]] = {}  # node → the same
         self._given: dict[int, NodeFrame] = {}  # by nodes that have given zones away
+
+    def settle(self) -> None:
+        """What was kept here last has come everywhere: what is older is of no use any more."""
+        newest = max(self._own, default=0)
+        for states in (self._own, *self._others.values()):
+            for old in [number for number in states if number < newest]:
+                del states[old]
 
     def keep(self, state: int, living: Sequence[int]) -> None:
         """Keep what the worlds are now, here and at the next of the living nodes."""
@@ -43,7 +50,7 @@ class KeptStates:
 
     def take(self, number: int, frame: NodeFrame) -> None:
         """What another node wants to have kept here."""
-        _add(self._others.setdefault(number, {}), frame.number, bytes(frame.data))
+        _add(self._others.setdefault(number, {}), frame.number, frame.data)
 
     def take_given(self, number: int, frame: NodeFrame) -> None:
         """What another node has had of zones that are hosted here from now on."""
@@ -85,7 +92,7 @@ class KeptStates:
             while donor not in self._given or self._given[donor].number != generation:
                 self._links.pump(None)
                 check()  # it may take what is awaited
-            given = from_bytes(bytes(self._given.pop(donor).data), like)
+            given = from_bytes(self._given.pop(donor).data, like)
             if saved is None:
                 saved = given
                 saved[self._first - 1][...] = 0  # contacts stay where they were counted
@@ -126,12 +133,12 @@ class KeptStates:
         return other[first - 1]
 
 
-def _add(states: dict[int, bytes], state: int, data: bytes) -> None:
+def _add(states: dict[int, Bytes], state: int, data: Bytes) -> None:
     states[state] = data
     for old in sorted(states)[:-KEPT]:
         del states[old]
 
 
-def _drop_later(states: dict[int, bytes], state: int) -> None:
+def _drop_later(states: dict[int, Bytes], state: int) -> None:
     for later in [number for number in states if number > state]:
         del states[later]

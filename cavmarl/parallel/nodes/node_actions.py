@@ -7,6 +7,7 @@ owner's number, and the caller sends it there. A node waits until it knows what 
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,16 +38,19 @@ class Actions(NamedTuple):
         arrays_of = (arrays.controls.reshape(-1, 2), arrays.meta_actions, arrays.mask)
         return cls(arrays_of[0].copy(), arrays_of[1].flatten(), arrays_of[2].flatten())
 
-    def of_node(self, number: int, owner: NDArray[np.int32]) -> list[Bytes]:
-        """What a node is told: of its agents, and of those that may get a vehicle anywhere.
+    def of_nodes(
+        self, numbers: Sequence[int], owner: NDArray[np.int32]
+    ) -> Iterator[tuple[int, list[Bytes]]]:
+        """What each node is told: of its agents, and of those that may get a vehicle anywhere.
 
         Args:
-            number: of the node.
+            numbers: of the nodes.
             owner: (W · A,) the node of each agent, as far as is known.
         """
-        acts = self.mask & (owner != UNOWNED)
-        own = np.flatnonzero(acts & (owner == number))
-        return self.some(own) + self.some(np.flatnonzero(~acts))
+        known = np.where(self.mask, owner, UNOWNED)
+        unowned = self.some(np.flatnonzero(known == UNOWNED))
+        for number in numbers:
+            yield number, self.some(np.flatnonzero(known == number)) + unowned
 
     def some(self, agents: Agents) -> list[Bytes]:
         controls, meta_actions = self.controls[agents], self.meta_actions[agents]
@@ -64,10 +68,16 @@ class NodeCommand(NamedTuple):
     cut: ZoneRects | None = None  # zones that the worlds have from then on
     receptions: list[bytes] | None = None  # what a network simulator has said so far, in a step
 
-    def of_node(self, number: int, owner: NDArray[np.int32]) -> list[Bytes]:
-        """The pieces of the frame that a node gets."""
-        own = [] if self.actions is None else self.actions.of_node(number, owner)
-        return [*self.pieces, *own]
+    def of_nodes(
+        self, numbers: Sequence[int], owner: NDArray[np.int32]
+    ) -> Iterator[tuple[int, list[Bytes]]]:
+        """The pieces of the frame that each node gets; arguments as of `Actions.of_nodes`."""
+        if self.actions is None:
+            for number in numbers:
+                yield number, list[Bytes](self.pieces)
+        else:
+            for number, own in self.actions.of_nodes(numbers, owner):
+                yield number, [*self.pieces, *own]
 
 
 def take_actions(data: memoryview, at: int, arrays: StepArrays) -> tuple[Agents, int]:

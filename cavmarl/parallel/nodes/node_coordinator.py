@@ -92,6 +92,7 @@ class NodeCoordinator:
 
     Attributes:
         switched: vehicles that have changed their owner.
+        is_late: a vehicle has crossed a border that was on no record: a lease of no ticks is due.
     """
 
     def __init__(
@@ -109,7 +110,7 @@ class NodeCoordinator:
         ]
         self._node_of = node_of
         self._links = links
-        self.switched = 0
+        self.switched, self.is_late = 0, False
 
     def host(self, neighbours: Neighbours) -> list[list[Hosting]]:
         """Begin; what the hosts of all zones have to know, by worlds."""
@@ -183,6 +184,7 @@ class NodeCoordinator:
         for messages, _ in reports.values():
             for w, message in messages:
                 self._take(w, message)
+        self.is_late = any(one.is_late for _, report in reports.values() for one in report)
         for w, world in enumerate(self._worlds):
             said = [report[w] for _, report in reports.values()]
             if world.directory.table.plan is not None:
@@ -196,8 +198,11 @@ class NodeCoordinator:
             world.births += [Birth(v, zone, b"") for report in said for v, zone in report.births]
             world.check_owned(w, said)
 
-    def begin(self, timeout_s: float) -> None:
-        """Decide the way to the next tick, once all offers are answered, and lease it.
+    def begin(self, timeout_s: float) -> dict[int, bytes]:
+        """Decide the way to the next ticks, once all offers are answered.
+
+        Returns:
+            node → its lease, STEP messages of its zones.
 
         Raises:
             SilenceError: an offer is not answered in time.
@@ -214,7 +219,7 @@ class NodeCoordinator:
             world.answered.clear()
             self.switched += world.write(output)
             messages += [(w, message) for message in output.messages]
-        self._send(messages)
+        return self._by_node(messages)
 
     @property
     def transfers(self) -> tuple[TransferLog, ...]:
@@ -232,12 +237,19 @@ class NodeCoordinator:
         ]
 
     def _send(self, messages: Sequence[tuple[int, Message]]) -> None:
+        self.lease(self._by_node(messages), 1)
+
+    def lease(self, messages: Mapping[int, bytes], ticks: int) -> None:
+        """Send each node what `begin` has decided; 0 ticks, or as many as a lease has."""
+        for node, data in messages.items():
+            self._links.send(node, FrameKind.LEASE, ticks, [data])
+
+    def _by_node(self, messages: Sequence[tuple[int, Message]]) -> dict[int, bytes]:
         by_node: defaultdict[int, list[tuple[int, Message]]] = defaultdict(list)
         for w, message in messages:
             for zone in message.destinations():
                 by_node[self._node_of[zone]].append((w, message))
-        for node, some in by_node.items():
-            self._links.send(node, FrameKind.LEASE, 0, [packed(some)])
+        return {node: packed(some) for node, some in by_node.items()}
 
     def close(self) -> None:
         for world in self._worlds:

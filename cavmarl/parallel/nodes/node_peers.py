@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from cavmarl.core.huge_pages import forget
-from cavmarl.core.numba.specialized import specialized
 from cavmarl.core.records.arrays import Gate, Outputs, Worlds
 from cavmarl.core.records.codes import (
     COUNT_REROUTED,
@@ -20,6 +19,7 @@ from cavmarl.core.records.codes import (
     POS_LAST,
 )
 from cavmarl.engine.simulation import Simulation
+from cavmarl.parallel.nodes.ghost_stream import GhostStream
 from cavmarl.parallel.nodes.links import (
     Bytes,
     FrameKind,
@@ -28,7 +28,6 @@ from cavmarl.parallel.nodes.links import (
     RecoveryOrderedError,
 )
 from cavmarl.parallel.nodes.node_actions import UNOWNED
-from cavmarl.zones.kernels.ghost_frames import count_ghosts, pack_ghosts, take_ghosts
 
 Array = NDArray[Any]
 PIECES = ("terms", "terminated", "present", "acted", "events", "vehicle_ids", "places")
@@ -68,9 +67,9 @@ class NodePeers:
         self._seen_s = self._detected_s.copy()
         self._running = np.zeros(self._num_worlds, dtype=np.int64)
         self._rerouted = np.zeros(self._num_worlds, dtype=np.int64)
-        self._count = specialized(count_ghosts)
-        self._pack = specialized(pack_ghosts)
-        self._take = specialized(take_ghosts)
+        self._ghosts = {
+            n: GhostStream(self._zoned, self._mine, self._zones[n]) for n in self._others
+        }
         self._sent = first_share
         self._is_stepping = False
         self.own: Array = np.zeros_like(simulation.outputs.present)
@@ -88,9 +87,11 @@ class NodePeers:
                 numbers[zone, chosen] = 0
             zoned.num_contacts[zone, chosen] = 0
             zoned.num_outer[zone, chosen] = -1
+        for zone in range(len(zoned.num_rows)):
             for w in np.flatnonzero(chosen).tolist():
+                num = zoned.num_rows.item(zone, w)  # the first zone had the vehicles of all
                 for array in (*zoned.rows[:, zone, w], *(each[zone, w] for each in self._of_rows)):
-                    forget(array)
+                    forget(array[num:])
         self._rerouted[chosen] = 0
 
     def take_up(self, gate: Gate, side: int) -> None:
@@ -112,38 +113,16 @@ class NodePeers:
         mine = zoned.num_owned[self._mine].sum(axis=0)
         rerouted = gate.counts[:, COUNT_REROUTED] - self._rerouted
         common = [mine, rerouted, *self._passing(gate)]
-        found = self._swap([*self._ghosts(to, side), *common] for to in self._others)
+        found = self._swap([*self._ghosts[to].packed(side), *common] for to in self._others)
         self._running[:] = mine
-        for _, data in found:
-            at = self._take_ghosts(data, side)
+        for number, data in found:
+            at = self._ghosts[number].take(data, side)
             theirs, at = _read(data, at, np.int64, self._num_worlds)
             more, at = _read(data, at, np.int64, self._num_worlds)
             self._running += theirs
             gate.counts[:, COUNT_REROUTED] += more
             self._add_passing(gate, data, at)
         self._rerouted[:] = gate.counts[:, COUNT_REROUTED]
-
-    def _ghosts(self, to: int, side: int) -> list[Bytes]:
-        zoned, zones = self._zoned, self._zones[to]
-        counts = np.empty((len(zones), self._num_worlds, 2), dtype=np.int64)
-        total = self._count(zoned, zones, counts)
-        rows = np.empty(total, dtype=zoned.rows.dtype)
-        step = np.empty(total, dtype=zoned.step.dtype)
-        step_at = np.empty(total, dtype=np.int64)
-        self._pack(zoned, side, zones, counts, rows, step, step_at)
-        return [counts.data, *map(_bytes, (rows, step, step_at))]
-
-    def _take_ghosts(self, data: memoryview, side: int) -> int:
-        """Take those of a frame; where in it they end."""
-        zoned, zones = self._zoned, self._mine
-        flat, at = _read(data, 0, np.int64, len(zones) * self._num_worlds * 2)
-        counts = flat.reshape(len(zones), self._num_worlds, 2)
-        total = int(counts[:, :, 0].sum())
-        rows, at = _read(data, at, zoned.rows.dtype, total)
-        step, at = _read(data, at, zoned.step.dtype, total)
-        step_at, at = _read(data, at, np.int64, total)
-        self._take(zoned, side, zones, counts, rows, step, step_at)
-        return at
 
     def running(self) -> NDArray[np.int64]:
         return self._running

@@ -14,12 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import (
-    MessageError,
-    ProtocolError,
-    WorkerError,
-    WorkerFailureError,
-)
+from cavmarl.core.errors import MessageError, ProtocolError, WorkerError, WorkerFailureError
 from cavmarl.core.processes import is_fork, refuse_fork
 from cavmarl.engine.compilation import compiled_before
 from cavmarl.engine.world_setup import World
@@ -31,13 +26,8 @@ from cavmarl.ownership.reactions import Hosting
 from cavmarl.parallel.commanded_worlds import own_error
 from cavmarl.parallel.journaled_worlds import unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
-from cavmarl.parallel.nodes.links import (
-    FrameKind,
-    LinkLostError,
-    Links,
-    NodeFrame,
-    said_by,
-)
+from cavmarl.parallel.nodes.leases import leases_of
+from cavmarl.parallel.nodes.links import FrameKind, LinkLostError, Links, NodeFrame, said_by
 from cavmarl.parallel.nodes.newcomers import Newcomer, Newcomers
 from cavmarl.parallel.nodes.node_actions import UNOWNED, NodeCommand, read_refusal
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
@@ -283,22 +273,30 @@ class NodePool:
         """Do a command once. Raises LinkLostError: a node is lost."""
         kept = self._opened.number if self._opened and self._log and command is self._log[-1] else 0
         self._performed = command
-        self._owner[~np.isin(self._owner, self._living)] = UNOWNED  # of lost ones any may be
-        for number in self._living:
-            pieces = command.of_node(number, self._owner)
-            self._links.send(number, FrameKind.COMMAND, kept, pieces)
+        leases = leases_of(command.ticks, self._ticks_per_step)
+        lease = self._begin_lease() if leases else {}
+        for number, pieces in command.of_nodes(self._living, self._owner):
+            self._links.send(number, FrameKind.COMMAND, kept, [*pieces, lease.get(number, b"")])
         if not command.changes:
             return [frame.data for frame in self._take(FrameKind.RESULT).values()]
-        results: list[memoryview] = []
-        for _ in range(command.ticks):
-            self._watch.wait(self._living, self._timeout_s, self._coordinator.begin)
-            results = self._commit()
-        if not command.ticks:
+        results = self._commit()
+        for _ in range(1, leases):
+            self._coordinator.lease(self._begin_lease(), self._ticks_per_step)
             results = self._commit()
         if command.cut is not None:
             self._cut = ZoneCut(command.cut, read_neighbours(json.loads(bytes(results[0]))))
             self._coordinator.know(self._cut.neighbours)
         return results
+
+    def _begin_lease(self) -> dict[int, bytes]:
+        """What nodes are to be told before the next ticks."""
+        decide = partial(self._watch.wait, self._living, self._timeout_s, self._coordinator.begin)
+        lease = decide()
+        while self._coordinator.is_late:
+            self._coordinator.lease(lease, 0)
+            self._commit()
+            lease = decide()
+        return lease
 
     def _hear(self, number: int, frame: NodeFrame) -> None:
         """Take an urgent frame; an error of a node is raised here."""
@@ -372,6 +370,7 @@ class NodePool:
         self._opened = None
         moves = moves_of(state.zones, self._homes, self._lost, self._nodes, state.number)
         self.zones = moves.zones
+        self._owner[~np.isin(self._owner, self._living)] = UNOWNED  # of lost ones any may be
         self._generation += 1
         self._cut = state.cut
         self._coordinator.know(state.cut.neighbours)

@@ -20,6 +20,7 @@ from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.parallel.hosts.host_process import code_stamp
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.nodes.kept_states import KeptStates
+from cavmarl.parallel.nodes.leases import lease_ticks
 from cavmarl.parallel.nodes.links import (
     Bytes,
     FrameKind,
@@ -127,6 +128,7 @@ class NodeProgram:
         self._hosts = ZoneHosts(
             simulation.division, mine, nodes_of(zones), told, limits, self._links, carried,
             generation, simulation.config.zones.check_invariants,
+            lease_ticks(simulation.config.clock.ticks_per_step),
         )  # fmt: skip
         self._run_own()
 
@@ -169,6 +171,8 @@ class NodeProgram:
                 frame = self._links.take([COORDINATOR])[COORDINATOR]
                 if frame.kind is FrameKind.RECOVER:
                     self._recover(frame)
+                elif frame.kind is FrameKind.LEASE:
+                    self._hosts.note(frame.data)
                 else:
                     self._perform(frame)
             except RecoveryOrderedError as ordered:
@@ -265,11 +269,12 @@ class NodeProgram:
     def _perform(self, frame: NodeFrame) -> None:
         worlds, peers = self._worlds, self._peers
         task, payload, at = command_of(frame.data, worlds.arrays)
+        self._kept.settle()
         if frame.number:
             self._kept.keep(frame.number, self._living)
         match task:
             case Task.STEP:
-                self._await_actions(frame.data, at)
+                self._hosts.lease(frame.data[self._await_actions(frame.data, at) :])
                 peers.begin_step()
                 worlds.step(self._commands)
                 self._hosts.report(self._results(worlds.simulation.everywhere, stepped=True))
@@ -299,8 +304,8 @@ class NodeProgram:
             case _:
                 self._look(task, payload)
 
-    def _await_actions(self, data: memoryview, at: int) -> None:
-        """Return when it is known what all agents of this node do in the next step.
+    def _await_actions(self, data: memoryview, at: int) -> int:
+        """Return when it is known what all agents of this node do in the next step: their end.
 
         Those of other nodes are refused, with the number of their owner.
 
@@ -309,7 +314,7 @@ class NodeProgram:
         """
         arrays, owner = self._worlds.arrays, self._peers.owner
         told, at = take_actions(data, at, arrays)
-        unowned, _ = take_actions(data, at, arrays)
+        unowned, at = take_actions(data, at, arrays)
         wrong = told[owner[told] != self._number]
         if len(wrong):
             said = refusal(wrong, owner)
@@ -324,6 +329,7 @@ class NodeProgram:
             if missing.any():
                 self._links.heed()
                 self._links.pump(None)
+        return at
 
     def _results(self, sensed: Any, stepped: bool) -> list[Bytes]:
         peers = self._peers

@@ -11,6 +11,7 @@ from typing import Any, Protocol, TypeAlias
 from cavmarl.parallel.hosts.listener import Listener, call
 from cavmarl.parallel.journaled_worlds import unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.nodes.leases import late_ticks
 from cavmarl.parallel.recipe import world_of
 
 Place: TypeAlias = tuple[str, int]
@@ -86,7 +87,8 @@ class Machine:
         self, recipe: Mapping[str, Any], trouble: str, num_worlds: int, in_next_step: bool
     ) -> LocalWorlds:
         world = unwatched(world_of(recipe, trouble))
-        return LocalWorlds(world, num_worlds, warm=True, in_next_step=in_next_step)
+        late = late_ticks(world.config.clock.ticks_per_step)
+        return LocalWorlds(world, num_worlds, warm=True, in_next_step=in_next_step, late_ticks=late)
 
 
 MACHINE = Machine()

@@ -26,7 +26,7 @@ from cavmarl.ownership.codec import decode, encode
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.ledger import state_digest
 from cavmarl.ownership.limits import Limits
-from cavmarl.ownership.messages import COORDINATOR, Message, Removed
+from cavmarl.ownership.messages import COORDINATOR, Message, Prepare, Removed
 from cavmarl.ownership.offers import Approach
 from cavmarl.ownership.reactions import Advance, Hosting
 from cavmarl.parallel.nodes.links import Bytes, FrameKind, Links, NodeFrame, RecoveryOrderedError
@@ -44,6 +44,8 @@ class Report(NamedTuple):
     began: bool  # the world has begun anew after the tick
     # zone, vehicles that its rows say it owns, the sum of their `owner_hash`; where it is checked
     owned: list[tuple[int, int, int]]
+    # a vehicle has crossed a border that is on no record yet: it is offered in a lease of no ticks
+    is_late: bool = False
 
 
 class ZoneHosts:
@@ -62,7 +64,9 @@ class ZoneHosts:
         carried: Sequence[NDArray[Any]],  # (W, A, …) of agents: what they do, what is kept of them
         generation: int = 0,  # how often nodes have been lost
         is_checked: bool = False,  # whether the caller checks what zones own
+        ticks: int = 1,  # of a lease
     ) -> None:
+        self._ticks, self._left = ticks, 0
         self._generation, self._is_checked = generation, is_checked
         self._owned_sum = specialized(owned_sum)
         self._carried = carried
@@ -80,6 +84,7 @@ class ZoneHosts:
         self._gone: list[dict[int, int]] = [{} for _ in range(num_worlds)]
         # of vehicles that were offered, and have not left: the zones that they are to go to
         self._targets: list[dict[int, int]] = [{} for _ in range(num_worlds)]
+        self._early: list[tuple[int, Message]] = []  # of an episode that begins with the next lease
         self._began = [False] * num_worlds
         self._stirred = [True] * num_worlds
         self._is_open = False
@@ -87,7 +92,10 @@ class ZoneHosts:
     # Called by a tick
 
     def begin(self, commands: Commands) -> None:
-        """Wait for the lease of the next tick, and let vehicles change hands as it says."""
+        """Wait for the lease of the next ticks, and let vehicles change hands as it says."""
+        if self._is_open and self._left:
+            self._left -= 1
+            return
         if self._is_open:
             self.report()
         while any(len(leases) < len(self._zones) for leases in self._leases):
@@ -96,8 +104,29 @@ class ZoneHosts:
                 raise RecoveryOrderedError(frame)
             if frame.kind is not FrameKind.LEASE:
                 raise ProtocolError(f"a frame of kind {frame.kind.name}, where a lease was due")
-            for w, message in unpacked(frame.data):
-                self._take(w, message)
+            if frame.number:
+                self.lease(frame.data)
+            else:
+                self.note(frame.data)
+        self._enter_lease()
+        self._left = self._ticks - 1
+
+    def lease(self, data: memoryview) -> None:
+        """Take STEP messages."""
+        for w, message in unpacked(data):
+            self._take(w, message)
+        early, self._early = self._early, []
+        for w, message in early:
+            self._take(w, message)
+
+    def note(self, data: memoryview) -> None:
+        """Let a lease of no ticks begin and end: births come on record, and can be offered."""
+        self.lease(data)
+        self._enter_lease()
+        self._stirred = [True] * len(self._stirred)
+        self.report()
+
+    def _enter_lease(self) -> None:
         for w, leases in enumerate(self._leases):
             self._change_hands(w, leases)
             self._leases[w] = {}
@@ -151,9 +180,9 @@ class ZoneHosts:
         for w in range(len(self._endpoints)):
             began, self._began[w] = self._began[w], False
             messages += [(w, done) for done in self._complete(w)]
-            movers = [] if began else self._offer(w)
+            movers, is_late = self._offer(w, began)
             owned = [self._owned(w, zone) for zone in self._endpoints[w]] if checked else []
-            reports.append(Report(movers, self._births[w], began, owned))
+            reports.append(Report(movers, self._births[w], began, owned, is_late))
             self._births[w] = []
         said = json.dumps(reports).encode()
         packed_messages = packed(messages)
@@ -169,6 +198,10 @@ class ZoneHosts:
 
     def _complete(self, w: int) -> Iterable[Message]:
         gone, self._gone[w] = self._gone[w], {}
+        if gone and self._births[w]:  # what comes and goes within a lease is on no record
+            born = {vehicle for vehicle, _ in self._births[w]} & gone.keys()
+            self._births[w] = [birth for birth in self._births[w] if birth[0] not in born]
+            gone = {vehicle: reason for vehicle, reason in gone.items() if vehicle not in born}
         left: dict[int, list[Removed]] = {}
         kept: dict[int, int] = {}
         for vehicle, reason in gone.items():
@@ -182,24 +215,32 @@ class ZoneHosts:
             if endpoint.lease is not None:
                 yield endpoint.complete(0, left.get(zone, ()))
 
-    def _offer(self, w: int) -> list[tuple[int, int, str]]:
-        """Offer the vehicles that have crossed to the zones that they are in."""
+    def _offer(self, w: int, began: bool) -> tuple[list[tuple[int, int, str]], bool]:
+        """Offer the vehicles that have crossed to the zones that they are in.
+
+        Returns:
+            movers of the report, and whether there are others that have crossed.
+        """
         division, endpoints = self._division, self._endpoints[w]
-        everybody, self._stirred[w] = self._stirred[w], False
+        everybody, self._stirred[w] = self._stirred[w] or began, False
         approaches: dict[int, list[Approach]] = {zone: [] for zone in endpoints}
-        movers = []
+        movers, is_late = [], False
         for entry in division.near(w, everybody):
             endpoint = endpoints.get(entry.source)
-            if entry.crossed and endpoint is not None and entry.vehicle in endpoint.owned:
+            if not entry.crossed or endpoint is None:
+                continue
+            if began or entry.vehicle not in endpoint.owned:
+                is_late = True
+            else:
                 state = division.state(w, entry.source, entry.row)
                 approaches[entry.source].append(Approach(entry.vehicle, entry.target, state))
                 self._targets[w][entry.vehicle] = entry.target
                 movers.append((entry.vehicle, entry.target, state_digest(state).hex()))
         for zone, endpoint in endpoints.items():
-            if approaches[zone] or endpoint.offers.open:
+            if not began and (approaches[zone] or endpoint.offers.open):
                 for message in endpoint.offer(approaches[zone]):
                     self._send(w, message)
-        return movers
+        return movers, is_late
 
     def hear(self, number: int, frame: NodeFrame) -> None:
         """Take messages of other nodes as soon as they come."""
@@ -210,6 +251,9 @@ class ZoneHosts:
         for zone in message.destinations():
             endpoint = self._endpoints[w].get(zone)
             if endpoint is None:
+                continue
+            if isinstance(message, Prepare) and message.episode > endpoint.episode:
+                self._early.append((w, message))  # its node has had the lease of the episode first
                 continue
             reaction = endpoint.on_message(message)
             if reaction.advance is not None:

@@ -1,0 +1,38 @@
+"""States that a node keeps: two at most, and one once the newest has come everywhere."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from cavmarl.parallel.nodes.kept_states import KeptStates
+from cavmarl.parallel.nodes.links import FrameKind, NodeFrame
+
+
+class Worlds:
+    def save(self) -> list[np.ndarray[Any, Any]]:
+        return [np.arange(3)]
+
+
+class Wires:
+    def __init__(self) -> None:
+        self.sent: list[tuple[int, int]] = []
+
+    def send(self, to: int, kind: FrameKind, number: int, pieces: Any) -> None:
+        assert kind is FrameKind.KEEP
+        self.sent.append((to, number))
+
+
+def test_older_states_go_when_the_newest_has_come_everywhere() -> None:
+    worlds, wires = Worlds(), Wires()
+    kept = KeptStates(worlds, wires, 1)  # type: ignore[arg-type]
+    for state in (1, 2, 3):
+        kept.take(0, NodeFrame(FrameKind.KEEP, state, memoryview(b"theirs")))
+        kept.keep(state, [0, 1, 4])
+    assert wires.sent == [(4, 1), (4, 2), (4, 3)]
+    assert (list(kept._own), list(kept._others[0])) == ([2, 3], [2, 3])
+    kept.settle()
+    kept.take(0, NodeFrame(FrameKind.KEEP, 4, memoryview(b"theirs")))  # ahead of this node
+    kept.settle()
+    assert (list(kept._own), list(kept._others[0])) == ([3], [3, 4]), "all may go back to 3"

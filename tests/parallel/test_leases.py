@@ -1,0 +1,117 @@
+"""Leases of several ticks, and vehicles that cross a border before they are on record."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cavmarl.config.registry import load_config
+from cavmarl.engine.world_setup import make_world
+from cavmarl.handoff.division import Division
+from cavmarl.handoff.shard_setup import limits_of, neighbours_of
+from cavmarl.ownership.ledger import state_digest
+from cavmarl.ownership.messages import COORDINATOR, Ack, Message, Offer, Prepare
+from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.nodes.leases import MOST, late_ticks, lease_ticks, leases_of
+from cavmarl.parallel.nodes.links import Bytes, FrameKind, NodeFrame
+from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
+from cavmarl.parallel.nodes.zone_hosts import Report, ZoneHosts, packed, read_report, unpacked
+
+WAIT_S = 0.1
+
+
+@pytest.mark.parametrize("ticks", range(1, 2 * MOST + 2))
+def test_leases_are_for_all_ticks_of_a_step(ticks: int) -> None:
+    each = lease_ticks(ticks)
+    assert each <= MOST
+    assert (leases_of(ticks, ticks) - 1) * each < ticks <= leases_of(ticks, ticks) * each
+    assert leases_of(0, ticks) == 0
+    assert late_ticks(ticks) == each - 1
+
+
+def test_zones_see_as_far_as_their_vehicles_get_in_a_lease() -> None:
+    config, base_dir = load_config("grid4x4", zones=2, agents=1)
+    world = make_world(config, base_dir)
+    halos = [
+        LocalWorlds(world, 1, late_ticks=late).simulation.division.halo.halo_m for late in (0, 1, 3)
+    ]
+    tick_m = halos[1] - halos[0]
+    assert tick_m > 0
+    assert halos[2] - halos[0] == pytest.approx(3 * tick_m)
+
+
+class Wires:
+    """Links that keep what is sent; those to oneself carry it at once."""
+
+    def __init__(self) -> None:
+        self.reports: list[list[Report]] = []
+        self.answers: list[Message] = []
+        self.coordinator: NodeCoordinator | None = None
+
+    def send(self, to: int, kind: FrameKind, number: int, pieces: Sequence[Bytes] = ()) -> None:
+        assert to == COORDINATOR
+        assert self.coordinator is not None
+        data = memoryview(b"".join(pieces))
+        if kind is FrameKind.REPORT:
+            messages, said, _ = read_report(data)
+            self.reports.append(said)
+            self.coordinator.commit({0: (messages, said)})
+        else:
+            self.answers += [message for _, message in unpacked(data)]
+            self.coordinator.hear(0, NodeFrame(kind, number, data))
+
+    def now_s(self) -> float:
+        return 0.0
+
+
+def begun() -> tuple[ZoneHosts, NodeCoordinator, Division, Any]:
+    """Hosts of two zones at one node, that have begun an episode and not reported it."""
+    config, base_dir = load_config("grid4x4", zones=2, agents=1, background=20)
+    worlds = LocalWorlds(make_world(config, base_dir), 1)
+    worlds.arrays.chosen[:] = True
+    worlds.reset(1, 0)
+    division = worlds.simulation.division
+    wires: Any = Wires()
+    limits = limits_of(config.zones, division.codec.schema)
+    coordinator = NodeCoordinator([bytes(16)], [0, 0], limits, wires, [None])
+    wires.coordinator = coordinator
+    hostings = coordinator.host(neighbours_of(division))
+    hosts = ZoneHosts(division, (0, 1), (0, 0), hostings, limits, wires, [], ticks=2)
+    hosts.reset(np.ones(1, dtype=np.bool_))
+    return hosts, coordinator, division, wires
+
+
+def test_a_vehicle_that_crosses_before_it_is_on_record_is_offered_without_a_tick() -> None:
+    hosts, coordinator, division, wires = begun()
+    row = division.owned(0, 0)[0]
+    there = division.owned(0, 1)[0]
+    row["x"], row["y"] = there["x"], there["y"]  # of zone 0 on record, and far behind the border
+
+    hosts.report()
+    ((report,),) = wires.reports
+    assert (report.movers, report.is_late, coordinator.is_late) == ([], True, True)
+    hosts.note(memoryview(coordinator.begin(WAIT_S)[0]))
+    (report,) = wires.reports[1]
+    assert [mover[:2] for mover in report.movers] == [[int(row["id"]), 1]]
+    assert (report.is_late, coordinator.is_late, coordinator.switched) == (False, False, 0)
+    coordinator.begin(WAIT_S)
+    assert coordinator.switched == 1
+
+
+def test_an_offer_that_comes_before_the_lease_of_its_episode_is_answered_after_it() -> None:
+    hosts, coordinator, division, wires = begun()
+    hosts.report()
+    table, state = coordinator._worlds[0].directory.table, b"state"
+    offer = Offer(10**6, 0, state_digest(state), state)
+    prepare = Prepare(
+        bytes(16), table.episode, table.tick + 1, 0, 1, 1, division.codec.schema, (offer,)
+    )
+    hosts.hear(1, NodeFrame(FrameKind.MESSAGES, 0, memoryview(packed([(0, prepare)]))))
+    assert wires.answers == []
+    hosts.note(memoryview(coordinator.begin(WAIT_S)[0]))
+    (ack,) = wires.answers
+    assert isinstance(ack, Ack)
+    assert (ack.zone, ack.entries[0].vehicle) == (1, 10**6)
