@@ -12,6 +12,7 @@ import pytest
 from cavmarl.core.records.codes import (
     DRIVER_AGENT,
     DRIVER_BACKGROUND,
+    HOLD_EXIT_BLOCKED,
     HOLD_NONE,
     HOLD_YIELD,
     SIGNAL_NONE,
@@ -31,7 +32,7 @@ SPEED_MPS = 10.0  # of both, all along: it is the limit
 HALF_M = 2.5
 FROM_WEST, FROM_SOUTH = 0, 1  # LINK rows
 
-Blocks = Callable[..., bool]
+Blocks = Callable[..., int]
 ALLWAY_STOP, EQUAL, MINOR, STOP = map(ord, "w=ms")
 
 
@@ -42,33 +43,35 @@ def network(crossing: Callable[..., Path]) -> RoadNetwork:
 
 @pytest.fixture
 def blocks(network: RoadNetwork) -> Blocks:
-    """Whether a car from the west blocks one from the south, which gives way to it."""
+    """Whether a car from the west blocks one from the south, which gives way to it (HOLD_*)."""
     link = network.links[FROM_SOUTH]
     first = int(link["first_conflict"])
     conflicts = network.conflicts[first : first + int(link["num_conflicts"])]
     (shared,) = conflicts[conflicts["foe"] == FROM_WEST]
     row = on_lane(network, network.lane_ids.index("s_0"), 0.0, speed=SPEED_MPS, length=2.0 * HALF_M)
 
-    def ask(own_s: float, end: str, foe_m: float, wait_s: float = 0.0) -> bool:
+    def ask(own_s: float, end: str, foe_m: float, wait_s: float = 0.0, **foe_fields: float) -> int:
         """By how long and how far they are before what they share.
 
         `own_s`: until the own front enters the shared area or is at its `line`, or the own rear is
         `out` of the junction, as `end` says. `foe_m`: of the other one's front to its line;
-        negative: of its rear to the end of the shared area.
+        negative: of its rear to the end of the shared area. `foe_fields`: of its record.
         """
         foe = np.zeros(1, APPROACH)
-        foe["link"], foe["row"], foe["half"], foe["speed"] = FROM_WEST, 1, HALF_M, SPEED_MPS
+        foe["link"], foe["row"], foe["half"] = FROM_WEST, 1, HALF_M
         inside = foe_m < 0.0
         foe["dist"] = -shared["foe_leave_m"] - HALF_M - foe_m if inside else foe_m + HALF_M
         ahead = {"enter": shared["enter_m"] - HALF_M, "line": -HALF_M}
         ahead["out"] = link["length_m"] + HALF_M
         row["wait_s"] = wait_s
-        return bool(
-            foe_blocks(
-                network.arrays, np.concatenate([row, row]), row[0], FROM_SOUTH,
-                own_s * SPEED_MPS - float(ahead[end]), SPEED_MPS, shared, foe[0], True,
-                np.zeros(1, np.int32),
-            )
+        rows = np.concatenate([row, row])
+        for name, value in foe_fields.items():
+            rows[1][name] = value
+        foe["speed"] = rows[1]["speed"]
+        return foe_blocks(
+            network.arrays, rows, row[0], FROM_SOUTH,
+            own_s * SPEED_MPS - float(ahead[end]), SPEED_MPS, shared, foe[0], True,
+            np.zeros(1, np.int32),
         )  # fmt: skip
 
     return ask
@@ -78,6 +81,22 @@ def test_behind_one_that_is_on_the_junction_half_a_second_is_enough(blocks: Bloc
     # Its rear leaves the shared area in 0.6 s.
     assert blocks(1.05, "enter", -6.0)
     assert not blocks(1.15, "enter", -6.0)
+
+
+@pytest.mark.parametrize(
+    ("speed", "wait_s", "foe_hold", "hold"),
+    [
+        (SPEED_MPS, 0.0, HOLD_NONE, HOLD_NONE),  # it will have left
+        (SPEED_MPS, 0.0, HOLD_EXIT_BLOCKED, HOLD_EXIT_BLOCKED),  # another one keeps it there
+        (0.0, 2.9, HOLD_NONE, HOLD_YIELD),  # it may go on at once
+        (0.0, 3.1, HOLD_NONE, HOLD_EXIT_BLOCKED),
+    ],
+)
+def test_one_that_stays_on_the_junction_keeps_others_before_it(
+    blocks: Blocks, speed: float, wait_s: float, foe_hold: int, hold: int
+) -> None:
+    assert blocks(9.0, "enter", -3.0, speed=speed, wait_s=wait_s, hold=foe_hold) == hold
+    assert blocks(9.0, "enter", -40.0, speed=0.0, wait_s=9.0) == HOLD_NONE, "it stands before it"
 
 
 def test_one_that_comes_is_let_over_the_whole_junction(

@@ -288,6 +288,65 @@ def test_who_still_moves_on_the_junction_will_need_room_beyond_it(scene: Make) -
     assert lanes[here["first"]["lane"]] == "E_out_0", "for the first one there was room"
 
 
+def test_who_waits_inside_goes_before_one_that_cannot_come_and_so_ends_a_ring(
+    crossing: Callable[..., Path],
+) -> None:
+    """The left turn stands in the way of one that stands in the way of one that it lets pass."""
+    here = Scene(crossing("priority", side_lanes=2))
+    network = here.simulation.network
+    ends = {"left": ("W_in_0", "N_out_1"), "cross": ("N_in_0", "S_out_0")}
+    link = {
+        name: next(
+            k
+            for k, row in enumerate(network.links)
+            if (network.lane_ids[row["from_lane"]], network.lane_ids[row["to_lane"]]) == end
+        )
+        for name, end in ends.items()
+    }
+    left, cross = (network.links[link[name]] for name in ends)
+    conflicts = network.conflicts[left["first_conflict"] :][: left["num_conflicts"]]
+    (shared,) = conflicts[conflicts["foe"] == link["cross"]]
+    wait_m = float(left["wait_m"])
+    assert shared["enter_m"] < wait_m - 1.0 < shared["leave_m"], "it waits in the shared area"
+    fronts = {"left": wait_m - 1.0, "cross": float(shared["foe_enter_m"]) - 1.0}
+    for name, row in (("left", left), ("cross", cross)):
+        lane = network.lanes[row["first_internal"]]
+        to_end = float(lane["length_m"]) - fronts[name]
+        goal = "N_out" if name == "left" else "S_out"
+        inside = network.lane_ids[row["first_internal"]]
+        here.put(name, inside, to_end, goal, wait_s=10.0, link=link[name])
+    here.put("main", "E_in_0", 1.0, "W_out", wait_s=10.0)
+    lanes, through = network.lane_ids, {}
+    for time in here.run(25.0):
+        for car in here.simulation.vehicles():
+            if lanes[car["lane"]].split("_")[1] == "out":
+                through.setdefault(here.names[car["id"]], time)
+    assert list(through) == ["left", "cross", "main"]
+    assert through["left"] < 10.0
+
+
+def test_who_stands_at_the_very_start_of_the_junction_is_not_driven_into(scene: Make) -> None:
+    here = scene("priority")
+    network = here.simulation.network
+    link = next(
+        row
+        for row in network.links
+        if (network.lane_ids[row["from_lane"]], network.lane_ids[row["to_lane"]])
+        == ("W_in_0", "N_out_0")
+    )
+    inside = int(link["first_internal"])
+    to_end = float(network.lanes["length_m"][inside]) - 2.5
+    here.put("left", network.lane_ids[inside], to_end, "N_out", agent=0)
+    here.simulation.vehicles()["driver"] = DRIVER_AGENT
+    here.put("straight", "W_in_0", 40.0, "E_out", speed=13.0)
+    assert here["left"]["s"] == 0.0
+    for _ in here.run(6.0):
+        vehicles = here.simulation.vehicles()
+        left = vehicles["id"] == here.names.index("left")
+        vehicles["speed"][left] = vehicles["s"][left] = 0.0  # it stands there for ever
+    assert here["straight"]["speed"] < 1.0
+
+
 def test_links_from_one_lane_share_their_way_up_to_the_fork(
     crossing: Callable[[str], Path],
 ) -> None:

@@ -27,7 +27,7 @@ def announcements(roads: RoadNetwork, travel: Travel, row: np.void) -> list[Entr
     here = roads.lanes[lane]
     found: list[Entry] = []
     if here["internal"]:
-        driven = float(here["link_offset_m"] + row["s"])
+        driven = max(float(here["link_offset_m"] + row["s"]), 1e-9)
         found.append((int(here["link"]), name, -driven))
     elif (came_by := link_into(roads, row)) >= 0:
         link = roads.links[came_by]

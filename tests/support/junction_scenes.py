@@ -20,15 +20,21 @@ ARM_M = 150
 NODES = {"W": (-ARM_M, 0), "E": (ARM_M, 0), "S": (0, -ARM_M), "N": (0, ARM_M)}
 
 
-def build_crossing(folder: Path, kind: str) -> Path:
+def build_crossing(folder: Path, kind: str, side_lanes: int = 1) -> Path:
     """A west-east main road and a south-north side road that cross, by SUMO's type of the node."""
-    target = folder / f"{kind}.net.xml"
+    target = folder / f"{kind}_{side_lanes}.net.xml"
     if target.exists():
         return target
     nodes = "".join(f'<node id="{n}" x="{x}" y="{y}"/>' for n, (x, y) in NODES.items())
     edges = "".join(
-        f'<edge id="{arm}_{way}" from="{start}" to="{end}" speed="14" priority="{priority}"/>'
-        for arm, priority in (("W", 9), ("E", 9), ("S", 1), ("N", 1))
+        f'<edge id="{arm}_{way}" from="{start}" to="{end}" speed="14" priority="{priority}" '
+        f'numLanes="{lanes}"/>'
+        for arm, priority, lanes in (
+            ("W", 9, 1),
+            ("E", 9, 1),
+            ("S", 1, side_lanes),
+            ("N", 1, side_lanes),
+        )
         for way, start, end in (("in", arm, "c"), ("out", "c", arm))
     )
     (folder / "c.nod.xml").write_text(

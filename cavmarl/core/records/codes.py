@@ -56,7 +56,7 @@ UNTIL_DEPARTURE = 2
 HOLD_NONE = 0
 HOLD_SIGNAL = 1  # red or yellow
 HOLD_YIELD = 2  # gives way
-HOLD_EXIT_BLOCKED = 3  # no room beyond the junction
+HOLD_EXIT_BLOCKED = 3  # no room beyond the junction, or one that stays on it is in the way
 
 # VEHICLE["events"]: bits, what happened in this step
 EVENT_COLLIDED = 1

@@ -19,6 +19,7 @@ from cavmarl.driving.kernels.ways import leave, next_step, own_step
 
 MAX_LINKS_AHEAD = 2
 STANDS_BEFORE_M = 15.0  # the centre of one that waits before the end of a lane to leave it
+LEAST_M = 1e-9  # beyond the line is one on the junction: at 0 are those at the end of a lane
 BLOCK = 64  # rows that are still near in memory when they are looked at again
 
 APPROACH = np.dtype(
@@ -138,7 +139,8 @@ def _announce(
     here = roads.lanes[lane]
     s = row["s"]
     if here["internal"]:
-        pairs = _note(scratch, pairs, here["link"], row, i, -(here["link_offset_m"] + s))
+        driven_m = max(here["link_offset_m"] + s, LEAST_M)
+        pairs = _note(scratch, pairs, here["link"], row, i, -driven_m)
     elif s - 0.5 * row["length"] < SWEPT_BEYOND_M:
         # Its centre has left the junction, its rear has not, or not the fork before it, or where
         # others wait for it.

@@ -166,10 +166,10 @@ def _at_line(
     to_line = front - roads.lanes[roads.links[link]["from_lane"]]["stop_back_m"]
     if to_line <= 0.0:
         # Its front is over the line: it does not wait there any more.
-        constraint, hold = constraint_inside(
+        constraint, hold, waits = constraint_inside(
             roads, travel, rows, i, link, -distance, way, phase, dt, scratch
         )
-        swept = before_swept(roads, rows, i, kind, link, front, hold, dt, scratch)
+        swept = before_swept(roads, rows, i, kind, link, front, waits, dt, scratch)
         return max(constraint, swept), hold, False
     hold = may_enter(roads, travel, rows, i, link, distance, way, phase, scratch)
     waits = HOLD_NONE
@@ -238,10 +238,10 @@ def _road_ahead(
         place = here["link_offset_m"] + row["s"]
         before = roads.links[here["link"]]["from_lane"]
         fork = behind_fork(roads, kind, row, before, here["link"], -place, scratch)
-        constraint, hold = constraint_inside(
+        constraint, hold, waits = constraint_inside(
             roads, travel, rows, i, here["link"], place, row["way"], phase, dt, scratch
         )
-        swept = before_swept(roads, rows, i, kind, here["link"], -place - half, hold, dt, scratch)
+        swept = before_swept(roads, rows, i, kind, here["link"], -place - half, waits, dt, scratch)
         constraint = max(constraint, fork, swept)
     look = min(look_ahead_m(kind, speed), travel.view_m)
     see = min(see_line_m(kind, speed) + half, travel.see_m)

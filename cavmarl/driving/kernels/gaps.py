@@ -16,6 +16,7 @@ from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays
 from cavmarl.core.records.codes import (
     DRIVER_AGENT,
+    HOLD_EXIT_BLOCKED,
     HOLD_NONE,
     HOLD_YIELD,
     SIGNAL_GREEN_MINOR,
@@ -190,6 +191,14 @@ def _is_harmless(
     return brakes
 
 
+@inlined_kernel
+def stays_inside(foe: np.void) -> bool:
+    """Whether a vehicle on a junction stays where it is: it stands, or has to stop for one."""
+    stands = (foe["speed"] < STANDING_MPS) & (foe["wait_s"] > IMPATIENT_S)
+    stays: bool = stands | (foe["hold"] == HOLD_EXIT_BLOCKED)
+    return stays
+
+
 @kernel
 def foe_blocks(
     roads: RoadArrays,
@@ -202,11 +211,14 @@ def foe_blocks(
     foe: np.void,
     gives_way: bool,
     phase: NDArray[np.int32],
-) -> bool:
-    """Whether one APPROACH is, or will be, in the shared area while `row` is, or goes first."""
+) -> int:
+    """Whether one APPROACH is, or will be, in the shared area while `row` is, or goes first.
+
+    HOLD_EXIT_BLOCKED says that it stays there; HOLD_YIELD that it will come, or leave.
+    """
     to_clear = foe["dist"] + conflict["foe_leave_m"] + foe["half"]
     if to_clear <= 0.0:
-        return False
+        return HOLD_NONE
     target = roads.links[link]
     foe_link = roads.links[conflict["foe"]]
     # Its front before the line that it can still stop at: the stop line, or, where the shared
@@ -218,18 +230,19 @@ def foe_blocks(
     half = 0.5 * row["length"]
     apart = distance + conflict["leave_m"] - half - to_clear
     if _is_harmless(roads, rows, row, link, conflict, foe, front, apart, gives_way, phase):
-        return False
+        return HOLD_NONE
     cleared = to_clear / max(foe["speed"], 0.1)
     time_in = _earliest(distance + conflict["enter_m"] - half, row["speed"], limit, BRISK_ACCEL)
     if front <= 0.0:
+        if stays_inside(rows[foe["row"]]):
+            return HOLD_EXIT_BLOCKED
         to_area = distance + conflict["enter_m"] - half
         if _in_turn(target["state"]) and _goes_on(row, link) and to_area > ROOM_M:
-            return False  # it lost its turn if it stood once more, and can wait before the area
+            return HOLD_NONE  # it lost its turn if it stood once more, and can wait before the area
         if foe["speed"] > STANDING_MPS:  # one that has just set off does not stay so slow
             top = roads.lanes[roads.links[conflict["foe"]]["next_lane"]]["speed_mps"]
             cleared = _earliest(to_clear, foe["speed"], top, GENTLE_ACCEL)
-        inside: bool = cleared + 0.5 * GAP_S > time_in
-        return inside
+        return HOLD_YIELD if cleared + 0.5 * GAP_S > time_in else HOLD_NONE
     # A foe before its line, and the vehicle itself, are given the whole way over the junction.
     over = target["length_m"]
     if conflict["enter_m"] < target["wait_m"]:
@@ -237,7 +250,7 @@ def foe_blocks(
     passed = (foe["dist"] + foe_link["length_m"] + foe["half"]) / max(foe["speed"], 0.1)
     after_s = GAP_S if conflict["merging"] else 0.0
     if passed + after_s < _earliest(distance - half, row["speed"], limit, BRISK_ACCEL):
-        return False
+        return HOLD_NONE
     speed = row["speed"]
     over += min(distance - half, 0.0)  # from a waiting position: the rest
     reached = math.sqrt(speed * speed + 2.0 * BRISK_ACCEL * max(over, 0.0))
@@ -247,5 +260,5 @@ def foe_blocks(
     # With the speed that it has; vehicles that have waited for long count on it to brake.
     arrives = (foe["dist"] - foe["half"]) / max(foe["speed"], STANDING_MPS)
     arrives *= 1.0 + min(row["wait_s"] / IMPATIENCE_S, 1.0)
-    blocks: bool = arrives < time_out + (MERGE_AHEAD_S if conflict["merging"] else AHEAD_S)
-    return blocks
+    comes = arrives < time_out + (MERGE_AHEAD_S if conflict["merging"] else AHEAD_S)
+    return HOLD_YIELD if comes else HOLD_NONE

@@ -38,6 +38,7 @@ from cavmarl.driving.kernels.gaps import (
     foe_blocks,
     link_signal,
     must_stop,
+    stays_inside,
 )
 from cavmarl.driving.kernels.swept_areas import wait_place
 from cavmarl.driving.kernels.ways import next_step
@@ -63,12 +64,15 @@ def _blocked_by_foes(
     gives_way: bool,
     phase: NDArray[np.int32],
     scratch: Scratch,
-) -> bool:
+) -> int:
     """Whether a foe is, or will be, where row i would be on `link`, `distance` m from its line.
 
-    Asks about the shared areas before `wait_m`, or, from `inside`, about those beyond.
+    Asks about the shared areas before `wait_m`, or, from `inside`, about those beyond. One that
+    stands and would have to drive over another that stays there is blocked (HOLD_EXIT_BLOCKED),
+    whatever else it gives way to (HOLD_YIELD): it will not come.
     """
     row = rows[i]
+    hold = HOLD_NONE
     limit = roads.lanes[roads.links[link]["next_lane"]]["speed_mps"]
     if row["driver"] == DRIVER_AGENT:
         limit = min(limit, STEERED_MPS)
@@ -81,11 +85,19 @@ def _blocked_by_foes(
             continue
         for k in range(begin, end):
             foe = scratch.approach[k]
-            if foe["row"] != i and foe_blocks(
+            if foe["row"] == i:
+                continue
+            found = foe_blocks(
                 roads, rows, row, link, distance, limit, conflict, foe, gives_way, phase
-            ):
-                return True
-    return False
+            )
+            if found == HOLD_NONE:
+                continue
+            if row["speed"] > STANDING_MPS:
+                return HOLD_YIELD
+            if found == HOLD_EXIT_BLOCKED:
+                return HOLD_EXIT_BLOCKED
+            hold = HOLD_YIELD
+    return hold
 
 
 @kernel
@@ -160,10 +172,11 @@ def may_enter(
     if must_stop(roads, link, signal) and row["stopped_at"] != link:
         return HOLD_YIELD
     gives_way = signal != SIGNAL_GREEN_MAJOR and signal != SIGNAL_OFF
-    if _blocked_by_foes(
+    hold = _blocked_by_foes(
         roads, rows, i, link, distance, target["wait_m"], False, gives_way, phase, scratch
-    ):
-        return HOLD_YIELD
+    )
+    if hold != HOLD_NONE:
+        return hold
     if _exit_blocked(roads, travel, row, link, way, scratch):
         return HOLD_EXIT_BLOCKED
     return HOLD_NONE
@@ -208,8 +221,9 @@ def waits_inside(
         return HOLD_NONE
     signal = link_signal(roads, link, phase)
     gives_way = signal != SIGNAL_GREEN_MAJOR and signal != SIGNAL_OFF
-    if _blocked_by_foes(roads, rows, i, link, distance, wait_m, True, gives_way, phase, scratch):
-        return HOLD_YIELD
+    hold = _blocked_by_foes(roads, rows, i, link, distance, wait_m, True, gives_way, phase, scratch)
+    if hold != HOLD_NONE:
+        return hold
     if _exit_blocked(roads, travel, rows[i], link, way, scratch):
         return HOLD_EXIT_BLOCKED
     return HOLD_NONE
@@ -227,24 +241,29 @@ def constraint_inside(
     phase: NDArray[np.int32],  # (num_signals,) PHASE rows that are on
     dt: float,  # seconds a tick
     scratch: Scratch,  # with the lane and link indices of this tick
-) -> tuple[float, int]:  # constraint, and why it holds at the waiting position (HOLD_*)
+) -> tuple[float, int, int]:
     """The constraint of foes on the same junction on row i, whose front is beyond its stop line.
 
     Of two vehicles in conflict the one that is nearer to the shared area goes first; at equal
     distance the smaller id. Where both lead into one lane, the other follows it there. At a
     waiting position inside, row i waits until it may go on.
+
+    Returns:
+        The constraint; why it cannot go on (HOLD_*), be it that one which stays there is in its
+        way; and why it has to stop at the waiting position alone.
     """
     row = rows[i]
     kind = travel.types[row["vtype"]]
     half = 0.5 * row["length"]
     front = place + half
-    constraint, hold = no_constraint(kind), HOLD_NONE
+    constraint, waits = no_constraint(kind), HOLD_NONE
     target = roads.links[link]
     if front <= target["wait_m"] + WAIT_SLACK_M:
-        hold = waits_inside(roads, travel, rows, i, link, -place, way, phase, scratch)
-        if hold != HOLD_NONE:
+        waits = waits_inside(roads, travel, rows, i, link, -place, way, phase, scratch)
+        if waits != HOLD_NONE:
             to_wait = wait_place(roads, link, half) - front
             constraint = before_line(kind, row["speed"], to_wait, dt)
+    hold = waits
     first = target["first_conflict"]
     for c in range(first, first + target["num_conflicts"]):
         conflict = roads.conflicts[c]
@@ -252,11 +271,14 @@ def constraint_inside(
             continue
         for k in range(scratch.link_start[conflict["foe"]], scratch.link_end[conflict["foe"]]):
             foe = scratch.approach[k]
-            if foe["row"] != i:
-                constraint = max(
-                    constraint, _constraint_of(roads, kind, row, conflict, foe, place, dt)
-                )
-    return constraint, hold
+            if foe["row"] == i:
+                continue
+            found = _constraint_of(roads, kind, row, conflict, foe, place, dt)
+            if found > no_constraint(kind):
+                constraint = max(constraint, found)
+                if hold == HOLD_NONE and stays_inside(rows[foe["row"]]):
+                    hold = HOLD_EXIT_BLOCKED
+    return constraint, hold, waits
 
 
 @kernel
