@@ -55,8 +55,9 @@ def results_of(
         pieces += [_flat(getattr(arrays, name)).data for name in _COMMON]
     for mask, sensed in zip((own, before & ended[:, None]), _sensed(arrays), strict=True):
         where = np.flatnonzero(mask.reshape(-1))
-        pieces += [np.int64(where.size).tobytes(), where.data]
-        pieces += [_flat(_by_agent(array)[where]).data for array in sensed]
+        pieces.append(np.int64(where.size).tobytes())
+        if where.size:
+            pieces += [where.data, *(_flat(_by_agent(array)[where]).data for array in sensed)]
     return pieces
 
 

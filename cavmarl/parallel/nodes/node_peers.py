@@ -202,14 +202,15 @@ class NodePeers:
         where = np.flatnonzero(mine.reshape(-1))
         arrays = [_by_agent(getattr(outputs, name)) for name in PIECES]
         pieces = [np.int64(where.size).tobytes(), where.data]
-        pieces += [_bytes(array[where]) for array in arrays]
+        if where.size:
+            pieces += [_bytes(array[where]) for array in arrays]
         self.owner.reshape(self.own.shape)[chosen] = UNOWNED
         self.owner[where] = self._number
         for number, data in self._swap(pieces for _ in self._others):
             (num,), at = _read(data, 0, np.int64, 1)
             agents, at = _read(data, at, np.int64, int(num))
             self.owner[agents] = number
-            for array in arrays:
+            for array in arrays if num else ():
                 found, at = _read(data, at, array.dtype, int(num) * array[0].size)
                 array[agents] = found.reshape(int(num), *array.shape[1:])
 
