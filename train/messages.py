@@ -112,8 +112,9 @@ def draw(path: Path, curve: Mapping[float, Figures], off: Figures) -> None:
 def compare(args: Args) -> str:
     """Train both arms, evaluate, write; returns the table."""
     arms = {"on": 0.0, "off": 1.0}
+    given = [args.settings] if args.settings else []
     folders = {
-        arm: train(replace(args, out=args.out / arm, settings=f"{LOSS}={loss}"))
+        arm: train(replace(args, out=args.out / arm, settings=",".join([*given, f"{LOSS}={loss}"])))
         for arm, loss in arms.items()
     }
     room = args.out / "evaluation"

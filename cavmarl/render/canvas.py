@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 Color = tuple[int, int, int]
 
 LAND: Color = (235, 237, 230)
+BUILDING: Color = (216, 213, 206)
 KERB: Color = (205, 208, 200)
 ASPHALT: Color = (98, 107, 119)
 PATH: Color = (212, 211, 203)  # lanes that are closed to cars

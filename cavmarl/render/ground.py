@@ -1,4 +1,7 @@
-"""The still part of a picture: land, roads, markings; and stop lines in their signals' colours."""
+"""The still part of a picture: land, buildings, roads, markings.
+
+And stop lines in their signals' colours.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ from numpy.typing import NDArray
 from cavmarl.core.records.codes import SIGNAL_NONE
 from cavmarl.render.canvas import (
     ASPHALT,
+    BUILDING,
     CENTRE_LINE,
     KERB,
     LAND,
@@ -52,7 +56,7 @@ def signal_codes(network: RoadNetwork, signal_phases: NDArray[np.int32]) -> NDAr
 
 
 def draw_ground(shapes: RoadShapes, camera: Viewport, detail: int) -> Surface:
-    """Land, roads and markings as seen by `camera`.
+    """Land, buildings, roads and markings as seen by `camera`.
 
     `shapes`: of the network. `detail`: drawn this many times larger, then reduced: the smoothness
     of edges.
@@ -62,6 +66,7 @@ def draw_ground(shapes: RoadShapes, camera: Viewport, detail: int) -> Surface:
     surface = blank(large.size)
     surface.fill(LAND)
     painter = _Painter(shapes, large, surface, detail)
+    painter.polygons(shapes.roofs, BUILDING)
     for level in np.unique(shapes.levels):
         for cars in (False, True):
             painter.roads(level, cars, KERB_M, KERB)
@@ -70,7 +75,7 @@ def draw_ground(shapes: RoadShapes, camera: Viewport, detail: int) -> Surface:
             painter.lines(level, shapes.dashes, MARKING)
             painter.lines(level, shapes.centre_lines, CENTRE_LINE)
         if camera.scale >= SCALE_OF_ARROWS:
-            painter.polygons(level, shapes.arrows, MARKING)
+            painter.polygons(on_level(shapes.arrows, level), MARKING)
     reduced: Surface = pygame.transform.smoothscale(surface, camera.size)
     return reduced
 
@@ -90,6 +95,11 @@ def draw_stop_lines(
     quads[:, 3] = quads[:, 0] + (quads[:, 3] - quads[:, 0]) * stretch
     for link, quad in zip(links, quads.tolist(), strict=True):
         stamp(surface, [((*SIGNALS[codes[link]], 255), quad)])
+
+
+def on_level(corners: NDArray[np.float64], level: int) -> NDArray[np.float64]:
+    """Those of the shapes (k, n, 3) that begin on a level."""
+    return corners[level_of(corners[:, 0, 2]) == level]
 
 
 class _Painter:
@@ -133,7 +143,7 @@ class _Painter:
 
     def lines(self, level: int, pieces: NDArray[np.float64], color: Color) -> None:
         """Straight lines (k, 2, 3) on asphalt; those thinner than a pixel are paler instead."""
-        pixels = self._camera.to_pixels(self._chosen(level, pieces))
+        pixels = self._camera.to_pixels(self._in_sight(on_level(pieces, level)))
         width_px = MARKING_M * self._camera.scale / self._detail
         share = min(max(width_px, 0.3), 1.0)
         ink = tuple(
@@ -142,14 +152,13 @@ class _Painter:
         half_px = np.full(len(pixels), max(width_px, 1.0) * self._detail / 2.0)
         self._bars(pixels[:, 0], pixels[:, 1], half_px, (ink[0], ink[1], ink[2]))
 
-    def polygons(self, level: int, corners: NDArray[np.float64], color: Color) -> None:
-        """Polygons (k, n, 3)."""
-        for polygon in self._camera.to_pixels(self._chosen(level, corners)).tolist():
+    def polygons(self, corners: NDArray[np.float64], color: Color) -> None:
+        """Polygons (k, n, 2 or more)."""
+        for polygon in self._camera.to_pixels(self._in_sight(corners)).tolist():
             self._pygame.draw.polygon(self._surface, color, polygon)
 
-    def _chosen(self, level: int, corners: NDArray[np.float64]) -> NDArray[np.float64]:
-        on_level = corners[level_of(corners[:, 0, 2]) == level]
-        return np.asarray(on_level[self._visible(on_level.min(axis=1), on_level.max(axis=1))])
+    def _in_sight(self, corners: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(corners[self._visible(corners.min(axis=1), corners.max(axis=1))])
 
     def _visible(self, low: NDArray[Any], high: NDArray[Any]) -> NDArray[np.bool_]:
         min_x, min_y, max_x, max_y = self._camera.bounds

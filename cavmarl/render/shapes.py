@@ -125,6 +125,7 @@ class RoadShapes:
     centre_lines: Points  # (k, 2, 3) between opposite directions
     arrows: Points  # (k, 4, 3) on lanes before junctions
     stop_lines: Points  # (num_links, 4, 2) the link's part of the bar at the end of its lane
+    roofs: Points  # (k, 4, 2) parts of buildings
 
 
 def road_shapes(network: RoadNetwork) -> RoadShapes:
@@ -158,6 +159,7 @@ def road_shapes(network: RoadNetwork) -> RoadShapes:
         centre_lines=_centre_lines(network),
         arrows=lane_arrows(network),
         stop_lines=_stop_lines(network),
+        roofs=network.roofs,
     )
 
 

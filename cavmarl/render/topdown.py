@@ -6,12 +6,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.errors import ConfigError
 from cavmarl.core.records.codes import DRIVER_SCRIPTED
+from cavmarl.engine.simulation import Simulation
 from cavmarl.handoff.zone_view import ZoneView
 from cavmarl.render.canvas import load_pygame, pixels
 from cavmarl.render.cars import draw_cars, in_view
@@ -24,15 +26,6 @@ from cavmarl.roads.network import RoadNetwork
 
 if TYPE_CHECKING:
     from pygame import Surface
-
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from pygame import Surface
-
-
-from cavmarl.core.errors import ConfigError
-from cavmarl.engine.simulation import Simulation
 
 
 class Window:

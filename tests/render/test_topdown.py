@@ -3,6 +3,7 @@ from __future__ import annotations
 import importlib
 import os
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -81,6 +82,20 @@ def test_vehicle_is_as_long_and_wide_as_it_is(ring: RoadNetwork, car: Car) -> No
     )
     assert np.ptp(columns) + 1 == pytest.approx(12.0 * scale, abs=3.0)
     assert rows.max() - 120 == pytest.approx(1.5 * scale, abs=2.0)
+
+
+def test_buildings_stand_where_they_are(ring: RoadNetwork) -> None:
+    min_x, min_y, max_x, max_y = ring.extent_of(0)
+    x, y = 0.5 * (min_x + max_x), 0.5 * (min_y + max_y)  # within the ring
+    focus = (x - 10.0, y - 7.5, x + 10.0, y + 7.5)
+    house = np.array(
+        [(x - 4.0, y - 3.0), (x + 4.0, y - 3.0), (x + 4.0, y + 3.0), (x - 4.0, y + 3.0)]
+    )
+    built = replace(ring, roofs=house[None], roof_height=np.array([9.0]))
+    nothing = np.zeros(0, VEHICLE)
+    renderers = [TopDownRenderer(network, SIZE, focus=focus) for network in (built, ring)]
+    seen, without = (count(one.frame(nothing), palette.BUILDING) for one in renderers)
+    assert seen - without == pytest.approx(48.0 * renderers[0].camera.scale ** 2, rel=0.05)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import cavmarl
 from cavmarl.engine.spaces import observation_parts
 
 COUNT, RANGE_M = 6, 80.0
-HOUSES = [(-60.0, -8.0), (8.0, 60.0)]  # blind_junction: along both axes
+HOUSES = [(-60.0, -5.0), (5.0, 60.0)]  # blind_junction: along both axes
 
 
 def seen_from(through_walls: bool, steps: int, **keywords: Any) -> Any:

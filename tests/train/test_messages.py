@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -36,3 +38,20 @@ def test_intervals_of_shares_end_at_0_and_100(monkeypatch: pytest.MonkeyPatch) -
     low = five.interval_of(np.array([0.0, 0.003, 0.0]), True)
     assert 0.0 <= low.low < 0.001 < low.high < 0.05
     assert five.interval_of(np.array([0.0, 0.003, 0.0]), False).low < 0.0
+
+
+def test_both_arms_are_trained_with_the_settings_that_are_given(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.syspath_prepend(TRAIN)
+    program = load_program("messages")
+    trained: list[str] = []
+    figures = {key: np.array([1.0]) for key in program.METRICS}
+    monkeypatch.setattr(program, "train", lambda args: trained.append(args.settings) or {})
+    monkeypatch.setattr(program, "drive", lambda *_: figures)
+    monkeypatch.setattr(program, "draw", lambda *_: None)
+    words = ["--config", "blind.yaml", "--env", "blind_junction", "--out", str(tmp_path)]
+    program.compare(*program.parse_args([*words, "--settings", "population.background=4"]))
+    program.compare(*program.parse_args(words))
+    lost = ["v2x.channel.loss=0.0", "v2x.channel.loss=1.0"]
+    assert trained == [*(f"population.background=4,{loss}" for loss in lost), *lost]
