@@ -99,7 +99,7 @@ def draw_stop_lines(
 
 def on_level(corners: NDArray[np.float64], level: int) -> NDArray[np.float64]:
     """Those of the shapes (k, n, 3) that begin on a level."""
-    return corners[level_of(corners[:, 0, 2]) == level]
+    return np.asarray(corners[level_of(corners[:, 0, 2]) == level])
 
 
 class _Painter:
