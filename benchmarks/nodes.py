@@ -48,10 +48,10 @@ def measure(
         raise ConfigError(f"{steps} steps, {repeats} turns: must be at least 1")
     sizes, counts = numbers_of("--vehicles", vehicles), numbers_of("--nodes", nodes)
     added = [float(text) * 1e-3 for text in latencies.split(",") if text]
-    if len(sizes) < 2 or min(sizes) < PER_JUNCTION * 16 or 2 not in counts:
+    if len(set(sizes)) < 2 or min(sizes) < PER_JUNCTION * 16 or not {1, 2} <= set(counts):
         raise ConfigError(
             f"--vehicles {vehicles} --nodes {nodes}: name two sizes from {PER_JUNCTION * 16} on, "
-            "and among the nodes 2"
+            "and among the nodes 1 and 2: the model is fitted to these"
         )
     samples: list[NodeSample] = []
     with tempfile.TemporaryDirectory() as folder:

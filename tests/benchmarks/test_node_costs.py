@@ -7,7 +7,9 @@ from dataclasses import asdict, replace
 
 import pytest
 
+from benchmarks import nodes as benchmark
 from benchmarks.node_costs import NodeCosts, NodeSample, borders, fitted
+from cavmarl.core.errors import ConfigError
 
 KNOWN = NodeCosts(
     tick_s=2e-4,
@@ -79,3 +81,12 @@ def test_borders_of_a_square_of_zones(side: int) -> None:
 def test_too_few_runs_are_refused() -> None:
     with pytest.raises(ValueError, match="two sizes undivided"):
         fitted([sample(1_000, nodes) for nodes in (0, 1, 2)])
+
+
+@pytest.mark.parametrize(
+    ("vehicles", "nodes"),
+    [("2500", "1,2"), ("2500,2500", "1,2"), ("100,2500", "1,2"), ("2500,9000", "2")],
+)
+def test_too_few_runs_are_refused_before_the_first(vehicles: str, nodes: str) -> None:
+    with pytest.raises(ConfigError, match="two sizes from 400 on, and among the nodes 1 and 2"):
+        benchmark.measure(vehicles, nodes)
