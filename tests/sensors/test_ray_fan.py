@@ -51,6 +51,16 @@ def test_columns_do_not_depend_on_which_are_cast_together(
     assert (parts == whole).all()
 
 
+def runs_within_a_wall(walls: NDArray[np.void], start: Floats, ray: Floats) -> bool:
+    """Whether a ray begins on the line of a wall and is parallel to it, within a micrometre a m."""
+    along = np.array([walls["bx"] - walls["ax"], walls["by"] - walls["ay"]])
+    before = np.array([start[0] - walls["ax"], start[1] - walls["ay"]])
+    least = 1e-6 * np.hypot(*along)
+    begins = np.abs(along[0] * before[1] - along[1] * before[0]) <= least
+    parallel = np.abs(along[0] * ray[1] - along[1] * ray[0]) <= least
+    return bool((begins & parallel).any())
+
+
 @given(
     crowds(most=6), wall_sets(), mounts(), AZIMUTHS,
     st.sampled_from([(0.0,), (-0.4, -0.1, 0.2)]), st.sampled_from([5.0, 60.0]),
@@ -74,6 +84,8 @@ def test_rays_equal_twin(
     start = matrix[:, 3]
     for a, e in np.ndindex(*hits.shape):
         hit = hits[a, e]
+        if runs_within_a_wall(walls, start, rays[a, e]):
+            continue  # rounding decides whether, and where, it meets that wall
         # Rounding decides whether a ray that grazes a side meets it: sizes differ by a micrometre.
         nearer, further = (
             naive.trace(rows, 0, walls, start, rays[a, e], range_m, margin)
