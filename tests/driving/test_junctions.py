@@ -288,7 +288,7 @@ def test_who_still_moves_on_the_junction_will_need_room_beyond_it(scene: Make) -
     assert lanes[here["first"]["lane"]] == "E_out_0", "for the first one there was room"
 
 
-def test_who_waits_inside_goes_before_one_that_cannot_come_and_so_ends_a_ring(
+def test_a_vehicle_inside_goes_before_one_that_cannot_come_which_ends_a_ring(
     crossing: Callable[..., Path],
 ) -> None:
     """The left turn stands in the way of one that stands in the way of one that it lets pass."""
@@ -325,7 +325,7 @@ def test_who_waits_inside_goes_before_one_that_cannot_come_and_so_ends_a_ring(
     assert through["left"] < 10.0
 
 
-def test_who_stands_at_the_very_start_of_the_junction_is_not_driven_into(scene: Make) -> None:
+def test_a_vehicle_at_the_very_start_of_the_junction_is_not_driven_into(scene: Make) -> None:
     here = scene("priority")
     network = here.simulation.network
     link = next(

@@ -1,6 +1,6 @@
 """`GhostStream`: the ghosts that go to another node and come from it, tick by tick.
 
-Both ends keep those of the frame before: a frame says what is different.
+Both ends keep the ghosts of the frame before; a frame has the words that have changed.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class GhostStream:
         """Take those of a frame of the other one; where in it they end.
 
         Raises:
-            MessageError: they are none.
+            MessageError: the words are not those of so many ghosts.
         """
         taken, size = self._taken, 8 * self._shape[0] * self._shape[1] * 2
         num = int.from_bytes(data[:8], "little")
@@ -112,5 +112,5 @@ class GhostStream:
             self._zoned, *self._words, side, self._zones, counts, taken.before, taken.now, like,
             bits, words,
         ):  # fmt: skip
-            raise MessageError(f"{total} ghosts in {num} words are none")
+            raise MessageError(f"a frame of {total} ghosts cannot have {num} words")
         return int(at + 16 * total + 8 * num)

@@ -1,8 +1,8 @@
 """Ghosts that go from process to process: packed by their owners, taken where they are seen.
 
 `exchange` leaves the ghosts of a zone that another process hosts behind that zone's owned rows, of
-which there are none in this one. Of a ghost that went there in the frame before, too, only words go
-that are others now. A ghost is V + S + 2 words: its row, its step, the lane of that, its world.
+which there are none in this one. Of a ghost that was in the frame before only the words that have
+changed are sent. A ghost is V + S + 2 words: its row, its step, the lane of that, its world.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from cavmarl.core.records.arrays import Zoned
 
 ID = 0  # the word of a row that names the vehicle
 AFTER = 2  # words of a ghost behind its row and its step
-MOST = 64  # words of a ghost: which of them are others is said in one word
+MOST = 64  # words of a ghost: one word has a bit for each that has changed
 
 Words = NDArray[np.int64]
 
@@ -47,9 +47,9 @@ def pack_ghosts(
     before: Words,  # (p, V + S + 2) the ghosts of the frame before
     slots: NDArray[np.int32],  # scratch, a power of two and more than p
     now: Words,  # (n, V + S + 2) written: the ghosts
-    like: NDArray[np.int64],  # (n,) written: the one before that it is told by; -1: whole
-    others: NDArray[np.uint64],  # (n,) written: a bit for each word that is another one
-    words: Words,  # written: those
+    like: NDArray[np.int64],  # (n,) written: where in `before` it was; -1: it is sent whole
+    changed: NDArray[np.uint64],  # (n,) written: a bit for each word that has changed
+    words: Words,  # written: those words
 ) -> int:
     """Pack the ghosts that `count_ghosts` has counted; how many words there are."""
     _fill_slots(before, slots)
@@ -74,7 +74,7 @@ def pack_ghosts(
                         words[num] = ghost[c]
                         num += 1
                 like[n] = found
-                others[n] = bits
+                changed[n] = bits
                 n += 1
     return num
 
@@ -91,7 +91,7 @@ def take_ghosts(
     before: Words,  # (p, V + S + 2) the ghosts of the frame before
     now: Words,  # (n, V + S + 2) written: the ghosts
     like: NDArray[np.int64],
-    others: NDArray[np.uint64],
+    changed: NDArray[np.uint64],
     words: Words,
 ) -> bool:
     """Put what another process has packed behind the rows of zones of this one.
@@ -101,7 +101,7 @@ def take_ghosts(
     Returns:
         whether it is what `pack_ghosts` makes; else nothing is put anywhere.
     """
-    if not _unpack(before, now, like, others, words):
+    if not _unpack(before, now, like, changed, words):
         return False
     row = rows.shape[4]
     at = row + steps.shape[3]
@@ -134,7 +134,7 @@ def _copy(source: Words, first: int, target: Words, to: int, num: int) -> None:
 
 @inlined_kernel
 def _unpack(
-    before: Words, now: Words, like: NDArray[np.int64], others: NDArray[np.uint64], words: Words
+    before: Words, now: Words, like: NDArray[np.int64], changed: NDArray[np.uint64], words: Words
 ) -> bool:
     """Write the ghosts of a frame to `now`."""
     num = 0
@@ -142,7 +142,7 @@ def _unpack(
         found = like[n]
         if found >= before.shape[0]:
             return False
-        bits = others[n]
+        bits = changed[n]
         for c in range(now.shape[1]):
             if bits >> np.uint64(c) & np.uint64(1):
                 if num == words.size:
