@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.records.rows import ENTER_REACH_M, SWEPT_BEYOND_M
+from cavmarl.core.records.rows import ENTER_REACH_M, SIZE_LENGTHS_M, SWEPT_BEYOND_M
 from cavmarl.driving.kernels.announcing import APPROACH_M
 from cavmarl.driving.kernels.junctions import EXIT_LOOK_M
 from cavmarl.driving.kernels.lane_choice import LOOK_BACK_M
@@ -48,6 +48,7 @@ class Looks:
         self.tail: dict[int, float] = defaultdict(lambda: math.inf)
         self.back: dict[int, float] = defaultdict(lambda: math.inf)
         self.line: dict[int, float] = defaultdict(lambda: math.inf)
+        self.room: dict[int, float] = defaultdict(lambda: math.inf)
         self.into: dict[int, list[int]] = defaultdict(list)
         for lane in range(len(self.lengths)):
             for other in self._after(lane):
@@ -57,8 +58,16 @@ class Looks:
         ahead = self._along(view_m)
         asked = self._asked(ahead, see_m)
         foes = {int(conflict["foe"]) for link in asked for conflict in self._conflicts(link)}
-        foes |= {int(sweep["foe"]) for link in asked for sweep in self._sweeps(link)}
-        self._at_lines(foes)
+        size = sum(2.0 * half_m > length for length in SIZE_LENGTHS_M)
+        swept = {
+            int(sweep["foe"])
+            for link in asked
+            for sweep in self._sweeps(link)
+            if max(sweep["own"], sweep["other"]) <= size
+        }
+        foes |= swept
+        self._at_lines(foes, self.line)
+        self._at_lines(swept, self.room)
         for link in asked | foes:
             *inside, lane = self._path(link)
             for each in inside:
@@ -122,7 +131,7 @@ class Looks:
             link for lane in lanes for beside in self._beside(lane) for link in self._links(beside)
         }
 
-    def _at_lines(self, foes: set[int]) -> None:
+    def _at_lines(self, foes: set[int], places: dict[int, float]) -> None:
         """See who announces itself at the lines of foes."""
         lines: Ways = {}
         for link in foes:
@@ -130,7 +139,7 @@ class Looks:
         for lane, way in self._ways(lines, self._before, APPROACH_M).items():
             for beside in self._beside(lane):
                 line = way + self.lengths[beside] - ROUNDING_M
-                self.line[beside] = min(self.line[beside], line)
+                places[beside] = min(places[beside], line)
 
     def _see(self, lane: int, first: float, last: float) -> None:
         for beside in self._beside(lane):

@@ -20,9 +20,12 @@ ARM_M = 150
 NODES = {"W": (-ARM_M, 0), "E": (ARM_M, 0), "S": (0, -ARM_M), "N": (0, ARM_M)}
 
 
-def build_crossing(folder: Path, kind: str, side_lanes: int = 1) -> Path:
-    """A west-east main road and a south-north side road that cross, by SUMO's type of the node."""
-    target = folder / f"{kind}_{side_lanes}.net.xml"
+def build_crossing(folder: Path, kind: str, side_lanes: int = 1, only_in: str = "") -> Path:
+    """A west-east main road and a south-north side road that cross, by SUMO's type of the node.
+
+    No road leads out to the arms `only_in`.
+    """
+    target = folder / f"{kind}_{side_lanes}{only_in}.net.xml"
     if target.exists():
         return target
     nodes = "".join(f'<node id="{n}" x="{x}" y="{y}"/>' for n, (x, y) in NODES.items())
@@ -36,6 +39,7 @@ def build_crossing(folder: Path, kind: str, side_lanes: int = 1) -> Path:
             ("N", 1, side_lanes),
         )
         for way, start, end in (("in", arm, "c"), ("out", "c", arm))
+        if way == "in" or arm not in only_in
     )
     (folder / "c.nod.xml").write_text(
         f'<nodes>{nodes}<node id="c" x="0" y="0" type="{kind}"/></nodes>'

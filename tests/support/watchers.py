@@ -13,7 +13,9 @@ __all__ = ["blank_looks", "looks_of"]
 def blank_looks(shape: int | tuple[int, ...]) -> NDArray[np.void]:
     """LOOK of drivers who ask about nobody."""
     looks = np.zeros(shape, dtype=LOOK)
-    looks["head"], looks["tail"], looks["back"], looks["line"] = -np.inf, np.inf, np.inf, np.inf
+    looks["head"] = -np.inf
+    for place in ("tail", "back", "line", "room"):
+        looks[place] = np.inf
     return looks
 
 

@@ -42,11 +42,13 @@ EDGE = """<edge id="e{n}" from="j{n}" to="j{end}">
   </edge>"""
 
 
-def looks_of(roads: RoadNetwork, rect: tuple[float, float, float, float]) -> NDArray[np.void]:
+def looks_of(
+    roads: RoadNetwork, rect: tuple[float, float, float, float], half_m: float = HALF_M
+) -> NDArray[np.void]:
     looks = np.zeros(len(roads.lanes), dtype=LOOK)
     scratch = make_scratch(len(roads.lanes), len(roads.links))
     for _ in range(2):  # what the scratch held before does not matter
-        find_looks(roads.arrays, np.array(rect), VIEW_M, SEE_M, HALF_M, scratch, looks)
+        find_looks(roads.arrays, np.array(rect), VIEW_M, SEE_M, half_m, scratch, looks)
     return looks
 
 
@@ -54,24 +56,28 @@ def looks_of(roads: RoadNetwork, rect: tuple[float, float, float, float]) -> NDA
 @pytest.mark.parametrize(
     "part", [(0.0, 0.0, 0.4, 1.0), (0.3, 0.45, 0.8, 0.7), (0.5, 0.5, 0.6, 0.6)]
 )
+@pytest.mark.parametrize("half_m", [2.5, HALF_M])
 def test_kernel_sees_what_sets_of_lanes_see(
-    name: str, part: tuple[float, float, float, float]
+    name: str, part: tuple[float, float, float, float], half_m: float
 ) -> None:
     """Same heads, tails and lines, as finely as the twin looks at lanes."""
     roads = network(name)
     min_x, min_y, max_x, max_y = roads.extent_m
     low, high = np.array([min_x, min_y] * 2), np.array([max_x, max_y] * 2)
     rect = tuple((low + np.array(part) * (high - low)).tolist())
-    found, twin = looks_of(roads, rect), Looks(roads, rect, VIEW_M, SEE_M, HALF_M)
+    found, twin = looks_of(roads, rect, half_m), Looks(roads, rect, VIEW_M, SEE_M, half_m)
     for field, told in (
         ("head", twin.head),
         ("tail", twin.tail),
         ("back", twin.back),
         ("line", twin.line),
+        ("room", twin.room),
     ):
         expected = np.array([told[lane] for lane in range(len(roads.lanes))])
         np.testing.assert_allclose(found[field], expected, atol=2.0 * STEP_M, err_msg=field)
     assert np.isfinite(found["line"]).any() == (name == "grid4x4")
+    # On these maps vans and buses alone sweep over ways beside theirs.
+    assert np.isfinite(found["room"]).any() == (name == "grid4x4" and half_m == HALF_M)
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.zones.kernels.borders import Borders
 from cavmarl.zones.kernels.ghost_exchange import exchange, gather
 from cavmarl.zones.kernels.handoff import make_book
-from cavmarl.zones.kernels.zone_lookup import Halo
+from cavmarl.zones.kernels.zone_lookup import LOOK, Halo
 from cavmarl.zones.partition.zone_halo import inner_parts, lane_watchers, zone_halo
 from cavmarl.zones.partition.zone_layouts import cut_map
 from cavmarl.zones.partition.zone_partition import ZonePartition
@@ -39,7 +39,8 @@ def asked_at_random(
     """What zones ask of lanes, mostly nothing."""
     looks = blank_looks((partition.count, len(roads.lanes)))
     length = roads.lanes["length_m"]
-    for field, nothing in (("head", -np.inf), ("tail", np.inf), ("back", np.inf), ("line", np.inf)):
+    for field in LOOK.names or ():
+        nothing = -np.inf if field == "head" else np.inf
         place = rng.uniform(0.0, 1.0, looks.shape) * length
         looks[field] = np.where(rng.random(looks.shape) < 0.2, place, nothing)
     start, watchers = lane_watchers(partition, roads.lanes, looks, SURE_M + ASIDE_M)
@@ -93,7 +94,8 @@ def expected_of(
         idle |= row["hold"] == HOLD_NONE and row["wait_s"] > 3.0
         idle &= row["speed"] == 0.0 and row["driver"] == DRIVER_BACKGROUND
         coming &= not idle or look["line"] - s <= LINE_M
-        if asked or coming or look["back"] - s < announced_m(row["speed"]):
+        coming |= min(look["back"], look["room"]) - s < announced_m(row["speed"])
+        if asked or coming:
             found.append(int(row["id"]))
     return sorted(found)
 

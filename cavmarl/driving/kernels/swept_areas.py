@@ -30,7 +30,8 @@ GIVE_UP_S = 60.0  # one that has stood so long goes on, whatever is in the area
 
 
 @inlined_kernel
-def _size(half: float) -> int:
+def size_of(half: float) -> int:
+    """The size class of a vehicle, of half its length in m."""
     return int(2.0 * half > VAN_M) + int(2.0 * half > BUS_M)
 
 
@@ -54,7 +55,7 @@ def swept_stop(
 ) -> float:
     """How far beyond the stop line row i's front may go, in m; inf where nothing is in the way."""
     row = rows[i]
-    size = _size(0.5 * row["length"])
+    size = size_of(0.5 * row["length"])
     rear = place - _body_m(0.5 * row["length"], size)
     stop = math.inf
     first = roads.links[link]["first_sweep"]
@@ -66,7 +67,7 @@ def swept_stop(
             continue
         for n in range(scratch.link_start[sweep["foe"]], scratch.link_end[sweep["foe"]]):
             foe = scratch.approach[n]
-            if foe["row"] == i or _size(foe["half"]) != sweep["other"]:
+            if foe["row"] == i or size_of(foe["half"]) != sweep["other"]:
                 continue
             if _is_in_the_way(rows, row, foe, sweep, place, room_m):
                 # One that is in the area, too, stops where it is. Behind one that stands, or may
@@ -104,7 +105,7 @@ def wait_place(roads: RoadArrays, link: int, half: float) -> float:
     That is the map's waiting position. Long vehicles wait up to `WAIT_EARLIER_M` before it where
     others would sweep over it: cars go back only where one comes, see `swept_stop`.
     """
-    size = _size(half)
+    size = size_of(half)
     wait_m = place = roads.links[link]["wait_m"]
     if size == 0:
         return float(wait_m)

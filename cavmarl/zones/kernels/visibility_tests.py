@@ -23,6 +23,7 @@ from cavmarl.core.records.rows import ENTER_REACH_M, SWEPT_BEYOND_M
 from cavmarl.driving.kernels.announcing import APPROACH_M
 from cavmarl.driving.kernels.junctions import EXIT_LOOK_M
 from cavmarl.driving.kernels.lane_choice import LOOK_BACK_M
+from cavmarl.driving.kernels.swept_areas import size_of
 from cavmarl.zones.kernels.zone_lookup import squared_distance
 
 AT_LINE_M = 0.2  # so near before a line a vehicle may be about to drive over it
@@ -39,19 +40,21 @@ class VisibilityScratch(NamedTuple):
     ahead: NDArray[np.float64]  # (L,) way from a driver of the zone to the start of a lane, m
     behind: NDArray[np.float64]  # (L,) way from the end of a lane to a vehicle with followers, m
     to_line: NDArray[np.float64]  # (L,) way from the end of a lane to the line of a foe, m
+    to_room: NDArray[np.float64]  # (L,) the same, of one that is left room for
     beyond: NDArray[np.float64]  # (L,) way from a junction that is asked about to a lane, m
     asked: NDArray[np.bool_]  # (K,) links that a driver of the zone may want to enter
     foe: NDArray[np.bool_]  # (K,) their foes
+    swept: NDArray[np.bool_]  # (K,) of these those that vehicles leave room for
     waits: NDArray[np.bool_]  # (L,) to be looked at
     following: NDArray[np.int32]  # (L,) which lane is to be looked at then
 
 
 def make_scratch(num_lanes: int, num_links: int) -> VisibilityScratch:
-    first, last, ahead, behind, to_line, beyond = np.full((6, num_lanes), np.inf)
-    asked, foe = np.zeros((2, num_links), dtype=np.bool_)
+    first, last, ahead, behind, to_line, to_room, beyond = np.full((7, num_lanes), np.inf)
+    asked, foe, swept = np.zeros((3, num_links), dtype=np.bool_)
     waits, following = np.zeros(num_lanes, dtype=np.bool_), np.zeros(num_lanes, dtype=np.int32)
     return VisibilityScratch(
-        first, last, ahead, behind, to_line, beyond, asked, foe, waits, following
+        first, last, ahead, behind, to_line, to_room, beyond, asked, foe, swept, waits, following
     )
 
 
@@ -238,11 +241,13 @@ def _look_along(
 
 
 @kernel
-def _find_lines(roads: RoadArrays, see_m: float, scratch: VisibilityScratch) -> None:
+def _find_lines(roads: RoadArrays, see_m: float, half_m: float, scratch: VisibilityScratch) -> None:
     """Which links the zone's drivers may ask about, and which are the foes of these."""
+    largest = size_of(half_m)
     for link in range(roads.links.shape[0]):
         scratch.asked[link] = False
         scratch.foe[link] = False
+        scratch.swept[link] = False
     for lane in range(roads.lanes.shape[0]):
         row = roads.lanes[lane]
         own = scratch.first[lane] <= scratch.last[lane]
@@ -260,7 +265,10 @@ def _find_lines(roads: RoadArrays, see_m: float, scratch: VisibilityScratch) -> 
                 scratch.foe[roads.conflicts[c]["foe"]] = True
             first = roads.links[link]["first_sweep"]
             for k in range(first, first + roads.links[link]["num_sweeps"]):
-                scratch.foe[roads.sweeps[k]["foe"]] = True
+                sweep = roads.sweeps[k]
+                if sweep["own"] <= largest and sweep["other"] <= largest:
+                    scratch.foe[sweep["foe"]] = True
+                    scratch.swept[sweep["foe"]] = True
 
 
 @kernel
@@ -280,6 +288,7 @@ def _look_at_junctions(
     """Vehicles that come to the lines of foes, are on a junction, or stand behind it."""
     for lane in range(roads.lanes.shape[0]):
         scratch.to_line[lane] = math.inf
+        scratch.to_room[lane] = math.inf
         scratch.beyond[lane] = math.inf
     for link in range(roads.links.shape[0]):
         if not (scratch.asked[link] or scratch.foe[link]):
@@ -296,7 +305,10 @@ def _look_at_junctions(
             edge = roads.edges[roads.lanes[row["from_lane"]]["edge"]]
             for other in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
                 scratch.to_line[other] = 0.0
+                if scratch.swept[link]:
+                    scratch.to_room[other] = 0.0
     _spread(roads, False, APPROACH_M, scratch.to_line, scratch)
+    _spread(roads, False, APPROACH_M, scratch.to_room, scratch)
     _spread(roads, True, EXIT_LOOK_M, scratch.beyond, scratch)
     for lane in range(roads.lanes.shape[0]):
         if scratch.beyond[lane] <= EXIT_LOOK_M:
@@ -306,6 +318,8 @@ def _look_at_junctions(
             for other in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
                 line = scratch.to_line[lane] + roads.lanes[other]["length_m"]
                 looks[other]["line"] = min(looks[other]["line"], line - ROUNDING_M)
+                room = scratch.to_room[lane] + roads.lanes[other]["length_m"]
+                looks[other]["room"] = min(looks[other]["room"], room - ROUNDING_M)
 
 
 @kernel
@@ -326,9 +340,10 @@ def find_looks(
         looks[lane]["tail"] = math.inf
         looks[lane]["back"] = math.inf
         looks[lane]["line"] = math.inf
+        looks[lane]["room"] = math.inf
     _find_own(roads, rect, scratch)
     _look_along(roads, view_m, see_m, scratch, looks)
-    _find_lines(roads, see_m, scratch)
+    _find_lines(roads, see_m, half_m, scratch)
     _look_at_junctions(roads, half_m, scratch, looks)
 
 

@@ -1,0 +1,117 @@
+"""Vehicles put by hand on the arms of a crossing, in one zone and divided, bit for bit alike."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.roads.sumo_net.reader import read_network
+from cavmarl.zones.partition.zone_file import write_zones
+from cavmarl.zones.partition.zone_partition import ZonePartition
+from tests.support.demand_worlds import make
+from tests.support.driving import drive, start
+from tests.support.junction_scenes import ARM_M, NODES
+from tests.support.traffic import on_lane
+
+CLASSES = {"car": "passenger", "bus": "bus"}
+MARGIN_M = 20.0  # beyond the arms' ends, within the zones
+TICK_S = 0.05
+# No vehicle of the file departs in the time of a scene: it says which types and ways there are.
+LATE_S = 900
+CLOCK = {"clock.sim_dt_s": TICK_S, "clock.ctrl_dt_s": TICK_S, "horizon_s": 200.0}
+# Zones see no further than bodies touch, but for vehicles that drivers ask about.
+CLOCK |= {"zones.approach_ticks": 2}
+
+
+class DividedScene:
+    """The same vehicles in one zone and in the four that meet at a place, m from the middle."""
+
+    def __init__(
+        self, path: Path, folder: Path, corner_m: tuple[float, float], kinds: tuple[str, ...]
+    ) -> None:
+        demand = folder / "late.rou.xml"
+        edges = read_network(path).edge_ids
+        demand.write_text(
+            "<routes>"
+            + "".join(f'<vType id="{kind}" vClass="{CLASSES[kind]}" sigma="0"/>' for kind in kinds)
+            + "".join(
+                f'<vehicle id="{kind}{a}{b}" type="{kind}" depart="{LATE_S}">'
+                f'<route edges="{a}_in {b}_out"/></vehicle>'
+                for kind in kinds
+                for a in NODES
+                for b in NODES
+                if a != b and f"{b}_out" in edges
+            )
+            + "</routes>"
+        )
+        self.kinds = ("generated", *kinds)  # by VEHICLE_TYPE row
+        x, y = (ARM_M + middle for middle in corner_m)
+        low, high = -MARGIN_M, 2.0 * ARM_M + MARGIN_M
+        rects = [[low, low, x, y], [x, low, high, y], [low, y, x, high], [x, y, high, high]]
+        layout = folder / "four.json"
+        write_zones(layout, ZonePartition((low, low, high, high), np.array(rects)))
+        four = {"zones.count": 4, "zones.layout": str(layout)}
+        self.whole, self.divided = (
+            make(path, [demand], overrides=CLOCK | zones) for zones in ({}, four)
+        )
+        for simulation in (self.whole, self.divided):
+            start(simulation, seed=0)
+        self.rows: list[NDArray[np.void]] = []
+        self.names: list[str] = []
+
+    def put(self, name: str, way: str, front_m: float, kind: str = "car", **fields: Any) -> None:
+        """A vehicle on a way such as "W_in_0 N_out_0", its front `front_m` beyond its line."""
+        network, plans = self.whole.network, self.whole._tick.traffic.plans
+        travel = self.whole._tick.traffic.travel
+        before, after = (network.lane_ids.index(lane) for lane in way.split())
+        links = network.links
+        (link,) = np.flatnonzero((links["from_lane"] == before) & (links["to_lane"] == after))
+        goal = int(np.flatnonzero(plans["link"][:, before] == link)[0])
+        vtype = self.kinds.index(kind)
+        length, width = (float(travel.types[vtype][field]) for field in ("length", "width"))
+        lane, place = before, float(network.lanes["length_m"][before]) + front_m - 0.5 * length
+        while place >= network.lanes["length_m"][lane]:
+            place -= float(network.lanes["length_m"][lane])
+            lane = int(plans["next"][goal, lane])
+            fields = fields | {"link": link}
+        row = on_lane(
+            network, lane, place, travel, goal=goal, vtype=vtype, length=length, width=width,
+            id=len(self.rows), **fields,
+        )  # fmt: skip
+        row["to_go"] = plans[goal, lane]["to_go"] - place
+        self.rows.append(row)
+        self.names.append(name)
+
+    def begin(self) -> None:
+        """Give both the vehicles that were put."""
+        rows = np.concatenate(self.rows)
+        for simulation in (self.whole, self.divided):
+            simulation.gate.next_id[0] = len(rows)
+            saved = [array.copy() for array in simulation.save()]
+            zones = simulation._tick.division.count
+            saved[-zones:] = [rows, *(rows[:0] for _ in range(1, zones))]
+            simulation.load(saved)
+
+    def run(self, seconds: float) -> Iterator[dict[str, np.void]]:
+        """Yields the vehicles by name after each tick, which both have driven alike."""
+        for tick in range(round(seconds / TICK_S)):
+            for simulation in (self.whole, self.divided):
+                drive(simulation)
+            assert self.divided.state_hash() == self.whole.state_hash(), f"tick {tick}"
+            vehicles = self.whole.vehicles()
+            assert (vehicles["hit"] < 0).all(), "a crash"
+            yield {self.names[row["id"]]: row for row in vehicles}
+
+    def ghosts(self, name: str) -> set[str]:
+        """The names of the vehicles that the zone of one sees of others."""
+        division, own = self.divided._tick.division, self.names.index(name)
+        for zone in range(division.count):
+            worlds = division._shards[zone].worlds
+            owned, rows = int(worlds.num_owned[0]), worlds.rows[0, : worlds.num_rows[0]]
+            if own in rows["id"][:owned]:
+                return {self.names[number] for number in rows["id"][owned:]}
+        raise KeyError(name)

@@ -1,0 +1,78 @@
+"""Junctions that a border runs through, or past: drivers decide as in one zone, bit for bit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from cavmarl.core.records.codes import HOLD_EXIT_BLOCKED, HOLD_YIELD
+from tests.support.divided_scenes import DividedScene
+from tests.support.junction_scenes import build_crossing
+
+CRAWLS = 1e-3  # of the limit: for others such a vehicle stands
+
+
+@pytest.fixture(scope="module")
+def priority(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build_crossing(tmp_path_factory.mktemp("crossing"), "priority")
+
+
+@pytest.mark.parametrize(
+    "corner_m", [(0.0, 0.0), (1.6, -1.6), (-3.0, 4.5), (7.5, -7.5), (-9.0, 9.0), (14.0, 3.0)]
+)
+def test_a_border_through_or_beside_a_junction_that_is_blocked_changes_nothing(
+    priority: Path, tmp_path: Path, corner_m: tuple[float, float]
+) -> None:
+    """One that stays on the junction blocks three others; the fourth need not wait for those."""
+    here = DividedScene(priority, tmp_path, corner_m, ("car",))
+    here.put("stays", "W_in_0 E_out_0", 9.0, wait_s=10.0, speed_factor=CRAWLS)
+    here.put("held", "S_in_0 N_out_0", 2.0, wait_s=10.0)
+    here.put("north", "N_in_0 E_out_0", -1.0, wait_s=10.0)
+    here.put("west", "W_in_0 N_out_0", -1.0, wait_s=10.0)
+    here.put("east", "E_in_0 W_out_0", -1.0, wait_s=10.0)
+    here.begin()
+    holds: dict[str, set[int]] = {name: set() for name in here.names}
+    for vehicles in here.run(8.0):
+        for name, row in vehicles.items():
+            holds[name].add(int(row["hold"]))
+    assert all(HOLD_EXIT_BLOCKED in holds[name] for name in ("held", "north", "west"))
+    assert HOLD_YIELD in holds["west"]
+    lanes = here.whole.network.lane_ids
+    assert {name for name, row in vehicles.items() if lanes[row["lane"]] == "W_out_0"} == {"east"}
+
+
+def test_no_driver_waits_for_one_that_cannot_come_which_its_zone_does_not_see(
+    tmp_path: Path,
+) -> None:
+    # No lane leads to the side road's zone on which another vehicle could follow one of it.
+    path = build_crossing(tmp_path, "priority", only_in="S")
+    here = DividedScene(path, tmp_path, (-1.0, -24.0), ("car",))
+    here.put("stays", "E_in_0 W_out_0", 23.0, speed_factor=CRAWLS)
+    here.put("held", "E_in_0 W_out_0", -1.0, wait_s=10.0, hold=HOLD_EXIT_BLOCKED)
+    here.put("side", "S_in_0 N_out_0", -25.0, speed=8.0)
+    here.begin()
+    for vehicles in here.run(0.5):
+        assert vehicles["held"]["hold"] == HOLD_EXIT_BLOCKED
+        assert "held" not in here.ghosts("side")
+        assert vehicles["side"]["speed"] > 8.0, "it does not wait"
+
+
+@pytest.mark.parametrize("is_second", [False, True])
+def test_room_is_left_for_a_bus_that_stands_in_a_queue_behind_a_border(
+    priority: Path, tmp_path: Path, is_second: bool
+) -> None:
+    """It turns over the place where the other would stop, and is let stand: it does not come."""
+    here = DividedScene(priority, tmp_path, (6.0, -22.0), ("car", "bus"))
+    here.put("waits", "S_in_0 N_out_0", -11.0, "bus", speed=8.0)
+    here.put("queued", "E_in_0 S_out_0", -22.5, "bus", wait_s=10.0)
+    if is_second:
+        here.put("first", "E_in_0 W_out_0", -12.0, wait_s=10.0)
+    here.put("main", "W_in_0 E_out_0", -30.0, speed=10.0)
+    here.begin()
+    assert "queued" in here.ghosts("waits")
+    first = next(here.run(1.0))
+    assert first["waits"]["hold"] == HOLD_YIELD
+    assert first["waits"]["speed"] < 7.8, "it brakes for a place before its line"
+    for _ in here.run(3.0):
+        pass
