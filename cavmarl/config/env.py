@@ -191,12 +191,16 @@ class EnvConfig(Section, key=""):
                 "there are no messages: set v2x.enabled to true, or this to 0",
             )
             check(count <= most, key, count, f"v2x.inbox.{name} = {most} keeps fewer")
-        check(
-            self.v2x.enabled or not self.sensors.messages.signal,
-            "sensors.messages.signal",
-            True,
-            "there are no messages: set v2x.enabled to true, or this to false",
-        )
+        for key, reads in (
+            ("messages.signal", self.sensors.messages.signal),
+            ("conflicts.heard", self.sensors.conflicts.heard),
+        ):
+            check(
+                self.v2x.enabled or not reads,
+                f"sensors.{key}",
+                True,
+                "there are no messages: set v2x.enabled to true, or this to false",
+            )
 
     def _check_sumo(self) -> None:
         """Refuse what cannot be together with SUMO as global traffic."""

@@ -305,10 +305,15 @@ class ConflictsConfig(Section, key="sensors.conflicts"):
     Attributes:
         count: how many at most; 0 switches the sensor off.
         range_m: distance up to which a vehicle is seen.
+        through_walls: false hides vehicles whose centre lies behind a wall of `map.buildings`.
+        heard: true adds those that are not seen and that a message tells of (`v2x`), where they are
+            if they have gone on as it says; and two numbers a vehicle, see `seen` and `age`.
     """
 
     count: Annotated[int, Whole(0, 64)] = 0
     range_m: Annotated[float, Within(1.0, 300.0)] = 60.0
+    through_walls: bool = True
+    heard: bool = False
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ from cavmarl.sensors.observed import layout, optional_arrays, sensor_arrays
 from cavmarl.shards.kernels.world_phases import suggest
 from cavmarl.shards.registered_outputs import RegisteredOutputs
 from cavmarl.traffic.kernels.leaving import leave
-from cavmarl.v2x.kernels.v2x_records import Mail
+from cavmarl.v2x.kernels.v2x_records import REPORT, Mail
 from cavmarl.zones.kernels.zone_lookup import OUTER, Halo, ZoneArrays
 
 CELL_M = 25.0  # of the spatial index over vehicles
@@ -112,7 +112,8 @@ class Shard:
         self.travel = travel
         self.lane_grid: LaneGrid = lane_grid(network)
         self.sensors = sensor_arrays(config.sensors, network)
-        self._further = optional_arrays(config.sensors, network, plans)
+        most_told = config.v2x.inbox.objects
+        self._further = optional_arrays(config.sensors, network, plans, most_told)
         self._registered = RegisteredOutputs(config, network)
         num_worlds, capacity = zoned.rows.shape[2:]
         self._floating = len(network.maps) > 1
@@ -146,6 +147,7 @@ class Shard:
         self.side = self.next_side = 0  # in which of them the committed rows are
         self.outputs = outputs
         self.mail: Mail | None = None  # what agents have been told over the air; None: no messages
+        self._untold = np.zeros((num_worlds, config.population.num_ids, 0), REPORT)
         self._messages_at = layout(config.sensors).get("messages")
         self.target_speeds = np.array(config.action.target_speeds_mps)
         self.discrete = config.action.kind == "discrete"
@@ -198,6 +200,7 @@ class Shard:
             clock = self.config.clock
             self._call_observe_further(
                 self.roads, self.travel, self.lane_grid, self.worlds, self.grid, self._further,
+                self._untold if self.mail is None else self.mail.objects,
                 clock.sim_dt_s, clock.ticks_per_step, stack, chosen, observations,
             )  # fmt: skip
         if self.mail is not None and self._messages_at is not None:

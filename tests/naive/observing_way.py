@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -212,22 +213,31 @@ def conflicts(
     shown: dict[int, str],
     count: int,
     range_m: float,
+    hidden: Collection[int] = (),
+    told: Mapping[int, tuple[np.void, float]] | None = None,
 ) -> list[float]:
-    """Nine numbers of each of the `count` vehicles that count most."""
+    """Nine numbers of each of the `count` vehicles that count most.
+
+    `hidden`: ids of those that are not seen. `told`: what messages say of whom, as a VEHICLE row
+    and its age in s; then the numbers are eleven.
+    """
     ego = rows[i]
     looks = own_looks(roads, plans, ego)
     way = way_of(roads, plans, ego)
+    known = {int(row["id"]): (row, -1.0) for row in rows if int(row["id"]) not in hidden}
+    known = {**(told or {}), **known}
+    del known[int(ego["id"])]
     ranked = []
-    for k, other in enumerate(rows):
+    for who, (other, _) in known.items():
         away = math.hypot(other["x"] - ego["x"], other["y"] - ego["y"])
-        if k == i or away > range_m or abs(other["z"] - ego["z"]) > 4.0:
+        if away > range_m or abs(other["z"] - ego["z"]) > 4.0:
             continue
         near, when = approach(looks, ego, other)
         # Of equal ones the sum rounds differently here and there: these are told apart by id.
-        ranked.append((round(near + 2.0 * when, 6), int(other["id"]), near, when, k))
+        ranked.append((round(near + 2.0 * when, 6), who, near, when))
     numbers: list[float] = []
-    for _, _, near, when, k in sorted(ranked)[:count]:
-        other = rows[k]
+    for _, who, near, when in sorted(ranked)[:count]:
+        other, age_s = known[who]
         cos, sin = math.cos(ego["heading"]), math.sin(ego["heading"])
         dx, dy = other["x"] - ego["x"], other["y"] - ego["y"]
         vx = other["speed"] * math.cos(other["heading"]) - ego["speed"] * cos
@@ -238,5 +248,9 @@ def conflicts(
         numbers += [bent(dx * cos + dy * sin, 10.0), bent(dy * cos - dx * sin, 10.0)]
         numbers += [bent(vx * cos + vy * sin, 10.0), bent(vy * cos - vx * sin, 10.0)]
         numbers += [math.cos(turned), math.sin(turned)]
-        numbers.append(goes_first(roads, way, reach_m, other, shown))
-    return [*numbers, *([0.0] * (9 * count))][: 9 * count]
+        is_seen = age_s < 0.0
+        numbers.append(goes_first(roads, way, reach_m, other, shown) if is_seen else 0.0)
+        if told is not None:
+            numbers += [1.0, 0.0] if is_seen else [0.0, min(age_s, 1.0)]
+    size = 9 if told is None else 11
+    return [*numbers, *([0.0] * (size * count))][: size * count]

@@ -11,13 +11,19 @@ import cavmarl
 from cavmarl.engine.spaces import observation_parts
 
 COUNT, RANGE_M = 6, 80.0
-HOUSES = [(-60.0, -5.0), (5.0, 60.0)]  # blind_junction: along both axes
+# blind_junction: along the main road, and along the side road.
+HOUSES_X, HOUSES_Y = [(-60.0, -5.0), (5.0, 60.0)], [(-60.0, -4.0), (4.0, 60.0)]
 
 
 def seen_from(through_walls: bool, steps: int, **keywords: Any) -> Any:
     vec = cavmarl.make_vec(
         "blind_junction",
-        overrides={"sensors.neighbors.through_walls": through_walls, "observation.kind": "flat"},
+        overrides={
+            "sensors.neighbors.count": COUNT,
+            "sensors.neighbors.range_m": RANGE_M,
+            "sensors.neighbors.through_walls": through_walls,
+            "observation.kind": "flat",
+        },
         **keywords,
     )
     vec.reset(seed=5)
@@ -31,8 +37,8 @@ def blocked(x: float, y: float, to_x: float, to_y: float) -> bool:
     share = np.linspace(0.0, 1.0, 401)
     px, py = x + share * (to_x - x), y + share * (to_y - y)
     inside = np.zeros(len(share), dtype=bool)
-    for left, right in HOUSES:
-        for low, high in HOUSES:
+    for left, right in HOUSES_X:
+        for low, high in HOUSES_Y:
             inside |= (px > left) & (px < right) & (py > low) & (py < high)
     return bool(inside.any())
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 import cavmarl
 from cavmarl.config.sensors import ConflictsConfig, HistoryConfig, SensorsConfig, WayConfig
 from cavmarl.core.math.neighbors import fill_grid, make_grid
+from cavmarl.core.math.walls import make_walls
 from cavmarl.driving.kernels.gaps import link_signal
 from cavmarl.roads.network import SIGNAL_STATES
 from cavmarl.sensors.kernels.observing_conflicts import observe_conflicts
@@ -22,6 +23,7 @@ from cavmarl.sensors.kernels.observing_way import observe_way
 from cavmarl.sensors.observed import frame_size, layout
 from cavmarl.sensors.observed.way_features import conflicts_settings, way_settings
 from cavmarl.shards.shard import CONTROLLER
+from cavmarl.v2x.kernels.v2x_records import REPORT
 from tests.naive import observing_way as naive
 from tests.sensors.test_observing_lanes import phases, traffic
 from tests.support.traffic import NAMES, network, on_lane, plans, travel
@@ -61,8 +63,9 @@ def observed_conflicts(
     fill_grid(rows, len(rows), grid)
     place = layout(CONFIG)["conflicts"]
     out = np.zeros(frame_size(CONFIG), np.float32)
-    sensor = conflicts_settings(CONFIG, place.start)
-    observe_conflicts(roads.arrays, travel(name), rows, i, grid, phase, sensor, out)
+    sensor = conflicts_settings(CONFIG, place.start, make_walls(np.zeros((0, 4))), 0)
+    told = np.zeros(0, REPORT)
+    observe_conflicts(roads.arrays, travel(name), rows, i, grid, phase, told, 0, 0.1, sensor, out)
     assert not out[: place.start].any()
     assert not out[place.stop :].any()
     return [float(value) for value in out[place]]

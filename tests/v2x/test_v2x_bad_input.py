@@ -54,6 +54,12 @@ def test_messages_that_nobody_sends_cannot_be_observed(name: str) -> None:
         load_world("grid4x4", overrides={f"sensors.messages.{name}": value})
 
 
+def test_a_vehicle_cannot_be_heard_of_without_messages() -> None:
+    settings = {"sensors.conflicts.count": 4, "sensors.conflicts.heard": True}
+    with pytest.raises(ConfigError, match=r"sensors\.conflicts\.heard = True: .*set v2x\.enabled"):
+        load_world("grid4x4", overrides=settings)
+
+
 def test_it_is_off_by_default_and_every_effect_of_the_channel_too() -> None:
     default = V2xConfig()
     assert not default.enabled

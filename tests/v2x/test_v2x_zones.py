@@ -16,6 +16,8 @@ OBSERVED = {
     "sensors.messages.objects": 6,
     "sensors.messages.events": 2,
     "sensors.messages.signal": True,
+    "sensors.conflicts.count": 4,
+    "sensors.conflicts.heard": True,
 }
 LOSSY = {
     "v2x.equipped": 0.7,

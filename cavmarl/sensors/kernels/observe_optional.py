@@ -28,6 +28,7 @@ def observe_optional(
     worlds: Worlds,
     grid: Grid,
     further: OptionalSensors,
+    objects: NDArray[np.void],
     tick_s: float,
     ticks_per_step: int,
     stack: int,
@@ -36,8 +37,9 @@ def observe_optional(
 ) -> None:
     """Write these sensors' parts of every agent's newest frame in the chosen worlds.
 
-    `further`: settings and scratch; sensors that are off write nothing. `observations`: (W, A, D),
-    the parts 0 before.
+    `further`: settings and scratch; sensors that are off write nothing. `objects`: REPORT (W, A or
+    more, N), the inboxes of vehicles; N is 0 where there are no messages. `observations`:
+    (W, A, D), the parts 0 before.
     """
     kinematics, occupancy, lidar_cells, roadgraph, path, conflicts, history = further
     for w in range(chosen.size):
@@ -68,7 +70,10 @@ def observe_optional(
                 controllers = worlds.controllers[w]
                 observe_way(roads, travel, controllers, row, phase, time, tick_s, path, out)
             if conflicts.most > 0:
-                observe_conflicts(roads, travel, rows, i, grid, phase, conflicts, out)
+                told, tick = objects[w, row["agent"]], worlds.ticks[w]
+                observe_conflicts(
+                    roads, travel, rows, i, grid, phase, told, tick, tick_s, conflicts, out
+                )
             if history.size > 0:
                 entered = has_entered(row, ticks_per_step)
                 observe_history(row, entered, history.at, history.size, out)

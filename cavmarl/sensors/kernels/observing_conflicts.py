@@ -4,6 +4,9 @@ All are taken to go on as they go now: the others straight on along their headin
 are not known, the own one along its way. At a few moments ahead the gap between the bodies is
 taken, as boxes along the own one; what comes nearest and soonest stands first. Right of way is that
 of the map: by the lane that the other is on, whichever way it takes from there.
+
+With `heard` those count, too, that are not seen and that a message tells of: where they are if they
+have gone on as it says, and nothing else of them. Which lane they are on it does not say.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.math.geometry import lane_pose
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
+from cavmarl.core.math.walls import is_cut
 from cavmarl.core.numba import kernel
 from cavmarl.core.records.arrays import RoadArrays, Travel
 from cavmarl.core.records.codes import SIGNAL_GREEN_MAJOR, SIGNAL_RED, SIGNAL_RED_YELLOW
@@ -25,6 +29,8 @@ from cavmarl.sensors.kernels.observing_way import MOST_LANES
 from cavmarl.sensors.kernels.sensor_arrays import ConflictsSensor
 
 CONFLICT_FEATURES = 9
+HEARD_FEATURES = 2  # more with `heard`
+AGE_SCALE_S = 1.0
 NUM_LOOKS = 10  # moments that are looked at,
 LOOK_S = 0.5  # so far apart
 SLOWEST_MPS = 3.0  # the own vehicle is taken to go on with: one that stands wants to set off
@@ -154,15 +160,74 @@ def _right_of_way(
 
 
 @kernel
+def _take_reports(
+    reports: NDArray[np.void], tick: int, tick_s: float, told: NDArray[np.void]
+) -> int:
+    """Write those that reports (N,) tell of into BODY `told` (N,); returns how many there are."""
+    for k in range(reports.size):
+        report = reports[k]
+        if report["sender"] < 0:
+            return k
+        body = told[k]
+        gone_m = (tick - report["tick"]) * tick_s * report["speed"]
+        body["id"] = report["subject"]
+        body["row"] = k
+        body["cos"] = math.cos(report["heading"])
+        body["sin"] = math.sin(report["heading"])
+        body["x"] = report["x"] + gone_m * body["cos"]
+        body["y"] = report["y"] + gone_m * body["sin"]
+        body["z"] = report["z"]
+        body["speed"] = report["speed"]
+        body["half_length"] = 0.5 * report["length"]
+        body["half_width"] = 0.5 * report["width"]
+    return int(reports.size)
+
+
+@kernel
+def _is_near(row: np.void, body: np.void, range_m: float) -> bool:
+    dx = body["x"] - row["x"]
+    dy = body["y"] - row["y"]
+    if not dx * dx + dy * dy <= range_m * range_m:
+        return False
+    return bool(abs(body["z"] - row["z"]) <= LEVEL_HEIGHT_M)
+
+
+@kernel
+def _put(row: np.void, body: np.void, at: int, found: int, sensor: ConflictsSensor) -> int:
+    """Put a body in its place among the `found` that count most; returns how many there are now."""
+    near, when = _nearest_approach(row, body, sensor.looks)
+    counts = near + WAIT_MPS * when
+    place = found
+    while place > 0:
+        other = sensor.ranked[place - 1]
+        if counts > other["counts"] or (counts == other["counts"] and body["id"] > other["id"]):
+            break
+        place -= 1
+    if place == sensor.most:
+        return found
+    if found < sensor.most:
+        found += 1
+    for k in range(found - 1, place, -1):
+        sensor.ranked[k] = sensor.ranked[k - 1]
+    ranked = sensor.ranked[place]
+    ranked["counts"] = counts
+    ranked["near"] = near
+    ranked["when"] = when
+    ranked["id"] = body["id"]
+    ranked["body"] = at
+    return found
+
+
+@kernel
 def _rank(
     grid: Grid,
     rows: NDArray[np.void],
     i: int,
+    num_told: int,
     sensor: ConflictsSensor,
 ) -> int:
     """Put those that count most into the sensor's scratch, first by their approach, then by id."""
     row = rows[i]
-    limit = sensor.range_m * sensor.range_m
     first_column, last_column = cell_columns(grid, row["x"], sensor.range_m)
     first_row, last_row = cell_rows(grid, row["y"], sensor.range_m)
     found = 0
@@ -171,33 +236,19 @@ def _rank(
         end = grid.start[j * grid.num_x + last_column + 1]
         for b in range(begin, end):
             body = grid.bodies[b]
-            dx = body["x"] - row["x"]
-            dy = body["y"] - row["y"]
-            if not dx * dx + dy * dy <= limit or body["row"] == i:
+            if body["row"] == i or not _is_near(row, body, sensor.range_m):
                 continue
-            if abs(body["z"] - row["z"]) > LEVEL_HEIGHT_M:
+            if is_cut(sensor.walls, row["x"], row["y"], body["x"], body["y"]):
                 continue
-            near, when = _nearest_approach(row, body, sensor.looks)
-            counts = near + WAIT_MPS * when
-            place = found
-            while place > 0:
-                other = sensor.ranked[place - 1]
-                if counts > other["counts"] or (
-                    counts == other["counts"] and body["id"] > grid.bodies[other["body"]]["id"]
-                ):
-                    break
-                place -= 1
-            if place == sensor.most:
-                continue
-            if found < sensor.most:
-                found += 1
-            for k in range(found - 1, place, -1):
-                sensor.ranked[k] = sensor.ranked[k - 1]
-            ranked = sensor.ranked[place]
-            ranked["counts"] = counts
-            ranked["near"] = near
-            ranked["when"] = when
-            ranked["body"] = b
+            found = _put(row, body, b, found, sensor)
+            for k in range(num_told):
+                if sensor.told[k]["id"] == body["id"]:
+                    sensor.told[k]["id"] = -1  # it is seen
+    for k in range(num_told):
+        body = sensor.told[k]
+        if body["id"] < 0 or body["id"] == row["id"] or not _is_near(row, body, sensor.range_m):
+            continue
+        found = _put(row, body, -1 - k, found, sensor)
     return found
 
 
@@ -209,27 +260,34 @@ def observe_conflicts(
     i: int,
     grid: Grid,
     phase: NDArray[np.int32],
+    reports: NDArray[np.void],
+    tick: int,
+    tick_s: float,
     sensor: ConflictsSensor,
     observation: NDArray[np.float32],
 ) -> None:
-    """Nine numbers each of the vehicles that count most; zeros where there are fewer.
+    """Nine numbers, or eleven, of each vehicle that counts most; zeros where there are fewer.
 
-    `i`: row of the agent's vehicle. `phase`: (num_signals,) PHASE rows that are on.
+    `i`: row of the agent's vehicle. `phase`: (num_signals,) PHASE rows that are on. `reports`:
+    REPORT (N,) of vehicles, the agent's inbox; not read without `heard`. `tick`: the world's.
     """
     row = rows[i]
     link, is_on = _foresee(roads, travel, row, sensor.looks)
-    found = _rank(grid, rows, i, sensor)
+    num_told = _take_reports(reports, tick, tick_s, sensor.told) if sensor.heard else 0
+    found = _rank(grid, rows, i, num_told, sensor)
     cos_heading = sensor.looks[0, 2]
     sin_heading = sensor.looks[0, 3]
+    size = CONFLICT_FEATURES + (HEARD_FEATURES if sensor.heard else 0)
     for k in range(found):
         ranked = sensor.ranked[k]
-        body = grid.bodies[ranked["body"]]
+        is_seen = ranked["body"] >= 0
+        body = grid.bodies[ranked["body"]] if is_seen else sensor.told[-1 - ranked["body"]]
         dx = body["x"] - row["x"]
         dy = body["y"] - row["y"]
         dvx = body["speed"] * body["cos"] - row["speed"] * cos_heading
         dvy = body["speed"] * body["sin"] - row["speed"] * sin_heading
-        at = sensor.at + CONFLICT_FEATURES * k
-        out = observation[at : at + CONFLICT_FEATURES]
+        at = sensor.at + size * k
+        out = observation[at : at + size]
         out[0] = GAP_HALF_M / (GAP_HALF_M + ranked["near"])
         out[1] = WHEN_HALF_S / (WHEN_HALF_S + ranked["when"])
         out[2] = _bent(dx * cos_heading + dy * sin_heading, PLACE_HALF_M)
@@ -238,4 +296,10 @@ def observe_conflicts(
         out[5] = _bent(dvy * cos_heading - dvx * sin_heading, SPEED_HALF_MPS)
         out[6] = min(max(body["cos"] * cos_heading + body["sin"] * sin_heading, -1.0), 1.0)
         out[7] = min(max(body["sin"] * cos_heading - body["cos"] * sin_heading, -1.0), 1.0)
-        out[8] = _right_of_way(roads, link, is_on, rows[body["row"]], phase)
+        if is_seen:
+            out[8] = _right_of_way(roads, link, is_on, rows[body["row"]], phase)
+        if sensor.heard and is_seen:
+            out[9] = 1.0
+        elif sensor.heard:
+            age_s = (tick - reports[body["row"]]["tick"]) * tick_s
+            out[10] = min(age_s / AGE_SCALE_S, 1.0)

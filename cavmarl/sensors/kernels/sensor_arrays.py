@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.math.walls import Walls
 from cavmarl.core.records import record
 
 
@@ -94,7 +95,8 @@ RANKED = record(
     ("counts", np.float64),  # m, what it is ranked by
     ("near", np.float64),  # m, the gap of its approach
     ("when", np.float64),  # s until then
-    ("body", np.int64),  # position in `Grid.bodies`
+    ("id", np.int64),
+    ("body", np.int64),  # position in `Grid.bodies`; -1 - k: `ConflictsSensor.told[k]`
 )
 
 
@@ -114,6 +116,9 @@ class ConflictsSensor(NamedTuple):
     at: int
     most: int  # vehicles that are told; 0: off
     range_m: float
+    walls: Walls  # that hide others
+    heard: bool  # whether messages tell of those that are not seen
+    told: NDArray[np.void]  # BODY (inbox,) scratch: those that messages tell of, where they are now
     looks: NDArray[np.float64]  # (NUM_LOOKS, 4) scratch
     ranked: NDArray[np.void]  # RANKED (count,) scratch
 

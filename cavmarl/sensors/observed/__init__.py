@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.sensors import SensorsConfig
 from cavmarl.core.extensions import REGISTERED_SENSORS
-from cavmarl.core.math.walls import make_walls
+from cavmarl.core.math.walls import Walls, make_walls
 from cavmarl.core.records.arrays import Sensors
 from cavmarl.rewards.kernels.terms import TTC_REACH_M
 from cavmarl.roads.network import RoadNetwork
@@ -144,11 +144,16 @@ def _starts(config: SensorsConfig) -> dict[str, int]:
     }
 
 
+def _walls(network: RoadNetwork, through_walls: bool) -> Walls:
+    """The walls that hide others; none where these are seen through walls."""
+    walls = network.walls[:0] if through_walls else network.walls
+    return make_walls(np.stack([walls[name] for name in ("ax", "ay", "bx", "by")], axis=1))
+
+
 def sensor_arrays(config: SensorsConfig, network: RoadNetwork) -> Sensors:
     """The settings and the scratch memory that `sense` takes."""
-    hides = not config.neighbors.through_walls
-    walls = network.walls if hides else network.walls[:0]
-    near = MAX_NEIGHBORS_TRIED if len(walls) else config.neighbors.count
+    walls = _walls(network, config.neighbors.through_walls)
+    near = MAX_NEIGHBORS_TRIED if len(walls.segments) else config.neighbors.count
     places = layout(config)
     starts = _starts(config)
     history = places.get("history", slice(0, 0))
@@ -174,7 +179,7 @@ def sensor_arrays(config: SensorsConfig, network: RoadNetwork) -> Sensors:
         lidar_speeds=config.lidar.speeds,
         rays=ray_directions(config.lidar.rays),
         echoes=np.zeros(config.lidar.rays, dtype=ECHO),
-        walls=make_walls(np.stack([walls[name] for name in ("ax", "ay", "bx", "by")], axis=1)),
+        walls=walls,
         near_body=np.zeros(near, dtype=np.int32),
         near_squared=np.zeros(near, dtype=np.float64),
         history_at=history.start,
@@ -183,9 +188,12 @@ def sensor_arrays(config: SensorsConfig, network: RoadNetwork) -> Sensors:
 
 
 def optional_arrays(
-    config: SensorsConfig, network: RoadNetwork, plans: NDArray[np.void]
+    config: SensorsConfig, network: RoadNetwork, plans: NDArray[np.void], most_told: int
 ) -> OptionalSensors | None:
-    """What `observe_optional` takes; None if all of its sensors are off."""
+    """What `observe_optional` takes; None if all of its sensors are off.
+
+    `most_told`: vehicles that an inbox keeps.
+    """
     if FURTHER.isdisjoint(layout(config)):
         return None
     starts = _starts(config)
@@ -196,6 +204,11 @@ def optional_arrays(
         lidar_cells=lidar_observation.settings(config, starts["lidar_observation"]),
         roadgraph=roadgraph.settings(config, starts["roadgraph"], network),
         way=way_features.way_settings(config, starts["way"]),
-        conflicts=way_features.conflicts_settings(config, starts["conflicts"]),
+        conflicts=way_features.conflicts_settings(
+            config,
+            starts["conflicts"],
+            _walls(network, config.conflicts.through_walls),
+            most_told,
+        ),
         history=way_features.history_settings(config, starts["history"]),
     )

@@ -9,9 +9,13 @@ from __future__ import annotations
 import numpy as np
 
 from cavmarl.config.sensors import SensorsConfig
+from cavmarl.core.math.neighbors import BODY
+from cavmarl.core.math.walls import Walls
 from cavmarl.sensors.kernels.observing_conflicts import (
+    AGE_SCALE_S,
     CONFLICT_FEATURES,
     GAP_HALF_M,
+    HEARD_FEATURES,
     NUM_LOOKS,
     PLACE_HALF_M,
     SPEED_HALF_MPS,
@@ -66,8 +70,8 @@ def way(config: SensorsConfig) -> list[Feature]:
 
 
 def conflicts(config: SensorsConfig) -> list[Feature]:
-    """Nine numbers a vehicle, the one first that comes nearest and soonest; 0: there are fewer."""
-    rows = (
+    """Nine numbers a vehicle, with `heard` eleven; first what comes nearest and soonest; or 0."""
+    rows: tuple[tuple[str, str, str, float], ...] = (
         (
             "near",
             f"how near it comes: {GAP_HALF_M:g} m / ({GAP_HALF_M:g} m + gap); 0: there is none",
@@ -93,6 +97,12 @@ def conflicts(config: SensorsConfig) -> list[Feature]:
             -1.0,
         ),
     )
+    if config.conflicts.heard:
+        age = "how old the message is that tells of it, if it is not seen"
+        rows += (
+            ("seen", "1 if it is seen; 0: a message tells of it, or there is none", "", 0.0),
+            ("age", age, f"{AGE_SCALE_S:g} s", 0.0),
+        )
     return [
         Feature(f"{name}_{k}", f"vehicle {k}: {meaning}", scale, low)
         for k in range(config.conflicts.count)
@@ -115,7 +125,8 @@ def history(config: SensorsConfig) -> list[Feature]:
 
 
 def conflicts_shape(config: SensorsConfig) -> tuple[int, ...]:
-    return config.conflicts.count, CONFLICT_FEATURES
+    more = HEARD_FEATURES if config.conflicts.heard else 0
+    return config.conflicts.count, CONFLICT_FEATURES + more
 
 
 def history_shape(config: SensorsConfig) -> tuple[int, ...]:
@@ -129,13 +140,18 @@ def way_settings(config: SensorsConfig, at: int) -> WaySensor:
     return WaySensor(at, distances, given.lines, given.range_m, given.timing)
 
 
-def conflicts_settings(config: SensorsConfig, at: int) -> ConflictsSensor:
-    """What the kernel takes."""
+def conflicts_settings(
+    config: SensorsConfig, at: int, walls: Walls, most_told: int
+) -> ConflictsSensor:
+    """What the kernel takes; `most_told`: vehicles that an inbox keeps."""
     given = config.conflicts
     return ConflictsSensor(
         at,
         given.count,
         given.range_m,
+        walls,
+        given.heard,
+        told=np.zeros(most_told, BODY),
         looks=np.zeros((NUM_LOOKS, 4)),
         ranked=np.zeros(given.count, RANKED),
     )
