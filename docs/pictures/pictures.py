@@ -13,14 +13,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cavmarl.config.env import EnvConfig
-from cavmarl.config.registry import load_config
 from cavmarl.engine.simulation import Simulation
-from cavmarl.engine.world_setup import load_roads
+from cavmarl.engine.world_setup import World, load_world
 from cavmarl.render.canvas import load_pygame
 from cavmarl.render.topdown import TopDownRenderer
 from cavmarl.render.viewport import Bounds
-from cavmarl.roads.network import RoadNetwork
 from cavmarl.shards.shard import Commands
 
 if TYPE_CHECKING:
@@ -90,14 +87,14 @@ PICTURES = {
 
 def draw_picture(picture: Picture) -> Surface:
     """Run the world up to the moment of the picture, and draw it."""
-    config, folder = load_config(
+    world = load_world(
         picture.env,
         agents=picture.agents,
         background=picture.background,
         overrides={"zones.approach_ticks": picture.approach_ticks},
     )
-    network = load_roads(config, folder)
-    simulation = moment(config, network, picture.time_s)
+    config, network = world.config, world.network
+    simulation = moment(world, picture.time_s)
     renderer = TopDownRenderer(network, picture.size, picture.focus, simulation.goal_edges)
     return renderer.draw(
         simulation.vehicles(),
@@ -109,9 +106,10 @@ def draw_picture(picture: Picture) -> Surface:
     )
 
 
-def moment(config: EnvConfig, network: RoadNetwork, time_s: float) -> Simulation:
+def moment(world: World, time_s: float) -> Simulation:
     """A seeded world in which the built-in driver has had all seats for so long."""
-    simulation = Simulation(config, network)
+    config = world.config
+    simulation = Simulation(config, world.network, demand=world.demand, partition=world.partition)
     simulation.seed(SEED)
     simulation.reset()
     suggested = np.zeros((1, config.population.num_ids, 2))

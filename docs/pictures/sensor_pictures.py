@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config.registry import load_config
-from cavmarl.engine.world_setup import load_roads
+from cavmarl.engine.world_setup import load_world
 from cavmarl.render.canvas import load_pygame
 from cavmarl.sensors.kernels.camera_picture import colours
 from cavmarl.sensors.kernels.panorama import LANE_LINE
@@ -46,8 +45,7 @@ def sensor_sheet() -> Image:
         "rig": {name: {**sensor, "rate_hz": 5} for name, sensor in RIG.items()},
         "map.buildings": BUILDINGS,
     }
-    config, folder = load_config(ENV, background=80, overrides=overrides)
-    frames = moment(config, load_roads(config, folder), TIME_S).frames
+    frames = moment(load_world(ENV, background=80, overrides=overrides), TIME_S).frames
     left = np.concatenate([_colours(frames), _gap(SIZE["width"], MARGIN), _depths(frames)])
     middle = np.concatenate([_classes(frames), _gap(SIZE["width"], MARGIN), _points(frames)])
     tall = left.shape[0]
