@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Callable, Iterator
+from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
@@ -21,6 +23,12 @@ def pytest_configure(config: pytest.Config) -> None:
     settings.register_profile("compiled", deadline=None)
     settings.register_profile("python", deadline=None, max_examples=25)
     settings.load_profile("python" if os.environ.get("NUMBA_DISABLE_JIT") == "1" else "compiled")
+
+
+def pytest_collection_finish() -> None:
+    """What all tests share stays: no search for garbage goes through it again."""
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
@@ -41,22 +49,24 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items.sort(key=lambda item: -costs[item.nodeid.partition("::")[0]])
 
 
-def _let_start(patch: pytest.MonkeyPatch, start: Callable[..., object]) -> None:
+def _let_start(patch: pytest.MonkeyPatch, start: Callable[..., object], context: object) -> None:
     from cavmarl.evaluate import fresh
+    from cavmarl.evaluate.traffic import sumo_side
     from cavmarl.parallel.nodes import node_starters
     from cavmarl.parallel.processes import fork_server
 
     for module in (fork_server, node_starters, fresh):
         patch.setattr(module, "start_python", start)
+    patch.setattr(sumo_side, "get_context", lambda how: context)
 
 
 @pytest.fixture(scope="session", autouse=True)
 def forked_processes() -> Iterator[None]:
     """Pools and evaluations get their processes as forks of one that has loaded the kernels."""
-    from tests.support.forked_processes import start_forked
+    from tests.support.forked_processes import FORKS, start_forked
 
     with pytest.MonkeyPatch.context() as patch:
-        _let_start(patch, start_forked)
+        _let_start(patch, start_forked, FORKS)
         yield
 
 
@@ -65,7 +75,7 @@ def fresh_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let Pythons of their own be started, as outside of the tests."""
     from cavmarl.core.processes import start_python
 
-    _let_start(monkeypatch, start_python)
+    _let_start(monkeypatch, start_python, get_context("spawn"))
 
 
 def pytest_runtest_setup() -> None:
@@ -84,16 +94,8 @@ def shared_maps() -> Path:
 
 
 @pytest.fixture(scope="session")
-def built_map(shared_maps: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """SUMO networks of the real maps, each built once, tolerantly: `built_map("osm/x.osm")`."""
-    from cavmarl.maps.netconvert import build_network
+def built_map(shared_maps: Path) -> Callable[[str], Path]:
+    """SUMO networks of the real maps, built tolerantly and kept: `built_map("osm/x.osm")`."""
+    from tests.support.kept_maps import built
 
-    folder = tmp_path_factory.mktemp("built")
-
-    def build(name: str) -> Path:
-        target = folder / f"{name.replace('/', '-')}.net.xml"
-        if not target.exists():
-            build_network(shared_maps / name, target, tolerant=True)
-        return target
-
-    return build
+    return lambda name: built(shared_maps / name)

@@ -6,6 +6,8 @@ import numba
 import numba.core.config
 import numpy as np
 import pytest
+from numba.core.errors import NumbaTypeError
+from numba.extending import typeof_impl
 from numpy.typing import NDArray
 
 from cavmarl.core.numba import kernel
@@ -80,11 +82,32 @@ ARGUMENTS = [
 ]
 
 
+def numbas(value: Any) -> Any:
+    """The type of a value, by Numba alone."""
+    register: Any = typeof_impl.register(np.ndarray)
+    register(specialized_calls._typeof_array)
+    try:
+        return _typeof(value)
+    finally:
+        register(specialized_calls._type_of_array)
+
+
 @pytest.mark.parametrize("argument", ARGUMENTS, ids=lambda argument: repr(_typeof(argument)))
 def test_types_that_are_kept_are_numbas(argument: Any) -> None:
     for value in (argument, *ARGUMENTS, argument):
-        assert _kind(value) == _typeof(value)
+        assert _kind(value) == _typeof(value) == numbas(value)
     assert _kind(argument) is _kind(argument)
+
+
+def test_an_array_of_equal_records_has_the_type_that_was_kept() -> None:
+    again = np.zeros(2, np.dtype(RECORDS.dtype.descr))
+    assert again.dtype is not RECORDS.dtype
+    assert _typeof(again) is _typeof(RECORDS)
+
+
+def test_arrays_that_numba_refuses_are_refused() -> None:
+    with pytest.raises(NumbaTypeError, match="MaskedArray"):
+        _typeof(np.ma.MaskedArray(np.zeros(2)))
 
 
 @pytest.mark.parametrize("setting", ["DISABLE_JIT", "BOUNDSCHECK"])

@@ -12,15 +12,15 @@ from tests.naive import approach as naive
 from tests.support.driving import drive, make_traffic, start
 from tests.support.traffic import scratch
 
-CROWDS = {"merge": 30, "grid4x4": 60, "ring": 20}
+CROWDS = {"merge": 30, "grid4x4": 40, "ring": 20}
 
 
 @pytest.fixture(params=CROWDS, scope="module")
 def world(request: pytest.FixtureRequest) -> Simulation:
-    """Traffic, a quarter of a minute after its start."""
+    """Traffic, some seconds after its start."""
     simulation = make_traffic(request.param, background=CROWDS[request.param])
     start(simulation, seed=4)
-    for _ in range(round(15.0 / simulation.config.clock.ctrl_dt_s)):
+    for _ in range(round(8.0 / simulation.config.clock.ctrl_dt_s)):
         drive(simulation)
     return simulation
 

@@ -47,6 +47,7 @@ def one_car(tmp_path: Path) -> SumoInput:
     return read_input([path])
 
 
+@pytest.mark.usefixtures("fresh_processes")
 def test_a_run_is_counted_and_measured() -> None:
     run = run_sumo(job(read_input([ROUTES]), seconds=120))
     figures = run.figures

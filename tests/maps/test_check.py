@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from cavmarl.maps.check import MapReport, check_map
 from cavmarl.maps.components import strong_components
 from cavmarl.roads.sumo_net.reader import read_network
+from tests.support.kept_maps import network_of
 
 BuiltMap = Callable[[str], Path]
 
@@ -72,7 +73,7 @@ def check(tmp_path: Path) -> Callable[..., MapReport]:
 
 @pytest.mark.parametrize("name", FIGURES)
 def test_figures_of_real_maps(built_map: BuiltMap, name: str) -> None:
-    report = check_map(read_network(built_map(name)))
+    report = check_map(network_of(built_map(name)))
     road_km, lane_km, junctions, signals, connected, edges = FIGURES[name]
 
     assert report.drivable
@@ -85,7 +86,7 @@ def test_figures_of_real_maps(built_map: BuiltMap, name: str) -> None:
 @pytest.mark.parametrize("name", FIGURES)
 def test_figures_equal_sumolib(built_map: BuiltMap, name: str) -> None:
     path = built_map(name)
-    report = check_map(read_network(path))
+    report = check_map(network_of(path))
     net = sumolib.net.readNet(str(path), withPrograms=True, withInternal=True)
     edges = [edge for edge in net.getEdges(withInternal=False) if edge.allows("passenger")]
     lanes = [lane for edge in edges for lane in edge.getLanes() if lane.allows("passenger")]
@@ -102,14 +103,14 @@ def test_figures_equal_sumolib(built_map: BuiltMap, name: str) -> None:
 
 
 def test_a_poorly_connected_map_is_drivable_and_noted(built_map: BuiltMap) -> None:
-    report = check_map(read_network(built_map("osm/berlin_siegessaeule.osm.gz")))
+    report = check_map(network_of(built_map("osm/berlin_siegessaeule.osm.gz")))
 
     assert report.drivable
     assert any("only 27% of the edges" in note for note in report.notes)
 
 
 def test_steep_lanes_are_noted(built_map: BuiltMap) -> None:
-    report = check_map(read_network(built_map("net/mcity/mcity.net.xml")))
+    report = check_map(network_of(built_map("net/mcity/mcity.net.xml")))
 
     assert report.elevation_m == pytest.approx((266.0, 279.4), abs=0.05)
     assert report.max_grade == pytest.approx(0.346, abs=0.001)

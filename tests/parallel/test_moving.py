@@ -7,7 +7,6 @@ import os
 import random
 import signal
 from pathlib import Path
-from threading import Timer
 from typing import Any
 
 import numpy as np
@@ -24,6 +23,7 @@ from cavmarl.parallel.pooled_worlds import PooledWorlds
 from cavmarl.parallel.processes.worker_pool import Pool
 from cavmarl.parallel.step_placement import StepPlacement
 from cavmarl.parallel.worlds_job import Task
+from tests.support.pools import strike_soon
 from tests.support.rerouting import CARS, DEVICE, FLOW, make_map, write_demand
 from tests.support.sumo_worlds import write_stops
 from tests.support.vec_runs import Make, drive, pool_of, same
@@ -143,8 +143,7 @@ def test_workers_that_die_while_something_moves(
     def strike(self: Pool, task: int, payload: Any = None, commits: bool = True) -> Any:
         if task in (Task.PACK, Task.UNPACK, Task.HOST) and len(timers) < 8:
             pid = self.pids[rng.randrange(2)]
-            timers.append(Timer(rng.uniform(0.0, 0.003), os.kill, (pid, how)))
-            timers[-1].start()
+            timers.append(strike_soon(pid, rng.uniform(0.0, 0.003), how))
         return run(self, task, payload, commits)
 
     monkeypatch.setattr(Pool, "run", strike)

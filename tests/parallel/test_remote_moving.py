@@ -6,7 +6,6 @@ import os
 import random
 import signal
 from pathlib import Path
-from threading import Timer
 from typing import Any
 
 import numpy as np
@@ -22,6 +21,7 @@ from cavmarl.parallel.hosts.host_pool import HostPool
 from cavmarl.parallel.hosts.remote_worlds import RemoteWorlds
 from cavmarl.parallel.worlds_job import Task
 from tests.parallel.test_moving import RESTLESS, STACKED, uneven
+from tests.support.pools import strike_soon
 from tests.support.rerouting import CARS, DEVICE, FLOW, make_map, write_demand
 from tests.support.vec_runs import Make, drive, same
 from tests.support.world_hosts import WorldHosts
@@ -121,8 +121,7 @@ def test_hosts_that_die_while_worlds_move(
         if task in (Task.PACK, Task.UNPACK) and len(timers) < 4:
             self.await_spare()
             pid = self.pids[rng.randrange(2)]
-            timers.append(Timer(rng.uniform(0.0, 0.01), os.kill, (pid, how)))
-            timers[-1].start()
+            timers.append(strike_soon(pid, rng.uniform(0.0, 0.01), how))
         return run(self, task, *args, **more)
 
     monkeypatch.setattr(HostPool, "run", strike)

@@ -19,9 +19,11 @@ subprocess.run([sys.executable, "-c", sys.argv[1]])
 
 def verdict(child: str) -> str | None:
     """Of a process that waits for one that runs `child`."""
-    with subprocess.Popen([sys.executable, "-c", PARENT, child]) as process:
+    words = [sys.executable, "-c", PARENT, f"print(flush=True)\n{child}"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
         try:
-            time.sleep(1.0)
+            process.stdout.readline()
             dog = Watchdog(process.pid, 60.0)
             found = None
             for _ in range(3 * STILL_CHECKS):

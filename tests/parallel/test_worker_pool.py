@@ -18,7 +18,7 @@ from cavmarl.core.errors import (
     WorkerError,
     WorkerFailureError,
 )
-from cavmarl.parallel.processes import worker_loop
+from cavmarl.parallel.processes import fork_server, worker_loop
 from cavmarl.parallel.processes.worker_pool import Pool
 from tests.support.pools import (
     MORE,
@@ -215,7 +215,10 @@ def test_an_interrupted_order_is_not_committed(make: Make, tmp_path: Path) -> No
     assert pool.deaths == []
 
 
-def test_the_process_that_forks_may_die_or_be_stopped(make: Make) -> None:
+def test_the_process_that_forks_may_die_or_be_stopped(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fork_server, "ANSWER_MS", 500)
     pool = make(workers=2)
     pool.run(ADD)
     os.kill(pool.server_pid, signal.SIGKILL)
@@ -276,7 +279,7 @@ def test_no_call_to_wake_up_is_missed(make: Make, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(barrier, "_look", lambda theirs, number, yields: False)
     pool = make(workers=2)
     rng = random.Random(0)
-    for _ in range(1000):
+    for _ in range(400):
         time.sleep(rng.uniform(0.0, 1e-4))
         pool.ping()
     assert pool.deaths == []

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.polylines import Shape
 from cavmarl.roads.sumo_net.backward_paths import Way, mend_backward_paths
-from cavmarl.roads.sumo_net.reader import read_network
+from tests.support.kept_maps import network_of
 
 sumo = pytest.importorskip("sumo", reason="needs the extra: sumo")
 
@@ -122,19 +122,19 @@ def _check_forward(network: RoadNetwork) -> None:
     "name", ["DRT/osm", "A10KW/osm", "bs3d/bs", "highway/highway", "corridor/corridor"]
 )
 def test_no_path_of_a_map_of_sumo_runs_backwards(name: str) -> None:
-    _check_forward(read_network(Path(sumo.SUMO_HOME) / f"tools/game/{name}.net.xml"))
+    _check_forward(network_of(Path(sumo.SUMO_HOME) / f"tools/game/{name}.net.xml"))
 
 
 @pytest.mark.parametrize(
     "name", ["osm/monaco.osm.gz", "xodr/Town01.xodr", "xodr/Town04.xodr", "xodr/newmarket.xodr"]
 )
 def test_no_path_of_a_real_map_runs_backwards(built_map: Callable[[str], Path], name: str) -> None:
-    _check_forward(read_network(built_map(name)))
+    _check_forward(network_of(built_map(name)))
 
 
 @pytest.mark.parametrize("name", ["bologna_acosta/acosta_buslanes", "mcity/mcity", "Town10HD"])
 def test_no_path_of_a_city_runs_backwards(shared_maps: Path, name: str) -> None:
-    _check_forward(read_network(shared_maps / "net" / f"{name}.net.xml"))
+    _check_forward(network_of(shared_maps / "net" / f"{name}.net.xml"))
 
 
 def test_a_path_drawn_anew_has_an_even_grade() -> None:

@@ -96,15 +96,17 @@ def test_pixels_equal_twin(
     start = matrix[:, 3]
     for j, i in np.ndindex(HEIGHT, WIDTH):
         ray = naive.pixel_ray(matrix[:, :3], WIDTH, HEIGHT, fov, j, i)
-        nearer, exact, further = (
-            naive.trace(rows, 0, walls, start, ray, range_m, margin)
-            for margin in (1e-6, 0.0, -1e-6)
-        )
+        exact = naive.trace(rows, 0, walls, start, ray, range_m, 0.0)
         if exact.distance < 0.02:
             continue  # inside of a body, of which a camera sees no face, or with its nose on it
-        if nearer.what == further.what and abs(nearer.distance - further.distance) < 1e-3:
-            assert depths[j, i] == pytest.approx(exact.distance, rel=1e-5, abs=1e-4)
-            assert classes[j, i] == CLASS_OF[exact.what[0]]
+        is_equal = depths[j, i] == pytest.approx(exact.distance, rel=1e-5, abs=1e-4)
+        if is_equal and classes[j, i] == CLASS_OF[exact.what[0]]:
+            continue
+        nearer, further = (
+            naive.trace(rows, 0, walls, start, ray, range_m, margin) for margin in (1e-6, -1e-6)
+        )
+        is_sure = nearer.what == further.what and abs(nearer.distance - further.distance) < 1e-3
+        assert not is_sure, (j, i, depths[j, i], classes[j, i], exact)
 
 
 @given(crowds(), mounts(), st.randoms(use_true_random=False))

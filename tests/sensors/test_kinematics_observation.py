@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -56,11 +57,17 @@ CONFIGS: dict[str, dict[str, Any]] = {
 }
 
 
+@cache
+def standing(name: str, seed: int) -> Any:
+    """One of highway-env's environments, which no test steps any further."""
+    return highway.make(name, seed)
+
+
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("name", ["highway-v0", "merge-v0", "two-way-v0", "intersection-v1"])
 @pytest.mark.parametrize("case", CONFIGS)
 def test_the_table_is_highway_envs(name: str, seed: int, case: str) -> None:
-    env = highway.make(name, seed)
+    env = standing(name, seed)
     config = {"vehicles_count": 5, "features": KinematicsConfig.features, **CONFIGS[case]}
     theirs = highway.observation(
         env, "Kinematics", **{**config, "features": list(config["features"])}
@@ -77,7 +84,7 @@ def test_the_table_is_highway_envs(name: str, seed: int, case: str) -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_shuffled_rows_are_highway_envs_in_another_order(seed: int) -> None:
-    env = highway.make("highway-v0", seed)
+    env = standing("highway-v0", seed)
     config = {"vehicles_count": 8, "order": "shuffled"}
     theirs = highway.observation(env, "Kinematics", **config)
     rows = highway.vehicles(env)
@@ -91,7 +98,7 @@ def test_shuffled_rows_are_highway_envs_in_another_order(seed: int) -> None:
 
 
 def test_the_order_of_rows_does_not_matter() -> None:
-    env = highway.make("highway-v0", 0)
+    env = standing("highway-v0", 0)
     rows = highway.vehicles(env)
     order = np.random.default_rng(0).permutation(len(rows))
     for config in ({"vehicles_count": 9}, {"vehicles_count": 9, "order": "shuffled"}):
@@ -102,7 +109,7 @@ def test_the_order_of_rows_does_not_matter() -> None:
 
 
 def test_one_row_is_the_vehicle_itself() -> None:
-    env = highway.make("highway-v0", 0)
+    env = standing("highway-v0", 0)
     rows = highway.vehicles(env)
     alone = table(env, rows, 2, {}, vehicles_count=1, normalize=False)
     speed, heading = rows["speed"][2], rows["heading"][2]

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -17,6 +19,7 @@ from cavmarl.sensors.kernels.nearest_road_points import (
     nearest_points,
     observe_roadgraph,
 )
+from cavmarl.sensors.kernels.sensor_arrays import RoadgraphSensor
 from cavmarl.sensors.observed import roadgraph
 from cavmarl.sensors.observed.roadgraph import road_points
 from tests.naive import roadgraph as naive
@@ -28,15 +31,16 @@ def config(points: int, range_m: float, spacing_m: float = 3.0) -> SensorsConfig
     return SensorsConfig(roadgraph=RoadgraphConfig(points, range_m, spacing_m))
 
 
-SENSORS = {
-    (name, points, range_m): roadgraph.settings(config(points, range_m), 0, network(name))
-    for name in NAMES
-    for points, range_m in ((5, 50.0), (64, 30.0), (200, 80.0))
-}
+@cache
+def settings_of(name: str, points: int, range_m: float = 50.0) -> RoadgraphSensor:
+    """A sensor on a map, the same for all tests that change nothing of it."""
+    return roadgraph.settings(config(points, range_m), 0, network(name))
 
 
 @given(
-    st.sampled_from(sorted(SENSORS)),
+    st.sampled_from(
+        [(name, *size) for name in NAMES for size in ((5, 50.0), (64, 30.0), (200, 80.0))]
+    ),
     st.floats(-0.1, 1.1),
     st.floats(-0.1, 1.1),
     st.sampled_from([0.0, 3.0, 9.0]),
@@ -44,7 +48,7 @@ SENSORS = {
 def test_nearest_points_equal_twin(
     which: tuple[str, int, float], across: float, up: float, z: float
 ) -> None:
-    sensor = SENSORS[which]
+    sensor = settings_of(*which)
     min_x, min_y, max_x, max_y = network(which[0]).extent_m
     x, y = min_x + across * (max_x - min_x), min_y + up * (max_y - min_y)
     found = nearest_points(x, y, z, sensor)
@@ -67,7 +71,7 @@ def test_of_equally_near_points_the_smaller_index_comes_first() -> None:
 
 def frame(name: str, x: float, y: float, heading: float, points: int = 40) -> NDArray[np.float32]:
     """(points, ROADGRAPH_FEATURES) as seen from a place."""
-    sensor = roadgraph.settings(config(points, 50.0), 0, network(name))
+    sensor = settings_of(name, points)
     out = np.zeros(points * ROADGRAPH_FEATURES, np.float32)
     observe_roadgraph(vehicles([(x, y, heading)])[0], sensor, out)
     return out.reshape(points, ROADGRAPH_FEATURES)
@@ -75,7 +79,7 @@ def frame(name: str, x: float, y: float, heading: float, points: int = 40) -> ND
 
 @given(st.floats(-3.0, 3.0))
 def test_points_are_in_the_ego_frame(heading: float) -> None:
-    sensor = roadgraph.settings(config(40, 50.0), 0, network("grid4x4"))
+    sensor = settings_of("grid4x4", 40)
     x, y = (float(network("grid4x4").points[axis][3]) for axis in ("x", "y"))
     seen = frame("grid4x4", x, y, heading)
     assert np.all(seen[:, 0] == 1.0)

@@ -86,9 +86,10 @@ def test_way_and_conflicts_equal_their_twins_whatever_the_order(
 ) -> None:
     rows = data.draw(traffic(name))
     rows["width"] = 2.0
-    # Vehicles stand at equal places: their ranks must not hang on the last bit of a sum.
+    # Vehicles stand at equal places: their ranks must not hang on the last bit of a sum, and a
+    # gap is the sum of both axes.
     nudge = 0.0137 * np.arange(len(rows)) ** 2
-    rows["x"], rows["y"] = rows["x"] + nudge, rows["y"] + nudge
+    rows["x"], rows["y"] = rows["x"] + nudge, rows["y"] + 0.62 * nudge
     phase = phases(name, random)
     letters = shown(name, phase)
     roads, ways = network(name), plans(name)
@@ -140,6 +141,7 @@ def made(env: str = "grid4x4", **overrides: Any) -> Any:
     return cavmarl.make_vec(env, num_envs=2, agents=6, background=12, seed=1, overrides=settings)
 
 
+@pytest.mark.skipif(config.DISABLE_JIT, reason="compares no twin")
 def test_history_is_what_was_observed_before_and_begins_with_the_first() -> None:
     vec = made()
     place = layout(vec.config.sensors)["history"]
@@ -182,6 +184,7 @@ def test_a_divided_world_observes_the_same(zones: int) -> None:
     divided.close()
 
 
+@pytest.mark.skipif(config.DISABLE_JIT, reason="compares no twin")
 def test_a_saved_state_keeps_the_history() -> None:
     vec = made()
     vec.reset()

@@ -22,7 +22,7 @@ import pytest
 __all__ = ["CpuTimes", "argued", "costs_of_files", "known_costs", "rare_tests"]
 
 LISTED_AT_END_S = 2.0  # a test that costs more is listed at the end of a run
-ARGUED_S = 3.0  # one that costs more is slow, but for those of the file of argued tests
+ARGUED_S = 2.0  # one that costs more is slow, but for those of the file of argued tests
 LISTED_S = 0.5  # a test that costs less is not in the file of costs
 OFTEN_S = 2.0  # of a test's variants, so many seconds are in every run, and one of them at least
 CHEAP_S = 0.05  # what one costs that is not in the file of costs
@@ -126,7 +126,9 @@ def _used_s() -> float:
 def _forks_s() -> float:
     """Of the process whose forks tests start, and of those forks that have ended."""
     server: Any = forkserver._forkserver  # type: ignore[attr-defined]
+    if server._forkserver_pid is None:
+        return 0.0
     try:
         return sum(psutil.Process(server._forkserver_pid).cpu_times()[:4])
-    except (psutil.Error, TypeError):  # there is none
+    except psutil.NoSuchProcess:
         return 0.0

@@ -20,7 +20,7 @@ from cavmarl.core.processes import start_python
 from cavmarl.evaluate.fresh import PROGRAM
 from tests.support.world_hosts import FORKS
 
-__all__ = ["ForkedProcess", "start_forked"]
+__all__ = ["FORKS", "ForkedProcess", "start_forked"]
 
 
 class ForkedProcess:
@@ -91,7 +91,8 @@ class ForkedProcess:
 
 def start_forked(words: Sequence[str], env: Mapping[str, str] | None = None, **options: Any) -> Any:
     """In the place of `start_python`; words that run nothing of ours go there."""
-    if (words[0] == "-m" and words[1].startswith("cavmarl.")) or words == ["-c", PROGRAM]:
+    ours = words[0] == "-m" and words[1].startswith(("cavmarl.", "tests."))
+    if ours or words == ["-c", PROGRAM]:
         return ForkedProcess(words, env={**os.environ, **(env or {})}, **options)
     return start_python(words, env=env, **options)
 

@@ -7,8 +7,9 @@ import select
 import signal
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from threading import Timer
 from typing import Any
 
 from cavmarl.parallel.processes.worker_pool import Pool, Program
@@ -51,6 +52,18 @@ def totals(pool: Pool) -> list[list[float]]:
 def alive(pids: list[int]) -> list[int]:
     """Those that are there, and be it as a zombie of ours."""
     return [pid for pid in pids if Path(f"/proc/{pid}").exists()]
+
+
+def strike_soon(pid: int, in_s: float, how: signal.Signals = signal.SIGKILL) -> Timer:
+    """Send a signal a while later; by then the process may have died of another one."""
+
+    def strike() -> None:
+        with suppress(ProcessLookupError):
+            os.kill(pid, how)
+
+    timer = Timer(in_s, strike)
+    timer.start()
+    return timer
 
 
 def gone(pids: list[int], limit_s: float = 60.0) -> bool:

@@ -47,7 +47,6 @@ ALONE_FILES: tuple[str, ...] = (
     "tests/parallel/test_core_placement.py",
     "tests/parallel/test_pool_resources.py",
     "tests/parallel/test_shared_huge_pages.py",
-    "tests/parallel/test_watchdog.py",
     "tests/parallel/test_worker_pool.py",
     "tests/test_memory.py",
 )

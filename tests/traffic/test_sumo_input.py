@@ -14,6 +14,7 @@ from cavmarl.config.registry import find_entry
 from cavmarl.core.errors import ConfigError, MapError
 from cavmarl.roads.sumo_net.reader import read_network
 from cavmarl.traffic.sumo.sumo_input import command_words, read_input, without_outputs
+from tests.support.kept_maps import network_of
 
 sumo = pytest.importorskip("sumo", reason="needs the extra 'sumo'")
 
@@ -26,7 +27,7 @@ TRIP = '<vType id="t"/><trip id="a" type="t" depart="0" from="{}" to="{}"/>'
 def trip() -> str:
     """A trip over two edges of the map."""
 
-    network = read_network(MAP)
+    network = network_of(MAP)
     link = network.links[0]
     ends = (network.lanes["edge"][link[side]] for side in ("from_lane", "to_lane"))
     return TRIP.format(*(network.edge_ids[edge] for edge in ends))
@@ -57,7 +58,7 @@ ADDITIONAL = {
 @pytest.mark.parametrize("element", ADDITIONAL.values(), ids=ADDITIONAL)
 def test_additional_files_write_nothing(tmp_path: Path, element: str, trip: str) -> None:
 
-    network = read_network(MAP)
+    network = network_of(MAP)
     text = element.format(
         edge=trip.split('from="')[1].split('"')[0],
         lane=network.lane_ids[int(network.links[0]["from_lane"])],

@@ -13,6 +13,8 @@ from typing import Any, ParamSpec, TypeVar
 import numba
 import numba.core.config
 import numpy as np
+from numba.extending import typeof_impl
+from numpy.typing import NDArray
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -119,26 +121,37 @@ class _Form:
         )
 
 
-# By what decides it, the type of an array or of a bundle. An entry of bundles keeps the types of
-# its parts, since their addresses are its key.
+# By what decides it, the type of an array.
 _arrays: dict[tuple[Any, ...], Any] = {}
-_bundles: dict[tuple[Any, ...], tuple[Any, tuple[Any, ...]]] = {}
+_extensible: Any = typeof_impl
+_typeof_array: Any = _extensible.dispatch(np.ndarray)
 
 
-def _kind(argument: Any) -> Any:
-    """Numba's type of an argument.
+@_extensible.register(np.ndarray)  # type: ignore[untyped-decorator]
+def _type_of_array(array: NDArray[Any], context: Any) -> Any:
+    """Numba's type of an array, in the place of its own function.
 
     Numba puts the type of an array of records together from its fields each time. A world has
     hundreds of such arrays, and a few types of them.
     """
+    if type(array) is not np.ndarray:
+        return _typeof_array(array, context)
+    dtype = array.dtype
+    form = (dtype, dtype.isalignedstruct, array.ndim, array.flags.num)
+    kind = _arrays.get(form)
+    if kind is None:
+        kind = _arrays[form] = _typeof_array(array, context)
+    return kind
+
+
+# By the types of its parts, that of a bundle. An entry keeps these, since their addresses are its
+# key.
+_bundles: dict[tuple[Any, ...], tuple[Any, tuple[Any, ...]]] = {}
+
+
+def _kind(argument: Any) -> Any:
+    """Numba's type of an argument."""
     typeof: Any = numba.typeof
-    if type(argument) is np.ndarray:
-        dtype = argument.dtype
-        form = (dtype, dtype.isalignedstruct, argument.ndim, argument.flags.num)
-        kind = _arrays.get(form)
-        if kind is None:
-            kind = _arrays[form] = typeof(argument)
-        return kind
     if not isinstance(argument, tuple):
         return typeof(argument)
     kinds = tuple(map(_kind, argument))

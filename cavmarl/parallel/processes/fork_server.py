@@ -134,6 +134,9 @@ class ForkServer:
         except (ServerGoneError, ProcessLookupError) as error:
             ours.close()
             raise ServerGoneError from error
+        except OSError as error:
+            ours.close()
+            raise WorkerError(f"no descriptor of a worker's process: {error}") from error
         finally:
             theirs.close()
 

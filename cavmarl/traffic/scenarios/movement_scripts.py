@@ -19,13 +19,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.geometry import project
 from cavmarl.core.records import record
 from cavmarl.core.records.arrays import Scripts
 from cavmarl.core.records.codes import CLASS_PEDESTRIAN, MODEL_IDM
 from cavmarl.driving.vehicle_types import CLASS_DEFAULTS, generated_types
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.routing import lane_grid
+from cavmarl.traffic.kernels.covered_stretch import covered_stretch
 from cavmarl.traffic.scenarios.motions import Act, Pose
 
 SAMPLE_M = 0.5  # between the points of a body that are looked at
@@ -71,13 +71,8 @@ class Shadows:
             row = self._network.lanes[lane]
             if not self._is_level(lane, pose.beside):
                 continue
-            line = self._network.points, row["first_point"], row["num_points"]
-            places = [project(*line, x, y)[:2] for x, y in points]
-            reach = 0.5 * float(row["width_m"])
-            length_m = float(row["length_m"])
-            covered = [s for s, d in places if abs(d) < reach and 0.0 <= s <= length_m]
-            if covered:
-                start, end = min(covered), max(covered)
+            start, end = covered_stretch(self._network.points, row, points)
+            if start <= end:
                 _, _, _, cos, sin, _ = self._network.pose_on(lane, 0.5 * (start + end))
                 along = math.cos(pose.heading) * cos + math.sin(pose.heading) * sin
                 found[lane] = Shadow(start, end, max(pose.speed * along, 0.0))
@@ -112,7 +107,10 @@ class Shadows:
 
     def _near(self, points: NDArray[np.float64]) -> list[int]:
         """Lanes that may reach below some of the points, by rising rows."""
-        cells = {self._cell(x, y) for x, y in points}
+        grid = self._grid
+        columns, lines = ((points - (grid.min_x, grid.min_y)) // grid.cell_m).astype(np.int64).T
+        columns, lines = columns.clip(0, grid.num_x - 1), lines.clip(0, grid.num_y - 1)
+        cells = set((lines * grid.num_x + columns).tolist())
         near = np.array(sorted({lane for cell in cells for lane in self._members(cell)}), np.int64)
         rows = self._network.lanes[near]
         reach = 0.5 * rows["width_m"] + BESIDE_M

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from cavmarl.driving.vehicle_types import CLASS_DEFAULTS
-from cavmarl.roads.sumo_net.reader import read_network
 from cavmarl.traffic.demand import DemandFile, read_demand
 from cavmarl.traffic.demand.element import DemandReport, Element
 from cavmarl.traffic.demand.sumo_config import read_sumo_config
 from cavmarl.traffic.demand.type_table import vtype_record
+from tests.support.kept_maps import network_of
 from tests.traffic.demand.conftest import Reader, sumo_binary
 
 VEHICLE = re.compile(
@@ -133,7 +133,7 @@ def test_bologna_is_read_as_sumo_reads_it(shared_maps: Path, tmp_path: Path) -> 
     # Detectors write beside themselves.
     for path in (shared_maps / "net/bologna_acosta").iterdir():
         (folder / path.name).write_bytes(path.read_bytes())
-    network = read_network(folder / "acosta_buslanes.net.xml")
+    network = network_of(folder / "acosta_buslanes.net.xml")
     file = read_demand([folder / "run.sumocfg"], network)
     theirs = sumo(folder, "-c", "run.sumocfg", "--end", "5000")
     assert len(theirs) == 8779
@@ -150,7 +150,7 @@ def test_scenarios_of_the_wheel_are_read(game: str) -> None:
         pytest.skip(f"this version of SUMO has no {game}")
     net_file = read_sumo_config(config).net_file
     assert net_file is not None
-    file = read_demand([config], read_network(net_file))
+    file = read_demand([config], network_of(net_file))
     orders = file.draw(1)
     assert len(orders) > 0
     assert np.all(np.diff(orders["depart"]) >= 0.0)
@@ -158,7 +158,7 @@ def test_scenarios_of_the_wheel_are_read(game: str) -> None:
 
 @pytest.mark.parametrize("name", ["town10hd_25", "town10hd_50", "town10hd_100"])
 def test_town10_is_read(shared_maps: Path, name: str) -> None:
-    network = read_network(shared_maps / "net/Town10HD.net.xml")
+    network = network_of(shared_maps / "net/Town10HD.net.xml")
     file = read_demand([shared_maps / f"demand/{name}.rou.xml"], network)
     assert len(file.draw(0)) == int(name.rpartition("_")[2])
 
@@ -166,7 +166,7 @@ def test_town10_is_read(shared_maps: Path, name: str) -> None:
 def test_mcity_is_read_without_its_cycle_lanes(shared_maps: Path) -> None:
     folder = shared_maps / "net/mcity"
     paths = [folder / "mcity.rou.xml", folder / "mcity.add.xml"]
-    file = read_demand(paths, read_network(folder / "mcity.net.xml"))
+    file = read_demand(paths, network_of(folder / "mcity.net.xml"))
     assert len(file.elements) == 23
     assert len(file.draw(0, until_s=3600.0)) > 2000
     assert file.report.tolerated["<personFlow> is not read"].count == 7
