@@ -57,7 +57,7 @@ def test_with_tls_the_certificate_is_checked(tmp_path: Path) -> None:
 
 def test_it_starts_within_two_seconds(tmp_path: Path) -> None:
     """Of the processor: others use this machine, too."""
-    with running_service(tmp_path / "store.sqlite") as service:
+    with running_service(tmp_path / "store.sqlite", fresh=True) as service:
         assert httpx.get(f"{service.url}/v1/health").status_code == 200
         assert sum(psutil.Process(service.process.pid).cpu_times()[:2]) < 2.0
 

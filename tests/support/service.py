@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -21,7 +22,7 @@ __all__ = ["Cluster", "RunningService", "running_service"]
 class RunningService:
     """`cavmarl serve` in a process of its own."""
 
-    process: subprocess.Popen[str]
+    process: Any
     url: str
     secret: str  # of the admin
     store: str | Path
@@ -35,33 +36,47 @@ class RunningService:
 
     def kill(self) -> None:
         self.process.kill()
-        self.process.communicate()
+        self._end()
+
+    def terminate(self) -> None:
+        self.process.send_signal(signal.SIGTERM)
+        self._end()
+
+    def _end(self) -> None:
+        self.process.wait()
+        self.process.stdout.close()
 
     def start_again(self, *options: str) -> None:
         """Start it anew, at the same port and on the same store."""
         port = self.url.rsplit(":", 1)[1]
-        words = [sys.executable, "-m", "cavmarl", "serve", "--port", port]
-        words += ["--store", str(self.store), *options]
-        self.process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
-        assert self.process.stdout is not None
+        words = ["-m", "cavmarl", "serve", "--port", port, "--store", str(self.store), *options]
+        self.process = ForkedProcess(words, stdout=subprocess.PIPE, text=True)
         assert self.url in self.process.stdout.readline()
 
 
 @contextmanager
-def running_service(store: str | Path, *options: str) -> Iterator[RunningService]:
-    """A service on a socket, with a new store; it ends with the block."""
-    words = [sys.executable, "-m", "cavmarl", "serve", "--port", "0", "--store", str(store)]
-    process = subprocess.Popen([*words, *options], stdout=subprocess.PIPE, text=True)
+def running_service(
+    store: str | Path, *options: str, fresh: bool = False
+) -> Iterator[RunningService]:
+    """A service on a socket, with a new store; it ends with the block.
+
+    It is a fork of a process that has loaded the kernels, or a Python of its own if it is `fresh`.
+    """
+    words = ["-m", "cavmarl", "serve", "--port", "0", "--store", str(store), *options]
+    process: Any
+    if fresh:
+        command = [sys.executable, *words]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    else:
+        process = ForkedProcess(words, stdout=subprocess.PIPE, text=True)
     running = RunningService(process, "", "", store)
     try:
-        assert process.stdout is not None
         running.url = process.stdout.readline().split()[1].rstrip(",")
         running.secret = process.stdout.readline().split()[-1]
         yield running
     finally:
         if running.process.poll() is None:
-            running.process.terminate()
-            running.process.communicate()
+            running.terminate()
 
 
 @dataclass

@@ -93,7 +93,7 @@ def test_a_cut_ends_both_ends(ends: tuple[FaultyNetwork, socket.socket, socket.s
 
 
 def test_nothing_stays_behind() -> None:
-    before = threading.active_count()
+    before = set(threading.enumerate())
     network = FaultyNetwork(seed=0)
     with socket.create_server(("127.0.0.1", 0)) as server:
         with socket.create_connection(network.route(server.getsockname())) as one:
@@ -101,10 +101,9 @@ def test_nothing_stays_behind() -> None:
             other.close()
             assert one.recv(1) == b""
     network.close()
-    for thread in threading.enumerate():
-        if thread is not threading.current_thread() and thread.daemon:
-            thread.join(1.0)
-    assert threading.active_count() <= before
+    for thread in set(threading.enumerate()) - before:
+        thread.join(5.0)
+    assert set(threading.enumerate()) <= before
 
 
 @pytest.mark.parametrize("fault", [NetworkFault.DAMAGE, NetworkFault.SILENCE, STOP])

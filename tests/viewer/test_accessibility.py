@@ -23,6 +23,14 @@ def browser() -> Iterator[Any]:
         yield found
 
 
+@pytest.fixture(autouse=True)
+def closed_pages(browser: Any) -> Iterator[None]:
+    """No page of one test is drawn any more during the next."""
+    yield
+    for context in browser.contexts:
+        context.close()
+
+
 @pytest.fixture(scope="module")
 def axe() -> str:
     """The script of axe-core, as a package of Python has it."""

@@ -34,6 +34,14 @@ def browser() -> Iterator[Any]:
         yield found
 
 
+@pytest.fixture(autouse=True)
+def closed_pages(browser: Any) -> Iterator[None]:
+    """No page of one test is drawn any more during the next."""
+    yield
+    for context in browser.contexts:
+        context.close()
+
+
 def opened(browser: Any, served: Served, script: str = "") -> tuple[Any, list[str], set[str]]:
     """A page that shows a first frame; its complaints, and the hosts that it has asked."""
     page = browser.new_page(viewport={"width": 1280, "height": 760})
