@@ -54,6 +54,7 @@ ALONE_FILES: tuple[str, ...] = (
 # Their kernels draw numbers by unsigned products, which Python warns of.
 _COMPILED_ONLY = (
     "tests/sensors/test_gnss.py",
+    "tests/sensors/test_heard_conflicts.py",
     "tests/sensors/test_measuring.py",
     "tests/sensors/test_rig_schedule.py",
     "tests/v2x/",
