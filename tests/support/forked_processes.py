@@ -13,6 +13,7 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
 from multiprocessing.reduction import DupFd
 from typing import IO, Any
 
@@ -133,7 +134,12 @@ def _run(words: list[str], passed: dict[int, Any], variables: dict[str, str], ca
         sys.argv = [how, *arguments]
         exec(what, {"__name__": "__main__"})
         return
-    sys.argv = [what, *arguments]
+    spec = find_spec(what)
+    if spec is not None and spec.submodule_search_locations is not None:
+        spec = find_spec(f"{what}.__main__")
+    assert spec is not None
+    assert spec.origin is not None
+    sys.argv = [spec.origin, *arguments]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # it has been imported before
         runpy.run_module(what, run_name="__main__")
