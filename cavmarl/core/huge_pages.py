@@ -56,9 +56,9 @@ def huge_zeros(shape: int | tuple[int, ...], dtype: DTypeLike = np.float64) -> N
 def huge_copy(array: NDArray[Any]) -> NDArray[Any]:
     """The same array in huge pages, as writable as it was; a small one is not copied.
 
-    Nor is one that lies in them.
+    Nor is one that lies in them, or in a file that is mapped.
     """
-    if array.nbytes < LEAST or _lies_in_pages(array):
+    if array.nbytes < LEAST or _is_mapped(array):
         return array
     copy = huge_zeros(array.shape, array.dtype)
     # Byte for byte: an assignment would leave out the padding of records, which hashes read.
@@ -67,8 +67,8 @@ def huge_copy(array: NDArray[Any]) -> NDArray[Any]:
     return copy
 
 
-def _lies_in_pages(array: NDArray[Any]) -> bool:
-    """Whether it has come out of `huge_zeros`, by the memory that its base is of."""
+def _is_mapped(array: NDArray[Any]) -> bool:
+    """Whether it has come out of `huge_zeros` or of a file, by the memory that its base is of."""
     base: Any = array
     while isinstance(base, np.ndarray):
         base = base.base

@@ -89,6 +89,7 @@ class LocalWorlds:
             self._write_continuation()
             self._keep_observations()
             self._steps[:] = 0
+        world.network.let_go()
 
     @property
     def transfers(self) -> tuple[TransferLog, ...]:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cavmarl.core.cache_folder import cache_dir, tell_unwritable
+from cavmarl.core.mapped_file import mapped
 from cavmarl.core.whole_file import write_whole
 from cavmarl.roads.kernels.backdrop_pieces import WALL
 from cavmarl.roads.network import (
@@ -34,9 +33,10 @@ from cavmarl.roads.network import (
 from cavmarl.roads.sumo_net.reader import map_name, read_network, source_hash
 
 # Raise this when the reader gives other rows for the same file; record types count by themselves.
-FORMAT = 34
+FORMAT = 37
 
-_DIGEST_BYTES = 32  # SHA-256 of the rest begins an entry: NumPy would stumble over a broken one
+_DIGEST_BYTES = 32  # SHA-256 of the rest begins an entry: of a broken one nothing is read
+_ALIGNED = 64  # arrays begin at multiples of so many bytes
 
 _DTYPES = {
     "points": POINT,
@@ -87,39 +87,50 @@ def network_layout() -> str:
 
 def pack_network(network: RoadNetwork) -> bytes:
     """All of a network but its name and the hash of its source, for `unpack_network`."""
-    stored: dict[str, NDArray[np.uint8]] = {}
-    for field in fields(network):
-        value = getattr(network, field.name)
-        if field.name in _DTYPES:
-            stored[field.name] = np.frombuffer(value.tobytes(), dtype=np.uint8)
-        elif field.name in _IDS:
-            stored[field.name] = _text(value)
-    stored["left_hand"] = _text(network.left_hand)
-    stored["geo"] = _text(None if network.geo is None else asdict(network.geo))
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **stored)
-    content = buffer.getvalue()
+    pieces: list[bytes] = []
+    sizes: dict[str, int] = {}
+    for name in _DTYPES:
+        content = getattr(network, name).tobytes()
+        sizes[name] = len(content)
+        pieces += [content, bytes(-len(content) % _ALIGNED)]
+    told: dict[str, Any] = {name: getattr(network, name) for name in _IDS}
+    told["left_hand"] = network.left_hand
+    told["geo"] = None if network.geo is None else asdict(network.geo)
+    head = json.dumps({"sizes": sizes, "told": told}).encode()
+    start = len(head).to_bytes(8, "little") + head
+    start += bytes(-(_DIGEST_BYTES + len(start)) % _ALIGNED)
+    content = b"".join([start, *pieces])
     return hashlib.sha256(content).digest() + content
 
 
-def unpack_network(content: bytes, name: str, digest: str) -> RoadNetwork | None:
+def unpack_network(content: bytes | memoryview, name: str, digest: str) -> RoadNetwork | None:
     """The network that `pack_network` of the same layout has packed, or None if it is damaged.
+
+    Its arrays are views of what was packed.
 
     Args:
         content: what was packed.
         name: of the network.
         digest: SHA-256 of its source, hex.
     """
-    if hashlib.sha256(content[_DIGEST_BYTES:]).digest() != content[:_DIGEST_BYTES]:
+    view = memoryview(content)
+    if hashlib.sha256(view[_DIGEST_BYTES:]).digest() != view[:_DIGEST_BYTES]:
         return None
-    with np.load(io.BytesIO(content[_DIGEST_BYTES:]), allow_pickle=False) as stored:
-        values: dict[str, Any] = {key: _thaw(stored[key], kind) for key, kind in _DTYPES.items()}
-        values |= {key: tuple(json.loads(stored[key].tobytes())) for key in _IDS}
-        values["roofs"] = values["roofs"].reshape(-1, 4, 2)
-        geo = json.loads(stored["geo"].tobytes())
-        values["geo"] = None if geo is None else GeoReference(**geo)
-        values["left_hand"] = bool(json.loads(stored["left_hand"].tobytes()))
-    return RoadNetwork(name=name, source_hash=digest, **values)
+    begin = _DIGEST_BYTES + 8
+    at = begin + int.from_bytes(view[_DIGEST_BYTES:begin], "little")
+    head = json.loads(bytes(view[begin:at]))
+    values: dict[str, Any] = {}
+    for key, kind in _DTYPES.items():
+        at += -at % _ALIGNED
+        size = head["sizes"][key]
+        # No array copy: it would leave the padding of the records undefined, and hashes read it.
+        values[key] = np.frombuffer(view[at : at + size], dtype=kind)
+        at += size
+    told = head["told"]
+    values |= {key: tuple(told[key]) for key in _IDS}
+    values["roofs"] = values["roofs"].reshape(-1, 4, 2)
+    values["geo"] = None if told["geo"] is None else GeoReference(**told["geo"])
+    return RoadNetwork(name=name, source_hash=digest, left_hand=told["left_hand"], **values)
 
 
 def _entry(digest: str) -> Path:
@@ -129,22 +140,13 @@ def _entry(digest: str) -> Path:
 def _restore(entry: Path, name: str, digest: str) -> RoadNetwork | None:
     """The network of a cache entry, or None if there is no whole one."""
     try:
-        content = entry.read_bytes()
-    except OSError:
+        content = mapped(entry)
+    except (OSError, ValueError):  # it is not there, or empty
         return None
-    return unpack_network(content, name, digest)
+    return unpack_network(memoryview(content), name, digest)
 
 
 def _store(entry: Path, network: RoadNetwork) -> None:
     content = pack_network(network)
     entry.parent.mkdir(parents=True, exist_ok=True)
     write_whole(entry, content)  # other processes may read it at any time
-
-
-def _text(value: object) -> NDArray[np.uint8]:
-    return np.frombuffer(json.dumps(value).encode(), dtype=np.uint8)
-
-
-def _thaw(raw: NDArray[np.uint8], dtype: np.dtype[np.generic]) -> NDArray[np.void]:
-    # No array copy: it would leave the padding of the records undefined, and hashes read it.
-    return np.frombuffer(raw.tobytes(), dtype=dtype)

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.huge_pages import huge_copy
+from cavmarl.core.mapped_file import file_of, let_go
 from cavmarl.core.math.geometry import lane_pose, project
 from cavmarl.core.records import record
 from cavmarl.core.records.arrays import RoadArrays
@@ -276,12 +277,21 @@ class RoadNetwork:
 
     @cached_property
     def arrays(self) -> RoadArrays:
-        """The tables as kernels take them, in huge pages; from then on the fields are these."""
+        """The tables as kernels take them; from then on the fields are these.
+
+        They are in huge pages, or where the cache's file is mapped.
+        """
         for name in _TABLES:
             object.__setattr__(self, name, huge_copy(getattr(self, name)))
         own = (getattr(self, name) for name in _TABLES)
         found = (*own, *map(huge_copy, self._places), self.maps)
         return RoadArrays(*found)
+
+    def let_go(self) -> None:
+        """Have only those parts of a cached map in memory that are used from now on."""
+        file = file_of(self.lanes)
+        if file is not None:
+            let_go(file)
 
     @cached_property
     def maps(self) -> NDArray[np.void]:

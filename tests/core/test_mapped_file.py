@@ -1,0 +1,61 @@
+"""Files whose bytes are read where the system keeps them."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cavmarl.core.huge_pages import LEAST, huge_copy
+from cavmarl.core.mapped_file import file_of, let_go, mapped
+from cavmarl.core.whole_file import write_whole
+
+NUMBERS = np.arange(LEAST, dtype=np.int64)
+
+
+def test_an_array_is_a_view_of_the_file_and_not_copied(tmp_path: Path) -> None:
+    path = tmp_path / "numbers"
+    write_whole(path, NUMBERS.tobytes())
+    file = mapped(path)
+    array = np.frombuffer(memoryview(file)[8:], np.int64)[1:].reshape(-1, 2)
+    assert file_of(array) is file
+    assert huge_copy(array) is array
+    assert not array.flags.writeable
+    write_whole(path, b"another one in its place")
+    let_go(file)
+    assert (array.reshape(-1) == NUMBERS[2:]).all()
+
+
+def test_other_arrays_are_of_no_file() -> None:
+    assert file_of(NUMBERS) is None
+    assert file_of(huge_copy(NUMBERS)) is None
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_what_is_let_go_takes_no_memory(tmp_path: Path) -> None:
+    path = tmp_path / "numbers"
+    write_whole(path, NUMBERS.tobytes())
+    file = mapped(path)
+    array = np.frombuffer(file, np.int64)
+    assert array.sum() == NUMBERS.sum()
+    used = _resident_kib(path)
+    let_go(file)
+    assert used == NUMBERS.nbytes // 1024
+    assert _resident_kib(path) == 0
+
+
+def test_no_file_and_an_empty_one(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        mapped(tmp_path / "none")
+    (tmp_path / "empty").touch()
+    with pytest.raises(ValueError, match="empty"):
+        mapped(tmp_path / "empty")
+
+
+def _resident_kib(path: Path) -> int:
+    """What a file takes of this process's memory."""
+    lines = Path("/proc/self/smaps").read_text(encoding="ascii").splitlines()
+    at = next(n for n, line in enumerate(lines) if line.endswith(str(path)))
+    return next(int(line.split()[1]) for line in lines[at:] if line.startswith("Rss:"))
