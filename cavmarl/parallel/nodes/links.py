@@ -34,6 +34,7 @@ _ALL = (1 << 32) - 1
 _HEAD = struct.Struct("<4sHHQQI")
 _SUM = struct.Struct("<I")
 HEAD_BYTES = _HEAD.size + _SUM.size
+MOST = 512  # pieces that the system is given at once
 
 # A machine that vanishes says nothing: after so many seconds it is asked, and again, so often.
 _ALIVE = [(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)] + [
@@ -84,6 +85,7 @@ class NodeFrame(NamedTuple):
     data: memoryview
 
 
+_KINDS = frozenset(FrameKind)
 URGENT = frozenset(
     {
         FrameKind.MESSAGES,
@@ -139,46 +141,58 @@ class Link:
                 connection.setsockopt(level, option, value)
         connection.setblocking(False)
         self.socket = connection
-        self.waiting: deque[memoryview] = deque()
+        self.waiting: deque[Bytes] = deque()
         self.frames: deque[NodeFrame] = deque()
         self._head = bytearray(HEAD_BYTES)
         self._into = memoryview(self._head)
         self._opened: tuple[FrameKind, int, int, bytearray] | None = None
         self._num_sent = self._num_heard = 0  # frames
+        # of what has been decrypted and not read yet a poll tells nothing
+        self._has_more = hasattr(connection, "pending")
 
-    def send(self, kind: FrameKind, number: int, pieces: Sequence[Bytes]) -> None:
-        """Send what the system takes at once; the rest is kept, as a copy."""
-        views = [memoryview(piece).cast("B") for piece in pieces if len(piece)]
+    def send(self, kind: FrameKind, number: int, pieces: Sequence[Bytes]) -> int:
+        """Send what the system takes at once; the rest is kept, as a copy.
+
+        Returns:
+            bytes of the frame.
+        """
+        views: list[Bytes] = [b""]
+        checksum = size = 0
+        for piece in pieces:
+            if len(piece):
+                view = piece if type(piece) is bytes else memoryview(piece).cast("B")
+                checksum = zlib.crc32(view, checksum)
+                size += len(view)
+                views.append(view)
         self._num_sent = self._num_sent + 1 & _ALL
-        checksum = 0
-        for view in views:
-            checksum = zlib.crc32(view, checksum)
-        size = sum(map(len, views))
         head = _HEAD.pack(MAGIC, VERSION, kind, number, size, checksum)
-        start = head + _SUM.pack(zlib.crc32(head, self._num_sent))
-        rest = [memoryview(start), *views]
-        if not self.waiting:
-            rest = self._sent(rest)
+        views[0] = head + _SUM.pack(zlib.crc32(head, self._num_sent))
+        size += HEAD_BYTES
+        rest = views if self.waiting else self._unsent(views, size)
         self.waiting.extend(memoryview(bytes(view)) for view in rest)
+        return size
 
     def go_on_sending(self) -> None:
-        self.waiting = deque(self._sent(list(self.waiting)))
+        self.waiting = deque(self._unsent(list(self.waiting), sum(map(len, self.waiting))))
 
-    def _sent(self, pieces: list[memoryview]) -> list[memoryview]:
-        """What is left after the system has taken all it can."""
+    def _unsent(self, pieces: list[Bytes], size: int) -> list[Bytes]:
+        """What is left of pieces of so many bytes after the system has taken all it can."""
         while pieces:
             try:
-                sent = self.socket.sendmsg(pieces[:512])
+                sent = self.socket.sendmsg(pieces if len(pieces) <= MOST else pieces[:MOST])
             except BlockingIOError:
                 break
-            while pieces and sent >= len(pieces[0]):
+            if sent == size:
+                return []
+            size -= sent
+            while sent >= len(pieces[0]):
                 sent -= len(pieces.pop(0))
             if sent:
                 pieces[0] = pieces[0][sent:]
         return pieces
 
     def receive(self, urgent: Urgent, number: int) -> None:
-        """Take what has come.
+        """Take what has come, or one frame where a poll tells of the next.
 
         Raises:
             EOFError, OSError: the other end has gone.
@@ -186,15 +200,15 @@ class Link:
             NeededNoMoreError, NodeRefusedError: the coordinator has said its last word.
         """
         while True:
-            if len(self._into):
+            if left := len(self._into):
                 try:
                     got = self.socket.recv_into(self._into)
                 except BlockingIOError:
                     return
                 if not got:
                     raise EOFError
-                self._into = self._into[got:]
-                if len(self._into):
+                if got < left:
+                    self._into = self._into[got:]
                     continue
             if self._opened is None:
                 self._open()
@@ -208,6 +222,8 @@ class Link:
                     urgent(number, frame)
                 else:
                     self.frames.append(frame)
+                if not self._has_more:
+                    return
 
     def _open(self) -> None:
         magic, version, kind, number, size, checksum = _HEAD.unpack_from(self._head)
@@ -222,7 +238,7 @@ class Link:
         found = zlib.crc32(memoryview(self._head)[: _HEAD.size], self._num_heard)
         if _SUM.unpack_from(self._head, _HEAD.size) != (found,):
             raise MessageError("a frame's head is not what was sent, or not the next one")
-        if size > MAX_FRAME or kind not in FrameKind.__members__.values():
+        if size > MAX_FRAME or kind not in _KINDS:
             raise MessageError(f"a frame of kind {kind} with {size} bytes is none")
         room = bytearray(size)
         self._opened = (FrameKind(kind), number, checksum, room)
@@ -271,9 +287,8 @@ class Links:
         if link is None:
             raise LinkLostError(to)
         self.sent_frames += 1
-        self.sent_bytes += HEAD_BYTES + sum(memoryview(piece).nbytes for piece in pieces)
         try:
-            link.send(kind, number, pieces)
+            self.sent_bytes += link.send(kind, number, pieces)
         except OSError as error:
             self.drop(to)
             raise LinkLostError(to) from error

@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from cavmarl.core.errors import MessageError
 from cavmarl.core.huge_pages import forget
+from cavmarl.core.numba.specialized import specialized
 from cavmarl.core.records.arrays import Gate, Outputs, Worlds
 from cavmarl.core.records.codes import (
     COUNT_REROUTED,
@@ -19,15 +21,18 @@ from cavmarl.core.records.codes import (
     POS_LAST,
 )
 from cavmarl.engine.simulation import Simulation
-from cavmarl.parallel.nodes.ghost_stream import GhostStream
+from cavmarl.parallel.nodes.agent_stream import AgentStream
 from cavmarl.parallel.nodes.links import (
     Bytes,
     FrameKind,
+    LinkLostError,
     Links,
     NodeFrame,
     RecoveryOrderedError,
 )
 from cavmarl.parallel.nodes.node_actions import UNOWNED
+from cavmarl.parallel.nodes.row_stream import RowStream, words_of
+from cavmarl.zones.kernels.row_frames import count_own
 
 Array = NDArray[Any]
 PIECES = ("terms", "terminated", "present", "acted", "events", "vehicle_ids", "places")
@@ -67,9 +72,12 @@ class NodePeers:
         self._seen_s = self._detected_s.copy()
         self._running = np.zeros(self._num_worlds, dtype=np.int64)
         self._rerouted = np.zeros(self._num_worlds, dtype=np.int64)
-        self._ghosts = {
-            n: GhostStream(self._zoned, self._mine, self._zones[n]) for n in self._others
+        mine = (self._zoned, self._mine)
+        self._rows = {
+            n: RowStream(*mine, self._zones[n], self._running, self._rerouted) for n in self._others
         }
+        self._count_own = specialized(count_own)
+        self._agents = AgentStream([getattr(simulation.outputs, name) for name in PIECES])
         self._sent = first_share
         self._is_stepping = False
         self.own: Array = np.zeros_like(simulation.outputs.present)
@@ -109,19 +117,12 @@ class NodePeers:
             self.owner[np.frombuffer(data, np.int64)] = number
 
     def share_rows(self, gate: Gate, side: int) -> None:
-        zoned = self._zoned
-        mine = zoned.num_owned[self._mine].sum(axis=0)
-        rerouted = gate.counts[:, COUNT_REROUTED] - self._rerouted
-        common = [mine, rerouted, *self._passing(gate)]
-        found = self._swap([*self._ghosts[to].packed(side), *common] for to in self._others)
-        self._running[:] = mine
+        self._count_own(self._zoned, self._mine, self._running)
+        passing, rows = words_of(gate.passing), self._rows
+        found = self._swap([rows[to].packed(side, gate, passing)] for to in self._others)
         for number, data in found:
-            at = self._ghosts[number].take(data, side)
-            theirs, at = _read(data, at, np.int64, self._num_worlds)
-            more, at = _read(data, at, np.int64, self._num_worlds)
-            self._running += theirs
-            gate.counts[:, COUNT_REROUTED] += more
-            self._add_passing(gate, data, at)
+            with _said_by(number):
+                rows[number].take(data, side, gate, passing)
         self._rerouted[:] = gate.counts[:, COUNT_REROUTED]
 
     def running(self) -> NDArray[np.int64]:
@@ -198,21 +199,12 @@ class NodePeers:
         if self._is_stepping:
             self._is_stepping = False
             self.stepped[...] = self.own
-        mine = self.own & chosen[:, None]
-        where = np.flatnonzero(mine.reshape(-1))
-        arrays = [_by_agent(getattr(outputs, name)) for name in PIECES]
-        pieces = [np.int64(where.size).tobytes(), where.data]
-        if where.size:
-            pieces += [_bytes(array[where]) for array in arrays]
+        mine = (self.own & chosen[:, None]).reshape(-1)
         self.owner.reshape(self.own.shape)[chosen] = UNOWNED
-        self.owner[where] = self._number
-        for number, data in self._swap(pieces for _ in self._others):
-            (num,), at = _read(data, 0, np.int64, 1)
-            agents, at = _read(data, at, np.int64, int(num))
-            self.owner[agents] = number
-            for array in arrays if num else ():
-                found, at = _read(data, at, array.dtype, int(num) * array[0].size)
-                array[agents] = found.reshape(int(num), *array.shape[1:])
+        self.owner[mine] = self._number
+        for number, data in self._swap([self._agents.packed(mine)] for _ in self._others):
+            with _said_by(number):
+                self._agents.take(data, number, self.owner)
 
     @contextmanager
     def everybody(self, gate: Gate, side: int) -> Iterator[None]:
@@ -226,7 +218,7 @@ class NodePeers:
     def whole(self, simulation: Simulation) -> Iterator[None]:
         """The time in which each node has whole worlds; all have to call it."""
         arrays = simulation.of_agents()
-        mine = self._agents(simulation.division.side)
+        mine = self._agents_of(simulation.division.side)
         with self._rows_of_all(simulation.division.side):
             pieces: list[Bytes] = [np.int64(len(mine)).tobytes(), mine.data]
             pieces += [_bytes(_by_agent(array)[mine]) for array in arrays]
@@ -238,7 +230,7 @@ class NodePeers:
                     array[agents] = found.reshape(int(num), *array.shape[1:])
             yield
 
-    def _agents(self, side: int) -> Array:
+    def _agents_of(self, side: int) -> Array:
         """(n,) agents whose vehicles are here, counted over all worlds."""
         zoned, num_agents = self._zoned, self.own.shape[1]
         found = [
@@ -295,6 +287,15 @@ class NodePeers:
             if frame.kind is not FrameKind.SHARE or frame.number != self._sent:
                 raise AssertionError(f"node {number} is at {frame[:2]}, not at share {self._sent}")
         return [(number, found[number].data) for number in self._others]
+
+
+@contextmanager
+def _said_by(number: int) -> Iterator[None]:
+    """Raises LinkLostError: what a node has sent cannot be."""
+    try:
+        yield
+    except MessageError as error:
+        raise LinkLostError(number, error) from error
 
 
 def _by_agent(array: Array) -> Array:

@@ -1,0 +1,301 @@
+"""What each process tells another one about the rows of a tick: ghosts, and vehicles that leave.
+
+`exchange` leaves the ghosts of a zone that another process hosts behind that zone's owned rows, of
+which there are none in this one. Of a ghost that was in the frame before only the words that have
+changed are sent. A ghost is V + S + 2 words: its row, its step, the lane of that, its world.
+
+A frame is words, of W worlds and k zones of the process that it goes to:
+
+    1           words of the frame
+    W           vehicles that this process owns
+    W           of these that have taken another way since the frame before
+    W           vehicles that leave
+    k · W · 2   ghosts; those of them that can touch a vehicle there
+    n           of each ghost where it was in the frame before; -1: it is sent whole
+    n           of each ghost a bit for each word that is sent
+    …           rows of the vehicles that leave
+    …           words of ghosts
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.numba import inlined_kernel, kernel
+from cavmarl.core.records.arrays import Gate, Zoned
+from cavmarl.core.records.codes import COUNT_REROUTED
+
+ID = 0  # the word of a row that names the vehicle
+AFTER = 2  # words of a ghost behind its row and its step
+MOST = 64  # words of a ghost: one word has a bit for each that has changed
+
+Words = NDArray[np.int64]
+
+
+class Both(NamedTuple):
+    """What two processes tell each other about, seen from one of them."""
+
+    zoned: Zoned
+    rows: Words  # (2, k, W, C, V) those of all zones
+    steps: Words  # (k, W, C, S)
+    mine: NDArray[np.int64]  # zones of this process
+    theirs: NDArray[np.int64]  # and of the other one
+    running: NDArray[np.int64]  # (W,) vehicles of this process, and of others as they come
+    rerouted: NDArray[np.int64]  # (W,) vehicles that had taken another way by the last frame
+
+
+@kernel
+def count_own(zoned: Zoned, mine: NDArray[np.int64], running: NDArray[np.int64]) -> None:
+    """Write how many vehicles zones own, (W,)."""
+    for w in range(running.size):
+        running[w] = 0
+        for k in range(mine.size):
+            running[w] += zoned.num_owned[mine[k], w]
+
+
+@kernel
+def pack_frame(
+    both: Both,
+    side: int,
+    gate: Gate,
+    passing: Words,  # (W, C + D, V) rows of the gate
+    before: Words,  # (p, V + S + 2) the ghosts of the frame before
+    slots: NDArray[np.int32],  # scratch, a power of two and more than p
+    now: Words,  # (n, V + S + 2) written: the ghosts, first of all
+    frame: Words,  # written
+) -> int:
+    """Write a frame.
+
+    Returns:
+        how many ghosts it has; if there is no room for them, -1 less that number.
+    """
+    zoned = both.zoned
+    num_worlds = zoned.num_owned.shape[1]
+    first = 1 + 3 * num_worlds
+    total = 0
+    leaving = 0
+    for w in range(num_worlds):
+        frame[1 + w] = both.running[w]
+        frame[1 + num_worlds + w] = gate.counts[w, COUNT_REROUTED] - both.rerouted[w]
+        frame[1 + 2 * num_worlds + w] = gate.num_passing[w]
+        leaving += gate.num_passing[w]
+    for k in range(both.theirs.size):
+        for w in range(num_worlds):
+            frame[first] = zoned.num_rows[both.theirs[k], w]
+            frame[first + 1] = zoned.num_near[both.theirs[k], w]
+            total += frame[first]
+            first += 2
+    row = passing.shape[2]
+    if total > now.shape[0] or first + total * (2 + now.shape[1]) + leaving * row > frame.size:
+        return -1 - total
+    at = first + 2 * total
+    for w in range(num_worlds):
+        for i in range(gate.num_passing[w]):
+            _copy(passing[w, i], 0, frame, at, row)
+            at += row
+    frame[0] = at + _pack_ghosts(both, side, before, slots, now, frame, first, total, at)
+    return int(total)
+
+
+@inlined_kernel
+def _pack_ghosts(
+    both: Both,
+    side: int,
+    before: Words,
+    slots: NDArray[np.int32],
+    now: Words,
+    frame: Words,
+    first: int,  # where `like` begins
+    total: int,
+    at: int,  # where their words begin
+) -> int:
+    """Write the ghosts of a frame; how many words they take."""
+    _fill_slots(before, slots)
+    row = both.rows.shape[4]
+    last = row + both.steps.shape[3]
+    begin = at
+    n = 0
+    for k in range(both.theirs.size):
+        zone = both.theirs[k]
+        for w in range(both.zoned.num_owned.shape[1]):
+            for i in range(both.zoned.num_rows[zone, w]):
+                ghost = now[n]
+                _copy(both.rows[side, zone, w, i], 0, ghost, 0, row)
+                _copy(both.steps[zone, w, i], 0, ghost, row, last - row)
+                ghost[last] = both.zoned.step_at[zone, w, i]
+                ghost[last + 1] = w
+                found = _find(before, slots, ghost)
+                bits = np.uint64(0)
+                for c in range(ghost.size):
+                    if found < 0 or before[found, c] != ghost[c]:
+                        bits |= np.uint64(1) << np.uint64(c)
+                        frame[at] = ghost[c]
+                        at += 1
+                frame[first + n] = found
+                frame[first + total + n] = np.int64(bits)
+                n += 1
+    return at - begin
+
+
+@kernel
+def count_ghosts(both: Both, frame: Words) -> int:
+    """How many ghosts a frame says that it has; -1: it is none that `pack_frame` makes.
+
+    Nothing else of a frame may be read if it is -1, nor if there is no room for what it has.
+    """
+    zoned = both.zoned
+    num_worlds = zoned.num_owned.shape[1]
+    first = 1 + 3 * num_worlds
+    if first + both.mine.size * num_worlds * 2 > frame.size or frame[0] != frame.size:
+        return -1
+    total = 0
+    leaving = 0
+    for w in range(num_worlds):
+        num = frame[1 + 2 * num_worlds + w]
+        if num < 0 or num > frame.size or frame[1 + w] < 0:
+            return -1
+        leaving += num
+    for k in range(both.mine.size):
+        for w in range(num_worlds):
+            num = frame[first]
+            room = zoned.step_at.shape[2] - zoned.num_rows[both.mine[k], w]
+            if num < 0 or num > room or frame[first + 1] < 0 or frame[first + 1] > num:
+                return -1
+            total += num
+            first += 2
+    if first + 2 * total + leaving * both.rows.shape[4] > frame.size:
+        return -1
+    return total
+
+
+@kernel
+def take_frame(
+    both: Both,
+    side: int,
+    gate: Gate,
+    passing: Words,
+    before: Words,
+    now: Words,  # (n, V + S + 2) written: the ghosts; as many as `count_ghosts` has said
+    frame: Words,
+) -> bool:
+    """Put what another process has packed behind the rows of zones of this one, and in the gate.
+
+    Ghosts that can touch a vehicle come before those that cannot.
+
+    Returns:
+        whether it is what `pack_frame` makes; else nothing is put anywhere.
+    """
+    zoned = both.zoned
+    num_worlds = zoned.num_owned.shape[1]
+    first = 1 + 3 * num_worlds
+    like = first + both.mine.size * num_worlds * 2
+    at = words = like + 2 * now.shape[0]
+    row = passing.shape[2]
+    for w in range(num_worlds):
+        leaving = frame[1 + 2 * num_worlds + w]
+        if gate.num_passing[w] + leaving > passing.shape[1]:
+            return False
+        words += leaving * row
+    if not _unpack(before, now, frame, like, words):
+        return False
+    for w in range(num_worlds):
+        both.running[w] += frame[1 + w]
+        gate.counts[w, COUNT_REROUTED] += frame[1 + num_worlds + w]
+        for _ in range(frame[1 + 2 * num_worlds + w]):
+            _copy(frame, at, passing[w, gate.num_passing[w]], 0, row)
+            gate.num_passing[w] += 1
+            at += row
+    n = 0
+    for k in range(both.mine.size):
+        for w in range(num_worlds):
+            for i in range(frame[first]):
+                _put(both, side, both.mine[k], w, now[n], i < frame[first + 1])
+                n += 1
+            first += 2
+    return True
+
+
+@inlined_kernel
+def _put(both: Both, side: int, zone: int, w: int, ghost: Words, is_near: bool) -> None:
+    """Put a ghost behind the rows of a zone."""
+    zoned = both.zoned
+    rows = both.rows[side, zone, w]
+    steps = both.steps[zone, w]
+    step_at = zoned.step_at[zone, w]
+    row = rows.shape[1]
+    at = row + steps.shape[1]
+    place = zoned.num_rows[zone, w]
+    if is_near:
+        first_far = zoned.num_near[zone, w]
+        _copy(rows[first_far], 0, rows[place], 0, row)
+        _copy(steps[first_far], 0, steps[place], 0, at - row)
+        step_at[place] = step_at[first_far]
+        place = first_far
+        zoned.num_near[zone, w] += 1
+    _copy(ghost, 0, rows[place], 0, row)
+    _copy(ghost, row, steps[place], 0, at - row)
+    step_at[place] = ghost[at]
+    zoned.num_rows[zone, w] += 1
+
+
+@inlined_kernel
+def _copy(source: Words, first: int, target: Words, to: int, num: int) -> None:
+    for c in range(num):
+        target[to + c] = source[first + c]
+
+
+@inlined_kernel
+def _unpack(before: Words, now: Words, frame: Words, like: int, words: int) -> bool:
+    """Write the ghosts of a frame to `now`; `like`, `words`: where these begin in it."""
+    num = now.shape[0]
+    for n in range(num):
+        found = frame[like + n]
+        if found >= before.shape[0]:
+            return False
+        bits = np.uint64(frame[like + num + n])
+        for c in range(now.shape[1]):
+            if bits >> np.uint64(c) & np.uint64(1):
+                if words == frame.size:
+                    return False
+                now[n, c] = frame[words]
+                words += 1
+            elif found < 0:
+                return False
+            else:
+                now[n, c] = before[found, c]
+    return words == frame.size
+
+
+@inlined_kernel
+def _slot(ghost: Words, slots: NDArray[np.int32]) -> int:
+    """Where a ghost is looked for first, by its vehicle."""
+    word = np.uint64(ghost[ID]) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(ghost[ghost.size - 1])
+    return int(np.int64((word >> np.uint64(32)) & np.uint64(slots.size - 1)))
+
+
+@inlined_kernel
+def _fill_slots(before: Words, slots: NDArray[np.int32]) -> None:
+    slots[:] = -1
+    for n in range(before.shape[0]):
+        at = _slot(before[n], slots)
+        while slots[at] >= 0:
+            at = (at + 1) & (slots.size - 1)
+        slots[at] = n
+
+
+@inlined_kernel
+def _find(before: Words, slots: NDArray[np.int32], ghost: Words) -> int:
+    """The ghost of the frame before of the same vehicle; -1: there was none."""
+    at = _slot(ghost, slots)
+    last = ghost.size - 1
+    found = -1
+    while slots[at] >= 0:
+        n = slots[at]
+        if before[n, ID] == ghost[ID] and before[n, last] == ghost[last]:
+            found = n
+            break
+        at = (at + 1) & (slots.size - 1)
+    return found

@@ -1,0 +1,223 @@
+"""Rows between two nodes: what is taken is what was sent, whatever changed since then."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import MessageError
+from cavmarl.core.records.arrays import Zoned
+from cavmarl.core.records.codes import COUNT_REROUTED
+from cavmarl.driving.vehicles import VEHICLE
+from cavmarl.parallel.nodes.agent_stream import AgentStream
+from cavmarl.parallel.nodes.row_stream import RowStream, words_of
+from cavmarl.shards.shard import make_zoned
+from cavmarl.traffic.departure_queue import make_gate
+from tests.support.traffic import network
+
+CAPACITY = 40
+WORLDS = 2
+ROOM = 6  # vehicles that pass a gate
+ROADS = network("merge")
+MINE, THEIRS = np.array([0]), np.array([1, 2])
+
+
+class Node:
+    """What one of two nodes has of the worlds."""
+
+    def __init__(self, zones: NDArray[np.int64], others: NDArray[np.int64]) -> None:
+        self.zoned = make_zoned(3, WORLDS, CAPACITY)
+        self.gate = make_gate(WORLDS, ROOM, ROADS.arrays, VEHICLE)
+        self.running = np.zeros(WORLDS, dtype=np.int64)
+        self.rerouted = np.zeros(WORLDS, dtype=np.int64)
+        self._frames = RowStream(self.zoned, zones, others, self.running, self.rerouted)
+
+    def packed(self) -> bytearray:
+        passing = words_of(self.gate.passing)
+        return bytearray(self._frames.packed(1, self.gate, passing))
+
+    def take(self, data: bytes | bytearray) -> None:
+        self._frames.take(memoryview(data), 1, self.gate, words_of(self.gate.passing))
+
+
+def nodes() -> tuple[Node, Node]:
+    """One of zone 0 and one of zones 1 and 2."""
+    return Node(MINE, THEIRS), Node(THEIRS, MINE)
+
+
+def fill(zoned: Zoned, drawn: np.random.Generator, ids: NDArray[np.int64]) -> None:
+    """Ghosts of these vehicles in some order, many words of them as they were."""
+    for zone in THEIRS.tolist():
+        for w in range(WORLDS):
+            chosen = drawn.permutation(ids)[: drawn.integers(len(ids) + 1)]
+            num = len(chosen)
+            rows = np.zeros(num, dtype=zoned.rows.dtype)
+            rows["id"] = chosen
+            rows["x"] = chosen + 0.5
+            rows["speed"] = drawn.integers(3)
+            rows["heading"] = drawn.choice([-0.0, 0.0])
+            zoned.rows[1, zone, w, :num] = rows
+            step = np.repeat(chosen, zoned.step.itemsize // 8)
+            zoned.step[zone, w, :num] = step.view(zoned.step.dtype)
+            zoned.step_at[zone, w, :num] = chosen % 9
+            zoned.num_rows[zone, w] = num
+            zoned.num_near[zone, w] = drawn.integers(num + 1)
+
+
+def clear(zoned: Zoned) -> None:
+    """What a tick does before ghosts are taken: owned rows stay."""
+    zoned.num_owned[THEIRS] = 2
+    zoned.num_rows[THEIRS] = zoned.num_near[THEIRS] = 2
+
+
+def found(zoned: Zoned, first: int) -> list[list[bytes]]:
+    """The ghosts of each zone and world behind its first rows, in no order; near ones apart."""
+    parts = []
+    for zone in THEIRS.tolist():
+        for w in range(WORLDS):
+            near, num = zoned.num_near.item(zone, w), zoned.num_rows.item(zone, w)
+            for some in (range(first, near), range(near, num)):
+                parts.append(
+                    sorted(
+                        zoned.rows[1, zone, w, i].tobytes()
+                        + zoned.step[zone, w, i].tobytes()
+                        + zoned.step_at[zone, w, i].tobytes()
+                        for i in some
+                    )
+                )
+    return parts
+
+
+def leave(node: Node, drawn: np.random.Generator) -> None:
+    """Some vehicles leave, and some take another way."""
+    gate = node.gate
+    gate.num_passing[:] = drawn.integers(ROOM // 2 + 1, size=WORLDS)
+    gate.passing["id"] = drawn.integers(1000, size=gate.passing.shape)
+    gate.counts[:, COUNT_REROUTED] += drawn.integers(3, size=WORLDS)
+
+
+def test_what_is_taken_is_what_was_sent() -> None:
+    near, far = nodes()
+    drawn = np.random.default_rng(1)
+    for tick in range(30):
+        fill(near.zoned, drawn, np.arange(tick, tick + 30))
+        leave(near, drawn)
+        near.running[:] = tick, 7
+        clear(far.zoned)
+        far.running[:] = 100
+        first = far.gate.num_passing[:] = drawn.integers(ROOM // 2 + 1, size=WORLDS)
+        counted = far.gate.counts[:, COUNT_REROUTED].copy()
+        far.take(near.packed())
+        assert found(far.zoned, 2) == found(near.zoned, 0)
+        assert far.running.tolist() == [100 + tick, 107]
+        more = near.gate.counts[:, COUNT_REROUTED] - near.rerouted
+        assert (far.gate.counts[:, COUNT_REROUTED] - counted == more).all()
+        near.rerouted[:] = near.gate.counts[:, COUNT_REROUTED]
+        for w, num in enumerate(near.gate.num_passing.tolist()):
+            assert far.gate.num_passing[w] == first[w] + num
+            sent = far.gate.passing[w, first[w] : first[w] + num]
+            assert sent.tobytes() == near.gate.passing[w, :num].tobytes()
+
+
+def test_what_stays_is_not_sent_again() -> None:
+    near, far = nodes()
+    fill(near.zoned, np.random.default_rng(2), np.arange(30))
+    ghosts = int(near.zoned.num_rows[THEIRS].sum())
+    sizes = []
+    for _ in range(3):
+        clear(far.zoned)
+        data = near.packed()
+        far.take(data)
+        assert found(far.zoned, 2) == found(near.zoned, 0)
+        sizes.append(len(data))
+    assert sizes[0] > ghosts * near.zoned.rows.itemsize
+    assert sizes[1] == sizes[2] < sizes[0] / 8
+
+
+GHOSTS = 1 + 3 * WORLDS  # the word of a frame from which on it says how many there are
+LIKE = GHOSTS + 2 * WORLDS * len(THEIRS)  # and what they are like
+
+
+def harmed(words: NDArray[np.int64], harm: str) -> NDArray[np.int64]:
+    """A frame without vehicles that leave, changed."""
+    ghosts = int(words[GHOSTS:LIKE:2].sum())
+    if harm == "cut short":
+        return words[:-1]
+    if harm == "one word more":
+        words = np.append(words, 0)
+    elif harm == "ghosts like none before":
+        words[LIKE] = 0
+    elif harm == "ghosts in part like none before":
+        words[LIKE + ghosts] = 0
+    elif harm == "more ghosts than there is room for":
+        words[GHOSTS] = CAPACITY - 1
+    elif harm == "less than no ghost":
+        words[GHOSTS] = -1
+    elif harm == "more that can touch than there are":
+        words[GHOSTS + 1] = words[GHOSTS] + 1
+    elif harm == "more that leave than there is room for":
+        words[1 + 2 * WORLDS] = ROOM + 1
+        words = np.concatenate([words, np.zeros(7 * (ROOM + 1), dtype=np.int64)])
+    elif harm == "less than none that leave":
+        words[1 + 2 * WORLDS] = -1
+    else:
+        return words[:0]
+    words[0] = len(words)
+    return words
+
+
+@pytest.mark.parametrize(
+    "harm",
+    [
+        "nothing",
+        "cut short",
+        "one word more",
+        "ghosts like none before",
+        "ghosts in part like none before",
+        "more ghosts than there is room for",
+        "less than no ghost",
+        "more that can touch than there are",
+        "more that leave than there is room for",
+        "less than none that leave",
+    ],
+)
+def test_what_cannot_be_is_refused(harm: str) -> None:
+    near, far = nodes()
+    fill(near.zoned, np.random.default_rng(3), np.arange(30))
+    data = harmed(np.frombuffer(near.packed(), np.int64).copy(), harm).tobytes()
+    clear(far.zoned)
+    with pytest.raises(MessageError, match=f"^{len(data)} bytes are not"):
+        far.take(data)
+    assert (far.zoned.num_rows[THEIRS] == 2).all(), "nothing of it was put anywhere"
+    assert not far.gate.num_passing.any()
+
+
+def tables(num: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    return np.zeros((WORLDS, num, 3), dtype=np.float32), np.zeros((WORLDS, num), dtype=np.bool_)
+
+
+def test_agents_are_taken_as_they_were_sent() -> None:
+    here, there = tables(4), tables(4)
+    drawn = np.random.default_rng(4)
+    here[0][...], here[1][...] = drawn.random((WORLDS, 4, 3)), True
+    mine = np.array([True, False, False, True, False, False, True, False])
+    owner = np.full(8, -1, dtype=np.int32)
+    AgentStream(there).take(AgentStream(here).packed(mine), 5, owner)
+    assert owner.tolist() == [5, -1, -1, 5, -1, -1, 5, -1]
+    for sent, taken in zip(here, there, strict=True):
+        flat, other = (array.reshape(8, -1) for array in (sent, taken))
+        assert (other[mine] == flat[mine]).all()
+        assert not other[~mine].any()
+
+
+@pytest.mark.parametrize("change", [b"", bytes(4), (1).to_bytes(8, "little"), None])
+def test_agents_that_cannot_be_are_refused(change: bytes | None) -> None:
+    here, there = tables(4), tables(4)
+    data = bytearray(AgentStream(here).packed(np.ones(8, dtype=np.bool_)))
+    if change is None:
+        data[8:16] = (8).to_bytes(8, "little")  # there are agents 0 to 7
+    owner = np.full(8, -1, dtype=np.int32)
+    with pytest.raises(MessageError, match="not what a node tells of its agents"):
+        AgentStream(there).take(memoryview(data if change is None else change), 5, owner)
+    assert (owner == -1).all()
