@@ -133,6 +133,12 @@ NEEDED = {
         "sensors.lanes.range_m": 100.0,
         "sensors.signal.enabled": True,
     },
+    "gap_taker": {
+        "v2x.enabled": True,
+        "sensors.conflicts.count": 4,
+        "sensors.conflicts.heard": True,
+        "sensors.signal.enabled": True,
+    },
     "reference": {"rig": REFERENCE_RIG},
 }
 
