@@ -28,8 +28,6 @@ FUNCTION_LINES = 70
 LONG_FUNCTIONS = {
     "cavmarl/driving/kernels/drivers.py:_road_ahead",
     "cavmarl/driving/kernels/drivers.py:decide",
-    "cavmarl/driving/kernels/lane_choice.py:_change_is_safe",
-    "cavmarl/shards/kernels/world_phases.py:advance",
 }
 
 # Modules of one name, outside of cli/ and config/.

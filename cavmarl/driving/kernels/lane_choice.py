@@ -107,6 +107,28 @@ def _is_left_slowly(scratch: Scratch, lane: np.void, front: float) -> bool:
     return False
 
 
+@inlined_kernel
+def _next_beyond(
+    roads: RoadArrays, travel: Travel, row: np.void, lane: int, far: float, scratch: Scratch
+) -> tuple[int, float]:
+    """The entry of the next vehicle behind the end of a lane, and how far ahead its centre is.
+
+    `far`: how far that end is ahead. It looks as far as over a junction and onto the lane behind
+    it; -1 and as far as it has looked: there is none.
+    """
+    j = -1
+    beyond, way, _ = next_step(roads, travel, lane, row["way"])
+    while beyond >= 0:
+        j = last_on(scratch, beyond, row["id"], far, travel.view_m)
+        if j >= 0:
+            far += scratch.entries[j]["s"]
+        if j >= 0 or not roads.lanes[beyond]["internal"]:
+            break
+        far += roads.lanes[beyond]["length_m"]
+        beyond, way, _ = next_step(roads, travel, beyond, way)
+    return j, far
+
+
 @kernel
 def _change_is_safe(
     roads: RoadArrays,
@@ -133,16 +155,7 @@ def _change_is_safe(
     if j >= 0:
         ahead = scratch.entries[j]["s"] - s
     else:
-        ahead = lane["length_m"] - s
-        beyond, way, _ = next_step(roads, travel, target, row["way"])
-        while beyond >= 0:
-            j = last_on(scratch, beyond, row["id"], ahead, travel.view_m)
-            if j >= 0:
-                ahead += scratch.entries[j]["s"]
-            if j >= 0 or not roads.lanes[beyond]["internal"]:
-                break
-            ahead += roads.lanes[beyond]["length_m"]
-            beyond, way, _ = next_step(roads, travel, beyond, way)
+        j, ahead = _next_beyond(roads, travel, row, target, lane["length_m"] - s, scratch)
         if _is_left_slowly(scratch, lane, lane["length_m"] - s - half):
             return False
     after = wish(kind, speed, desired, no_constraint(kind))
@@ -177,15 +190,9 @@ def _change_is_safe(
     after = max(after, -speed / BRAKE_TIME_S)
     if after < -MAX_BRAKING_ACCEPTED:
         return False
+    most = MAX_BRAKING_NEEDED if mandatory else MAX_BRAKING_IMPOSED
     return mobil_accepts(
-        own_wish,
-        after,
-        follower_before,
-        follower_after,
-        0.0,
-        0.0,
-        mandatory,
-        MAX_BRAKING_NEEDED if mandatory else MAX_BRAKING_IMPOSED,
+        own_wish, after, follower_before, follower_after, 0.0, 0.0, mandatory, most
     )
 
 

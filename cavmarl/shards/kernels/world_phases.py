@@ -150,6 +150,53 @@ def _drive_agent(
     row["blinker"] = needed_change(roads, travel, row, travel.steps[own_step(roads, row)])
 
 
+@inlined_kernel
+def _fetch_lanes(roads: RoadArrays, rows: NDArray[np.void], k: int, scratch: Scratch) -> None:
+    """Ask for what is read for the next rows: a place on a lane is found among its points."""
+    prefetch(roads.lanes, rows[scratch.order[k + SOON]]["lane"], 0)
+    near = roads.lanes[rows[scratch.order[k + SOON // 2]]["lane"]]
+    prefetch(roads.points, near["first_point"], 0)
+    prefetch(roads.points, near["first_point"], 1)
+
+
+@inlined_kernel
+def _decide_in_background(
+    roads: RoadArrays, travel: Travel, worlds: Worlds, w: int, dt: float, scratch: Scratch
+) -> bool:
+    """Let the background vehicles of a world decide; whether there are any."""
+    rows, num, owned = worlds.rows[w], worlds.num_rows[w], worlds.num_owned[w]
+    if not _any_driver(rows, owned, DRIVER_BACKGROUND):
+        return False
+    step, phase = worlds.step[w], worlds.signal_phase[w]
+    index_lanes(roads, travel, rows, num, scratch)
+    register_links(roads, travel, rows, num, step, worlds.step_at[w], scratch)
+    tick = worlds.ticks[w]
+    decide(roads, travel, rows, owned, DRIVER_BACKGROUND, tick, dt, phase, step, scratch)
+    return True
+
+
+@inlined_kernel
+def _drive_in_background(
+    roads: RoadArrays,
+    travel: Travel,
+    row: np.void,
+    step: np.void,
+    i: int,  # the row that was decided for
+    most: float,  # m/s², if it is held
+    dt: float,
+    scratch: Scratch,
+) -> int:
+    """Move a background vehicle as was decided; `EVENT_ARRIVED` if its trip is over, or 0."""
+    row["events"] = 0
+    row["hold"] = scratch.hold[i]
+    row["blinker"] = scratch.blinker[i]
+    if scratch.link_ahead[i] >= 0 and row["wait_s"] >= STOOD_S:
+        row["stopped_at"] = scratch.link_ahead[i]
+    accel, change = min(scratch.accel[i], most), scratch.lane_change[i]
+    move_background(roads, travel, row, step, accel, change, dt)
+    return row["events"] & EVENT_ARRIVED  # type: ignore[no-any-return]
+
+
 @kernel
 def advance(
     roads: RoadArrays,
@@ -175,38 +222,15 @@ def advance(
         rows = worlds.rows[w]
         step = worlds.step[w]
         owned = worlds.num_owned[w]
-        drivers = _any_driver(rows, owned, DRIVER_BACKGROUND)
-        if drivers:
-            phase = worlds.signal_phase[w]
-            index_lanes(roads, travel, rows, worlds.num_rows[w], scratch)
-            register_links(
-                roads, travel, rows, worlds.num_rows[w], step, worlds.step_at[w], scratch
-            )
-            decide(
-                roads,
-                travel,
-                rows,
-                owned,
-                DRIVER_BACKGROUND,
-                worlds.ticks[w],
-                dt,
-                phase,
-                step,
-                scratch,
-            )
+        drivers = _decide_in_background(roads, travel, worlds, w, dt, scratch)
         if drivers and not in_place:
             _order_by_lane(roads, rows, owned, scratch)
         else:
             _keep_order(owned, scratch)
-        through = 0
-        outer = 0
-        touching = 0
+        through = outer = touching = 0
         for k in range(owned):
-            if k + SOON < owned:  # a place on a lane is found among its points
-                prefetch(roads.lanes, rows[scratch.order[k + SOON]]["lane"], 0)
-                near = roads.lanes[rows[scratch.order[k + SOON // 2]]["lane"]]
-                prefetch(roads.points, near["first_point"], 0)
-                prefetch(roads.points, near["first_point"], 1)
+            if k + SOON < owned:
+                _fetch_lanes(roads, rows, k, scratch)
             i = scratch.order[k]
             most = math.inf
             if num_held[w] > 0:
@@ -216,14 +240,7 @@ def advance(
             row = worlds.next_rows[w, k]
             touching += row["hit"] >= 0
             if row["driver"] == DRIVER_BACKGROUND:
-                row["events"] = 0
-                row["hold"] = scratch.hold[i]
-                row["blinker"] = scratch.blinker[i]
-                if scratch.link_ahead[i] >= 0 and row["wait_s"] >= STOOD_S:
-                    row["stopped_at"] = scratch.link_ahead[i]
-                accel, change = min(scratch.accel[i], most), scratch.lane_change[i]
-                move_background(roads, travel, row, step[i], accel, change, dt)
-                through += row["events"] & EVENT_ARRIVED
+                through += _drive_in_background(roads, travel, row, step[i], i, most, dt, scratch)
             elif row["driver"] == DRIVER_SCRIPTED:
                 row["events"] = 0
                 follow_script(roads, travel, worlds.cues[w], row, dt)
