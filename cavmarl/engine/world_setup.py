@@ -24,6 +24,7 @@ from cavmarl.config.registry import (
 from cavmarl.config.zones import ZONE_LAYOUTS
 from cavmarl.core.errors import ConfigError, MapError
 from cavmarl.core.huge_pages import trim
+from cavmarl.driving.steered_sweeps import load_steered
 from cavmarl.maps.buildings import with_buildings
 from cavmarl.maps.netconvert import map_file
 from cavmarl.roads.cache import load_network
@@ -41,8 +42,9 @@ from cavmarl.zones.partition.zone_file import zones_for
 from cavmarl.zones.partition.zone_layouts import cut_map
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
-# Networks of this process that something still uses, by the names and hashes of their files.
-_LOADED: WeakValueDictionary[tuple[tuple[str, str], ...], RoadNetwork] = WeakValueDictionary()
+# Networks of this process that something still uses, by whether there are agents and the names and
+# hashes of their files.
+_LOADED: WeakValueDictionary[tuple[object, ...], RoadNetwork] = WeakValueDictionary()
 
 
 class World(NamedTuple):
@@ -122,7 +124,7 @@ def load_roads(config: EnvConfig, base_dir: Path) -> RoadNetwork:
     Raises:
         MapError: the map or a file of buildings or programs cannot be read, or they do not fit.
     """
-    network = _joined(resolve_maps(config, base_dir))
+    network = _joined(resolve_maps(config, base_dir), config.population.agents > 0)
     if len(network.maps) > 1:
         _refuse_of_one_map(config)
     buildings = resolve_buildings(config, base_dir)
@@ -131,8 +133,10 @@ def load_roads(config: EnvConfig, base_dir: Path) -> RoadNetwork:
     return with_programs(network, resolve_programs(config, base_dir), config.map.program)
 
 
-def _joined(paths: Sequence[Path]) -> RoadNetwork:
+def _joined(paths: Sequence[Path], has_agents: bool) -> RoadNetwork:
     """The network of map files; worlds of one process that are made of the same files share it.
+
+    With agents it says where these sweep.
 
     Raises MapError: what is wrong with any of them, all together.
     """
@@ -146,18 +150,18 @@ def _joined(paths: Sequence[Path]) -> RoadNetwork:
             files.append(file)
         except MapError as error:
             refused.append(str(error))
-    found = None if refused else _LOADED.get(tuple(contents))
+    found = None if refused else _LOADED.get((has_agents, *contents))
     if found is not None:
         return found
     networks: list[RoadNetwork] = []
     for file in files:
         try:
-            networks.append(load_network(file))
+            networks.append(load_steered(file) if has_agents else load_network(file))
         except MapError as error:
             refused.append(str(error))
     if refused:
         raise MapError("\n".join(refused))
-    return _LOADED.setdefault(tuple(contents), join(networks))
+    return _LOADED.setdefault((has_agents, *contents), join(networks))
 
 
 def _refuse_of_one_map(config: EnvConfig) -> None:

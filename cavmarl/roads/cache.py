@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -66,12 +67,25 @@ def load_network(path: str | Path) -> RoadNetwork:
 
     Raises MapError: see `read_network`.
     """
-    path = Path(path)
+    return _kept(Path(path), "", read_network)
+
+
+def derived_network(
+    path: str | Path, what: str, derive: Callable[[RoadNetwork], RoadNetwork]
+) -> RoadNetwork:
+    """What is made of the network of a map file, in the same cache; `what` names it.
+
+    Raises MapError: see `read_network`.
+    """
+    return _kept(Path(path), f"-{what}", lambda source: derive(load_network(source)))
+
+
+def _kept(path: Path, what: str, make: Callable[[Path], RoadNetwork]) -> RoadNetwork:
     digest = source_hash(path)
-    entry = _entry(digest)
+    entry = _entry(f"{digest}{what}")
     network = _restore(entry, map_name(path), digest)
     if network is None:
-        network = read_network(path)
+        network = make(path)
         try:
             _store(entry, network)
         except OSError as error:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.records.rows import ENTER_REACH_M, SIZE_LENGTHS_M, SWEPT_BEYOND_M
+from cavmarl.core.records.rows import ENTER_REACH_M, SIZE_LENGTHS_M, STEERED, SWEPT_BEYOND_M
 from cavmarl.driving.kernels.announcing import APPROACH_M
 from cavmarl.driving.kernels.junctions import EXIT_LOOK_M
 from cavmarl.driving.kernels.lane_choice import LOOK_BACK_M
@@ -58,12 +58,12 @@ class Looks:
         ahead = self._along(view_m)
         asked = self._asked(ahead, see_m)
         foes = {int(conflict["foe"]) for link in asked for conflict in self._conflicts(link)}
-        size = sum(2.0 * half_m > length for length in SIZE_LENGTHS_M)
+        sizes = {*range(1 + sum(2.0 * half_m > length for length in SIZE_LENGTHS_M)), STEERED}
         swept = {
             int(sweep["foe"])
             for link in asked
             for sweep in self._sweeps(link)
-            if max(sweep["own"], sweep["other"]) <= size
+            if {int(sweep["own"]), int(sweep["other"])} <= sizes
         }
         foes |= swept
         self._at_lines(foes, self.line)

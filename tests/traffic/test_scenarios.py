@@ -43,9 +43,9 @@ GOLDEN = {
     ("merge_conflict", False): "4f1dda8d3bdfc38929b64fb0c1eaf60f",
     ("pedestrian_crossing", False): "d9ea21caeb1504be3cb9b7ae9c1e6289",
     ("pedestrian_crossing", True): "2bdf5731261a74ff181a519b9daf6bfd",
-    ("road_closure", False): "63057a9b811d30cff149b764fa08d7f0",
+    ("road_closure", False): "b9fb1c3a9ac665f5cda1b278541baf69",
     ("signal_outage", False): "e6dd0ced6cdf7682f6a0cdc530f0cb84",
-    ("unprotected_left_turn", False): "c61fa293d08fb4492f54009630ed42ba",
+    ("unprotected_left_turn", False): "7d6b6502fb4cc9cfa8a9417e431b66bb",
 }
 
 

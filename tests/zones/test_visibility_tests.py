@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from cavmarl.driving.kernels.announcing import APPROACH_M
+from cavmarl.driving.steered_sweeps import with_steered_sweeps
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.zones.kernels.visibility_tests import (
@@ -57,11 +58,12 @@ def looks_of(
     "part", [(0.0, 0.0, 0.4, 1.0), (0.3, 0.45, 0.8, 0.7), (0.5, 0.5, 0.6, 0.6)]
 )
 @pytest.mark.parametrize("half_m", [2.5, HALF_M])
+@pytest.mark.parametrize("steered", [False, True])
 def test_kernel_sees_what_sets_of_lanes_see(
-    name: str, part: tuple[float, float, float, float], half_m: float
+    name: str, part: tuple[float, float, float, float], half_m: float, steered: bool
 ) -> None:
     """Same heads, tails and lines, as finely as the twin looks at lanes."""
-    roads = network(name)
+    roads = with_steered_sweeps(network(name)) if steered else network(name)
     min_x, min_y, max_x, max_y = roads.extent_m
     low, high = np.array([min_x, min_y] * 2), np.array([max_x, max_y] * 2)
     rect = tuple((low + np.array(part) * (high - low)).tolist())
@@ -76,8 +78,9 @@ def test_kernel_sees_what_sets_of_lanes_see(
         expected = np.array([told[lane] for lane in range(len(roads.lanes))])
         np.testing.assert_allclose(found[field], expected, atol=2.0 * STEP_M, err_msg=field)
     assert np.isfinite(found["line"]).any() == (name == "grid4x4")
-    # On these maps vans and buses alone sweep over ways beside theirs.
-    assert np.isfinite(found["room"]).any() == (name == "grid4x4" and half_m == HALF_M)
+    # On these maps vans, buses and steered cars alone sweep over ways beside theirs.
+    sweeps = name == "grid4x4" and (half_m == HALF_M or steered)
+    assert np.isfinite(found["room"]).any() == sweeps
 
 
 @pytest.fixture(scope="module")

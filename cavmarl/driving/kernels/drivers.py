@@ -21,11 +21,11 @@ from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
 from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_BACKGROUND, HOLD_NONE, MODEL_KRAUSS
 from cavmarl.core.records.rows import is_lost
 from cavmarl.driving.kernels.bends import LIMIT_DECEL, bend_speed
+from cavmarl.driving.kernels.beside import behind_askew, behind_entry, beside
 from cavmarl.driving.kernels.courtesy import COURTESY_DECEL, let_merge
 from cavmarl.driving.kernels.following import (
     LINE_MARGIN_M,
     before_line,
-    behind,
     no_constraint,
     response,
     wish,
@@ -47,7 +47,7 @@ from cavmarl.driving.kernels.lane_choice import (
     thinks_of_lanes,
     wish_on_lane,
 )
-from cavmarl.driving.kernels.lane_index import VIEW_M, ahead_on, beside_s, last_on
+from cavmarl.driving.kernels.lane_index import VIEW_M, last_on
 from cavmarl.driving.kernels.stopping import way_to_stop
 from cavmarl.driving.kernels.swept_areas import (
     before_line_gently,
@@ -105,11 +105,6 @@ def _slowing_to(kind: np.void, limit: float, distance: float, speed: float, dt: 
         decel = kind["decel"]
         lead_s = dt
     return math.sqrt(limit * limit + 2.0 * decel * max(distance - lead_s * speed, 0.0))
-
-
-@inlined_kernel
-def _behind_entry(kind: np.void, speed: float, gap: float, leader: np.void) -> float:
-    return behind(kind, speed, gap, leader["speed"], leader["decel"])
 
 
 @kernel
@@ -224,7 +219,7 @@ def _road_ahead(
     if queues and k + 1 < scratch.lane_end[lane] and distance >= half + NEXT_LINE_M:
         leader = scratch.entries[k + 1]
         gap = leader["s"] - row["s"] - half - leader["half"]
-        constraint = _behind_entry(kind, speed, gap, leader)
+        constraint = behind_entry(kind, speed, gap, leader)
         if constraint == 0.0:
             return constraint, 0.0, HOLD_NONE, -1
     limit = min(here["speed_mps"], kind["desired_max_speed"])
@@ -251,7 +246,7 @@ def _road_ahead(
         leader = scratch.entries[k + 1]
         constraint = max(
             constraint,
-            _behind_entry(kind, speed, leader["s"] - row["s"] - half - leader["half"], leader),
+            behind_entry(kind, speed, leader["s"] - row["s"] - half - leader["half"], leader),
         )
         look = min(look, half + NEXT_LINE_M + speed + 0.5 * speed * speed / kind["decel"])
     way = row["way"]
@@ -292,40 +287,11 @@ def _road_ahead(
             gap = distance + leader["s"] - half - leader["half"]
             if gap < NEAR_M and _is_askew(row, rows[leader["row"]]):
                 gap -= ASKEW_M
-            constraint = max(constraint, _behind_entry(kind, speed, gap, leader))
+            constraint = max(constraint, behind_entry(kind, speed, gap, leader))
         if j >= 0 or stops:
             break
         distance += ahead["length_m"]
     return constraint, allowed, hold, link_ahead
-
-
-@kernel
-def _beside(
-    roads: RoadArrays, travel: Travel, kind: np.void, row: np.void, lane: int, scratch: Scratch
-) -> float:
-    """The constraint of the leader on a neighbour lane that the body covers, or is about to."""
-    beside = roads.lanes[lane]
-    s = beside_s(roads, row["lane"], lane, row["s"])
-    half = 0.5 * row["length"]
-    j = ahead_on(scratch, lane, s, row["id"], travel.view_m)
-    if j >= 0:
-        leader = scratch.entries[j]
-        return _behind_entry(kind, row["speed"], leader["s"] - s - half - leader["half"], leader)
-    # Beyond the end of that lane, whichever way others have gone there.
-    constraint = no_constraint(kind)
-    for link in range(beside["first_link"], beside["first_link"] + beside["num_links"]):
-        distance = beside["length_m"] - s
-        beyond = roads.links[link]["next_lane"]
-        j = last_on(scratch, beyond, row["id"], distance, travel.view_m)
-        while j < 0 and roads.lanes[beyond]["internal"]:
-            distance += roads.lanes[beyond]["length_m"]
-            beyond = roads.lanes[beyond]["successor"]
-            j = last_on(scratch, beyond, row["id"], distance, travel.view_m)
-        if j >= 0:
-            leader = scratch.entries[j]
-            gap = distance + leader["s"] - half - leader["half"]
-            constraint = max(constraint, _behind_entry(kind, row["speed"], gap, leader))
-    return constraint
 
 
 @inlined_kernel
@@ -396,9 +362,13 @@ def decide(
         to_stop = way_to_stop(roads, travel, row)
         if to_stop < math.inf:
             constraint = max(constraint, before_line(kind, speed, to_stop + LINE_MARGIN_M, dt))
+        askew = no_constraint(kind)
+        if driver == DRIVER_AGENT:
+            askew = behind_askew(roads, travel, rows, kind, row, scratch)
+            constraint = max(constraint, askew)
         if row["side_lane"] >= 0:
             constraint = max(
-                constraint, _beside(roads, travel, kind, row, row["side_lane"], scratch)
+                constraint, beside(roads, travel, kind, row, row["side_lane"], scratch)
             )
         needed = needed_change(roads, travel, row, step[i])
         change = 0
@@ -415,7 +385,8 @@ def decide(
                 roads, travel, rows, k, step[i], phase, CHANGING_ROOM_M + further_m, dt, scratch
             )
             target = lane["left"] if change > 0 else lane["right"]
-            constraint = max(constraint, _beside(roads, travel, kind, row, target, scratch))
+            aside = beside(roads, travel, kind, row, target, scratch)
+            constraint = max(constraint, askew, aside)
         share = 0.0
         if kind["sigma"] > 0.0:
             share = quick_uniform(row["rng_key"], row["id"], tick, STREAM_DRIVER)
@@ -427,7 +398,7 @@ def decide(
             if target >= 0 and room < FALL_IN_M:
                 # Fall in behind its future leader on the other lane.
                 fall_in = wish(
-                    kind, speed, allowed, _beside(roads, travel, kind, row, target, scratch)
+                    kind, speed, allowed, beside(roads, travel, kind, row, target, scratch)
                 )
                 accel = min(accel, max(fall_in, -COURTESY_DECEL))
         scratch.accel[i] = accel

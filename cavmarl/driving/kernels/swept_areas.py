@@ -1,4 +1,4 @@
-"""Swept areas: where a long vehicle in a bend, or one beside it, has to wait for the other.
+"""Swept areas: where a long or a steered vehicle in a bend, or one beside it, has to wait.
 
 No right of way says which goes first there. A vehicle in the area does; of two before it the
 one that is further along, unless something else holds it. What it waits for is no reason for others
@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays, Scratch
-from cavmarl.core.records.codes import HOLD_NONE, MODEL_KRAUSS
-from cavmarl.core.records.rows import SIZE_BODIES_M, SIZE_LENGTHS_M
+from cavmarl.core.records.codes import DRIVER_AGENT, HOLD_NONE, MODEL_KRAUSS
+from cavmarl.core.records.rows import SIZE_BODIES_M, SIZE_LENGTHS_M, STEERED
 from cavmarl.driving.kernels.announcing import APPROACH_STANDING_M, STANDING_MPS
 from cavmarl.driving.kernels.following import before_line, behind, no_constraint
 
@@ -26,6 +26,7 @@ HARD_STOP = 3.5  # one that needs more goes first
 SOON_M = 3.5  # one that is so near to the area may be in it at once
 LONG_FORK_M = 6.0  # how much further long vehicles need to be clear of one another at a fork
 WAIT_EARLIER_M = 3.0  # how much before the map's position a long vehicle waits inside, at most
+MOST_BACK_M = 5.0  # before its line, where a steered car waits so that others can pass
 GIVE_UP_S = 60.0  # one that has stood so long goes on, whatever is in the area
 
 
@@ -38,7 +39,7 @@ def size_of(half: float) -> int:
 @inlined_kernel
 def _body_m(half: float, size: int) -> float:
     """How long a vehicle counts as: areas end where a body of its class ends at the line."""
-    least = CAR_BODY_M if size == 0 else (VAN_BODY_M if size == 1 else BUS_BODY_M)
+    least = VAN_BODY_M if size == 1 else (BUS_BODY_M if size == 2 else CAR_BODY_M)
     return float(max(2.0 * half, least))
 
 
@@ -57,17 +58,23 @@ def swept_stop(
     row = rows[i]
     size = size_of(0.5 * row["length"])
     rear = place - _body_m(0.5 * row["length"], size)
+    own = STEERED if size == 0 and row["driver"] == DRIVER_AGENT else size
     stop = math.inf
     first = roads.links[link]["first_sweep"]
     for k in range(first, first + roads.links[link]["num_sweeps"]):
         sweep = roads.sweeps[k]
-        if sweep["own"] > size:
+        if sweep["own"] > own:
             break  # they are sorted by it
-        if sweep["own"] != size or rear > sweep["leave_m"]:
+        if sweep["own"] != own or rear > sweep["leave_m"]:
             continue
+        if own == STEERED and room_m > 0.0 and -MOST_BACK_M < sweep["enter_m"] <= 0.0:
+            stop = min(stop, max(sweep["enter_m"], place))  # it waits where no other will sweep
         for n in range(scratch.link_start[sweep["foe"]], scratch.link_end[sweep["foe"]]):
             foe = scratch.approach[n]
-            if foe["row"] == i or size_of(foe["half"]) != sweep["other"]:
+            other = size_of(foe["half"])
+            if other == 0 and own == STEERED and rows[foe["row"]]["driver"] == DRIVER_AGENT:
+                other = STEERED
+            if foe["row"] == i or other != sweep["other"]:
                 continue
             if _is_in_the_way(rows, row, foe, sweep, place, room_m):
                 # One that is in the area, too, stops where it is. Behind one that stands, or may
@@ -138,6 +145,8 @@ def _is_in_the_way(
         return False
     if inside:
         return _is_ahead(foe, foe_place, row, place)
+    # One that does not know of this area does not wait before it.
+    unaware = sweep["own"] == STEERED and sweep["other"] != STEERED
     to_area = sweep["foe_enter_m"] - foe_place
     own_to_area = sweep["enter_m"] - place
     if _needs(foe["speed"], to_area, HARD_STOP) and not _needs(
@@ -145,7 +154,8 @@ def _is_in_the_way(
     ):
         return True
     soon = to_area < SOON_M or _needs(foe["speed"], to_area, EASY_STOP)
-    return soon and _is_ahead(foe, foe_place, row, place)
+    comes = unaware and foe["speed"] > STANDING_MPS
+    return soon and (comes or _is_ahead(foe, foe_place, row, place))
 
 
 @inlined_kernel

@@ -20,9 +20,16 @@ from cavmarl.roads.kernels.swept_range import swept_range
 from cavmarl.roads.network import SWEEP
 from cavmarl.roads.sumo_net.conflicts import CLEARANCE_M, LINE_MARGIN_M, LinkPath
 
-# Half length and half width of the bodies of each size class, with a margin: a car, a van or truck,
-# a bus. A vehicle counts as the next longer one.
-BODIES = tuple(zip((0.5 * m for m in SIZE_BODIES_M), (0.95, 1.25, 1.3), strict=True))
+
+class SweptBody(NamedTuple):
+    """Half a body, in m, with a margin."""
+
+    half_m: float
+    half_width_m: float
+
+
+# Of each size class: a car, a van or truck, a bus. A vehicle counts as the next longer one.
+BODIES = tuple(map(SweptBody, (0.5 * m for m in SIZE_BODIES_M), (0.95, 1.25, 1.3)))
 STEP_M = 0.5
 BEFORE_M = 10.0  # of the front to its line, and
 BEYOND_M = 4.0  # of the rear behind the junction: where bodies are asked about
@@ -53,7 +60,7 @@ def sweep_rows(movements: Movements) -> tuple[NDArray[np.void], NDArray[np.int32
             way = movements.ways[link]
             assert way is not None
             length = float(movements.links["length_m"][link])
-            poses[link] = [_poses(way, half, length) for half, _ in BODIES]
+            poses[link] = [poses_on_rails(way, half, length) for half, _ in BODIES]
         for one, other in combinations(links, 2):
             if movements.links["from_lane"][one] != movements.links["from_lane"][other]:
                 _find_pair(movements, one, other, poses, found)
@@ -79,39 +86,54 @@ def _find_pair(
     poses: dict[int, list[NDArray[np.float64]]],
     found: list[list[tuple[float, ...]]],
 ) -> None:
-    a, b = movements.links[one], movements.links[other]
-    if not _is_near(poses[one][0], poses[other][0]):
+    if not is_near(poses[one][0], poses[other][0]):
         return
-    merging = a["to_lane"] == b["to_lane"]
+    for own, body in enumerate(BODIES):
+        for foe, foe_body in enumerate(BODIES):
+            mine, theirs = (poses[one][own], body), (poses[other][foe], foe_body)
+            row = find_pair(movements, (one, other), mine, theirs)
+            if row is not None:
+                here, there = row
+                found[one].append((other, own, foe, *here, *there))
+                found[other].append((one, foe, own, *there, *here))
+
+
+Area = tuple[float, float]  # in places of a front that comes and of a rear that leaves, m
+
+
+def find_pair(
+    movements: Movements,
+    pair: tuple[int, int],  # LINK rows
+    one: tuple[NDArray[np.float64], SweptBody],  # poses on the first, and the body
+    other: tuple[NDArray[np.float64], SweptBody],  # on the second
+) -> tuple[Area, Area] | None:
+    """Where two bodies on two links touch that no conflict keeps apart: on each of the two."""
+    a, b = (movements.links[link] for link in pair)
+    (mine, body), (theirs, foe_body) = one, other
     conflicts = movements.conflicts[a["first_conflict"] :][: a["num_conflicts"]]
-    area = conflicts[conflicts["foe"] == other]
+    area = conflicts[conflicts["foe"] == pair[1]]
     foes = bool(area.size)
     mine_m = theirs_m = (0.0, 0.0)
     if foes:
         row = area[0]
         mine_m = _begin_m(a, row["enter_m"]), float(row["leave_m"])
         theirs_m = _begin_m(b, row["foe_enter_m"]), float(row["foe_leave_m"])
-    for own, (half, wide) in enumerate(BODIES):
-        for foe, (foe_half, foe_wide) in enumerate(BODIES):
-            mine, theirs = poses[one][own], poses[other][foe]
-            if merging:  # behind the junction one follows the other
-                mine = mine[mine[:, 0] <= a["length_m"]]
-                theirs = theirs[theirs[:, 0] <= b["length_m"]]
-            first, last, foe_first, foe_last = swept_range(
-                mine,
-                theirs,
-                (half, wide, float(a["length_m"]), *mine_m),
-                (foe_half, foe_wide, float(b["length_m"]), *theirs_m),
-                CLEARANCE_M,
-                foes,
-            )
-            if first == np.inf:
-                continue
-            # In places of a front that comes and of a rear that leaves.
-            here = (first + half - MARGIN_M, last - half + MARGIN_M)
-            there = (foe_first + foe_half - MARGIN_M, foe_last - foe_half + MARGIN_M)
-            found[one].append((other, own, foe, *here, *there))
-            found[other].append((one, foe, own, *there, *here))
+    if a["to_lane"] == b["to_lane"]:  # behind the junction one follows the other
+        mine = mine[mine[:, 0] <= a["length_m"]]
+        theirs = theirs[theirs[:, 0] <= b["length_m"]]
+    first, last, foe_first, foe_last = swept_range(
+        mine,
+        theirs,
+        (*body, float(a["length_m"]), *mine_m),
+        (*foe_body, float(b["length_m"]), *theirs_m),
+        CLEARANCE_M,
+        foes,
+    )
+    if first == np.inf:
+        return None
+    here = (first + body.half_m - MARGIN_M, last - body.half_m + MARGIN_M)
+    there = (foe_first + foe_body.half_m - MARGIN_M, foe_last - foe_body.half_m + MARGIN_M)
+    return here, there
 
 
 def _begin_m(link: np.void, enter_m: float) -> float:
@@ -152,14 +174,14 @@ def _find_behind(
                     found[link].append((turn, own, foe, *here, *there))
 
 
-def _is_near(mine: NDArray[np.float64], theirs: NDArray[np.float64]) -> bool:
+def is_near(mine: NDArray[np.float64], theirs: NDArray[np.float64]) -> bool:
     """Whether two ways come so near that bodies of any size might touch."""
     apart = mine[::2, None, 1:3] - theirs[None, ::2, 1:3]
     square = apart[..., 0] * apart[..., 0] + apart[..., 1] * apart[..., 1]
     return bool(square.min() < 6.0 * 6.0)
 
 
-def _poses(way: LinkPath, half_m: float, length_m: float) -> NDArray[np.float64]:
+def poses_on_rails(way: LinkPath, half_m: float, length_m: float) -> NDArray[np.float64]:
     """(n, 6) place of the centre, x, y, z, cosine and sine of bodies with both bumpers on a way."""
     at = np.arange(-(BEFORE_M + half_m), length_m + BEYOND_M + half_m + STEP_M, STEP_M)
     front, rear = _points(way, at + half_m), _points(way, at - half_m)

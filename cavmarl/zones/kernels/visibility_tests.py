@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays
-from cavmarl.core.records.rows import ENTER_REACH_M, SWEPT_BEYOND_M
+from cavmarl.core.records.rows import ENTER_REACH_M, STEERED, SWEPT_BEYOND_M
 from cavmarl.driving.kernels.announcing import APPROACH_M
 from cavmarl.driving.kernels.junctions import EXIT_LOOK_M
 from cavmarl.driving.kernels.lane_choice import LOOK_BACK_M
@@ -266,7 +266,8 @@ def _find_lines(roads: RoadArrays, see_m: float, half_m: float, scratch: Visibil
             first = roads.links[link]["first_sweep"]
             for k in range(first, first + roads.links[link]["num_sweeps"]):
                 sweep = roads.sweeps[k]
-                if sweep["own"] <= largest and sweep["other"] <= largest:
+                known = sweep["own"] <= largest or sweep["own"] == STEERED
+                if known and (sweep["other"] <= largest or sweep["other"] == STEERED):
                     scratch.foe[sweep["foe"]] = True
                     scratch.swept[sweep["foe"]] = True
 

@@ -1,0 +1,97 @@
+"""Leaders on neighbour lanes: those that a body is about to cover, and those that stick out."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.math.geometry import lane_pose
+from cavmarl.core.numba import inlined_kernel, kernel
+from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
+from cavmarl.core.records.codes import DRIVER_AGENT
+from cavmarl.driving.kernels.following import behind, no_constraint
+from cavmarl.driving.kernels.lane_index import ahead_on, beside_s, last_on
+
+STICKS_OUT_M = 0.1  # over the side of its lane, so far that others have to mind it
+ASKEW_RAD = 0.15  # a vehicle that stands less askew does not stick out
+
+
+@inlined_kernel
+def behind_entry(kind: np.void, speed: float, gap: float, leader: np.void) -> float:
+    return behind(kind, speed, gap, leader["speed"], leader["decel"])
+
+
+@kernel
+def beside(
+    roads: RoadArrays, travel: Travel, kind: np.void, row: np.void, lane: int, scratch: Scratch
+) -> float:
+    """The constraint of the leader on a neighbour lane that the body covers, or is about to."""
+    target = roads.lanes[lane]
+    s = beside_s(roads, row["lane"], lane, row["s"])
+    half = 0.5 * row["length"]
+    j = ahead_on(scratch, lane, s, row["id"], travel.view_m)
+    if j >= 0:
+        leader = scratch.entries[j]
+        return behind_entry(kind, row["speed"], leader["s"] - s - half - leader["half"], leader)
+    # Beyond the end of that lane, whichever way others have gone there.
+    constraint = no_constraint(kind)
+    for link in range(target["first_link"], target["first_link"] + target["num_links"]):
+        distance = target["length_m"] - s
+        beyond = roads.links[link]["next_lane"]
+        j = last_on(scratch, beyond, row["id"], distance, travel.view_m)
+        while j < 0 and roads.lanes[beyond]["internal"]:
+            distance += roads.lanes[beyond]["length_m"]
+            beyond = roads.lanes[beyond]["successor"]
+            j = last_on(scratch, beyond, row["id"], distance, travel.view_m)
+        if j >= 0:
+            leader = scratch.entries[j]
+            gap = distance + leader["s"] - half - leader["half"]
+            constraint = max(constraint, behind_entry(kind, row["speed"], gap, leader))
+    return constraint
+
+
+@kernel
+def _sticks_out(roads: RoadArrays, other: np.void, to_left: bool) -> bool:
+    """Whether a corner of a vehicle reaches over a side of its lane, as it crawls askew."""
+    here = roads.lanes[other["lane"]]
+    _, _, _, cos, sin, _ = lane_pose(
+        roads.points, here["first_point"], here["num_points"], other["s"]
+    )
+    across = math.sin(other["heading"]) * cos - math.cos(other["heading"]) * sin
+    if abs(across) < ASKEW_RAD:
+        return False
+    along = math.sqrt(max(1.0 - across * across, 0.0))
+    reach = 0.5 * (other["length"] * abs(across) + other["width"] * along)
+    aside = other["d"] if to_left else -other["d"]
+    out: bool = aside + reach > 0.5 * here["width_m"] + STICKS_OUT_M
+    return out
+
+
+@kernel
+def behind_askew(
+    roads: RoadArrays,
+    travel: Travel,
+    rows: NDArray[np.void],  # VEHICLE (C,)
+    kind: np.void,
+    row: np.void,  # of an agent
+    scratch: Scratch,
+) -> float:
+    """The constraint of steered vehicles ahead on neighbour lanes that stick out into its own."""
+    constraint = no_constraint(kind)
+    here = roads.lanes[row["lane"]]
+    for side in range(2):
+        lane = here["left"] if side == 0 else here["right"]
+        if lane < 0:
+            continue
+        s = beside_s(roads, row["lane"], lane, row["s"])
+        k = ahead_on(scratch, lane, s, row["id"], travel.view_m)
+        if k < 0 or scratch.entries[k]["side"]:
+            continue
+        leader = scratch.entries[k]
+        other = rows[leader["row"]]
+        if other["driver"] == DRIVER_AGENT and _sticks_out(roads, other, side == 1):
+            gap = leader["s"] - s - 0.5 * row["length"] - leader["half"]
+            constraint = max(constraint, behind_entry(kind, row["speed"], gap, leader))
+    return constraint

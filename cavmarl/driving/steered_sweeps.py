@@ -1,0 +1,165 @@
+"""Where cars that are steered sweep over ways beside theirs: for maps of worlds with agents.
+
+Background vehicles have both bumpers on their paths. A steered car, whose axles are at its bumpers,
+drives its front outside of a bend and its rear inside, and turns in late. So it is driven over each
+link once, and SWEEP rows say where it meets others; drivers in agents' seats read them, and no
+others.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config.action import ActionConfig
+from cavmarl.core.records.rows import SIZE_BODIES_M, STEERED
+from cavmarl.driving.kernels.steered_drive import steered_poses
+from cavmarl.driving.vehicles import blank_vehicle
+from cavmarl.roads.cache import derived_network
+from cavmarl.roads.network import SWEEP, RoadNetwork
+from cavmarl.roads.routing import PLAN, lane_grid
+from cavmarl.roads.sumo_net.conflicts import LinkPath, sample_path
+from cavmarl.roads.sumo_net.sweeps import (
+    AHEAD_M,
+    BEFORE_M,
+    BEYOND_M,
+    BODIES,
+    Movements,
+    SweptBody,
+    find_pair,
+    is_near,
+    poses_on_rails,
+)
+
+LENGTH_M, WIDTH_M = 5.0, 2.0
+HALF_M = 0.5 * SIZE_BODIES_M[0]
+BODY = SweptBody(HALF_M, 0.5 * WIDTH_M + 0.25)
+TICKS_S = (0.05, 0.1)  # the longer a tick is, the further out a car drives
+SETTLE_M = 20.0  # before the places that count: there it comes at the speed of the bend
+MOST_POSES = 2000
+FORMAT = "steered-2"  # another one when other rows are found for the same map
+
+
+def load_steered(path: str | Path) -> RoadNetwork:
+    """The network of a map file with SWEEP rows of steered cars, kept between runs, too.
+
+    Raises MapError: see `read_network`.
+    """
+    return derived_network(path, FORMAT, with_steered_sweeps)
+
+
+def with_steered_sweeps(network: RoadNetwork) -> RoadNetwork:
+    """A map with SWEEP rows of steered cars beside those that it has."""
+    # Bytes, for copies of arrays would leave the padding of the records undefined.
+    links = np.frombuffer(bytearray(network.links.tobytes()), dtype=network.links.dtype)
+    ways = [_way(network, link) for link in range(len(links))]
+    movements = Movements(links, network.conflicts, ways)
+    found = _rows(network, movements)
+    own = np.split(network.sweeps, links["first_sweep"][1:]) if len(links) else []
+    parts: list[bytes] = []
+    for link, (old, rows) in enumerate(zip(own, found, strict=True)):
+        # Behind one that turns round it waits as others do.
+        behind = links["from_lane"][old["foe"]] == links["from_lane"][link]
+        rows += [(int(k["foe"]), STEERED, *k.item()[2:]) for k in old[behind & (old["own"] == 0)]]
+        new = np.zeros(len(rows), SWEEP)
+        new[:] = sorted(rows)
+        parts += [old.tobytes(), new.tobytes()]
+    counts = np.array([len(rows) for rows in found], dtype=np.int32) + links["num_sweeps"]
+    links["num_sweeps"] = counts
+    links["first_sweep"] = np.concatenate([[0], np.cumsum(counts)[:-1]]) if len(links) else 0
+    sweeps = np.frombuffer(bytearray(b"".join(parts)), dtype=SWEEP)
+    return replace(network, links=links, sweeps=sweeps)
+
+
+def _rows(network: RoadNetwork, movements: Movements) -> list[list[tuple[float, ...]]]:
+    """The rows of each link."""
+    by_junction: dict[int, list[int]] = defaultdict(list)
+    for link, way in enumerate(movements.ways):
+        if way is not None:
+            by_junction[int(movements.links["junction"][link])].append(link)
+    found: list[list[tuple[float, ...]]] = [[] for _ in movements.ways]
+    drive = _Drive(network)
+    for links in by_junction.values():
+        rails, steered = {}, {}
+        for link in links:
+            way = movements.ways[link]
+            assert way is not None
+            length = float(movements.links["length_m"][link])
+            rails[link] = [poses_on_rails(way, body.half_m, length) for body in BODIES]
+        for one, other in combinations(links, 2):
+            apart = movements.links["from_lane"][one] != movements.links["from_lane"][other]
+            if not apart or not is_near(rails[one][0], rails[other][0]):
+                continue
+            for link in (one, other):
+                if link not in steered:
+                    steered[link] = drive.poses(link)
+            for mine, theirs in ((one, other), (other, one)):
+                for foe, body in enumerate(BODIES):
+                    here = steered[mine], BODY
+                    row = find_pair(movements, (mine, theirs), here, (rails[theirs][foe], body))
+                    if row is not None:
+                        found[mine].append((theirs, STEERED, foe, *row[0], *row[1]))
+            both = find_pair(movements, (one, other), (steered[one], BODY), (steered[other], BODY))
+            if both is not None:
+                found[one].append((other, STEERED, STEERED, *both[0], *both[1]))
+                found[other].append((one, STEERED, STEERED, *both[1], *both[0]))
+    return found
+
+
+def _way(network: RoadNetwork, link: int) -> LinkPath | None:
+    """A link's path, with some of the lanes at its ends; None where it has none."""
+    row = network.links[link]
+    if row["first_internal"] < 0:
+        return None
+    part = network.lane_points(int(row["from_lane"]))
+    length = float(network.lanes["length_m"][row["from_lane"]])
+    near = part["s"] > length - AHEAD_M
+    near[np.flatnonzero(near)[0] - 1 if near.any() and not near[0] else 0] = True
+    s, points = [part["s"][near] - length], [part[near]]
+    lane = int(row["first_internal"])
+    while network.lanes["internal"][lane]:
+        s.append(network.lane_points(lane)["s"] + network.lanes["link_offset_m"][lane])
+        points.append(network.lane_points(lane))
+        lane = int(network.lanes["successor"][lane])
+    part = network.lane_points(lane)
+    near = part["s"] < AHEAD_M
+    near[: min(int(near.sum()) + 1, len(near))] = True
+    s.append(part["s"][near] + float(row["length_m"]))
+    points.append(part[near])
+    xyz = np.concatenate([np.column_stack([part[axis] for axis in "xyz"]) for part in points])
+    return sample_path(np.concatenate(s), xyz)
+
+
+class _Drive:
+    """A car that is driven over the links of a map."""
+
+    def __init__(self, network: RoadNetwork) -> None:
+        self._network = network
+        self._grid = lane_grid(network)
+        self._plan = np.zeros((1, len(network.lanes)), dtype=PLAN)
+        self._plan["next"] = network.lanes["successor"]
+        self._plan["link"] = -1
+        self._poses = np.empty((MOST_POSES, 6))
+
+    def poses(self, link: int) -> NDArray[np.float64]:
+        """(n, 6) as `poses_on_rails` gives them."""
+        network, lane = self._network, int(self._network.links["from_lane"][link])
+        self._plan["next"][0, lane] = network.links["first_internal"][link]
+        self._plan["link"][0, lane] = link
+        row = blank_vehicle()[0]
+        row["length"], row["width"] = LENGTH_M, WIDTH_M
+        found = []
+        for dt in TICKS_S:
+            number = steered_poses(
+                network.arrays, self._plan, self._grid, row, LENGTH_M, ActionConfig().steering_rad,
+                link, BEFORE_M + HALF_M + SETTLE_M, BEYOND_M + HALF_M, dt, self._poses,
+            )  # fmt: skip
+            found.append(self._poses[:number].copy())
+        self._plan["next"][0, lane] = self._plan["link"][0, lane] = -1
+        poses = np.concatenate(found)
+        return poses[poses[:, 0] >= -(BEFORE_M + HALF_M)]

@@ -1,0 +1,159 @@
+"""Steered cars in bends: where they sweep, who minds that, and that fewer of them touch."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_BACKGROUND, HOLD_NONE, HOLD_SIGNAL
+from cavmarl.core.records.rows import STEERED
+from cavmarl.driving.kernels.approach import APPROACH
+from cavmarl.driving.kernels.beside import behind_askew
+from cavmarl.driving.kernels.following import no_constraint
+from cavmarl.driving.kernels.lane_index import index_lanes
+from cavmarl.driving.kernels.swept_areas import MOST_BACK_M, room_m, swept_stop
+from cavmarl.driving.steered_sweeps import load_steered, with_steered_sweeps
+from cavmarl.driving.vehicle_types import generated_types
+from cavmarl.engine.world_setup import load_world
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.sumo_net.reader import read_network
+from tests.support.junction_scenes import build_crossing
+from tests.support.traffic import network as network_of
+from tests.support.traffic import on_lane, scratch, travel
+
+CAR = 0
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build_crossing(tmp_path_factory.mktemp("crossing"), "traffic_light", side_lanes=2)
+
+
+@pytest.fixture(scope="module")
+def network(path: Path) -> RoadNetwork:
+    return load_steered(path)
+
+
+def rows_of(network: RoadNetwork, link: int) -> np.ndarray:
+    row = network.links[link]
+    return network.sweeps[row["first_sweep"] :][: row["num_sweeps"]]
+
+
+def test_rows_of_other_vehicles_stay_as_they_are(path: Path, network: RoadNetwork) -> None:
+    plain = read_network(path)
+    for link in range(len(plain.links)):
+        found, before = rows_of(network, link), rows_of(plain, link)
+        assert found[: len(before)].tobytes() == before.tobytes()
+        assert (found["own"][len(before) :] == STEERED).all()
+    assert len(network.sweeps) > len(plain.sweeps)
+    for name in ("swept_m", "fork_m", "num_conflicts", "wait_m"):
+        np.testing.assert_array_equal(network.links[name], plain.links[name])
+    again = load_steered(path)  # from the cache
+    assert again.sweeps.tobytes() == network.sweeps.tobytes()
+
+
+def test_each_area_of_two_steered_cars_is_known_from_both_sides(network: RoadNetwork) -> None:
+    own = np.repeat(np.arange(len(network.links)), network.links["num_sweeps"])
+    rows = {
+        (int(link), *(row[name].item() for name in network.sweeps.dtype.names or ()))
+        for link, row in zip(own, network.sweeps, strict=True)
+        if row["own"] == row["other"] == STEERED
+    }
+    assert len(rows) > 3
+    for link, foe, size, other, enter, leave, foe_enter, foe_leave in rows:
+        assert (foe, link, other, size, foe_enter, foe_leave, enter, leave) in rows
+
+
+@pytest.mark.parametrize("agents", [0, 1])
+def test_maps_of_worlds_without_agents_have_no_such_rows(path: Path, agents: int) -> None:
+    roads = load_world(str(path), agents=agents, background=4).network
+    assert (roads.sweeps["own"] == STEERED).any() == (agents > 0)
+
+
+def side_by_side(network: RoadNetwork) -> tuple[int, np.void]:
+    """A link on which two steered cars would touch, and two background cars not; and its row."""
+    for link in range(len(network.links)):
+        rows = rows_of(network, link)
+        cars = set(rows["foe"][(rows["own"] == CAR) & (rows["other"] == CAR)])
+        for row in rows[(rows["own"] == STEERED) & (rows["other"] == STEERED)]:
+            if row["foe"] not in cars and row["enter_m"] > 1.0:
+                return link, row
+    raise AssertionError("no steered cars would touch")
+
+
+@pytest.mark.parametrize(
+    ("asks", "other", "waits"),
+    [
+        (DRIVER_AGENT, DRIVER_AGENT, True),
+        (DRIVER_BACKGROUND, DRIVER_AGENT, False),
+        (DRIVER_BACKGROUND, DRIVER_BACKGROUND, False),
+    ],
+)
+def test_a_driver_in_an_agents_seat_waits_before_an_area_that_another_is_in(
+    network: RoadNetwork, asks: int, other: int, waits: bool
+) -> None:
+    link, sweep = side_by_side(network)
+    foe = int(sweep["foe"])
+    lanes = [int(network.links[k]["from_lane"]) for k in (link, foe)]
+    rows = np.concatenate(
+        [on_lane(network, lane, 30.0, id=k, hold=HOLD_NONE, speed=3.0)
+         for k, lane in enumerate(lanes)]
+    )  # fmt: skip
+    rows["driver"] = asks, other
+    room = scratch(network, 2)
+    room.approach[0] = np.zeros(1, APPROACH)[0]
+    entry = room.approach[0]
+    entry["link"], entry["row"], entry["id"], entry["half"] = foe, 1, 1, 2.5
+    entry["dist"], entry["speed"] = 2.5 - (float(sweep["foe_enter_m"]) + 0.5), 3.0
+    room.link_end[foe] = 1
+    place = float(sweep["enter_m"]) - 2.0
+    stop = swept_stop(network.arrays, rows, 0, link, place, -np.inf, room)
+    assert stop == (sweep["enter_m"] if waits else np.inf)
+
+
+@pytest.mark.parametrize(("driver", "back"), [(DRIVER_AGENT, True), (DRIVER_BACKGROUND, False)])
+def test_a_steered_car_waits_before_its_line_where_others_will_sweep(
+    network: RoadNetwork, driver: int, back: bool
+) -> None:
+    own = np.repeat(np.arange(len(network.links)), network.links["num_sweeps"])
+    over = (network.sweeps["own"] == STEERED) & (network.sweeps["enter_m"] < -0.5)
+    over &= network.sweeps["enter_m"] > -MOST_BACK_M
+    link = int(own[over][0])
+    row = on_lane(network, int(network.links["from_lane"][link]), 30.0)
+    row["driver"] = driver
+    room = scratch(network, 1)
+    held, goes = room_m(HOLD_SIGNAL, HOLD_NONE), room_m(HOLD_NONE, HOLD_NONE)
+    stop = swept_stop(network.arrays, row, 0, link, -12.0, held, room)
+    rows = rows_of(network, link)
+    before = rows["enter_m"][(rows["own"] == STEERED) & (rows["enter_m"] > -MOST_BACK_M)]
+    assert stop == (before.min() if back else np.inf)
+    assert swept_stop(network.arrays, row, 0, link, -12.0, goes, room) == np.inf
+
+
+@pytest.mark.parametrize(
+    ("askew", "driver", "minds"),
+    [(0.6, DRIVER_AGENT, True), (0.0, DRIVER_AGENT, False), (0.6, DRIVER_BACKGROUND, False)],
+)
+def test_one_that_crawls_askew_on_a_lane_beside_is_a_leader(
+    askew: float, driver: int, minds: bool
+) -> None:
+    roads, tables = network_of("merge"), travel("merge")
+    lane = next(k for k, row in enumerate(roads.lanes) if row["left"] >= 0)
+    left = int(roads.lanes["left"][lane])
+    rows = np.concatenate(
+        [on_lane(roads, lane, 20.0, tables, id=0, speed=10.0),
+         on_lane(roads, left, 45.0, tables, id=1)]
+    )  # fmt: skip
+    rows["driver"] = DRIVER_AGENT, driver
+    rows["heading"][1] += askew
+    room = scratch(roads, 2)
+    index_lanes(roads.arrays, tables, rows, 2, room)
+    kind = generated_types()[0]
+    found = behind_askew(roads.arrays, tables, rows, kind, rows[0], room)
+    assert (found > no_constraint(kind)) == minds
+
+
+def test_a_map_without_junctions_has_no_rows() -> None:
+    assert len(with_steered_sweeps(network_of("ring")).sweeps) == 0
