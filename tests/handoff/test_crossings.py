@@ -15,7 +15,6 @@ import pytest
 from numpy.typing import NDArray
 
 from cavmarl.engine.simulation import Simulation
-from cavmarl.engine.world_setup import find_map
 from cavmarl.roads.cache import load_network
 from cavmarl.zones.partition.zone_layouts import cut_map
 from tests.support.borders import bounds_around, cut_at, write_platoon, write_roads
@@ -170,9 +169,6 @@ def test_a_reset_around_the_tick_of_the_crossing(
 
 
 def test_each_episode_may_have_zones_of_its_own(tmp_path: Path) -> None:
-    network = load_network(find_map("grid4x4"))
-    partitions = [cut_map(network, layout, k) for layout, k in (("grid", 4), ("strips", 9))]
-
     def build(overrides: dict[str, Any]) -> Simulation:
         return make_simulation(
             "grid4x4", mode="respawn", agents=6, background=60, overrides=ONE_TICK | overrides
@@ -180,6 +176,8 @@ def test_each_episode_may_have_zones_of_its_own(tmp_path: Path) -> None:
 
     whole = build({})
     start(whole, seed=3)
+    network = whole.network
+    partitions = [cut_map(network, layout, k) for layout, k in (("grid", 4), ("strips", 9))]
     for episode, partition in enumerate(partitions):
         divided = Simulation(whole.config, network, partition=partition)
         start(divided, seed=3)
