@@ -7,7 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from cavmarl.driving.kernels.announcing import APPROACH_M
-from cavmarl.driving.steered_sweeps import with_steered_sweeps
+from cavmarl.driving.steered_sweeps import load_steered
+from cavmarl.engine.world_setup import find_map
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.zones.kernels.visibility_tests import (
@@ -63,7 +64,8 @@ def test_kernel_sees_what_sets_of_lanes_see(
     name: str, part: tuple[float, float, float, float], half_m: float, steered: bool
 ) -> None:
     """Same heads, tails and lines, as finely as the twin looks at lanes."""
-    roads = with_steered_sweeps(network(name)) if steered else network(name)
+    # From the cache: without the compiler it takes minutes to drive a car over each link.
+    roads = load_steered(find_map(name)) if steered else network(name)
     min_x, min_y, max_x, max_y = roads.extent_m
     low, high = np.array([min_x, min_y] * 2), np.array([max_x, max_y] * 2)
     rect = tuple((low + np.array(part) * (high - low)).tolist())
