@@ -1,4 +1,4 @@
-"""Steered cars in bends: where they sweep, who minds that, and that fewer of them touch."""
+"""Steered cars in bends: where they sweep, which drivers mind it, and that fewer of them touch."""
 
 from __future__ import annotations
 

@@ -218,8 +218,8 @@ def conflicts(
 ) -> list[float]:
     """Nine numbers of each of the `count` vehicles that count most.
 
-    `hidden`: ids of those that are not seen. `told`: what messages say of whom, as a VEHICLE row
-    and its age in s; then the numbers are eleven.
+    `hidden`: ids of those that are not seen. `told`: what messages say of each
+    vehicle, as a VEHICLE row and its age in s; then the numbers are eleven.
     """
     ego = rows[i]
     looks = own_looks(roads, plans, ego)
@@ -228,16 +228,16 @@ def conflicts(
     known = {**(told or {}), **known}
     del known[int(ego["id"])]
     ranked = []
-    for who, (other, _) in known.items():
+    for subject, (other, _) in known.items():
         away = math.hypot(other["x"] - ego["x"], other["y"] - ego["y"])
         if away > range_m or abs(other["z"] - ego["z"]) > 4.0:
             continue
         near, when = approach(looks, ego, other)
         # Of equal ones the sum rounds differently here and there: these are told apart by id.
-        ranked.append((round(near + 2.0 * when, 6), who, near, when))
+        ranked.append((round(near + 2.0 * when, 6), subject, near, when))
     numbers: list[float] = []
-    for _, who, near, when in sorted(ranked)[:count]:
-        other, age_s = known[who]
+    for _, subject, near, when in sorted(ranked)[:count]:
+        other, age_s = known[subject]
         cos, sin = math.cos(ego["heading"]), math.sin(ego["heading"])
         dx, dy = other["x"] - ego["x"], other["y"] - ego["y"]
         vx = other["speed"] * math.cos(other["heading"]) - ego["speed"] * cos

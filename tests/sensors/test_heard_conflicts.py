@@ -1,4 +1,4 @@
-"""`sensors.conflicts.heard`: whom houses hide is told of by messages, and by nothing else."""
+"""`sensors.conflicts.heard`: messages, and nothing else, tell of vehicles behind houses."""
 
 from __future__ import annotations
 

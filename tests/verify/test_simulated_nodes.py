@@ -16,8 +16,10 @@ from cavmarl.engine.world_setup import World, make_world
 from cavmarl.handoff.division import Division
 from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.parallel.nodes import links as links_module
-from cavmarl.parallel.nodes.links import FrameKind, Links
+from cavmarl.parallel.nodes.agent_stream import AgentStream
+from cavmarl.parallel.nodes.links import Bytes, FrameKind, Links
 from cavmarl.parallel.nodes.node_system import NodeSystem
+from cavmarl.parallel.nodes.row_stream import RowStream
 from cavmarl.verify.simulated_machine import SimulatedListener, SimulatedMachine, SimulatedSocket
 from cavmarl.verify.simulated_nodes import MIXES, SimulatedLine, verify_simulated_nodes
 
@@ -127,6 +129,35 @@ def test_owners_are_checked_over_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "on record are" in found.lines[0].wrong[0]
     unchecked = {**checked, "overrides": {}}
     assert verify_simulated_nodes("merge", [3], mixes=["none"], seeds=1, **unchecked).holds
+
+
+@pytest.mark.parametrize("stream", [RowStream, AgentStream])
+def test_a_node_that_says_what_cannot_be_is_lost(
+    monkeypatch: pytest.MonkeyPatch, stream: type[RowStream] | type[AgentStream]
+) -> None:
+    """A whole frame, of which the words cannot be: a connection ends, and no node fails."""
+    packed: Any = stream.packed
+    send = Links.send
+    calls = 0
+    kinds = set()
+
+    def note(self: Links, to: int, kind: FrameKind, *rest: Any) -> None:
+        kinds.add(kind)
+        send(self, to, kind, *rest)
+
+    def cut_short(self: object, *arguments: Any) -> Bytes:
+        nonlocal calls
+        calls += 1
+        data: memoryview = packed(self, *arguments)
+        return data[:-8] if calls == 20 else data
+
+    monkeypatch.setattr(stream, "packed", cut_short)
+    monkeypatch.setattr(Links, "send", note)
+    (line,) = verify_simulated_nodes("merge", [3], mixes=["none"], seeds=1, **SMALL).lines
+    assert calls > 20
+    assert FrameKind.MISSED in kinds
+    assert FrameKind.FAILED not in kinds
+    assert line == SimulatedLine(3, "none", runs=1, lost=1, back=1)
 
 
 @pytest.mark.slow

@@ -20,6 +20,7 @@ ASKEW_RAD = 0.15  # a vehicle that stands less askew does not stick out
 
 @inlined_kernel
 def behind_entry(kind: np.void, speed: float, gap: float, leader: np.void) -> float:
+    """The constraint of a leader by its ENTRY in the index of lanes; `gap`: between bumpers, m."""
     return behind(kind, speed, gap, leader["speed"], leader["decel"])
 
 
