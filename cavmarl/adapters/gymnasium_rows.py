@@ -36,7 +36,8 @@ class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
 
     With `DISABLED`, `reset(options={"reset_mask": …})` takes (num_envs,) rows: a world that is over
     begins anew with any of its rows, one that goes on with all of them. A row that ended while its
-    world goes on waits as ever, and shows 0 until it has a vehicle.
+    world goes on waits as ever, and shows 0 until it has a vehicle. The horizon truncates every row
+    of a world, also those without a vehicle.
 
     A frame of a row is that of its world.
 
@@ -137,6 +138,9 @@ class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
         )
         terms = {name: infos["terms"][..., k] for k, name in enumerate(self._term_names)}
         told = self._told({"active": infos["mask"], "vehicle_done": infos["vehicle_done"], **terms})
+        if self.autoreset_mode is AutoresetMode.DISABLED:
+            # Rows without a vehicle have to say so as well: a world may end when none has one.
+            cut = cut | (infos["episode_over"][:, None] & ~ended)
         over = self._rows(ended | cut)
         self._over = np.stack([over, infos["episode_over"].repeat(self._shape[1])])
         if self.autoreset_mode is AutoresetMode.SAME_STEP and over.any():

@@ -232,6 +232,23 @@ def test_rows_of_a_world_begin_anew_together() -> None:
     assert waiting > 0
 
 
+def test_a_world_may_end_while_none_of_its_rows_has_a_vehicle() -> None:
+    """Without autoreset the rows say so: a loop that resets what ended never meets a world over."""
+    rows = make(num_worlds=4, autoreset_mode="Disabled")
+    rows.reset(seed=0)
+    rng = np.random.default_rng(0)
+    empty = 0
+    had = np.ones(ROWS, dtype=np.bool_)
+    for _ in range(300):
+        *_, terminated, cut, infos = rows.step(wild(rng, ROWS))
+        over = terminated | cut
+        empty += int((over & ~had).reshape(4, -1).all(axis=1).sum())
+        had = infos["active"]
+        if over.any():
+            had = rows.reset(options={"reset_mask": over})[1]["active"]
+    assert empty > 0
+
+
 @pytest.mark.parametrize("autoreset", ["Disabled", "SameStep"])
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:torchrl")
 @pytest.mark.filterwarnings("ignore:Creating .* inherits from WeightUpdaterBase")
