@@ -4,10 +4,9 @@
     python train/ppo.py --env town --start cities_ippo --workers 2
     python train/ppo.py --resume runs/merge_ippo_1 --total-agent-steps 8000000
 
-Read from top to bottom: the settings; `Batch`, what is learnt from; `Collector`, which drives the
-worlds; `Learner`, the update; `Run`, which takes turns between both. Every agent learns from its
-own observations and rewards, all share the weights (Schulman et al. 2017; de Witt et al. 2020);
-with `--mappo` the critic also sees the world's state (Yu et al. 2022). See docs/learning.md.
+Read from top to bottom: settings; `Batch`, what is learnt from; `Collector`, which drives worlds;
+`Learner`, the update; `Run`, which takes turns. Agents learn from their own observations and
+rewards, and share the weights (Schulman et al. 2017; de Witt et al. 2020). See docs/learning.md.
 """
 
 from __future__ import annotations
@@ -20,7 +19,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, ClassVar
 
-import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
 from rich.console import Console
@@ -33,11 +31,13 @@ from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.learning import options
 from cavmarl.learning.checkpoint import Parts, bytes_of, tensor_of
 from cavmarl.learning.log import Trips, describe, progress_bar
+from cavmarl.learning.opponents import Opponents
+from cavmarl.learning.phase_times import PhaseTimes
 from cavmarl.learning.run_folder import RunFolder, parse_run
 from cavmarl.learning.scales import Scales
 from cavmarl.parallel.local_worlds import kept_elsewhere
 from cavmarl.policies.networks import ActorCritic, NetworkConfig
-from cavmarl.policies.policy import driver_keys, load_policy, policy_files
+from cavmarl.policies.policy import driver_keys, policy_files
 
 PHASES = ("simulation", "transfer", "inference", "learning")
 RED_LIGHT = TERMS.index("red_light")
@@ -83,6 +83,7 @@ class Args:
     mappo: Annotated[bool, "the critic sees the state of the whole world"] = False
     hidden: Annotated[int, "width of the two hidden layers"] = 128
     shared: Annotated[bool, "one body with LayerNorm for actor and critic"] = False
+    residual: Annotated[bool, "its actions are added to those of the built-in driver"] = False
     threads: Annotated[int, "of torch"] = 1
     device: Annotated[str, "where the network is: cpu, or cuda on a machine with a GPU"] = "cpu"
     checkpoint_updates: Annotated[int, "updates between two checkpoints"] = 20
@@ -95,11 +96,13 @@ class Args:
         ones = "num_envs total_agent_steps num_steps epochs minibatches hidden threads"
         zeros = "agents zones workers seed minutes entropy_weight value_weight imitation_weight"
         above = "keep learning_rate clip max_gradient_norm throttle_std steering_std"
-        options.check_at_least(self, dict.fromkeys(f"{ones} checkpoint_updates".split(), 1))
-        options.check_at_least(self, {"background": -1, **dict.fromkeys(zeros.split(), 0)})
+        least = dict.fromkeys(f"{ones} checkpoint_updates".split(), 1)
+        options.check_at_least(self, least | dict.fromkeys(zeros.split(), 0) | {"background": -1})
         options.check_above_zero(self, [*above.split(), "imitation_share"])
         options.check_shares(self, ("gamma", "gae_lambda", "keep", "opponent_share"))
         options.check_device(self.device)
+        if self.residual and self.imitation_weight:
+            raise ConfigError("--residual: not with --imitation-weight; it begins as that driver")
         if self.shared and self.mappo:
             raise ConfigError("--shared: not with --mappo, whose critic sees more than the actor")
 
@@ -150,36 +153,23 @@ class Collector:
     def __init__(self, vec: CavVectorEnv, network: ActorCritic, args: Args, seed: int) -> None:
         self.vec, self.network, self._args, self._device = vec, network, args, args.device
         self.trips = Trips(vec.num_envs, vec.num_agents)
-        self.spent_s = dict.fromkeys(PHASES, 0.0)
+        self.times = PhaseTimes(PHASES)
         self._mask = vec.reset(seed=seed)[1]["mask"]
         # Worlds write here what is seen: it is copied once, into a batch.
         self._observations = torch.from_numpy(vec.worlds.arrays.observations)
-        self._opponents = [load_policy(name, vec) for name in args.opponents.split(",") if name]
-        drawn = np.random.default_rng(args.seed).random(self._mask.shape)
-        self._seats = np.floor(drawn / max(args.opponent_share, 1e-9))  # which driver has each
-        self._seats[self._seats >= len(self._opponents)] = -1  # the network's
-
-    @contextmanager
-    def phase(self, name: str) -> Iterator[None]:
-        """The time of a block goes to this phase; not to be nested."""
-        began = time.perf_counter()
-        yield
-        self.spent_s[name] += time.perf_counter() - began
+        self._opponents = Opponents(args.opponents, vec, args.opponent_share, args.seed)
 
     @torch.inference_mode()
     def collect(self, with_suggested: bool) -> Batch:
         """Some steps of all worlds, on request with what the built-in driver would do."""
-        began, simulated_s = time.perf_counter(), self.vec.simulated_s
-        before_s = sum(self.spent_s.values())
-        batch = self._empty(with_suggested)
-        for opponent in self._opponents:
-            opponent.reset(self._args.seed)  # so that a run that goes on has the same ones
-        for t in range(self._args.num_steps):
-            self._step(batch, t)
-        self._expect(batch)
-        self.spent_s["simulation"] += self.vec.simulated_s - simulated_s
-        elsewhere_s = sum(self.spent_s.values()) - before_s
-        self.spent_s["transfer"] += time.perf_counter() - began - elsewhere_s
+        simulated_s = self.vec.simulated_s
+        with self.times.rest("transfer"):
+            batch = self._empty(with_suggested)
+            self._opponents.begin()
+            for t in range(self._args.num_steps):
+                self._step(batch, t)
+            self._expect(batch)
+            self.times.spent_s["simulation"] += self.vec.simulated_s - simulated_s
         return batch
 
     def _empty(self, with_suggested: bool) -> Batch:
@@ -189,7 +179,7 @@ class Collector:
         with torch.device(self._device):
             actions = torch.zeros((*shape, 2)) if continuous else torch.zeros(shape).long()
             return Batch(
-                observations=torch.empty((*shape, self._observations.shape[-1])),
+                observations=torch.empty((*shape, len(self.network.mean))),
                 states=torch.zeros((*shape[:2], self.network.state_size)),
                 actions=actions,
                 acted=torch.zeros(shape, dtype=torch.bool),
@@ -201,37 +191,46 @@ class Collector:
     def _step(self, batch: Batch, t: int) -> None:
         """Let the network decide, and write down what is entry `t` of a batch."""
         if batch.suggested is not None:
-            with self.phase("simulation"):
+            with self.times.of("simulation"):
                 batch.suggested[t] = torch.from_numpy(self.vec.suggest_actions())
-        batch.observations[t] = self._observations
+        batch.observations[t] = self._seen()
         batch.states[t] = self._look()
-        with self.phase("inference"):
+        with self.times.of("inference"):
             output, values = self._heads(batch.observations[t], batch.states[t])
             actions, batch.log_probs[t] = self.network.draw(output)
             batch.values[t], batch.actions[t] = values, actions
-            given = (actions.clamp(-1.0, 1.0) if self.network.continuous else actions).cpu().numpy()
-        for k, opponent in enumerate(self._opponents):
-            seen, theirs = self._observations.numpy(), self._seats == k
-            given[theirs] = opponent.act_batch(seen, self._mask & theirs)[theirs]
+            given = self.network.given(actions, batch.observations[t]).cpu().numpy()
+        self._opponents.act(self._observations.numpy(), self._mask, given)
         _, reward, ended, cut, infos = self.vec.step(given)
         if self._args.end_at_red:
             ended = ended | (infos["terms"][..., RED_LIGHT] > 0.0)
-        ours, self._mask = self._seats < 0, infos["mask"]
+        ours, self._mask = self._opponents.absent, infos["mask"]
         acted = infos["acted"] & ours
         batch.rewards[t] = torch.from_numpy(reward)
         batch.acted[t] = torch.from_numpy(acted)
         batch.goes_on[t] = torch.from_numpy(acted & self._mask & ~ended & ~cut)
         if len((rows := (cut & ~ended).nonzero())[0]):
             last = torch.from_numpy(infos["final_observations"][rows]).to(self._device)
+            # What the built-in driver would have done there is not known: 0.
+            last = nn.functional.pad(last, (0, len(self.network.mean) - last.shape[1]))
             batch.next_values[t][rows] = self.network.value(last, self._look()[rows[0]])
         self.trips.add(reward, infos["vehicle_done"] & ours, cut, infos["terms"])
 
     def _expect(self, batch: Batch) -> None:
         """What was to be expected after each step of a vehicle that goes on."""
-        with self.phase("inference"):
-            after = self._heads(self._observations.to(self._device), self._look())[1]
+        seen = self._seen()
+        with self.times.of("inference"):
+            after = self._heads(seen.to(self._device), self._look())[1]
         following = torch.cat([batch.values[1:], after[None]])
         batch.next_values = torch.where(batch.goes_on, following, batch.next_values)
+
+    def _seen(self) -> Tensor:
+        """(W, A, D) what is observed now; `residual`: with the action of the built-in driver."""
+        if not self.network.residual:
+            return self._observations
+        with self.times.of("simulation"):
+            proposed = torch.from_numpy(self.vec.suggest_actions())
+        return torch.cat([self._observations, proposed], dim=-1)
 
     def _heads(self, observations: Tensor, states: Tensor) -> tuple[Tensor, Tensor]:
         """What the network says of all seats, (W, A, …) and (W, A)."""
@@ -350,13 +349,14 @@ class Run:
         torch.manual_seed(args.seed + self.updates)
         self.config = NetworkConfig(
             environment=vec.config.name,
-            observation_size=vec.single_observation_space.shape[0],
+            observation_size=vec.single_observation_space.shape[0] + 2 * args.residual,
             sensors=vec.config.sensors,
             action=vec.config.action,
             hidden=(args.hidden, args.hidden),
             seed=args.seed,
             state_size=vec.state_size if args.mappo else 0,
             shared=args.shared,
+            residual=args.residual,
         )
         self.network = ActorCritic(self.config, (args.throttle_std, args.steering_std))
         self.learner = Learner(self.network, args)
@@ -379,9 +379,9 @@ class Run:
     def update(self) -> dict[str, float]:
         """Collect, learn, and log the numbers, which are returned."""
         started, left, collector = time.perf_counter(), 1.0 - self.done(), self.collector
-        collector.spent_s = dict.fromkeys(PHASES, 0.0)
+        collector.times.clear()
         batch = collector.collect(self.learner.imitation_weight(left) > 0.0)
-        with collector.phase("learning"):
+        with collector.times.of("learning"):
             numbers = self.learner.update(batch, left)
         new = int(batch.acted.sum())
         self.agent_steps, self.updates = self.agent_steps + new, self.updates + 1
@@ -392,7 +392,7 @@ class Run:
             "agent_steps_per_s": new / (time.perf_counter() - started),
             **collector.trips.means(),
             **numbers,
-            **{f"{phase}_s": seconds for phase, seconds in collector.spent_s.items()},
+            **{f"{phase}_s": seconds for phase, seconds in collector.times.spent_s.items()},
         }
         self.folder.log.write(row)
         return row

@@ -53,6 +53,8 @@ class NetworkConfig:
         state_size: numbers of the world's state that its critic sees beside the observation. The
             driver itself never does.
         shared: one body for actor and critic, of ReLU with LayerNorm; else each is a tanh network.
+        residual: what it does is added to what the built-in driver would do, which it observes last
+            (residual learning: Silver et al. 2018, Johannink et al. 2019).
     """
 
     environment: str
@@ -64,12 +66,18 @@ class NetworkConfig:
     agent_steps: int = 0
     state_size: int = 0
     shared: bool = False
+    residual: bool = False
 
     def __post_init__(self) -> None:
         if not 1 <= self.observation_size <= MAX_OBSERVATION_SIZE:
             raise ConfigError(
                 f"observation_size = {self.observation_size}: must be from 1 to "
                 f"{MAX_OBSERVATION_SIZE}"
+            )
+        if self.residual and self.action.kind != "continuous":
+            raise ConfigError(
+                f"residual with action.kind = {self.action.kind}: choices cannot be added to the "
+                "built-in driver's; use action.kind = continuous"
             )
         if self.shared and self.state_size:
             raise ConfigError("shared: a critic that sees the world's state has a body of its own")
@@ -82,6 +90,11 @@ class NetworkConfig:
                 f"hidden = {list(self.hidden)}: must be 1 to {MAX_LAYERS} widths from 1 to "
                 f"{MAX_WIDTH}"
             )
+
+    @property
+    def sensed(self) -> int:
+        """Numbers of an observation that its sensors give; the others are the built-in driver's."""
+        return self.observation_size - (CONTINUOUS_ACTIONS if self.residual else 0)
 
     @property
     def num_weights(self) -> int:
@@ -128,6 +141,7 @@ class ActorCritic(nn.Module):
     ) -> None:
         super().__init__()
         self.continuous = config.action.kind == "continuous"
+        self.residual = config.residual
         self.state_size = config.state_size
         actions = config.action.choices or CONTINUOUS_ACTIONS
         self.register_buffer("mean", torch.zeros(config.observation_size))
@@ -181,7 +195,15 @@ class ActorCritic(nn.Module):
     def best(self, observations: Tensor) -> Tensor:
         """The most likely actions: (N, 2) within [-1, 1], or (N,) choices."""
         output = self.forward(observations)
-        return output.clamp(-1.0, 1.0) if self.continuous else output.argmax(-1)
+        return self.given(output if self.continuous else output.argmax(-1), observations)
+
+    def given(self, actions: Tensor, observations: Tensor) -> Tensor:
+        """What the environment gets for actions (…) as sampled, after observations (…, D)."""
+        if not self.continuous:
+            return actions
+        if self.residual:
+            actions = actions + observations[..., -CONTINUOUS_ACTIONS:]
+        return actions.clamp(-1.0, 1.0)
 
     def sample(self, observations: Tensor) -> tuple[Tensor, Tensor]:
         """Random actions, continuous ones not clipped, and their log probabilities (N,)."""

@@ -101,6 +101,9 @@ class NetworkPolicy(Policy):
         """The network's most likely actions where `mask`, 0 elsewhere."""
         import torch
 
+        if self.network.residual:
+            proposed = built_in_actions(self.env, mask)
+            observations = np.concatenate([observations, proposed], axis=-1)
         threads = torch.get_num_threads()
         torch.set_num_threads(1)  # for so small a network, more cost many times what they bring
         try:
@@ -280,12 +283,12 @@ def _load_network_policy(folder: Path, env: Environment) -> NetworkPolicy:
         lines = (f"{key} is {there} there, {ours} here" for key, (there, ours) in unlike.items())
         cure = {key: there for key, (there, _) in unlike.items()}
         raise PolicyError(
-            f"{name} does not fit {here.name}: {'; '.join(lines)} ({config.observation_size} "
+            f"{name} does not fit {here.name}: {'; '.join(lines)} ({config.sensed} "
             f"numbers observed there, {size} here); make the environment with overrides={cure}"
         )
-    if config.observation_size != size:
+    if config.sensed != size:
         raise PolicyError(
-            f"{name}: observes {config.observation_size} numbers, but its sensors give {size} in "
+            f"{name}: observes {config.sensed} numbers, but its sensors give {size} in "
             "this version: train it again"
         )
     return NetworkPolicy(env, network)

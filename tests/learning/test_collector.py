@@ -22,15 +22,16 @@ def make_worlds(mode: str) -> CavVectorEnv:
     )
 
 
-def make_collector(vec: CavVectorEnv, state_size: int) -> Any:
+def make_collector(vec: CavVectorEnv, state_size: int, *, residual: bool = False) -> Any:
     torch.manual_seed(0)
     config = NetworkConfig(
         "merge",
-        vec.single_observation_space.shape[0],
+        vec.single_observation_space.shape[0] + 2 * residual,
         vec.config.sensors,
         vec.config.action,
         (8,),
         state_size=state_size,
+        residual=residual,
     )
     args = PPO.Args(num_steps=STEPS)
     return PPO.Collector(vec, ActorCritic(config, (2.0, 2.0)), args, seed=0)
@@ -74,8 +75,8 @@ def test_values_are_of_the_state_that_the_world_was_in() -> None:
 def test_the_clock_accounts_for_all_time() -> None:
     collector = make_collector(make_worlds("SameStep"), 0)
     collector.collect(with_suggested=True)
-    assert collector.spent_s["learning"] == 0.0
-    assert all(collector.spent_s[phase] > 0.0 for phase in PPO.PHASES[:3])
+    assert collector.times.spent_s["learning"] == 0.0
+    assert all(collector.times.spent_s[phase] > 0.0 for phase in PPO.PHASES[:3])
 
 
 def test_seats_of_opponents_teach_nothing_and_drive_as_they_do() -> None:
@@ -85,7 +86,7 @@ def test_seats_of_opponents_teach_nothing_and_drive_as_they_do() -> None:
     args = PPO.Args(num_steps=STEPS, opponents="idm,random_actions", opponent_share=0.3)
     collector = PPO.Collector(vec, ActorCritic(config), args, seed=0)
     batch = collector.collect(with_suggested=False)
-    theirs = collector._seats >= 0
+    theirs = ~collector._opponents.absent
     assert 0 < int(theirs.sum()) < theirs.size
     assert not batch.acted[:, theirs].any()
     assert not batch.goes_on[:, theirs].any()
@@ -109,3 +110,14 @@ def test_nothing_is_expected_after_a_red_light() -> None:
     ended = calm.goes_on & ~strict.goes_on
     assert ended.any()
     assert (strict.next_values[ended] == 0.0).all()
+
+
+def test_a_residual_driver_sees_what_the_built_in_one_would_do() -> None:
+    vec = make_worlds("SameStep")
+    collector = make_collector(vec, 0, residual=True)
+    proposed = torch.from_numpy(vec.suggest_actions().copy())
+    batch = collector.collect(with_suggested=False)
+    acted = batch.acted[0]
+    assert torch.equal(batch.observations[0, ..., -2:][acted], proposed[acted])
+    assert (batch.observations[1:, ..., -2:] != 0.0).any()
+    assert (batch.acted & ~batch.goes_on & (batch.next_values != 0.0)).any()

@@ -15,7 +15,9 @@ pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a G
 FEW = "--env merge --num-envs 4 --num-steps 16 --checkpoint-updates 1 --shared".split()
 
 
-@pytest.mark.parametrize("words", [[], ["--imitation-weight", "1"], ["--keep", "0.35"]])
+@pytest.mark.parametrize(
+    "words", [[], ["--imitation-weight", "1"], ["--keep", "0.35"], ["--residual"]]
+)
 def test_what_was_begun_on_a_gpu_goes_on_there_and_on_the_cpu(
     tmp_path: Path, words: list[str]
 ) -> None:

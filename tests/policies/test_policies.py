@@ -15,7 +15,7 @@ import pytest
 
 from cavmarl.config.registry import agent_entries
 from cavmarl.config.terms import TERMS
-from cavmarl.core.errors import MissingExtraError, PolicyError
+from cavmarl.core.errors import ConfigError, MissingExtraError, PolicyError
 from cavmarl.cosim.stack.stack import REFERENCE_RIG
 from cavmarl.env.parallel import CavEnv, parallel_env
 from cavmarl.env.vector import CavVectorEnv, make_vec
@@ -37,7 +37,7 @@ def checkpoint(tmp_path: Path) -> Path:
     return save_driver(tmp_path / "driver", small_vec())
 
 
-def save_driver(folder: Path, vec: CavVectorEnv) -> Path:
+def save_driver(folder: Path, vec: CavVectorEnv, *, residual: bool = False) -> Path:
     import torch
 
     from cavmarl.policies.networks import ActorCritic, NetworkConfig, save_network
@@ -45,10 +45,11 @@ def save_driver(folder: Path, vec: CavVectorEnv) -> Path:
     torch.manual_seed(0)
     config = NetworkConfig(
         environment=vec.config.name,
-        observation_size=vec.single_observation_space.shape[0],
+        observation_size=vec.single_observation_space.shape[0] + 2 * residual,
         sensors=vec.config.sensors,
         action=vec.config.action,
         hidden=(8, 8),
+        residual=residual,
     )
     save_network(folder, ActorCritic(config), config)
     return folder
@@ -255,6 +256,36 @@ def test_a_shield_brakes_where_the_built_in_driver_would(kind: str) -> None:
         observations, _, _, _, infos = vec.step(found)
     assert relieved
     assert policy_files(name) == policy_files("never_yield")
+
+
+def test_corrections_are_added_to_what_the_built_in_driver_would_do(tmp_path: Path) -> None:
+    torch = pytest.importorskip("torch")
+    vec = make_vec("merge", num_envs=1, agents=3)
+    folder = save_driver(tmp_path / "residual", vec, residual=True)
+    policy, idm = load_policy(folder, vec), load_policy("idm", vec)
+    network = policy.network  # type: ignore[attr-defined]
+    one = parallel_env("merge", agents=3)
+    seen, _ = one.reset(seed=5)
+    alone = load_policy(folder, one)
+    observations, infos = vec.reset(seed=5)
+    for step in range(40):
+        mask = infos["mask"]
+        proposed, found = (p.act_batch(observations, mask)[mask] for p in (idm, policy))
+        known = torch.from_numpy(np.concatenate([observations[mask], proposed], axis=1))
+        due = (proposed + network(known).detach().numpy()).clip(-1.0, 1.0)
+        np.testing.assert_array_equal(found, due)
+        assert step > 0 or (np.abs(due - proposed) > 0.0).any()
+        by_agent = alone.act(seen)
+        for row, k in zip(found, np.flatnonzero(mask[0]), strict=True):
+            np.testing.assert_array_equal(by_agent[one.possible_agents[k]], row)
+        seen, *_ = one.step(by_agent)
+        observations, _, _, _, infos = vec.step(policy.act_batch(observations, mask))
+
+
+def test_choices_cannot_be_corrected(tmp_path: Path) -> None:
+    pytest.importorskip("torch")
+    with pytest.raises(ConfigError, match=r"residual with action\.kind = discrete: choices cannot"):
+        save_driver(tmp_path, small_vec(action__kind="discrete"), residual=True)
 
 
 def test_a_shield_compares_throttles() -> None:

@@ -265,3 +265,5 @@ def test_a_run_begins_with_the_weights_of_a_driver(
         assert (mine - theirs).abs().max() < 1e-6
     assert ippo.main([*TINY, "--hidden", "9", "--name", "wide", "--start", "runs/first"]) == 2
     assert "--start runs/first: does not fit this run" in capsys.readouterr().err
+    assert ippo.main([*TINY, "--residual", "--name", "next2", "--start", "runs/first"]) == 2
+    assert "--start runs/first: leave out --residual" in capsys.readouterr().err

@@ -135,6 +135,7 @@ def test_a_run_that_is_killed_goes_on_bit_for_bit(
     [
         (["--imitation-weight", "1", "--end-at-red"], []),
         (["--shared", "--keep", "0.5", "--opponents", "idm,random_actions"], []),
+        (["--residual"], []),
         (["--mappo"], ["--zones", "2"]),
         (["--mappo"], ["--workers", "2"]),
     ],
