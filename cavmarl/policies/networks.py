@@ -30,6 +30,8 @@ WEIGHTS_FILE = "model.safetensors"
 CONFIG_FILE = "config.json"
 
 CONTINUOUS_ACTIONS = 2
+# A residual driver's own part of throttle and of steering: it keeps to the built-in driver's lanes.
+RESIDUAL_PARTS = (1.0, 0.1)
 MAX_LAYERS = 8
 MAX_WIDTH = 4096
 MAX_OBSERVATION_SIZE = 65_536
@@ -53,8 +55,8 @@ class NetworkConfig:
         state_size: numbers of the world's state that its critic sees beside the observation. The
             driver itself never does.
         shared: one body for actor and critic, of ReLU with LayerNorm; else each is a tanh network.
-        residual: what it does is added to what the built-in driver would do, which it observes last
-            (residual learning: Silver et al. 2018, Johannink et al. 2019).
+        residual: what it does is added, by `RESIDUAL_PARTS`, to what the built-in driver would do,
+            which it observes last (residual learning: Silver et al. 2018, Johannink et al. 2019).
     """
 
     environment: str
@@ -202,7 +204,8 @@ class ActorCritic(nn.Module):
         if not self.continuous:
             return actions
         if self.residual:
-            actions = actions + observations[..., -CONTINUOUS_ACTIONS:]
+            parts = actions.new_tensor(RESIDUAL_PARTS)
+            actions = actions * parts + observations[..., -CONTINUOUS_ACTIONS:]
         return actions.clamp(-1.0, 1.0)
 
     def sample(self, observations: Tensor) -> tuple[Tensor, Tensor]:

@@ -260,6 +260,8 @@ def test_a_shield_brakes_where_the_built_in_driver_would(kind: str) -> None:
 
 def test_corrections_are_added_to_what_the_built_in_driver_would_do(tmp_path: Path) -> None:
     torch = pytest.importorskip("torch")
+    from cavmarl.policies.networks import RESIDUAL_PARTS
+
     vec = make_vec("merge", num_envs=1, agents=3)
     folder = save_driver(tmp_path / "residual", vec, residual=True)
     policy, idm = load_policy(folder, vec), load_policy("idm", vec)
@@ -272,7 +274,8 @@ def test_corrections_are_added_to_what_the_built_in_driver_would_do(tmp_path: Pa
         mask = infos["mask"]
         proposed, found = (p.act_batch(observations, mask)[mask] for p in (idm, policy))
         known = torch.from_numpy(np.concatenate([observations[mask], proposed], axis=1))
-        due = (proposed + network(known).detach().numpy()).clip(-1.0, 1.0)
+        own = network(known).detach().numpy() * np.array(RESIDUAL_PARTS, dtype=np.float32)
+        due = (own + proposed).clip(-1.0, 1.0)
         np.testing.assert_array_equal(found, due)
         assert step > 0 or (np.abs(due - proposed) > 0.0).any()
         by_agent = alone.act(seen)
