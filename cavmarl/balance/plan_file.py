@@ -112,6 +112,7 @@ def _rule(document: Mapping[str, Any]) -> BalanceRule:
         max_moves=_whole(document.get("max_moves"), "max_moves"),
         move_s=_real(document.get("move_s"), "move_s"),
         payback_ticks=_whole(document.get("payback_ticks"), "payback_ticks"),
+        keeps_one=_truth(document.get("keeps_one", False), "keeps_one"),
     )
 
 

@@ -44,6 +44,7 @@ class BalanceRule:
     move_s: float = 0.01  # what a move costs, once
     # a round is made only if it saves the workers together that much in so many ticks
     payback_ticks: int = 1000
+    keeps_one: bool = False  # a worker's last shard stays with it, or is swapped
 
     def __post_init__(self) -> None:
         for name in ("tolerance", "move_s"):

@@ -27,7 +27,7 @@ def refine(
     """Move one shard off the slowest worker, or swap it for one of another, as long as that helps.
 
     A change helps if both workers then take less long than the slowest took. Nothing is moved to
-    a worker that is excluded.
+    a worker that is excluded, and none is left without a shard if the rule says so.
     """
     left = MOVES_A_SHARD * len(placement.homes) if max_moves is None else max_moves
     touching = _touching(placement.problem)
@@ -73,6 +73,8 @@ def _best_change(
         (loads[targets] + change) / workers.speeds[targets],
     )
     worst[:, ~workers.is_open[targets] | (targets == source)] = math.inf
+    if placement.problem.rule.keeps_one and len(own) == 1:
+        worst[:, :count] = math.inf
     if not worst.size or not worst.min() < ticks[source] * (1.0 - LEAST_GAIN):
         return None
     limit_s = min(worst.min() + slack_s, ticks[source] * (1.0 - LEAST_GAIN))

@@ -28,7 +28,8 @@ class WorkersConfig(Section, key="workers"):
             would, nothing moves.
         max_moves: worlds or zones that change their worker in one round.
         monitor_cpu: see how busy others keep the workers' cores, and give nothing more to
-            workers above a threshold; without it the cores are taken to be free.
+            workers above a threshold; without it the cores are taken to be free. Zone nodes watch
+            their machines for `balance_steps`.
         sensors: processes that the sensors of `rig` are shared out over, for each process that
             keeps the state of worlds; 0: it senses itself. Results do not depend on it. See
             docs/sensor_workers.md.

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 import cavmarl.core.errors
 from cavmarl.balance.balance_plan import Plan
+from cavmarl.balance.load_snapshot import LoadSnapshot
 from cavmarl.balance.plan_text import describe_plan
 from cavmarl.config.v2x import V2xConfig
 from cavmarl.core.errors import CavmarlError, ConfigError, WorkerDeathError, WorkerFailureError
@@ -60,6 +61,9 @@ class OrderedWorlds(ABC):
     def _pids(self) -> Mapping[int, int]:
         """Of the workers' processes, as far as this machine can look at them."""
 
+    def _seen(self) -> LoadSnapshot:
+        return self.placement.snapshot(self._pids())
+
     @abstractmethod
     def _settle(self, parts: list[Part]) -> None:
         """Note which worker runs what from now on."""
@@ -91,7 +95,7 @@ class OrderedWorlds(ABC):
 
         Before that worlds or zones change their worker, if it is time.
         """
-        parts = None if self.mover is None else self.mover.before_step(self._order, self._pids)
+        parts = None if self.mover is None else self.mover.before_step(self._order, self._seen)
         if parts is not None:
             self._settle(parts)
         arrays = self.arrays

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.balance.load_snapshot import LoadSnapshot
 from cavmarl.core.errors import WorkerError
 from cavmarl.parallel.processes.shared_memory import Segment, arrays_in, size_of
 from cavmarl.parallel.step_placement import StepPlacement
@@ -40,7 +41,11 @@ class Mover:
         self.moves = 0  # of shards, up to now
         self.moved_s = 0.0  # how long they have taken together
 
-    def before_step(self, run: Run, pids: Callable[[], Mapping[int, int]]) -> list[Part] | None:
+    def before_step(
+        self,
+        run: Run,
+        seen: Callable[[], LoadSnapshot],  # how busy workers are
+    ) -> list[Part] | None:
         """Count a step; if it is time, plan anew and move.
 
         Returns:
@@ -50,7 +55,8 @@ class Mover:
             self._steps += 1
             return None
         before = self._placement.plans
-        moves = self._placement.round(self._spent_s, self._steps, pids())
+        snapshot = seen()  # may add to what shards have cost
+        moves = self._placement.round(self._spent_s, self._steps, snapshot)
         self._steps = 1
         if not moves:
             return None

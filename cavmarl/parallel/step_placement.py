@@ -30,14 +30,22 @@ class StepPlacement:
         NoAdmissibleWorkerError: workers are too busy.
     """
 
-    def __init__(self, world: World, num_worlds: int, workers: int) -> None:
+    def __init__(
+        self,
+        world: World,
+        num_worlds: int,
+        workers: int,
+        is_here: bool = True,  # they are on this machine; else each watches its own
+    ) -> None:
         settings = world.config.workers
         self._rule = BalanceRule(
-            tolerance=settings.imbalance_tolerance, max_moves=settings.max_moves
+            tolerance=settings.imbalance_tolerance,
+            max_moves=settings.max_moves,
+            keeps_one=not is_here,
         )
         self._ticks_per_step = world.config.clock.ticks_per_step
-        self._watches = settings.monitor_cpu
-        seen = _present_snapshot(workers) if settings.monitor_cpu else None
+        self._watches = settings.monitor_cpu and is_here
+        seen = _present_snapshot(workers) if self._watches else None
         plans = make_plans(world, num_worlds, workers, seen, self._rule)
         self._balancers = [Balancer(plan.problem) for plan in plans]
         self._watch: Watch | None = None
@@ -64,10 +72,9 @@ class StepPlacement:
         # (W, zones) processor time of each shard from the start on; whole worlds count as one zone
         spent_s: Floats,
         steps: int,  # since the last round
-        pids: Mapping[int, int],  # of the workers' processes
+        seen: LoadSnapshot,  # how busy workers are
     ) -> bool:  # whether something has to be moved
         """Plan anew by what shards have cost since the last round."""
-        seen = self._snapshot(pids)
         cost_s = (spent_s - self._before_s) / (steps * self._ticks_per_step)
         self._before_s = spent_s.copy()
         for balancer in self._balancers:
@@ -94,7 +101,10 @@ class StepPlacement:
         self._rule = replace(self._rule, move_s=lasted_s / moves)
         return moves
 
-    def _snapshot(self, pids: Mapping[int, int]) -> LoadSnapshot:
+    def snapshot(
+        self,
+        pids: Mapping[int, int],  # of the workers' processes
+    ) -> LoadSnapshot:
         """How busy workers are; idle where not measured, and where one was replaced meanwhile."""
         watch, before = self._watch, self._pids
         self.watch(pids)

@@ -6,6 +6,7 @@ import pytest
 
 from cavmarl.balance.balance_plan import replan
 from cavmarl.balance.balancer import Balancer
+from cavmarl.balance.load_score import Candidate, Utilisation
 from cavmarl.balance.load_snapshot import LoadSnapshot, idle_snapshot
 from cavmarl.balance.problem import BalanceRule, Problem, ShardCost, equal_costs
 from cavmarl.core.errors import ConfigError
@@ -63,3 +64,16 @@ def test_other_shards_than_those_of_the_plan_are_refused(
     shards = tuple(ShardCost(n // 4, n % 4, cost) for n, cost in enumerate(costs))
     with pytest.raises(ConfigError, match="must be those of the plan"):
         balancer.measure(shards)
+
+
+@pytest.mark.parametrize("keeps_one", [False, True])
+def test_a_busy_worker_keeps_its_last_shard_if_the_rule_says_so(keeps_one: bool) -> None:
+    rule = BalanceRule(tolerance=0.0, move_s=0.0, keeps_one=keeps_one)
+    first = Problem(equal_costs(1, 4), grid(2, 2), idle_snapshot(2), rule)
+    balancer = Balancer(first)
+    balancer.measure(row([0.1 if home else 5.0 for home in balancer.plan.homes]))
+    idle, busy = idle_snapshot(2), Utilisation(0.99, 0.1)
+    workers = (Candidate(0, busy), idle.workers[1])
+    for _ in range(4):
+        balancer.round(LoadSnapshot(workers, idle.gpu_source, idle.origin))
+    assert balancer.plan.homes.count(0) == keeps_one

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from cavmarl import CavVectorEnv
+from cavmarl.balance import probe
+from cavmarl.balance.load_snapshot import LoadSnapshot, idle_snapshot
 from cavmarl.core.errors import ConfigError
 from cavmarl.v2x.v2x_messages import RECEPTION, Exchange
 from tests.support.actuated import actuated_grid
@@ -81,6 +84,7 @@ FEATURES: dict[str, Callable[[Path], Keywords]] = {
         "sensor_workers": 1,
     },
     "balance": _with(workers__balance_steps=3),
+    "balance by LoadScore": _with(workers__balance_steps=3, workers__monitor_cpu=True),
     "a journal": lambda folder: _with(zones__journal=str(folder / "run.jsonl"))(folder),
     "invariant checks": _with(zones__check_invariants=True),
     "repartitions": _with(zones__repartition_steps=3),
@@ -99,7 +103,7 @@ PLACES: dict[str, Keywords] = {
 # What an undivided world, beside which others are run, does not know.
 ONLY_DIVIDED = (
     "zones.faults", "zones.journal", "zones.check_invariants", "zones.repartition_steps",
-    "workers.balance_steps", "zones.policy", "zones.grace_ticks",
+    "workers.balance_steps", "workers.monitor_cpu", "zones.policy", "zones.grace_ticks",
 )  # fmt: skip
 OF_ONE_WORLD = "of one world over"
 OF_THE_CALLER = "a network simulator is in the caller's process"
@@ -117,6 +121,7 @@ REFUSED = {
     ("a journal", "worlds on Ray"): NOT_ON_HOSTS,
     ("planned faults", "worlds on Ray"): NOT_ON_HOSTS,
     ("sensor workers", "worlds on Ray"): "leave out the hosts",
+    ("balance by LoadScore", "worlds on Ray"): "or leave out the hosts",
     ("sensor workers", "nodes on Ray"): NOT_OVER_NODES,
     ("planned faults", "nodes on Ray"): NOT_OVER_NODES,
 }
@@ -138,6 +143,11 @@ def _run(vec: CavVectorEnv) -> Run:
     return drive(vec, steps=8)
 
 
+def _idle(workers: Mapping[int, Any]) -> LoadSnapshot:
+    """How busy this machine is if no other program uses it: workers of busy ones are refused."""
+    return idle_snapshot(len(workers))
+
+
 def check(make: Make, folder: Path, feature: str, place: str) -> None:
     """They are the undivided world bit for bit, or refused as the table says."""
     keywords, where = FEATURES[feature](folder), PLACES[place]
@@ -150,7 +160,9 @@ def check(make: Make, folder: Path, feature: str, place: str) -> None:
     alone = {**keywords, "overrides": plain, "num_envs": where.get("num_envs", 1)}
     alone.pop("sensor_workers", None)
     whole = _run(make(**alone))
-    assert same(_run(make(**keywords, **where)), whole)
+    with patch.object(probe, "take_snapshot", _idle):
+        vec = make(**keywords, **where)
+    assert same(_run(vec), whole)
 
 
 @pytest.mark.parametrize("feature", FEATURES)

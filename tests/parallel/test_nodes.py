@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import random
 import signal
-import time
 from pathlib import Path
 from threading import Timer
 from typing import Any
@@ -23,8 +22,6 @@ from cavmarl.parallel.nodes.node_pool import NodePool
 from cavmarl.parallel.nodes.node_starters import LocalNodes
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.parallel.step_arrays import StepArrays
-from cavmarl.viewer.audience import Audience, Wishes
-from cavmarl.viewer.run_loads import RunLoads
 from tests.support.actuated import actuated_grid
 from tests.support.forks import said_in_fork
 from tests.support.vec_runs import Make, drive, same
@@ -310,6 +307,10 @@ def test_one_environment_of_pettingzoo() -> None:
         ({"nodes": 2, "zones": 2, "hosts": "127.0.0.1:7600"}, "without workers.key_file"),
         ({"nodes": 2, "zones": 2, "sensor_workers": 1}, "workers.sensors = 1"),
         ({"nodes": 2, "zones": 2, "overrides": {"zones.faults": "x.json"}}, "zones.faults"),
+        (
+            {"nodes": 2, "zones": 2, "overrides": {"workers.monitor_cpu": True}},
+            r"workers\.monitor_cpu = True.*set workers\.balance_steps",
+        ),
     ],
 )
 def test_bad_input(arguments: dict[str, Any], words: str) -> None:
@@ -396,52 +397,3 @@ def test_a_node_that_is_lost_while_zones_are_given_out_is_replaced(
     struck.clear()
     with pytest.raises(WorkerError, match=f"node {nodes - 1} ended with -9 before it had begun"):
         make("grid4x4", zones=4, nodes=nodes, overrides={"workers.max_retries": 1}, **WANTED)
-
-
-def test_nodes_tell_what_they_have_done(make: Make) -> None:
-    vec = make("grid4x4", zones=4, nodes=2, num_envs=2, **WANTED)
-    drive(vec, steps=5)
-    over_nodes(vec).node_loads()
-    for _ in range(3):
-        vec.step(vec.suggest_actions())
-    loads = over_nodes(vec).node_loads()
-    running = sum(vec.traffic_stats(w)["running"] for w in range(2))
-    assert [load.node for load in loads] == [0, 1]
-    assert sum(load.vehicles for load in loads) == running
-    for load in loads:
-        assert load.ticks == 3 * vec.config.clock.ticks_per_step
-        assert 0.0 < load.cpu_s < 10.0
-        assert load.waited_s > 0.0
-        assert load.sent_frames >= 2 * load.ticks
-        assert load.sent_bytes > 40 * load.sent_frames
-        assert load.memory_bytes > 1 << 26
-        assert load.ghosts > 0
-    assert all(load.ticks == 0 for load in over_nodes(vec).node_loads())
-
-
-def test_loads_of_the_nodes_machines_are_told_to_pages(
-    make: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    vec = make("grid4x4", zones=4, nodes=2, **WANTED)
-    drive(vec, steps=2)
-    nodes = over_nodes(vec)
-    assert sorted(nodes.worker_pids) == [0, 1]
-    assert os.getpid() not in nodes.worker_pids.values()
-    monkeypatch.setattr(NodeWorlds, "worker_pids", {})  # as of nodes of other machines
-    monkeypatch.setattr("cavmarl.viewer.run_loads.EVERY_S", 0.05)
-    audience = Audience()
-    told: list[Any] = []
-    monkeypatch.setattr(audience, "tell_all", told.append)
-    loads = RunLoads(nodes, audience)
-    loads.look()
-    assert not told  # none watches
-    audience.wishes = Wishes(watchers=1)
-    loads.look()
-    time.sleep(0.3)
-    before = vec.state_hash(0)
-    loads.others = [{"name": "another", "zones": "-", "score": 0.5, "note": ""}]
-    loads.look()
-    (found,) = told
-    assert [row["zones"] for row in found["rows"]] == ["0, 1", "2, 3", "-"]
-    assert all(0.0 < row["score"] <= 1.0 for row in found["rows"])
-    assert vec.state_hash(0) == before

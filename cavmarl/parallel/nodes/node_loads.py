@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import resource
+import socket
 import time
 from collections.abc import Sequence
 from dataclasses import astuple
@@ -15,7 +16,7 @@ from cavmarl.balance.probe import Watch
 from cavmarl.engine.simulation import Simulation
 from cavmarl.parallel.nodes.links import Links
 
-OF_MACHINE = "machine"  # what a node is asked for, in the place of what it has done itself
+TO_SHOW, TO_BALANCE = "to show", "to balance"  # for what nodes are asked about their machines
 
 
 class NodeLoad(NamedTuple):
@@ -32,25 +33,45 @@ class NodeLoad(NamedTuple):
     ghosts: int  # copies of other zones' vehicles that it has now
 
 
+class MachineAsked(NamedTuple):
+    """What nodes are asked about their machines."""
+
+    purpose: str  # those that ask for another one do not change the time that it is about
+    processes: dict[str, list[int]]  # machine → those of this run on it, as nodes have said
+
+
 class MachineWatch:
-    """How busy others keep this machine."""
+    """How busy other programs than this run keep this machine."""
 
     def __init__(self) -> None:
-        self._watch = Watch({0: os.getpid()})
+        self._watch = _watch([])
 
-    def since(self) -> list[Any]:
-        """Shares as of `Utilisation`, and their source, since this was asked last, or first."""
-        found, self._watch = self._watch.snapshot(), Watch({0: os.getpid()})
+    def since(self, pids: Sequence[int]) -> list[Any]:
+        """Shares as of `Utilisation`, and their source, since this was asked last, or first.
+
+        Args:
+            pids: the run's processes on this machine from now on.
+        """
+        found, self._watch = self._watch.snapshot(), _watch(pids)
         return [astuple(found.workers[0].use), found.gpu_source]
 
 
-machine_watch = cache(MachineWatch)  # of this process
+def _watch(pids: Sequence[int]) -> Watch:
+    """The first one is this process."""
+    return Watch(dict(enumerate(dict.fromkeys((os.getpid(), *pids)))))
+
+
+@cache
+def machine_watch(purpose: str) -> MachineWatch:
+    """That of this process for a purpose."""
+    return MachineWatch()
 
 
 def told_of(payload: Any, links: Links, simulation: Simulation, zones: Sequence[int]) -> list[Any]:
     """What a node is asked for: of its machine, or of itself."""
-    if payload == OF_MACHINE:
-        return machine_watch().since()
+    if payload is not None:
+        asked = MachineAsked(*payload)
+        return machine_watch(asked.purpose).since(asked.processes.get(socket.gethostname(), ()))
     return totals(links, simulation, zones)
 
 

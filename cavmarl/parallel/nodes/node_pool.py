@@ -87,7 +87,7 @@ class NodePool:
         config, count = world.config, world.partition.count
         layout = layout_of(config, world.capacity, num_worlds).items()
         self.arrays = StepArrays.of({name: np.zeros(shape, kind) for name, (kind, shape) in layout})
-        self._placement = StepPlacement(world, 1, nodes)
+        self._placement = StepPlacement(world, 1, nodes, is_here=False)
         self.zones = parts_of(self._placement.plans, count)[0].zones
         self._homes = self.zones
         self._generation = 0

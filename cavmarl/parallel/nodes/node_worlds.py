@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import socket
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +15,7 @@ from numpy.typing import NDArray
 
 from cavmarl.balance.balance_plan import Plan
 from cavmarl.balance.load_score import Candidate, Utilisation
-from cavmarl.balance.load_snapshot import NO_GPU, LoadSnapshot
+from cavmarl.balance.load_snapshot import NO_GPU, LoadSnapshot, idle_snapshot
 from cavmarl.balance.probe import MEASURED
 from cavmarl.core.errors import ConfigError, MessageError
 from cavmarl.engine.simulation import Simulation
@@ -32,7 +35,13 @@ from cavmarl.parallel.nodes.node_frames import (
     take_results,
     worlds_payload,
 )
-from cavmarl.parallel.nodes.node_loads import OF_MACHINE, NodeLoad, since
+from cavmarl.parallel.nodes.node_loads import (
+    TO_BALANCE,
+    TO_SHOW,
+    MachineAsked,
+    NodeLoad,
+    since,
+)
 from cavmarl.parallel.nodes.node_network import NetworkFailedError, answer_of, read_asked
 from cavmarl.parallel.nodes.node_pool import NodePool
 from cavmarl.parallel.nodes.node_starters import LocalNodes, Route, Start, start_nodes, straight
@@ -86,6 +95,8 @@ class NodeWorlds(NodePool):
         self._exchanged = 0  # answers of it that nodes have got in the present command
         self._told: dict[int, list[Any]] = {}  # what nodes have said of themselves last
         self.mover = Mover(self._placement, count, every, self._spent_s) if every else None
+        if world.config.workers.monitor_cpu:
+            self.node_snapshot(TO_BALANCE)  # from now on they watch
 
     def reset(self, seed: int | None, first_world: int) -> None:
         arrays = self.arrays
@@ -103,7 +114,7 @@ class NodeWorlds(NodePool):
             arrays.meta_actions[:] = commands.meta_actions
         self._cut_anew()
         if self.mover is not None:
-            self.mover.before_step(self._move, self._measured)
+            self.mover.before_step(self._move, self._seen)
         arrays.declared[:] = commands.declared if commands.declared.size else 0
         arrays.inserted[:] = commands.inserted if commands.inserted.size else 0
         results = self.run(self._command(Task.STEP))
@@ -160,17 +171,23 @@ class NodeWorlds(NodePool):
             self._links.send(node, FrameKind.RECEPTIONS, self._generation, [answer])
         self._exchanged += 1
 
-    def _measured(self) -> dict[int, int]:
-        """Ask what zones have cost, before they are balanced by it; a number for each node."""
+    def _seen(self) -> LoadSnapshot:
+        """Ask what zones have cost, before they are balanced by it; how busy all nodes are.
+
+        Those that are not watched, or lost, are taken to be idle.
+        """
         for data in self.run(self._command(Task.HOST)):
             for zone, spent_s in json.loads(bytes(data)):
                 self._spent_s[0, zone] += spent_s
-        return dict.fromkeys(range(len(self._homes)), 0)
+        idle = idle_snapshot(len(self._homes))
+        if not self.world.config.workers.monitor_cpu:
+            return idle
+        seen = self.node_snapshot(TO_BALANCE)
+        states = {one.worker: one for one in (*idle.workers, *seen.workers)}
+        return replace(seen, workers=tuple(states[node] for node in sorted(states)))
 
     def _move(self, task: Task, zones: list[Any], commits: bool) -> None:
-        """Let zones have other homes from now on; no node is left without one."""
-        if not all(zones[0]):
-            return
+        """Let zones have other homes from now on."""
         before, self._homes = self._homes, zones[0]
         self._is_torn, self._opened = True, None
         try:
@@ -220,11 +237,16 @@ class NodeWorlds(NodePool):
             self._told[node] = now
         return sorted(found)
 
-    def node_snapshot(self) -> LoadSnapshot:
-        """How busy others keep the machine of each node, as it says, since it was asked last."""
-        found = [
-            json.loads(bytes(data)) for data in self.run(self._command(Task.LOADS, OF_MACHINE))
-        ]
+    def node_snapshot(self, purpose: str = TO_SHOW) -> LoadSnapshot:
+        """How busy others keep the machine of each node, as it says, since it was asked last.
+
+        Other purposes have times of their own. What this run itself computes there does not count.
+        """
+        here: dict[str, list[int]] = {socket.gethostname(): [os.getpid()]}
+        for node in self._nodes.values():
+            here.setdefault(node.machine, []).append(node.pid)
+        asked = self._command(Task.LOADS, MachineAsked(purpose, here))
+        found = [json.loads(bytes(data)) for data in self.run(asked)]
         states = tuple(Candidate(node, Utilisation(*shares)) for node, shares, _ in found)
         source = next((source for *_, source in found if source != NO_GPU), NO_GPU)
         return LoadSnapshot(states, source, MEASURED)
@@ -323,11 +345,12 @@ def check_nodes(world: World, nodes: int) -> None:
             config.workers.sensors,
             "each node senses for its own vehicles; use more nodes in place of sensor workers",
         ),
-        "workers.monitor_cpu": (
-            config.workers.monitor_cpu,
-            "it watches the caller's machine, and nodes may be elsewhere",
-        ),
     }
     for key, (value, why) in refused.items():
         if value:
             raise ConfigError(f"{key} = {value!r}: worlds over nodes do not have it: {why}")
+    if config.workers.monitor_cpu and not config.workers.balance_steps:
+        raise ConfigError(
+            "workers.monitor_cpu = True: nodes watch their machines for rounds of balance; set "
+            "workers.balance_steps, or leave it out"
+        )
