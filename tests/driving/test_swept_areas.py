@@ -7,10 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cavmarl.core.records.arrays import Scratch
 from cavmarl.core.records.codes import HOLD_NONE, HOLD_SIGNAL, HOLD_YIELD
 from cavmarl.driving.kernels.approach import APPROACH
 from cavmarl.driving.kernels.following import behind, no_constraint
-from cavmarl.driving.kernels.swept_areas import behind_fork, room_m, swept_stop, wait_place
+from cavmarl.driving.kernels.swept_areas import (
+    behind_fork,
+    room_m,
+    swept_stop,
+    wait_place,
+    would_be_swept,
+)
 from cavmarl.driving.vehicle_types import generated_types
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network
@@ -82,8 +89,8 @@ class Meeting:
              for k, (lane, length) in enumerate(zip(lanes, (BUS_M, CAR_M), strict=True))]
         )  # fmt: skip
 
-    def stop(self, asks: int, places: tuple[float, float], room_m: float = -np.inf) -> float:
-        """Where the front of one has to stop; `places`: of both fronts beyond their lines."""
+    def _announced(self, asks: int, places: tuple[float, float]) -> Scratch:
+        """The other one, announced; `places`: of both fronts beyond their lines."""
         room = scratch(self.network, 2)
         other = 1 - asks
         links = (self.link, int(self.sweep["foe"]))
@@ -94,8 +101,18 @@ class Meeting:
         room.approach[0] = entry[0]
         room.link_start[:] = room.link_end[:] = 0
         room.link_end[links[other]] = 1
-        roads = self.network.arrays
-        return float(swept_stop(roads, self.rows, asks, links[asks], places[asks], room_m, room))
+        return room
+
+    def stop(self, asks: int, places: tuple[float, float], room_m: float = -np.inf) -> float:
+        """Where the front of one has to stop."""
+        room, roads = self._announced(asks, places), self.network.arrays
+        link = (self.link, int(self.sweep["foe"]))[asks]
+        return float(swept_stop(roads, self.rows, asks, link, places[asks], room_m, room))
+
+    def car_is_swept(self, places: tuple[float, float]) -> bool:
+        """Whether the car may not enter at its place."""
+        room, roads, link = self._announced(1, places), self.network.arrays, self.sweep["foe"]
+        return bool(would_be_swept(roads, self.rows, self.rows[1], link, places[1], room))
 
 
 def test_a_bus_waits_before_the_junction_for_a_car_that_stands_at_the_line(
@@ -142,6 +159,23 @@ def test_of_two_before_it_the_one_further_along_goes_first(network: RoadNetwork)
     assert meeting.stop(0, places) == np.inf
     meeting.rows["speed"][1] = 15.0  # it cannot stop any more
     assert meeting.stop(0, (bus_enter_m - 9.0, enter_m - 6.0)) == bus_enter_m
+
+
+def test_no_car_enters_where_a_bus_sweeps_that_is_there_or_cannot_stop(
+    network: RoadNetwork,
+) -> None:
+    meeting = Meeting(network)
+    enter_m, leave_m = (float(meeting.sweep[name]) for name in ("enter_m", "leave_m"))
+    at_line, far = -0.5, float(meeting.sweep["foe_enter_m"]) - 1.0
+    assert meeting.car_is_swept((enter_m + 1.0, at_line))
+    assert not meeting.car_is_swept((leave_m + BUS_M + 1.0, at_line)), "the bus has passed"
+    assert not meeting.car_is_swept((enter_m + 1.0, far)), "it enters before the area"
+    assert not meeting.car_is_swept((enter_m - 5.0, at_line)), "the bus stands"
+    meeting.rows["speed"][0] = 6.0
+    assert meeting.car_is_swept((enter_m - 5.0, at_line)), "it would have to brake hard"
+    assert not meeting.car_is_swept((enter_m - 15.0, at_line))
+    meeting.rows["speed"] = 6.0, 4.0
+    assert meeting.car_is_swept((enter_m + 1.0, far)), "it could not stop before the area"
 
 
 def test_nothing_touches_buses_that_turn(path: Path, tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -28,10 +28,18 @@ CLOCK |= {"zones.approach_ticks": 2}
 
 
 class DividedScene:
-    """The same vehicles in one zone and in the four that meet at a place, m from the middle."""
+    """The same vehicles in one zone and in the four that meet at a place, m from the middle.
+
+    `departs` has more lines of the demand file, which depart in the time of the scene, by name.
+    """
 
     def __init__(
-        self, path: Path, folder: Path, corner_m: tuple[float, float], kinds: tuple[str, ...]
+        self,
+        path: Path,
+        folder: Path,
+        corner_m: tuple[float, float],
+        kinds: tuple[str, ...],
+        departs: Mapping[str, str] = {},
     ) -> None:
         demand = folder / "late.rou.xml"
         edges = read_network(path).edge_ids
@@ -46,6 +54,7 @@ class DividedScene:
                 for b in NODES
                 if a != b and f"{b}_out" in edges
             )
+            + "".join(departs.values())
             + "</routes>"
         )
         self.kinds = ("generated", *kinds)  # by VEHICLE_TYPE row
@@ -62,6 +71,7 @@ class DividedScene:
             start(simulation, seed=0)
         self.rows: list[NDArray[np.void]] = []
         self.names: list[str] = []
+        self.departs = list(departs)
 
     def put(self, name: str, way: str, front_m: float, kind: str = "car", **fields: Any) -> None:
         """A vehicle on a way such as "W_in_0 N_out_0", its front `front_m` beyond its line."""
@@ -89,6 +99,7 @@ class DividedScene:
     def begin(self) -> None:
         """Give both the vehicles that were put."""
         rows = np.concatenate(self.rows)
+        self.names += self.departs
         for simulation in (self.whole, self.divided):
             simulation.gate.next_id[0] = len(rows)
             saved = [array.copy() for array in simulation.save()]

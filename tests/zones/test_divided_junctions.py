@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from cavmarl.core.records.codes import HOLD_EXIT_BLOCKED, HOLD_YIELD
-from tests.support.divided_scenes import DividedScene
+from tests.support.divided_scenes import TICK_S, DividedScene
 from tests.support.junction_scenes import build_crossing
 
 CRAWLS = 1e-3  # of the limit: for others such a vehicle stands
@@ -76,3 +76,22 @@ def test_room_is_left_for_a_bus_that_stands_in_a_queue_behind_a_border(
     assert first["waits"]["speed"] < 7.8, "it brakes for a place before its line"
     for _ in here.run(3.0):
         pass
+
+
+@pytest.mark.parametrize("corner_m", [(6.0, -22.0), (-9.0, -9.0), (0.0, 0.0)])
+@pytest.mark.parametrize("is_far", [False, True])
+def test_no_car_departs_where_a_bus_turns_over_the_line(
+    priority: Path, tmp_path: Path, corner_m: tuple[float, float], is_far: bool
+) -> None:
+    car = """<vehicle id="late" type="car" depart="0.2" departPos="-0.2" departSpeed="0">
+        <route edges="S_in N_out"/></vehicle>"""
+    here = DividedScene(priority, tmp_path, corner_m, ("car", "bus"), {"late": car})
+    here.put("turns", "E_in_0 S_out_0", -60.0 if is_far else 4.0, "bus", speed=4.0)
+    here.begin()
+    entered_s = 0.0
+    for vehicles in here.run(8.0):
+        entered_s += TICK_S * ("late" not in vehicles)
+    if is_far:
+        assert entered_s < 0.5, "the bus can wait"
+    else:
+        assert 2.0 < entered_s < 6.0, "it waits until the bus has passed, and no longer"

@@ -43,6 +43,15 @@ def _body_m(half: float, size: int) -> float:
     return float(max(2.0 * half, least))
 
 
+@inlined_kernel
+def _size_of_foe(rows: NDArray[np.void], foe: np.void, own: int) -> int:
+    """The size class of one APPROACH, as a vehicle of the class `own` knows it."""
+    other = size_of(foe["half"])
+    if other == 0 and own == STEERED and rows[foe["row"]]["driver"] == DRIVER_AGENT:
+        other = STEERED
+    return other
+
+
 @kernel
 def swept_stop(
     roads: RoadArrays,
@@ -71,10 +80,7 @@ def swept_stop(
             stop = min(stop, max(sweep["enter_m"], place))  # it waits where no other will sweep
         for n in range(scratch.link_start[sweep["foe"]], scratch.link_end[sweep["foe"]]):
             foe = scratch.approach[n]
-            other = size_of(foe["half"])
-            if other == 0 and own == STEERED and rows[foe["row"]]["driver"] == DRIVER_AGENT:
-                other = STEERED
-            if foe["row"] == i or other != sweep["other"]:
+            if foe["row"] == i or _size_of_foe(rows, foe, own) != sweep["other"]:
                 continue
             if _is_in_the_way(rows, row, foe, sweep, place, room_m):
                 # One that is in the area, too, stops where it is. Behind one that stands, or may
@@ -85,6 +91,42 @@ def swept_stop(
                 ):
                     stop = min(stop, 0.0)
     return stop
+
+
+@kernel
+def would_be_swept(
+    roads: RoadArrays,
+    rows: NDArray[np.void],  # VEHICLE (C,) of those that are there
+    row: np.void,  # VEHICLE that enters
+    link: int,  # that it takes next
+    place: float,  # of its front, m beyond its stop line
+    scratch: Scratch,
+) -> bool:
+    """Whether one that enters stands where another sweeps that is there or stops in haste only."""
+    size = size_of(0.5 * row["length"])
+    rear = place - _body_m(0.5 * row["length"], size)
+    own = STEERED if size == 0 and row["driver"] == DRIVER_AGENT else size
+    first = roads.links[link]["first_sweep"]
+    for k in range(first, first + roads.links[link]["num_sweeps"]):
+        sweep = roads.sweeps[k]
+        if sweep["own"] > own:
+            break  # they are sorted by it
+        if sweep["own"] != own or rear > sweep["leave_m"]:
+            continue
+        to_area = sweep["enter_m"] - place
+        if to_area >= 0.0 and not _needs(row["speed"], to_area, EASY_STOP):
+            continue
+        for n in range(scratch.link_start[sweep["foe"]], scratch.link_end[sweep["foe"]]):
+            foe = scratch.approach[n]
+            if _size_of_foe(rows, foe, own) != sweep["other"]:
+                continue
+            foe_place = foe["half"] - foe["dist"]
+            to_area = sweep["foe_enter_m"] - foe_place
+            if foe_place - _body_m(foe["half"], sweep["other"]) <= sweep["foe_leave_m"] and (
+                to_area < 0.0 or _needs(foe["speed"], to_area, EASY_STOP)
+            ):
+                return True
+    return False
 
 
 @kernel

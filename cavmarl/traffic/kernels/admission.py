@@ -18,7 +18,10 @@ from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M
 from cavmarl.core.numba import kernel
 from cavmarl.core.records.arrays import Demand, Gate, RoadArrays, Scratch, Travel, Worlds
 from cavmarl.core.records.codes import COUNT_DEPARTED, LANE_FIRST, LANE_GIVEN, LANE_RANDOM, POS_LAST
+from cavmarl.driving.kernels.approach import register_links
 from cavmarl.driving.kernels.lane_index import index_lanes
+from cavmarl.driving.kernels.swept_areas import would_be_swept
+from cavmarl.driving.kernels.ways import next_step
 from cavmarl.traffic.kernels.demand_generator import enter
 from cavmarl.traffic.kernels.entering import (
     crowd,
@@ -150,6 +153,14 @@ def _touches_any(rows: NDArray[np.void], num: int, own: np.void) -> bool:
 
 
 @kernel
+def _link_ahead(roads: RoadArrays, travel: Travel, row: np.void) -> int:
+    """The link at the end of an entrant's lane: of its way, else the first, -1 where none is."""
+    _, _, link = next_step(roads, travel, row["lane"], row["way"])
+    here = roads.lanes[row["lane"]]
+    return here["first_link"] if link < 0 and here["num_links"] > 0 else link
+
+
+@kernel
 def propose(
     demand: Demand,
     roads: RoadArrays,
@@ -171,7 +182,7 @@ def propose(
         rows = worlds.next_rows[w]
         num = worlds.num_rows[w]
         key = worlds.keys[w]
-        indexed = False
+        indexed = announced = False
         for q in range(gate.num_queue[w]):
             lane = gate.tries[w, q]
             if lane < 0:
@@ -199,9 +210,20 @@ def propose(
             row = gate.passing[w, n]
             gate.passing[w, n] = demand.blank[0]
             enter(roads, travel, worlds, w, departure, lane, s, speed, row)
-            if not _touches_any(rows, num, row):
-                gate.places[w, n] = q
-                gate.num_passing[w] = n + 1
+            if _touches_any(rows, num, row):
+                continue
+            to_line = roads.lanes[lane]["length_m"] - s
+            link = _link_ahead(roads, travel, row) if to_line <= travel.see_m else -1
+            if link >= 0 and roads.links[link]["num_sweeps"] > 0:
+                if not announced:
+                    step, step_at = worlds.step[w], worlds.step_at[w]
+                    register_links(roads, travel, rows, num, step, step_at, scratch)
+                    announced = True
+                place = 0.5 * row["length"] - to_line
+                if would_be_swept(roads, rows, row, link, place, scratch):
+                    continue
+            gate.places[w, n] = q
+            gate.num_passing[w] = n + 1
 
 
 @kernel
