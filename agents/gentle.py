@@ -1,16 +1,17 @@
 """A driver for dense traffic on one lane that speeds up so gently that no wave can grow.
 
-It drives towards a little less than the speed of uniform flow, by 0.03 m/s more each second, and
-never faster than it can brake behind the vehicle ahead. Those behind follow without a stop. In
-`ring22` this dissolves the stop and go of 21 human drivers; elsewhere it is of no use. It reads the
-world's clock, which no sensor shows, and steers by the built-in driver's suggestions. It needs
-`sensors.ego`, `sensors.lanes` and continuous actions.
+It drives towards a little less than the speed of uniform flow, by 0.03 m/s more each second, after
+a stop hardly faster, and never faster than it can brake behind the vehicle ahead. Those behind
+follow without a stop. In `ring22` this dissolves the stop and go of 21 human drivers; elsewhere it
+is of no use. It reads the world's clock, which no sensor shows, and steers towards a point ahead on
+its way (pure pursuit: Coulter 1992). It needs `sensors.ego`, `sensors.route`, `sensors.lanes` and
+continuous actions.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +24,11 @@ from cavmarl.policies.policy import Policy
 
 MOST_MPS = 4.5
 GAIN_MPS2 = 0.03
+CATCH_UP_MPS2 = 0.035
 BRAKE_MPS2 = 1.5
 REACT_S = 0.6
 STAND_M = 1.5  # between the bumpers
+WHEELBASE_M = 3.0
 
 # Scales of the features, see the table of any environment's card.
 SPEED_SCALE = 40.0
@@ -33,7 +36,7 @@ HALF_M = 10.0
 
 
 class GentlePolicy(Policy):
-    """Steers as the built-in driver does, and asks for the speed that is due.
+    """Follows its lane, and asks for the speed that is due.
 
     Args:
         env: where it drives.
@@ -43,36 +46,50 @@ class GentlePolicy(Policy):
         super().__init__(env)
         config = env.config
         parts = observation_parts(config.sensors)
-        if not {"ego", "lanes"} <= parts.keys() or config.action.kind != "continuous":
+        needed = {"ego", "route", "lanes"}
+        if not needed <= parts.keys() or config.action.kind != "continuous":
             raise PolicyError(
-                "gentle needs a look at lanes and continuous actions: make the environment with "
-                "overrides={'sensors.lanes.range_m': 100.0, 'action.kind': 'continuous'}"
+                "gentle needs a look at lanes, points of its way and continuous actions: make the "
+                "environment with overrides={'sensors.lanes.range_m': 100.0, "
+                "'sensors.route.points': 3, 'action.kind': 'continuous'}"
             )
         self._ego, self._lanes = parts["ego"].place, parts["lanes"].place
+        # The second point, or the only one.
+        at = parts["route"].place.start + 2 * min(1, config.sensors.route.points - 1)
+        self._aim = slice(at, at + 2)
+        self._aim_scale_m = config.sensors.route.points * config.sensors.route.spacing_m
+        self._steering_rad = config.action.steering_rad
         self._frame = sum(part.place.stop - part.place.start for part in parts.values())
         self._accel_mps2 = config.action.acceleration_mps2
         self._tick_s = config.clock.sim_dt_s
 
     def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
-        """(W, A, 2): the built-in driver's steering, and the throttle for the speed that is due."""
+        """(W, A, 2): throttle for the speed that is due, and steering along the lane."""
         if isinstance(self.env, CavEnv):
             raise PolicyError("act_batch() drives a make_vec; a parallel_env is driven by act()")
-        actions = cast(NDArray[Any], self.env.suggest_actions()).copy()
-        actions[..., 0] = self._throttle(observations)
-        return actions
+        return self._controls(observations)
 
     def act(self, observations: Mapping[str, Any]) -> dict[str, Any]:
         """The same for one world."""
         if isinstance(self.env, CavVectorEnv):
             raise PolicyError("act() drives a parallel_env; a make_vec is driven by act_batch()")
-        actions = self.env.suggest_actions()
-        for agent, action in actions.items():
-            action[0] = self._throttle(np.asarray(observations[agent])[None, None])[0, 0]
-        return actions
+        return {
+            agent: self._controls(np.asarray(seen)[None, None])[0, 0]
+            for agent, seen in observations.items()
+            if agent in self.env.agents
+        }
 
-    def _throttle(self, observations: NDArray[np.float32]) -> NDArray[np.float64]:
-        """(W, A)."""
+    def _controls(self, observations: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(W, A, 2)."""
         newest = observations[..., -self._frame :].astype(np.float64)
+        ahead_m, left_m = np.moveaxis(newest[..., self._aim] * self._aim_scale_m, -1, 0)
+        squared = np.maximum(ahead_m**2 + left_m**2, 1.0)
+        steering = np.arctan(2.0 * WHEELBASE_M * left_m / squared) / self._steering_rad
+        controls = np.stack([self._throttle(newest), np.clip(steering, -1.0, 1.0)], axis=-1)
+        return controls.astype(np.float32)
+
+    def _throttle(self, newest: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(W, A)."""
         ego, lanes = newest[..., self._ego], newest[..., self._lanes]
         with np.errstate(divide="ignore"):
             gap_m = HALF_M / lanes[..., 0] - HALF_M
@@ -82,9 +99,10 @@ class GentlePolicy(Policy):
         safe = np.sqrt(2.0 * BRAKE_MPS2 * np.maximum(room_m, 0.0) + front**2)
         safe = np.where(room_m > 0.0, safe, 0.0)
         seconds = np.asarray(self.env.worlds.ticks())[:, None] * self._tick_s
-        wanted = np.minimum(np.minimum(GAIN_MPS2 * seconds, MOST_MPS), safe)
+        due = np.minimum(np.minimum(GAIN_MPS2 * seconds, MOST_MPS), safe)
+        wanted = np.minimum(due, speed + CATCH_UP_MPS2 * REACT_S)
         throttle: NDArray[np.float64] = (wanted - speed) / REACT_S / self._accel_mps2
-        return np.clip(throttle, -1.0, 0.5)
+        return np.maximum(throttle, -1.0)
 
 
 def make_policy(env: CavEnv | CavVectorEnv) -> Policy:

@@ -71,7 +71,8 @@ class Args:
     clip: Annotated[float, "how far the ratio of probabilities may leave 1"] = 0.2
     entropy_weight: Annotated[float, "of the entropy in the loss"] = 0.0
     value_weight: Annotated[float, "of the value loss"] = 0.5
-    imitation_weight: Annotated[float, "of the distance to the built-in driver, at the start"] = 0.0
+    imitate: Annotated[str, "driver that is imitated at first; empty: the built-in one"] = ""
+    imitation_weight: Annotated[float, "of the distance to that driver, at the start"] = 0.0
     imitation_share: Annotated[float, "share of the run in which that weight falls to 0"] = 0.1
     start: Annotated[str, "driver whose weights, sensors and actions it begins with"] = ""
     end_at_red: Annotated[bool, "expect nothing after running a red light, as at a crash"] = False
@@ -108,8 +109,7 @@ class Args:
 
     @property
     def folder(self) -> Path:
-        algorithm = "mappo" if self.mappo else "ippo"
-        name = (self.name, self.env, algorithm, self.seed)
+        name = (self.name, self.env, "mappo" if self.mappo else "ippo", self.seed)
         return options.run_folder(self.runs, *name, self.resume)
 
 
@@ -126,7 +126,7 @@ class Batch:
     acted: Tensor  # (T, W, A) which entries are decisions of the network
     next_values: Tensor  # (T, W, A) what was to be expected after the step; 0 where a vehicle ended
     goes_on: Tensor  # (T, W, A) whether entry t + 1 is of the same vehicle and episode
-    suggested: Tensor | None = None  # (T, W, A, …) the built-in driver's, while it is imitated
+    suggested: Tensor | None = None  # (T, W, A, …) the imitated driver's, while it is imitated
 
     def advantages(self, gamma: float, gae_lambda: float) -> Tensor:
         """(T, W, A) generalised advantage estimates (Schulman et al. 2016); 0 where no agent acted.
@@ -158,10 +158,11 @@ class Collector:
         # Worlds write here what is seen: it is copied once, into a batch.
         self._observations = torch.from_numpy(vec.worlds.arrays.observations)
         self._opponents = Opponents(args.opponents, vec, args.opponent_share, args.seed)
+        self._suggest = self._opponents.example(args.imitate)
 
     @torch.inference_mode()
     def collect(self, with_suggested: bool) -> Batch:
-        """Some steps of all worlds, on request with what the built-in driver would do."""
+        """Some steps of all worlds, on request with what the imitated driver would do."""
         simulated_s = self.vec.simulated_s
         with self.times.rest("transfer"):
             batch = self._empty(with_suggested)
@@ -192,9 +193,8 @@ class Collector:
         """Let the network decide, and write down what is entry `t` of a batch."""
         if batch.suggested is not None:
             with self.times.of("simulation"):
-                batch.suggested[t] = torch.from_numpy(self.vec.suggest_actions())
-        batch.observations[t] = self._seen()
-        batch.states[t] = self._look()
+                batch.suggested[t] = self._suggest(self._observations, self._mask)
+        batch.observations[t], batch.states[t] = self._seen(), self._look()
         with self.times.of("inference"):
             output, values = self._heads(batch.observations[t], batch.states[t])
             actions, batch.log_probs[t] = self.network.draw(output)
@@ -268,7 +268,7 @@ class Learner:
         self.scales = Scales(network)
 
     def imitation_weight(self, left: float) -> float:
-        """How much the built-in driver's example counts with `left` of the run to go."""
+        """How much the imitated driver's example counts with `left` of the run to go."""
         args = self._args
         return args.imitation_weight * max(1.0 - (1.0 - left) / args.imitation_share, 0.0)
 

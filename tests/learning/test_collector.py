@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.policies.networks import ActorCritic, NetworkConfig
+from cavmarl.policies.policy import load_policy
 from tests.support.training import load_program
 
 PPO = load_program("ppo")
@@ -22,7 +24,9 @@ def make_worlds(mode: str) -> CavVectorEnv:
     )
 
 
-def make_collector(vec: CavVectorEnv, state_size: int, *, residual: bool = False) -> Any:
+def make_collector(
+    vec: CavVectorEnv, state_size: int, *, residual: bool = False, imitate: str = ""
+) -> Any:
     torch.manual_seed(0)
     config = NetworkConfig(
         "merge",
@@ -33,7 +37,7 @@ def make_collector(vec: CavVectorEnv, state_size: int, *, residual: bool = False
         state_size=state_size,
         residual=residual,
     )
-    args = PPO.Args(num_steps=STEPS)
+    args = PPO.Args(num_steps=STEPS, imitate=imitate)
     return PPO.Collector(vec, ActorCritic(config, (2.0, 2.0)), args, seed=0)
 
 
@@ -121,3 +125,15 @@ def test_a_residual_driver_sees_what_the_built_in_one_would_do() -> None:
     assert torch.equal(batch.observations[0, ..., -2:][acted], proposed[acted])
     assert (batch.observations[1:, ..., -2:] != 0.0).any()
     assert (batch.acted & ~batch.goes_on & (batch.next_values != 0.0)).any()
+
+
+@pytest.mark.parametrize("name", ["", "gentle"])
+def test_what_is_imitated_is_what_that_driver_would_do(name: str) -> None:
+    vec = make_vec("ring22", num_envs=2)
+    collector = make_collector(vec, 0, imitate=name)
+    teacher = load_policy(name or "idm", vec)
+    seen, mask = vec.worlds.arrays.observations.copy(), np.ones((2, 1), dtype=bool)
+    first = torch.from_numpy(teacher.act_batch(seen, mask))
+    batch = collector.collect(with_suggested=True)
+    assert torch.equal(batch.suggested[0], first.float())
+    assert (batch.suggested[1:] != batch.suggested[0]).any()

@@ -134,6 +134,7 @@ def test_a_run_that_is_killed_goes_on_bit_for_bit(
     ("words", "others"),
     [
         (["--imitation-weight", "1", "--end-at-red"], []),
+        (["--imitation-weight", "1", "--imitate", "random_actions"], []),
         (["--shared", "--keep", "0.5", "--opponents", "idm,random_actions"], []),
         (["--residual"], []),
         (["--mappo"], ["--zones", "2"]),
