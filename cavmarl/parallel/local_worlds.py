@@ -310,6 +310,14 @@ class LocalWorlds:
         shares = [from_bytes(one, [*like[:-zones], like[-1]]) for one in saved]
         return self.join([[*share, *[share[-1][:0]] * (zones - 1)] for share in shares])
 
+    def refusal(self, saved: Sequence[bytes]) -> str:
+        """Why worlds cannot go on from these; empty: they can."""
+        try:
+            self.read_worlds(saved)
+        except ConfigError as error:
+            return str(error)
+        return ""
+
     @property
     def num_parts(self) -> int:
         """Arrays at the end of `save` that are there once a zone of each world."""

@@ -15,10 +15,11 @@ import threading
 from collections import deque
 from collections.abc import Callable, Mapping
 from itertools import count
-from typing import Any, cast
+from typing import Any, NoReturn, cast
 
 from cavmarl.core.errors import MessageError
 from cavmarl.engine.world_setup import World
+from cavmarl.parallel.journaled_worlds import unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.nodes.leases import late_ticks
 from cavmarl.parallel.nodes.node_system import NodeListener, NodeSystem, Place, Poll
@@ -378,5 +379,10 @@ class _System:
         self, recipe: Mapping[str, Any], trouble: str, num_worlds: int, in_next_step: bool
     ) -> LocalWorlds:
         world = self._machine.world
-        late = late_ticks(world.config.clock.ticks_per_step)
+        late = late_ticks(world.config)
+        world = unwatched(world)
         return LocalWorlds(world, num_worlds, in_next_step=in_next_step, late_ticks=late)
+
+    def end(self) -> NoReturn:
+        self._machine.end(self._process)
+        raise ProcessEndedError

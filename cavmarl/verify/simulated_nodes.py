@@ -261,7 +261,9 @@ class _Reference:
     """What an undivided world gives, and what drives it."""
 
     def __init__(self, spec: WorldSpec, steps: int, policy: str | Path) -> None:
-        vec = make_vec(spec.env, num_envs=1, **spec.keywords)
+        told = {name: value for name, value in spec.overrides.items() if name != "zones.faults"}
+        keywords = {**spec.keywords, "overrides": told}
+        vec = make_vec(spec.env, num_envs=1, **keywords)
         run = DrivenRun(vec, policy, spec.seed)
         self.seed, self.first = spec.seed, run.results
         self.results: list[Arrays] = []

@@ -116,14 +116,12 @@ REFUSED = {
     ("planned faults", "zones over workers"): OF_ONE_WORLD,
     ("repartitions", "zones over workers"): "needs zones that stay",
     ("sensor workers", "nodes"): NOT_OVER_NODES,
-    ("planned faults", "nodes"): NOT_OVER_NODES,
     ("a network simulator", "worlds on Ray"): OF_THE_CALLER,
     ("a journal", "worlds on Ray"): NOT_ON_HOSTS,
     ("planned faults", "worlds on Ray"): NOT_ON_HOSTS,
     ("sensor workers", "worlds on Ray"): "leave out the hosts",
     ("balance by LoadScore", "worlds on Ray"): "or leave out the hosts",
     ("sensor workers", "nodes on Ray"): NOT_OVER_NODES,
-    ("planned faults", "nodes on Ray"): NOT_OVER_NODES,
 }
 
 

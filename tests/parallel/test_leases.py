@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from cavmarl.config.env import EnvConfig
 from cavmarl.config.registry import load_config
 from cavmarl.engine.world_setup import make_world
 from cavmarl.handoff.division import Division
@@ -25,11 +26,27 @@ WAIT_S = 0.1
 
 @pytest.mark.parametrize("ticks", range(1, 2 * MOST + 2))
 def test_leases_are_for_all_ticks_of_a_step(ticks: int) -> None:
-    each = lease_ticks(ticks)
+    config = stepped(ticks)
+    each = lease_ticks(config)
     assert each <= MOST
-    assert (leases_of(ticks, ticks) - 1) * each < ticks <= leases_of(ticks, ticks) * each
-    assert leases_of(0, ticks) == 0
-    assert late_ticks(ticks) == each - 1
+    assert (leases_of(ticks, each) - 1) * each < ticks <= leases_of(ticks, each) * each
+    assert leases_of(0, each) == 0
+    assert late_ticks(config) == each - 1
+
+
+def test_with_a_plan_of_faults_a_lease_is_a_tick() -> None:
+    config = stepped(MOST, **{"zones.faults": "{}", "zones.policy": "extend"})
+    assert lease_ticks(config) == 1
+    assert late_ticks(config) == config.zones.max_deferred_ticks + config.zones.grace_ticks == 5
+
+
+def stepped(ticks: int, **overrides: Any) -> EnvConfig:
+    """Settings with so many ticks a step."""
+    overrides |= {"clock.ctrl_dt_s": 0.05 * ticks, "clock.sim_dt_s": 0.05, "zones.grace_ticks": 3}
+    overrides["horizon_s"] = 5.0 * ticks
+    if "zones.policy" not in overrides:
+        del overrides["zones.grace_ticks"]
+    return load_config("grid4x4", zones=2, overrides=overrides)[0]
 
 
 def test_zones_see_as_far_as_their_vehicles_get_in_a_lease() -> None:

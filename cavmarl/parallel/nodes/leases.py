@@ -6,19 +6,27 @@ be offered before that, since it is on no record yet, a lease of no ticks comes 
 
 from __future__ import annotations
 
+from cavmarl.config.env import EnvConfig
+from cavmarl.handoff.shard_setup import limits_of
+
 MOST = 4  # ticks: the longer, the further zones have to see over their borders
 
 
-def lease_ticks(ticks_per_step: int) -> int:
-    """The ticks of a lease; the last one of a step may have fewer."""
-    return min(ticks_per_step, MOST)
+def lease_ticks(config: EnvConfig) -> int:
+    """The ticks of a lease; the last one of a step may have fewer.
+
+    One with a plan of faults, which counts deadlines by ticks.
+    """
+    return 1 if config.zones.faults else min(config.clock.ticks_per_step, MOST)
 
 
-def leases_of(ticks: int, ticks_per_step: int) -> int:
-    """How many leases so many ticks take."""
-    return -(-ticks // lease_ticks(ticks_per_step))
+def leases_of(ticks: int, lease: int) -> int:
+    """How many leases of so many ticks, `lease`, they take."""
+    return -(-ticks // lease)
 
 
-def late_ticks(ticks_per_step: int) -> int:
+def late_ticks(config: EnvConfig) -> int:
     """For how many ticks more than one a vehicle that has crossed may stay with its zone."""
-    return lease_ticks(ticks_per_step) - 1
+    if config.zones.faults:
+        return limits_of(config.zones).longest_deferral
+    return lease_ticks(config) - 1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 
 from cavmarl.core.errors import MessageError, ProtocolError
@@ -23,10 +23,10 @@ class CrossingDigests:
     """Digests of the states of vehicles that have crossed a border, as their owners said."""
 
     def __init__(self) -> None:
-        self.digests: dict[int, bytes] = {}
+        self.told: dict[int, bytes] = {}
 
     def digest_of(self, vehicle: int) -> bytes:
-        return self.digests[vehicle]
+        return self.told[vehicle]
 
     def state(self, vehicle: int) -> bytes:
         """No state is known here: a node that needs one has lost what it was sent."""
@@ -45,8 +45,9 @@ class _World:
         limits: Limits,
         journal: AnyJournal | None,
         is_checked: bool,
+        states: CrossingDigests,
     ) -> None:
-        self.states = CrossingDigests()
+        self.states = states
         self.directory = Directory(run, range(zones), self.states, limits)
         self.journal = journal
         self.log = TransferLog(limits.lifetime)
@@ -92,8 +93,11 @@ class NodeCoordinator:
 
     Attributes:
         switched: vehicles that have changed their owner.
+        injected: (kind, fault) → how often a plan of faults has had it happen to a message.
         is_late: a vehicle has crossed a border that was on no record: a lease of no ticks is due.
     """
+
+    states: type[CrossingDigests] = CrossingDigests
 
     def __init__(
         self,
@@ -105,12 +109,13 @@ class NodeCoordinator:
         is_checked: bool = False,  # whether it is checked what zones own
     ) -> None:
         self._worlds = [
-            _World(run, len(node_of), limits, journal, is_checked)
+            _World(run, len(node_of), limits, journal, is_checked, self.states())
             for run, journal in zip(runs, journals, strict=True)
         ]
         self._node_of = node_of
-        self._links = links
+        self._links, self._limits = links, limits
         self.switched, self.is_late = 0, False
+        self.injected: Counter[tuple[str, str]] = Counter()
 
     def host(self, neighbours: Neighbours) -> list[list[Hosting]]:
         """Begin; what the hosts of all zones have to know, by worlds."""
@@ -194,7 +199,7 @@ class NodeCoordinator:
                 world.births = []
             movers = [mover for report in said for mover in report.movers]
             world.movers = [(vehicle, target) for vehicle, target, _ in movers]
-            world.states.digests = {v: bytes.fromhex(digest) for v, _, digest in movers}
+            world.states.told = {v: bytes.fromhex(digest) for v, _, digest in movers}
             world.births += [Birth(v, zone, b"") for report in said for v, zone in report.births]
             world.check_owned(w, said)
 
@@ -212,6 +217,9 @@ class NodeCoordinator:
             if self._links.now_s() > until_s:
                 raise SilenceError(f"offers are not answered within {timeout_s:g} s")
             self._links.pump(1e3 * timeout_s)
+        return self._by_node(self._decide())
+
+    def _decide(self) -> list[tuple[int, Message]]:
         messages = []
         for w, world in enumerate(self._worlds):
             births, world.births = world.births, []
@@ -219,7 +227,7 @@ class NodeCoordinator:
             world.answered.clear()
             self.switched += world.write(output)
             messages += [(w, message) for message in output.messages]
-        return self._by_node(messages)
+        return messages
 
     @property
     def transfers(self) -> tuple[TransferLog, ...]:

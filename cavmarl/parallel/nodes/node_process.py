@@ -12,15 +12,14 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from cavmarl.core.errors import CavmarlError, ConfigError, MessageError, NodeRefusedError
+from cavmarl.core.errors import CavmarlError, MessageError, NodeRefusedError
 from cavmarl.core.tracebacks import traceback_text
 from cavmarl.engine.shard_clock import ShardClock
-from cavmarl.handoff.shard_setup import limits_of
+from cavmarl.handoff.fault_injection.injected_faults import ZoneDeath
 from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.parallel.hosts.host_process import code_stamp
-from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.nodes.faulty_hosts import hosts_of
 from cavmarl.parallel.nodes.kept_states import KeptStates
-from cavmarl.parallel.nodes.leases import lease_ticks
 from cavmarl.parallel.nodes.links import (
     Bytes,
     FrameKind,
@@ -40,7 +39,7 @@ from cavmarl.parallel.nodes.node_loads import told_of
 from cavmarl.parallel.nodes.node_network import AskedNetwork
 from cavmarl.parallel.nodes.node_peers import NodePeers
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
-from cavmarl.parallel.nodes.zone_hosts import ZoneHosts, hosting_of
+from cavmarl.parallel.nodes.zone_hosts import hosting_of
 from cavmarl.parallel.nodes.zone_moves import nodes_of
 from cavmarl.parallel.worlds_job import Task, commands_of
 
@@ -83,6 +82,7 @@ class NodeProgram:
             recipe, DIFFERENT, job["num_worlds"], job["in_next_step"]
         )
         self._commands = commands_of(worlds.arrays)
+        self._faults, self._lease_ticks = job["faults"], job["lease_ticks"]
         worlds.keep_logs()
         v2x = worlds.world.config.v2x
         if v2x.enabled and v2x.channel.external:
@@ -120,15 +120,13 @@ class NodeProgram:
             for run, some in zip(runs, hostings, strict=True)
         ]
         self._peers = NodePeers(simulation, self._links, zones, self._number, generation << 32)
-        limits = limits_of(simulation.config.zones, simulation.division.codec.schema)
         mounted = simulation.mounted
         arrays = self._worlds.arrays
         carried = [arrays.controls, arrays.meta_actions]
         carried += [] if mounted is None else mounted.arrays()
-        self._hosts = ZoneHosts(
-            simulation.division, mine, nodes_of(zones), told, limits, self._links, carried,
-            generation, simulation.config.zones.check_invariants,
-            lease_ticks(simulation.config.clock.ticks_per_step),
+        self._hosts = hosts_of(
+            simulation, mine, nodes_of(zones), told, self._links, carried, generation,
+            self._lease_ticks, self._faults,
         )  # fmt: skip
         self._run_own()
 
@@ -139,7 +137,8 @@ class NodeProgram:
         foreign = [shard for shard in simulation.shards if shard.zone not in self.zones]
         every = simulation.config.workers.balance_steps
         self._clock = ShardClock(own, MEASURED_TICKS) if every else None
-        simulation.share(self._peers, self._hosts, NodeExecutor(own, foreign, self._clock))
+        executor = self._hosts.executor(NodeExecutor(own, foreign, self._clock))
+        simulation.share(self._peers, self._hosts, executor)
 
     def _hear(self, number: int, frame: NodeFrame) -> None:
         """Take an urgent frame."""
@@ -173,6 +172,8 @@ class NodeProgram:
                     self._recover(frame)
                 elif frame.kind is FrameKind.LEASE:
                     self._hosts.note(frame.data)
+                elif frame.kind is FrameKind.PHASE:
+                    self._hosts.phase(frame)
                 else:
                     self._perform(frame)
             except RecoveryOrderedError as ordered:
@@ -356,7 +357,7 @@ class NodeProgram:
         elif task == Task.SAVE:
             found = worlds_payload(worlds.save_worlds())
         elif task == Task.LOAD:
-            found = _refusal(worlds, saved_of(payload))
+            found = worlds.refusal(saved_of(payload))
         elif task == Task.TRAFFIC_STATS:
             found = worlds.traffic_stats(payload)
         elif task == Task.DRIVEN:
@@ -415,6 +416,8 @@ def run_node(
         node.serve()
     except NodeRefusedError:
         raise
+    except ZoneDeath:
+        system.end()
     except NeededNoMoreError:
         return True
     except LinkLostError:
@@ -439,12 +442,3 @@ def run_on_ray(recipe: str, place: tuple[str, int], secret: bytes, number: int) 
     """The same as an actor, which Ray starts again if it ends before it is needed no more."""
     if not run_node(place, secret, number):
         os._exit(1)
-
-
-def _refusal(worlds: LocalWorlds, saved: Sequence[bytes]) -> str:
-    """Why worlds cannot go on from these; empty: they can."""
-    try:
-        worlds.read_worlds(saved)
-    except ConfigError as error:
-        return str(error)
-    return ""

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import select
 import socket
 import time
 from collections.abc import Mapping
-from typing import Any, Protocol, TypeAlias
+from typing import Any, NoReturn, Protocol, TypeAlias
 
 from cavmarl.parallel.hosts.listener import Listener, call
 from cavmarl.parallel.journaled_worlds import unwatched
@@ -65,6 +66,10 @@ class NodeSystem(Protocol):
         in_next_step: bool,  # when worlds begin anew
     ) -> LocalWorlds: ...
 
+    def end(self) -> NoReturn:
+        """End this process at once, as SIGKILL does."""
+        ...
+
 
 class Machine:
     """This machine's."""
@@ -86,9 +91,13 @@ class Machine:
     def worlds_of(
         self, recipe: Mapping[str, Any], trouble: str, num_worlds: int, in_next_step: bool
     ) -> LocalWorlds:
-        world = unwatched(world_of(recipe, trouble))
-        late = late_ticks(world.config.clock.ticks_per_step)
+        world = world_of(recipe, trouble)
+        late = late_ticks(world.config)
+        world = unwatched(world)
         return LocalWorlds(world, num_worlds, warm=True, in_next_step=in_next_step, late_ticks=late)
+
+    def end(self) -> NoReturn:
+        os._exit(1)
 
 
 MACHINE = Machine()

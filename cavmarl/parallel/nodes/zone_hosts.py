@@ -30,6 +30,7 @@ from cavmarl.ownership.messages import COORDINATOR, Message, Prepare, Removed
 from cavmarl.ownership.offers import Approach
 from cavmarl.ownership.reactions import Advance, Hosting
 from cavmarl.parallel.nodes.links import Bytes, FrameKind, Links, NodeFrame, RecoveryOrderedError
+from cavmarl.parallel.nodes.node_executor import NodeExecutor
 from cavmarl.shards.shard import Commands
 from cavmarl.zones.kernels.zone_lookup import zones_of
 
@@ -39,7 +40,8 @@ _LENGTH = struct.Struct("<II")
 class Report(NamedTuple):
     """What the coordinator has to know of a world's tick beside DONE."""
 
-    movers: list[tuple[int, int, str]]  # vehicle, zone that it is in, digest of its state as hex
+    # vehicle, zone that it is in, digest of its state as hex, or with a plan of faults the state
+    movers: list[tuple[int, int, str]]
     births: list[tuple[int, int]]  # vehicle, zone that owns it first
     began: bool  # the world has begun anew after the tick
     # zone, vehicles that its rows say it owns, the sum of their `owner_hash`; where it is checked
@@ -102,9 +104,11 @@ class ZoneHosts:
             frame = self._links.take([COORDINATOR])[COORDINATOR]
             if frame.kind is FrameKind.RECOVER:
                 raise RecoveryOrderedError(frame)
-            if frame.kind is not FrameKind.LEASE:
+            if frame.kind is FrameKind.PHASE:
+                self.phase(frame)
+            elif frame.kind is not FrameKind.LEASE:
                 raise ProtocolError(f"a frame of kind {frame.kind.name}, where a lease was due")
-            if frame.number:
+            elif frame.number:
                 self.lease(frame.data)
             else:
                 self.note(frame.data)
@@ -126,11 +130,19 @@ class ZoneHosts:
         self._stirred = [True] * len(self._stirred)
         self.report()
 
+    def phase(self, frame: NodeFrame) -> None:
+        """Take and send messages as a plan of faults lets them come."""
+        raise ProtocolError("a phase of a plan of faults, and there is none")
+
     def _enter_lease(self) -> None:
         for w, leases in enumerate(self._leases):
             self._change_hands(w, leases)
             self._leases[w] = {}
         self._is_open = True
+
+    def executor(self, plain: NodeExecutor) -> NodeExecutor:
+        """What runs the phases of a tick."""
+        return plain
 
     def end(self) -> None:
         """The tick is over here; `report` tells the coordinator."""
@@ -235,12 +247,16 @@ class ZoneHosts:
                 state = division.state(w, entry.source, entry.row)
                 approaches[entry.source].append(Approach(entry.vehicle, entry.target, state))
                 self._targets[w][entry.vehicle] = entry.target
-                movers.append((entry.vehicle, entry.target, state_digest(state).hex()))
+                movers.append((entry.vehicle, entry.target, self._told(state)))
         for zone, endpoint in endpoints.items():
             if not began and (approaches[zone] or endpoint.offers.open):
                 for message in endpoint.offer(approaches[zone]):
                     self._send(w, message)
         return movers, is_late
+
+    def _told(self, state: bytes) -> str:
+        """What the coordinator has to know of a state."""
+        return state_digest(state).hex()
 
     def hear(self, number: int, frame: NodeFrame) -> None:
         """Take messages of other nodes as soon as they come."""
