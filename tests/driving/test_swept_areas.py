@@ -112,7 +112,7 @@ class Meeting:
     def car_is_swept(self, places: tuple[float, float]) -> bool:
         """Whether the car may not enter at its place."""
         room, roads, link = self._announced(1, places), self.network.arrays, self.sweep["foe"]
-        return bool(would_be_swept(roads, self.rows, self.rows[1], link, places[1], room))
+        return bool(would_be_swept(roads, self.rows[1], link, places[1], room))
 
 
 def test_a_bus_waits_before_the_junction_for_a_car_that_stands_at_the_line(

@@ -43,15 +43,6 @@ def _body_m(half: float, size: int) -> float:
     return float(max(2.0 * half, least))
 
 
-@inlined_kernel
-def _size_of_foe(rows: NDArray[np.void], foe: np.void, own: int) -> int:
-    """The size class of one APPROACH, as a vehicle of the class `own` knows it."""
-    other = size_of(foe["half"])
-    if other == 0 and own == STEERED and rows[foe["row"]]["driver"] == DRIVER_AGENT:
-        other = STEERED
-    return other
-
-
 @kernel
 def swept_stop(
     roads: RoadArrays,
@@ -80,7 +71,10 @@ def swept_stop(
             stop = min(stop, max(sweep["enter_m"], place))  # it waits where no other will sweep
         for n in range(scratch.link_start[sweep["foe"]], scratch.link_end[sweep["foe"]]):
             foe = scratch.approach[n]
-            if foe["row"] == i or _size_of_foe(rows, foe, own) != sweep["other"]:
+            other = size_of(foe["half"])
+            if other == 0 and own == STEERED and rows[foe["row"]]["driver"] == DRIVER_AGENT:
+                other = STEERED
+            if foe["row"] == i or other != sweep["other"]:
                 continue
             if _is_in_the_way(rows, row, foe, sweep, place, room_m):
                 # One that is in the area, too, stops where it is. Behind one that stands, or may
@@ -96,16 +90,17 @@ def swept_stop(
 @kernel
 def would_be_swept(
     roads: RoadArrays,
-    rows: NDArray[np.void],  # VEHICLE (C,) of those that are there
     row: np.void,  # VEHICLE that enters
     link: int,  # that it takes next
     place: float,  # of its front, m beyond its stop line
     scratch: Scratch,
 ) -> bool:
-    """Whether one that enters stands where another sweeps that is there or stops in haste only."""
-    size = size_of(0.5 * row["length"])
-    rear = place - _body_m(0.5 * row["length"], size)
-    own = STEERED if size == 0 and row["driver"] == DRIVER_AGENT else size
+    """Whether one that enters stands where another sweeps that is there or stops in haste only.
+
+    Areas of steered cars do not count: where roads share ground, none could enter any more.
+    """
+    own = size_of(0.5 * row["length"])
+    rear = place - _body_m(0.5 * row["length"], own)
     first = roads.links[link]["first_sweep"]
     for k in range(first, first + roads.links[link]["num_sweeps"]):
         sweep = roads.sweeps[k]
@@ -118,7 +113,7 @@ def would_be_swept(
             continue
         for n in range(scratch.link_start[sweep["foe"]], scratch.link_end[sweep["foe"]]):
             foe = scratch.approach[n]
-            if _size_of_foe(rows, foe, own) != sweep["other"]:
+            if size_of(foe["half"]) != sweep["other"]:
                 continue
             foe_place = foe["half"] - foe["dist"]
             to_area = sweep["foe_enter_m"] - foe_place

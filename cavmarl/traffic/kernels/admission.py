@@ -220,7 +220,7 @@ def propose(
                     register_links(roads, travel, rows, num, step, step_at, scratch)
                     announced = True
                 place = 0.5 * row["length"] - to_line
-                if would_be_swept(roads, rows, row, link, place, scratch):
+                if would_be_swept(roads, row, link, place, scratch):
                     continue
             gate.places[w, n] = q
             gate.num_passing[w] = n + 1
