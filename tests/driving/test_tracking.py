@@ -177,7 +177,8 @@ def test_a_body_covers_the_side_lane_that_it_reaches_into(name: str, lane: int, 
     roads = network(name)
     lane %= len(roads.lanes)
     here = roads.lanes[lane]
-    found = side_lane(roads.lanes, lane, d, 2.0)
+    row = on_lane(roads, lane, 0.0, d=d, width=2.0)[0]
+    found = side_lane(roads.arrays, row)
     reach = abs(d) + 1.0 - 0.5 * float(here["width_m"])
     beside = int(here["left"] if d > 0.0 else here["right"])
     if reach > 0.2:

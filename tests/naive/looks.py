@@ -14,8 +14,10 @@ from cavmarl.core.records.rows import ENTER_REACH_M, SIZE_LENGTHS_M, STEERED, SW
 from cavmarl.driving.kernels.announcing import APPROACH_M
 from cavmarl.driving.kernels.junctions import EXIT_LOOK_M
 from cavmarl.driving.kernels.lane_choice import LOOK_BACK_M
+from cavmarl.driving.kernels.lane_index import GOES_ON_M
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.zones.kernels.visibility_tests import ASIDE_M, ROUNDING_M
+from tests.naive.lanes import beside_s
 
 __all__ = ["Looks"]
 
@@ -42,7 +44,7 @@ class Looks:
         see_m: float,
         half_m: float,
     ) -> None:
-        self.network = network
+        self.network, self.half_m = network, half_m
         self.lengths = network.lanes["length_m"].tolist()
         self.head: dict[int, float] = defaultdict(lambda: -math.inf)
         self.tail: dict[int, float] = defaultdict(lambda: math.inf)
@@ -113,6 +115,9 @@ class Looks:
                 aside_m = 0.0 if beside == lane else ASIDE_M
                 back = way + self.lengths[lane] - aside_m - ROUNDING_M
                 self.back[beside] = min(self.back[beside], back)
+                for inside, _ in self._beyond(beside):
+                    offset = self.lengths[beside] + self.network.lanes["link_offset_m"][inside]
+                    self.back[inside] = min(self.back[inside], float(back - offset))
         return ahead
 
     def _asked(self, ahead: Ways, see_m: float) -> set[int]:
@@ -144,6 +149,9 @@ class Looks:
     def _see(self, lane: int, first: float, last: float) -> None:
         for beside in self._beside(lane):
             length = self.lengths[beside]
+            if first <= last and last + ASIDE_M >= length:
+                for inside, further in self._beyond(beside):
+                    self.head[inside] = max(self.head[inside], further + ROUNDING_M)
             if first > last or last < 0.0 or first > length:
                 continue
             if first <= 0.0:
@@ -152,6 +160,24 @@ class Looks:
                 self.tail[beside] = min(self.tail[beside], first - ROUNDING_M)
             else:
                 self.head[beside] = math.inf
+
+    def _beyond(self, lane: int) -> list[tuple[int, float]]:
+        """Lanes behind the end of one, and how far there bodies may cover longer lanes beside."""
+        row = self.network.lanes[lane]
+        if row["internal"]:
+            return []
+        sides = [int(row[side]) for side in ("left", "right") if row[side] >= 0]
+        ends = [beside_s(self.network, lane, side, self.lengths[lane]) for side in sides]
+        more = [self.lengths[k] - end for k, end in zip(sides, ends, strict=True)]
+        if max(more, default=0.0) <= GOES_ON_M:
+            return []
+        found = []
+        for link in self._links(lane):
+            for inside in self._path(link)[:-1]:
+                rest = max(more) + self.half_m - self.network.lanes["link_offset_m"][inside]
+                if rest + ROUNDING_M > 0.0:
+                    found.append((inside, rest + ROUNDING_M))
+        return found
 
     def _ways(self, begin: Ways, neighbors: Callable[[int], list[int]], limit_m: float) -> Ways:
         """Dijkstra's shortest ways."""

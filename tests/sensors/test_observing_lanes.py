@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -8,25 +10,36 @@ from numpy.typing import NDArray
 
 from cavmarl.config.sensors import LanesConfig, SensorsConfig
 from cavmarl.core.math.neighbors import fill_grid, make_grid
+from cavmarl.core.records.arrays import Travel
 from cavmarl.core.records.codes import SIGNAL_RED, SIGNAL_RED_YELLOW
 from cavmarl.driving.kernels.gaps import link_signal
+from cavmarl.driving.kernels.tracking import side_lane
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.routing import make_plans
+from cavmarl.roads.sumo_net.reader import read_network
 from cavmarl.sensors.kernels.observing_lanes import LANES_FEATURES, observe_lanes
 from cavmarl.sensors.observed import layout, sensor_arrays
 from tests.naive import observing_lanes as naive
-from tests.support.traffic import NAMES, crowds_on_lanes, network, on_lane, plans, travel
+from tests.support.junction_scenes import build_crossing, with_shorter_lane
+from tests.support.traffic import NAMES, crowds_on_lanes, network, on_lane, plans, travel, travel_by
 
 RANGE_M = 60.0
 CONFIG = SensorsConfig(lanes=LanesConfig(range_m=RANGE_M))
 
 
 def observe(name: str, rows: NDArray[np.void], i: int, phase: NDArray[np.int32]) -> list[float]:
-    roads = network(name)
+    return observed(network(name), travel(name), rows, i, phase)
+
+
+def observed(
+    roads: RoadNetwork, ways: Travel, rows: NDArray[np.void], i: int, phase: NDArray[np.int32]
+) -> list[float]:
     grid = make_grid(roads.extent_m, 25.0, len(rows))
     fill_grid(rows, len(rows), grid)
     place = layout(CONFIG)["lanes"]
     out = np.zeros(place.stop, np.float32)
     sensors = sensor_arrays(CONFIG, roads)
-    observe_lanes(roads.arrays, travel(name), rows, i, grid, phase, sensors, out)
+    observe_lanes(roads.arrays, ways, rows, i, grid, phase, sensors, out)
     assert place.stop - place.start == LANES_FEATURES
     assert not out[: place.start].any()
     return [float(value) for value in out[place]]
@@ -93,3 +106,20 @@ def test_gaps_on_a_straight_road() -> None:
     assert found[2:4] == [0.0, 0.0]
     assert found[4:6] == pytest.approx([0.5, 0.1])
     assert found[6:] == [0.0] * 8
+
+
+def test_one_that_has_left_a_shorter_lane_is_ahead_on_the_longer_one(tmp_path: Path) -> None:
+    """It is on the junction by its own lane, and still covers the one beside it."""
+    path = with_shorter_lane(build_crossing(tmp_path, "priority", side_lanes=2), "S_in_1", 8.0)
+    roads = read_network(path)
+    own, inside = (roads.lane_ids.index(lane) for lane in ("S_in_0", ":c_10_0"))
+    steps = make_plans(roads, [roads.edge_ids.index("N_out")])
+    ways = travel_by(steps)
+    rows = np.concatenate(
+        [on_lane(roads, own, 110.0, ways, id=0, goal=0), on_lane(roads, inside, 2.0, d=-2.8, id=1)]
+    )
+    rows["side_lane"][1] = side_lane(roads.arrays, rows[1])
+    assert rows["side_lane"][1] == own
+    found = observed(roads, ways, rows, 0, np.zeros(0, np.int32))
+    apart_m = float(roads.lanes["length_m"][own]) - 8.0 + 2.0 - 110.0
+    assert found[0] == pytest.approx(naive.closeness(apart_m - 5.0), abs=1e-3)

@@ -8,7 +8,7 @@ import pytest
 
 from cavmarl.core.records.codes import HOLD_EXIT_BLOCKED, HOLD_YIELD
 from tests.support.divided_scenes import TICK_S, DividedScene
-from tests.support.junction_scenes import build_crossing
+from tests.support.junction_scenes import build_crossing, with_shorter_lane
 
 CRAWLS = 1e-3  # of the limit: for others such a vehicle stands
 
@@ -95,3 +95,30 @@ def test_no_car_departs_where_a_bus_turns_over_the_line(
         assert entered_s < 0.5, "the bus can wait"
     else:
         assert 2.0 < entered_s < 6.0, "it waits until the bus has passed, and no longer"
+
+
+@pytest.fixture(scope="module")
+def shorter(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The left lane of the southern arm ends 8 m before the right one."""
+    path = build_crossing(tmp_path_factory.mktemp("shorter"), "priority", side_lanes=2)
+    return with_shorter_lane(path, "S_in_1", 8.0)
+
+
+@pytest.mark.parametrize("corner_m", [(6.0, -22.0), (-9.0, -11.5), (0.0, -14.0), (0.0, 0.0)])
+@pytest.mark.parametrize("way", ["S_in_1 N_out_1", "S_in_1 W_out_0"])
+def test_one_that_has_left_a_shorter_lane_is_seen_on_the_longer_one_that_it_still_covers(
+    shorter: Path, tmp_path: Path, corner_m: tuple[float, float], way: str
+) -> None:
+    here = DividedScene(shorter, tmp_path, corner_m, ("car",))
+    right, left = (here.whole.network.lane_ids.index(f"S_in_{k}") for k in range(2))
+    lanes = here.whole.network.lanes
+    assert lanes["length_m"][right] - lanes["length_m"][left] == pytest.approx(8.0)
+    crawls = {"speed": 0.5, "speed_factor": 0.03}
+    here.put("changed", way, 3.0, d=-2.8, side_lane=right, **crawls)
+    here.put("follows", "S_in_0 E_out_0", -17.0, speed=6.0)
+    here.begin()
+    covered = 0
+    for vehicles in here.run(9.0):
+        covered += int(vehicles["changed"]["side_lane"]) == right
+    assert covered > 20
+    assert vehicles["follows"]["speed"] > 3.0, "and goes on where it has room"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -11,6 +13,7 @@ from cavmarl.driving.steered_sweeps import load_steered
 from cavmarl.engine.world_setup import find_map
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.sumo_net.reader import read_network
 from cavmarl.zones.kernels.visibility_tests import (
     ASIDE_M,
     ROUNDING_M,
@@ -20,6 +23,7 @@ from cavmarl.zones.kernels.visibility_tests import (
 )
 from cavmarl.zones.kernels.zone_lookup import LOOK
 from tests.naive.looks import STEP_M, Looks
+from tests.support.junction_scenes import build_crossing, with_shorter_lane
 from tests.support.traffic import network
 
 VIEW_M, SEE_M, HALF_M = 90.0, 40.0, 6.0
@@ -83,6 +87,24 @@ def test_kernel_sees_what_sets_of_lanes_see(
     # On these maps vans, buses and steered cars alone sweep over ways beside theirs.
     sweeps = name == "grid4x4" and (half_m == HALF_M or steered)
     assert np.isfinite(found["room"]).any() == sweeps
+
+
+@pytest.mark.parametrize("from_line_m", [-40.0, 10.0, 95.0, 120.0])
+def test_behind_a_shorter_lane_those_are_seen_that_may_cover_the_longer_one(
+    tmp_path: Path, from_line_m: float
+) -> None:
+    """From a place behind the junction, and from places before it: near, far, and too far."""
+    path = build_crossing(tmp_path, "priority", side_lanes=2)
+    roads = read_network(with_shorter_lane(path, "S_in_1", 8.0))
+    turn = roads.lane_ids.index(":c_10_0")
+    y = float(roads.lanes["length_m"][roads.lane_ids.index("S_in_0")]) - from_line_m
+    rect = (140.0, y - 10.0, 160.0, y - 9.0)
+    found, twin = looks_of(roads, rect), Looks(roads, rect, VIEW_M, SEE_M, HALF_M)
+    for field, told in (("head", twin.head), ("back", twin.back), ("tail", twin.tail)):
+        expected = np.array([told[lane] for lane in range(len(roads.lanes))])
+        np.testing.assert_allclose(found[field], expected, atol=2.0 * STEP_M, err_msg=field)
+    assert (found["head"][turn] > 8.0 + HALF_M) == (from_line_m < 120.0)
+    assert (found["back"][turn] < np.inf) == (from_line_m < 0.0)
 
 
 @pytest.fixture(scope="module")

@@ -23,6 +23,7 @@ from cavmarl.core.records.rows import is_lost
 from cavmarl.driving.kernels.announcing import announced_m
 
 MAX_LOOK_BACK_LANES = 4
+GOES_ON_M = 1.0  # lanes of one road end beside each other but for this
 VIEW_M = 250.0  # the farthest view along the road that a world can have
 
 ENTRY = np.dtype(
@@ -42,15 +43,34 @@ ENTRY = np.dtype(
 
 @kernel
 def beside_s(roads: RoadArrays, lane: int, neighbor: int, s: float) -> float:
-    """Where on a neighbour lane a place on a lane lies, in m."""
+    """Where on a neighbour lane a place on a lane lies, in m.
+
+    On one that goes on beside the junction, see `goes_on_m`, as far as the way has gone since.
+    """
     row = roads.lanes[lane]
+    driven = 0.0
+    if row["internal"] and not roads.lanes[neighbor]["internal"]:
+        driven = row["link_offset_m"] + s
+        lane = roads.links[row["link"]]["from_lane"]
+        row = roads.lanes[lane]
+        s = row["length_m"]
     k = segment_at(roads.points, row["first_point"], row["num_points"], s)
     point = roads.points[k]
     after = roads.points[k + 1]
     share = min(max((s - point["s"]) / (after["s"] - point["s"]), 0.0), 1.0)
     if neighbor == row["left"]:
-        return float(point["left_s"] + share * (after["left_s"] - point["left_s"]))
-    return float(point["right_s"] + share * (after["right_s"] - point["right_s"]))
+        return float(driven + point["left_s"] + share * (after["left_s"] - point["left_s"]))
+    return float(driven + point["right_s"] + share * (after["right_s"] - point["right_s"]))
+
+
+@kernel
+def goes_on_m(roads: RoadArrays, lane: int, neighbor: int) -> float:
+    """How far a neighbour lane goes on beside the junction at the end of a lane, in m; or 0."""
+    row = roads.lanes[neighbor]
+    end = roads.points[roads.lanes[lane]["first_point"] + roads.lanes[lane]["num_points"] - 1]
+    place = end["left_s"] if neighbor == roads.lanes[lane]["left"] else end["right_s"]
+    further = row["length_m"] - place
+    return float(further) if further > GOES_ON_M else 0.0
 
 
 @inlined_kernel

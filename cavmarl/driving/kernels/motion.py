@@ -220,7 +220,7 @@ def move_background(
     sideways = min(LATERAL_MPS, max(LATERAL_RATIO * speed, LATERAL_MIN_MPS)) * dt
     offset = row["d"]
     row["d"] = offset - clamp(offset, -sideways, sideways)
-    row["side_lane"] = side_lane(roads.lanes, row["lane"], row["d"], row["width"])
+    row["side_lane"] = side_lane(roads, row)
     heading = place_on_lane(roads, travel, row)
     if row["d"] != offset and speed > STANDING_MPS:
         drift = math.atan2((row["d"] - offset) / dt, speed)
@@ -273,7 +273,7 @@ def move_agent(
         signal = link_signal(roads, row["link"], phase)
         if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW:
             row["events"] |= EVENT_RED_LIGHT
-    row["side_lane"] = side_lane(roads.lanes, row["lane"], row["d"], row["width"])
+    row["side_lane"] = side_lane(roads, row)
     lane = roads.lanes[row["lane"]]
     _, _, z, _, _, slope = lane_pose(
         roads.points, lane["first_point"], lane["num_points"], row["s"]

@@ -16,6 +16,7 @@ from cavmarl.core.math.geometry import lane_pose, project, project_near
 from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import LaneGrid, RoadArrays
 from cavmarl.core.records.codes import EVENT_OFF_ROAD, EVENT_WRONG_WAY
+from cavmarl.driving.kernels.lane_index import beside_s, goes_on_m
 
 JUNCTION_MARGIN_M = (
     2.0  # inside junctions lanes are guides: this much beyond their sides is still road
@@ -29,14 +30,26 @@ LEVEL_M = 4.0  # lanes further above or below are another road
 
 
 @kernel
-def side_lane(lanes: NDArray[np.void], lane: int, d: float, width: float) -> int:
-    """The neighbour lane that a body `width` wide at offset `d` also covers, or -1."""
-    free = 0.5 * (lanes[lane]["width_m"] - width) - SIDE_MARGIN_M
-    if d > free:
-        return int(lanes[lane]["left"])
-    if d < -free:
-        return int(lanes[lane]["right"])
-    return -1
+def side_lane(roads: RoadArrays, row: np.void) -> int:
+    """The neighbour lane that a vehicle's body also covers, or -1.
+
+    Where its own lane has led into a junction beside which the neighbour goes on, it is that one
+    until the rear has passed its end.
+    """
+    lane = roads.lanes[row["lane"]]
+    d = row["d"]
+    free = 0.5 * (lane["width_m"] - row["width"]) - SIDE_MARGIN_M
+    if -free <= d <= free:
+        return -1
+    to_left = d > free
+    if lane["internal"] and to_left == (d > 0.0):
+        before = roads.links[lane["link"]]["from_lane"]
+        beside = roads.lanes[before]["left"] if to_left else roads.lanes[before]["right"]
+        if beside >= 0 and goes_on_m(roads, before, beside) > 0.0:
+            rear = beside_s(roads, row["lane"], beside, row["s"]) - 0.5 * row["length"]
+            if rear < roads.lanes[beside]["length_m"]:
+                return int(beside)
+    return int(lane["left"] if to_left else lane["right"])
 
 
 @kernel

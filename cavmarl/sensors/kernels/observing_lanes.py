@@ -19,6 +19,7 @@ from cavmarl.core.records.arrays import RoadArrays, Sensors, Travel
 from cavmarl.core.records.codes import SIGNAL_RED, SIGNAL_RED_YELLOW
 from cavmarl.core.records.rows import is_off_lanes
 from cavmarl.driving.kernels.gaps import link_signal
+from cavmarl.driving.kernels.lane_index import beside_s
 from cavmarl.driving.kernels.ways import next_step
 
 OWN = 0  # slots of two features each: a gap and a speed
@@ -88,7 +89,10 @@ def _observe_gap(
     ahead = math.inf
     for on in (other["lane"], other["side_lane"]):
         if on >= 0:
-            way = _way_between(roads, travel, lane, row["way"], s, on, other["s"])
+            place = other["s"]
+            if roads.lanes[other["lane"]]["internal"] and not roads.lanes[on]["internal"]:
+                place = beside_s(roads, other["lane"], on, place)
+            way = _way_between(roads, travel, lane, row["way"], s, on, place)
             if way >= 0.0:
                 ahead = min(ahead, way)
     if ahead - half < range_m:

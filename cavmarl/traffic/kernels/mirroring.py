@@ -200,7 +200,7 @@ def _stand_in(roads: RoadArrays, travel: Travel, paths: Paths, seen: np.void, ro
     )
     row["z"] = seen["z"] - half * slope
     row["pitch"] = math.atan(slope)
-    row["side_lane"] = side_lane(roads.lanes, row["lane"], row["d"], row["width"])
+    row["side_lane"] = side_lane(roads, row)
     row["target_lane"] = row["lane"]
     signals = seen["signals"]
     row["blinker"] = 0

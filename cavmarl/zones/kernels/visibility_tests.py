@@ -23,6 +23,7 @@ from cavmarl.core.records.rows import ENTER_REACH_M, STEERED, SWEPT_BEYOND_M
 from cavmarl.driving.kernels.announcing import APPROACH_M
 from cavmarl.driving.kernels.junctions import EXIT_LOOK_M
 from cavmarl.driving.kernels.lane_choice import LOOK_BACK_M
+from cavmarl.driving.kernels.lane_index import goes_on_m
 from cavmarl.driving.kernels.swept_areas import size_of
 from cavmarl.zones.kernels.zone_lookup import squared_distance
 
@@ -199,12 +200,59 @@ def _widen(looks: NDArray[np.void], lane: int, first: float, last: float, length
         looks[lane]["head"] = math.inf
 
 
+@inlined_kernel
+def _longest_beside_m(roads: RoadArrays, lane: int) -> float:
+    """How far a lane's neighbours go on beside the junction at its end; 0: they end there, too."""
+    further = 0.0
+    for side in (roads.lanes[lane]["left"], roads.lanes[lane]["right"]):
+        if side >= 0 and not roads.lanes[lane]["internal"]:
+            further = max(further, goes_on_m(roads, lane, side))
+    return further
+
+
 @kernel
-def _see(roads: RoadArrays, lane: int, first: float, last: float, looks: NDArray[np.void]) -> None:
+def _look_beyond(
+    roads: RoadArrays, lane: int, back: float, half_m: float, looks: NDArray[np.void]
+) -> None:
+    """Let vehicles behind the end of a lane be seen that may cover a longer one beside it.
+
+    `back`: from where on followers are seen, in m of the lane; inf: all are, not as followers.
+    """
+    further = _longest_beside_m(roads, lane)
+    if further == 0.0:
+        return
+    for link in range(
+        roads.lanes[lane]["first_link"],
+        roads.lanes[lane]["first_link"] + roads.lanes[lane]["num_links"],
+    ):
+        inside = roads.links[link]["next_lane"]
+        rest = further + half_m + ROUNDING_M
+        while roads.lanes[inside]["internal"] and rest > 0.0:
+            if back == math.inf:
+                _widen(looks, inside, 0.0, rest, roads.lanes[inside]["length_m"])
+            else:
+                place = back - roads.lanes[lane]["length_m"] - roads.lanes[inside]["link_offset_m"]
+                looks[inside]["back"] = min(looks[inside]["back"], place)
+            rest -= roads.lanes[inside]["length_m"]
+            inside = roads.lanes[inside]["successor"]
+
+
+@kernel
+def _see(
+    roads: RoadArrays,
+    lane: int,
+    first: float,
+    last: float,
+    half_m: float,  # of the longest vehicle
+    looks: NDArray[np.void],
+) -> None:
     """The same on all lanes of its edge: vehicles beside one may be about to change to it."""
     edge = roads.edges[roads.lanes[lane]["edge"]]
     for other in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
-        _widen(looks, other, first, last, roads.lanes[other]["length_m"])
+        length = roads.lanes[other]["length_m"]
+        _widen(looks, other, first, last, length)
+        if edge["num_lanes"] > 1 and first <= last and last + ASIDE_M >= length:
+            _look_beyond(roads, other, math.inf, half_m, looks)
 
 
 @kernel
@@ -212,6 +260,7 @@ def _look_along(
     roads: RoadArrays,
     view_m: float,
     see_m: float,
+    half_m: float,
     scratch: VisibilityScratch,
     looks: NDArray[np.void],
 ) -> None:
@@ -225,11 +274,12 @@ def _look_along(
             left = roads.lanes[lane]["length_m"] - scratch.last[lane]
             _begin(roads, lane, True, left, scratch.ahead)
             _begin(roads, lane, False, scratch.first[lane], scratch.behind)
-            _see(roads, lane, scratch.first[lane] - view_m, scratch.last[lane] + view_m, looks)
+            first, last = scratch.first[lane] - view_m, scratch.last[lane] + view_m
+            _see(roads, lane, first, last, half_m, looks)
     _spread(roads, True, view_m, scratch.ahead, scratch)
     for lane in range(roads.lanes.shape[0]):
         if scratch.ahead[lane] <= view_m:
-            _see(roads, lane, 0.0, view_m - scratch.ahead[lane], looks)
+            _see(roads, lane, 0.0, view_m - scratch.ahead[lane], half_m, looks)
     _spread(roads, False, BACK_M, scratch.behind, scratch)
     for lane in range(roads.lanes.shape[0]):
         if scratch.behind[lane] <= BACK_M:
@@ -238,6 +288,7 @@ def _look_along(
             for other in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
                 place = back if other == lane else back - ASIDE_M
                 looks[other]["back"] = min(looks[other]["back"], place)
+                _look_beyond(roads, other, place, half_m, looks)
 
 
 @kernel
@@ -297,9 +348,9 @@ def _look_at_junctions(
         row = roads.links[link]
         lane = row["next_lane"]
         while roads.lanes[lane]["internal"]:
-            _see(roads, lane, 0.0, roads.lanes[lane]["length_m"], looks)
+            _see(roads, lane, 0.0, roads.lanes[lane]["length_m"], half_m, looks)
             lane = roads.lanes[lane]["successor"]
-        _see(roads, lane, 0.0, SWEPT_BEYOND_M + half_m, looks)
+        _see(roads, lane, 0.0, SWEPT_BEYOND_M + half_m, half_m, looks)
         if scratch.asked[link] and row["num_conflicts"] > 0:
             scratch.beyond[lane] = 0.0
         if scratch.foe[link]:
@@ -313,7 +364,7 @@ def _look_at_junctions(
     _spread(roads, True, EXIT_LOOK_M, scratch.beyond, scratch)
     for lane in range(roads.lanes.shape[0]):
         if scratch.beyond[lane] <= EXIT_LOOK_M:
-            _see(roads, lane, 0.0, EXIT_LOOK_M - scratch.beyond[lane], looks)
+            _see(roads, lane, 0.0, EXIT_LOOK_M - scratch.beyond[lane], half_m, looks)
         if scratch.to_line[lane] <= APPROACH_M:
             edge = roads.edges[roads.lanes[lane]["edge"]]
             for other in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
@@ -343,7 +394,7 @@ def find_looks(
         looks[lane]["line"] = math.inf
         looks[lane]["room"] = math.inf
     _find_own(roads, rect, scratch)
-    _look_along(roads, view_m, see_m, scratch, looks)
+    _look_along(roads, view_m, see_m, half_m, scratch, looks)
     _find_lines(roads, see_m, half_m, scratch)
     _look_at_junctions(roads, half_m, scratch, looks)
 
