@@ -41,7 +41,8 @@ class Told(NamedTuple):
 
     phase: int  # counted from when nodes were lost last
     again: bool  # what was offered and not answered is offered once more
-    harms: bool  # whether anything happens to messages
+    harms: bool  # whether anything happens to messages, and nodes
+    tick: int  # the lease that is under way, of those with ticks, also of those done again
 
 
 class Said(NamedTuple):

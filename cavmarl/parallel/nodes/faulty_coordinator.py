@@ -51,6 +51,7 @@ class FaultyNodeCoordinator(NodeCoordinator):
     def __init__(self, *arguments: Any, faults: Faults, exchange: Exchange) -> None:
         super().__init__(*arguments)
         self._faults, self._exchange = faults, exchange
+        self._ticks = 0  # that have been leased, also those that were done again
         self._begin_phases()
 
     def _begin_phases(self) -> None:
@@ -70,6 +71,7 @@ class FaultyNodeCoordinator(NodeCoordinator):
         or is there when all have gone back to a state, changes its owner with it.
         """
         self._harms = not self.is_late
+        self._ticks += self._harms
         for w, message in self._decide():
             self._post.send(w, (message,))
         self._deliver()
@@ -122,7 +124,7 @@ class FaultyNodeCoordinator(NodeCoordinator):
             due: defaultdict[int, list[Parcel]] = defaultdict(list)
             for parcel in self._post.deliver():
                 due[self._node_of[parcel.destination]].append(parcel)
-            head = Told(self._post.phase, again, self._harms)
+            head = Told(self._post.phase, again, self._harms, self._ticks)
             told = {node: packed_parcels(head, due[node]) for node in set(self._node_of)}
             arrived = self._owed = busy = 0
             self._unleased, again = [], False

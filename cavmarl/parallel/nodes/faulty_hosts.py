@@ -26,6 +26,8 @@ from cavmarl.parallel.nodes.links import FrameKind, Links, NodeFrame
 from cavmarl.parallel.nodes.node_executor import NodeExecutor
 from cavmarl.parallel.nodes.zone_hosts import ZoneHosts
 
+NEVER = -1  # a tick in which no process dies
+
 
 class FaultyZoneHosts(ZoneHosts):
     """Hosts that send and take all messages in the caller's phases.
@@ -51,14 +53,14 @@ class FaultyZoneHosts(ZoneHosts):
     def lease(self, data: memoryview) -> None:
         """Begin the ticks for which all zones have taken their lease."""
         self._leases, self._advances = self._advances, [{} for _ in self._advances]
-        if self._crashes is not None:
-            self._crashes.tick = max(advance.tick for advance in self._leases[0].values())
 
     def phase(self, frame: NodeFrame) -> None:
         head, parcels = unpacked_parcels(frame.data)
         told = Told(*head)  # type: ignore[arg-type]
         post = self._post
         post.begin(told.harms)
+        if self._crashes is not None:
+            self._crashes.tick = told.tick if told.harms else NEVER
         if told.again:
             for w, endpoints in enumerate(self._endpoints):
                 for endpoint in endpoints.values():
@@ -120,7 +122,7 @@ class FaultyZoneHosts(ZoneHosts):
         if endpoint is None:
             return
         first, last = _POINTS.get(type(message), ("", ""))
-        self._visit(first, zone, message)
+        self._visit(first, zone)
         if is_refused and isinstance(message, Prepare):
             reaction = endpoint.refuse(message)
         else:
@@ -128,11 +130,10 @@ class FaultyZoneHosts(ZoneHosts):
         if reaction.advance is not None:
             self._advances[w][zone] = reaction.advance
         self._post.send(w, reaction.messages)
-        self._visit(last, zone, message)
+        self._visit(last, zone)
 
-    def _visit(self, point: str, zone: int, message: Message) -> None:
+    def _visit(self, point: str, zone: int) -> None:
         if self._crashes is not None and point:
-            self._crashes.tick = message.tick + isinstance(message, Prepare)
             self._crashes.zone(point, zone)
 
     def _complete(self, w: int) -> Sequence[Message]:
