@@ -74,7 +74,7 @@ class Args:
     imitate: Annotated[str, "driver that is imitated at first; empty: the built-in one"] = ""
     imitation_weight: Annotated[float, "of the distance to that driver, at the start"] = 0.0
     imitation_share: Annotated[float, "share of the run in which that weight falls to 0"] = 0.1
-    start: Annotated[str, "driver whose weights, sensors and actions it begins with"] = ""
+    start: Annotated[str, "driver whose weights, form, sensors and actions it has at first"] = ""
     end_at_red: Annotated[bool, "expect nothing after running a red light, as at a crash"] = False
     opponents: Annotated[str, "drivers of some seats, not learnt from: names, by commas"] = ""
     opponent_share: Annotated[float, "share of the seats that each opponent drives"] = 0.1
@@ -82,9 +82,9 @@ class Args:
     throttle_std: Annotated[float, "standard deviation of throttle at first; not --start's"] = 0.3
     steering_std: Annotated[float, "standard deviation of steering at first; not --start's"] = 0.1
     mappo: Annotated[bool, "the critic sees the state of the whole world"] = False
-    hidden: Annotated[int, "width of the two hidden layers"] = 128
-    shared: Annotated[bool, "one body with LayerNorm for actor and critic"] = False
-    residual: Annotated[bool, "its actions are added to those of the built-in driver"] = False
+    hidden: Annotated[int, "width of the two hidden layers; not --start's"] = 128
+    shared: Annotated[bool, "one body with LayerNorm for actor and critic; not --start's"] = False
+    residual: Annotated[bool, "it adds its actions to the built-in driver's; not --start's"] = False
     threads: Annotated[int, "of torch"] = 1
     device: Annotated[str, "where the network is: cpu, or cuda on a machine with a GPU"] = "cpu"
     checkpoint_updates: Annotated[int, "updates between two checkpoints"] = 20
@@ -105,7 +105,7 @@ class Args:
         if self.residual and self.imitation_weight:
             raise ConfigError("--residual: not with --imitation-weight; it begins as that driver")
         if self.shared and self.mappo:
-            raise ConfigError("--shared: not with --mappo, whose critic sees more than the actor")
+            raise ConfigError("--shared: not with --mappo, whose critic sees more than actors do")
 
     @property
     def folder(self) -> Path:
@@ -155,8 +155,7 @@ class Collector:
         self.trips = Trips(vec.num_envs, vec.num_agents)
         self.times = PhaseTimes(PHASES)
         self._mask = vec.reset(seed=seed)[1]["mask"]
-        # Worlds write here what is seen: it is copied once, into a batch.
-        self._observations = torch.from_numpy(vec.worlds.arrays.observations)
+        self._observations = torch.from_numpy(vec.worlds.arrays.observations)  # worlds write here
         self._opponents = Opponents(args.opponents, vec, args.opponent_share, args.seed)
         self._suggest = self._opponents.example(args.imitate)
 
@@ -407,6 +406,7 @@ class Run:
 @contextmanager
 def opened(args: Args) -> Iterator[Run]:
     """A run in its worlds and its folder, which are closed at the end."""
+    args = options.with_form_of(args, args.start)
     own = driver_keys(args.start) if args.start else {}
     vec = make_vec(
         args.env,

@@ -96,6 +96,22 @@ def check_device(name: str) -> None:
         raise ConfigError(f"--device {name}: cannot be used ({reason}): {cure}") from error
 
 
+def with_form_of(args: S, start: str) -> S:
+    """Settings whose network has the form of a driver: `hidden`, `shared`, `residual`.
+
+    `start`: its name or folder; empty: the settings as they are. Raises PolicyError: nothing of
+    that name, or no trained driver.
+    """
+    if not start:
+        return args
+    from cavmarl.policies.networks import load_network  # as above
+    from cavmarl.policies.policy import policy_files
+
+    form = load_network(policy_files(start)[0].parent)[1]
+    own = {"hidden": form.hidden[0], "shared": form.shared, "residual": form.residual}
+    return replace(args, **own)
+
+
 def run_folder(runs: str, name: str, env: str, program: str, seed: int, resume: str = "") -> Path:
     """Where a run lies: RUNS/NAME, without a name RUNS/ENV_PROGRAM_SEED; or RESUME."""
     if resume:

@@ -28,9 +28,6 @@ class Scales:
         Raises PolicyError: it is not of the network's form.
         """
         driver, config = load_network(folder)
-        if config.residual != self._network.residual:
-            cure = "add" if config.residual else "leave out"
-            raise PolicyError(f"--start {folder}: {cure} --residual, as that driver learnt")
         try:
             self._network.load_state_dict(driver.state_dict())
         except RuntimeError as error:

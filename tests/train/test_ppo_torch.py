@@ -263,7 +263,17 @@ def test_a_run_begins_with_the_weights_of_a_driver(
     one, other = (load_network(here / "runs" / name)[0] for name in ("first", "next"))
     for mine, theirs in zip(one.parameters(), other.parameters(), strict=True):
         assert (mine - theirs).abs().max() < 1e-6
-    assert ippo.main([*TINY, "--hidden", "9", "--name", "wide", "--start", "runs/first"]) == 2
+    assert ippo.main([*TINY, "--mappo", "--name", "sees", "--start", "runs/first"]) == 2
     assert "--start runs/first: does not fit this run" in capsys.readouterr().err
-    assert ippo.main([*TINY, "--residual", "--name", "next2", "--start", "runs/first"]) == 2
-    assert "--start runs/first: leave out --residual" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("form", [["--shared"], ["--residual"], ["--hidden", "9"]])
+def test_a_run_has_the_form_of_the_driver_that_it_begins_with(
+    ippo: ModuleType, here: Path, form: list[str]
+) -> None:
+    short = [*TINY, "--total-agent-steps", "20"]
+    assert ippo.main([*short, *form, "--name", "first"]) == 0
+    assert ippo.main([*short, "--name", "next", "--start", "runs/first"]) == 0
+    one, other = (load_network(here / "runs" / name)[1] for name in ("first", "next"))
+    assert (one.hidden, one.shared, one.residual) == (other.hidden, other.shared, other.residual)
+    assert ippo.main(["--resume", "runs/next", "--total-agent-steps", "40"]) == 0
