@@ -22,6 +22,7 @@ from cavmarl.sensors.kernels.camera_picture import (
 )
 from cavmarl.sensors.kernels.faces import CameraPose, PixelRows
 from cavmarl.sensors.kernels.panorama import BUILDING, CAR, GROUND, NOTHING, PEDESTRIAN, ROAD
+from cavmarl.sensors.kernels.rig_pictures import camera_reach_m
 from tests.naive import imaging as naive
 from tests.support.builders import crowds, vehicles
 from tests.support.imaging import NO_WALLS, backdrop, look_around, mount, mounts, wall_sets
@@ -41,7 +42,7 @@ def shoot(
     row: int = 0,
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8], PixelRows]:
     """Depths and classes."""
-    reach_m = 2.0 * camera.range_m
+    reach_m = camera_reach_m(camera, *size) + 1.0  # a pitch moves a camera above the ground
     panorama, counts = look_around(rows, row, backdrop(walls, strips), reach_m)
     picture = make_picture(*size, panorama)
     num = find_faces(camera, panorama, counts, picture)
@@ -60,7 +61,8 @@ def test_rows_do_not_depend_on_which_are_taken_together(
     """Pictures that are too large for the cache are taken in bands; a worker takes some of them."""
     camera = make_camera(matrix, WIDTH, RIGHT, 60.0)
     depths, classes, _ = shoot(rows, camera, walls=walls)
-    panorama, counts = look_around(rows, 0, backdrop(walls), 2.0 * camera.range_m)
+    reach_m = camera_reach_m(camera, WIDTH, HEIGHT) + 1.0
+    panorama, counts = look_around(rows, 0, backdrop(walls), reach_m)
     picture = make_picture(WIDTH, HEIGHT, panorama)
     num = find_faces(camera, panorama, counts, picture)
     for first in reversed(range(0, HEIGHT, band)):
