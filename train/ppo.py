@@ -360,7 +360,7 @@ class Run:
         self.network = ActorCritic(self.config, (args.throttle_std, args.steering_std))
         self.learner = Learner(self.network, args)
         if args.start and not folder.began.parts:
-            self.learner.scales.start(policy_files(args.start)[0].parent)
+            self.learner.scales.start(self.config, policy_files(args.start)[0].parent)
         self.collector = Collector(vec, self.network, args, args.seed + self.updates)
         if not folder.began.parts:
             self.save()  # a run that is killed early begins from here

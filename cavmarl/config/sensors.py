@@ -300,7 +300,8 @@ class WayConfig(Section, key="sensors.way"):
 class ConflictsConfig(Section, key="sensors.conflicts"):
     """The vehicles that come nearest to the own way, the soonest and nearest ones first.
 
-    Nothing of their plans is told: each is taken to go on as it goes, along its heading.
+    Nothing of their plans is told but what `indicators` show: each is taken to go on as it goes,
+    along its heading.
 
     Attributes:
         count: how many at most; 0 switches the sensor off.
@@ -308,12 +309,16 @@ class ConflictsConfig(Section, key="sensors.conflicts"):
         through_walls: false hides vehicles whose centre lies behind a wall of `map.buildings`.
         heard: true adds those that are not seen and that a message tells of (`v2x`), where they are
             if they have gone on as it says; and two numbers a vehicle, see `seen` and `age`.
+        indicators: true takes vehicles that are seen to follow their lanes and the way that they
+            indicate over the junction that they are on or come to next; and one number a vehicle,
+            see `turn`.
     """
 
     count: Annotated[int, Whole(0, 64)] = 0
     range_m: Annotated[float, Within(1.0, 300.0)] = 60.0
     through_walls: bool = True
     heard: bool = False
+    indicators: bool = False
 
 
 @dataclass(frozen=True)

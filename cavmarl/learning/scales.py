@@ -7,9 +7,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from cavmarl.core.errors import PolicyError
 from cavmarl.learning.checkpoint import Parts
-from cavmarl.policies.networks import ActorCritic, load_network
+from cavmarl.learning.starting import begin_with
+from cavmarl.policies.networks import ActorCritic, NetworkConfig
 
 LEAST_DEVIATION = 0.02  # of an observation; those that hardly change are not blown up
 
@@ -22,18 +22,9 @@ class Scales:
         self._count = 0
         self._squares = torch.zeros_like(network.deviation)
 
-    def start(self, folder: Path) -> None:
-        """Begin with the weights and the scales of a driver.
-
-        Raises PolicyError: it is not of the network's form.
-        """
-        driver, config = load_network(folder)
-        try:
-            self._network.load_state_dict(driver.state_dict())
-        except RuntimeError as error:
-            reason = str(error).splitlines()[-1].strip()
-            raise PolicyError(f"--start {folder}: does not fit this run: {reason}") from error
-        self._count = config.agent_steps
+    def start(self, config: NetworkConfig, folder: Path) -> None:
+        """Begin with the weights and the scales of a driver, see `begin_with`."""
+        self._count = begin_with(self._network, config, folder)
         self._squares = self._network.deviation.square() * self._count
 
     def add(self, observations: Tensor) -> None:

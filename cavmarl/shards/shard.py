@@ -113,9 +113,9 @@ class Shard:
         self.lane_grid: LaneGrid = lane_grid(network)
         self.sensors = sensor_arrays(config.sensors, network)
         most_told = config.v2x.inbox.objects
-        self._further = optional_arrays(config.sensors, network, plans, most_told)
-        self._registered = RegisteredOutputs(config, network)
         num_worlds, capacity = zoned.rows.shape[2:]
+        self._further = optional_arrays(config.sensors, network, plans, most_told, capacity)
+        self._registered = RegisteredOutputs(config, network)
         self._floating = len(network.maps) > 1
         self._extent_m = network.room_m
         self.cut(zones, halo)

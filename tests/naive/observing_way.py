@@ -131,12 +131,34 @@ def lines(
     return [number for line in found for number in line]
 
 
-def own_looks(
+def straight_looks(vehicle: np.void) -> list[tuple[float, float, float]]:
+    """Where it will be at each look if it goes straight on: x, y, direction."""
+    x, y, heading, speed = (float(vehicle[name]) for name in ("x", "y", "heading", "speed"))
+    return [
+        (x + time * speed * math.cos(heading), y + time * speed * math.sin(heading), heading)
+        for time in LOOKS_S
+    ]
+
+
+def indicated_way(
     roads: RoadNetwork, plans: NDArray[np.void], vehicle: np.void
+) -> tuple[list[Stretch], int]:
+    """The way up to the end of the lane behind the next junction; the link over it, or -1."""
+    way = way_of(roads, plans, vehicle)
+    here = roads.lanes[way[0].lane]
+    links = [int(here["link"])] if here["internal"] else []
+    for k, stretch in enumerate(way):
+        if stretch.link >= 0:
+            links.append(stretch.link)
+        if len(links) > 1:
+            return way[: k + 1], links[0]
+    return way, next(iter(links), -1)
+
+
+def looks_along(
+    roads: RoadNetwork, way: list[Stretch], vehicle: np.void, speed: float
 ) -> list[tuple[float, float, float]]:
     """Where the vehicle is now, and will be at each look: x, y, direction."""
-    way = way_of(roads, plans, vehicle)
-    speed = max(float(vehicle["speed"]), 3.0)
     found = [(float(vehicle["x"]), float(vehicle["y"]), float(vehicle["heading"]))]
     for time in LOOKS_S[1:]:
         stretch, s = on_way(way, speed * time)
@@ -145,14 +167,18 @@ def own_looks(
 
 
 def approach(
-    looks: list[tuple[float, float, float]], ego: np.void, other: np.void
+    looks: list[tuple[float, float, float]],
+    others: list[tuple[float, float, float]],
+    ego: np.void,
+    other: np.void,
 ) -> tuple[float, float]:
     """The gap of the approach that counts most, and its time."""
     gaps = []
-    for time, (x, y, direction) in zip(LOOKS_S, looks, strict=True):
-        dx = other["x"] + time * other["speed"] * math.cos(other["heading"]) - x
-        dy = other["y"] + time * other["speed"] * math.sin(other["heading"]) - y
-        turned = other["heading"] - direction
+    for time, (x, y, direction), (x_there, y_there, direction_there) in zip(
+        LOOKS_S, looks, others, strict=True
+    ):
+        dx, dy = x_there - x, y_there - y
+        turned = direction_there - direction
         ends = [
             (0.5 * a * other["length"], 0.5 * b * other["width"]) for a in (1, -1) for b in (1, -1)
         ]
@@ -201,6 +227,16 @@ def goes_first(
     return next((value for value in (1.0, -1.0) if value in answers), 0.0)
 
 
+def turn_over(roads: RoadNetwork, link: int) -> float:
+    """1: to the left, -1: to the right, 0: neither."""
+    if link < 0:
+        return 0.0
+    before, after = int(roads.links[link]["from_lane"]), int(roads.links[link]["to_lane"])
+    direction = pose(roads, before, float(roads.lanes[before]["length_m"]))[2]
+    turned = math.remainder(pose(roads, after, 0.0)[2] - direction, 2.0 * math.pi)
+    return math.copysign(1.0, turned) if abs(turned) >= 0.4 else 0.0
+
+
 def bent(value: float, half: float) -> float:
     return value / (half + abs(value))
 
@@ -215,15 +251,16 @@ def conflicts(
     range_m: float,
     hidden: Collection[int] = (),
     told: Mapping[int, tuple[np.void, float]] | None = None,
+    indicators: bool = False,
 ) -> list[float]:
-    """Nine numbers of each of the `count` vehicles that count most.
+    """Nine numbers of each of the `count` vehicles that count most, with `indicators` ten.
 
     `hidden`: ids of those that are not seen. `told`: what messages say of each
     vehicle, as a VEHICLE row and its age in s; then the numbers are eleven.
     """
     ego = rows[i]
-    looks = own_looks(roads, plans, ego)
     way = way_of(roads, plans, ego)
+    looks = looks_along(roads, way, ego, max(float(ego["speed"]), 3.0))
     known = {int(row["id"]): (row, -1.0) for row in rows if int(row["id"]) not in hidden}
     known = {**(told or {}), **known}
     del known[int(ego["id"])]
@@ -232,7 +269,11 @@ def conflicts(
         away = math.hypot(other["x"] - ego["x"], other["y"] - ego["y"])
         if away > range_m or abs(other["z"] - ego["z"]) > 4.0:
             continue
-        near, when = approach(looks, ego, other)
+        others = straight_looks(other)
+        if indicators:
+            its_way = indicated_way(roads, plans, other)[0]
+            others = looks_along(roads, its_way, other, float(other["speed"]))
+        near, when = approach(looks, others, ego, other)
         # Of equal ones the sum rounds differently here and there: these are told apart by id.
         ranked.append((round(near + 2.0 * when, 6), subject, near, when))
     numbers: list[float] = []
@@ -252,5 +293,7 @@ def conflicts(
         numbers.append(goes_first(roads, way, reach_m, other, shown) if is_seen else 0.0)
         if told is not None:
             numbers += [1.0, 0.0] if is_seen else [0.0, min(age_s, 1.0)]
-    size = 9 if told is None else 11
+        if indicators:
+            numbers.append(turn_over(roads, indicated_way(roads, plans, other)[1]))
+    size = (9 if told is None else 11) + int(indicators)
     return [*numbers, *([0.0] * (size * count))][: size * count]

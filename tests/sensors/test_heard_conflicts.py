@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 import cavmarl
 from cavmarl.core.math.neighbors import fill_grid
 from cavmarl.engine.spaces import observation_parts
-from cavmarl.sensors.kernels.observing_conflicts import observe_conflicts
+from cavmarl.sensors.kernels.observing_conflicts import forget_others, observe_conflicts
 from cavmarl.sensors.observed.way_features import conflicts_settings
 from tests.naive import observing_way as naive
 from tests.sensors.test_hidden_neighbors import blocked
@@ -120,13 +120,14 @@ def test_what_a_hidden_vehicle_does_changes_nothing_until_it_says_so() -> None:
     shard = vec.worlds.simulation.shards[0]
     rows = vec.worlds.simulation.vehicles(0).copy()
     walls = shard._further.conflicts.walls
-    sensor = conflicts_settings(vec.config.sensors, 0, walls, vec.config.v2x.inbox.objects)
+    sensor = conflicts_settings(vec.config.sensors, 0, walls, vec.config.v2x.inbox.objects, 64)
     inboxes = vec.simulation.messages.mail.objects[0]
     phase, tick = np.zeros(0, np.int32), ticks(vec)
 
     def observed(rows: NDArray[np.void], i: int) -> NDArray[np.float32]:
         out = np.zeros(COUNT * SIZE, np.float32)
         fill_grid(rows, len(rows), shard.grid)
+        forget_others(sensor)
         told = inboxes[rows[i]["agent"]]
         observe_conflicts(
             shard.roads, shard.travel, rows, i, shard.grid, phase, told, tick, 0.1, sensor, out

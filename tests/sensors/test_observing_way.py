@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -34,6 +36,7 @@ CONFIG = SensorsConfig(
     way=WayConfig(distances_m=tuple(DISTANCES_M), lines=LINES, timing=False),
     conflicts=ConflictsConfig(count=COUNT, range_m=RANGE_M),
 )
+INDICATED = replace(CONFIG, conflicts=replace(CONFIG.conflicts, indicators=True))
 # What the entry `cities` has.
 ON = {
     "sensors.way.distances_m": DISTANCES_M,
@@ -56,14 +59,18 @@ def observed_way(name: str, row: np.void, phase: NDArray[np.int32]) -> list[floa
 
 
 def observed_conflicts(
-    name: str, rows: NDArray[np.void], i: int, phase: NDArray[np.int32]
+    name: str,
+    rows: NDArray[np.void],
+    i: int,
+    phase: NDArray[np.int32],
+    config: SensorsConfig = CONFIG,
 ) -> list[float]:
     roads = network(name)
     grid = make_grid(roads.extent_m, 25.0, len(rows))
     fill_grid(rows, len(rows), grid)
-    place = layout(CONFIG)["conflicts"]
-    out = np.zeros(frame_size(CONFIG), np.float32)
-    sensor = conflicts_settings(CONFIG, place.start, make_walls(np.zeros((0, 4))), 0)
+    place = layout(config)["conflicts"]
+    out = np.zeros(frame_size(config), np.float32)
+    sensor = conflicts_settings(config, place.start, make_walls(np.zeros((0, 4))), 0, len(rows))
     told = np.zeros(0, REPORT)
     observe_conflicts(roads.arrays, travel(name), rows, i, grid, phase, told, 0, 0.1, sensor, out)
     assert not out[: place.start].any()
@@ -103,6 +110,10 @@ def test_way_and_conflicts_equal_their_twins_whatever_the_order(
         assert seen == observed_conflicts(name, rows[order], place, phase)
         twin = naive.conflicts(roads, ways, rows, i, letters, COUNT, RANGE_M)
         assert seen == pytest.approx(twin, abs=2e-5)
+        seen = observed_conflicts(name, rows, i, phase, INDICATED)
+        assert seen == observed_conflicts(name, rows[order], place, phase, INDICATED)
+        twin = naive.conflicts(roads, ways, rows, i, letters, COUNT, RANGE_M, indicators=True)
+        assert seen == pytest.approx(twin, abs=2e-5)
 
 
 def on_main_road(*cars: tuple[float, float, float]) -> NDArray[np.void]:
@@ -134,6 +145,35 @@ def test_the_plan_of_another_changes_nothing() -> None:
     for name in ("goal", "way", "target_lane", "link", "throttle", "steering", "to_go"):
         rows[name][1:] = 0
     assert observed_conflicts("merge", rows, 0, phase) == before
+
+
+def test_an_indicated_way_is_told_over_one_junction_and_no_further() -> None:
+    """Of two cars that come to a junction, one changes its mind; of another, the one after."""
+    roads, ways = network("grid4x4"), plans("grid4x4")
+    phase = np.zeros(len(roads.arrays.signals), np.int32)
+    num_lanes = len(roads.lanes)
+
+    def numbers(lane: int, s: float, goal: int) -> list[float]:
+        other = on_lane(roads, lane, s, speed=10.0)
+        before = int(np.flatnonzero(roads.links["from_lane"] == lane)[0])
+        ego = on_lane(roads, int(roads.links[before]["to_lane"]), 5.0, speed=0.0)
+        rows = np.concatenate([ego, other])
+        rows["goal"], rows["id"] = [0, goal], [0, 1]
+        rows["way"] = rows["goal"] * num_lanes
+        return observed_conflicts("grid4x4", rows, 0, phase, INDICATED)
+
+    told_apart = alike = 0
+    for lane in np.unique(roads.links["from_lane"]):
+        s = float(roads.lanes[lane]["length_m"]) - 12.0
+        goals = [goal for goal in range(len(ways)) if ways[goal][lane]["link"] >= 0]
+        for one, other in pairwise(goals):
+            first, second = (int(ways[goal][lane]["link"]) for goal in (one, other))
+            same = numbers(int(lane), s, one) == numbers(int(lane), s, other)
+            assert same or first != second
+            alike += same and first == second
+            told_apart += not same
+    assert told_apart > 0
+    assert alike > 0
 
 
 def made(env: str = "grid4x4", **overrides: Any) -> Any:
@@ -169,9 +209,10 @@ def test_history_is_what_was_observed_before_and_begins_with_the_first() -> None
 
 
 @pytest.mark.skipif(config.DISABLE_JIT, reason="compares no twin")
-@pytest.mark.parametrize("zones", [4])
-def test_a_divided_world_observes_the_same(zones: int) -> None:
-    whole, divided = made(), made(**{"zones.count": zones})
+@pytest.mark.parametrize("indicators", [False, True])
+def test_a_divided_world_observes_the_same(indicators: bool) -> None:
+    shown = {"sensors.conflicts.indicators": indicators}
+    whole, divided = made(**shown), made(**shown, **{"zones.count": 4})
     rng = np.random.default_rng(1)
     one, other = whole.reset()[0], divided.reset()[0]
     for _ in range(40):

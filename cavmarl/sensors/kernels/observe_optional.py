@@ -12,7 +12,7 @@ from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.sensors.kernels.kinematics_observation import observe_kinematics
 from cavmarl.sensors.kernels.lidar_cells import observe_lidar_cells
 from cavmarl.sensors.kernels.nearest_road_points import observe_roadgraph
-from cavmarl.sensors.kernels.observing_conflicts import observe_conflicts
+from cavmarl.sensors.kernels.observing_conflicts import forget_others, observe_conflicts
 from cavmarl.sensors.kernels.observing_history import observe_history
 from cavmarl.sensors.kernels.observing_way import observe_way
 from cavmarl.sensors.kernels.occupancy import observe_occupancy
@@ -53,6 +53,7 @@ def observe_optional(
                 continue
             if not is_filled:
                 fill_grid(rows, worlds.num_rows[w], grid)
+                forget_others(conflicts)
                 is_filled = True
             seen = observations[w, row["agent"]]
             out = seen[newest_frame(seen, stack) :]

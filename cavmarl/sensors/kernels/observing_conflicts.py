@@ -5,6 +5,9 @@ are not known, the own one along its way. At a few moments ahead the gap between
 taken, as boxes along the own one; what comes nearest and soonest stands first. Right of way is that
 of the map: by the lane that the other is on, whichever way it takes from there.
 
+With `indicators` the others are taken to follow their lanes, and over one junction the way that
+they indicate: the next one, or the one that they are on. From there on they go straight.
+
 With `heard` those count, too, that are not seen and that a message tells of: where they are if they
 have gone on as it says, and nothing else of them. Which lane they are on it does not say.
 """
@@ -21,7 +24,12 @@ from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell
 from cavmarl.core.math.walls import is_cut
 from cavmarl.core.numba import kernel
 from cavmarl.core.records.arrays import RoadArrays, Travel
-from cavmarl.core.records.codes import SIGNAL_GREEN_MAJOR, SIGNAL_RED, SIGNAL_RED_YELLOW
+from cavmarl.core.records.codes import (
+    DRIVER_SCRIPTED,
+    SIGNAL_GREEN_MAJOR,
+    SIGNAL_RED,
+    SIGNAL_RED_YELLOW,
+)
 from cavmarl.core.records.rows import is_off_lanes
 from cavmarl.driving.kernels.gaps import link_signal
 from cavmarl.driving.kernels.ways import goes_on
@@ -30,6 +38,8 @@ from cavmarl.sensors.kernels.sensor_arrays import ConflictsSensor
 
 CONFLICT_FEATURES = 9
 HEARD_FEATURES = 2  # more with `heard`
+INDICATED_FEATURES = 1  # more with `indicators`
+INDICATED_RAD = 0.4  # a way that turns by less is not indicated
 AGE_SCALE_S = 1.0
 NUM_LOOKS = 10  # moments that are looked at,
 LOOK_S = 0.5  # so far apart
@@ -49,27 +59,36 @@ def _bent(value: float, half: float) -> float:
 
 @kernel
 def _foresee(
-    roads: RoadArrays, travel: Travel, row: np.void, looks: NDArray[np.float64]
+    roads: RoadArrays,
+    travel: Travel,
+    row: np.void,
+    speed: float,
+    num_links: int,
+    looks: NDArray[np.float64],
 ) -> tuple[int, bool]:
-    """Write where the own vehicle will be, `looks` (NUM_LOOKS, 4): x, y, cos and sin.
+    """Write where a vehicle will be with `speed`, `looks` (NUM_LOOKS, 4): x, y, cos and sin.
 
-    Returns the link that it is on or comes to first within these, -1: none, and whether it is on
-    it.
+    Its way is followed over `num_links` links at most, and straight on from there. Returns the link
+    that it is on or comes to first within these, -1: none, and whether it is on it.
     """
     looks[0, 0] = row["x"]
     looks[0, 1] = row["y"]
     looks[0, 2] = math.cos(row["heading"])
     looks[0, 3] = math.sin(row["heading"])
-    stride = LOOK_S * max(row["speed"], SLOWEST_MPS)
+    stride = LOOK_S * speed
     lane, way = row["lane"], row["way"]
     here = roads.lanes[lane]
     crossed = here["link"] if here["internal"] else -1
     is_on = crossed >= 0
+    left = num_links - int(is_on)
     start = -row["s"]
     told = 1
     for _ in range(MOST_LANES):
         end = start + here["length_m"]
         following, way_there, link = goes_on(roads, travel, lane, way)
+        if link >= 0:
+            following = following if left > 0 else -1
+            left -= 1
         while told < NUM_LOOKS and (told * stride <= end or following < 0):
             x, y, _, cos, sin, _ = lane_pose(
                 roads.points, here["first_point"], here["num_points"], told * stride - start
@@ -79,7 +98,7 @@ def _foresee(
             looks[told, 2] = cos
             looks[told, 3] = sin
             told += 1
-        if crossed < 0 and link >= 0:
+        if crossed < 0 and link >= 0 and following >= 0:
             crossed = link
         if told == NUM_LOOKS or following < 0:
             break
@@ -93,12 +112,68 @@ def _foresee(
 
 
 @kernel
+def _go_straight(body: np.void, looks: NDArray[np.float64]) -> None:
+    """Write where a body will be that goes on as it goes, along its heading."""
+    for k in range(NUM_LOOKS):
+        time = LOOK_S * k
+        looks[k, 0] = body["x"] + time * body["speed"] * body["cos"]
+        looks[k, 1] = body["y"] + time * body["speed"] * body["sin"]
+        looks[k, 2] = body["cos"]
+        looks[k, 3] = body["sin"]
+
+
+@kernel
+def _indicated(roads: RoadArrays, link: int) -> float:
+    """1: a link turns left, -1: right, 0: neither, or there is no link."""
+    if link < 0:
+        return 0.0
+    before = roads.lanes[roads.links[link]["from_lane"]]
+    after = roads.lanes[roads.links[link]["to_lane"]]
+    first, num = before["first_point"], before["num_points"]
+    _, _, _, cos, sin, _ = lane_pose(roads.points, first, num, before["length_m"])
+    first, num = after["first_point"], after["num_points"]
+    _, _, _, cos_after, sin_after, _ = lane_pose(roads.points, first, num, 0.0)
+    turns = math.atan2(sin_after * cos - cos_after * sin, cos_after * cos + sin_after * sin)
+    if abs(turns) < INDICATED_RAD:
+        return 0.0
+    return 1.0 if turns > 0.0 else -1.0
+
+
+@kernel
+def forget_others(sensor: ConflictsSensor) -> None:
+    """Begin anew with bodies that are sorted into the grid anew."""
+    sensor.filling[0] += 1
+
+
+@kernel
+def _foresee_other(
+    roads: RoadArrays,
+    travel: Travel,
+    other: np.void,
+    body: np.void,
+    at: int,
+    sensor: ConflictsSensor,
+) -> None:
+    """Write where the body `at` of the grid will be, once for all agents that see it."""
+    if sensor.foreseen[at] == sensor.filling[0]:
+        return
+    sensor.foreseen[at] = sensor.filling[0]
+    sensor.indicated[at] = 0.0
+    if sensor.indicators and other["driver"] != DRIVER_SCRIPTED and not is_off_lanes(other):
+        link, _ = _foresee(roads, travel, other, other["speed"], 1, sensor.others[at])
+        sensor.indicated[at] = _indicated(roads, link)
+    else:
+        _go_straight(body, sensor.others[at])
+
+
+@kernel
 def _nearest_approach(
-    row: np.void, body: np.void, looks: NDArray[np.float64]
+    row: np.void, body: np.void, looks: NDArray[np.float64], others: NDArray[np.float64]
 ) -> tuple[float, float]:
     """The gap in m that counts most, between two boxes, and in how many seconds it is so.
 
-    The gap is the sum of those along and across the own vehicle.
+    The gap is the sum of those along and across the own vehicle. `looks`, `others` (NUM_LOOKS, 4):
+    where the own one and the other will be.
     """
     half_length = 0.5 * row["length"]
     half_width = 0.5 * row["width"]
@@ -108,12 +183,12 @@ def _nearest_approach(
     for k in range(NUM_LOOKS):
         time = LOOK_S * k
         cos, sin = looks[k, 2], looks[k, 3]
-        dx = body["x"] + time * body["speed"] * body["cos"] - looks[k, 0]
-        dy = body["y"] + time * body["speed"] * body["sin"] - looks[k, 1]
+        dx = others[k, 0] - looks[k, 0]
+        dy = others[k, 1] - looks[k, 1]
         along = abs(dx * cos + dy * sin)
         across = abs(dy * cos - dx * sin)
-        same = abs(body["cos"] * cos + body["sin"] * sin)
-        turned = abs(body["sin"] * cos - body["cos"] * sin)
+        same = abs(others[k, 2] * cos + others[k, 3] * sin)
+        turned = abs(others[k, 3] * cos - others[k, 2] * sin)
         along -= half_length + same * body["half_length"] + turned * body["half_width"]
         across -= half_width + turned * body["half_length"] + same * body["half_width"]
         gap = max(along, 0.0) + max(across, 0.0)
@@ -193,9 +268,16 @@ def _is_near(row: np.void, body: np.void, range_m: float) -> bool:
 
 
 @kernel
-def _put(row: np.void, body: np.void, at: int, found: int, sensor: ConflictsSensor) -> int:
+def _put(
+    row: np.void,
+    body: np.void,
+    others: NDArray[np.float64],
+    at: int,
+    found: int,
+    sensor: ConflictsSensor,
+) -> int:
     """Put a body in its place among the `found` that count most; returns how many there are now."""
-    near, when = _nearest_approach(row, body, sensor.looks)
+    near, when = _nearest_approach(row, body, sensor.looks, others)
     counts = near + WAIT_MPS * when
     place = found
     while place > 0:
@@ -220,6 +302,8 @@ def _put(row: np.void, body: np.void, at: int, found: int, sensor: ConflictsSens
 
 @kernel
 def _rank(
+    roads: RoadArrays,
+    travel: Travel,
     grid: Grid,
     rows: NDArray[np.void],
     i: int,
@@ -240,7 +324,8 @@ def _rank(
                 continue
             if is_cut(sensor.walls, row["x"], row["y"], body["x"], body["y"]):
                 continue
-            found = _put(row, body, b, found, sensor)
+            _foresee_other(roads, travel, rows[body["row"]], body, b, sensor)
+            found = _put(row, body, sensor.others[b], b, found, sensor)
             for k in range(num_told):
                 if sensor.told[k]["id"] == body["id"]:
                     sensor.told[k]["id"] = -1  # it is seen
@@ -248,7 +333,8 @@ def _rank(
         body = sensor.told[k]
         if body["id"] < 0 or body["id"] == row["id"] or not _is_near(row, body, sensor.range_m):
             continue
-        found = _put(row, body, -1 - k, found, sensor)
+        _go_straight(body, sensor.heard_looks)
+        found = _put(row, body, sensor.heard_looks, -1 - k, found, sensor)
     return found
 
 
@@ -266,18 +352,20 @@ def observe_conflicts(
     sensor: ConflictsSensor,
     observation: NDArray[np.float32],
 ) -> None:
-    """Nine numbers, or eleven, of each vehicle that counts most; zeros where there are fewer.
+    """Nine to twelve numbers of each vehicle that counts most; zeros where there are fewer.
 
     `i`: row of the agent's vehicle. `phase`: (num_signals,) PHASE rows that are on. `reports`:
     REPORT (N,) of vehicles, the agent's inbox; not read without `heard`. `tick`: the world's.
     """
     row = rows[i]
-    link, is_on = _foresee(roads, travel, row, sensor.looks)
+    speed = max(row["speed"], SLOWEST_MPS)
+    link, is_on = _foresee(roads, travel, row, speed, MOST_LANES, sensor.looks)
     num_told = _take_reports(reports, tick, tick_s, sensor.told) if sensor.heard else 0
-    found = _rank(grid, rows, i, num_told, sensor)
+    found = _rank(roads, travel, grid, rows, i, num_told, sensor)
     cos_heading = sensor.looks[0, 2]
     sin_heading = sensor.looks[0, 3]
     size = CONFLICT_FEATURES + (HEARD_FEATURES if sensor.heard else 0)
+    size += INDICATED_FEATURES if sensor.indicators else 0
     for k in range(found):
         ranked = sensor.ranked[k]
         is_seen = ranked["body"] >= 0
@@ -303,3 +391,5 @@ def observe_conflicts(
         elif sensor.heard:
             age_s = (tick - reports[body["row"]]["tick"]) * tick_s
             out[10] = min(age_s / AGE_SCALE_S, 1.0)
+        if sensor.indicators and is_seen:
+            out[size - 1] = sensor.indicated[ranked["body"]]

@@ -119,7 +119,13 @@ class ConflictsSensor(NamedTuple):
     walls: Walls  # that hide others
     heard: bool  # whether messages tell of those that are not seen
     told: NDArray[np.void]  # BODY (inbox,) scratch: those that messages tell of, where they are now
-    looks: NDArray[np.float64]  # (NUM_LOOKS, 4) scratch
+    indicators: bool  # whether others show their way over the next junction
+    looks: NDArray[np.float64]  # (NUM_LOOKS, 4) scratch: where the own vehicle will be,
+    heard_looks: NDArray[np.float64]  # (NUM_LOOKS, 4) one that a message tells of,
+    others: NDArray[np.float64]  # (capacity, NUM_LOOKS, 4) and those in `Grid.bodies`
+    indicated: NDArray[np.float64]  # (capacity,) the turn that each indicates: 1 left, -1 right
+    foreseen: NDArray[np.int64]  # (capacity,) at which filling of the grid these were written
+    filling: NDArray[np.int64]  # (1,) which one it is now
     ranked: NDArray[np.void]  # RANKED (count,) scratch
 
 

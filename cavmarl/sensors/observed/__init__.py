@@ -188,11 +188,15 @@ def sensor_arrays(config: SensorsConfig, network: RoadNetwork) -> Sensors:
 
 
 def optional_arrays(
-    config: SensorsConfig, network: RoadNetwork, plans: NDArray[np.void], most_told: int
+    config: SensorsConfig,
+    network: RoadNetwork,
+    plans: NDArray[np.void],
+    most_told: int,
+    capacity: int,
 ) -> OptionalSensors | None:
     """What `observe_optional` takes; None if all of its sensors are off.
 
-    `most_told`: vehicles that an inbox keeps.
+    `most_told`: vehicles that an inbox keeps. `capacity`: rows of a world.
     """
     if FURTHER.isdisjoint(layout(config)):
         return None
@@ -209,6 +213,7 @@ def optional_arrays(
             starts["conflicts"],
             _walls(network, config.conflicts.through_walls),
             most_told,
+            capacity,
         ),
         history=way_features.history_settings(config, starts["history"]),
     )

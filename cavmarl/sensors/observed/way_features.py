@@ -16,6 +16,7 @@ from cavmarl.sensors.kernels.observing_conflicts import (
     CONFLICT_FEATURES,
     GAP_HALF_M,
     HEARD_FEATURES,
+    INDICATED_FEATURES,
     NUM_LOOKS,
     PLACE_HALF_M,
     SPEED_HALF_MPS,
@@ -70,7 +71,7 @@ def way(config: SensorsConfig) -> list[Feature]:
 
 
 def conflicts(config: SensorsConfig) -> list[Feature]:
-    """Nine numbers a vehicle, with `heard` eleven; first what comes nearest and soonest; or 0."""
+    """Nine numbers a vehicle, or up to twelve; first what comes nearest and soonest; or 0."""
     rows: tuple[tuple[str, str, str, float], ...] = (
         (
             "near",
@@ -103,6 +104,8 @@ def conflicts(config: SensorsConfig) -> list[Feature]:
             ("seen", "1 if it is seen; 0: a message tells of it, or there is none", "", 0.0),
             ("age", age, f"{AGE_SCALE_S:g} s", 0.0),
         )
+    if config.conflicts.indicators:
+        rows += (("turn", "1 if it indicates that it turns left, -1: right; else 0", "", -1.0),)
     return [
         Feature(f"{name}_{k}", f"vehicle {k}: {meaning}", scale, low)
         for k in range(config.conflicts.count)
@@ -126,6 +129,7 @@ def history(config: SensorsConfig) -> list[Feature]:
 
 def conflicts_shape(config: SensorsConfig) -> tuple[int, ...]:
     more = HEARD_FEATURES if config.conflicts.heard else 0
+    more += INDICATED_FEATURES if config.conflicts.indicators else 0
     return config.conflicts.count, CONFLICT_FEATURES + more
 
 
@@ -141,10 +145,11 @@ def way_settings(config: SensorsConfig, at: int) -> WaySensor:
 
 
 def conflicts_settings(
-    config: SensorsConfig, at: int, walls: Walls, most_told: int
+    config: SensorsConfig, at: int, walls: Walls, most_told: int, capacity: int
 ) -> ConflictsSensor:
-    """What the kernel takes; `most_told`: vehicles that an inbox keeps."""
+    """What the kernel takes; `most_told`: vehicles that an inbox keeps; `capacity`: of the grid."""
     given = config.conflicts
+    capacity = capacity if given.count else 0
     return ConflictsSensor(
         at,
         given.count,
@@ -152,7 +157,13 @@ def conflicts_settings(
         walls,
         given.heard,
         told=np.zeros(most_told, BODY),
+        indicators=given.indicators,
         looks=np.zeros((NUM_LOOKS, 4)),
+        heard_looks=np.zeros((NUM_LOOKS, 4)),
+        others=np.zeros((capacity, NUM_LOOKS, 4)),
+        indicated=np.zeros(capacity),
+        foreseen=np.zeros(capacity, np.int64),
+        filling=np.ones(1, np.int64),
         ranked=np.zeros(given.count, RANKED),
     )
 

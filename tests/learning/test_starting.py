@@ -1,0 +1,85 @@
+"""A run begins with a driver's weights, and decides as the driver does, whatever it sees beside."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from cavmarl.config.action import ActionConfig
+from cavmarl.config.sensors import ConflictsConfig, HistoryConfig, SensorsConfig
+from cavmarl.core.errors import PolicyError
+from cavmarl.learning.starting import begin_with
+from cavmarl.policies.networks import ActorCritic, NetworkConfig, save_network
+from cavmarl.sensors.observed import feature_names
+
+FEWER = SensorsConfig(stack=2, conflicts=ConflictsConfig(count=2), history=HistoryConfig(steps=1))
+MORE = SensorsConfig(
+    stack=3,
+    conflicts=ConflictsConfig(count=3, indicators=True),
+    history=HistoryConfig(steps=2),
+)
+FORMS = ({"shared": True}, {"residual": True}, {"state_size": 4})
+
+
+def made(sensors: SensorsConfig, form: dict[str, int], seed: int) -> NetworkConfig:
+    size = sensors.stack * len(feature_names(sensors)) + (2 if "residual" in form else 0)
+    config = NetworkConfig("merge", size, sensors, ActionConfig(), (8, 8), agent_steps=7)
+    return replace(config, seed=seed, **form)
+
+
+def network(config: NetworkConfig) -> ActorCritic:
+    torch.manual_seed(config.seed)
+    made = ActorCritic(config)
+    with torch.no_grad():
+        for weights in (*made.parameters(), made.mean):
+            weights.normal_()
+        made.deviation.uniform_(0.5, 2.0)
+    return made
+
+
+def named(sensors: SensorsConfig) -> list[tuple[int, str, str]]:
+    """The newest frame is the last."""
+    frames = range(-sensors.stack, 0)
+    return [(frame, *name) for frame in frames for name in feature_names(sensors)]
+
+
+@pytest.mark.parametrize("form", FORMS, ids=str)
+def test_it_decides_and_judges_as_the_driver_does(form: dict[str, int], tmp_path: Path) -> None:
+    its, ours = made(FEWER, form, 1), made(MORE, form, 2)
+    driver, run = network(its), network(ours)
+    save_network(tmp_path, driver, its)
+    assert begin_with(run, ours, tmp_path) == 7
+    more = torch.randn(16, ours.observation_size)
+    places = {name: k for k, name in enumerate(named(MORE))}
+    columns = [places[name] for name in named(FEWER)]
+    if "residual" in form:
+        columns += [ours.observation_size - 2, ours.observation_size - 1]
+    states = torch.randn(16, its.state_size) if its.state_size else None
+    torch.testing.assert_close(run(more), driver(more[:, columns]))
+    torch.testing.assert_close(run.value(more, states), driver.value(more[:, columns], states))
+
+
+def test_with_the_same_sensors_the_weights_are_the_same(tmp_path: Path) -> None:
+    its = made(FEWER, {}, 1)
+    driver, run = network(its), network(replace(its, seed=2))
+    save_network(tmp_path, driver, its)
+    begin_with(run, replace(its, seed=2), tmp_path)
+    for name, tensor in driver.state_dict().items():
+        assert run.state_dict()[name].equal(tensor), name
+
+
+def test_one_that_observes_what_the_run_does_not_is_refused(tmp_path: Path) -> None:
+    its, ours = made(MORE, {}, 1), made(FEWER, {}, 2)
+    save_network(tmp_path, network(its), its)
+    with pytest.raises(PolicyError, match=r"observes \d+ numbers that this run does not, first"):
+        begin_with(network(ours), ours, tmp_path)
+
+
+def test_one_of_another_form_is_refused(tmp_path: Path) -> None:
+    its, ours = made(FEWER, {}, 1), made(MORE, {"shared": True}, 2)
+    save_network(tmp_path, network(its), its)
+    with pytest.raises(PolicyError, match="does not fit this run"):
+        begin_with(network(ours), ours, tmp_path)
