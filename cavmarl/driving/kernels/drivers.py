@@ -18,7 +18,13 @@ from cavmarl.core.math.rng import STREAM_DRIVER, quick_uniform
 from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.numba.prefetch import SOON, prefetch
 from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
-from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_BACKGROUND, HOLD_NONE, MODEL_KRAUSS
+from cavmarl.core.records.codes import (
+    DRIVER_AGENT,
+    DRIVER_BACKGROUND,
+    HOLD_NONE,
+    HOLD_SIGNAL,
+    MODEL_KRAUSS,
+)
 from cavmarl.core.records.rows import is_lost
 from cavmarl.driving.kernels.bends import LIMIT_DECEL, bend_speed
 from cavmarl.driving.kernels.beside import behind_askew, behind_entry, beside
@@ -34,6 +40,7 @@ from cavmarl.driving.kernels.gaps import is_minor
 from cavmarl.driving.kernels.junctions import (
     STOP_LINE_M,
     constraint_inside,
+    has_crept,
     may_enter,
     waits_inside,
 )
@@ -159,6 +166,8 @@ def _at_line(
     speed = row["speed"]
     front = distance - 0.5 * row["length"]
     to_line = front - roads.lanes[roads.links[link]["from_lane"]]["stop_back_m"]
+    if to_line <= 0.0 and has_crept(roads, row, link, -to_line, phase):
+        return before_line(kind, speed, 0.0, dt), HOLD_SIGNAL, True
     if to_line <= 0.0:
         # Its front is over the line: it does not wait there any more.
         constraint, hold, waits = constraint_inside(

@@ -49,6 +49,9 @@ STEERED_MPS = 5.0  # a steered car is taken to turn no faster than this
 LAST_CHANCE_M = 3.0  # with the front this near to the line
 EXIT_LANES = 4  # looked along for room,
 EXIT_LOOK_M = 75.0  # and no further than this: ten cars stand there
+CREPT_M = 2.4  # a steered car whose front is so little beyond a red line,
+CREPT_MPS = 2.0  # and that is so slow, stays there;
+INSIDE_M = 1.0  # nearer to a waiting position inside it may be one that waits there
 STOP_LINE_M = 5.0  # standing with the front nearer than this counts as standing at the line
 
 
@@ -180,6 +183,24 @@ def may_enter(
     if _exit_blocked(roads, travel, row, link, way, scratch):
         return HOLD_EXIT_BLOCKED
     return HOLD_NONE
+
+
+@inlined_kernel
+def has_crept(
+    roads: RoadArrays,
+    row: np.void,  # VEHICLE
+    link: int,  # LINK row
+    over_m: float,  # of its front beyond the line
+    phase: NDArray[np.int32],  # (num_signals,) PHASE rows that are on
+) -> bool:
+    """Whether an agent's vehicle that stood at a red line has crept over it, and stays there."""
+    if row["driver"] != DRIVER_AGENT or row["speed"] > CREPT_MPS:
+        return False
+    if over_m >= min(CREPT_M, roads.links[link]["wait_m"] - INSIDE_M):
+        return False
+    signal = link_signal(roads, link, phase)
+    red: bool = signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW
+    return red
 
 
 @inlined_kernel
