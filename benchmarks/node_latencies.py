@@ -5,7 +5,11 @@ from __future__ import annotations
 import os
 import random
 import signal
+import socket
+import subprocess
+import sys
 import time
+import zlib
 from statistics import median
 from typing import Annotated, Any
 
@@ -14,14 +18,20 @@ import numpy as np
 from benchmarks.harness import Env, Report, Say, about, check_positive, run, silent
 from cavmarl.config.registry import load_config
 from cavmarl.core.errors import ConfigError
+from cavmarl.core.processes import start_python
 from cavmarl.engine.world_setup import make_world
 from cavmarl.env.vector import CavVectorEnv
+from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.shards.shard import Commands
 
 TURN_STEPS = 50
 LEAST_STEPS = 3  # of a round, before a node is killed
 REPLACED_S = 120.0  # for another node to have joined
+LOCAL = "127.0.0.1"
+FRAME = bytes(96)  # about as long as those of an empty tick
+PORT_BYTES = 4
+SERVES = "import sys; from benchmarks.node_latencies import serve; serve(*sys.argv[1:])"
 
 
 def measure(
@@ -55,8 +65,10 @@ def measure(
         rows,
         notes=[
             "tick, wall: of a turn's ticks on average, by the clock; tick, processor: the same of "
-            "the caller and of all nodes together; zones stand still: from SIGKILL to the "
-            "end of the step of the caller that was under way or came next",
+            "the caller and of all nodes together; tick, least: what cannot be left out, by the "
+            "clock, by turns with the others: as many frames between as many processes, which do "
+            "nothing else but run the phases of the same world, undivided; zones stand still: from "
+            "SIGKILL to the end of the step of the caller that was under way or came next",
         ],
     )
 
@@ -85,7 +97,8 @@ class _Worlds:
 
 def _empty_ticks(env: str, nodes: int, turns: int) -> list[dict[str, Any]]:
     worlds = _Worlds(env, nodes, background=0)
-    wall_us, cpu_us = [], []
+    least = _Least(env, nodes, worlds.ticks_per_step)
+    wall_us, cpu_us, least_us = [], [], []
     try:
         for turn in range(turns + 1):
             worlds.cpu_s()
@@ -94,13 +107,112 @@ def _empty_ticks(env: str, nodes: int, turns: int) -> list[dict[str, Any]]:
                 worlds.step()
             wall_s = time.perf_counter() - began_s
             cpu_s = worlds.cpu_s() - began_cpu_s
+            least_s = least.turn()
             if turn:  # the first one warms up
                 ticks = TURN_STEPS * worlds.ticks_per_step
                 wall_us.append(1e6 * wall_s / ticks)
                 cpu_us.append(1e6 * cpu_s / ticks)
+                least_us.append(1e6 * least_s / ticks)
     finally:
+        least.close()
         worlds.vec.close()
-    return [_row("tick, wall", wall_us, "us"), _row("tick, processor", cpu_us, "us")]
+    found = {"tick, wall": wall_us, "tick, processor": cpu_us, "tick, least": least_us}
+    return [_row(what, values, "us") for what, values in found.items()]
+
+
+class _Least:
+    """Processes between which the frames of empty ticks go; this one is the caller."""
+
+    def __init__(self, env: str, nodes: int, ticks_per_step: int) -> None:
+        with socket.create_server((LOCAL, 0)) as listener:
+            told = [env, str(listener.getsockname()[1]), str(nodes), str(ticks_per_step)]
+            self._processes: list[subprocess.Popen[Any]] = [
+                start_python(["-c", SERVES, *told, str(number)]) for number in range(nodes)
+            ]
+            self._nodes = [_answered(listener) for _ in range(nodes)]
+        ports = [_read(node, PORT_BYTES) for node in self._nodes]
+        for node in self._nodes:
+            node.sendall(b"".join(ports))
+        self.turn()
+
+    def turn(self) -> float:
+        """Seconds of a turn."""
+        began_s = time.perf_counter()
+        for _ in range(TURN_STEPS):
+            for node in self._nodes:
+                node.sendall(_framed())
+            for node in self._nodes:
+                _take(node)
+        return time.perf_counter() - began_s
+
+    def close(self) -> None:
+        for node in self._nodes:
+            node.close()
+        for process in self._processes:
+            process.kill()
+            process.wait()
+
+
+def serve(env: str, port: str, nodes: str, ticks_per_step: str, number: str) -> None:
+    """Be one of the nodes; its number is not that by which the caller knows it."""
+    config, base_dir = load_config(env, agents=1, background=0, max_cycles=1_000_000)
+    worlds = LocalWorlds(make_world(config, base_dir), 1, warm=True)
+    worlds.arrays.chosen[:] = True
+    worlds.reset(1, 0)
+    commands = Commands(worlds.arrays.controls, worlds.arrays.meta_actions)
+    caller = _call(int(port))
+    with socket.create_server((LOCAL, 0)) as listener:
+        own = listener.getsockname()[1].to_bytes(PORT_BYTES, "little")
+        caller.sendall(own)
+        told = _read(caller, PORT_BYTES * int(nodes))
+        ports = [told[at : at + PORT_BYTES] for at in range(0, len(told), PORT_BYTES)]
+        before = ports.index(own)
+        others = [_call(int.from_bytes(one, "little")) for one in ports[:before]]
+        others += [_answered(listener) for _ in ports[before + 1 :]]
+    while True:
+        _take(caller)
+        for tick in range(int(ticks_per_step)):
+            is_last = tick == int(ticks_per_step) - 1
+            worlds.simulation.run_tick(commands, tick == 0, is_last)
+            for _ in range(1 + is_last):  # rows, and after the last tick what agents got
+                for other in others:
+                    other.sendall(_framed())
+                for other in others:
+                    _take(other)
+        caller.sendall(_framed())
+
+
+def _call(port: int) -> socket.socket:
+    return _prompt(socket.create_connection((LOCAL, port)))
+
+
+def _answered(listener: socket.socket) -> socket.socket:
+    return _prompt(listener.accept()[0])
+
+
+def _prompt(connection: socket.socket) -> socket.socket:
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return connection
+
+
+def _framed() -> bytes:
+    return FRAME + zlib.crc32(FRAME).to_bytes(4, "little")
+
+
+def _take(connection: socket.socket) -> None:
+    data = _read(connection, len(FRAME) + 4)
+    if zlib.crc32(data[:-4]).to_bytes(4, "little") != data[-4:]:
+        raise ConfigError("a frame is not what was sent")
+
+
+def _read(connection: socket.socket, size: int) -> bytes:
+    data = connection.recv(size)
+    while len(data) < size:
+        more = connection.recv(size - len(data))
+        if not more:
+            sys.exit()  # the caller has ended
+        data += more
+    return data
 
 
 def _kills(

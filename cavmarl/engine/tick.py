@@ -103,7 +103,8 @@ class Tick:
             self.division.exchange()
         if self.peers is not None:
             self.peers.share_rows(self.gate, self.division.next_side)
-            self.traffic.settle(self.gate, self._shard.worlds)
+            if any(self.gate.num_passing.tolist()):
+                self.traffic.settle(self.gate, self._shard.worlds)
         self.executor.each("resolve")
         if self._gathers:
             self.division.note_gathered()  # others may still be about their contacts

@@ -15,10 +15,22 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import fields
 from itertools import groupby
+from operator import attrgetter
 from typing import Any, get_args, get_origin, get_type_hints
 
 from cavmarl.core.errors import MessageError
-from cavmarl.ownership.messages import Abort, Ack, Done, Message, Nack, Need, Prepare, Step
+from cavmarl.ownership.ledger import OwnedTally
+from cavmarl.ownership.messages import (
+    RUN_BYTES,
+    Abort,
+    Ack,
+    Done,
+    Message,
+    Nack,
+    Need,
+    Prepare,
+    Step,
+)
 
 VERSION = 1
 MAGIC = b"CVMO"
@@ -32,6 +44,9 @@ _WIDE = frozenset({"rows", "digest"})  # sums of hashes: up to 16 bytes
 
 def encode(message: Message) -> bytes:
     number = _NUMBER_OF[type(message)]
+    plain = _PLAIN.get(number)
+    if plain is not None and plain.fits(message):
+        return plain.write(message)
     parts = [_HEADER.pack(MAGIC, VERSION, number, 0)]
     _FORMS[number].write(parts, message)
     body = b"".join(parts)
@@ -55,10 +70,12 @@ def decode(
         raise MessageError(f"the checksum of a message of {len(data)} bytes is wrong")
     if kind >= len(KINDS) or zero:
         raise MessageError(f"kind {kind} of message does not exist")
-    message: Message
-    message, at = _FORMS[kind].read(body, _HEADER.size)
-    if at != len(body):
-        raise MessageError(f"{len(body) - at} bytes follow after the message")
+    plain = _PLAIN.get(kind)
+    message: Message | None = None if plain is None else plain.read(data)
+    if message is None:
+        message, at = _FORMS[kind].read(body, _HEADER.size)
+        if at != len(body):
+            raise MessageError(f"{len(body) - at} bytes follow after the message")
     if run is not None and message.run != run:
         raise MessageError(f"a message of run {message.run.hex()}; this is {run.hex()}")
     return message
@@ -232,5 +249,63 @@ def _message_hints(kind: type[Message]) -> tuple[tuple[str, Any], ...]:
     return tuple((field.name, hints[field.name]) for field in fields(kind))
 
 
+class _Plain:
+    """A STEP or DONE of which all lists are empty, as bytes in one go.
+
+    Most are, and this takes a quarter of the time of going from field to field.
+    """
+
+    def __init__(self, number: int, kind: type[Message]) -> None:
+        self._begin = _HEADER.pack(MAGIC, VERSION, number, 0) + _LENGTH.pack(RUN_BYTES)
+        self._kind = kind
+        self._empty: list[tuple[int, Any]] = []  # where there is a list or bytes, and what it is
+        self._wide: list[int] = []
+        letters, names = f"{RUN_BYTES}s", ["run"]
+        for name, hint in _message_hints(kind)[1:]:
+            if hint is OwnedTally:
+                self._owned = len(names)
+                letters, names = letters + "q16s", [*names, "owned.vehicles", "owned.digest"]
+                self._wide.append(len(names) - 1)
+                continue
+            if not _is_plain(hint):
+                self._empty.append((len(names), hint() if hint is bytes else ()))
+            elif name in _WIDE:
+                self._wide.append(len(names))
+            letters += _letter(name, hint) if _is_plain(hint) else _LENGTH.format[-1]
+            names.append(name)
+        self._numbers = struct.Struct("<" + letters)
+        self._values = attrgetter(*names)
+        self._lists = attrgetter(*(names[n] for n, _ in self._empty))
+        self._size = len(self._begin) + self._numbers.size + _CRC.size
+
+    def fits(self, message: Message) -> bool:
+        return not any(self._lists(message)) and len(message.run) == RUN_BYTES
+
+    def write(self, message: Message) -> bytes:
+        values = list(self._values(message))
+        for n, _ in self._empty:
+            values[n] = 0
+        for n in self._wide:
+            values[n] = values[n].to_bytes(16, "little")
+        body = self._begin + self._numbers.pack(*values)
+        return body + _CRC.pack(zlib.crc32(body))
+
+    def read(self, data: bytes) -> Message | None:
+        """None: it is no such message."""
+        if len(data) != self._size or not data.startswith(self._begin):
+            return None
+        values: list[Any] = list(self._numbers.unpack_from(data, len(self._begin)))
+        for n, empty in self._empty:
+            if values[n]:
+                return None
+            values[n] = empty
+        for n in self._wide:
+            values[n] = int.from_bytes(values[n], "little")
+        at = self._owned
+        values[at : at + 2] = [OwnedTally(*values[at : at + 2])]
+        return self._kind(*values)
+
+
 _FORMS = [_Form(kind, _message_hints(kind)) for kind in KINDS]
 _NUMBER_OF = {kind: number for number, kind in enumerate(KINDS)}
+_PLAIN = {_NUMBER_OF[kind]: _Plain(_NUMBER_OF[kind], kind) for kind in (Step, Done)}

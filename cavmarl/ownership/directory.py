@@ -76,6 +76,7 @@ class Directory:
         self.run = run
         self.table = Table(zones, safeguards)
         self.dones: dict[int, Done] = {}  # zone → its DONE for the tick in progress
+        self.is_quiet = False  # the tick in progress is one of `begin_quiet`
         self.readiness = Readiness(safeguards)  # what targets have acknowledged
         self.dropped: Counter[tuple[str, str]] = Counter()
         self.refusals: Counter[Refusal] = Counter()
@@ -119,9 +120,9 @@ class Directory:
     def reset(self) -> Output:
         """Begin an episode, the first one or another. Whatever is under way is void."""
         table = self.table
-        tick = table.tick if table.plan is None else table.plan.record.tick
+        tick = table.tick + self.is_quiet if table.plan is None else table.plan.record.tick
         episode = table.episode + 1
-        self.dones = {}
+        self.dones, self.is_quiet = {}, False
         if not self._safeguards.tick_never_resets:
             tick, episode = 0, 0
         return self._logged(Reset(episode, tick, self.run))
@@ -172,8 +173,8 @@ class Directory:
     ) -> Output:
         """Decide the way to the next tick: BEGIN, then a STEP for every zone."""
         table = self.table
-        if table.plan is not None:
-            raise ProtocolError(f"tick {table.plan.record.tick} is not committed")
+        if table.plan is not None or self.is_quiet:
+            raise ProtocolError(f"tick {table.tick + 1} is not committed")
         new = tuple(sorted(births))
         self.check_births(new)
         switches, deferred, teleports = self._decisions.switches(table, movers)
@@ -248,6 +249,39 @@ class Directory:
             return output
         return Output((begin, *output.records))
 
+    def begin_quiet(self) -> bool:
+        """Begin a tick of which there is nothing to say: no vehicle changes its owner, none is new.
+
+        No STEP is sent, and no DONE is awaited: `Endpoint.go_on` stands for both. For a coordinator
+        without a log.
+
+        Returns:
+            whether there can be such a tick; else nothing has begun.
+        """
+        table = self.table
+        self.is_quiet = table.plan is None and not (table.deferred or table.waiting)
+        return self.is_quiet
+
+    def commit_quiet(self) -> None:
+        """Make a quiet tick the truth: no zone has anything to say of it."""
+        self.is_quiet = False
+        self.table.settle(self.table.tick + 1)
+        self.readiness.forget(self.table.tick)
+
+    def break_quiet(self) -> Output:
+        """A zone has something to say: the tick goes on as if all had been told by STEP."""
+        self.is_quiet = False
+        return Output(self.begin(()).records)
+
+    def answer_for_silent(self) -> None:
+        """Zones that say nothing of a tick that was quiet have changed nothing in it."""
+        table, plan = self.table, self.table.planned
+        for zone in self.waiting_for():
+            self.dones[zone] = Done(
+                self.run, table.episode, plan.record.tick, zone, table.hosts[zone][1],
+                owned=plan.expected[zone],
+            )  # fmt: skip
+
     def on_message(self, message: Message) -> Output:
         """Take a message in. One that comes late or from elsewhere is dropped and counted."""
         reason = self._misfit(message)
@@ -282,6 +316,7 @@ class Directory:
             return "incarnation"
         current = table.plan is not None and message.tick == table.tick + 1
         if isinstance(message, (Ack, Nack)):
+            current = current or (self.is_quiet and message.tick == table.tick + 1)
             fresh = current or message.tick == table.tick or not guards.ack_freshness
             return None if fresh else "tick"
         if isinstance(message, Done):

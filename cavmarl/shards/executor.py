@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from cavmarl.shards.shard import Shard
@@ -29,7 +29,4 @@ class SerialExecutor:
     """Shards in the caller's process, all of them or some, as one group."""
 
     def __init__(self, shards: Sequence[Shard]) -> None:
-        self._group = ShardGroup(shards)
-
-    def each(self, phase: str, *arguments: Any) -> None:
-        self._group.each(phase, *arguments)
+        self.each: Callable[..., None] = ShardGroup(shards).each

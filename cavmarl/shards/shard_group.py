@@ -98,7 +98,7 @@ class ShardGroup:
     def begin_step(self, commands: Commands) -> None:
         """Open the accounts of a step, take its meta-actions, let barriers drive on."""
         first, inserted = self._first, commands.inserted
-        if (inserted[..., 0] == INSERT_OPEN).any():
+        if inserted.size and (inserted[..., 0] == INSERT_OPEN).any():
             first_stop = len(self._travel.stops) - len(self._roads.lanes)
             self._drive_on(self._members, first.side, np.array(inserted), first_stop)
         if self._config.population.agents == 0:

@@ -364,7 +364,8 @@ class NativeTraffic:
 
     def call_orders(self, gate: Gate, worlds: Worlds) -> None:
         """Put the orders that are due by the coming tick into the queue."""
-        self._calls.call_orders(gate, worlds)
+        if gate.next_order.tolist() != gate.num_orders.tolist():
+            self._calls.call_orders(gate, worlds)
 
     def insert(self, gate: Gate, worlds: Worlds, inserted: NDArray[np.float64]) -> None:
         """Put what is to enter in this step into the queue; `inserted` as in `Commands`."""

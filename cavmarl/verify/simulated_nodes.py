@@ -23,7 +23,7 @@ from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError, NodeRefusedError, WorkerDeathError
 from cavmarl.engine.world_setup import World, make_world
 from cavmarl.env.vector import CavVectorEnv, make_vec
-from cavmarl.parallel.nodes.links import HEAD_BYTES, MAGIC, FrameKind
+from cavmarl.parallel.nodes.link import HEAD_BYTES, MAGIC, FrameKind
 from cavmarl.parallel.nodes.node_process import run_node
 from cavmarl.parallel.nodes.node_starters import NodeStarter, Route
 from cavmarl.parallel.nodes.node_system import NodeSystem

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from cavmarl.parallel.nodes.kept_states import KeptStates
-from cavmarl.parallel.nodes.links import FrameKind, NodeFrame
+from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
 
 
 class Worlds:

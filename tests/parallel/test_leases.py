@@ -17,7 +17,7 @@ from cavmarl.ownership.ledger import state_digest
 from cavmarl.ownership.messages import COORDINATOR, Ack, Message, Offer, Prepare
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.nodes.leases import MOST, late_ticks, lease_ticks, leases_of
-from cavmarl.parallel.nodes.links import Bytes, FrameKind, NodeFrame
+from cavmarl.parallel.nodes.link import Bytes, FrameKind, NodeFrame
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
 from cavmarl.parallel.nodes.zone_hosts import Report, ZoneHosts, packed, read_report, unpacked
 
@@ -73,7 +73,7 @@ class Wires:
         assert self.coordinator is not None
         data = memoryview(b"".join(pieces))
         if kind is FrameKind.REPORT:
-            messages, said, _ = read_report(data)
+            messages, said, _ = read_report(data, 1)
             self.reports.append(said)
             self.coordinator.commit({0: (messages, said)})
         else:

@@ -29,7 +29,7 @@ from cavmarl.core.errors import (
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.parallel.hosts.listener import MAX_CALLERS, Listener
 from cavmarl.parallel.nodes import node_starters
-from cavmarl.parallel.nodes.links import Link
+from cavmarl.parallel.nodes.link import Link
 from cavmarl.parallel.nodes.newcomers import ANYONE, Newcomer, Newcomers
 from cavmarl.parallel.nodes.node_files import WorldFile
 from cavmarl.parallel.nodes.node_process import run_node

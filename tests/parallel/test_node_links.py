@@ -13,14 +13,8 @@ from cavmarl.core.errors import MessageError
 from cavmarl.ownership.decisions import Neighbours
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import Done
-from cavmarl.parallel.nodes.links import (
-    MAX_FRAME,
-    FrameKind,
-    LinkLostError,
-    Links,
-    NodeFrame,
-    said_by,
-)
+from cavmarl.parallel.nodes.link import MAX_FRAME, FrameKind, NodeFrame, said_by
+from cavmarl.parallel.nodes.links import LinkLostError, Links
 from cavmarl.parallel.nodes.meeting import call_node, calls_of
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
 from cavmarl.parallel.nodes.node_system import MACHINE
@@ -46,14 +40,14 @@ def frame(kind: FrameKind, data: bytes) -> bytes:
 
 def head(kind: int, size: int) -> bytes:
     """The head of a first frame."""
-    found = b"cavN\x04\x00" + kind.to_bytes(2, "little") + bytes(8) + size.to_bytes(8, "little")
+    found = b"cavN\x05\x00" + kind.to_bytes(2, "little") + bytes(8) + size.to_bytes(8, "little")
     found += bytes(4)
     return found + zlib.crc32(found, 1).to_bytes(4, "little")
 
 
 def test_the_bytes_of_a_frame() -> None:
     assert frame(FrameKind.PING, b"abc").hex() == (
-        "6361764e04000d0007000000000000000300000000000000c2412435" + "7d65328d" + b"abc".hex()
+        "6361764e05000d0007000000000000000300000000000000c2412435" + "5a00170c" + b"abc".hex()
     )
 
 

@@ -16,7 +16,8 @@ from cavmarl.parallel.hosts.framed_socket import VERSION
 from cavmarl.parallel.hosts.host_process import code_stamp
 from cavmarl.parallel.hosts.listener import Listener, call
 from cavmarl.parallel.nodes import newcomers as newcomers_module
-from cavmarl.parallel.nodes.links import FrameKind, LinkLostError, Links
+from cavmarl.parallel.nodes.link import FrameKind
+from cavmarl.parallel.nodes.links import LinkLostError, Links
 from cavmarl.parallel.nodes.newcomers import ANYONE, Newcomers
 from cavmarl.parallel.nodes.node_process import run_node
 from tests.parallel.test_node_joining import WAIT_S, elsewhere

@@ -17,7 +17,7 @@ from cavmarl import ConfigError, make_vec, parallel_env
 from cavmarl.core.errors import MessageError, WorkerDeathError, WorkerError
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.handoff.coordinator.journal import JournalReader
-from cavmarl.parallel.nodes.node_actions import Actions, read_refusal, take_actions
+from cavmarl.parallel.nodes.node_actions import Actions, ActionsTaken, read_refusal
 from cavmarl.parallel.nodes.node_pool import NodePool
 from cavmarl.parallel.nodes.node_starters import LocalNodes
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
@@ -82,16 +82,37 @@ def test_a_node_is_told_what_its_own_agents_do() -> None:
     actions = Actions.of(arrays._replace(meta_actions=np.arange(4)[None]))
     owner = np.array([1, 0, -1, 1], np.int32)
     there = StepArrays(*(array.copy() for array in arrays[:-2]), {}, {})
-    ((number, pieces),) = actions.of_nodes([1], owner)
-    assert number == 1
-    data = memoryview(b"".join(map(bytes, pieces)))
     there = there._replace(meta_actions=np.zeros((1, 4), np.int64))
     there.controls[...] = -1.0
-    told, at = take_actions(data, 0, there)
-    unowned, _ = take_actions(data, at, there)
-    assert (told.tolist(), unowned.tolist()) == ([0], [2, 3])
+    taken = ActionsTaken(there, number=1)
+    taken.begin(owner)
+    data = memoryview(bytes(8) + bytes(actions.of_node(1, owner)))
+    wrong, end = taken.take(data, 8, owner)
+    assert (wrong.tolist(), end, taken.are_due) == ([], len(data), False)
     assert there.controls[0, :, 0].tolist() == [0.0, -1.0, 2.0, 3.0]
     assert there.meta_actions.tolist() == [[0, 0, 2, 3]]
+
+
+def test_actions_of_others_and_what_are_none() -> None:
+    arrays = StepArrays.of(
+        {name: np.ones((1, 4, 2)) for name in StepArrays._fields[:-2]}
+        | {"mask": np.ones((1, 4), bool), "meta_actions": np.ones((1, 4), np.int64)}
+    )
+    owner = np.array([1, 0, 1, -1], np.int32)
+    taken = ActionsTaken(arrays, number=1)
+    taken.begin(owner)
+    told = bytes(Actions.of(arrays).some(np.array([0, 1])))
+    wrong, _ = taken.take(memoryview(told), 0, owner)
+    assert wrong.tolist() == [1]
+    assert taken.are_due, "agent 2 is missing"
+    taken.take(memoryview(bytes(Actions.of(arrays).some(np.array([2])))), 0, owner)
+    assert not taken.are_due
+    words = np.frombuffer(told, np.int64)
+    for word, value in ((0, -1), (0, 5), (1, 4), (2, 4), (6, -1)):
+        other = words.copy()
+        other[word] = value
+        with pytest.raises(MessageError, match="do not tell what agents do"):
+            taken.take(memoryview(other.tobytes()), 0, owner)
 
 
 @pytest.mark.parametrize(

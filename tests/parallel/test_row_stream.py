@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -103,7 +106,7 @@ def test_what_is_taken_is_what_was_sent() -> None:
     for tick in range(30):
         fill(near.zoned, drawn, np.arange(tick, tick + 30))
         leave(near, drawn)
-        near.running[:] = tick, 7
+        near.zoned.num_owned[MINE] = tick, 7
         clear(far.zoned)
         far.running[:] = 100
         first = far.gate.num_passing[:] = drawn.integers(ROOM // 2 + 1, size=WORLDS)
@@ -197,13 +200,22 @@ def tables(num: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     return np.zeros((WORLDS, num, 3), dtype=np.float32), np.zeros((WORLDS, num), dtype=np.bool_)
 
 
+def packed(here: Sequence[NDArray[Any]], mine: NDArray[np.bool_]) -> memoryview:
+    own, everywhere = np.zeros((WORLDS, 4), dtype=np.bool_), np.ones(WORLDS, dtype=np.bool_)
+    owner = np.full(8, 7, dtype=np.int32)
+    told = AgentStream(here).packed(mine.reshape(WORLDS, 4), everywhere, 2, own, owner)
+    assert (own.reshape(-1) == mine).all()
+    assert (owner == np.where(mine, 2, -1)).all()
+    return memoryview(told)
+
+
 def test_agents_are_taken_as_they_were_sent() -> None:
     here, there = tables(4), tables(4)
     drawn = np.random.default_rng(4)
     here[0][...], here[1][...] = drawn.random((WORLDS, 4, 3)), True
     mine = np.array([True, False, False, True, False, False, True, False])
     owner = np.full(8, -1, dtype=np.int32)
-    AgentStream(there).take(AgentStream(here).packed(mine), 5, owner)
+    AgentStream(there).take(packed(here, mine), 5, owner)
     assert owner.tolist() == [5, -1, -1, 5, -1, -1, 5, -1]
     for sent, taken in zip(here, there, strict=True):
         flat, other = (array.reshape(8, -1) for array in (sent, taken))
@@ -214,7 +226,7 @@ def test_agents_are_taken_as_they_were_sent() -> None:
 @pytest.mark.parametrize("change", [b"", bytes(4), (1).to_bytes(8, "little"), None])
 def test_agents_that_cannot_be_are_refused(change: bytes | None) -> None:
     here, there = tables(4), tables(4)
-    data = bytearray(AgentStream(here).packed(np.ones(8, dtype=np.bool_)))
+    data = bytearray(packed(here, np.ones(8, dtype=np.bool_)))
     if change is None:
         data[8:16] = (8).to_bytes(8, "little")  # there are agents 0 to 7
     owner = np.full(8, -1, dtype=np.int32)

@@ -17,7 +17,8 @@ from cavmarl.handoff.division import Division
 from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.parallel.nodes import links as links_module
 from cavmarl.parallel.nodes.agent_stream import AgentStream
-from cavmarl.parallel.nodes.links import Bytes, FrameKind, Links
+from cavmarl.parallel.nodes.link import Bytes, FrameKind
+from cavmarl.parallel.nodes.links import Links
 from cavmarl.parallel.nodes.node_system import NodeSystem
 from cavmarl.parallel.nodes.row_stream import RowStream
 from cavmarl.verify.simulated_machine import SimulatedListener, SimulatedMachine, SimulatedSocket
@@ -110,7 +111,7 @@ def test_nodes_that_do_not_heed_an_order_to_go_back(monkeypatch: pytest.MonkeyPa
 
 def test_frames_whose_head_is_not_guarded(monkeypatch: pytest.MonkeyPatch) -> None:
     """The campaign finds it: a damaged frame is taken for another one."""
-    monkeypatch.setattr("cavmarl.parallel.nodes.links.zlib.crc32", lambda data, first=0: 0)
+    monkeypatch.setattr("cavmarl.parallel.nodes.link.zlib.crc32", lambda data, first=0: 0)
     found = verify_simulated_nodes("merge", [3], mixes=["damage"], seeds=3, **SMALL)
     assert not found.holds
 

@@ -26,7 +26,7 @@ def specialized(kernel: Callable[P, R], checks: bool = True) -> Callable[P, R]:
     The types are those of the first call. Later calls compare what is not the same object as in the
     call before, array by array in a bundle: another type is a TypeError. For that a call keeps its
     arguments until the next one. Without `checks` nothing is compared: for loops in which one
-    process waits for another, whose few callers see to the types.
+    process waits for another, and for frames, whose few callers see to the types.
 
     With `NUMBA_DISABLE_JIT=1` or `NUMBA_BOUNDSCHECK=1` it is the kernel itself.
     """

@@ -21,7 +21,7 @@ from cavmarl.handoff.fault_injection.fault_plan import Faults
 from cavmarl.ownership.codec import decode, encode
 from cavmarl.ownership.messages import Message
 from cavmarl.ownership.transport import FaultPlan, Network
-from cavmarl.parallel.nodes.links import Bytes
+from cavmarl.parallel.nodes.link import Bytes
 
 _PARCEL = struct.Struct("<IiBI")
 _SIZE = struct.Struct("<I")

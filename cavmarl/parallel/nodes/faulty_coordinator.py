@@ -24,7 +24,8 @@ from cavmarl.parallel.nodes.fault_phases import (
     packed_parcels,
     unpacked_parcels,
 )
-from cavmarl.parallel.nodes.links import Bytes, LinkLostError, Links
+from cavmarl.parallel.nodes.link import Bytes
+from cavmarl.parallel.nodes.links import LinkLostError, Links
 from cavmarl.parallel.nodes.node_coordinator import CrossingDigests, NodeCoordinator
 from cavmarl.parallel.nodes.zone_hosts import Report
 
@@ -47,6 +48,7 @@ class FaultyNodeCoordinator(NodeCoordinator):
     """Sends nothing at once: all messages go in phases, and again where nothing is answered."""
 
     states = CrossingStates
+    may_be_quiet = False
 
     def __init__(self, *arguments: Any, faults: Faults, exchange: Exchange) -> None:
         super().__init__(*arguments)

@@ -12,7 +12,7 @@ from cavmarl.engine.simulation import Simulation
 from cavmarl.handoff.fault_injection.fault_plan import PHASES, Faults, read_faults
 from cavmarl.handoff.fault_injection.injected_faults import Crashes
 from cavmarl.handoff.shard_setup import limits_of
-from cavmarl.ownership.messages import COORDINATOR, Message, Prepare, Step
+from cavmarl.ownership.messages import COORDINATOR, Done, Message, Prepare, Step
 from cavmarl.ownership.reactions import Advance, Hosting
 from cavmarl.parallel.nodes.fault_phases import (
     Parcel,
@@ -22,7 +22,8 @@ from cavmarl.parallel.nodes.fault_phases import (
     packed_parcels,
     unpacked_parcels,
 )
-from cavmarl.parallel.nodes.links import FrameKind, Links, NodeFrame
+from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
+from cavmarl.parallel.nodes.links import Links
 from cavmarl.parallel.nodes.node_executor import NodeExecutor
 from cavmarl.parallel.nodes.zone_hosts import ZoneHosts
 
@@ -136,7 +137,7 @@ class FaultyZoneHosts(ZoneHosts):
         if self._crashes is not None and point:
             self._crashes.zone(point, zone)
 
-    def _complete(self, w: int) -> Sequence[Message]:
+    def _complete(self, w: int) -> Sequence[Done]:
         """DONE goes to the coordinator by the post, and not with the report."""
         if self._crashes is not None:
             for zone in self._endpoints[w]:

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import WorkerError
 from cavmarl.parallel.checkpoint.world_bytes import from_bytes, to_bytes
 from cavmarl.parallel.local_worlds import LocalWorlds
-from cavmarl.parallel.nodes.links import Bytes, FrameKind, Links, NodeFrame
+from cavmarl.parallel.nodes.link import Bytes, FrameKind, NodeFrame
+from cavmarl.parallel.nodes.links import Links
 
 Array = NDArray[Any]
 KEPT = 2  # so many states: the newest may not have come everywhere
@@ -32,9 +33,13 @@ class KeptStates:
         self._own: dict[int, Bytes] = {}  # by numbers of states
         self._others: dict[int, dict[int, Bytes]] = {}  # node → the same
         self._given: dict[int, NodeFrame] = {}  # by nodes that have given zones away
+        self._is_settled = True  # nothing has been kept since `settle`
 
     def settle(self) -> None:
         """What was kept here last has come everywhere: what is older is of no use any more."""
+        if self._is_settled:
+            return
+        self._is_settled = True
         newest = max(self._own, default=0)
         for states in (self._own, *self._others.values()):
             for old in [number for number in states if number < newest]:
@@ -44,6 +49,7 @@ class KeptStates:
         """Keep what the worlds are now, here and at the next of the living nodes."""
         data = to_bytes(self._worlds.save())
         _add(self._own, state, data)
+        self._is_settled = False
         if len(living) > 1:
             to = living[(living.index(self._number) + 1) % len(living)]
             self._links.send(to, FrameKind.KEEP, state, [data])
@@ -51,6 +57,7 @@ class KeptStates:
     def take(self, number: int, frame: NodeFrame) -> None:
         """What another node wants to have kept here."""
         _add(self._others.setdefault(number, {}), frame.number, frame.data)
+        self._is_settled = False
 
     def take_given(self, number: int, frame: NodeFrame) -> None:
         """What another node has had of zones that are hosted here from now on."""

@@ -13,7 +13,8 @@ from cavmarl.core.errors import WorkerError, WorkerFailureError
 from cavmarl.ownership.decisions import Neighbours
 from cavmarl.parallel.commanded_worlds import own_error
 from cavmarl.parallel.hosts.host_process import code_stamp
-from cavmarl.parallel.nodes.links import FrameKind, Link, LinkLostError, Links, NodeFrame
+from cavmarl.parallel.nodes.link import FrameKind, Link, NodeFrame
+from cavmarl.parallel.nodes.links import LinkLostError, Links
 from cavmarl.parallel.nodes.node_cuts import read_neighbours
 from cavmarl.parallel.nodes.node_files import WorldFile
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeListener, NodeSystem

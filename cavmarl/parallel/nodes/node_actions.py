@@ -7,15 +7,16 @@ owner's number, and the caller sends it there. A node waits until it knows what 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import MessageError
-from cavmarl.parallel.nodes.links import Bytes
+from cavmarl.core.numba.specialized import specialized
+from cavmarl.parallel.nodes.link import Bytes
 from cavmarl.parallel.step_arrays import StepArrays
+from cavmarl.zones.kernels.agent_frames import UNOWNED, pack_actions, take_actions
 
 Agents = NDArray[np.int64]
 """Some, counted over all worlds."""
@@ -23,7 +24,7 @@ Agents = NDArray[np.int64]
 ZoneRects = list[list[float]]
 """Zones as `node_cuts.told_zones` gives them."""
 
-UNOWNED = -1  # owns an agent that has no vehicle
+_pack = specialized(pack_actions, checks=False)
 
 
 class Actions(NamedTuple):
@@ -38,24 +39,21 @@ class Actions(NamedTuple):
         arrays_of = (arrays.controls.reshape(-1, 2), arrays.meta_actions, arrays.mask)
         return cls(arrays_of[0].copy(), arrays_of[1].flatten(), arrays_of[2].flatten())
 
-    def of_nodes(
-        self, numbers: Sequence[int], owner: NDArray[np.int32]
-    ) -> Iterator[tuple[int, list[Bytes]]]:
-        """What each node is told: of its agents, and of those that may get a vehicle anywhere.
+    def of_node(self, number: int, owner: NDArray[np.int32]) -> Bytes:
+        """What a node is told: of its agents, and of those that may get a vehicle anywhere.
 
         Args:
-            numbers: of the nodes.
+            number: of the node.
             owner: (W · A,) the node of each agent, as far as is known.
         """
-        known = np.where(self.mask, owner, UNOWNED)
-        unowned = self.some(np.flatnonzero(known == UNOWNED))
-        for number in numbers:
-            yield number, self.some(np.flatnonzero(known == number)) + unowned
+        words = np.empty(2 + 4 * len(owner), dtype=np.int64)
+        return words[: _pack(*self, owner, number, words, words.view(np.float64))].data
 
-    def some(self, agents: Agents) -> list[Bytes]:
-        controls, meta_actions = self.controls[agents], self.meta_actions[agents]
-        number = np.int64(len(agents)).tobytes()
-        return [number, agents.data, controls.reshape(-1).data, meta_actions.data]
+    def some(self, agents: Agents) -> Bytes:
+        """What the owner of some agents is told of them."""
+        owner = np.full(len(self.mask), UNOWNED - 1, dtype=np.int32)
+        owner[agents] = 0
+        return self._replace(mask=np.ones_like(self.mask)).of_node(0, owner)
 
 
 class NodeCommand(NamedTuple):
@@ -68,27 +66,47 @@ class NodeCommand(NamedTuple):
     cut: ZoneRects | None = None  # zones that the worlds have from then on
     receptions: list[bytes] | None = None  # what a network simulator has said so far, in a step
 
-    def of_nodes(
-        self, numbers: Sequence[int], owner: NDArray[np.int32]
-    ) -> Iterator[tuple[int, list[Bytes]]]:
-        """The pieces of the frame that each node gets; arguments as of `Actions.of_nodes`."""
-        if self.actions is None:
-            for number in numbers:
-                yield number, list[Bytes](self.pieces)
-        else:
-            for number, own in self.actions.of_nodes(numbers, owner):
-                yield number, [*self.pieces, *own]
+    def of_node(self, number: int, owner: NDArray[np.int32], lease: bytes) -> list[Bytes]:
+        """The pieces of the frame that a node gets; arguments as of `Actions.of_node`.
+
+        The actions begin at a whole word of 8 bytes, for kernels read them.
+        """
+        first, *rest = self.pieces
+        told = [] if self.actions is None else [self.actions.of_node(number, owner)]
+        return [first, *told, *rest, lease]
 
 
-def take_actions(data: memoryview, at: int, arrays: StepArrays) -> tuple[Agents, int]:
-    """Write what some agents do to the arrays; which, and where in the data it ends."""
-    (number,), at = _read(data, at, np.int64, 1)
-    agents, at = _read(data, at, np.int64, int(number))
-    controls, at = _read(data, at, np.float64, 2 * int(number))
-    meta_actions, at = _read(data, at, np.int64, int(number))
-    arrays.controls.reshape(-1, 2)[agents] = controls.reshape(-1, 2)
-    arrays.meta_actions.reshape(-1)[agents] = meta_actions
-    return agents, at
+class ActionsTaken:
+    """What agents do, as one node is told it step by step."""
+
+    def __init__(self, arrays: StepArrays, number: int) -> None:  # `number`: of the node
+        num = arrays.mask.size
+        self._number = number
+        self._arrays = arrays.controls.reshape(num, 2), arrays.meta_actions.reshape(num)
+        self._missing = np.zeros(num, dtype=np.bool_)
+        self._wrong = np.empty(num, dtype=np.int64)
+        self._take = specialized(take_actions, checks=False)
+        self.are_due = False  # some of the node's own agents have not been told of yet
+
+    def begin(self, owner: NDArray[np.int32]) -> None:
+        """A step begins; `owner`: (W · A,) the node of each agent."""
+        np.equal(owner, self._number, out=self._missing)
+
+    def take(self, data: memoryview, at: int, owner: NDArray[np.int32]) -> tuple[Agents, int]:
+        """Write what agents do to the arrays; those that other nodes own, and where it ends.
+
+        Raises:
+            MessageError: the bytes tell of no actions.
+        """
+        words = np.frombuffer(data, np.int64, (len(data) - at) // 8, at)
+        size, wrong, missing = self._take(
+            words, words.view(np.float64), *self._arrays,
+            self._missing, owner, self._number, self._wrong,
+        )  # fmt: skip
+        if size < 0:
+            raise MessageError(f"{len(data)} bytes do not tell what agents do")
+        self.are_due = missing > 0
+        return self._wrong[:wrong], at + 8 * size
 
 
 def refusal(agents: Agents, owner: NDArray[np.int32]) -> list[Bytes]:
@@ -109,8 +127,3 @@ def read_refusal(data: memoryview, num_agents: int, nodes: set[int]) -> NDArray[
     if ((agents < 0) | (agents >= num_agents)).any() or not set(owners.tolist()) <= nodes:
         raise MessageError("a refusal names agents or nodes that there are not")
     return found
-
-
-def _read(data: memoryview, at: int, kind: Any, num: int) -> tuple[NDArray[Any], int]:
-    found = np.frombuffer(data, kind, num, at) if num else np.zeros(0, kind)
-    return found, at + found.nbytes

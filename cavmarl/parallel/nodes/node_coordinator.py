@@ -15,7 +15,8 @@ from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import Ack, Begin, Birth, Message, Nack, Output
 from cavmarl.ownership.reactions import Hosting
 from cavmarl.ownership.transfers import TransferLog
-from cavmarl.parallel.nodes.links import FrameKind, Links, NodeFrame, SilenceError
+from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
+from cavmarl.parallel.nodes.links import Links, SilenceError
 from cavmarl.parallel.nodes.zone_hosts import Report, packed, unpacked
 
 
@@ -54,6 +55,7 @@ class _World:
         self.movers: list[tuple[int, int]] = []
         self.births: list[Birth] = []
         self.answered: set[tuple[int, int]] = set()
+        self.has_told = False  # of the present episode, by a STEP to each zone
         self.has_begun = False  # before the first reset nodes have rows of no episode
         self.on_record = OwnersOnRecord(zones, limits, is_direct=True) if is_checked else None
 
@@ -78,9 +80,16 @@ class _World:
                     "zones.journal shows the records"
                 )
 
+    def says_nothing(self, births: Sequence[Birth]) -> bool:
+        """Whether there is nothing to say of the next tick, nor to write down."""
+        is_watched = self.journal is not None or self.on_record is not None
+        return self.has_told and not (births or self.movers or is_watched)
+
     def write(self, output: Output) -> int:
         """Write records down; how many vehicles change their owner by them."""
-        if self.journal is not None and output.records:
+        if not output.records:
+            return 0
+        if self.journal is not None:
             self.journal.append(output.records)
         self.log.logged(output.records)
         if self.on_record is not None:
@@ -98,6 +107,7 @@ class NodeCoordinator:
     """
 
     states: type[CrossingDigests] = CrossingDigests
+    may_be_quiet = True  # where there is nothing to say of a tick nothing is sent
 
     def __init__(
         self,
@@ -147,6 +157,7 @@ class NodeCoordinator:
                 world.write(world.directory.host(zone, worker=node_of[zone]))
             world.births, world.movers = [], []
             world.answered.clear()
+            world.has_told = False
         self._node_of, self.switched = node_of, switched
         return self._hostings()
 
@@ -182,21 +193,29 @@ class NodeCoordinator:
             world.answered.update((entry.vehicle, message.zone) for entry in message.entries)
         output = world.directory.on_message(message)
         world.write(output)
-        self._send([(w, answer) for answer in output.messages])
+        if output.messages:
+            self._send([(w, answer) for answer in output.messages])
 
     def commit(self, reports: Mapping[int, tuple[list[tuple[int, Message]], list[Report]]]) -> None:
         """All nodes are through with the tick, as they report."""
-        for messages, _ in reports.values():
-            for w, message in messages:
-                self._take(w, message)
+        told = [message for messages, _ in reports.values() for message in messages]
+        disturbed = [w for w in {w for w, _ in told} if self._worlds[w].directory.is_quiet]
+        for w in disturbed:
+            self._worlds[w].write(self._worlds[w].directory.break_quiet())
+        for w, message in told:
+            self._take(w, message)
+        for w in disturbed:
+            self._worlds[w].directory.answer_for_silent()
         self.is_late = any(one.is_late for _, report in reports.values() for one in report)
         for w, world in enumerate(self._worlds):
             said = [report[w] for _, report in reports.values()]
-            if world.directory.table.plan is not None:
+            if world.directory.is_quiet:
+                world.directory.commit_quiet()
+            elif world.directory.table.plan is not None:
                 world.write(world.directory.commit(dict.fromkeys(range(len(self._node_of)), 0)))
             if any(report.began for report in said):
                 world.write(world.directory.reset())
-                world.births = []
+                world.births, world.has_told = [], False
             movers = [mover for report in said for mover in report.movers]
             world.movers = [(vehicle, target) for vehicle, target, _ in movers]
             world.states.told = {v: bytes.fromhex(digest) for v, _, digest in movers}
@@ -207,7 +226,8 @@ class NodeCoordinator:
         """Decide the way to the next ticks, once all offers are answered.
 
         Returns:
-            node → its lease, STEP messages of its zones.
+            node → its lease, STEP messages of its zones; of worlds of which there is nothing to say
+            there are none.
 
         Raises:
             SilenceError: an offer is not answered in time.
@@ -217,14 +237,17 @@ class NodeCoordinator:
             if self._links.now_s() > until_s:
                 raise SilenceError(f"offers are not answered within {timeout_s:g} s")
             self._links.pump(1e3 * timeout_s)
-        return self._by_node(self._decide())
+        return dict.fromkeys(self._node_of, b"") | self._by_node(self._decide())
 
     def _decide(self) -> list[tuple[int, Message]]:
         messages = []
         for w, world in enumerate(self._worlds):
             births, world.births = world.births, []
-            output = world.directory.begin(world.movers, births)
             world.answered.clear()
+            if self.may_be_quiet and world.says_nothing(births) and world.directory.begin_quiet():
+                continue
+            output = world.directory.begin(world.movers, births)
+            world.has_told = True
             self.switched += world.write(output)
             messages += [(w, message) for message in output.messages]
         return messages

@@ -16,11 +16,14 @@ class NodeExecutor:
     def __init__(
         self, own: Sequence[Shard], foreign: Sequence[Shard], clock: ShardClock | None
     ) -> None:
-        self._executor: Executor = clock or SerialExecutor(own)
+        executor: Executor = clock or SerialExecutor(own)
+        self._each = executor.each
         self._first, self._foreign = own[0], foreign
 
     def each(self, phase: str, *arguments: Any) -> None:
-        self._executor.each(phase, *arguments)
+        self._each(phase, *arguments)
         if phase in ("advance", "commit"):
+            side, next_side = self._first.side, self._first.next_side
             for shard in self._foreign:
-                shard.face(self._first.side, self._first.next_side)
+                if (shard.side, shard.next_side) != (side, next_side):
+                    shard.face(side, next_side)

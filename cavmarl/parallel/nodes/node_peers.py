@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -22,16 +22,10 @@ from cavmarl.core.records.codes import (
 )
 from cavmarl.engine.simulation import Simulation
 from cavmarl.parallel.nodes.agent_stream import AgentStream
-from cavmarl.parallel.nodes.links import (
-    Bytes,
-    FrameKind,
-    LinkLostError,
-    Links,
-    NodeFrame,
-    RecoveryOrderedError,
-)
-from cavmarl.parallel.nodes.node_actions import UNOWNED
+from cavmarl.parallel.nodes.link import Bytes, FrameKind, NodeFrame
+from cavmarl.parallel.nodes.links import LinkLostError, Links, RecoveryOrderedError
 from cavmarl.parallel.nodes.row_stream import RowStream, words_of
+from cavmarl.zones.kernels.agent_frames import UNOWNED
 from cavmarl.zones.kernels.row_frames import count_own
 
 Array = NDArray[Any]
@@ -80,6 +74,8 @@ class NodePeers:
         self._agents = AgentStream([getattr(simulation.outputs, name) for name in PIECES])
         self._sent = first_share
         self._is_stepping = False
+        self._gate: Gate | None = None
+        self._leaving: Array = np.empty(0)  # the words of its rows
         self.own: Array = np.zeros_like(simulation.outputs.present)
         self.stepped = self.own.copy()
         self.owner: NDArray[np.int32] = np.full(self.own.size, UNOWNED, dtype=np.int32)
@@ -117,15 +113,19 @@ class NodePeers:
             self.owner[np.frombuffer(data, np.int64)] = number
 
     def share_rows(self, gate: Gate, side: int) -> None:
-        self._count_own(self._zoned, self._mine, self._running)
-        passing, rows = words_of(gate.passing), self._rows
+        if gate is not self._gate:
+            self._gate, self._leaving = gate, words_of(gate.passing)
+        rows, passing = self._rows, self._leaving
         found = self._swap([rows[to].packed(side, gate, passing)] for to in self._others)
         for number, data in found:
-            with _said_by(number):
+            try:
                 rows[number].take(data, side, gate, passing)
-        self._rerouted[:] = gate.counts[:, COUNT_REROUTED]
+            except MessageError as error:
+                raise LinkLostError(number, error) from error
 
     def running(self) -> NDArray[np.int64]:
+        if not self._others:
+            self._count_own(self._zoned, self._mine, self._running)
         return self._running
 
     def clear_ranks(self, gate: Gate) -> None:
@@ -195,16 +195,15 @@ class NodePeers:
         self._seen_s[...] = seen
 
     def share_outputs(self, outputs: Outputs, chosen: NDArray[np.bool_]) -> None:
-        self.own[chosen] = outputs.present[chosen]
+        told = self._agents.packed(outputs.present, chosen, self._number, self.own, self.owner)
         if self._is_stepping:
             self._is_stepping = False
             self.stepped[...] = self.own
-        mine = (self.own & chosen[:, None]).reshape(-1)
-        self.owner.reshape(self.own.shape)[chosen] = UNOWNED
-        self.owner[mine] = self._number
-        for number, data in self._swap([self._agents.packed(mine)] for _ in self._others):
-            with _said_by(number):
+        for number, data in self._swap([told] for _ in self._others):
+            try:
                 self._agents.take(data, number, self.owner)
+            except MessageError as error:
+                raise LinkLostError(number, error) from error
 
     @contextmanager
     def everybody(self, gate: Gate, side: int) -> Iterator[None]:
@@ -263,39 +262,30 @@ class NodePeers:
             for array in (zoned.num_owned, zoned.num_contacts):
                 array[self._foreign] = 0
 
-    def _take_all(self) -> dict[int, NodeFrame]:
-        """The next frame of each of the others.
+    def _swap(self, pieces: Any) -> list[tuple[int, memoryview]]:
+        """Send pieces to each of the others, and take theirs, by rising numbers.
 
         Raises:
             RecoveryOrderedError: one of them has been told to go back already.
         """
-        found = self._links.take(self._others)
-        ahead = {n: frame for n, frame in found.items() if frame.kind is FrameKind.SYNC}
-        for number, frame in ahead.items():
-            self._links.put_back(number, frame)
-        if ahead:
-            raise RecoveryOrderedError(None)
-        return found
-
-    def _swap(self, pieces: Any) -> list[tuple[int, memoryview]]:
-        """Send pieces to each of the others, and take theirs, by rising numbers."""
+        links, others = self._links, self._others
         self._sent += 1
-        for to, some in zip(self._others, pieces, strict=True):
-            self._links.send(to, FrameKind.SHARE, self._sent, some)
-        found = self._take_all()
+        for to, some in zip(others, pieces, strict=True):
+            links.send(to, FrameKind.SHARE, self._sent, some)
+        found = links.take(others)
         for number, frame in found.items():
             if frame.kind is not FrameKind.SHARE or frame.number != self._sent:
-                raise AssertionError(f"node {number} is at {frame[:2]}, not at share {self._sent}")
-        return [(number, found[number].data) for number in self._others]
+                self._refuse(number, found)
+        return [(number, frame.data) for number, frame in found.items()]
 
-
-@contextmanager
-def _said_by(number: int) -> Iterator[None]:
-    """Raises LinkLostError: what a node has sent cannot be."""
-    try:
-        yield
-    except MessageError as error:
-        raise LinkLostError(number, error) from error
+    def _refuse(self, number: int, found: dict[int, NodeFrame]) -> NoReturn:
+        """One of some frames is not what is due."""
+        ahead = {n: frame for n, frame in found.items() if frame.kind is FrameKind.SYNC}
+        for n, frame in ahead.items():
+            self._links.put_back(n, frame)
+        if ahead:
+            raise RecoveryOrderedError(None)
+        raise AssertionError(f"node {number} is at {found[number][:2]}, not at share {self._sent}")
 
 
 def _by_agent(array: Array) -> Array:

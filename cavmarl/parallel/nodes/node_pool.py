@@ -27,9 +27,10 @@ from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.nodes.fault_phases import node_faults
 from cavmarl.parallel.nodes.faulty_coordinator import Pieces, coordinator_of
 from cavmarl.parallel.nodes.leases import lease_ticks, leases_of
-from cavmarl.parallel.nodes.links import FrameKind, LinkLostError, Links, NodeFrame, said_by
+from cavmarl.parallel.nodes.link import FrameKind, NodeFrame, said_by
+from cavmarl.parallel.nodes.links import LinkLostError, Links
 from cavmarl.parallel.nodes.newcomers import Newcomer, Newcomers
-from cavmarl.parallel.nodes.node_actions import UNOWNED, NodeCommand, read_refusal
+from cavmarl.parallel.nodes.node_actions import NodeCommand, read_refusal
 from cavmarl.parallel.nodes.node_cuts import PoolState, ZoneCut, read_neighbours, told_zones
 from cavmarl.parallel.nodes.node_files import files_of
 from cavmarl.parallel.nodes.node_starters import Route, Start, start_nodes, straight
@@ -41,6 +42,7 @@ from cavmarl.parallel.recipe import recipe_of
 from cavmarl.parallel.step_arrays import StepArrays, layout_of
 from cavmarl.parallel.step_placement import StepPlacement
 from cavmarl.parallel.work_shares import parts_of
+from cavmarl.zones.kernels.agent_frames import UNOWNED
 
 log = logging.getLogger("cavmarl.nodes")
 
@@ -100,8 +102,7 @@ class NodePool:
         self._lost: list[int] = []
         self._is_torn = False
         self.losses = self.recoveries = self.replacements = self.redirected = 0
-        self._timeout_s = config.workers.timeout_s
-        self._pid = os.getpid()
+        self._timeout_s, self._pid = config.workers.timeout_s, os.getpid()
         self._ticks_per_step = config.clock.ticks_per_step
         self._links = Links(_nothing, system)
         self._watch = NodeWatch(self._links, lambda: self._starter.stopped())
@@ -272,8 +273,9 @@ class NodePool:
         self._performed = command
         leases = leases_of(command.ticks, self._lease_ticks)
         lease = self._begin_lease() if leases else {}
-        for number, pieces in command.of_nodes(self._living, self._owner):
-            self._links.send(number, FrameKind.COMMAND, kept, [*pieces, lease.get(number, b"")])
+        for number in self._living:
+            pieces = command.of_node(number, self._owner, lease.get(number, b""))
+            self._links.send(number, FrameKind.COMMAND, kept, pieces)
         if not command.changes:
             return [frame.data for frame in self._take(FrameKind.RESULT).values()]
         results = self._commit()
@@ -326,14 +328,13 @@ class NodePool:
             MessageError: there are no such agents, or owners.
         """
         found = read_refusal(frame.data, self._owner.size, set(self._living))
-        if self._performed is None or self._performed.actions is None:
+        if self._performed is None or (actions := self._performed.actions) is None:
             raise MessageError("actions are refused where there are none")
         for owner in np.unique(found[1]).tolist():
             agents = found[0, found[1] == owner]
             self._owner[agents] = owner
             self.redirected += len(agents)
-            pieces = self._performed.actions.some(agents)
-            self._links.send(owner, FrameKind.ACTIONS, self._generation, pieces)
+            self._links.send(owner, FrameKind.ACTIONS, self._generation, [actions.some(agents)])
 
     def _lose(self, lost: LinkLostError, has_begun: bool = True) -> None:
         """A node is gone: nothing of it counts any more.
@@ -427,7 +428,7 @@ class NodePool:
         read, frames = {}, self._take(FrameKind.REPORT)
         for number in sorted(frames, key=lambda number: (number != self._teller, number)):
             try:
-                read[number] = read_report(frames[number].data)
+                read[number] = read_report(frames[number].data, len(self._runs))
                 self._coordinator.check(number, read[number][0])
             except (ValueError, TypeError, struct.error, ProtocolError) as error:
                 raise LinkLostError(number, MessageError(f"no report: {error}")) from error

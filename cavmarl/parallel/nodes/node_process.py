@@ -11,6 +11,7 @@ from contextlib import suppress
 from typing import Any, NoReturn
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cavmarl.core.errors import CavmarlError, MessageError, NodeRefusedError
 from cavmarl.core.tracebacks import traceback_text
@@ -18,23 +19,22 @@ from cavmarl.engine.shard_clock import ShardClock
 from cavmarl.handoff.fault_injection.injected_faults import ZoneDeath
 from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.parallel.hosts.host_process import code_stamp
+from cavmarl.parallel.nodes.agent_stream import ResultStream
 from cavmarl.parallel.nodes.faulty_hosts import hosts_of
 from cavmarl.parallel.nodes.kept_states import KeptStates
-from cavmarl.parallel.nodes.links import (
-    Bytes,
-    FrameKind,
-    LinkLostError,
-    Links,
-    NeededNoMoreError,
-    NodeFrame,
-    RecoveryOrderedError,
-)
+from cavmarl.parallel.nodes.link import Bytes, FrameKind, NeededNoMoreError, NodeFrame
+from cavmarl.parallel.nodes.links import LinkLostError, Links, RecoveryOrderedError
 from cavmarl.parallel.nodes.meeting import call_node, calls_of
-from cavmarl.parallel.nodes.node_actions import refusal, take_actions
+from cavmarl.parallel.nodes.node_actions import ActionsTaken, refusal
 from cavmarl.parallel.nodes.node_cuts import cut_worlds, proposal_of, read_zones, told_neighbours
 from cavmarl.parallel.nodes.node_executor import NodeExecutor
 from cavmarl.parallel.nodes.node_files import WorldFile, recipe_with
-from cavmarl.parallel.nodes.node_frames import command_of, results_of, saved_of, worlds_payload
+from cavmarl.parallel.nodes.node_frames import (
+    Inputs,
+    command_of,
+    saved_of,
+    worlds_payload,
+)
 from cavmarl.parallel.nodes.node_loads import told_of
 from cavmarl.parallel.nodes.node_network import AskedNetwork
 from cavmarl.parallel.nodes.node_peers import NodePeers
@@ -82,6 +82,7 @@ class NodeProgram:
             recipe, DIFFERENT, job["num_worlds"], job["in_next_step"]
         )
         self._commands = commands_of(worlds.arrays)
+        self._inputs, self._results = Inputs(worlds.arrays), ResultStream(worlds.arrays)
         self._faults, self._lease_ticks = job["faults"], job["lease_ticks"]
         worlds.keep_logs()
         v2x = worlds.world.config.v2x
@@ -210,6 +211,7 @@ class NodeProgram:
         self._generation = frame.number
         if self._number < 0:
             self._number = int(told["number"])
+            self._taken = ActionsTaken(self._worlds.arrays, self._number)
             self._kept = KeptStates(self._worlds, links, self._number)
             links.urgent = self._hear
         self._tells = told["first"] == self._number
@@ -269,20 +271,22 @@ class NodeProgram:
 
     def _perform(self, frame: NodeFrame) -> None:
         worlds, peers = self._worlds, self._peers
-        task, payload, at = command_of(frame.data, worlds.arrays)
+        task, payload, at = command_of(frame.data)
         self._kept.settle()
         if frame.number:
             self._kept.keep(frame.number, self._living)
         match task:
             case Task.STEP:
-                self._hosts.lease(frame.data[self._await_actions(frame.data, at) :])
+                at = self._await_actions(frame.data, at)
+                at = self._inputs.take(task, frame.data, at)
+                self._hosts.lease(frame.data[at:])
                 peers.begin_step()
                 worlds.step(self._commands)
-                self._hosts.report(self._results(worlds.simulation.everywhere, stepped=True))
+                self._hosts.report([self._results_of(worlds.simulation.everywhere, of_step=True)])
             case Task.RESET:
-                chosen = worlds.arrays.chosen.copy()
+                self._inputs.take(task, frame.data, at)
                 worlds.reset(payload["seed"], payload["first_world"])
-                self._hosts.report(self._results(chosen, stepped=False))
+                self._hosts.report([self._results_of(worlds.arrays.chosen, of_step=False)])
             case Task.LOAD if not payload["only_reads"]:
                 worlds.load_worlds(saved_of(payload))
                 self._hosts.report()
@@ -313,30 +317,25 @@ class NodeProgram:
         Raises:
             RecoveryOrderedError: the coordinator wants something else by now.
         """
-        arrays, owner = self._worlds.arrays, self._peers.owner
-        told, at = take_actions(data, at, arrays)
-        unowned, at = take_actions(data, at, arrays)
-        wrong = told[owner[told] != self._number]
+        taken, owner = self._taken, self._peers.owner
+        taken.begin(owner)
+        wrong, end = taken.take(data, at, owner)
         if len(wrong):
             said = refusal(wrong, owner)
             self._links.send(COORDINATOR, FrameKind.NOT_MINE, self._generation, said)
-        missing = owner == self._number
-        missing[told] = missing[unowned] = False
-        while missing.any():
+        while taken.are_due:
             while self._actions:
                 late = self._actions.popleft()
                 if late.number == self._generation:
-                    missing[take_actions(late.data, 0, arrays)[0]] = False
-            if missing.any():
+                    taken.take(late.data, 0, owner)
+            if taken.are_due:
                 self._links.heed()
                 self._links.pump(None)
-        return at
+        return end
 
-    def _results(self, sensed: Any, stepped: bool) -> list[Bytes]:
+    def _results_of(self, chosen: NDArray[np.bool_], of_step: bool) -> Bytes:
         peers = self._peers
-        own = peers.own & sensed[:, None]
-        before = peers.stepped if stepped else np.zeros_like(own)
-        return results_of(self._worlds.arrays, own, before, with_common=self._tells)
+        return self._results.packed(peers.own, chosen, peers.stepped, of_step, self._tells)
 
     def _look(self, task: Task, payload: Any) -> None:
         """Answer what only the first node can, which has the whole world meanwhile."""

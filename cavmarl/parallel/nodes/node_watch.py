@@ -7,14 +7,8 @@ from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 from cavmarl.core.errors import MessageError, WorkerError
-from cavmarl.parallel.nodes.links import (
-    FrameKind,
-    LinkLostError,
-    Links,
-    NodeFrame,
-    SilenceError,
-    said_by,
-)
+from cavmarl.parallel.nodes.link import FrameKind, NodeFrame, said_by
+from cavmarl.parallel.nodes.links import LinkLostError, Links, SilenceError
 
 LOOK_S = 0.5  # between looks; a process that is stopped at two of them is given up
 PONG_S = 1.0  # for a living node to answer

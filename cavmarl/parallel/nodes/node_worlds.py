@@ -26,14 +26,13 @@ from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.parallel.commanded_worlds import uncopied
 from cavmarl.parallel.mover import Mover
-from cavmarl.parallel.nodes.links import FrameKind, NodeFrame
-from cavmarl.parallel.nodes.node_actions import UNOWNED, Actions, NodeCommand
+from cavmarl.parallel.nodes.agent_stream import ResultStream
+from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
+from cavmarl.parallel.nodes.node_actions import Actions, NodeCommand
 from cavmarl.parallel.nodes.node_cuts import read_zones
 from cavmarl.parallel.nodes.node_frames import (
-    clear_sensed,
     pieces_of,
     saved_of,
-    take_results,
     worlds_payload,
 )
 from cavmarl.parallel.nodes.node_loads import (
@@ -91,6 +90,8 @@ class NodeWorlds(NodePool):
         self._spent_s = np.zeros((1, count))
         self._ticks_done = self._ticks_told = 0
         self.recuts: list[Recut] = []
+        self._everywhere = np.ones(num_worlds, dtype=np.bool_)
+        self._results = ResultStream(self.arrays)
         self._steps = 0
         self._network: NetworkSimulator | None = None
         self._exchanged = 0  # answers of it that nodes have got in the present command
@@ -102,8 +103,7 @@ class NodeWorlds(NodePool):
     def reset(self, seed: int | None, first_world: int) -> None:
         arrays = self.arrays
         results = self.run(self._command(Task.RESET, {"seed": seed, "first_world": first_world}))
-        clear_sensed(arrays, arrays.chosen)
-        self._write(results, of_step=False)
+        self._write(results, arrays.chosen, of_step=False)
         if not arrays.chosen.all():
             arrays.observations[~arrays.mask] = 0.0
 
@@ -120,8 +120,7 @@ class NodeWorlds(NodePool):
         arrays.inserted[:] = commands.inserted if commands.inserted.size else 0
         results = self.run(self._command(Task.STEP))
         self._ticks_done += self._ticks_per_step
-        clear_sensed(arrays, np.ones(len(arrays.chosen), dtype=np.bool_))
-        self._write(results, of_step=True)
+        self._write(results, self._everywhere, of_step=True)
 
     def _cut_anew(self) -> None:
         """Every so many steps cut the zones by their vehicles; see `zones.repartition_steps`."""
@@ -206,12 +205,11 @@ class NodeWorlds(NodePool):
         actions = Actions.of(self.arrays)
         return NodeCommand(pieces, changes, self._ticks_per_step, actions, receptions=[])
 
-    def _write(self, results: Sequence[memoryview], of_step: bool) -> None:
-        arrays = self.arrays
-        begun = np.ones_like(arrays.chosen) if of_step else arrays.chosen
-        self._owner.reshape(arrays.mask.shape)[begun] = UNOWNED
+    def _write(
+        self, results: Sequence[memoryview], chosen: NDArray[np.bool_], of_step: bool
+    ) -> None:
         for n, (number, data) in enumerate(zip(self._tellers, results, strict=True)):
-            self._owner[take_results(data, arrays, with_common=n == 0, of_step=of_step)] = number
+            self._results.take(data, chosen, of_step, n == 0, number, self._owner)
 
     def suggest(self) -> None:
         """Write what the built-in driver would do in the agents' place."""

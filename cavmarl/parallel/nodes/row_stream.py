@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import MessageError
 from cavmarl.core.numba.specialized import specialized
 from cavmarl.core.records.arrays import Gate, Zoned
-from cavmarl.parallel.nodes.links import Bytes
+from cavmarl.parallel.nodes.link import Bytes
 from cavmarl.zones.kernels.row_frames import (
     AFTER,
     ID,
     MOST,
+    NO_FRAME,
     Both,
-    count_ghosts,
     pack_frame,
     take_frame,
 )
@@ -68,10 +68,9 @@ class RowStream:
         assert zoned.rows["id"].ctypes.data - zoned.rows.ctypes.data == 8 * ID
         self._sent, self._taken = _Room(size), _Room(size)
         self._slots = np.empty(1, dtype=np.int32)
-        self._frame = np.empty(1 + (3 + 2 * len(others)) * running.size, dtype=np.int64)
-        self._pack = specialized(pack_frame)
-        self._count = specialized(count_ghosts)
-        self._take = specialized(take_frame)
+        self._make_frame(1 + (3 + 2 * len(others)) * running.size)
+        self._pack = specialized(pack_frame, checks=False)
+        self._take = specialized(take_frame, checks=False)
 
     def packed(self, side: int, gate: Gate, passing: Array) -> Bytes:
         """The frame that the other one gets, until the next is packed.
@@ -93,9 +92,14 @@ class RowStream:
             ghosts = -1 - num
             words = ghosts * (2 + sent.now(ghosts).shape[1])
             words += int(gate.num_passing.sum()) * self._row
-            self._frame = np.empty(frame.size + words + words // 2, dtype=np.int64)
+            self._make_frame(frame.size + words + words // 2)
         sent.turn(num)
-        return frame[: frame.item(0)].view(np.uint8).data
+        return self._bytes[: 8 * frame.item(0)]
+
+    def _make_frame(self, words: int) -> None:
+        """Make room for a frame."""
+        self._frame = np.empty(words, dtype=np.int64)
+        self._bytes = self._frame.view(np.uint8).data
 
     def take(self, data: memoryview, side: int, gate: Gate, passing: Array) -> None:
         """Take a frame of the other one.
@@ -105,13 +109,15 @@ class RowStream:
         """
         taken, whole = self._taken, len(data) // 8
         frame = np.frombuffer(data, np.int64, whole) if whole else np.zeros(1, dtype=np.int64)
-        num = self._count(self._both, frame) if 8 * whole == len(data) else -1
-        if num >= 0:
-            now = taken.now(num)[:num]
-            if self._take(self._both, side, gate, passing, taken.before, now, frame):
-                taken.turn(num)
-                return
-        raise MessageError(f"{len(data)} bytes are not what a node tells of the rows of a tick")
+        num = NO_FRAME
+        if 8 * whole == len(data):
+            args = self._both, side, gate, passing, taken.before
+            num = self._take(*args, taken.now(), frame)
+            if NO_FRAME < num < 0:
+                num = self._take(*args, taken.now(-1 - num), frame)
+        if num < 0:
+            raise MessageError(f"{len(data)} bytes are not what a node tells of the rows of a tick")
+        taken.turn(num)
 
 
 def words_of(rows: Array) -> Array:

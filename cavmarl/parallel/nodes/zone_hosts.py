@@ -26,10 +26,11 @@ from cavmarl.ownership.codec import decode, encode
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.ledger import state_digest
 from cavmarl.ownership.limits import Limits
-from cavmarl.ownership.messages import COORDINATOR, Message, Prepare, Removed
+from cavmarl.ownership.messages import COORDINATOR, Done, Message, Prepare, Removed
 from cavmarl.ownership.offers import Approach
 from cavmarl.ownership.reactions import Advance, Hosting
-from cavmarl.parallel.nodes.links import Bytes, FrameKind, Links, NodeFrame, RecoveryOrderedError
+from cavmarl.parallel.nodes.link import Bytes, FrameKind, NodeFrame
+from cavmarl.parallel.nodes.links import Links, RecoveryOrderedError
 from cavmarl.parallel.nodes.node_executor import NodeExecutor
 from cavmarl.shards.shard import Commands
 from cavmarl.zones.kernels.zone_lookup import zones_of
@@ -48,6 +49,9 @@ class Report(NamedTuple):
     owned: list[tuple[int, int, int]]
     # a vehicle has crossed a border that is on no record yet: it is offered in a lease of no ticks
     is_late: bool = False
+
+
+NOTHING = Report([], [], False, [])
 
 
 class ZoneHosts:
@@ -89,6 +93,7 @@ class ZoneHosts:
         self._early: list[tuple[int, Message]] = []  # of an episode that begins with the next lease
         self._began = [False] * num_worlds
         self._stirred = [True] * num_worlds
+        self._is_quiet = [False] * num_worlds  # the lease has come without a STEP
         self._is_open = False
 
     # Called by a tick
@@ -116,9 +121,17 @@ class ZoneHosts:
         self._left = self._ticks - 1
 
     def lease(self, data: memoryview) -> None:
-        """Take STEP messages."""
+        """Take STEP messages; zones of worlds without any go on with what they own."""
+        told = set()
         for w, message in unpacked(data):
+            told.add(w)
             self._take(w, message)
+        for w, endpoints in enumerate(self._endpoints):
+            if w in told:
+                self._is_quiet[w] = False
+            elif not self._leases[w]:
+                self._is_quiet[w] = True
+                self._leases[w] = {zone: each.go_on() for zone, each in endpoints.items()}
         early, self._early = self._early, []
         for w, message in early:
             self._take(w, message)
@@ -191,24 +204,21 @@ class ZoneHosts:
         reports, checked = [], self._is_checked
         for w in range(len(self._endpoints)):
             began, self._began[w] = self._began[w], False
-            messages += [(w, done) for done in self._complete(w)]
+            quiet = self._is_quiet[w]
+            messages += [(w, done) for done in self._complete(w) if done.removed or not quiet]
             movers, is_late = self._offer(w, began)
             owned = [self._owned(w, zone) for zone in self._endpoints[w]] if checked else []
             reports.append(Report(movers, self._births[w], began, owned, is_late))
             self._births[w] = []
-        said = json.dumps(reports).encode()
-        packed_messages = packed(messages)
-        head = _LENGTH.pack(len(packed_messages), len(said))
-        self._links.send(
-            COORDINATOR, FrameKind.REPORT, self._generation, [head, packed_messages, said, *more]
-        )
+        data = packed_report(messages, reports)
+        self._links.send(COORDINATOR, FrameKind.REPORT, self._generation, [data, *more])
         self._is_open = False
 
     def _owned(self, w: int, zone: int) -> tuple[int, int, int]:
         rows = self._division.owned(w, zone)
         return zone, len(rows), int(self._owned_sum(rows, len(rows)))
 
-    def _complete(self, w: int) -> Iterable[Message]:
+    def _complete(self, w: int) -> Iterable[Done]:
         gone, self._gone[w] = self._gone[w], {}
         if gone and self._births[w]:  # what comes and goes within a lease is on no record
             born = {vehicle for vehicle, _ in self._births[w]} & gone.keys()
@@ -377,10 +387,23 @@ def unpacked(data: memoryview) -> list[tuple[int, Message]]:
     return found
 
 
-def read_report(data: memoryview) -> tuple[list[tuple[int, Message]], list[Report], memoryview]:
+def packed_report(messages: Sequence[tuple[int, Message]], reports: Sequence[Report]) -> bytes:
+    """Messages and what is said of each world, in whole words of 8 bytes; what follows may be."""
+    data = packed(messages)
+    said = b"" if all(map(NOTHING.__eq__, reports)) else json.dumps(reports).encode()
+    end = b" " * (-(len(data) + len(said)) % 8)
+    return _LENGTH.pack(len(data), len(said) + len(end)) + data + said + end
+
+
+def read_report(
+    data: memoryview,
+    num_worlds: int,
+) -> tuple[list[tuple[int, Message]], list[Report], memoryview]:
     """Messages, what is said of each world, and what follows."""
-    size, said = _LENGTH.unpack_from(data)
+    size, length = _LENGTH.unpack_from(data)
     at = _LENGTH.size
     messages = unpacked(data[at : at + size])
-    reports: Any = json.loads(bytes(data[at + size : at + size + said]))
-    return messages, [Report(*report) for report in reports], data[at + size + said :]
+    end = at + size + length
+    said = bytes(data[at + size : end]).rstrip()
+    reports = [Report(*report) for report in json.loads(said)] if said else [NOTHING] * num_worlds
+    return messages, reports, data[end:]

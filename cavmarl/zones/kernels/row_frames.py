@@ -31,6 +31,7 @@ from cavmarl.core.records.codes import COUNT_REROUTED
 ID = 0  # the word of a row that names the vehicle
 AFTER = 2  # words of a ghost behind its row and its step
 MOST = 64  # words of a ghost: one word has a bit for each that has changed
+NO_FRAME = -(1 << 62)
 
 Words = NDArray[np.int64]
 
@@ -43,8 +44,8 @@ class Both(NamedTuple):
     steps: Words  # (k, W, C, S)
     mine: NDArray[np.int64]  # zones of this process
     theirs: NDArray[np.int64]  # and of the other one
-    running: NDArray[np.int64]  # (W,) vehicles of this process, and of others as they come
-    rerouted: NDArray[np.int64]  # (W,) vehicles that had taken another way by the last frame
+    running: NDArray[np.int64]  # (W,) written: vehicles of this process, and of others as they come
+    rerouted: NDArray[np.int64]  # (W,) written: those that had taken another way by the last frame
 
 
 @kernel
@@ -77,6 +78,7 @@ def pack_frame(
     first = 1 + 3 * num_worlds
     total = 0
     leaving = 0
+    count_own(zoned, both.mine, both.running)
     for w in range(num_worlds):
         frame[1 + w] = both.running[w]
         frame[1 + num_worlds + w] = gate.counts[w, COUNT_REROUTED] - both.rerouted[w]
@@ -140,8 +142,8 @@ def _pack_ghosts(
     return at - begin
 
 
-@kernel
-def count_ghosts(both: Both, frame: Words) -> int:
+@inlined_kernel
+def _count_ghosts(both: Both, frame: Words) -> int:
     """How many ghosts a frame says that it has; -1: it is none that `pack_frame` makes.
 
     Nothing else of a frame may be read if it is -1, nor if there is no room for what it has.
@@ -178,32 +180,40 @@ def take_frame(
     gate: Gate,
     passing: Words,
     before: Words,
-    now: Words,  # (n, V + S + 2) written: the ghosts; as many as `count_ghosts` has said
+    now: Words,  # (n, V + S + 2) written: the ghosts, first of all
     frame: Words,
-) -> bool:
+) -> int:
     """Put what another process has packed behind the rows of zones of this one, and in the gate.
 
     Ghosts that can touch a vehicle come before those that cannot.
 
     Returns:
-        whether it is what `pack_frame` makes; else nothing is put anywhere.
+        how many ghosts it has; if there is no room for them, -1 less that number; `NO_FRAME`: it is
+        none that `pack_frame` makes. Below 0 nothing is put anywhere.
     """
+    total = _count_ghosts(both, frame)
+    if total < 0:
+        return NO_FRAME
+    if total > now.shape[0]:
+        return int(-1 - total)
+    now = now[:total]
     zoned = both.zoned
     num_worlds = zoned.num_owned.shape[1]
     first = 1 + 3 * num_worlds
     like = first + both.mine.size * num_worlds * 2
-    at = words = like + 2 * now.shape[0]
+    at = words = like + 2 * total
     row = passing.shape[2]
     for w in range(num_worlds):
         leaving = frame[1 + 2 * num_worlds + w]
         if gate.num_passing[w] + leaving > passing.shape[1]:
-            return False
+            return NO_FRAME
         words += leaving * row
     if not _unpack(before, now, frame, like, words):
-        return False
+        return NO_FRAME
     for w in range(num_worlds):
         both.running[w] += frame[1 + w]
         gate.counts[w, COUNT_REROUTED] += frame[1 + num_worlds + w]
+        both.rerouted[w] = gate.counts[w, COUNT_REROUTED]
         for _ in range(frame[1 + 2 * num_worlds + w]):
             _copy(frame, at, passing[w, gate.num_passing[w]], 0, row)
             gate.num_passing[w] += 1
@@ -215,7 +225,7 @@ def take_frame(
                 _put(both, side, both.mine[k], w, now[n], i < frame[first + 1])
                 n += 1
             first += 2
-    return True
+    return int(total)
 
 
 @inlined_kernel

@@ -1,0 +1,268 @@
+"""`Link`: a connection over which whole frames go.
+
+A frame is a head of fixed size and bytes. Frames of a connection arrive in their order, or the
+connection has ended. Nothing in a frame is ever run.
+
+    head    magic, version, kind, number, bytes of what follows, checksum of what follows,
+            checksum of the head
+
+The head's checksum begins with how many frames went before on that connection, so that one that
+comes twice or out of turn is no frame. It is compared before anything else of the frame is awaited.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+import struct
+import zlib
+from collections import deque
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import Any, NamedTuple, TypeAlias
+
+from cavmarl.core.errors import MessageError, NodeRefusedError
+
+MAGIC = b"cavN"
+VERSION = 5
+MAX_FRAME = 1 << 32
+_ALL = (1 << 32) - 1
+_HEAD = struct.Struct("<4sHHQQI")
+_SUM = struct.Struct("<I")
+_WHOLE_HEAD = struct.Struct("<4sHHQQII")
+HEAD_BYTES = _WHOLE_HEAD.size
+ROOM = 1 << 14  # bytes that are read at once where it is not known what comes
+MOST = 512  # pieces that the system is given at once
+
+# A machine that vanishes says nothing: after so many seconds it is asked, and again, so often.
+_ALIVE = [(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)] + [
+    (socket.IPPROTO_TCP, getattr(socket, name), value)
+    for name, value in (("TCP_KEEPIDLE", 10), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3))
+    if hasattr(socket, name)
+]
+
+Bytes: TypeAlias = bytes | bytearray | memoryview
+
+
+class FrameKind(IntEnum):
+    """What a frame carries."""
+
+    JOB = 0  # C → N: what to be
+    READY = 1  # N → C: where other nodes can call
+    JOIN = 2  # N → C: what it runs
+    COMMAND = 3  # C → N: a task, and what it needs
+    LEASE = 4  # C → N: STEP messages
+    REPORT = 5  # N → C: DONE messages, and what the next decision needs
+    MESSAGES = 6  # N → N, N → C: the protocol's other messages
+    RESULT = 7  # N → C: what a task gave
+    FAILED = 8  # N → C: an error
+    SHARE = 9  # N → N: a part of a tick
+    KEEP = 10  # N → N: the state of a node's zones, for when it is lost
+    RECOVER = 11  # C → N: nodes are lost or new; begin, or go back to a state that was kept
+    SYNC = 12  # N → N: all before this is of no use any more
+    PING = 13  # C → N: answer at once
+    PONG = 14  # N → C: the answer
+    AGENT = 15  # N → N: what is kept of an agent whose vehicle changes its node
+    WANTED = 16  # N → C: files that it does not have
+    FILES = 17  # C → N: those
+    MISSED = 18  # N → C: the connection to another node has ended
+    REFUSED = 19  # C → N: why it is of no use
+    END = 20  # C → N: it is needed no more
+    GIVE = 21  # N → N: the state of zones that another node hosts from now on
+    NOT_MINE = 22  # N → C: agents whose actions have come to the wrong node, and their owners
+    ACTIONS = 23  # C → N: those
+    EXCHANGE = 24  # N → C: messages that are sent, for a network simulator
+    RECEPTIONS = 25  # C → N: which of them are received where
+    PHASE = 26  # C → N, N → C: messages of the protocol that a plan of faults may harm
+
+
+class NodeFrame(NamedTuple):
+    """A frame that has come."""
+
+    kind: FrameKind
+    number: int  # which of its kind, as both ends count
+    data: memoryview
+
+
+_KINDS = {int(kind): kind for kind in FrameKind}
+URGENT = frozenset(
+    {
+        FrameKind.MESSAGES,
+        FrameKind.KEEP,
+        FrameKind.PING,
+        FrameKind.PONG,
+        FrameKind.MISSED,
+        FrameKind.AGENT,
+        FrameKind.FAILED,
+        FrameKind.GIVE,
+        FrameKind.NOT_MINE,
+        FrameKind.ACTIONS,
+        FrameKind.EXCHANGE,
+        FrameKind.RECEPTIONS,
+    }
+)
+
+
+class NeededNoMoreError(Exception):
+    """The coordinator says that this node may end."""
+
+
+class Link:
+    """One connection: what is to be sent, and what has come of the next frame."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        if connection.family != socket.AF_UNIX:
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            for level, option, value in _ALIVE:
+                connection.setsockopt(level, option, value)
+        connection.setblocking(False)
+        self.socket = connection
+        self.waiting: deque[Bytes] = deque()
+        self.frames: deque[NodeFrame] = deque()
+        self._room = memoryview(bytearray(ROOM))  # what has come, until it is known what it is
+        self._filled = 0  # bytes of it
+        self._opened: tuple[FrameKind, int, int, bytearray] | None = None  # of which a part is due
+        self._due = memoryview(b"")  # that part
+        self._num_sent = self._num_heard = 0  # frames
+        # of what has been decrypted and not read yet a poll tells nothing
+        self._has_more = hasattr(connection, "pending")
+
+    def send(self, kind: FrameKind, number: int, pieces: Sequence[Bytes]) -> int:
+        """Send what the system takes at once; the rest is kept, as a copy.
+
+        Returns:
+            bytes of the frame.
+        """
+        views: list[Bytes] = [b""]
+        checksum = size = 0
+        for piece in pieces:
+            if len(piece):
+                view = piece if type(piece) is bytes else memoryview(piece).cast("B")
+                checksum = zlib.crc32(view, checksum)
+                size += len(view)
+                views.append(view)
+        self._num_sent = self._num_sent + 1 & _ALL
+        head = _HEAD.pack(MAGIC, VERSION, kind, number, size, checksum)
+        views[0] = head + _SUM.pack(zlib.crc32(head, self._num_sent))
+        size += HEAD_BYTES
+        if rest := views if self.waiting else self._unsent(views, size):
+            self.waiting.extend(memoryview(bytes(view)) for view in rest)
+        return size
+
+    def go_on_sending(self) -> None:
+        self.waiting = deque(self._unsent(list(self.waiting), sum(map(len, self.waiting))))
+
+    def _unsent(self, pieces: list[Bytes], size: int) -> list[Bytes]:
+        """What is left of pieces of so many bytes after the system has taken all it can."""
+        while pieces:
+            try:
+                sent = self.socket.sendmsg(pieces if len(pieces) <= MOST else pieces[:MOST])
+            except BlockingIOError:
+                break
+            if sent == size:
+                return []
+            size -= sent
+            while sent >= len(pieces[0]):
+                sent -= len(pieces.pop(0))
+            if sent:
+                pieces[0] = pieces[0][sent:]
+        return pieces
+
+    def receive(self, urgent: deque[tuple[int, NodeFrame]], number: int) -> None:
+        """Take what has come; urgent frames are added to those of others, with a number each.
+
+        Raises:
+            EOFError, OSError: the other end has gone.
+            MessageError: what came is no frame.
+            NeededNoMoreError, NodeRefusedError: the coordinator has said its last word.
+        """
+        while True:
+            into = self._room[self._filled :] if self._opened is None else self._due
+            try:
+                got = self.socket.recv_into(into)
+            except BlockingIOError:
+                return
+            if not got:
+                raise EOFError
+            if self._opened is None:
+                self._split(self._filled + got, urgent, number)
+            elif got < len(into):
+                self._due = into[got:]
+            else:
+                opened, self._opened = self._opened, None
+                self._close(*opened, urgent, number)
+            if got < len(into) and not self._has_more:
+                return
+
+    def _split(self, filled: int, urgent: deque[tuple[int, NodeFrame]], number: int) -> None:
+        """Take the frames that begin in what has come."""
+        room, at = self._room, 0
+        while filled - at >= HEAD_BYTES:
+            kind, which, size, checksum = self._open(room[at : at + HEAD_BYTES])
+            at += HEAD_BYTES
+            body = bytearray(room[at : min(at + size, filled)])
+            at += len(body)
+            if due := size - len(body):
+                body += bytes(due)
+                self._due = memoryview(body)[-due:]
+                self._opened = (kind, which, checksum, body)
+            else:
+                self._close(kind, which, checksum, body, urgent, number)
+        self._filled = filled - at
+        if at < filled:
+            room[: filled - at] = bytes(room[at:filled])
+
+    def _open(self, head: memoryview) -> tuple[FrameKind, int, int, int]:
+        """The kind of a frame, its number, bytes of what follows, and its checksum."""
+        magic, version, code, number, size, checksum, own = _WHOLE_HEAD.unpack(head)
+        if magic != MAGIC:
+            raise MessageError(f"{bytes(magic)!r} begins no frame of a node")
+        if version != VERSION:
+            raise MessageError(
+                f"a frame of version {version}, this is {VERSION}: install the same cavmarl "
+                "everywhere"
+            )
+        self._num_heard = self._num_heard + 1 & _ALL
+        if zlib.crc32(head[: _HEAD.size], self._num_heard) != own:
+            raise MessageError("a frame's head is not what was sent, or not the next one")
+        kind = _KINDS.get(code)
+        if size > MAX_FRAME or kind is None:
+            raise MessageError(f"a frame of kind {code} with {size} bytes is none")
+        return kind, number, size, checksum
+
+    def _close(
+        self,
+        kind: FrameKind,
+        which: int,
+        checksum: int,
+        body: bytearray,
+        urgent: deque[tuple[int, NodeFrame]],
+        number: int,
+    ) -> None:
+        """Take a frame that has come whole."""
+        if zlib.crc32(body) != checksum:
+            raise MessageError("a frame is not what was sent")
+        frame = NodeFrame(kind, which, memoryview(body))
+        if kind in URGENT:
+            urgent.append((number, frame))
+        elif kind is FrameKind.END:
+            raise NeededNoMoreError
+        elif kind is FrameKind.REFUSED:
+            raise NodeRefusedError(f"the caller refuses this node: {_text(frame)}")
+        else:
+            self.frames.append(frame)
+
+
+def said_by(frame: NodeFrame) -> list[Any]:
+    """A list as JSON. Raises MessageError: it is none."""
+    try:
+        said = json.loads(bytes(frame.data))
+    except ValueError as error:
+        raise MessageError(f"a frame of kind {frame.kind.name} says nothing: {error}") from error
+    if not isinstance(said, list):
+        raise MessageError(f"a frame of kind {frame.kind.name} says {said!r}")
+    return said
+
+
+def _text(frame: NodeFrame) -> str:
+    return bytes(frame.data).decode(errors="replace")
