@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.records.arrays import RoadArrays
-from cavmarl.driving.kernels.trial_drive import BEYOND_M, stays_on_road
+from cavmarl.driving.kernels.trial_drive import BEYOND_M, FASTER_MPS, TRIAL_MPS, stays_on_road
 from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.roads.kernels.plans import TURNAROUND
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
@@ -96,11 +96,27 @@ class _Trial:
             return False
         for lane, following in pairwise(lanes):
             self._plan["next"][0, lane] = following
-        stays = self._drives(lanes[0], begin_m, lanes[-1], end_m)
+        ends = lanes[0], begin_m, lanes[-1], end_m
+        stays = self._drives(*ends)
+        if stays:
+            # So far it aimed as before the first link of the map. As it aims at this turn it may
+            # cut the corner, at whichever speed, until its centre is off the road.
+            self._plan["link"][0, lanes[0]] = link
+            stays = any(self._drives(*ends, speed, False) for speed in (TRIAL_MPS, FASTER_MPS))
+            self._plan["link"][0, lanes[0]] = 0
         self._plan["next"][0, lanes[0]] = -1
         return not stays
 
-    def _drives(self, lane: int, begin_m: float, last_lane: int, end_m: float) -> bool:
+    def _drives(
+        self,
+        lane: int,
+        begin_m: float,
+        last_lane: int,
+        end_m: float,
+        speed: float = TRIAL_MPS,
+        whole_body: bool = True,
+    ) -> bool:
+        inwards = -1 if self._network.left_hand else 1
         row = blank_vehicle()[0]
         row["length"], row["width"] = self._body.length, self._body.width
         return bool(
@@ -115,7 +131,8 @@ class _Trial:
                 last_lane,
                 max(end_m, 0.0),
                 self._steering_rad,
-                -1 if self._network.left_hand else 1,
+                inwards if whole_body else 0,
+                speed,
             )
         )
 

@@ -122,6 +122,31 @@ def test_one_that_has_waited_for_long_counts_on_others_to_brake(
     assert not blocks(arrives_s - 3.05, "out", 40.0, wait_s)
 
 
+@pytest.mark.parametrize(("foe_mps", "more"), [(10.0, False), (30.0, True)])
+def test_a_steered_car_leaves_a_fast_one_the_way_to_brake_behind_it(
+    network: RoadNetwork, foe_mps: float, more: bool
+) -> None:
+    own = np.repeat(np.arange(len(network.links)), network.links["num_conflicts"])
+    shared = next(k for k in np.flatnonzero(network.conflicts["merging"])
+                  if network.conflicts["must_yield"][k])  # fmt: skip
+    conflict, link = network.conflicts[shared], int(own[shared])
+    rows = np.concatenate([on_lane(network, 0, 0.0, speed=4.0)] * 2)
+    rows["speed"][1] = foe_mps
+    foe = np.zeros(1, APPROACH)
+    foe["link"], foe["row"], foe["half"], foe["speed"] = conflict["foe"], 1, HALF_M, foe_mps
+
+    def least_m(driver: int) -> float:
+        rows["driver"] = driver
+        for front_m in np.arange(5.0, 400.0):
+            foe["dist"] = front_m + HALF_M
+            if not foe_blocks(network.arrays, rows, rows[0], link, 5.0, 5.0, conflict, foe[0],
+                              True, np.zeros(1, np.int32)):  # fmt: skip
+                return float(front_m)
+        raise AssertionError("it waits for ever")
+
+    assert (least_m(DRIVER_AGENT) > least_m(DRIVER_BACKGROUND) + 5.0) == more
+
+
 def waiting_pair(**fields: Any) -> Any:
     """One that asks, and its foe at link 1: both stand and give way."""
     return vehicles([(0.0, 0.0, 0.0)] * 2, hold=HOLD_YIELD, stopped_at=[-1, 1], **fields)

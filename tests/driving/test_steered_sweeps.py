@@ -157,3 +157,35 @@ def test_one_that_crawls_askew_on_a_lane_beside_is_a_leader(
 
 def test_a_map_without_junctions_has_no_rows() -> None:
     assert len(with_steered_sweeps(network_of("ring")).sweeps) == 0
+
+
+@pytest.mark.parametrize(("beyond_m", "goes_on"), [(0.5, True), (-0.5, False)])
+def test_one_that_is_in_the_way_of_a_fast_one_does_not_stop_for_it(
+    network: RoadNetwork, beyond_m: float, goes_on: bool
+) -> None:
+    # It has the right of way: the fast one has to brake for it anyway.
+    found = None
+    for link, row in enumerate(network.links):
+        own = network.conflicts[row["first_conflict"] :][: row["num_conflicts"]]
+        for sweep in rows_of(network, link):
+            for conflict in own[(own["foe"] == sweep["foe"]) & ~own["must_yield"]]:
+                foe = network.links[sweep["foe"]]
+                theirs = network.conflicts[foe["first_conflict"] :][: foe["num_conflicts"]]
+                yields = theirs["must_yield"][theirs["foe"] == link].any()
+                steered = sweep["own"] == sweep["other"] == STEERED
+                if yields and steered and 0.0 < conflict["enter_m"] + 1.0 < sweep["enter_m"]:
+                    found = link, sweep, conflict
+    assert found is not None, "no steered car sweeps beyond the area that it has the right of"
+    link, sweep, conflict = found
+    lanes = [int(network.links[k]["from_lane"]) for k in (link, int(sweep["foe"]))]
+    rows = np.concatenate([on_lane(network, lane, 30.0, id=k) for k, lane in enumerate(lanes)])
+    rows["driver"], rows["hold"] = DRIVER_AGENT, HOLD_NONE
+    rows["speed"] = 2.0, 15.0
+    room = scratch(network, 2)
+    entry = room.approach[0]
+    entry["link"], entry["row"], entry["id"], entry["half"] = sweep["foe"], 1, -1, 2.5
+    entry["dist"], entry["speed"] = 20.0 + 2.5, 15.0
+    room.link_end[sweep["foe"]] = 1
+    place = float(conflict["enter_m"]) + beyond_m
+    stop = swept_stop(network.arrays, rows, 0, link, place, -np.inf, room)
+    assert (stop == np.inf) == goes_on

@@ -108,3 +108,22 @@ def test_the_controller_brings_a_car_to_the_middle_and_keeps_it_there(
         assert locate(roads.arrays, table, grid, car) == 0
         offsets.append(abs(float(car["d"])))
     assert max(offsets[len(offsets) // 2 :]) < 0.3
+
+
+@pytest.mark.parametrize(
+    ("speed", "d", "askew", "straightens"),
+    [
+        (0.3, -0.05, 0.5, True),  # its front would be over the far side
+        (0.3, -1.5, 0.5, False),  # it has room to come to the middle
+        (8.0, -0.05, 0.5, True),  # this fast it comes back anyway
+    ],
+)
+def test_a_car_that_crawls_to_a_lane_keeps_its_front_on_it(
+    speed: float, d: float, askew: float, straightens: bool
+) -> None:
+    roads = network("merge")
+    lane = roads.lane_ids.index("main_in_0")
+    row = on_lane(roads, lane, 50.0, speed=speed, d=d)
+    row["heading"] += askew
+    steering = steer_to_lane(roads.arrays, plans("merge"), row[0], lane, 5.0)
+    assert (steering < 0.0) == straightens

@@ -21,6 +21,19 @@ from tests.support.netgenerate import netconvert, netgenerate
 from tests.support.traffic import network
 
 STEERING_RAD = math.pi / 4.0
+# A road that bends by 100° to the right, its first lane within 3 m.
+CORNER = {
+    "nod": """<nodes><node id="z" x="-20" y="400"/>
+        <node id="a" x="-10" y="200"/><node id="b" x="0" y="0"/>
+        <node id="c" x="213" y="27"/><node id="d" x="194" y="-160"/></nodes>""",
+    "edg": """<edges><edge id="a0" from="z" to="a" numLanes="2"/>"""
+    + "".join(
+        f"""<edge id="{one}{two}" from="{one}" to="{two}" numLanes="2"/>"""
+        for one, two in ("ab", "ba", "bc", "cb", "cd", "dc")
+    )
+    + "</edges>",
+    "con": "<connections/>",
+}
 RANDOM = ["--rand", "--rand.iterations", "40", "--seed", "1"]
 
 
@@ -52,6 +65,20 @@ def test_turns_that_are_too_tight_are_sharp_ones_and_no_trip_has_one(tmp_path: P
         while plan[lane]["next"] >= 0:
             assert plan[lane]["link"] not in tight
             lane = int(plan[lane]["next"])
+
+
+def test_a_corner_is_tight_if_the_car_leaves_its_road_as_it_steers_there(tmp_path: Path) -> None:
+    # By the aim of a link that leads straight on the car would stay on its road.
+    for kind, text in CORNER.items():
+        (tmp_path / f"m.{kind}.xml").write_text(text)
+    roads = read_network(netconvert(tmp_path, "m"))
+    links = with_tight_turns(roads, STEERING_RAD).links
+    corners = {
+        roads.lane_ids[link["from_lane"]]: before["direction"] != link["direction"]
+        for before, link in zip(roads.links, links, strict=True)
+        if link["direction"] == ord("t") and before["direction"] != ord("t")
+    }
+    assert corners == {"bc_0": True}
 
 
 def test_turning_in_a_junction_is_not_the_wrong_way() -> None:

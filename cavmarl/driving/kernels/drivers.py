@@ -46,14 +46,13 @@ from cavmarl.driving.kernels.junctions import (
 )
 from cavmarl.driving.kernels.lane_choice import (
     MERGE_ROOM_M,
-    MERGE_ROOM_SHARE,
-    SWAP_ROOM_M,
     choose_lane,
     needed_change,
     room_for_more,
     thinks_of_lanes,
     wish_on_lane,
 )
+from cavmarl.driving.kernels.lane_ends import behind_over_line, lane_end, misses_change
 from cavmarl.driving.kernels.lane_index import VIEW_M, last_on
 from cavmarl.driving.kernels.stopping import way_to_stop
 from cavmarl.driving.kernels.swept_areas import (
@@ -77,6 +76,7 @@ FALL_IN_M = 100.0  # before the place where a lane change must be made
 # `MERGE_ROOM_M` of a steered vehicle on its way into the other lane: its front comes to 0.2 m
 # before the end, nearer than to a line.
 CHANGING_ROOM_M = -0.8
+MISSED_ROOM_M = 1.5  # more, where its lane goes on to a turn that it cannot take
 ROW_LINES = 3  # of a VEHICLE row that drivers ask for
 RETURN_MPS = 5.0  # at which a lost vehicle looks for its lane
 
@@ -119,32 +119,6 @@ def _is_askew(row: np.void, leader: np.void) -> bool:
     """Whether a leader around a corner stands so that its flank is nearer than its rear."""
     askew: bool = abs(wrap_angle(leader["heading"] - row["heading"])) > ASKEW_RAD
     return askew
-
-
-@kernel
-def _lane_end(
-    roads: RoadArrays,
-    travel: Travel,
-    row: np.void,
-    kind: np.void,
-    lane: int,
-    way: int,
-    distance: float,
-    merge_room_m: float,
-    dt: float,
-) -> float:
-    """The constraint of the end of a lane from which the way goes on only after a lane change."""
-    step = travel.steps[way + lane]
-    if step["to_go"] < math.inf and step["change"] == 0:
-        return no_constraint(kind)
-    # Stop with room enough to swing out, but on this lane and not before it.
-    length = roads.lanes[lane]["length_m"]
-    half = 0.5 * row["length"]
-    room = min(merge_room_m, MERGE_ROOM_SHARE * length)
-    if step["change"] > 0 and merge_room_m > 0.0:
-        room += row["length"] + SWAP_ROOM_M
-    place = max(length - half - room, min(2.0 * LINE_MARGIN_M, 0.5 * length))
-    return before_line(kind, row["speed"], distance - length + place, dt)
 
 
 @kernel
@@ -266,10 +240,8 @@ def _road_ahead(
             lane, way, link = leave(roads, step, before, way)
         else:
             lane, way, link = next_step(roads, travel, before, way)
-        if lane < 0:
-            end = _lane_end(
-                roads, travel, row, kind, before, before_way, distance, merge_room_m, dt
-            )
+        if lane < 0 or (steered and misses_change(roads, travel, before, before_way)):
+            end = lane_end(roads, travel, row, kind, before, before_way, distance, merge_room_m, dt)
             # A vehicle that has left that lane by any link may still have its rear over the end.
             leaving = behind_fork(roads, kind, row, before, -1, distance, scratch)
             constraint = max(constraint, end, leaving)
@@ -297,6 +269,9 @@ def _road_ahead(
             if gap < NEAR_M and _is_askew(row, rows[leader["row"]]):
                 gap -= ASKEW_M
             constraint = max(constraint, behind_entry(kind, speed, gap, leader))
+        elif stops and steered:
+            over = behind_over_line(roads, travel, row, kind, lane, way, distance, scratch)
+            constraint = max(constraint, over)
         if j >= 0 or stops:
             break
         distance += ahead["length_m"]
@@ -365,8 +340,11 @@ def decide(
         further_m = 0.0
         if driver == DRIVER_AGENT and step[i]["changes"] > 1:
             further_m = room_for_more(roads.lanes[row["lane"]], row, step[i])
+        room_m = MERGE_ROOM_M + further_m
+        if driver == DRIVER_AGENT and misses_change(roads, travel, row["lane"], row["way"]):
+            room_m += MISSED_ROOM_M
         constraint, allowed, hold, link_ahead = _road_ahead(
-            roads, travel, rows, k, step[i], phase, MERGE_ROOM_M + further_m, dt, scratch
+            roads, travel, rows, k, step[i], phase, room_m, dt, scratch
         )
         to_stop = way_to_stop(roads, travel, row)
         if to_stop < math.inf:

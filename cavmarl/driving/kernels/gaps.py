@@ -260,5 +260,10 @@ def foe_blocks(
     # With the speed that it has; vehicles that have waited for long count on it to brake.
     arrives = (foe["dist"] - foe["half"]) / max(foe["speed"], STANDING_MPS)
     arrives *= 1.0 + min(row["wait_s"] / IMPATIENCE_S, 1.0)
-    comes = arrives < time_out + (MERGE_AHEAD_S if conflict["merging"] else AHEAD_S)
+    ahead_s = MERGE_AHEAD_S if conflict["merging"] else AHEAD_S
+    faster_mps = foe["speed"] - leaves_mps
+    if conflict["merging"] and row["driver"] == DRIVER_AGENT and faster_mps > 0.0:
+        # A steered car comes slowly out of a turn: one that is fast needs the way to brake.
+        ahead_s = max(ahead_s, faster_mps * faster_mps / (2.0 * FORCED_STOP * foe["speed"]))
+    comes = arrives < time_out + ahead_s
     return HOLD_YIELD if comes else HOLD_NONE

@@ -88,7 +88,8 @@ def wish_on_lane(
     lane = row["lane"]
     kind = travel.types[row["vtype"]]
     desired = _desired(roads, kind, row, lane)
-    if k + 1 == scratch.lane_end[lane]:
+    sees = k + 1 < scratch.lane_end[lane]
+    if not sees or scratch.entries[k + 1]["s"] - row["s"] > travel.view_m:
         return wish(kind, row["speed"], desired, no_constraint(kind))
     leader = scratch.entries[k + 1]
     gap = leader["s"] - row["s"] - 0.5 * row["length"] - leader["half"]

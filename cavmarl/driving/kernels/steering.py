@@ -38,6 +38,8 @@ CUT_RADIUS_M = 6.0  # a turn of this radius is cut,
 WIDE_RADIUS_M = 9.0  # one of that is followed
 NEAR_TURN_M = 10.0  # before it, a junction counts as one
 TURNING_RATIO = 1.118  # radius of the turning circle over the wheelbase, wheels turned by 45°
+SLOW_MPS = 3.0  # a slower car on its way to a lane may stop askew:
+SWING_OUT_M = 0.1  # its front does not reach further over the far side of that lane
 CHORD_M = 1.5  # real lanes have corners: their direction is that of a chord, this far to both sides
 
 
@@ -102,7 +104,13 @@ def steer_to_lane(
     if aimed < math.inf:
         return aimed
     direction = _direction_at(roads, plans, row["goal"], lane, ahead)
-    return steering_control(row["speed"], d, wrap_angle(direction - row["heading"]), wheelbase)
+    turned = wrap_angle(direction - row["heading"])
+    if row["speed"] < SLOW_MPS and d * turned > 0.0 and not here["internal"]:
+        room = 0.5 * here["width_m"] + SWING_OUT_M - 0.5 * row["width"] + abs(d)
+        most = math.asin(clamp(2.0 * room / row["length"], 0.0, 1.0))
+        if abs(turned) > most:
+            d, turned = 0.0, math.copysign(abs(turned) - most, turned)
+    return steering_control(row["speed"], d, turned, wheelbase)
 
 
 @kernel

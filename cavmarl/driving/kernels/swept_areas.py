@@ -76,6 +76,8 @@ def swept_stop(
                 other = STEERED
             if foe["row"] == i or other != sweep["other"]:
                 continue
+            if own == STEERED and _stands_in_the_way(roads, link, place, sweep["foe"], foe):
+                continue  # that one brakes hard for it anyway: it does not stop there
             if _is_in_the_way(rows, row, foe, sweep, place, room_m):
                 # One that is in the area, too, stops where it is. Behind one that stands, or may
                 # have to for it, it waits before the junction: else neither could go on.
@@ -131,6 +133,26 @@ def _must_yield(roads: RoadArrays, link: int, other: int) -> bool:
     for c in range(first, first + roads.links[link]["num_conflicts"]):
         if roads.conflicts[c]["foe"] == other:
             return bool(roads.conflicts[c]["must_yield"])
+    return False
+
+
+@kernel
+def _stands_in_the_way(
+    roads: RoadArrays, link: int, place: float, foe_link: int, foe: np.void
+) -> bool:
+    """Whether a row whose front is at `place` is where a foe would drive that comes fast.
+
+    It has the right of way, and the foe is still before its line.
+    """
+    front = foe["dist"] - foe["half"]
+    if front <= 0.0 or not _needs(foe["speed"], front, HARD_STOP):
+        return False
+    first = roads.links[link]["first_conflict"]
+    for c in range(first, first + roads.links[link]["num_conflicts"]):
+        conflict = roads.conflicts[c]
+        if conflict["foe"] == foe_link:
+            inside: bool = place > conflict["enter_m"]
+            return inside and _must_yield(roads, foe_link, link)
     return False
 
 

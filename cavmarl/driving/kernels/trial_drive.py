@@ -15,7 +15,8 @@ from cavmarl.driving.kernels.bicycle import bicycle_step
 from cavmarl.driving.kernels.steering import steer_to_lane
 from cavmarl.driving.kernels.tracking import locate
 
-TRIAL_MPS = 3.5  # about the speed to which drivers slow down for sharp bends
+TRIAL_MPS = 3.5  # about the speed to which drivers slow down for sharp bends,
+FASTER_MPS = 4.2  # and for those of a right angle
 TRIAL_DT_S = 0.1
 SWING_M = 0.5  # of a body beyond the middle of a road: others have so much room beside them
 BEYOND_M = 12.0  # before and behind a junction: there a car swings out
@@ -26,7 +27,7 @@ MOST_TICKS = 5000
 def _reaches_over(roads: RoadArrays, row: np.void, lane: int, inwards: int) -> bool:
     """Whether a corner of a body lies far beyond the inner side of the innermost lane of a road."""
     here = roads.lanes[lane]
-    if (here["left"] if inwards > 0 else here["right"]) >= 0:
+    if inwards == 0 or (here["left"] if inwards > 0 else here["right"]) >= 0:
         return False
     cos = math.cos(row["heading"])
     sin = math.sin(row["heading"])
@@ -54,7 +55,9 @@ def stays_on_road(
     last_lane: int,  # on which it ends,
     end_m: float,  # and where on it
     steering_rad: float,  # the most that its front wheels turn
-    inwards: int,  # 1: the middle of the road is to the left, -1: to the right
+    # 1: the middle of the road is to the left, -1: to the right, 0: where it is does not matter
+    inwards: int,
+    speed: float,  # m/s
 ) -> bool:
     """Whether a car that creeps along its way is never off the road or on the wrong side.
 
@@ -67,14 +70,14 @@ def stays_on_road(
     row["lane"] = lane
     row["s"] = begin_m
     row["d"] = 0.0
-    row["speed"] = TRIAL_MPS
+    row["speed"] = speed
     for _ in range(MOST_TICKS):
         steering = steer_to_lane(roads, plan, row, row["lane"], wheelbase)
         row["x"], row["y"], row["heading"], _, _ = bicycle_step(
             row["x"],
             row["y"],
             row["heading"],
-            TRIAL_MPS,
+            speed,
             0.0,
             clamp(steering, -steering_rad, steering_rad),
             wheelbase,

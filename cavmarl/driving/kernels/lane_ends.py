@@ -1,0 +1,87 @@
+"""What the end of a lane asks of a driver: room to change lanes, and rears that are over it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from cavmarl.core.numba import kernel
+from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
+from cavmarl.driving.kernels.beside import behind_entry
+from cavmarl.driving.kernels.following import LINE_MARGIN_M, before_line, no_constraint
+from cavmarl.driving.kernels.lane_choice import MERGE_ROOM_SHARE, SWAP_ROOM_M
+from cavmarl.driving.kernels.lane_index import last_on
+from cavmarl.driving.kernels.ways import next_step
+
+LONGEST_HALF_M = 10.0  # of vehicles: a rear over a line belongs to a centre that is no further
+
+
+@kernel
+def lane_end(
+    roads: RoadArrays,
+    travel: Travel,
+    row: np.void,
+    kind: np.void,
+    lane: int,
+    way: int,
+    distance: float,
+    merge_room_m: float,
+    dt: float,
+) -> float:
+    """The constraint of the end of a lane from which the way goes on only after a lane change."""
+    step = travel.steps[way + lane]
+    if step["to_go"] < math.inf and step["change"] == 0:
+        return no_constraint(kind)
+    # Stop with room enough to swing out, but on this lane and not before it.
+    length = roads.lanes[lane]["length_m"]
+    half = 0.5 * row["length"]
+    room = min(merge_room_m, MERGE_ROOM_SHARE * length)
+    if step["change"] > 0 and merge_room_m > 0.0:
+        room += row["length"] + SWAP_ROOM_M
+    place = max(length - half - room, min(2.0 * LINE_MARGIN_M, 0.5 * length))
+    return before_line(kind, row["speed"], distance - length + place, dt)
+
+
+@kernel
+def misses_change(roads: RoadArrays, travel: Travel, lane: int, way: int) -> bool:
+    """Whether a lane that the way leaves sideways leads on to a turn that a car cannot take."""
+    if roads.lanes[lane]["internal"]:
+        return False
+    step = travel.steps[way + lane]
+    if step["link"] < 0 or step["change"] == 0:
+        return False
+    beyond = travel.steps[way + step["shift"] + roads.links[step["link"]]["to_lane"]]
+    misses: bool = beyond["turnarounds"] > step["turnarounds"]
+    return misses
+
+
+@kernel
+def behind_over_line(
+    roads: RoadArrays,
+    travel: Travel,
+    row: np.void,
+    kind: np.void,
+    lane: int,
+    way: int,
+    distance: float,
+    scratch: Scratch,
+) -> float:
+    """The constraint of a vehicle whose rear is still before the line, behind a short first lane.
+
+    `lane`: that lane, which begins at the line, `distance` m ahead.
+    """
+    line = distance
+    while distance - line < LONGEST_HALF_M:
+        distance += roads.lanes[lane]["length_m"]
+        lane, way, _ = next_step(roads, travel, lane, way)
+        if lane < 0:
+            break
+        j = last_on(scratch, lane, row["id"], distance, travel.view_m)
+        if j >= 0:
+            leader = scratch.entries[j]
+            rear = distance + leader["s"] - leader["half"]
+            if rear < line:
+                return behind_entry(kind, row["speed"], rear - 0.5 * row["length"], leader)
+            break
+    return no_constraint(kind)
