@@ -5,10 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cavmarl.driving.kernels.lane_choice import MERGE_ROOM_M, SWAP_ROOM_M, room_for_more
+from cavmarl.driving.kernels.lane_choice import (
+    MERGE_ROOM_M,
+    SWAP_ROOM_M,
+    room_for_more,
+    wish_on_lane,
+)
+from cavmarl.driving.kernels.lane_index import index_lanes
 from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.roads.network import LANE
 from cavmarl.roads.routing import PLAN
+from tests.support.traffic import network, on_lane, scratch, travel
 
 
 @pytest.mark.parametrize(
@@ -27,3 +34,23 @@ def test_each_further_change_of_lanes_has_room_of_its_own(
     lane, step = np.zeros(1, LANE)[0], np.zeros(1, PLAN)[0]
     lane["length_m"], step["changes"] = length_m, changes
     assert room_for_more(lane, blank_vehicle()[0], step) == pytest.approx(room_m)
+
+
+@pytest.mark.parametrize(("view_m", "minds"), [(100.0, True), (60.0, False)])
+def test_a_leader_beyond_the_view_is_none(view_m: float, minds: bool) -> None:
+    """Whether it is known depends on the zones."""
+    roads = network("merge")
+    tables = travel("merge")._replace(view_m=view_m)
+    lane = int(roads.lanes["length_m"].argmax())
+    length_m = float(roads.lanes["length_m"][lane])
+    assert length_m > 80.0
+    places = (1.0, 78.0)
+    rows = np.concatenate([on_lane(roads, lane, s, tables, id=k) for k, s in enumerate(places)])
+    rows["speed"] = 12.0, 0.0
+    wishes = []
+    for num in (1, 2):
+        room = scratch(roads, 2)
+        index_lanes(roads.arrays, tables, rows, num, room)
+        first = int(room.lane_start[lane])
+        wishes.append(wish_on_lane(roads.arrays, tables, rows[0], first, room))
+    assert (wishes[1] < wishes[0]) == minds

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -13,34 +12,16 @@ from cavmarl.driving.kernels.following import no_constraint
 from cavmarl.driving.kernels.lane_ends import LONGEST_HALF_M, behind_over_line, misses_change
 from cavmarl.driving.kernels.lane_index import index_lanes
 from cavmarl.driving.vehicle_types import generated_types
-from tests.support.driving import make_simulation, start, suggested
-from tests.support.netgenerate import netconvert
+from tests.support.dead_ends import before_dead_end, put
+from tests.support.driving import suggested
 from tests.support.traffic import network, on_lane, scratch, travel
-
-# The left lane leads to the goal; the right one to a dead end in which a car cannot turn.
-DEAD_END = {
-    "nod": """<nodes><node id="a" x="0" y="0"/><node id="b" x="300" y="0" type="unregulated"/>
-        <node id="c" x="600" y="0"/><node id="d" x="300" y="-200"/></nodes>""",
-    "edg": """<edges><edge id="ab" from="a" to="b" numLanes="2"/><edge id="bc" from="b" to="c"/>
-        <edge id="bd" from="b" to="d"/><edge id="db" from="d" to="b"/></edges>""",
-    "con": """<connections><connection from="ab" to="bc" fromLane="1" toLane="0"/>
-        <connection from="ab" to="bd" fromLane="0" toLane="0"/>
-        <connection from="db" to="bc" fromLane="0" toLane="0"/></connections>""",
-}
 
 
 def test_a_steered_car_stops_before_the_end_of_a_lane_to_a_turn_that_it_cannot_take(
     tmp_path: Path,
 ) -> None:
-    for kind, text in DEAD_END.items():
-        (tmp_path / f"m.{kind}.xml").write_text(text)
-    path = netconvert(tmp_path, "m")
-    overrides = {"traffic.destinations": ["bc"], "traffic.min_trip_m": 0.0}
-    world = make_simulation(path, mode="respawn", agents=2, background=0, overrides=overrides)
-    start(world, 0)
+    world, right, left, goal = before_dead_end(tmp_path, length_m=200.0)
     roads, plans, tables = world.network, world.plans, world._tick.traffic.travel
-    right, left = (roads.lane_ids.index(f"ab_{k}") for k in (0, 1))
-    goal = int(world.vehicles(0)["goal"][0])
     way = goal * len(roads.lanes)
     assert plans["change"][goal, right] == 1
     assert plans["link"][goal, right] >= 0, "its lane goes on, too"
@@ -51,16 +32,7 @@ def test_a_steered_car_stops_before_the_end_of_a_lane_to_a_turn_that_it_cannot_t
     rows = world.vehicles(0)  # side by side before the end
     end = float(roads.lanes["length_m"][right])
     for row, lane in zip(rows, (right, left), strict=True):
-        row["lane"], row["s"], row["d"], row["speed"], row["goal"] = (
-            lane,
-            end - 16.0,
-            0.0,
-            8.0,
-            goal,
-        )
-        row["x"], row["y"], _, cos, sin = roads.pose_on(lane, end - 16.0)[:5]
-        row["heading"], row["side_lane"], row["target_lane"] = math.atan2(sin, cos), -1, lane
-        row["way"] = way
+        put(world, row, lane, end - 16.0, 8.0, goal)
     throttle = suggested(world)[0, rows["agent"], 0]
     assert throttle[0] < -0.5
     assert throttle[1] > throttle[0]

@@ -113,9 +113,10 @@ def test_the_controller_brings_a_car_to_the_middle_and_keeps_it_there(
 @pytest.mark.parametrize(
     ("speed", "d", "askew", "straightens"),
     [
-        (0.3, -0.05, 0.5, True),  # its front would be over the far side
-        (0.3, -1.5, 0.5, False),  # it has room to come to the middle
-        (8.0, -0.05, 0.5, True),  # this fast it comes back anyway
+        (0.3, -0.5, 0.6, True),  # its front would be over the far side
+        (0.3, -0.5, 0.4, False),  # it has room to come to the middle
+        (0.3, -1.5, 0.5, False),
+        (8.0, -0.5, 0.6, True),  # this fast it comes back anyway
     ],
 )
 def test_a_car_that_crawls_to_a_lane_keeps_its_front_on_it(

@@ -16,6 +16,7 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import lane_grid, make_plans
 from cavmarl.roads.sumo_net.reader import read_network
 from cavmarl.traffic.turning_circle import with_tight_turns
+from tests.support.dead_ends import before_dead_end, put
 from tests.support.driving import drive, make_simulation, start, suggested
 from tests.support.netgenerate import netconvert, netgenerate
 from tests.support.traffic import network
@@ -169,40 +170,18 @@ def test_all_ways_into_one_lane_are_foes(tmp_path: Path) -> None:
     assert pairs > 100
 
 
-# The left lane leads to the goal; the right one, too, by a dead end in which a car cannot turn.
-BEHIND_DEAD_END = {
-    "nod": """<nodes><node id="a" x="0" y="0"/><node id="b" x="300" y="0" type="unregulated"/>
-        <node id="c" x="600" y="0"/><node id="d" x="300" y="-30"/></nodes>""",
-    "edg": """<edges><edge id="ab" from="a" to="b" numLanes="2"/><edge id="bc" from="b" to="c"/>
-        <edge id="bd" from="b" to="d"/><edge id="db" from="d" to="b"/></edges>""",
-    "con": """<connections><connection from="ab" to="bc" fromLane="1" toLane="0"/>
-        <connection from="ab" to="bd" fromLane="0" toLane="0"/>
-        <connection from="db" to="bc" fromLane="0" toLane="0"/></connections>""",
-}
-
-
 def test_a_steered_car_does_not_overtake_onto_a_way_with_a_turn_that_it_cannot_take(
     tmp_path: Path,
 ) -> None:
-    for kind, text in BEHIND_DEAD_END.items():
-        (tmp_path / f"m.{kind}.xml").write_text(text)
-    path = netconvert(tmp_path, "m")
-    overrides = {"traffic.destinations": ["bc"], "traffic.min_trip_m": 0.0}
-    world = make_simulation(path, mode="respawn", agents=2, background=0, overrides=overrides)
-    start(world, 0)
-    roads, plans = world.network, world.plans
-    right, left = (roads.lane_ids.index(f"ab_{k}") for k in (0, 1))
-    goal = int(world.vehicles(0)["goal"][0])
+    world, right, left, goal = before_dead_end(tmp_path, length_m=30.0)
+    plans = world.plans
     assert plans["turnarounds"][goal, [right, left]].tolist() == [1, 0]
     assert plans["change"][goal, right] == 0, "its way goes on from the right lane"
 
     def wants(lane: int) -> int:
         rows = world.vehicles(0)
         for row, s, speed in zip(rows, (60.0, 85.0), (13.0, 2.0), strict=True):
-            row["lane"], row["s"], row["d"], row["speed"], row["goal"] = lane, s, 0.0, speed, goal
-            row["x"], row["y"], _, cos, sin = roads.pose_on(lane, s)[:5]
-            row["heading"], row["side_lane"], row["target_lane"] = math.atan2(sin, cos), -1, lane
-            row["way"] = goal * len(roads.lanes)
+            put(world, row, lane, s, speed, goal)
         return int(suggested(world)[0, int(rows["agent"][0]), 1] * 1000.0)
 
     assert wants(left) == 0

@@ -88,8 +88,11 @@ def wish_on_lane(
     lane = row["lane"]
     kind = travel.types[row["vtype"]]
     desired = _desired(roads, kind, row, lane)
-    sees = k + 1 < scratch.lane_end[lane]
-    if not sees or scratch.entries[k + 1]["s"] - row["s"] > travel.view_m:
+    # Beyond the view a leader may be another zone's, and not known here.
+    follows = (
+        k + 1 < scratch.lane_end[lane] and scratch.entries[k + 1]["s"] - row["s"] <= travel.view_m
+    )
+    if not follows:
         return wish(kind, row["speed"], desired, no_constraint(kind))
     leader = scratch.entries[k + 1]
     gap = leader["s"] - row["s"] - 0.5 * row["length"] - leader["half"]
