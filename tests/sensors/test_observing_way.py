@@ -93,10 +93,11 @@ def test_way_and_conflicts_equal_their_twins_whatever_the_order(
 ) -> None:
     rows = data.draw(traffic(name))
     rows["width"] = 2.0
-    # Vehicles stand at equal places: their ranks must not hang on the last bit of a sum, and a
-    # gap is the sum of both axes.
-    nudge = 0.0137 * np.arange(len(rows)) ** 2
-    rows["x"], rows["y"] = rows["x"] + nudge, rows["y"] + 0.62 * nudge
+    # Vehicles stand at equal places, or mirrored about a third: their ranks must not hang on the
+    # last bit of a sum. Drawn numbers have no relation to one another; squares have (1 + 49 is
+    # twice 25).
+    nudge = np.random.default_rng(0).uniform(0.0, 1.0, (2, len(rows)))
+    rows["x"], rows["y"] = rows["x"] + nudge[0], rows["y"] + nudge[1]
     phase = phases(name, random)
     letters = shown(name, phase)
     roads, ways = network(name), plans(name)

