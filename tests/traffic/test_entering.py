@@ -156,9 +156,16 @@ def test_random_places_are_anywhere_and_others_in_another_tick(code: int) -> Non
     np.testing.assert_array_equal(found, [place(room, tick, pos_code=code) for tick in range(400)])
 
 
-def speed(room: Scratch, s: float = 20.0, vehicle: int = 50, **fields: Any) -> float:
+def speed(
+    room: Scratch,
+    s: float = 20.0,
+    vehicle: int = 50,
+    cars: NDArray[np.void] | None = None,
+    **fields: Any,
+) -> float:
     waiting = departure(id=vehicle, **fields)
-    return entry_speed(ROADS.arrays, TRAVEL, KEY, waiting, KIND, MAIN[0], s, room)
+    rows = traffic()[0] if cars is None else cars
+    return entry_speed(ROADS.arrays, TRAVEL, rows, KEY, waiting, KIND, MAIN[0], s, room)
 
 
 @pytest.mark.parametrize("factor", [0.8, 1.2])
@@ -200,6 +207,27 @@ def test_the_leader_may_be_beyond_the_end_of_the_lane() -> None:
     _, room = traffic((beyond, 0.0, 0.0))
     near = speed(room, s=LENGTH - 12.0, speed_code=codes.SPEED_MAX)
     assert near == pytest.approx(speed_behind(KIND, 7.0, 0.0, KIND["decel"]))
+
+
+@pytest.mark.parametrize(
+    ("askew", "driver", "minds"),
+    [(-0.47, codes.DRIVER_AGENT, True), (0.0, codes.DRIVER_AGENT, False),
+     (-0.47, codes.DRIVER_BACKGROUND, False)],
+)  # fmt: skip
+def test_a_steered_car_that_sticks_out_from_the_lane_beside_is_a_leader(
+    askew: float, driver: int, minds: bool
+) -> None:
+    # It has nearly made its change to the left, and its rear is still over the entrant's lane.
+    cars, _ = traffic((MAIN[1], 50.0, 2.0))
+    cars["driver"], cars["d"] = driver, -0.3
+    cars["heading"] -= askew
+    room = scratch(ROADS, 1)
+    index_lanes(ROADS.arrays, TRAVEL, cars, 1, room)
+    safe = speed_behind(KIND, 15.0, 2.0, KIND["decel"])
+    found = speed(room, s=30.0, cars=cars, speed_code=codes.SPEED_MAX)
+    assert found == pytest.approx(safe if minds else LIMIT)
+    near = speed(room, s=44.5, cars=cars, speed_code=codes.SPEED_MAX)
+    assert (near == -1.0) == minds
 
 
 def test_before_the_end_of_a_lane_nobody_enters_fast() -> None:

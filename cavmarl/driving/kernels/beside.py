@@ -71,6 +71,35 @@ def _sticks_out(roads: RoadArrays, other: np.void, to_left: bool) -> bool:
 
 
 @kernel
+def askew_beside(
+    roads: RoadArrays,
+    travel: Travel,
+    rows: NDArray[np.void],  # VEHICLE (C,)
+    lane: int,
+    s: float,
+    own_id: int,
+    to_left: bool,  # whether it is asked of the left neighbour
+    scratch: Scratch,
+) -> tuple[int, float]:
+    """The steered vehicle that sticks out from a neighbour lane into a lane, next ahead of `s`.
+
+    Its entry, and how far ahead its centre is in m; (-1, inf) where there is none.
+    """
+    here = roads.lanes[lane]
+    neighbor = here["left"] if to_left else here["right"]
+    if neighbor < 0:
+        return -1, math.inf
+    place = beside_s(roads, lane, neighbor, s)
+    k = ahead_on(scratch, neighbor, place, own_id, travel.view_m)
+    if k < 0 or scratch.entries[k]["side"]:
+        return -1, math.inf
+    other = rows[scratch.entries[k]["row"]]
+    if other["driver"] != DRIVER_AGENT or not _sticks_out(roads, other, not to_left):
+        return -1, math.inf
+    return k, scratch.entries[k]["s"] - place
+
+
+@kernel
 def behind_askew(
     roads: RoadArrays,
     travel: Travel,
@@ -81,18 +110,12 @@ def behind_askew(
 ) -> float:
     """The constraint of steered vehicles ahead on neighbour lanes that stick out into its own."""
     constraint = no_constraint(kind)
-    here = roads.lanes[row["lane"]]
-    for side in range(2):
-        lane = here["left"] if side == 0 else here["right"]
-        if lane < 0:
-            continue
-        s = beside_s(roads, row["lane"], lane, row["s"])
-        k = ahead_on(scratch, lane, s, row["id"], travel.view_m)
-        if k < 0 or scratch.entries[k]["side"]:
-            continue
-        leader = scratch.entries[k]
-        other = rows[leader["row"]]
-        if other["driver"] == DRIVER_AGENT and _sticks_out(roads, other, side == 1):
-            gap = leader["s"] - s - 0.5 * row["length"] - leader["half"]
+    for to_left in (True, False):
+        k, apart = askew_beside(
+            roads, travel, rows, row["lane"], row["s"], row["id"], to_left, scratch
+        )
+        if k >= 0:
+            leader = scratch.entries[k]
+            gap = apart - 0.5 * row["length"] - leader["half"]
             constraint = max(constraint, behind_entry(kind, row["speed"], gap, leader))
     return constraint

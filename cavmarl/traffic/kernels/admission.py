@@ -201,7 +201,7 @@ def propose(
             if not indexed:
                 index_lanes(roads, travel, rows, num, scratch)
                 indexed = True
-            speed = entry_speed(roads, travel, key, departure, kind, lane, s, scratch)
+            speed = entry_speed(roads, travel, rows, key, departure, kind, lane, s, scratch)
             if speed < 0.0:
                 continue
             if follower_brakes(roads, travel, rows, departure, kind, lane, s, speed, scratch):

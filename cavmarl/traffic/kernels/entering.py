@@ -29,6 +29,7 @@ from cavmarl.core.records.codes import (
     SPEED_RANDOM,
 )
 from cavmarl.core.records.rows import ENTER_REACH_M
+from cavmarl.driving.kernels.beside import askew_beside
 from cavmarl.driving.kernels.following import accel_behind, speed_behind
 from cavmarl.driving.kernels.lane_index import ahead_on, behind_on, comes_over, last_on
 from cavmarl.driving.kernels.ways import next_step
@@ -150,6 +151,7 @@ def speed_at(roads: RoadArrays, kind: np.void, lane: int, s: float, wanted: floa
 def entry_speed(
     roads: RoadArrays,
     travel: Travel,
+    rows: NDArray[np.void],
     key: np.uint64,
     departure: np.void,
     kind: np.void,
@@ -157,7 +159,10 @@ def entry_speed(
     s: float,
     scratch: Scratch,
 ) -> float:
-    """The speed in m/s with which a departure enters somewhere, -1 if the leader is too near."""
+    """The speed in m/s with which a departure enters somewhere, -1 if a leader is too near.
+
+    A steered vehicle that sticks out into its lane as it changes to the next one is a leader, too.
+    """
     here = roads.lanes[lane]
     code = departure["speed_code"]
     wanted = here["speed_mps"] * departure["speed_factor"]
@@ -178,16 +183,25 @@ def entry_speed(
     elif (code == SPEED_LAST or code == SPEED_AVERAGE) and j >= 0:
         wanted = min(wanted, scratch.entries[j]["speed"])
     wanted = speed_at(roads, kind, lane, s, wanted)
-    if j < 0:
-        return wanted
-    leader = scratch.entries[j]
-    gap = distance + leader["s"] - half - leader["half"]
-    if gap < ENTER_GAP_M:
-        return -1.0
-    safe = speed_behind(kind, gap, leader["speed"], leader["decel"])
-    if code == SPEED_GIVEN and safe < wanted:
+    safe = math.inf
+    if j >= 0:
+        safe = _safe_behind(kind, scratch.entries[j], distance + scratch.entries[j]["s"] - half)
+    for to_left in (True, False):
+        k, apart = askew_beside(roads, travel, rows, lane, s, departure["id"], to_left, scratch)
+        if k >= 0:
+            safe = min(safe, _safe_behind(kind, scratch.entries[k], apart - half))
+    if safe < 0.0 or (code == SPEED_GIVEN and safe < wanted):
         return -1.0
     return min(wanted, safe)
+
+
+@kernel
+def _safe_behind(kind: np.void, leader: np.void, to_centre: float) -> float:
+    """The speed in m/s that is safe behind an entry whose centre is so far ahead; -1: too near."""
+    gap = to_centre - leader["half"]
+    if gap < ENTER_GAP_M:
+        return -1.0
+    return speed_behind(kind, gap, leader["speed"], leader["decel"])
 
 
 @kernel
