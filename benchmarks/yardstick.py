@@ -40,6 +40,8 @@ MOST_SHARE = 0.0005  # of the trips that may end off the road, and with a collis
 STANDS_S = 120.0
 NEAR_AHEAD_M = 20.0  # another vehicle whose centre is so near ahead is a cause to stand
 COMES_M = 100.0  # as is one so near to a line that has the right of way
+AXIS_PLACES = 9  # of a vehicle, between which and those of another a touch is looked for
+NEAR_AXIS_M = 4.0  # nearer than that are the axes of two that touch
 TOGETHER = 100  # vehicles that are stepped at once, about
 RECORDED = ("off_road", "collision", "wrong_way", "red_light")
 OF_TRIPS = (*RECORDED, "shared_ground")  # the last are collisions, counted apart
@@ -192,7 +194,7 @@ def drive(env: str, model: str, agents: int, seconds: int, seed: int) -> Drive:
                 if trip[what]:
                     rows = before[trip["episode"]]
                     own = rows[rows["agent"] == trip["agent"]][0]
-                    shared = what == "collision" and ground.holds(own, rows)
+                    shared = what == "collision" and ground.holds(own, rows, vec.step_s)
                     named = "shared_ground" if shared else what
                     found.counts[named] += 1
                     found.faults.append(_place(vec, named, int(trip["episode"]), own, step))
@@ -224,13 +226,40 @@ class _SharedGround:
     def _pairs(self) -> frozenset[tuple[int, int]]:
         return frozenset(shared_ground(self._network))
 
-    def holds(self, row: np.void, rows: NDArray[np.void]) -> bool:
-        """Whether the vehicle next to one that collided is on a lane that shares its ground."""
+    def holds(self, row: np.void, rows: NDArray[np.void], dt: float) -> bool:
+        """Whether the vehicle that one is about to touch is on a lane that shares its ground.
+
+        `dt`: s until they touch, at most. It is the one to whose axis its own comes nearest. Where
+        none is near it has departed meanwhile: on the other lane, as on the same one it keeps off.
+        Inside a junction it counts as on the lanes that its own one leads from and to.
+        """
         others = rows[rows["id"] != row["id"]]
-        apart = np.hypot(others["x"] - row["x"], others["y"] - row["y"])
+        own_x, own_y = _axes(row[None], dt)
+        x, y = _axes(others, dt)
+        apart = np.hypot(x[:, :, None] - own_x, y[:, :, None] - own_y).min(axis=(1, 2))
         apart += np.where(np.abs(others["z"] - row["z"]) < LEVEL_M, 0.0, np.inf)
-        pair = sorted((int(row["lane"]), int(others["lane"][apart.argmin()])))
-        return (pair[0], pair[1]) in self._pairs
+        lanes = self._connected(int(row["lane"]))
+        if apart.min(initial=math.inf) > NEAR_AXIS_M:
+            return any(lane in pair for lane in lanes for pair in self._pairs)
+        beside = self._connected(int(others["lane"][apart.argmin()]))
+        pairs = [(min(one, other), max(one, other)) for one in lanes for other in beside]
+        return not self._pairs.isdisjoint(pairs)
+
+    def _connected(self, lane: int) -> tuple[int, ...]:
+        here = self._network.lanes[lane]
+        if not here["internal"]:
+            return (lane,)
+        link = self._network.links[here["link"]]
+        return int(link["from_lane"]), int(link["to_lane"])
+
+
+def _axes(rows: NDArray[np.void], dt: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Places from the rear to the front of vehicles, where they are after `dt`: (n, k) each."""
+    inset = 0.5 * (rows["length"] - rows["width"])
+    along = (rows["speed"] * dt)[:, None] + inset[:, None] * np.linspace(-1.0, 1.0, AXIS_PLACES)
+    x = rows["x"][:, None] + np.cos(rows["heading"])[:, None] * along
+    y = rows["y"][:, None] + np.sin(rows["heading"])[:, None] * along
+    return x, y
 
 
 class _Standing:

@@ -56,12 +56,19 @@ def test_what_touches_on_shared_ground_is_counted_apart(tmp_path: Path) -> None:
     one, other = yardstick.shared_ground(network)[0]
     rows = np.zeros(3, dtype=VEHICLE)
     rows["id"], rows["lane"], rows["x"] = [0, 1, 2], [one, other, one], [0.0, 4.0, 50.0]
-    assert ground.holds(rows[0], rows)
-    assert ground.holds(rows[1], rows)
+    assert ground.holds(rows[0], rows, 0.1)
+    assert ground.holds(rows[1], rows, 0.1)
     rows["x"] = [0.0, 50.0, 4.0]  # one behind the other on one lane
-    assert not ground.holds(rows[0], rows)
-    rows["x"], rows["z"] = [0.0, 4.0, 50.0], [0.0, 5.0, 0.0]  # one on a bridge
-    assert not ground.holds(rows[0], rows)
+    assert not ground.holds(rows[0], rows, 0.1)
+    rows["x"], rows["z"] = [0.0, 2.0, 4.0], [0.0, 5.0, 0.0]  # one on a bridge
+    assert not ground.holds(rows[0], rows, 0.1)
+    rows["x"] = [0.0, 50.0, 50.0]  # one that has departed meanwhile
+    assert ground.holds(rows[0], rows, 0.1)
+    # The one behind it has the nearer centre, and the one that comes touches it.
+    rows["z"], rows["length"], rows["width"] = 0.0, 5.0, 2.0
+    rows["x"], rows["speed"] = [0.0, 8.0, -6.0], [15.0, 15.0, 0.0]
+    rows["heading"][1] = np.pi
+    assert ground.holds(rows[0], rows, 0.1)
 
 
 def test_a_bound_that_is_broken_is_told() -> None:

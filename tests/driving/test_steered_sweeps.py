@@ -189,3 +189,32 @@ def test_one_that_is_in_the_way_of_a_fast_one_does_not_stop_for_it(
     place = float(conflict["enter_m"]) + beyond_m
     stop = swept_stop(network.arrays, rows, 0, link, place, -np.inf, room)
     assert (stop == np.inf) == goes_on
+
+
+@pytest.mark.parametrize(("place", "goes_on"), [(1.0, True), (-1.0, False)])
+def test_one_that_was_let_in_does_not_stop_where_a_fast_one_drives(
+    network: RoadNetwork, place: float, goes_on: bool
+) -> None:
+    # It turns before one that has the right of way, and would stop behind that one's front.
+    found = None
+    for link, row in enumerate(network.links):
+        own = network.conflicts[row["first_conflict"] :][: row["num_conflicts"]]
+        for sweep in rows_of(network, link):
+            for conflict in own[(own["foe"] == sweep["foe"]) & own["must_yield"]]:
+                steered = sweep["own"] == sweep["other"] == STEERED
+                over = conflict["enter_m"] < sweep["enter_m"] < conflict["leave_m"] + 5.0
+                if steered and over and sweep["enter_m"] > 5.0:
+                    found = link, sweep
+    assert found is not None, "no steered car gives way and sweeps beyond the middle"
+    link, sweep = found
+    lanes = [int(network.links[k]["from_lane"]) for k in (link, int(sweep["foe"]))]
+    rows = np.concatenate([on_lane(network, lane, 30.0, id=k) for k, lane in enumerate(lanes)])
+    rows["driver"], rows["hold"] = DRIVER_AGENT, HOLD_NONE
+    rows["speed"] = 2.0, 25.0
+    room = scratch(network, 2)
+    entry = room.approach[0]
+    entry["link"], entry["row"], entry["id"], entry["half"] = sweep["foe"], 1, -1, 2.5
+    entry["dist"], entry["speed"] = 60.0 + 2.5, 25.0
+    room.link_end[sweep["foe"]] = 1
+    stop = swept_stop(network.arrays, rows, 0, link, place, -np.inf, room)
+    assert (stop == np.inf) == goes_on

@@ -76,7 +76,7 @@ def swept_stop(
                 other = STEERED
             if foe["row"] == i or other != sweep["other"]:
                 continue
-            if own == STEERED and _stands_in_the_way(roads, link, place, sweep["foe"], foe):
+            if own == STEERED and _stands_in_the_way(roads, row, link, place, sweep, foe):
                 continue  # that one brakes hard for it anyway: it does not stop there
             if _is_in_the_way(rows, row, foe, sweep, place, room_m):
                 # One that is in the area, too, stops where it is. Behind one that stands, or may
@@ -138,11 +138,12 @@ def _must_yield(roads: RoadArrays, link: int, other: int) -> bool:
 
 @kernel
 def _stands_in_the_way(
-    roads: RoadArrays, link: int, place: float, foe_link: int, foe: np.void
+    roads: RoadArrays, row: np.void, link: int, place: float, sweep: np.void, foe: np.void
 ) -> bool:
-    """Whether a row whose front is at `place` is where a foe would drive that comes fast.
+    """Whether a row that stops for a foe's sweep stands where that one drives, and comes fast.
 
-    It has the right of way, and the foe is still before its line.
+    Its front is at `place`. The foe is still before its line. One that gives way has been let in,
+    and would stop behind the foe's front; one that has the right of way is there already.
     """
     front = foe["dist"] - foe["half"]
     if front <= 0.0 or not _needs(foe["speed"], front, HARD_STOP):
@@ -150,9 +151,13 @@ def _stands_in_the_way(
     first = roads.links[link]["first_conflict"]
     for c in range(first, first + roads.links[link]["num_conflicts"]):
         conflict = roads.conflicts[c]
-        if conflict["foe"] == foe_link:
-            inside: bool = place > conflict["enter_m"]
-            return inside and _must_yield(roads, foe_link, link)
+        if conflict["foe"] == sweep["foe"]:
+            if conflict["must_yield"] and place > 0.0:
+                place = max(place, sweep["enter_m"])
+            elif not _must_yield(roads, sweep["foe"], link):
+                return False
+            inside: bool = conflict["enter_m"] < place < conflict["leave_m"] + row["length"]
+            return inside
     return False
 
 
