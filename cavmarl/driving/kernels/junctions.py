@@ -40,7 +40,7 @@ from cavmarl.driving.kernels.gaps import (
     must_stop,
     stays_inside,
 )
-from cavmarl.driving.kernels.swept_areas import wait_place
+from cavmarl.driving.kernels.swept_areas import MOST_BACK_M, wait_place
 from cavmarl.driving.kernels.ways import next_step
 
 # m/s², a driver stops for yellow where this braking is enough; Krauss's brakes as hard as it can
@@ -52,7 +52,9 @@ EXIT_LOOK_M = 75.0  # and no further than this: ten cars stand there
 CREPT_M = 2.4  # a steered car whose front is so little beyond a red line,
 CREPT_MPS = 2.0  # and that is so slow, stays there;
 INSIDE_M = 1.0  # nearer to a waiting position inside it may be one that waits there
-STOP_LINE_M = 5.0  # standing with the front nearer than this counts as standing at the line
+STOP_LINE_M = 5.0  # standing with the front nearer than this counts as standing at the line,
+# and in an agent's seat nearer than this: it may wait so far before it, and with some slack
+STOP_SIGN_M = MOST_BACK_M + 2.0 * LINE_MARGIN_M
 
 
 @kernel
@@ -217,7 +219,7 @@ def note_stop(
         return
     here = roads.lanes[row["lane"]]
     to_line = here["length_m"] - row["s"] - 0.5 * row["length"] - here["stop_back_m"]
-    if to_line < STOP_LINE_M and must_stop(roads, link, link_signal(roads, link, phase)):
+    if to_line < STOP_SIGN_M and must_stop(roads, link, link_signal(roads, link, phase)):
         row["stopped_at"] = link
 
 
