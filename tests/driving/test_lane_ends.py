@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from cavmarl.core.records.codes import DRIVER_AGENT
+from cavmarl.driving.kernels.beside import behind_askew
 from cavmarl.driving.kernels.following import no_constraint
 from cavmarl.driving.kernels.lane_ends import LONGEST_HALF_M, behind_over_line, misses_change
 from cavmarl.driving.kernels.lane_index import index_lanes
@@ -59,3 +60,22 @@ def test_a_rear_over_the_line_is_a_leader_behind_a_short_first_lane(over_m: floa
         roads.arrays, tables, rows[0], kind, first, int(rows["way"][0]), 20.0, room
     )
     assert (found > no_constraint(kind)) == (over_m > 0.0)
+
+
+@pytest.mark.parametrize("askew", [0.5, 0.0])
+def test_a_car_that_sticks_out_beyond_the_border_of_a_lane_is_a_leader(askew: float) -> None:
+    roads, tables = network("merge"), travel("merge")
+    lane = roads.lane_ids.index("weave_1")
+    before = int(roads.arrays.into[roads.lanes["first_into"][lane]])
+    rows = np.concatenate(
+        [on_lane(roads, before, 10.0, tables, id=0, speed=8.0, driver=DRIVER_AGENT),
+         on_lane(roads, int(roads.lanes["left"][lane]), 6.0, tables, id=1, driver=DRIVER_AGENT)]
+    )  # fmt: skip
+    rows["heading"][1] += askew
+    room = scratch(roads, 2)
+    index_lanes(roads.arrays, tables, rows, 2, room)
+    kind = generated_types()[0]
+    found = behind_askew(roads.arrays, tables, rows, kind, rows[0], lane, -20.0, room)
+    assert (found > no_constraint(kind)) == (askew > 0.0)
+    far = behind_askew(roads.arrays, tables, rows, kind, rows[0], lane, -tables.view_m, room)
+    assert far == no_constraint(kind)

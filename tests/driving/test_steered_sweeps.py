@@ -151,7 +151,7 @@ def test_one_that_crawls_askew_on_a_lane_beside_is_a_leader(
     room = scratch(roads, 2)
     index_lanes(roads.arrays, tables, rows, 2, room)
     kind = generated_types()[0]
-    found = behind_askew(roads.arrays, tables, rows, kind, rows[0], room)
+    found = behind_askew(roads.arrays, tables, rows, kind, rows[0], lane, 20.0, room)
     assert (found > no_constraint(kind)) == minds
 
 

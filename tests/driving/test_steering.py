@@ -8,7 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cavmarl.driving.kernels.bicycle import bicycle_step
-from cavmarl.driving.kernels.steering import nearest_speed, steer_to_lane, take_meta_action
+from cavmarl.driving.kernels.highway_control import steering_control
+from cavmarl.driving.kernels.steering import (
+    TURN_MPS,
+    nearest_speed,
+    steer_to_lane,
+    take_meta_action,
+)
 from cavmarl.driving.kernels.tracking import locate
 from cavmarl.roads.routing import lane_grid
 from tests.support.traffic import network, on_lane, plans
@@ -128,3 +134,15 @@ def test_a_car_that_crawls_to_a_lane_keeps_its_front_on_it(
     row["heading"] += askew
     steering = steer_to_lane(roads.arrays, plans("merge"), row[0], lane, 5.0)
     assert (steering < 0.0) == straightens
+
+
+@pytest.mark.parametrize(("place", "as_fast"), [(5.0, True), (50.0, False)])
+def test_behind_a_junction_a_crawling_car_steers_no_harder_than_one_that_turns(
+    place: float, as_fast: bool
+) -> None:
+    # It has cut the corner, and would swing out over the other road.
+    roads = network("merge")
+    lane = roads.lane_ids.index("main_in_0")
+    row = on_lane(roads, lane, place, speed=1.0, d=-0.7)
+    steering = steer_to_lane(roads.arrays, plans("merge"), row[0], lane, 5.0)
+    assert steering == pytest.approx(steering_control(TURN_MPS if as_fast else 1.0, -0.7, 0.0, 5.0))

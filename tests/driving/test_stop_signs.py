@@ -10,7 +10,11 @@ import pytest
 import cavmarl
 from cavmarl.config.terms import TERMS
 from cavmarl.core.records.codes import DRIVER_AGENT
+from cavmarl.driving.kernels.junctions import note_stop
+from cavmarl.roads.routing import PLAN
+from cavmarl.roads.sumo_net.reader import read_network
 from tests.support.netgenerate import netgenerate
+from tests.support.traffic import on_lane
 
 STOP_SIGNS = ("allway_stop", "priority_stop")
 ARRIVAL = TERMS.index("arrival")
@@ -68,3 +72,40 @@ def test_agents_and_others_let_each_other_through_at_stop_signs(maps: dict[str, 
 
 def test_without_stop_signs_no_stop_is_noted(maps: dict[str, Path]) -> None:
     assert drive(maps["priority"], agents=6, steps=200, background=10)[1] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("stub", "to_line_m", "wait_s", "notes"),
+    [(False, 6.5, 1.0, True), (False, 6.5, 0.1, False), (False, 8.0, 1.0, False),
+     (True, 3.0, 1.0, True), (True, 8.0, 1.0, False)],
+)  # fmt: skip
+def test_one_that_waits_some_metres_before_a_stop_sign_has_stood_there(
+    maps: dict[str, Path], stub: bool, to_line_m: float, wait_s: float, notes: bool
+) -> None:
+    # It leaves room for those that sweep over its line; the lane before the sign may be a stub.
+    roads = read_network(maps["allway_stop"])
+    link = next(
+        k
+        for k, row in enumerate(roads.links)
+        if row["state"] == ord("w") and roads.lanes["num_into"][row["from_lane"]] > 0
+    )
+    lane = int(roads.links["from_lane"][link])
+    before = int(roads.arrays.into[roads.lanes["first_into"][lane]])
+    lanes = roads.lanes.copy()
+    if stub:
+        lanes["length_m"][lane] = 0.2
+    arrays = roads.arrays._replace(lanes=lanes)
+    steps = np.zeros((1, len(lanes)), PLAN)
+    steps["next"], steps["link"] = -1, -1
+    steps["next"][0, before], steps["link"][0, lane] = lane, link
+    own = before if stub else lane
+    rest = to_line_m - (0.2 if stub else 0.0) + 2.5
+    row = on_lane(roads, own, float(lanes["length_m"][own]) - rest, wait_s=wait_s)
+    note_stop(arrays, steps, row[0], np.zeros(0, np.int32))
+    assert row["stopped_at"][0] == (link if notes else -1)
+    row["wait_s"] = 0.0
+    note_stop(arrays, steps, row[0], np.zeros(0, np.int32))
+    assert row["stopped_at"][0] == (link if notes else -1), "it goes on, and has stood"
+    row["lane"] = int(roads.links["first_internal"][link])
+    note_stop(arrays, steps, row[0], np.zeros(0, np.int32))
+    assert row["stopped_at"][0] == -1

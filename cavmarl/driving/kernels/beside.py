@@ -106,15 +106,17 @@ def behind_askew(
     rows: NDArray[np.void],  # VEHICLE (C,)
     kind: np.void,
     row: np.void,  # of an agent
+    lane: int,  # its own, or one ahead,
+    s: float,  # and where it is on it: before its start if negative
     scratch: Scratch,
 ) -> float:
-    """The constraint of steered vehicles ahead on neighbour lanes that stick out into its own."""
+    """The constraint of steered vehicles ahead on neighbour lanes that stick out into a lane."""
     constraint = no_constraint(kind)
+    begin = max(s, 0.0)
     for to_left in (True, False):
-        k, apart = askew_beside(
-            roads, travel, rows, row["lane"], row["s"], row["id"], to_left, scratch
-        )
-        if k >= 0:
+        k, apart = askew_beside(roads, travel, rows, lane, begin, row["id"], to_left, scratch)
+        apart += begin - s
+        if k >= 0 and apart <= travel.view_m:
             leader = scratch.entries[k]
             gap = apart - 0.5 * row["length"] - leader["half"]
             constraint = max(constraint, behind_entry(kind, row["speed"], gap, leader))

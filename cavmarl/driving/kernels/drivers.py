@@ -39,6 +39,7 @@ from cavmarl.driving.kernels.following import (
 from cavmarl.driving.kernels.gaps import is_minor
 from cavmarl.driving.kernels.junctions import (
     STOP_LINE_M,
+    behind_merging,
     constraint_inside,
     has_crept,
     may_enter,
@@ -149,6 +150,9 @@ def _at_line(
         )
         swept = before_swept(roads, rows, i, kind, link, front, waits, dt, scratch)
         return max(constraint, swept), hold, False
+    merging = no_constraint(kind)
+    if row["driver"] == DRIVER_AGENT:
+        merging = behind_merging(roads, kind, row, link, distance, scratch)
     hold = may_enter(roads, travel, rows, i, link, distance, way, phase, scratch)
     waits = HOLD_NONE
     if hold == HOLD_NONE:
@@ -159,15 +163,16 @@ def _at_line(
         if hold != HOLD_NONE:
             to_line = min(to_line, max(stop, 0.0))
         elif stop < math.inf:
-            return before_line_gently(kind, row, stop, dt), HOLD_NONE, stop <= front
+            swept = before_line_gently(kind, row, stop, dt)
+            return max(swept, merging), HOLD_NONE, stop <= front
     if hold != HOLD_NONE:
         return before_line(kind, speed, to_line, dt), hold, True
     if front > SEE_FOES_M and kind["model"] == MODEL_KRAUSS and is_minor(roads, link, phase):
         return before_line(kind, speed, front + LINE_MARGIN_M, dt), HOLD_NONE, False
     if waits != HOLD_NONE:
         to_wait = front + wait_place(roads, link, 0.5 * row["length"])
-        return before_line(kind, speed, to_wait, dt), HOLD_NONE, False
-    return no_constraint(kind), HOLD_NONE, False
+        return max(before_line(kind, speed, to_wait, dt), merging), HOLD_NONE, False
+    return merging, HOLD_NONE, False
 
 
 @inlined_kernel
@@ -272,6 +277,9 @@ def _road_ahead(
         elif stops and steered:
             over = behind_over_line(roads, travel, row, kind, lane, way, distance, scratch)
             constraint = max(constraint, over)
+        if steered:
+            aside = behind_askew(roads, travel, rows, kind, row, lane, -distance, scratch)
+            constraint = max(constraint, aside)
         if j >= 0 or stops:
             break
         distance += ahead["length_m"]
@@ -351,7 +359,7 @@ def decide(
             constraint = max(constraint, before_line(kind, speed, to_stop + LINE_MARGIN_M, dt))
         askew = no_constraint(kind)
         if driver == DRIVER_AGENT:
-            askew = behind_askew(roads, travel, rows, kind, row, scratch)
+            askew = behind_askew(roads, travel, rows, kind, row, row["lane"], row["s"], scratch)
             constraint = max(constraint, askew)
         if row["side_lane"] >= 0:
             constraint = max(

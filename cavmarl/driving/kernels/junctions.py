@@ -47,6 +47,7 @@ from cavmarl.driving.kernels.ways import next_step
 COMFORT_STOP = 3.0
 STEERED_MPS = 5.0  # a steered car is taken to turn no faster than this
 LAST_CHANCE_M = 3.0  # with the front this near to the line
+STUB_LANES = 4  # looked along for a stop sign
 EXIT_LANES = 4  # looked along for room,
 EXIT_LOOK_M = 75.0  # and no further than this: ten cars stand there
 CREPT_M = 2.4  # a steered car whose front is so little beyond a red line,
@@ -205,22 +206,71 @@ def has_crept(
     return red
 
 
-@inlined_kernel
+@kernel
 def note_stop(
     roads: RoadArrays,
+    plans: NDArray[np.void],
     row: np.void,  # VEHICLE of an agent before its tick; stopped_at is written
-    link: int,  # that its plan takes at the end of its lane, or -1
     phase: NDArray[np.int32],  # (num_signals,) PHASE rows that are on
 ) -> None:
-    """Note before which stop sign an agent's vehicle has stood, until it leaves that lane."""
-    if row["stopped_at"] >= 0 and roads.links[row["stopped_at"]]["from_lane"] != row["lane"]:
-        row["stopped_at"] = -1
-    if link < 0 or row["wait_s"] < STOP_SIGN_S or roads.lanes[row["lane"]]["internal"]:
-        return
-    here = roads.lanes[row["lane"]]
-    to_line = here["length_m"] - row["s"] - 0.5 * row["length"] - here["stop_back_m"]
-    if to_line < STOP_SIGN_M and must_stop(roads, link, link_signal(roads, link, phase)):
-        row["stopped_at"] = link
+    """Note before which stop sign an agent's vehicle has stood, until it leaves that lane.
+
+    Where the lane before the sign is short the vehicle stands on one before that.
+    """
+    lane = row["lane"]
+    to_end = -row["s"] - 0.5 * row["length"]
+    noted = -1
+    for _ in range(STUB_LANES):
+        here, step = roads.lanes[lane], plans[row["goal"], lane]
+        to_end += here["length_m"]
+        if row["stopped_at"] >= 0 and roads.links[row["stopped_at"]]["from_lane"] == lane:
+            noted = row["stopped_at"]
+        to_line = to_end - here["stop_back_m"]
+        link = step["link"] if not here["internal"] and row["wait_s"] >= STOP_SIGN_S else -1
+        if link >= 0 and to_line < STOP_SIGN_M:
+            if must_stop(roads, link, link_signal(roads, link, phase)):
+                noted = link
+                break
+        lane = step["next"]
+        if noted >= 0 or lane < 0 or to_end > STOP_SIGN_M:
+            break
+    row["stopped_at"] = noted
+
+
+@kernel
+def behind_merging(
+    roads: RoadArrays,
+    kind: np.void,
+    row: np.void,
+    link: int,  # that it takes next
+    distance: float,  # of its centre to the end of its lane in m
+    scratch: Scratch,
+) -> float:
+    """The constraint of those that are on the junction on their way into the same lane.
+
+    They come slowly out of a turn: one that is fast brakes early.
+    """
+    constraint = no_constraint(kind)
+    front = 0.5 * row["length"] - distance
+    first = roads.links[link]["first_conflict"]
+    for c in range(first, first + roads.links[link]["num_conflicts"]):
+        conflict = roads.conflicts[c]
+        if not conflict["merging"]:
+            continue
+        for k in range(scratch.link_start[conflict["foe"]], scratch.link_end[conflict["foe"]]):
+            foe = scratch.approach[k]
+            foe_front = foe["half"] - foe["dist"]
+            rear = -foe["half"] - foe["dist"]
+            wait_m = roads.links[foe["link"]]["wait_m"]
+            waits = foe_front <= wait_m < conflict["foe_enter_m"] + LINE_MARGIN_M
+            if foe_front <= 0.0 or rear > conflict["foe_leave_m"] or waits:
+                continue
+            if foe["speed"] > STANDING_MPS:
+                gap = (conflict["leave_m"] - front) - (conflict["foe_leave_m"] - rear)
+                gap = max(gap, conflict["enter_m"] - front)
+                found = behind(kind, row["speed"], gap, foe["speed"], kind["decel"])
+                constraint = max(constraint, found)
+    return constraint
 
 
 @kernel

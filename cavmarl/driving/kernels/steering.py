@@ -37,6 +37,7 @@ MOST_TURN_RAD = 2.8  # a sharper turn counts as this
 CUT_RADIUS_M = 6.0  # a turn of this radius is cut,
 WIDE_RADIUS_M = 9.0  # one of that is followed
 NEAR_TURN_M = 10.0  # before it, a junction counts as one
+TURN_MPS = 3.5  # in and behind junctions a slower car steers as one that turns at this speed
 TURNING_RATIO = 1.118  # radius of the turning circle over the wheelbase, wheels turned by 45°
 SLOW_MPS = 3.0  # a slower car on its way to a lane may stop askew:
 SWING_OUT_M = 0.1  # its front does not reach further over the far side of that lane
@@ -110,7 +111,10 @@ def steer_to_lane(
         most = math.asin(clamp(2.0 * room / row["length"], 0.0, 1.0))
         if abs(turned) > most:
             d, turned = 0.0, math.copysign(abs(turned) - most, turned)
-    return steering_control(row["speed"], d, turned, wheelbase)
+    pace = row["speed"]
+    if 0.0 <= pace < TURN_MPS and (here["internal"] or s < NEAR_TURN_M):
+        pace = TURN_MPS
+    return steering_control(pace, d, turned, wheelbase)
 
 
 @kernel

@@ -130,7 +130,7 @@ def _drive_agent(
     if row["events"] & EVENTS_THAT_END:
         row["tick"] += 1
         return
-    note_stop(roads, row, plans[row["goal"], row["lane"]]["link"], worlds.signal_phase[w])
+    note_stop(roads, plans, row, worlds.signal_phase[w])
     kind = travel.types[row["vtype"]]
     throttle = commands[w, row["agent"], 0]
     steering = commands[w, row["agent"], 1]
