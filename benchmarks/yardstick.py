@@ -234,7 +234,7 @@ class _SharedGround:
         Inside a junction it counts as on the lanes that its own one leads from and to.
         """
         others = rows[rows["id"] != row["id"]]
-        own_x, own_y = _axes(row[None], dt)
+        own_x, own_y = _axes(rows[rows["id"] == row["id"]], dt)
         x, y = _axes(others, dt)
         apart = np.hypot(x[:, :, None] - own_x, y[:, :, None] - own_y).min(axis=(1, 2))
         apart += np.where(np.abs(others["z"] - row["z"]) < LEVEL_M, 0.0, np.inf)

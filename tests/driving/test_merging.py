@@ -1,0 +1,34 @@
+"""A steered car before a junction, and one that turns into its lane."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cavmarl.driving.kernels.following import no_constraint
+from cavmarl.driving.kernels.junctions import behind_merging
+from cavmarl.driving.vehicle_types import generated_types
+from tests.support.traffic import network, on_lane, scratch
+
+
+@pytest.mark.parametrize(("merging", "front_m"), [(True, 3.0), (False, 3.0), (True, -3.0)])
+def test_a_steered_car_brakes_early_behind_one_that_turns_into_its_lane(
+    merging: bool, front_m: float
+) -> None:
+    # By the shared area alone it would brake when no braking is enough any more.
+    roads, kind = network("intersection"), generated_types()[0]
+    own = np.repeat(np.arange(len(roads.links)), roads.links["num_conflicts"])
+    picked = int(np.flatnonzero(roads.conflicts["merging"] == merging)[0])
+    link, foe = int(own[picked]), int(roads.conflicts["foe"][picked])
+    lane = int(roads.links["from_lane"][link])
+    row = on_lane(roads, lane, float(roads.lanes["length_m"][lane]) - 40.0, speed=28.0)
+    room = scratch(roads, 2)
+    entry = room.approach[0]
+    entry["link"], entry["row"], entry["id"], entry["half"] = foe, 1, 1, 2.5
+    entry["dist"], entry["speed"] = 2.5 - front_m, 4.0
+    room.link_end[foe] = 1
+    found = behind_merging(roads.arrays, kind, row[0], link, 40.0, room)
+    if merging and front_m > 0.0:
+        assert found > 5.0
+    else:
+        assert found == no_constraint(kind)
