@@ -252,8 +252,8 @@ class Directory:
     def begin_quiet(self) -> bool:
         """Begin a tick of which there is nothing to say: no vehicle changes its owner, none is new.
 
-        No STEP is sent, and no DONE is awaited: `Endpoint.go_on` stands for both. For a coordinator
-        without a log.
+        No STEP is sent, and no DONE is awaited: `Endpoint.go_on` and `rest` stand for them. For a
+        coordinator without a log.
 
         Returns:
             whether there can be such a tick; else nothing has begun.

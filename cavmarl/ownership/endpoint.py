@@ -89,16 +89,18 @@ class Endpoint:
                 return NOTHING
         return self._drop(message, "kind")
 
-    def go_on(self) -> Advance:
+    def go_on(self) -> None:
         """Take a lease for the next tick without a STEP: the zone owns what it owned before."""
         if self.lease is not None:
             raise ProtocolError(f"zone {self.zone} has a lease for tick {self.lease} already")
-        return self._take_lease(
-            Step(
-                self.run, self.episode, self.tick + 1, self.zone, self.incarnation, self.tick,
-                owned=self.tally,
-            )
-        )  # fmt: skip
+        self._release()
+        self._hold(self.tick + 1, ())
+
+    def rest(self) -> None:
+        """End a lease of `go_on` in which no vehicle has left the world: there is no DONE of it."""
+        if self.lease is None:
+            raise ProtocolError(f"zone {self.zone} has no lease after tick {self.tick}")
+        self._end_lease(self.lease)
 
     def complete(
         self,
@@ -112,14 +114,17 @@ class Endpoint:
         for vehicle, _ in removed:
             after(Party.ROW, self.row_state(vehicle), Event.REMOVE)
             self.tally = self.tally.minus(self.run, vehicle, self.owned.pop(vehicle))
-        self.tick, self.lease = self.lease, None
-        self.offers.owed.clear()  # what is not answered by now is of the tick before
+        self._end_lease(self.lease)
         self._answer = Done(
             self.run, self.episode, self.tick, self.zone, self.incarnation,
             confirmed=self._entering, removed=tuple(sorted(removed)),
             owned=self.tally, rows=rows, payload=payload,
         )  # fmt: skip
         return self._answer
+
+    def _end_lease(self, tick: int) -> None:
+        self.tick, self.lease = tick, None
+        self.offers.owed.clear()  # what is not answered by now is of the tick before
 
     def offer(self, approaches: Iterable[Approach]) -> tuple[Message, ...]:
         """After `complete`, tell other zones of vehicles that come near, all of a tick at once."""
@@ -197,10 +202,7 @@ class Endpoint:
         return Reaction(advance=self._take_lease(step))
 
     def _take_lease(self, step: Step) -> Advance:
-        release = tuple(self.retained)
-        for vehicle in release:
-            after(Party.ROW, self.row_state(vehicle), Event.RELEASE)
-            del self.retained[vehicle]
+        release = self._release()
         leave = tuple(vehicle for vehicle, _ in step.leave)
         if self._safeguards.one_step_lease:
             for vehicle in leave:
@@ -215,13 +217,23 @@ class Endpoint:
             self._own(vehicle, 0, Event.SPAWN)
         if self._safeguards.ledger and step.owned != self.tally:
             step.owned.check(self.tally, f"zone {self.zone} on its way to tick {step.tick}")
-        self._entering = tuple(Confirmed(entry.vehicle, entry.epoch) for entry in step.enter)
-        self.lease, self._answer = step.tick, None
-        self.replicas.expire(self.tick)
+        self._hold(step.tick, tuple(Confirmed(vehicle, epoch) for vehicle, epoch, *_ in step.enter))
         return Advance(
             self.episode, step.tick, release, leave, overwrites + tuple(enter), step.spawn,
             step.payload,
         )  # fmt: skip
+
+    def _release(self) -> tuple[int, ...]:
+        """Let go of the rows that were kept until their switch was committed."""
+        release = tuple(self.retained)
+        for vehicle in release:
+            after(Party.ROW, self.row_state(vehicle), Event.RELEASE)
+            del self.retained[vehicle]
+        return release
+
+    def _hold(self, tick: int, entering: tuple[Confirmed, ...]) -> None:
+        self.lease, self._answer, self._entering = tick, None, entering
+        self.replicas.expire(self.tick)
 
     def _own(self, vehicle: int, epoch: int, event: Event) -> None:
         after(Party.ROW, self.row_state(vehicle), event)

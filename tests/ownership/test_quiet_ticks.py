@@ -55,7 +55,7 @@ class Both:
         assert self.directory.begin_quiet()
         for zone in self.zones.values():
             zone.go_on()
-            zone.complete(0)
+            zone.rest()
 
     def known(self) -> tuple[object, ...]:
         table = self.directory.table
@@ -89,7 +89,7 @@ def test_a_zone_may_have_something_to_say_after_all() -> None:
     assert quiet.directory.begin_quiet()
     for zone in quiet.zones.values():
         zone.go_on()
-    quiet.zones[1].complete(0)
+    quiet.zones[1].rest()
     done = quiet.zones[0].complete(0, [Removed(2, 1)])
     quiet.directory.break_quiet()
     quiet.deliver((done,))
@@ -133,3 +133,5 @@ def test_one_tick_at_a_time() -> None:
     both.zones[0].go_on()
     with pytest.raises(ProtocolError, match="zone 0 has a lease for tick 3 already"):
         both.zones[0].go_on()
+    with pytest.raises(ProtocolError, match="zone 1 has no lease after tick 2"):
+        both.zones[1].rest()

@@ -7,12 +7,14 @@ import zlib
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 
+import numpy as np
 import pytest
 
 from cavmarl.core.errors import MessageError
 from cavmarl.ownership.decisions import Neighbours
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import Done
+from cavmarl.parallel.hosts.encryption import encrypted
 from cavmarl.parallel.nodes.link import MAX_FRAME, FrameKind, NodeFrame, said_by
 from cavmarl.parallel.nodes.links import LinkLostError, Links
 from cavmarl.parallel.nodes.meeting import call_node, calls_of
@@ -107,6 +109,33 @@ def test_each_bit_of_a_frame_is_guarded() -> None:
         with pytest.raises(LinkLostError, match="frame"):
             links.take([0], WAIT_S)
         far.close()
+
+
+@pytest.mark.parametrize("is_encrypted", [False, True])
+def test_what_the_system_does_not_take_at_once_is_sent_later(is_encrypted: bool) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        ends = socket.create_connection(server.getsockname()), server.accept()[0]
+    if is_encrypted:
+        with ThreadPoolExecutor() as pool:
+            called = pool.submit(encrypted, ends[0], b"secret", calls=True)
+            there = encrypted(ends[1], b"secret", calls=False)
+            there.do_handshake()
+            ends = called.result(), there
+    near, far = (Links(lambda number, frame: None) for _ in ends)
+    near.add(0, ends[0])
+    far.add(0, ends[1])
+    parts = np.random.default_rng(0).integers(256, size=(3, 3 << 20), dtype=np.uint8)
+    for part in parts:
+        near.send(0, FrameKind.SHARE, 1, [part[:7].data, part[7:].data])
+        near.send(0, FrameKind.SYNC, 2, [b"small"])
+    with ThreadPoolExecutor() as pool:
+        flushed = pool.submit(near.flush)
+        for part in parts:
+            assert far.next(0).data == part.data
+            assert far.next(0).data == b"small"
+        flushed.result()
+    near.close()
+    far.close()
 
 
 @pytest.mark.parametrize("said", [b"no JSON", b"{}", b"\xff"])

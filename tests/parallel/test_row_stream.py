@@ -14,7 +14,7 @@ from cavmarl.core.records.arrays import Zoned
 from cavmarl.core.records.codes import COUNT_REROUTED
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.parallel.nodes.agent_stream import AgentStream
-from cavmarl.parallel.nodes.row_stream import RowStream, words_of
+from cavmarl.parallel.nodes.row_stream import RowStream, passing_of
 from cavmarl.shards.shard import make_zoned
 from cavmarl.traffic.departure_queue import make_gate
 from tests.support.traffic import network
@@ -37,11 +37,10 @@ class Node:
         self._frames = RowStream(self.zoned, zones, others, self.running, self.rerouted)
 
     def packed(self) -> bytearray:
-        passing = words_of(self.gate.passing)
-        return bytearray(self._frames.packed(1, self.gate, passing))
+        return bytearray(self._frames.packed(1, passing_of(self.gate)))
 
     def take(self, data: bytes | bytearray) -> None:
-        self._frames.take(memoryview(data), 1, self.gate, words_of(self.gate.passing))
+        self._frames.take(memoryview(data), 1, passing_of(self.gate))
 
 
 def nodes() -> tuple[Node, Node]:

@@ -24,8 +24,8 @@ from cavmarl.parallel.nodes.fault_phases import (
 )
 from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
 from cavmarl.parallel.nodes.links import Links
-from cavmarl.parallel.nodes.node_executor import NodeExecutor
 from cavmarl.parallel.nodes.zone_hosts import ZoneHosts
+from cavmarl.shards.executor import Executor
 
 NEVER = -1  # a tick in which no process dies
 
@@ -47,7 +47,7 @@ class FaultyZoneHosts(ZoneHosts):
         self._others = sorted(set(self._node_of) - own)
         self._arrived: defaultdict[int, dict[int, memoryview]] = defaultdict(dict)
 
-    def executor(self, plain: NodeExecutor) -> NodeExecutor:
+    def executor(self, plain: Executor) -> Executor:
         """What runs the phases of a tick."""
         return plain if self._crashes is None else _Dying(plain, sorted(self._zones), self._crashes)
 
@@ -96,11 +96,11 @@ class FaultyZoneHosts(ZoneHosts):
     def _from(self, node: int, number: int) -> list[Parcel]:
         """What another node sends in a phase."""
         links = self._links
-        links.awaited = {node}
+        links.wanted = (node,)
         while node not in self._arrived[number]:
             links.heed()
             links.pump(None)
-        links.awaited = set()
+        links.wanted = ()
         return unpacked_parcels(self._arrived[number][node])[1]
 
     def _said(self, arrived: int) -> Said:
@@ -181,10 +181,10 @@ _POINTS: dict[type[Any], tuple[str, str]] = {
 }
 
 
-class _Dying(NodeExecutor):
+class _Dying:
     """Runs the phases of zones whose process dies at some of them."""
 
-    def __init__(self, plain: NodeExecutor, zones: Sequence[int], crashes: Crashes) -> None:
+    def __init__(self, plain: Executor, zones: Sequence[int], crashes: Crashes) -> None:
         self._plain, self._zones, self._crashes = plain, zones, crashes
 
     def each(self, phase: str, *arguments: Any) -> None:

@@ -15,11 +15,13 @@ from __future__ import annotations
 import json
 import socket
 import struct
-import zlib
 from collections import deque
 from collections.abc import Sequence
+from contextlib import suppress
 from enum import IntEnum
+from itertools import islice
 from typing import Any, NamedTuple, TypeAlias
+from zlib import crc32
 
 from cavmarl.core.errors import MessageError, NodeRefusedError
 
@@ -27,12 +29,14 @@ MAGIC = b"cavN"
 VERSION = 5
 MAX_FRAME = 1 << 32
 _ALL = (1 << 32) - 1
-_HEAD = struct.Struct("<4sHHQQI")
+BEGIN = MAGIC + VERSION.to_bytes(2, "little")
+_HEAD = struct.Struct("<6sHQQI")
+SUMMED = _HEAD.size  # bytes of a head that its checksum is of
 _SUM = struct.Struct("<I")
-_WHOLE_HEAD = struct.Struct("<4sHHQQII")
+_WHOLE_HEAD = struct.Struct("<6sHQQII")
 HEAD_BYTES = _WHOLE_HEAD.size
+MOST = 512  # frames that the system is given at once
 ROOM = 1 << 14  # bytes that are read at once where it is not known what comes
-MOST = 512  # pieces that the system is given at once
 
 # A machine that vanishes says nothing: after so many seconds it is asked, and again, so often.
 _ALIVE = [(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)] + [
@@ -101,6 +105,7 @@ URGENT = frozenset(
         FrameKind.RECEPTIONS,
     }
 )
+_AT_ONCE = URGENT | {FrameKind.END, FrameKind.REFUSED}  # not kept until they are taken
 
 
 class NeededNoMoreError(Exception):
@@ -117,12 +122,12 @@ class Link:
                 connection.setsockopt(level, option, value)
         connection.setblocking(False)
         self.socket = connection
-        self.waiting: deque[Bytes] = deque()
+        self.waiting: deque[memoryview] = deque()
         self.frames: deque[NodeFrame] = deque()
         self._room = memoryview(bytearray(ROOM))  # what has come, until it is known what it is
         self._filled = 0  # bytes of it
-        self._opened: tuple[FrameKind, int, int, bytearray] | None = None  # of which a part is due
-        self._due = memoryview(b"")  # that part
+        self._into = self._room  # where the next bytes go: there, or into a frame that has begun
+        self._opened: tuple[NodeFrame, int] | None = None  # that frame, and its checksum
         self._num_sent = self._num_heard = 0  # frames
         # of what has been decrypted and not read yet a poll tells nothing
         self._has_more = hasattr(connection, "pending")
@@ -133,40 +138,29 @@ class Link:
         Returns:
             bytes of the frame.
         """
-        views: list[Bytes] = [b""]
-        checksum = size = 0
-        for piece in pieces:
-            if len(piece):
-                view = piece if type(piece) is bytes else memoryview(piece).cast("B")
-                checksum = zlib.crc32(view, checksum)
-                size += len(view)
-                views.append(view)
-        self._num_sent = self._num_sent + 1 & _ALL
-        head = _HEAD.pack(MAGIC, VERSION, kind, number, size, checksum)
-        views[0] = head + _SUM.pack(zlib.crc32(head, self._num_sent))
-        size += HEAD_BYTES
-        if rest := views if self.waiting else self._unsent(views, size):
-            self.waiting.extend(memoryview(bytes(view)) for view in rest)
+        data = b"".join(pieces)
+        self._num_sent = num_sent = self._num_sent + 1 & _ALL
+        head = _HEAD.pack(BEGIN, kind, number, len(data), crc32(data))
+        head += _SUM.pack(crc32(head, num_sent))
+        size, sent = HEAD_BYTES + len(data), 0
+        if not self.waiting:
+            try:
+                sent = self.socket.sendmsg((head, data))
+            except BlockingIOError:
+                pass
+        if sent < size:
+            self.waiting.append(memoryview(head + data)[sent:])
         return size
 
     def go_on_sending(self) -> None:
-        self.waiting = deque(self._unsent(list(self.waiting), sum(map(len, self.waiting))))
-
-    def _unsent(self, pieces: list[Bytes], size: int) -> list[Bytes]:
-        """What is left of pieces of so many bytes after the system has taken all it can."""
-        while pieces:
-            try:
-                sent = self.socket.sendmsg(pieces if len(pieces) <= MOST else pieces[:MOST])
-            except BlockingIOError:
-                break
-            if sent == size:
-                return []
-            size -= sent
-            while sent >= len(pieces[0]):
-                sent -= len(pieces.pop(0))
-            if sent:
-                pieces[0] = pieces[0][sent:]
-        return pieces
+        waiting = self.waiting
+        with suppress(BlockingIOError):
+            while waiting:
+                sent = self.socket.sendmsg(list(islice(waiting, MOST)))
+                while waiting and sent >= len(waiting[0]):
+                    sent -= len(waiting.popleft())
+                if sent:
+                    waiting[0] = waiting[0][sent:]
 
     def receive(self, urgent: deque[tuple[int, NodeFrame]], number: int) -> None:
         """Take what has come; urgent frames are added to those of others, with a number each.
@@ -177,7 +171,7 @@ class Link:
             NeededNoMoreError, NodeRefusedError: the coordinator has said its last word.
         """
         while True:
-            into = self._room[self._filled :] if self._opened is None else self._due
+            into = self._into
             try:
                 got = self.socket.recv_into(into)
             except BlockingIOError:
@@ -187,9 +181,9 @@ class Link:
             if self._opened is None:
                 self._split(self._filled + got, urgent, number)
             elif got < len(into):
-                self._due = into[got:]
+                self._into = into[got:]
             else:
-                opened, self._opened = self._opened, None
+                opened, self._opened, self._into = self._opened, None, self._room
                 self._close(*opened, urgent, number)
             if got < len(into) and not self._has_more:
                 return
@@ -198,59 +192,62 @@ class Link:
         """Take the frames that begin in what has come."""
         room, at = self._room, 0
         while filled - at >= HEAD_BYTES:
-            kind, which, size, checksum = self._open(room[at : at + HEAD_BYTES])
+            begin, code, which, size, checksum, own = _WHOLE_HEAD.unpack_from(room, at)
+            self._num_heard = heard = self._num_heard + 1 & _ALL
+            is_next = crc32(room[at : at + SUMMED], heard) == own
+            if begin != BEGIN or not is_next or code not in _KINDS or size > MAX_FRAME:
+                raise _stranger(begin, is_next, code, size)
             at += HEAD_BYTES
-            body = bytearray(room[at : min(at + size, filled)])
-            at += len(body)
-            if due := size - len(body):
-                body += bytes(due)
-                self._due = memoryview(body)[-due:]
-                self._opened = (kind, which, checksum, body)
-            else:
-                self._close(kind, which, checksum, body, urgent, number)
-        self._filled = filled - at
+            end = at + size
+            if end <= filled:
+                data = memoryview(bytearray(room[at:end]))
+                self._close(NodeFrame(_KINDS[code], which, data), checksum, urgent, number)
+                at = end
+                continue
+            data, come = memoryview(bytearray(size)), filled - at
+            data[:come] = room[at:filled]
+            self._opened = NodeFrame(_KINDS[code], which, data), checksum
+            self._into, self._filled = data[come:], 0
+            return
         if at < filled:
             room[: filled - at] = bytes(room[at:filled])
-
-    def _open(self, head: memoryview) -> tuple[FrameKind, int, int, int]:
-        """The kind of a frame, its number, bytes of what follows, and its checksum."""
-        magic, version, code, number, size, checksum, own = _WHOLE_HEAD.unpack(head)
-        if magic != MAGIC:
-            raise MessageError(f"{bytes(magic)!r} begins no frame of a node")
-        if version != VERSION:
-            raise MessageError(
-                f"a frame of version {version}, this is {VERSION}: install the same cavmarl "
-                "everywhere"
-            )
-        self._num_heard = self._num_heard + 1 & _ALL
-        if zlib.crc32(head[: _HEAD.size], self._num_heard) != own:
-            raise MessageError("a frame's head is not what was sent, or not the next one")
-        kind = _KINDS.get(code)
-        if size > MAX_FRAME or kind is None:
-            raise MessageError(f"a frame of kind {code} with {size} bytes is none")
-        return kind, number, size, checksum
+        if self._filled or at < filled:
+            self._into = room[filled - at :]
+        self._filled = filled - at
 
     def _close(
         self,
-        kind: FrameKind,
-        which: int,
+        frame: NodeFrame,
         checksum: int,
-        body: bytearray,
         urgent: deque[tuple[int, NodeFrame]],
         number: int,
     ) -> None:
         """Take a frame that has come whole."""
-        if zlib.crc32(body) != checksum:
+        if crc32(frame.data) != checksum:
             raise MessageError("a frame is not what was sent")
-        frame = NodeFrame(kind, which, memoryview(body))
-        if kind in URGENT:
+        kind = frame.kind
+        if kind not in _AT_ONCE:
+            self.frames.append(frame)
+        elif kind in URGENT:
             urgent.append((number, frame))
         elif kind is FrameKind.END:
             raise NeededNoMoreError
-        elif kind is FrameKind.REFUSED:
-            raise NodeRefusedError(f"the caller refuses this node: {_text(frame)}")
         else:
-            self.frames.append(frame)
+            raise NodeRefusedError(f"the caller refuses this node: {_text(frame)}")
+
+
+def _stranger(begin: bytes, is_next: bool, code: int, size: int) -> MessageError:
+    """Why a head is none."""
+    version = int.from_bytes(begin[len(MAGIC) :], "little")
+    if not begin.startswith(MAGIC):
+        return MessageError(f"{begin[: len(MAGIC)]!r} begins no frame of a node")
+    if version != VERSION:
+        return MessageError(
+            f"a frame of version {version}, this is {VERSION}: install the same cavmarl everywhere"
+        )
+    if not is_next:
+        return MessageError("a frame's head is not what was sent, or not the next one")
+    return MessageError(f"a frame of kind {code} with {size} bytes is none")
 
 
 def said_by(frame: NodeFrame) -> list[Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import select
 import socket
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from typing import TypeAlias
 
@@ -47,11 +47,12 @@ class Links:
     def __init__(self, urgent: Urgent, system: NodeSystem = MACHINE) -> None:
         self.urgent = urgent
         self.now_s = system.now_s
+        self._looks = system.looks
         self._links: dict[int, Link] = {}
         self._poll = system.poll()
-        self._by_socket: dict[int, int] = {}
+        self._by_socket: dict[int, tuple[int, Link]] = {}
         self._heard: deque[tuple[int, NodeFrame]] = deque()  # urgent frames, and their senders
-        self.awaited: set[int] = set()  # whose frames `take` waits for
+        self.wanted: Collection[int] = ()  # whose frames `take` waits for
         self.waited_s = 0.0
         self.sent_bytes = 0
         self.sent_frames = 0
@@ -59,12 +60,18 @@ class Links:
     def add(self, number: int, connection: socket.socket | Link) -> None:
         link = connection if isinstance(connection, Link) else Link(connection)
         self._links[number] = link
-        self._by_socket[link.socket.fileno()] = number
+        self._by_socket[link.socket.fileno()] = number, link
         self._poll.register(link.socket, select.POLLIN)
 
     @property
     def numbers(self) -> tuple[int, ...]:
         return tuple(self._links)
+
+    @property
+    def awaited(self) -> list[int]:
+        """Whose frames `take` waits for."""
+        links = self._links
+        return sorted(n for n in self.wanted if n not in links or not links[n].frames)
 
     def send(self, to: int, kind: FrameKind, number: int, pieces: Sequence[Bytes] = ()) -> None:
         """Send a frame.
@@ -72,20 +79,20 @@ class Links:
         Raises:
             LinkLostError: the other end has gone.
         """
-        link = self._links.get(to)
-        if link is None:
-            raise LinkLostError(to)
-        self.sent_frames += 1
         try:
+            link = self._links[to]
             self.sent_bytes += link.send(kind, number, pieces)
+        except KeyError:
+            raise LinkLostError(to) from None
         except OSError as error:
             raise self._lost(to, error) from error
+        self.sent_frames += 1
         if link.waiting:
             self._poll.modify(link.socket, select.POLLIN | select.POLLOUT)
 
     def take(
         self,
-        wanted: Iterable[int],  # numbers of the nodes whose frames are awaited
+        wanted: Collection[int],  # numbers of the nodes whose frames are awaited
         timeout_s: float | None = None,  # None: as long as it takes
     ) -> dict[int, NodeFrame]:
         """The next frame of each.
@@ -96,22 +103,46 @@ class Links:
             SilenceError: nothing has come in time.
             RecoveryOrderedError: the coordinator has one that is not awaited.
         """
-        numbers, links = list(wanted), self._links
+        links, heeds = self._links, COORDINATOR not in wanted
+        self.wanted = wanted
         until_s = None if timeout_s is None else self.now_s() + timeout_s
-        while True:
-            if COORDINATOR not in numbers:
-                self.heed()
-            missing = {n for n in numbers if n not in links or not links[n].frames}
-            self.awaited = missing
-            if not missing:
-                return {number: links[number].frames.popleft() for number in numbers}
-            for number in numbers:
+        left_ms = None
+        for number in wanted:
+            while number not in links or not links[number].frames:
+                if heeds:
+                    self.heed()
                 if number not in links:
                     raise LinkLostError(number)
-            left_ms = None if until_s is None else 1e3 * max(until_s - self.now_s(), 0.0)
-            if left_ms == 0.0:
-                raise SilenceError(f"nodes {sorted(missing)} do not answer within {timeout_s:g} s")
-            self.pump(left_ms)
+                if until_s is not None:
+                    left_ms = 1e3 * (until_s - self.now_s())
+                    if left_ms <= 0.0:
+                        silent = self.awaited
+                        raise SilenceError(f"nodes {silent} do not answer within {timeout_s:g} s")
+                self.pump(left_ms)
+        if heeds:
+            self.heed()
+        found = {}
+        for number in wanted:
+            found[number] = links[number].frames.popleft()
+        self.wanted = ()
+        return found
+
+    def next(self, number: int) -> NodeFrame:
+        """The next frame of one, however long that takes; errors as of `take`."""
+        try:
+            frames = self._links[number].frames
+        except KeyError:
+            raise LinkLostError(number) from None
+        if not frames:
+            self.wanted = (number,)
+            # another node is at the same place of its tick: to be woken would take longer
+            looks = 0 if number == COORDINATOR else self._looks
+            while not frames:
+                if number != COORDINATOR:
+                    self.heed()
+                self.pump(None, looks)
+            self.wanted = ()
+        return frames.popleft()
 
     def heed(self) -> None:
         """Raises RecoveryOrderedError: the coordinator's order to go back has come.
@@ -141,17 +172,24 @@ class Links:
         """Let a frame be the next one of its sender once more."""
         self._links[number].frames.appendleft(frame)
 
-    def pump(self, timeout_ms: float | None) -> None:
-        """Send and receive what can be; wait so long for the first that can."""
+    def pump(self, timeout_ms: float | None, looks: int = 0) -> None:
+        """Send and receive what can be; wait so long for the first that can.
+
+        Before it sleeps it looks so many times.
+        """
         if self._heard:  # an error was raised of the one before them
             self._tell()
             return
         began_s = self.now_s()
-        ready = self._poll.poll(timeout_ms)
+        poll = self._poll.poll
+        for _ in range(looks):
+            if ready := poll(0):
+                break
+        else:
+            ready = poll(timeout_ms)
         self.waited_s += self.now_s() - began_s
         for socket_number, _ in ready:
-            number = self._by_socket[socket_number]
-            link = self._links[number]
+            number, link = self._by_socket[socket_number]
             try:
                 if link.waiting:
                     link.go_on_sending()

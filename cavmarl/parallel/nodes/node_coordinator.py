@@ -198,19 +198,16 @@ class NodeCoordinator:
 
     def commit(self, reports: Mapping[int, tuple[list[tuple[int, Message]], list[Report]]]) -> None:
         """All nodes are through with the tick, as they report."""
-        told = [message for messages, _ in reports.values() for message in messages]
-        disturbed = [w for w in {w for w, _ in told} if self._worlds[w].directory.is_quiet]
-        for w in disturbed:
-            self._worlds[w].write(self._worlds[w].directory.break_quiet())
-        for w, message in told:
-            self._take(w, message)
-        for w in disturbed:
-            self._worlds[w].directory.answer_for_silent()
-        self.is_late = any(one.is_late for _, report in reports.values() for one in report)
+        if told := [message for messages, _ in reports.values() for message in messages]:
+            self._take_all(told)
+        every = [report for _, report in reports.values() if report]
+        self.is_late = any(one.is_late for report in every for one in report)
         for w, world in enumerate(self._worlds):
-            said = [report[w] for _, report in reports.values()]
+            said = [report[w] for report in every]
             if world.directory.is_quiet:
                 world.directory.commit_quiet()
+                if not said:
+                    continue
             elif world.directory.table.plan is not None:
                 world.write(world.directory.commit(dict.fromkeys(range(len(self._node_of)), 0)))
             if any(report.began for report in said):
@@ -221,6 +218,16 @@ class NodeCoordinator:
             world.states.told = {v: bytes.fromhex(digest) for v, _, digest in movers}
             world.births += [Birth(v, zone, b"") for report in said for v, zone in report.births]
             world.check_owned(w, said)
+
+    def _take_all(self, told: Sequence[tuple[int, Message]]) -> None:
+        """Take what nodes say of a tick; those of which nothing is said have changed nothing."""
+        disturbed = [w for w in {w for w, _ in told} if self._worlds[w].directory.is_quiet]
+        for w in disturbed:
+            self._worlds[w].write(self._worlds[w].directory.break_quiet())
+        for w, message in told:
+            self._take(w, message)
+        for w in disturbed:
+            self._worlds[w].directory.answer_for_silent()
 
     def begin(self, timeout_s: float) -> dict[int, bytes]:
         """Decide the way to the next ticks, once all offers are answered.
@@ -233,11 +240,13 @@ class NodeCoordinator:
             SilenceError: an offer is not answered in time.
         """
         until_s = self._links.now_s() + timeout_s
-        while any(not set(world.movers) <= world.answered for world in self._worlds):
-            if self._links.now_s() > until_s:
-                raise SilenceError(f"offers are not answered within {timeout_s:g} s")
-            self._links.pump(1e3 * timeout_s)
-        return dict.fromkeys(self._node_of, b"") | self._by_node(self._decide())
+        for world in self._worlds:
+            while world.movers and not world.answered.issuperset(world.movers):
+                if self._links.now_s() > until_s:
+                    raise SilenceError(f"offers are not answered within {timeout_s:g} s")
+                self._links.pump(1e3 * timeout_s)
+        lease, messages = dict.fromkeys(self._node_of, b""), self._decide()
+        return lease | self._by_node(messages) if messages else lease
 
     def _decide(self) -> list[tuple[int, Message]]:
         messages = []

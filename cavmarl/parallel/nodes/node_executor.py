@@ -6,24 +6,40 @@ from collections.abc import Sequence
 from typing import Any
 
 from cavmarl.engine.shard_clock import ShardClock
-from cavmarl.shards.executor import Executor, SerialExecutor
 from cavmarl.shards.shard import Shard
+from cavmarl.shards.shard_group import ShardGroup
 
 
-class NodeExecutor:
+class NodeExecutor(ShardGroup):
     """Runs phases on the shards of this node; the other shards' rows stay on the same side."""
 
-    def __init__(
-        self, own: Sequence[Shard], foreign: Sequence[Shard], clock: ShardClock | None
-    ) -> None:
-        executor: Executor = clock or SerialExecutor(own)
-        self._each = executor.each
-        self._first, self._foreign = own[0], foreign
+    def __init__(self, own: Sequence[Shard], foreign: Sequence[Shard]) -> None:
+        super().__init__(own)
+        self._foreign = foreign
+
+    def turn(self) -> None:
+        super().turn()
+        self.follow()
+
+    def commit(self) -> None:
+        super().commit()
+        self.follow()
+
+    def follow(self) -> None:
+        """Let the other shards' rows be on the side of those of this node."""
+        side, next_side = self._first.side, self._first.next_side
+        for shard in self._foreign:
+            if shard.side != side or shard.next_side != next_side:
+                shard.face(side, next_side)
+
+
+class TimedNodeExecutor:
+    """The same, with a clock on each zone."""
+
+    def __init__(self, plain: NodeExecutor, clock: ShardClock) -> None:
+        self._plain, self._clock = plain, clock
 
     def each(self, phase: str, *arguments: Any) -> None:
-        self._each(phase, *arguments)
+        self._clock.each(phase, *arguments)
         if phase in ("advance", "commit"):
-            side, next_side = self._first.side, self._first.next_side
-            for shard in self._foreign:
-                if (shard.side, shard.next_side) != (side, next_side):
-                    shard.face(side, next_side)
+            self._plain.follow()

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.parallel.nodes.link import Bytes
 from cavmarl.parallel.step_arrays import StepArrays
 from cavmarl.parallel.worlds_job import Task
 
@@ -22,11 +21,11 @@ _INPUTS: Mapping[Task, tuple[str, ...]] = {
 }
 
 
-def pieces_of(task: Task, payload: Any, arrays: StepArrays) -> list[Bytes]:
+def pieces_of(task: Task, payload: Any, arrays: StepArrays) -> list[bytes]:
     """A command: the task with what it is told, and the arrays that all nodes read."""
     said = b"" if payload is None else json.dumps(payload).encode()
-    read = (_flat(getattr(arrays, name)).data for name in _INPUTS.get(task, ()))
-    return [_HEAD.pack(task, len(said)) + said, *read]
+    read = [getattr(arrays, name) for name in _INPUTS.get(task, ())]
+    return [_HEAD.pack(task, len(said)) + said, *(each.tobytes() for each in read if each.size)]
 
 
 def command_of(data: memoryview) -> tuple[Task, Any, int]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -24,11 +24,12 @@ from cavmarl.engine.simulation import Simulation
 from cavmarl.parallel.nodes.agent_stream import AgentStream
 from cavmarl.parallel.nodes.link import Bytes, FrameKind, NodeFrame
 from cavmarl.parallel.nodes.links import LinkLostError, Links, RecoveryOrderedError
-from cavmarl.parallel.nodes.row_stream import RowStream, words_of
+from cavmarl.parallel.nodes.row_stream import RowStream, passing_of
 from cavmarl.zones.kernels.agent_frames import UNOWNED
-from cavmarl.zones.kernels.row_frames import count_own
+from cavmarl.zones.kernels.row_frames import Passing, count_own
 
 Array = NDArray[Any]
+_SHARE = FrameKind.SHARE
 PIECES = ("terms", "terminated", "present", "acted", "events", "vehicle_ids", "places")
 
 
@@ -75,7 +76,7 @@ class NodePeers:
         self._sent = first_share
         self._is_stepping = False
         self._gate: Gate | None = None
-        self._leaving: Array = np.empty(0)  # the words of its rows
+        self._leaving: Passing  # of that
         self.own: Array = np.zeros_like(simulation.outputs.present)
         self.stepped = self.own.copy()
         self.owner: NDArray[np.int32] = np.full(self.own.size, UNOWNED, dtype=np.int32)
@@ -109,23 +110,26 @@ class NodePeers:
         mine = np.flatnonzero(self.own.reshape(-1))
         self.owner[:] = UNOWNED
         self.owner[mine] = self._number
-        for number, data in self._swap([mine.data] for _ in self._others):
+        for number, data in self._swap([mine.data]):
             self.owner[np.frombuffer(data, np.int64)] = number
 
     def share_rows(self, gate: Gate, side: int) -> None:
         if gate is not self._gate:
-            self._gate, self._leaving = gate, words_of(gate.passing)
-        rows, passing = self._rows, self._leaving
-        found = self._swap([rows[to].packed(side, gate, passing)] for to in self._others)
-        for number, data in found:
+            self._gate, self._leaving = gate, passing_of(gate)
+        passing, send = self._leaving, self._links.send
+        self._sent = due = self._sent + 1
+        for to, rows in self._rows.items():
+            send(to, _SHARE, due, (rows.packed(side, passing),))
+        for number, rows in self._rows.items():
+            data = self._share_of(number)
             try:
-                rows[number].take(data, side, gate, passing)
+                rows.take(data, side, passing)
             except MessageError as error:
                 raise LinkLostError(number, error) from error
 
     def running(self) -> NDArray[np.int64]:
         if not self._others:
-            self._count_own(self._zoned, self._mine, self._running)
+            self._count_own(self._zoned.num_owned, self._mine, self._running)
         return self._running
 
     def clear_ranks(self, gate: Gate) -> None:
@@ -142,7 +146,7 @@ class NodePeers:
         if not asks.any():
             return
         ranks, last_s = gate.ranks[:, :longest][asks], gate.last_s[:, :longest][asks]
-        for _, data in self._swap([ranks.data, last_s.data] for _ in self._others):
+        for _, data in self._swap([ranks.data, last_s.data]):
             theirs, at = _read(data, 0, ranks.dtype, ranks.size)
             theirs_s, _ = _read(data, at, last_s.dtype, last_s.size)
             np.maximum(ranks, theirs.reshape(ranks.shape), out=ranks)
@@ -153,7 +157,7 @@ class NodePeers:
     def share_proposals(self, gate: Gate) -> None:
         places = [gate.places[w, :num] for w, num in enumerate(gate.num_passing.tolist())]
         pieces = [*self._passing(gate), np.concatenate(places).data]
-        for _, data in self._swap(pieces for _ in self._others):
+        for _, data in self._swap(pieces):
             before = gate.num_passing.copy()
             at = self._add_passing(gate, data, 0)
             for w in range(self._num_worlds):
@@ -161,7 +165,7 @@ class NodePeers:
                 gate.places[w, first:last], at = _read(data, at, np.int64, last - first)
 
     def share_leavers(self, gate: Gate) -> None:
-        for _, data in self._swap(self._passing(gate) for _ in self._others):
+        for _, data in self._swap(self._passing(gate)):
             self._add_passing(gate, data, 0)
 
     def _passing(self, gate: Gate) -> list[Bytes]:
@@ -186,9 +190,7 @@ class NodePeers:
         seen = worlds.detected_s
         changed = np.flatnonzero(seen.reshape(-1) != self._seen_s.reshape(-1))
         times = seen.reshape(-1)[changed]
-        for _, data in self._swap(
-            [np.int64(changed.size).tobytes(), changed.data, times.data] for _ in self._others
-        ):
+        for _, data in self._swap([np.int64(changed.size).tobytes(), changed.data, times.data]):
             (num,), at = _read(data, 0, np.int64, 1)
             where, at = _read(data, at, np.int64, int(num))
             seen.reshape(-1)[where], _ = _read(data, at, np.float64, int(num))
@@ -199,7 +201,7 @@ class NodePeers:
         if self._is_stepping:
             self._is_stepping = False
             self.stepped[...] = self.own
-        for number, data in self._swap([told] for _ in self._others):
+        for number, data in self._swap([told]):
             try:
                 self._agents.take(data, number, self.owner)
             except MessageError as error:
@@ -221,7 +223,7 @@ class NodePeers:
         with self._rows_of_all(simulation.division.side):
             pieces: list[Bytes] = [np.int64(len(mine)).tobytes(), mine.data]
             pieces += [_bytes(_by_agent(array)[mine]) for array in arrays]
-            for _, data in self._swap(pieces for _ in self._others):
+            for _, data in self._swap(pieces):
                 (num,), at = _read(data, 0, np.int64, 1)
                 agents, at = _read(data, at, np.int64, int(num))
                 for array in map(_by_agent, arrays):
@@ -250,7 +252,7 @@ class NodePeers:
         ]
         numbers = [array[self._mine].sum(axis=0) for array in (zoned.num_owned, zoned.num_contacts)]
         pieces = [*map(_bytes, numbers), *map(_bytes, filter(len, owned))]
-        for number, data in self._swap(pieces for _ in self._others):
+        for number, data in self._swap(pieces):
             zone = self._zones[number][0]
             zoned.num_owned[zone], at = _read(data, 0, np.int64, self._num_worlds)
             zoned.num_contacts[zone], at = _read(data, at, np.int64, self._num_worlds)
@@ -262,30 +264,27 @@ class NodePeers:
             for array in (zoned.num_owned, zoned.num_contacts):
                 array[self._foreign] = 0
 
-    def _swap(self, pieces: Any) -> list[tuple[int, memoryview]]:
-        """Send pieces to each of the others, and take theirs, by rising numbers.
+    def _swap(self, pieces: Sequence[Bytes]) -> Iterator[tuple[int, memoryview]]:
+        """Send pieces to all others, and take theirs, by rising numbers."""
+        self._sent += 1
+        for to in self._others:
+            self._links.send(to, _SHARE, self._sent, pieces)
+        for number in self._others:
+            yield number, self._share_of(number)
+
+    def _share_of(self, number: int) -> memoryview:
+        """What another node has sent in the present share.
 
         Raises:
-            RecoveryOrderedError: one of them has been told to go back already.
+            RecoveryOrderedError: it has been told to go back already.
         """
-        links, others = self._links, self._others
-        self._sent += 1
-        for to, some in zip(others, pieces, strict=True):
-            links.send(to, FrameKind.SHARE, self._sent, some)
-        found = links.take(others)
-        for number, frame in found.items():
-            if frame.kind is not FrameKind.SHARE or frame.number != self._sent:
-                self._refuse(number, found)
-        return [(number, frame.data) for number, frame in found.items()]
-
-    def _refuse(self, number: int, found: dict[int, NodeFrame]) -> NoReturn:
-        """One of some frames is not what is due."""
-        ahead = {n: frame for n, frame in found.items() if frame.kind is FrameKind.SYNC}
-        for n, frame in ahead.items():
-            self._links.put_back(n, frame)
-        if ahead:
+        kind, which, data = self._links.next(number)
+        if kind is _SHARE and which == self._sent:
+            return data
+        if kind is FrameKind.SYNC:
+            self._links.put_back(number, NodeFrame(kind, which, data))
             raise RecoveryOrderedError(None)
-        raise AssertionError(f"node {number} is at {found[number][:2]}, not at share {self._sent}")
+        raise AssertionError(f"node {number} is at {kind, which}, not at share {self._sent}")
 
 
 def _by_agent(array: Array) -> Array:

@@ -37,7 +37,7 @@ from cavmarl.parallel.nodes.node_starters import Route, Start, start_nodes, stra
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.nodes.node_watch import NodeWatch, SilentNodeError
 from cavmarl.parallel.nodes.zone_hosts import read_report, told_hostings
-from cavmarl.parallel.nodes.zone_moves import ZoneMoves, moves_of, name_of, nodes_of
+from cavmarl.parallel.nodes.zone_moves import ZoneMoves, living_of, moves_of, name_of, nodes_of
 from cavmarl.parallel.recipe import recipe_of
 from cavmarl.parallel.step_arrays import StepArrays, layout_of
 from cavmarl.parallel.step_placement import StepPlacement
@@ -89,8 +89,8 @@ class NodePool:
         layout = layout_of(config, world.capacity, num_worlds).items()
         self.arrays = StepArrays.of({name: np.zeros(shape, kind) for name, (kind, shape) in layout})
         self._placement = StepPlacement(world, 1, nodes, is_here=False)
-        self.zones = parts_of(self._placement.plans, count)[0].zones
-        self._homes = self.zones
+        self.zones = self._homes = parts_of(self._placement.plans, count)[0].zones
+        self._living = living_of(self.zones)
         self._generation = 0
         self._teller = 0
         self._cut = ZoneCut(told_zones(world.partition), Neighbours(()))
@@ -189,7 +189,7 @@ class NodePool:
             LinkLostError: a node is lost.
         """
         found: dict[int, NodeFrame] = {}
-        while missing := [number for number in self._living if number not in found]:
+        while missing := [n for n in self._living if n not in found] if found else self._living:
             wait = partial(self._links.take, missing)
             for number, frame in self._watch.wait(self._living, self._timeout_s, wait).items():
                 if frame.number == self._generation:
@@ -198,10 +198,6 @@ class NodePool:
             if frame.kind is not kind:
                 raise LinkLostError(number, MessageError(f"{frame.kind.name}, not {kind.name}"))
         return dict(sorted(found.items()))
-
-    @property
-    def _living(self) -> list[int]:
-        return [number for number, zones in enumerate(self.zones) if zones]
 
     # Commands, and what becomes of them when nodes are lost
 
@@ -373,7 +369,7 @@ class NodePool:
         state = self._state
         self._opened = None
         moves = moves_of(state.zones, self._homes, self._lost, self._nodes, state.number)
-        self.zones = moves.zones
+        self.zones, self._living = moves.zones, living_of(moves.zones)
         self._owner[~np.isin(self._owner, self._living)] = UNOWNED  # of lost ones any may be
         self._generation += 1
         self._cut = state.cut
@@ -425,16 +421,19 @@ class NodePool:
         Raises:
             LinkLostError: one is lost, or has sent what cannot be.
         """
-        read, frames = {}, self._take(FrameKind.REPORT)
-        for number in sorted(frames, key=lambda number: (number != self._teller, number)):
+        told, results = {}, []
+        frames = self._take(FrameKind.REPORT)
+        for number in sorted(frames, key=self._teller.__ne__):  # else by rising numbers
             try:
-                read[number] = read_report(frames[number].data, len(self._runs))
-                self._coordinator.check(number, read[number][0])
+                messages, said, more = read_report(frames[number].data, len(self._runs))
+                self._coordinator.check(number, messages)
             except (ValueError, TypeError, struct.error, ProtocolError) as error:
                 raise LinkLostError(number, MessageError(f"no report: {error}")) from error
-        self._coordinator.commit({n: (messages, said) for n, (messages, said, _) in read.items()})
-        self._tellers = list(read)
-        return [more for _, _, more in read.values()]
+            told[number] = messages, said
+            results.append(more)
+        self._coordinator.commit(told)
+        self._tellers = list(told)
+        return results
 
     def close(self) -> None:
         """End the nodes; a fork of the pool's process has no right to."""

@@ -27,7 +27,7 @@ from cavmarl.parallel.nodes.links import LinkLostError, Links, RecoveryOrderedEr
 from cavmarl.parallel.nodes.meeting import call_node, calls_of
 from cavmarl.parallel.nodes.node_actions import ActionsTaken, refusal
 from cavmarl.parallel.nodes.node_cuts import cut_worlds, proposal_of, read_zones, told_neighbours
-from cavmarl.parallel.nodes.node_executor import NodeExecutor
+from cavmarl.parallel.nodes.node_executor import NodeExecutor, TimedNodeExecutor
 from cavmarl.parallel.nodes.node_files import WorldFile, recipe_with
 from cavmarl.parallel.nodes.node_frames import (
     Inputs,
@@ -40,7 +40,7 @@ from cavmarl.parallel.nodes.node_network import AskedNetwork
 from cavmarl.parallel.nodes.node_peers import NodePeers
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.nodes.zone_hosts import hosting_of
-from cavmarl.parallel.nodes.zone_moves import nodes_of
+from cavmarl.parallel.nodes.zone_moves import living_of, nodes_of
 from cavmarl.parallel.worlds_job import Task, commands_of
 
 MEASURED_TICKS = 10  # one of so many shows what zones cost
@@ -106,7 +106,7 @@ class NodeProgram:
 
     def _take(self, kind: FrameKind) -> memoryview:
         """What the caller sends next, while it may send this node away."""
-        frame = self._links.take([COORDINATOR])[COORDINATOR]
+        frame = self._links.next(COORDINATOR)
         if frame.kind is not kind:
             raise MessageError(f"the caller sent {frame.kind.name}, not {kind.name}")
         return frame.data
@@ -115,7 +115,7 @@ class NodeProgram:
         """Host the zones that are this node's from now on."""
         simulation, mine = self._worlds.simulation, zones[self._number]
         self.zones = tuple(mine)
-        self._living = [node for node, some in enumerate(zones) if some]
+        self._living = living_of(zones)
         told = [
             [hosting_of(bytes.fromhex(run), some[zone]) for zone in mine]
             for run, some in zip(runs, hostings, strict=True)
@@ -138,8 +138,9 @@ class NodeProgram:
         foreign = [shard for shard in simulation.shards if shard.zone not in self.zones]
         every = simulation.config.workers.balance_steps
         self._clock = ShardClock(own, MEASURED_TICKS) if every else None
-        executor = self._hosts.executor(NodeExecutor(own, foreign, self._clock))
-        simulation.share(self._peers, self._hosts, executor)
+        plain = NodeExecutor(own, foreign)
+        executor = plain if self._clock is None else TimedNodeExecutor(plain, self._clock)
+        simulation.share(self._peers, self._hosts, self._hosts.executor(executor))
 
     def _hear(self, number: int, frame: NodeFrame) -> None:
         """Take an urgent frame."""
@@ -154,7 +155,7 @@ class NodeProgram:
         elif frame.kind is FrameKind.GIVE:
             self._kept.take_given(number, frame)
         elif frame.kind is FrameKind.PING:
-            said = json.dumps(sorted(self._links.awaited)).encode()
+            said = json.dumps(self._links.awaited).encode()
             self._links.send(COORDINATOR, FrameKind.PONG, frame.number, [said])
         else:
             self._hosts.hear(number, frame)
@@ -168,7 +169,7 @@ class NodeProgram:
         """
         while True:
             try:
-                frame = self._links.take([COORDINATOR])[COORDINATOR]
+                frame = self._links.next(COORDINATOR)
                 if frame.kind is FrameKind.RECOVER:
                     self._recover(frame)
                 elif frame.kind is FrameKind.LEASE:
@@ -188,7 +189,7 @@ class NodeProgram:
         while True:
             try:
                 while frame is None or frame.kind is not FrameKind.RECOVER:
-                    frame = self._links.take([COORDINATOR])[COORDINATOR]
+                    frame = self._links.next(COORDINATOR)
                 self._recover(frame)
                 return
             except RecoveryOrderedError as ordered:
@@ -228,7 +229,7 @@ class NodeProgram:
             links.send(node, FrameKind.SYNC, frame.number)
         for node in others:
             while True:
-                found = links.take([node])[node]
+                found = links.next(node)
                 if found.kind is FrameKind.SYNC and found.number == frame.number:
                     break
         state, mine = int(told["state"]), zones[self._number]

@@ -15,6 +15,8 @@ from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.nodes.leases import late_ticks
 from cavmarl.parallel.recipe import world_of
 
+LOOKS = 25  # of about a microsecond each
+
 Place: TypeAlias = tuple[str, int]
 
 
@@ -46,6 +48,8 @@ class NodeListener(Protocol):
 class NodeSystem(Protocol):
     """`cavmarl.verify` has one beside this machine's, in which all processes are threads of one."""
 
+    looks: int  # that a node takes for what another one sends before it sleeps
+
     def now_s(self) -> float:
         """A clock that never goes back; of this process alone."""
         ...
@@ -74,6 +78,7 @@ class NodeSystem(Protocol):
 class Machine:
     """This machine's."""
 
+    looks = LOOKS if (os.cpu_count() or 1) > 1 else 0
     now_s = staticmethod(time.monotonic)
 
     def poll(self) -> Poll:

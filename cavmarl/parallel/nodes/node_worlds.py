@@ -116,8 +116,12 @@ class NodeWorlds(NodePool):
         self._cut_anew()
         if self.mover is not None:
             self.mover.before_step(self._move, self._seen)
-        arrays.declared[:] = commands.declared if commands.declared.size else 0
-        arrays.inserted[:] = commands.inserted if commands.inserted.size else 0
+        for told, array in (
+            (commands.declared, arrays.declared),
+            (commands.inserted, arrays.inserted),
+        ):
+            if array.size:
+                array[:] = told if told.size else 0
         results = self.run(self._command(Task.STEP))
         self._ticks_done += self._ticks_per_step
         self._write(results, self._everywhere, of_step=True)
@@ -199,7 +203,7 @@ class NodeWorlds(NodePool):
     def _command(self, task: Task, payload: Any = None) -> NodeCommand:
         loads = task == Task.LOAD and not payload["only_reads"]
         changes = loads or task in (Task.STEP, Task.RESET, Task.CUT)
-        pieces = [bytes(piece) for piece in pieces_of(task, payload, self.arrays)]
+        pieces = pieces_of(task, payload, self.arrays)
         if task != Task.STEP:
             return NodeCommand(pieces, changes, 0, cut=payload if task == Task.CUT else None)
         actions = Actions.of(self.arrays)

@@ -20,6 +20,7 @@ from cavmarl.zones.kernels.row_frames import (
     MOST,
     NO_FRAME,
     Both,
+    Passing,
     pack_frame,
     take_frame,
 )
@@ -28,25 +29,21 @@ Array = NDArray[Any]
 
 
 class _Room:
-    """Ghosts of two frames: the one before, and the present one."""
+    """Ghosts of two frames: the one before, and room for the present one."""
 
     def __init__(self, words: int) -> None:  # of a ghost
-        self._before, self._now = (np.empty((0, words), dtype=np.int64) for _ in range(2))
-        self._num = 0
+        self._before, self.now = (np.empty((0, words), dtype=np.int64) for _ in range(2))
+        self.before = self._before
 
-    @property
-    def before(self) -> Array:
-        return self._before[: self._num]
-
-    def now(self, num: int = 0) -> Array:
-        """Room for so many, at least."""
-        if len(self._now) < num:
-            self._now = np.empty((num + num // 2, self._now.shape[1]), dtype=np.int64)
-        return self._now
+    def make(self, num: int) -> None:
+        """Make room for so many, at least."""
+        if len(self.now) < num:
+            self.now = np.empty((num + num // 2, self.now.shape[1]), dtype=np.int64)
 
     def turn(self, num: int) -> None:
         """So many that have been written are those before from now on."""
-        self._before, self._now, self._num = self._now, self._before, num
+        self._before, self.now = self.now, self._before
+        self.before = self._before[:num]
 
 
 class RowStream:
@@ -61,7 +58,8 @@ class RowStream:
         rerouted: NDArray[np.int64],  # (W,) likewise
     ) -> None:
         rows, steps = words_of(zoned.rows), words_of(zoned.step)
-        self._both = Both(zoned, rows, steps, zones, others, running, rerouted)
+        numbers = zoned.num_owned, zoned.num_rows, zoned.num_near
+        self._both = Both(rows, steps, zoned.step_at, *numbers, zones, others, running, rerouted)
         self._row = rows.shape[-1]
         size = self._row + steps.shape[-1] + AFTER
         assert size <= MOST
@@ -72,52 +70,57 @@ class RowStream:
         self._pack = specialized(pack_frame, checks=False)
         self._take = specialized(take_frame, checks=False)
 
-    def packed(self, side: int, gate: Gate, passing: Array) -> Bytes:
+    def packed(self, side: int, passing: Passing) -> Bytes:
         """The frame that the other one gets, until the next is packed.
 
         Args:
             side: of the rows whose ghosts are sent.
-            gate: what leaves.
-            passing: the words of its rows.
+            passing: what leaves.
         """
         sent = self._sent
         before = sent.before
         if self._slots.size < 2 * len(before):
             self._slots = np.empty(1 << (2 * len(before)).bit_length(), dtype=np.int32)
-        while True:
-            now, frame = sent.now(), self._frame
-            num = self._pack(self._both, side, gate, passing, before, self._slots, now, frame)
-            if num >= 0:
-                break
+        args = self._both, side, passing, before, self._slots
+        num = self._pack(*args, sent.now, self._frame)
+        if num < 0:
             ghosts = -1 - num
-            words = ghosts * (2 + sent.now(ghosts).shape[1])
-            words += int(gate.num_passing.sum()) * self._row
-            self._make_frame(frame.size + words + words // 2)
-        sent.turn(num)
-        return self._bytes[: 8 * frame.item(0)]
+            sent.make(ghosts)
+            words = ghosts * (2 + sent.now.shape[1]) + int(passing.num.sum()) * self._row
+            self._make_frame(self._frame.size + words + words // 2)
+            num = self._pack(*args, sent.now, self._frame)
+        if num or len(before):
+            sent.turn(num)
+        return self._bytes[: 8 * self._frame.item(0)]
 
     def _make_frame(self, words: int) -> None:
         """Make room for a frame."""
         self._frame = np.empty(words, dtype=np.int64)
         self._bytes = self._frame.view(np.uint8).data
 
-    def take(self, data: memoryview, side: int, gate: Gate, passing: Array) -> None:
+    def take(self, data: memoryview, side: int, passing: Passing) -> None:
         """Take a frame of the other one.
 
         Raises:
             MessageError: it is none, or there is no room for what it has.
         """
-        taken, whole = self._taken, len(data) // 8
-        frame = np.frombuffer(data, np.int64, whole) if whole else np.zeros(1, dtype=np.int64)
-        num = NO_FRAME
-        if 8 * whole == len(data):
-            args = self._both, side, gate, passing, taken.before
-            num = self._take(*args, taken.now(), frame)
+        taken, num = self._taken, NO_FRAME
+        if data and not len(data) % 8:
+            frame = np.frombuffer(data, np.int64)
+            args = self._both, side, passing, taken.before
+            num = self._take(*args, taken.now, frame)
             if NO_FRAME < num < 0:
-                num = self._take(*args, taken.now(-1 - num), frame)
+                taken.make(-1 - num)
+                num = self._take(*args, taken.now, frame)
         if num < 0:
             raise MessageError(f"{len(data)} bytes are not what a node tells of the rows of a tick")
-        taken.turn(num)
+        if num or len(taken.before):
+            taken.turn(num)
+
+
+def passing_of(gate: Gate) -> Passing:
+    """What leaves by a gate; views."""
+    return Passing(words_of(gate.passing), gate.num_passing, gate.counts)
 
 
 def words_of(rows: Array) -> Array:

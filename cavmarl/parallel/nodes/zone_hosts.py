@@ -31,7 +31,7 @@ from cavmarl.ownership.offers import Approach
 from cavmarl.ownership.reactions import Advance, Hosting
 from cavmarl.parallel.nodes.link import Bytes, FrameKind, NodeFrame
 from cavmarl.parallel.nodes.links import Links, RecoveryOrderedError
-from cavmarl.parallel.nodes.node_executor import NodeExecutor
+from cavmarl.shards.executor import Executor
 from cavmarl.shards.shard import Commands
 from cavmarl.zones.kernels.zone_lookup import zones_of
 
@@ -105,8 +105,8 @@ class ZoneHosts:
             return
         if self._is_open:
             self.report()
-        while any(len(leases) < len(self._zones) for leases in self._leases):
-            frame = self._links.take([COORDINATOR])[COORDINATOR]
+        while not all(map(self._is_leased, range(len(self._leases)))):
+            frame = self._links.next(COORDINATOR)
             if frame.kind is FrameKind.RECOVER:
                 raise RecoveryOrderedError(frame)
             if frame.kind is FrameKind.PHASE:
@@ -127,14 +127,16 @@ class ZoneHosts:
             told.add(w)
             self._take(w, message)
         for w, endpoints in enumerate(self._endpoints):
-            if w in told:
-                self._is_quiet[w] = False
-            elif not self._leases[w]:
+            if not (w in told or self._leases[w] or self._is_quiet[w]):
                 self._is_quiet[w] = True
-                self._leases[w] = {zone: each.go_on() for zone, each in endpoints.items()}
+                for endpoint in endpoints.values():
+                    endpoint.go_on()
         early, self._early = self._early, []
         for w, message in early:
             self._take(w, message)
+
+    def _is_leased(self, w: int) -> bool:
+        return self._is_quiet[w] or len(self._leases[w]) == len(self._zones)
 
     def note(self, data: memoryview) -> None:
         """Let a lease of no ticks begin and end: births come on record, and can be offered."""
@@ -149,11 +151,12 @@ class ZoneHosts:
 
     def _enter_lease(self) -> None:
         for w, leases in enumerate(self._leases):
-            self._change_hands(w, leases)
-            self._leases[w] = {}
+            if leases:
+                self._change_hands(w, leases)
+                self._leases[w] = {}
         self._is_open = True
 
-    def executor(self, plain: NodeExecutor) -> NodeExecutor:
+    def executor(self, plain: Executor) -> Executor:
         """What runs the phases of a tick."""
         return plain
 
@@ -203,8 +206,11 @@ class ZoneHosts:
         messages: list[tuple[int, Message]] = []
         reports, checked = [], self._is_checked
         for w in range(len(self._endpoints)):
+            quiet, self._is_quiet[w] = self._is_quiet[w], False
+            if quiet and self._rests(w):
+                reports.append(NOTHING)
+                continue
             began, self._began[w] = self._began[w], False
-            quiet = self._is_quiet[w]
             messages += [(w, done) for done in self._complete(w) if done.removed or not quiet]
             movers, is_late = self._offer(w, began)
             owned = [self._owned(w, zone) for zone in self._endpoints[w]] if checked else []
@@ -213,6 +219,19 @@ class ZoneHosts:
         data = packed_report(messages, reports)
         self._links.send(COORDINATOR, FrameKind.REPORT, self._generation, [data, *more])
         self._is_open = False
+
+    def _rests(self, w: int) -> bool:
+        """End a quiet lease of a world of which there is nothing to tell; whether it is one."""
+        endpoints = self._endpoints[w].values()
+        if self._began[w] or self._stirred[w] or self._gone[w] or self._births[w]:
+            return False
+        if self._is_checked or self._division.near(w, everybody=False):
+            return False
+        if any(endpoint.offers.open for endpoint in endpoints):
+            return False
+        for endpoint in endpoints:
+            endpoint.rest()
+        return True
 
     def _owned(self, w: int, zone: int) -> tuple[int, int, int]:
         rows = self._division.owned(w, zone)
@@ -399,8 +418,10 @@ def read_report(
     data: memoryview,
     num_worlds: int,
 ) -> tuple[list[tuple[int, Message]], list[Report], memoryview]:
-    """Messages, what is said of each world, and what follows."""
+    """Messages, what is said of each world, none where that is nothing, and what follows."""
     size, length = _LENGTH.unpack_from(data)
+    if not size and not length:
+        return [], [], data[_LENGTH.size :]
     at = _LENGTH.size
     messages = unpacked(data[at : at + size])
     end = at + size + length

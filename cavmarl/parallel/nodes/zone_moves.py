@@ -18,6 +18,11 @@ class ZoneMoves(NamedTuple):
     donors: list[tuple[int, int]]  # nodes that give zones away, and those that get them
 
 
+def living_of(zones: Sequence[Sequence[int]]) -> list[int]:
+    """The nodes that host some, by rising numbers."""
+    return [number for number, some in enumerate(zones) if some]
+
+
 def moves_of(
     kept: Sequence[Sequence[int]],  # zones of each node when the state was kept
     homes: Sequence[Sequence[int]],  # zones of each node if none is lost
@@ -30,7 +35,7 @@ def moves_of(
     Raises:
         WorkerDeathError: the next one is lost, too.
     """
-    ring = [number for number, zones in enumerate(kept) if zones]
+    ring = living_of(kept)
     zones = [list(some) for some in kept]
     heirs: dict[int, int] = {}
     for number in (n for n in ring if n in lost):

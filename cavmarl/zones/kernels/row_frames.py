@@ -25,7 +25,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.numba import inlined_kernel, kernel
-from cavmarl.core.records.arrays import Gate, Zoned
 from cavmarl.core.records.codes import COUNT_REROUTED
 
 ID = 0  # the word of a row that names the vehicle
@@ -39,30 +38,42 @@ Words = NDArray[np.int64]
 class Both(NamedTuple):
     """What two processes tell each other about, seen from one of them."""
 
-    zoned: Zoned
     rows: Words  # (2, k, W, C, V) those of all zones
     steps: Words  # (k, W, C, S)
+    step_at: NDArray[np.int64]  # (k, W, C)
+    num_owned: NDArray[np.int64]  # (k, W)
+    num_rows: NDArray[np.int64]  # (k, W)
+    num_near: NDArray[np.int64]  # (k, W)
     mine: NDArray[np.int64]  # zones of this process
     theirs: NDArray[np.int64]  # and of the other one
     running: NDArray[np.int64]  # (W,) written: vehicles of this process, and of others as they come
     rerouted: NDArray[np.int64]  # (W,) written: those that had taken another way by the last frame
 
 
+class Passing(NamedTuple):
+    """What leaves, as the gate has it."""
+
+    rows: Words  # (W, C + D, V)
+    num: NDArray[np.int64]  # (W,)
+    counts: NDArray[np.int64]  # (W, NUM_COUNTS)
+
+
 @kernel
-def count_own(zoned: Zoned, mine: NDArray[np.int64], running: NDArray[np.int64]) -> None:
+def count_own(
+    num_owned: NDArray[np.int64], mine: NDArray[np.int64], running: NDArray[np.int64]
+) -> None:
     """Write how many vehicles zones own, (W,)."""
     for w in range(running.size):
         running[w] = 0
         for k in range(mine.size):
-            running[w] += zoned.num_owned[mine[k], w]
+            running[w] += num_owned[mine[k], w]
 
 
 @kernel
 def pack_frame(
     both: Both,
     side: int,
-    gate: Gate,
-    passing: Words,  # (W, C + D, V) rows of the gate
+    passing: Passing,
     before: Words,  # (p, V + S + 2) the ghosts of the frame before
     slots: NDArray[np.int32],  # scratch, a power of two and more than p
     now: Words,  # (n, V + S + 2) written: the ghosts, first of all
@@ -73,30 +84,29 @@ def pack_frame(
     Returns:
         how many ghosts it has; if there is no room for them, -1 less that number.
     """
-    zoned = both.zoned
-    num_worlds = zoned.num_owned.shape[1]
+    num_worlds = both.num_owned.shape[1]
     first = 1 + 3 * num_worlds
     total = 0
     leaving = 0
-    count_own(zoned, both.mine, both.running)
+    count_own(both.num_owned, both.mine, both.running)
     for w in range(num_worlds):
         frame[1 + w] = both.running[w]
-        frame[1 + num_worlds + w] = gate.counts[w, COUNT_REROUTED] - both.rerouted[w]
-        frame[1 + 2 * num_worlds + w] = gate.num_passing[w]
-        leaving += gate.num_passing[w]
+        frame[1 + num_worlds + w] = passing.counts[w, COUNT_REROUTED] - both.rerouted[w]
+        frame[1 + 2 * num_worlds + w] = passing.num[w]
+        leaving += passing.num[w]
     for k in range(both.theirs.size):
         for w in range(num_worlds):
-            frame[first] = zoned.num_rows[both.theirs[k], w]
-            frame[first + 1] = zoned.num_near[both.theirs[k], w]
+            frame[first] = both.num_rows[both.theirs[k], w]
+            frame[first + 1] = both.num_near[both.theirs[k], w]
             total += frame[first]
             first += 2
-    row = passing.shape[2]
+    row = passing.rows.shape[2]
     if total > now.shape[0] or first + total * (2 + now.shape[1]) + leaving * row > frame.size:
         return -1 - total
     at = first + 2 * total
     for w in range(num_worlds):
-        for i in range(gate.num_passing[w]):
-            _copy(passing[w, i], 0, frame, at, row)
+        for i in range(passing.num[w]):
+            _copy(passing.rows[w, i], 0, frame, at, row)
             at += row
     frame[0] = at + _pack_ghosts(both, side, before, slots, now, frame, first, total, at)
     return int(total)
@@ -122,12 +132,12 @@ def _pack_ghosts(
     n = 0
     for k in range(both.theirs.size):
         zone = both.theirs[k]
-        for w in range(both.zoned.num_owned.shape[1]):
-            for i in range(both.zoned.num_rows[zone, w]):
+        for w in range(both.num_owned.shape[1]):
+            for i in range(both.num_rows[zone, w]):
                 ghost = now[n]
                 _copy(both.rows[side, zone, w, i], 0, ghost, 0, row)
                 _copy(both.steps[zone, w, i], 0, ghost, row, last - row)
-                ghost[last] = both.zoned.step_at[zone, w, i]
+                ghost[last] = both.step_at[zone, w, i]
                 ghost[last + 1] = w
                 found = _find(before, slots, ghost)
                 bits = np.uint64(0)
@@ -148,8 +158,7 @@ def _count_ghosts(both: Both, frame: Words) -> int:
 
     Nothing else of a frame may be read if it is -1, nor if there is no room for what it has.
     """
-    zoned = both.zoned
-    num_worlds = zoned.num_owned.shape[1]
+    num_worlds = both.num_owned.shape[1]
     first = 1 + 3 * num_worlds
     if first + both.mine.size * num_worlds * 2 > frame.size or frame[0] != frame.size:
         return -1
@@ -163,7 +172,7 @@ def _count_ghosts(both: Both, frame: Words) -> int:
     for k in range(both.mine.size):
         for w in range(num_worlds):
             num = frame[first]
-            room = zoned.step_at.shape[2] - zoned.num_rows[both.mine[k], w]
+            room = both.step_at.shape[2] - both.num_rows[both.mine[k], w]
             if num < 0 or num > room or frame[first + 1] < 0 or frame[first + 1] > num:
                 return -1
             total += num
@@ -177,8 +186,7 @@ def _count_ghosts(both: Both, frame: Words) -> int:
 def take_frame(
     both: Both,
     side: int,
-    gate: Gate,
-    passing: Words,
+    passing: Passing,  # written
     before: Words,
     now: Words,  # (n, V + S + 2) written: the ghosts, first of all
     frame: Words,
@@ -197,26 +205,25 @@ def take_frame(
     if total > now.shape[0]:
         return int(-1 - total)
     now = now[:total]
-    zoned = both.zoned
-    num_worlds = zoned.num_owned.shape[1]
+    num_worlds = both.num_owned.shape[1]
     first = 1 + 3 * num_worlds
     like = first + both.mine.size * num_worlds * 2
     at = words = like + 2 * total
-    row = passing.shape[2]
+    row = passing.rows.shape[2]
     for w in range(num_worlds):
         leaving = frame[1 + 2 * num_worlds + w]
-        if gate.num_passing[w] + leaving > passing.shape[1]:
+        if passing.num[w] + leaving > passing.rows.shape[1]:
             return NO_FRAME
         words += leaving * row
     if not _unpack(before, now, frame, like, words):
         return NO_FRAME
     for w in range(num_worlds):
         both.running[w] += frame[1 + w]
-        gate.counts[w, COUNT_REROUTED] += frame[1 + num_worlds + w]
-        both.rerouted[w] = gate.counts[w, COUNT_REROUTED]
+        passing.counts[w, COUNT_REROUTED] += frame[1 + num_worlds + w]
+        both.rerouted[w] = passing.counts[w, COUNT_REROUTED]
         for _ in range(frame[1 + 2 * num_worlds + w]):
-            _copy(frame, at, passing[w, gate.num_passing[w]], 0, row)
-            gate.num_passing[w] += 1
+            _copy(frame, at, passing.rows[w, passing.num[w]], 0, row)
+            passing.num[w] += 1
             at += row
     n = 0
     for k in range(both.mine.size):
@@ -231,24 +238,23 @@ def take_frame(
 @inlined_kernel
 def _put(both: Both, side: int, zone: int, w: int, ghost: Words, is_near: bool) -> None:
     """Put a ghost behind the rows of a zone."""
-    zoned = both.zoned
     rows = both.rows[side, zone, w]
     steps = both.steps[zone, w]
-    step_at = zoned.step_at[zone, w]
+    step_at = both.step_at[zone, w]
     row = rows.shape[1]
     at = row + steps.shape[1]
-    place = zoned.num_rows[zone, w]
+    place = both.num_rows[zone, w]
     if is_near:
-        first_far = zoned.num_near[zone, w]
+        first_far = both.num_near[zone, w]
         _copy(rows[first_far], 0, rows[place], 0, row)
         _copy(steps[first_far], 0, steps[place], 0, at - row)
         step_at[place] = step_at[first_far]
         place = first_far
-        zoned.num_near[zone, w] += 1
+        both.num_near[zone, w] += 1
     _copy(ghost, 0, rows[place], 0, row)
     _copy(ghost, row, steps[place], 0, at - row)
     step_at[place] = ghost[at]
-    zoned.num_rows[zone, w] += 1
+    both.num_rows[zone, w] += 1
 
 
 @inlined_kernel
