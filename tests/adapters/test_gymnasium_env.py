@@ -34,7 +34,7 @@ def test_the_other_agents_become_background() -> None:
     entry, _ = load_config("merge")
     everybody = entry.population.agents + entry.population.background
     assert (population.agents, population.background) == (1, everybody - 1)
-    overridden = gymnasium.make("cavmarl/ring-v2", overrides={"population.background": 3})
+    overridden = gymnasium.make("cavmarl/ring-v3", overrides={"population.background": 3})
     assert overridden.unwrapped._env.config.population.background == 3
 
 
@@ -70,7 +70,7 @@ def test_an_episode_is_one_trip_or_is_cut_at_the_horizon(mode: str) -> None:
 )
 def test_one_vehicle_is_one_vehicle(arguments: dict[str, Any], key: str) -> None:
     with pytest.raises(ConfigError, match=f"^{key}: this view decides it"):
-        gymnasium.make("cavmarl/ring-v2", **arguments)
+        gymnasium.make("cavmarl/ring-v3", **arguments)
 
 
 def test_the_spec_tells_the_horizon_and_makes_the_same_again() -> None:
@@ -78,7 +78,7 @@ def test_the_spec_tells_the_horizon_and_makes_the_same_again() -> None:
     assert world.spec is not None
     assert world.spec.max_episode_steps == 40
     assert gymnasium.make(world.spec).unwrapped._env.max_cycles == 40
-    cut = gymnasium.make("cavmarl/ring-v2", max_episode_steps=2)
+    cut = gymnasium.make("cavmarl/ring-v3", max_episode_steps=2)
     cut.reset(seed=0)
     cut.step(cut.action_space.sample())
     assert cut.step(cut.action_space.sample())[3], "Gymnasium's own limit works, too"

@@ -266,7 +266,7 @@ def test_the_spec_tells_the_horizon_and_makes_the_same_again() -> None:
     assert rows.spec.max_episode_steps == 12
     again = gymnasium.make_vec(rows.spec)
     assert (again.num_envs, again.vec.max_cycles) == (ROWS, 12)
-    shorter = gymnasium.make_vec("cavmarl/ringAgents-v2", num_envs=2, max_episode_steps=7)
+    shorter = gymnasium.make_vec("cavmarl/ringAgents-v3", num_envs=2, max_episode_steps=7)
     assert shorter.vec.max_cycles == 7
 
 

@@ -160,7 +160,7 @@ def test_a_slow_follower_holds_the_world_and_misses_no_frame(address: Path, star
         began = time.monotonic()
         hashes(world, 4)
         assert time.monotonic() - began > 0.2
-        assert world.seats[0].wait_wall_s > 0.25
+        assert world.seats[0].wait_wall_s > 0.2  # the fifth answer may be on its way already
     assert frames == [0, 1, 2, 3, 4]
 
 
