@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import random
 import subprocess
-import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 from benchmarks.harness import Report, Say, about, check_range, numbers_of, run, silent
-from cavmarl.core.errors import require
+from cavmarl.core.errors import ConfigError, require
 from cavmarl.evaluate.traffic.traffic_comparison import compare_traffic
 
 # Kind of junction → vehicles an hour and arm that go straight on, to the left, to the right.
@@ -41,7 +40,7 @@ def measure(
     chosen = numbers_of("--seeds", seeds)
     unknown = sorted(set(kinds.split(",")) - set(FLOWS))
     if unknown:
-        sys.exit(f"--kinds: no {', '.join(unknown)}; there are {', '.join(FLOWS)}")
+        raise ConfigError(f"--kinds: no {', '.join(unknown)}; there are {', '.join(FLOWS)}")
     rows: list[dict[str, Any]] = []
     with TemporaryDirectory() as name:
         for kind in kinds.split(","):

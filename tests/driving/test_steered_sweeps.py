@@ -159,6 +159,22 @@ def test_a_map_without_junctions_has_no_rows() -> None:
     assert len(with_steered_sweeps(network_of("ring")).sweeps) == 0
 
 
+def stop_for_a_fast_one(
+    network: RoadNetwork, link: int, sweep: np.void, place: float, front_m: float, speed: float
+) -> float:
+    """Where a car at `place` of a link stops for one so far before the line of the other link."""
+    lanes = [int(network.links[k]["from_lane"]) for k in (link, int(sweep["foe"]))]
+    rows = np.concatenate([on_lane(network, lane, 30.0, id=k) for k, lane in enumerate(lanes)])
+    rows["driver"], rows["hold"] = DRIVER_AGENT, HOLD_NONE
+    rows["speed"] = 2.0, speed
+    room = scratch(network, 2)
+    entry = room.approach[0]
+    entry["link"], entry["row"], entry["id"], entry["half"] = sweep["foe"], 1, -1, 2.5
+    entry["dist"], entry["speed"] = front_m + 2.5, speed
+    room.link_end[sweep["foe"]] = 1
+    return swept_stop(network.arrays, rows, 0, link, place, -np.inf, room)
+
+
 @pytest.mark.parametrize(("beyond_m", "goes_on"), [(0.5, True), (-0.5, False)])
 def test_one_that_is_in_the_way_of_a_fast_one_does_not_stop_for_it(
     network: RoadNetwork, beyond_m: float, goes_on: bool
@@ -177,17 +193,8 @@ def test_one_that_is_in_the_way_of_a_fast_one_does_not_stop_for_it(
                     found = link, sweep, conflict
     assert found is not None, "no steered car sweeps beyond the area that it has the right of"
     link, sweep, conflict = found
-    lanes = [int(network.links[k]["from_lane"]) for k in (link, int(sweep["foe"]))]
-    rows = np.concatenate([on_lane(network, lane, 30.0, id=k) for k, lane in enumerate(lanes)])
-    rows["driver"], rows["hold"] = DRIVER_AGENT, HOLD_NONE
-    rows["speed"] = 2.0, 15.0
-    room = scratch(network, 2)
-    entry = room.approach[0]
-    entry["link"], entry["row"], entry["id"], entry["half"] = sweep["foe"], 1, -1, 2.5
-    entry["dist"], entry["speed"] = 20.0 + 2.5, 15.0
-    room.link_end[sweep["foe"]] = 1
     place = float(conflict["enter_m"]) + beyond_m
-    stop = swept_stop(network.arrays, rows, 0, link, place, -np.inf, room)
+    stop = stop_for_a_fast_one(network, link, sweep, place, front_m=20.0, speed=15.0)
     assert (stop == np.inf) == goes_on
 
 
@@ -207,14 +214,5 @@ def test_one_that_was_let_in_does_not_stop_where_a_fast_one_drives(
                     found = link, sweep
     assert found is not None, "no steered car gives way and sweeps beyond the middle"
     link, sweep = found
-    lanes = [int(network.links[k]["from_lane"]) for k in (link, int(sweep["foe"]))]
-    rows = np.concatenate([on_lane(network, lane, 30.0, id=k) for k, lane in enumerate(lanes)])
-    rows["driver"], rows["hold"] = DRIVER_AGENT, HOLD_NONE
-    rows["speed"] = 2.0, 25.0
-    room = scratch(network, 2)
-    entry = room.approach[0]
-    entry["link"], entry["row"], entry["id"], entry["half"] = sweep["foe"], 1, -1, 2.5
-    entry["dist"], entry["speed"] = 60.0 + 2.5, 25.0
-    room.link_end[sweep["foe"]] = 1
-    stop = swept_stop(network.arrays, rows, 0, link, place, -np.inf, room)
+    stop = stop_for_a_fast_one(network, link, sweep, place, front_m=60.0, speed=25.0)
     assert (stop == np.inf) == goes_on
