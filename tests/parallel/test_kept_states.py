@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from io import BytesIO
 from typing import Any
 
 import numpy as np
 
+from cavmarl.parallel.checkpoint.world_bytes import from_bytes, to_bytes
 from cavmarl.parallel.nodes.kept_states import KeptStates
 from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
 
@@ -36,3 +38,16 @@ def test_older_states_go_when_the_newest_has_come_everywhere() -> None:
     kept.take(0, NodeFrame(FrameKind.KEEP, 4, memoryview(b"theirs")))  # ahead of this node
     kept.settle()
     assert (list(kept._own), list(kept._others[0])) == ([3], [3, 4]), "all may go back to 3"
+
+
+def test_arrays_are_written_as_numpy_writes_them() -> None:
+    rows = np.zeros(5, dtype=np.dtype([("id", np.int64), ("is_near", np.bool_)], align=True))
+    rows["id"] = np.arange(5)
+    arrays = [rows, rows[:0], np.zeros((2, 0)), np.arange(6).reshape(2, 3).T, np.ones(1, np.bool_)]
+    file = BytesIO()
+    for array in arrays:
+        np.lib.format.write_array(file, np.ascontiguousarray(array), allow_pickle=False)
+    data = to_bytes(arrays)
+    assert data == file.getvalue()
+    for array, found in zip(arrays, from_bytes(data, arrays), strict=True):
+        assert (array == found).all()

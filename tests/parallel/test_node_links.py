@@ -31,7 +31,7 @@ def pair() -> tuple[Links, socket.socket]:
     return links, far
 
 
-def frame(kind: FrameKind, data: bytes) -> bytes:
+def frame(kind: FrameKind, data: bytes | memoryview) -> bytes:
     links, far = pair()
     links.send(0, kind, 7, [data])
     with far:
@@ -42,14 +42,14 @@ def frame(kind: FrameKind, data: bytes) -> bytes:
 
 def head(kind: int, size: int) -> bytes:
     """The head of a first frame."""
-    found = b"cavN\x05\x00" + kind.to_bytes(2, "little") + bytes(8) + size.to_bytes(8, "little")
+    found = b"cavN\x06\x00" + kind.to_bytes(2, "little") + bytes(8) + size.to_bytes(8, "little")
     found += bytes(4)
     return found + zlib.crc32(found, 1).to_bytes(4, "little")
 
 
 def test_the_bytes_of_a_frame() -> None:
     assert frame(FrameKind.PING, b"abc").hex() == (
-        "6361764e05000d0007000000000000000300000000000000c2412435" + "5a00170c" + b"abc".hex()
+        "6361764e06000d0007000000000000000300000000000000c2412435" + "72a90954" + b"abc".hex()
     )
 
 
@@ -111,6 +111,23 @@ def test_each_bit_of_a_frame_is_guarded() -> None:
         far.close()
 
 
+def test_a_large_frame_is_guarded_likewise() -> None:
+    sent = frame(FrameKind.SYNC, np.random.default_rng(0).bytes(9999))
+    for bit in np.random.default_rng(1).integers(8 * len(sent), size=99).tolist():
+        changed = bytearray(sent)
+        changed[bit // 8] ^= 1 << bit % 8
+        links, far = pair()
+        far.sendall(changed)
+        with pytest.raises(LinkLostError, match="frame"):
+            links.take([0], WAIT_S)
+        far.close()
+
+
+def test_words_are_sent_as_bytes() -> None:
+    words = np.arange(3)
+    assert frame(FrameKind.SYNC, words.data)[-24:] == words.tobytes()
+
+
 @pytest.mark.parametrize("is_encrypted", [False, True])
 def test_what_the_system_does_not_take_at_once_is_sent_later(is_encrypted: bool) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
@@ -128,11 +145,15 @@ def test_what_the_system_does_not_take_at_once_is_sent_later(is_encrypted: bool)
     for part in parts:
         near.send(0, FrameKind.SHARE, 1, [part[:7].data, part[7:].data])
         near.send(0, FrameKind.SYNC, 2, [b"small"])
+    alone = parts[0, :-1].copy()
+    near.send(0, FrameKind.SHARE, 3, [alone.data])
+    alone[:] = 0  # its owner writes the next one there
     with ThreadPoolExecutor() as pool:
         flushed = pool.submit(near.flush)
         for part in parts:
             assert far.next(0).data == part.data
             assert far.next(0).data == b"small"
+        assert far.next(0).data == parts[0, :-1].data
         flushed.result()
     near.close()
     far.close()

@@ -23,10 +23,13 @@ from itertools import islice
 from typing import Any, NamedTuple, TypeAlias
 from zlib import crc32
 
+import numpy as np
+
 from cavmarl.core.errors import MessageError, NodeRefusedError
+from cavmarl.core.math.checksums import checksum
 
 MAGIC = b"cavN"
-VERSION = 5
+VERSION = 6
 MAX_FRAME = 1 << 32
 _ALL = (1 << 32) - 1
 BEGIN = MAGIC + VERSION.to_bytes(2, "little")
@@ -138,9 +141,9 @@ class Link:
         Returns:
             bytes of the frame.
         """
-        data = b"".join(pieces)
+        data = _joined(pieces)
         self._num_sent = num_sent = self._num_sent + 1 & _ALL
-        head = _HEAD.pack(BEGIN, kind, number, len(data), crc32(data))
+        head = _HEAD.pack(BEGIN, kind, number, len(data), checksum(data))
         head += _SUM.pack(crc32(head, num_sent))
         size, sent = HEAD_BYTES + len(data), 0
         if not self.waiting:
@@ -149,7 +152,8 @@ class Link:
             except BlockingIOError:
                 pass
         if sent < size:
-            self.waiting.append(memoryview(head + data)[sent:])
+            self.waiting.append(memoryview(head)[sent:])
+            self.waiting.append(memoryview(bytes(data))[max(sent - HEAD_BYTES, 0) :])
         return size
 
     def go_on_sending(self) -> None:
@@ -192,7 +196,7 @@ class Link:
         """Take the frames that begin in what has come."""
         room, at = self._room, 0
         while filled - at >= HEAD_BYTES:
-            begin, code, which, size, checksum, own = _WHOLE_HEAD.unpack_from(room, at)
+            begin, code, which, size, summed, own = _WHOLE_HEAD.unpack_from(room, at)
             self._num_heard = heard = self._num_heard + 1 & _ALL
             is_next = crc32(room[at : at + SUMMED], heard) == own
             if begin != BEGIN or not is_next or code not in _KINDS or size > MAX_FRAME:
@@ -201,12 +205,12 @@ class Link:
             end = at + size
             if end <= filled:
                 data = memoryview(bytearray(room[at:end]))
-                self._close(NodeFrame(_KINDS[code], which, data), checksum, urgent, number)
+                self._close(NodeFrame(_KINDS[code], which, data), summed, urgent, number)
                 at = end
                 continue
-            data, come = memoryview(bytearray(size)), filled - at
+            data, come = np.empty(size, dtype=np.uint8).data, filled - at
             data[:come] = room[at:filled]
-            self._opened = NodeFrame(_KINDS[code], which, data), checksum
+            self._opened = NodeFrame(_KINDS[code], which, data), summed
             self._into, self._filled = data[come:], 0
             return
         if at < filled:
@@ -218,12 +222,12 @@ class Link:
     def _close(
         self,
         frame: NodeFrame,
-        checksum: int,
+        summed: int,  # its checksum, as the head has it
         urgent: deque[tuple[int, NodeFrame]],
         number: int,
     ) -> None:
         """Take a frame that has come whole."""
-        if crc32(frame.data) != checksum:
+        if checksum(frame.data) != summed:
             raise MessageError("a frame is not what was sent")
         kind = frame.kind
         if kind not in _AT_ONCE:
@@ -234,6 +238,16 @@ class Link:
             raise NeededNoMoreError
         else:
             raise NodeRefusedError(f"the caller refuses this node: {_text(frame)}")
+
+
+def _joined(pieces: Sequence[Bytes]) -> Bytes:
+    """Pieces as one; a single one is not copied."""
+    if len(pieces) != 1:
+        return b"".join(pieces)
+    (data,) = pieces
+    if isinstance(data, memoryview) and data.nbytes != len(data):
+        return data.tobytes()
+    return data
 
 
 def _stranger(begin: bytes, is_next: bool, code: int, size: int) -> MessageError:

@@ -24,7 +24,7 @@ from cavmarl.engine.simulation import Simulation
 from cavmarl.parallel.nodes.agent_stream import AgentStream
 from cavmarl.parallel.nodes.link import Bytes, FrameKind, NodeFrame
 from cavmarl.parallel.nodes.links import LinkLostError, Links, RecoveryOrderedError
-from cavmarl.parallel.nodes.row_stream import RowStream, passing_of
+from cavmarl.parallel.nodes.row_stream import RowStream, forecast_of, passing_of
 from cavmarl.zones.kernels.agent_frames import UNOWNED
 from cavmarl.zones.kernels.row_frames import Passing, count_own
 
@@ -68,8 +68,11 @@ class NodePeers:
         self._running = np.zeros(self._num_worlds, dtype=np.int64)
         self._rerouted = np.zeros(self._num_worlds, dtype=np.int64)
         mine = (self._zoned, self._mine)
+        clock = simulation.config.clock
+        law = forecast_of(shard.roads, clock.sim_dt_s, clock.ticks_per_step)
         self._rows = {
-            n: RowStream(*mine, self._zones[n], self._running, self._rerouted) for n in self._others
+            n: RowStream(*mine, self._zones[n], self._running, self._rerouted, law)
+            for n in self._others
         }
         self._count_own = specialized(count_own)
         self._agents = AgentStream([getattr(simulation.outputs, name) for name in PIECES])

@@ -1,6 +1,7 @@
 """`RowStream`: what two nodes tell each other about the rows of each tick.
 
-Both ends keep the ghosts of the frame before; a frame has the words that have changed.
+Both ends keep the ghosts of the frame before, and foresee those of the next; a frame has the words
+that are different.
 """
 
 from __future__ import annotations
@@ -11,15 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import MessageError
+from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.numba.specialized import specialized
-from cavmarl.core.records.arrays import Gate, Zoned
+from cavmarl.core.records.arrays import Gate, RoadArrays, Zoned
+from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.parallel.nodes.link import Bytes
+from cavmarl.roads.routing import PLAN
+from cavmarl.zones.kernels.ghost_forecast import PLACES, Forecast
 from cavmarl.zones.kernels.row_frames import (
     AFTER,
     ID,
     MOST,
     NO_FRAME,
     Both,
+    Ghosts,
     Passing,
     pack_frame,
     take_frame,
@@ -32,18 +38,45 @@ class _Room:
     """Ghosts of two frames: the one before, and room for the present one."""
 
     def __init__(self, words: int) -> None:  # of a ghost
-        self._before, self.now = (np.empty((0, words), dtype=np.int64) for _ in range(2))
+        self._before, self.now = (_ghosts(np.empty((0, words), dtype=np.int64)) for _ in range(2))
         self.before = self._before
 
     def make(self, num: int) -> None:
         """Make room for so many, at least."""
-        if len(self.now) < num:
-            self.now = np.empty((num + num // 2, self.now.shape[1]), dtype=np.int64)
+        if len(self.now.words) < num:
+            size = self.now.words.shape[1]
+            self.now = _ghosts(huge_zeros((num + num // 2, size), dtype=np.int64))
 
     def turn(self, num: int) -> None:
         """So many that have been written are those before from now on."""
         self._before, self.now = self.now, self._before
-        self.before = self._before[:num]
+        self.before = _ghosts(self._before.words[:num])
+
+
+def _ghosts(words: Array) -> Ghosts:
+    return Ghosts(words, words.view(np.float64))
+
+
+def forecast_of(roads: RoadArrays, dt: float, ticks_per_step: int) -> Forecast:
+    """What is foreseen on some roads, in ticks of `dt` seconds."""
+    lanes, links = roads.lanes, roads.links
+    beyond = np.zeros(len(lanes))
+    inside = lanes["internal"]
+    of_link = lanes[inside]
+    beyond[inside] = links["length_m"][of_link["link"]] - of_link["link_offset_m"]
+    words = np.zeros(MOST, dtype=np.int64)
+    limits = lanes["speed_mps"].astype(np.float64)
+    way_to_go = VEHICLE.itemsize // 8 + _word(PLAN, "to_go")
+    assert all(_word(VEHICLE, name) == place for name, place in PLACES.items())
+    return Forecast(
+        dt, ticks_per_step, way_to_go, limits, beyond, words, words.view(np.float64)
+    )  # fmt: skip
+
+
+def _word(dtype: np.dtype[Any], name: str) -> int:
+    """Which word of a record a field is in."""
+    assert dtype.fields is not None
+    return int(dtype.fields[name][1]) // 8
 
 
 class RowStream:
@@ -56,13 +89,15 @@ class RowStream:
         others: NDArray[np.int64],  # of the other one
         running: NDArray[np.int64],  # (W,) see `Both`
         rerouted: NDArray[np.int64],  # (W,) likewise
+        law: Forecast,
     ) -> None:
         rows, steps = words_of(zoned.rows), words_of(zoned.step)
         numbers = zoned.num_owned, zoned.num_rows, zoned.num_near
         self._both = Both(rows, steps, zoned.step_at, *numbers, zones, others, running, rerouted)
         self._row = rows.shape[-1]
         size = self._row + steps.shape[-1] + AFTER
-        assert size <= MOST
+        assert size < MOST
+        self._law = law
         assert zoned.rows["id"].ctypes.data - zoned.rows.ctypes.data == 8 * ID
         self._sent, self._taken = _Room(size), _Room(size)
         self._slots = np.empty(1, dtype=np.int32)
@@ -78,24 +113,24 @@ class RowStream:
             passing: what leaves.
         """
         sent = self._sent
-        before = sent.before
-        if self._slots.size < 2 * len(before):
-            self._slots = np.empty(1 << (2 * len(before)).bit_length(), dtype=np.int32)
-        args = self._both, side, passing, before, self._slots
+        before = len(sent.before.words)
+        if self._slots.size < 2 * before:
+            self._slots = np.empty(1 << (2 * before).bit_length(), dtype=np.int32)
+        args = self._both, side, passing, self._law, sent.before, self._slots
         num = self._pack(*args, sent.now, self._frame)
         if num < 0:
             ghosts = -1 - num
             sent.make(ghosts)
-            words = ghosts * (2 + sent.now.shape[1]) + int(passing.num.sum()) * self._row
+            words = ghosts * (2 + sent.now.words.shape[1]) + int(passing.num.sum()) * self._row
             self._make_frame(self._frame.size + words + words // 2)
             num = self._pack(*args, sent.now, self._frame)
-        if num or len(before):
+        if num or before:
             sent.turn(num)
         return self._bytes[: 8 * self._frame.item(0)]
 
     def _make_frame(self, words: int) -> None:
         """Make room for a frame."""
-        self._frame = np.empty(words, dtype=np.int64)
+        self._frame = huge_zeros(words, dtype=np.int64)
         self._bytes = self._frame.view(np.uint8).data
 
     def take(self, data: memoryview, side: int, passing: Passing) -> None:
@@ -107,14 +142,14 @@ class RowStream:
         taken, num = self._taken, NO_FRAME
         if data and not len(data) % 8:
             frame = np.frombuffer(data, np.int64)
-            args = self._both, side, passing, taken.before
+            args = self._both, side, passing, self._law, taken.before
             num = self._take(*args, taken.now, frame)
             if NO_FRAME < num < 0:
                 taken.make(-1 - num)
                 num = self._take(*args, taken.now, frame)
         if num < 0:
             raise MessageError(f"{len(data)} bytes are not what a node tells of the rows of a tick")
-        if num or len(taken.before):
+        if num or len(taken.before.words):
             taken.turn(num)
 
 

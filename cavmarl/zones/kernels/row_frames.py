@@ -12,7 +12,7 @@ A frame is words, of W worlds and k zones of the process that it goes to:
     W           vehicles that leave
     k · W · 2   ghosts; those of them that can touch a vehicle there
     n           of each ghost where it was in the frame before; -1: it is sent whole
-    n           of each ghost a bit for each word that is sent
+    n           of each ghost a bit for each word that is sent: it is not as `ghost_forecast` says
     …           rows of the vehicles that leave
     …           words of ghosts
 """
@@ -26,10 +26,12 @@ from numpy.typing import NDArray
 
 from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.codes import COUNT_REROUTED
+from cavmarl.zones.kernels.ghost_forecast import Forecast, foresee, is_told
 
 ID = 0  # the word of a row that names the vehicle
 AFTER = 2  # words of a ghost behind its row and its step
-MOST = 64  # words of a ghost: one word has a bit for each that has changed
+MOST = 64  # words of a ghost: one word has a bit for each that is sent
+GROUP = 8  # words that are compared at once
 NO_FRAME = -(1 << 62)
 
 Words = NDArray[np.int64]
@@ -48,6 +50,13 @@ class Both(NamedTuple):
     theirs: NDArray[np.int64]  # and of the other one
     running: NDArray[np.int64]  # (W,) written: vehicles of this process, and of others as they come
     rerouted: NDArray[np.int64]  # (W,) written: those that had taken another way by the last frame
+
+
+class Ghosts(NamedTuple):
+    """Ghosts of a frame, (n, V + S + 2), as whole numbers and as floats: the same memory."""
+
+    words: Words
+    floats: NDArray[np.float64]
 
 
 class Passing(NamedTuple):
@@ -74,9 +83,10 @@ def pack_frame(
     both: Both,
     side: int,
     passing: Passing,
-    before: Words,  # (p, V + S + 2) the ghosts of the frame before
-    slots: NDArray[np.int32],  # scratch, a power of two and more than p
-    now: Words,  # (n, V + S + 2) written: the ghosts, first of all
+    law: Forecast,
+    before: Ghosts,  # those of the frame before
+    slots: NDArray[np.int32],  # scratch, a power of two and more than these
+    now: Ghosts,  # written: the ghosts, first of all
     frame: Words,  # written
 ) -> int:
     """Write a frame.
@@ -101,14 +111,15 @@ def pack_frame(
             total += frame[first]
             first += 2
     row = passing.rows.shape[2]
-    if total > now.shape[0] or first + total * (2 + now.shape[1]) + leaving * row > frame.size:
+    most = first + total * (2 + now.words.shape[1]) + leaving * row
+    if total > now.words.shape[0] or most > frame.size:
         return -1 - total
     at = first + 2 * total
     for w in range(num_worlds):
         for i in range(passing.num[w]):
             _copy(passing.rows[w, i], 0, frame, at, row)
             at += row
-    frame[0] = at + _pack_ghosts(both, side, before, slots, now, frame, first, total, at)
+    frame[0] = at + _pack_ghosts(both, side, law, before, slots, now, frame, first, total, at)
     return int(total)
 
 
@@ -116,16 +127,17 @@ def pack_frame(
 def _pack_ghosts(
     both: Both,
     side: int,
-    before: Words,
+    law: Forecast,
+    before: Ghosts,
     slots: NDArray[np.int32],
-    now: Words,
+    now: Ghosts,
     frame: Words,
     first: int,  # where `like` begins
     total: int,
     at: int,  # where their words begin
 ) -> int:
     """Write the ghosts of a frame; how many words they take."""
-    _fill_slots(before, slots)
+    _fill_slots(before.words, slots)
     row = both.rows.shape[4]
     last = row + both.steps.shape[3]
     begin = at
@@ -134,22 +146,61 @@ def _pack_ghosts(
         zone = both.theirs[k]
         for w in range(both.num_owned.shape[1]):
             for i in range(both.num_rows[zone, w]):
-                ghost = now[n]
+                ghost = now.words[n]
                 _copy(both.rows[side, zone, w, i], 0, ghost, 0, row)
                 _copy(both.steps[zone, w, i], 0, ghost, row, last - row)
                 ghost[last] = both.step_at[zone, w, i]
                 ghost[last + 1] = w
-                found = _find(before, slots, ghost)
-                bits = np.uint64(0)
-                for c in range(ghost.size):
-                    if found < 0 or before[found, c] != ghost[c]:
-                        bits |= np.uint64(1) << np.uint64(c)
-                        frame[at] = ghost[c]
-                        at += 1
+                found = _find(before.words, slots, ghost)
+                bits = _every_bit(ghost.size)
+                if found < 0:
+                    _copy(ghost, 0, frame, at, ghost.size)
+                    at += ghost.size
+                else:
+                    _copy(before.words[found], 0, law.words, 0, ghost.size)
+                    foresee(
+                        law, before.floats[found], before.words[found],
+                        now.floats[n], ghost, np.uint64(0), law.floats, law.words,
+                    )  # fmt: skip
+                    bits, at = _pack_differences(law.words, ghost, frame, at)
                 frame[first + n] = found
                 frame[first + total + n] = np.int64(bits)
                 n += 1
     return at - begin
+
+
+@inlined_kernel
+def _every_bit(num: int) -> np.uint64:
+    """The first bits, so many, at most 63."""
+    return (np.uint64(1) << np.uint64(num)) - np.uint64(1)
+
+
+@inlined_kernel
+def _pack_differences(known: Words, ghost: Words, frame: Words, at: int) -> tuple[np.uint64, int]:
+    """Write the words that are not as they are known; their bits, and where they end."""
+    bits = np.uint64(0)
+    for first in range(0, ghost.size, GROUP):
+        if _differ(known, ghost, first):
+            for c in range(first, min(first + GROUP, ghost.size)):
+                word = ghost[np.uint64(c)]
+                if known[np.uint64(c)] != word:
+                    bits |= np.uint64(1) << np.uint64(c)
+                    frame[np.uint64(at)] = word
+                    at += 1
+    return bits, at
+
+
+@inlined_kernel
+def _differ(known: Words, ghost: Words, first: int) -> bool:
+    """Whether two rows are different in the words of a group."""
+    differ = np.int64(0)
+    if first + GROUP <= ghost.size:
+        for c in range(GROUP):
+            differ |= known[np.uint64(first + c)] ^ ghost[np.uint64(first + c)]
+    else:
+        for c in range(first, ghost.size):
+            differ |= known[np.uint64(c)] ^ ghost[np.uint64(c)]
+    return bool(differ != 0)
 
 
 @inlined_kernel
@@ -187,8 +238,9 @@ def take_frame(
     both: Both,
     side: int,
     passing: Passing,  # written
-    before: Words,
-    now: Words,  # (n, V + S + 2) written: the ghosts, first of all
+    law: Forecast,
+    before: Ghosts,  # those of the frame before
+    now: Ghosts,  # written: the ghosts, first of all
     frame: Words,
 ) -> int:
     """Put what another process has packed behind the rows of zones of this one, and in the gate.
@@ -202,9 +254,8 @@ def take_frame(
     total = _count_ghosts(both, frame)
     if total < 0:
         return NO_FRAME
-    if total > now.shape[0]:
+    if total > now.words.shape[0]:
         return int(-1 - total)
-    now = now[:total]
     num_worlds = both.num_owned.shape[1]
     first = 1 + 3 * num_worlds
     like = first + both.mine.size * num_worlds * 2
@@ -215,7 +266,7 @@ def take_frame(
         if passing.num[w] + leaving > passing.rows.shape[1]:
             return NO_FRAME
         words += leaving * row
-    if not _unpack(before, now, frame, like, words):
+    if not _unpack(law, before, now, total, frame, like, words):
         return NO_FRAME
     for w in range(num_worlds):
         both.running[w] += frame[1 + w]
@@ -229,7 +280,7 @@ def take_frame(
     for k in range(both.mine.size):
         for w in range(num_worlds):
             for i in range(frame[first]):
-                _put(both, side, both.mine[k], w, now[n], i < frame[first + 1])
+                _put(both, side, both.mine[k], w, now.words[n], i < frame[first + 1])
                 n += 1
             first += 2
     return int(total)
@@ -259,30 +310,49 @@ def _put(both: Both, side: int, zone: int, w: int, ghost: Words, is_near: bool) 
 
 @inlined_kernel
 def _copy(source: Words, first: int, target: Words, to: int, num: int) -> None:
+    # Unsigned: Numba asks of each other number whether it is below 0.
     for c in range(num):
-        target[to + c] = source[first + c]
+        target[np.uint64(to + c)] = source[np.uint64(first + c)]
 
 
 @inlined_kernel
-def _unpack(before: Words, now: Words, frame: Words, like: int, words: int) -> bool:
-    """Write the ghosts of a frame to `now`; `like`, `words`: where these begin in it."""
-    num = now.shape[0]
+def _unpack(
+    law: Forecast,
+    before: Ghosts,
+    now: Ghosts,
+    num: int,
+    frame: Words,
+    like: int,  # where `like` begins
+    at: int,  # where the ghosts' words begin
+) -> bool:
+    """Write the ghosts of a frame to `now`; whether they are of one."""
+    size = now.words.shape[1]
     for n in range(num):
         found = frame[like + n]
-        if found >= before.shape[0]:
-            return False
         bits = np.uint64(frame[like + num + n])
-        for c in range(now.shape[1]):
-            if bits >> np.uint64(c) & np.uint64(1):
-                if words == frame.size:
-                    return False
-                now[n, c] = frame[words]
-                words += 1
-            elif found < 0:
+        if found >= before.words.shape[0] or bits > _every_bit(size):
+            return False
+        ghost = now.words[n]
+        if found < 0:
+            if bits != _every_bit(size) or at + size > frame.size:
                 return False
-            else:
-                now[n, c] = before[found, c]
-    return words == frame.size
+            _copy(frame, at, ghost, 0, size)
+            at += size
+            continue
+        _copy(before.words[found], 0, ghost, 0, size)
+        for first in range(0, size, GROUP):
+            if bits >> np.uint64(first) & _every_bit(GROUP):
+                for c in range(first, min(first + GROUP, size)):
+                    if is_told(bits, c):
+                        if at == frame.size:
+                            return False
+                        ghost[c] = frame[at]
+                        at += 1
+        foresee(
+            law, before.floats[found], before.words[found],
+            now.floats[n], ghost, bits, now.floats[n], ghost,
+        )  # fmt: skip
+    return at == frame.size
 
 
 @inlined_kernel
