@@ -53,12 +53,12 @@ def huge_zeros(shape: int | tuple[int, ...], dtype: DTypeLike = np.float64) -> N
     return _PAGES.take(size).view(kind).reshape(sides)
 
 
-def huge_copy(array: NDArray[Any]) -> NDArray[Any]:
+def huge_copy(array: NDArray[Any], also_mapped: bool = False) -> NDArray[Any]:
     """The same array in huge pages, as writable as it was; a small one is not copied.
 
-    Nor is one that lies in them, or in a file that is mapped.
+    Nor is one that lies in them, or in a file that is mapped, unless `also_mapped` says so.
     """
-    if array.nbytes < LEAST or _is_mapped(array):
+    if array.nbytes < LEAST or (_is_mapped(array) and not also_mapped):
         return array
     copy = huge_zeros(array.shape, array.dtype)
     # Byte for byte: an assignment would leave out the padding of records, which hashes read.

@@ -212,6 +212,10 @@ MAP = record(
     ("num_programs", np.int32),
 )
 
+# At most so many bytes of a map's file are copied. A tick reads many places of a map: in the small
+# pages of a file it takes a tenth longer, but processes of one machine share that memory.
+COPIED = 1 << 27
+
 # Fields of a network that kernels take, in the order of `RoadArrays`.
 _TABLES = (
     "points", "lanes", "edges", "links", "conflicts", "sweeps", "into", "signals", "programs",
@@ -279,10 +283,14 @@ class RoadNetwork:
     def arrays(self) -> RoadArrays:
         """The tables as kernels take them; from then on the fields are these.
 
-        They are in huge pages, or where the cache's file is mapped.
+        They are in huge pages; those of a large map stay where the cache's file is mapped.
         """
+        file = file_of(self.lanes)
+        is_copied = file is not None and len(file) <= COPIED
         for name in _TABLES:
-            object.__setattr__(self, name, huge_copy(getattr(self, name)))
+            object.__setattr__(self, name, huge_copy(getattr(self, name), also_mapped=is_copied))
+        if file is not None and is_copied:
+            let_go(file)
         own = (getattr(self, name) for name in _TABLES)
         found = (*own, *map(huge_copy, self._places), self.maps)
         return RoadArrays(*found)

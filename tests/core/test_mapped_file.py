@@ -22,6 +22,10 @@ def test_an_array_is_a_view_of_the_file_and_not_copied(tmp_path: Path) -> None:
     array = np.frombuffer(memoryview(file)[8:], np.int64)[1:].reshape(-1, 2)
     assert file_of(array) is file
     assert huge_copy(array) is array
+    copy = huge_copy(array, also_mapped=True)
+    assert file_of(copy) is None
+    assert (copy == array).all()
+    assert not copy.flags.writeable
     assert not array.flags.writeable
     write_whole(path, b"another one in its place")
     let_go(file)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cavmarl.core.mapped_file import file_of
 from cavmarl.roads import cache
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
@@ -47,6 +48,24 @@ def test_a_second_load_restores_every_array(
         else:
             assert one == other
     assert [entry.suffix for entry in cache_folder.iterdir()] == [".network"]
+
+
+@pytest.mark.parametrize("copied", [0, 1 << 27])
+def test_a_large_map_stays_in_its_file(
+    crossing: Callable[..., Path],
+    cache_folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    copied: int,  # bytes, at most
+) -> None:
+    monkeypatch.setattr("cavmarl.roads.network.COPIED", copied)
+    monkeypatch.setattr("cavmarl.core.huge_pages.LEAST", 1)
+    path = crossing()
+    first, second = load_network(path), load_network(path)
+    assert first.content_hash == second.content_hash
+    assert (file_of(second.arrays.lanes) is None) == (copied > 0)
+    for one, other in zip(first.arrays, second.arrays, strict=True):
+        assert one.tobytes() == other.tobytes()
+    assert not second.lanes.flags.writeable
 
 
 def test_a_changed_source_is_read_again(crossing: Callable[..., Path], cache_folder: Path) -> None:
