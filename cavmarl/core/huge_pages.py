@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import mmap
+import os
 import sys
 import threading
 from math import prod
@@ -20,6 +21,7 @@ from numpy.typing import DTypeLike, NDArray
 PAGE = 1 << 21  # bytes
 LEAST = 1 << 16  # bytes of an array that is worth it
 _LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
+_TUNABLES = "GLIBC_TUNABLES"
 _LINE = 64  # bytes of a cache line: no two arrays share one
 
 
@@ -73,6 +75,15 @@ def _is_mapped(array: NDArray[Any]) -> bool:
     while isinstance(base, np.ndarray):
         base = base.base
     return isinstance(getattr(base, "obj", base), mmap.mmap)
+
+
+def huge_heap() -> dict[str, str]:
+    """With these variables of its environment a process has its heap in huge pages; glibc can.
+
+    What the user has set of the C library comes last, and so counts.
+    """
+    own = os.environ.get(_TUNABLES)
+    return {_TUNABLES: ":".join(["glibc.malloc.hugetlb=1", *([own] if own else [])])}
 
 
 def trim() -> None:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
+from cavmarl.core.huge_pages import huge_heap
 from cavmarl.core.processes import start_python
 from cavmarl.parallel.nodes.newcomers import ANYONE
 from cavmarl.parallel.nodes.node_starters import NODE
@@ -45,7 +46,7 @@ class ZoneProcesses:
 def _start(door: Door) -> subprocess.Popen[Any]:
     host, port, key = door
     words = ["-m", NODE, host, str(port), str(ANYONE)]
-    process = start_python(words, stdin=subprocess.PIPE, text=True)
+    process = start_python(words, huge_heap(), stdin=subprocess.PIPE, text=True)
     assert process.stdin is not None
     with suppress(BrokenPipeError), process.stdin as pipe:
         pipe.write(f"{key}\n")

@@ -9,7 +9,7 @@ import weakref
 import numpy as np
 import pytest
 
-from cavmarl.core.huge_pages import LEAST, PAGE, huge_copy, huge_zeros
+from cavmarl.core.huge_pages import LEAST, PAGE, huge_copy, huge_heap, huge_zeros
 
 RECORD = np.dtype([("x", np.float64), ("on", np.bool_)], align=True)
 
@@ -79,3 +79,13 @@ def _mapping(memory: object) -> mmap.mmap:
     found = memory.obj if isinstance(memory, memoryview) else memory
     assert isinstance(found, mmap.mmap)
     return found
+
+
+@pytest.mark.parametrize("own", ["", "glibc.malloc.hugetlb=0"])
+def test_a_heap_in_huge_pages_unless_the_user_says_otherwise(
+    monkeypatch: pytest.MonkeyPatch, own: str
+) -> None:
+    monkeypatch.setenv("GLIBC_TUNABLES", own)
+    first, *more = huge_heap()["GLIBC_TUNABLES"].split(":")
+    assert first == "glibc.malloc.hugetlb=1"
+    assert more == ([own] if own else [])

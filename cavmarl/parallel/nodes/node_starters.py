@@ -10,6 +10,7 @@ from typing import Any, Protocol, TypeAlias
 
 from cavmarl.config.workers import WorkersConfig
 from cavmarl.core.errors import ConfigError
+from cavmarl.core.huge_pages import huge_heap
 from cavmarl.core.processes import start_python
 from cavmarl.parallel.hosts.host_registry import Launcher
 from cavmarl.parallel.hosts.listener import Listener
@@ -77,7 +78,8 @@ class LocalNodes:
 
     def _start(self, number: int) -> subprocess.Popen[Any]:
         told = map(str, (*self._place, number))
-        process = start_python(["-m", NODE, *told], stdin=subprocess.PIPE, text=True)
+        # States that are kept, and large frames, are new memory each time.
+        process = start_python(["-m", NODE, *told], huge_heap(), stdin=subprocess.PIPE, text=True)
         assert process.stdin is not None
         with suppress(BrokenPipeError), process.stdin as pipe:
             pipe.write(f"{self._listener.secret.hex()}\n")
