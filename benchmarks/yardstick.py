@@ -2,8 +2,9 @@
 
 Every trip counts, those that the end of the run cuts, too. A vehicle stands without a cause if it
 has stood for `STANDS_S`, its signal is not red, no other vehicle is near ahead of it or behind the
-junction, and none is on a way or near a line where it has to give way. What touches on ground that
-the map gives two roads is counted apart (`maps.shared_ground`).
+junction, and none is, or has its rear, on a way that crosses its own, or is near a line where it
+has to give way. What touches on ground that the map gives two roads is counted apart
+(`maps.shared_ground`).
 """
 
 from __future__ import annotations
@@ -302,8 +303,9 @@ class _Standing:
         if ((others["lane"] == target["to_lane"]) & (others["s"] < NEAR_AHEAD_M)).any():
             return True
         conflicts = network.conflicts[target["first_conflict"] :][: target["num_conflicts"]]
-        inside = lanes["internal"][others["lane"]]
-        crosses = inside & np.isin(lanes["link"][others["lane"]], conflicts["foe"])
+        crosses = np.isin(lanes["link"][others["lane"]], conflicts["foe"])  # outside they have none
+        into = network.links["to_lane"][conflicts["foe"]]
+        crosses |= np.isin(others["lane"], into) & (others["s"] < 0.5 * others["length"])
         first = network.links["from_lane"][conflicts["foe"][conflicts["must_yield"]]]
         to_line = lanes["length_m"][others["lane"]] - others["s"]
         comes = np.isin(others["lane"], first) & (to_line < COMES_M)
