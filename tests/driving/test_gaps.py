@@ -108,43 +108,62 @@ def test_one_that_comes_is_let_over_the_whole_junction(
     assert not blocks(over_s + 0.05, "line", 20.0)
 
 
-def test_before_one_that_comes_to_its_line_it_is_three_seconds(blocks: Blocks) -> None:
+@pytest.mark.parametrize(("driver", "ahead_s"), [(DRIVER_BACKGROUND, 1.0), (DRIVER_AGENT, 3.0)])
+def test_before_one_that_comes_to_its_line_it_is_a_second_and_before_a_steered_one_three(
+    blocks: Blocks, driver: int, ahead_s: float
+) -> None:
     # Its front reaches its line in 5 s.
-    assert blocks(2.05, "out", 50.0)
-    assert not blocks(1.95, "out", 50.0)
+    assert blocks(5.05 - ahead_s, "out", 50.0, driver=driver)
+    assert not blocks(4.95 - ahead_s, "out", 50.0, driver=driver)
 
 
-@pytest.mark.parametrize(("wait_s", "arrives_s"), [(90.0, 6.0), (180.0, 8.0), (900.0, 8.0)])
+def test_one_that_speeds_up_comes_earlier(blocks: Blocks) -> None:
+    # From 4 m/s with 2 m/s² it has 10 m/s, the limit, after 3 s and 21 m, and 50 m after 5.9 s.
+    assert blocks(4.95, "out", 50.0, speed=4.0, accel=2.0)
+    assert not blocks(4.85, "out", 50.0, speed=4.0, accel=2.0)
+    assert not blocks(4.95, "out", 50.0, speed=4.0), "at the speed that it has it takes 12.5 s"
+
+
+@pytest.mark.parametrize(("wait_s", "arrives_s"), [(90.0, 3.0), (180.0, 4.0), (900.0, 4.0)])
 def test_one_that_has_waited_for_long_counts_on_others_to_brake(
     blocks: Blocks, wait_s: float, arrives_s: float
 ) -> None:
-    assert blocks(arrives_s - 2.95, "out", 40.0, wait_s)
-    assert not blocks(arrives_s - 3.05, "out", 40.0, wait_s)
+    assert blocks(arrives_s - 0.95, "out", 20.0, wait_s)
+    assert not blocks(arrives_s - 1.05, "out", 20.0, wait_s)
 
 
-@pytest.mark.parametrize(("foe_mps", "more"), [(10.0, False), (30.0, True)])
-def test_a_steered_car_leaves_a_fast_one_the_way_to_brake_behind_it(
-    network: RoadNetwork, foe_mps: float, more: bool
+@pytest.mark.parametrize(
+    ("driver", "foe_mps", "ahead_s"),
+    [
+        (DRIVER_BACKGROUND, 4.0, 1.0),  # it is as fast as that one
+        (DRIVER_BACKGROUND, 10.0, 4.5),
+        (DRIVER_BACKGROUND, 30.0, 4.5),
+        (DRIVER_AGENT, 4.0, 1.5),
+        (DRIVER_AGENT, 10.0, 1.5),
+        (DRIVER_AGENT, 30.0, 2.3),  # (30 - 5)² / (2 · 4.5 · 30): the way to brake behind it
+    ],
+)
+def test_before_one_that_comes_fast_into_the_same_lane_it_takes_longer(
+    network: RoadNetwork, driver: int, foe_mps: float, ahead_s: float
 ) -> None:
     own = np.repeat(np.arange(len(network.links)), network.links["num_conflicts"])
     shared = next(k for k in np.flatnonzero(network.conflicts["merging"])
                   if network.conflicts["must_yield"][k])  # fmt: skip
     conflict, link = network.conflicts[shared], int(own[shared])
-    rows = np.concatenate([on_lane(network, 0, 0.0, speed=4.0)] * 2)
+    rows = np.concatenate([on_lane(network, 0, 0.0, speed=5.0, driver=driver)] * 2)
     rows["speed"][1] = foe_mps
     foe = np.zeros(1, APPROACH)
     foe["link"], foe["row"], foe["half"], foe["speed"] = conflict["foe"], 1, HALF_M, foe_mps
+    length_m = float(rows["length"][0])
+    over_m = 5.0 + 0.5 * length_m + min(network.links[["length_m", "wait_m"]][link].tolist())
 
-    def least_m(driver: int) -> float:
-        rows["driver"] = driver
-        for front_m in np.arange(5.0, 400.0):
-            foe["dist"] = front_m + HALF_M
-            if not foe_blocks(network.arrays, rows, rows[0], link, 5.0, 5.0, conflict, foe[0],
-                              True, np.zeros(1, np.int32)):  # fmt: skip
-                return float(front_m)
-        raise AssertionError("it waits for ever")
+    def waits(front_m: float) -> int:
+        foe["dist"] = front_m + HALF_M
+        return foe_blocks(network.arrays, rows, rows[0], link, 5.0, 5.0, conflict, foe[0],
+                          True, np.zeros(1, np.int32))  # fmt: skip
 
-    assert (least_m(DRIVER_AGENT) > least_m(DRIVER_BACKGROUND) + 5.0) == more
+    least_m = next(m for m in np.arange(1.0, 400.0, 0.1) if not waits(m))
+    assert least_m / foe_mps == pytest.approx(over_m / 5.0 + ahead_s, abs=0.1)
 
 
 def waiting_pair(**fields: Any) -> Any:

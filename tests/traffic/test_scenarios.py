@@ -40,7 +40,7 @@ ROOMY = {"failed_u_turn": "A1B1_1", "pedestrian_crossing": "A1B1_0"}
 GOLDEN = {
     ("failed_u_turn", False): "8c96686d6f7f4c3fb7618e14c20de981",
     ("intersection_blockage", False): "8076b53af2bd13a47b5420ae08f51132",
-    ("merge_conflict", False): "4f1dda8d3bdfc38929b64fb0c1eaf60f",
+    ("merge_conflict", False): "ab0d9157919a39a12c4311264c6b7dd0",
     ("pedestrian_crossing", False): "d9ea21caeb1504be3cb9b7ae9c1e6289",
     ("pedestrian_crossing", True): "2bdf5731261a74ff181a519b9daf6bfd",
     ("road_closure", False): "b9fb1c3a9ac665f5cda1b278541baf69",

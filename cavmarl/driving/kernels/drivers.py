@@ -69,8 +69,7 @@ from cavmarl.driving.kernels.ways import leave, next_step
 SEE_LINE_M = 8.0
 SEE_FOES_M = 4.5  # before a line, a driver that gives way is ready to stop, as SUMO's are
 NEAR_M = 8.0  # to a leader so near the corner between matters,
-ASKEW_RAD = 0.7  # if it turns by so much,
-ASKEW_M = 2.5  # which takes this off the gap
+ASKEW_RAD = 0.7  # if it turns by so much: the gap is half a width less
 NEXT_LINE_M = 5.0  # and braking way: so near a line is minded by a vehicle with a leader
 LIMIT_LEAD_S = 1.0  # to be down this time before it, as the model lags behind what is allowed
 FALL_IN_M = 100.0  # before the place where a lane change must be made
@@ -135,21 +134,25 @@ def _at_line(
     phase: NDArray[np.int32],
     dt: float,
     scratch: Scratch,
-) -> tuple[float, int, bool]:
-    """What the lane's end, `distance` m ahead of row i, asks: (constraint, HOLD_*, it stops)."""
+) -> tuple[float, int, float]:
+    """What the lane's end, `distance` m ahead of row i, asks.
+
+    Returns:
+        The constraint; why it holds there (HOLD_*); how far ahead it stops in m, inf if it goes on.
+    """
     row = rows[i]
     speed = row["speed"]
     front = distance - 0.5 * row["length"]
     to_line = front - roads.lanes[roads.links[link]["from_lane"]]["stop_back_m"]
     if to_line <= 0.0 and has_crept(roads, row, link, -to_line, phase):
-        return before_line(kind, speed, 0.0, dt), HOLD_SIGNAL, True
+        return before_line(kind, speed, 0.0, dt), HOLD_SIGNAL, 0.0
     if to_line <= 0.0:
         # Its front is over the line: it does not wait there any more.
         constraint, hold, waits = constraint_inside(
             roads, travel, rows, i, link, -distance, way, phase, dt, scratch
         )
         swept = before_swept(roads, rows, i, kind, link, front, waits, dt, scratch)
-        return max(constraint, swept), hold, False
+        return max(constraint, swept), hold, math.inf
     merging = no_constraint(kind)
     if row["driver"] == DRIVER_AGENT:
         merging = behind_merging(roads, kind, row, link, distance, scratch)
@@ -164,15 +167,15 @@ def _at_line(
             to_line = min(to_line, max(stop, 0.0))
         elif stop < math.inf:
             swept = before_line_gently(kind, row, stop, dt)
-            return max(swept, merging), HOLD_NONE, stop <= front
+            return max(swept, merging), HOLD_NONE, stop if stop <= front else math.inf
     if hold != HOLD_NONE:
-        return before_line(kind, speed, to_line, dt), hold, True
+        return before_line(kind, speed, to_line, dt), hold, to_line
     if front > SEE_FOES_M and kind["model"] == MODEL_KRAUSS and is_minor(roads, link, phase):
-        return before_line(kind, speed, front + LINE_MARGIN_M, dt), HOLD_NONE, False
+        return before_line(kind, speed, front + LINE_MARGIN_M, dt), HOLD_NONE, math.inf
     if waits != HOLD_NONE:
         to_wait = front + wait_place(roads, link, 0.5 * row["length"])
-        return max(before_line(kind, speed, to_wait, dt), merging), HOLD_NONE, False
-    return merging, HOLD_NONE, False
+        return max(before_line(kind, speed, to_wait, dt), merging), HOLD_NONE, math.inf
+    return merging, HOLD_NONE, math.inf
 
 
 @inlined_kernel
@@ -253,12 +256,14 @@ def _road_ahead(
             break
         stops = False
         if link >= 0 and distance < see:
-            if distance - half - roads.lanes[before]["stop_back_m"] < STOP_LINE_M:
-                link_ahead = link if link_ahead < 0 else link_ahead
             fork = behind_fork(roads, kind, row, before, link, distance, scratch)
-            at_line, found, stops = _at_line(
+            at_line, found, to_stop = _at_line(
                 roads, travel, rows, i, kind, link, distance, way, phase, dt, scratch
             )
+            stops = to_stop < math.inf
+            to_line = distance - half - roads.lanes[before]["stop_back_m"]
+            if min(to_line, to_stop) < STOP_LINE_M:
+                link_ahead = link if link_ahead < 0 else link_ahead
             constraint = max(constraint, fork, at_line)
             hold = found if found != HOLD_NONE else hold
         ahead = roads.lanes[lane]
@@ -272,7 +277,7 @@ def _road_ahead(
             leader = scratch.entries[j]
             gap = distance + leader["s"] - half - leader["half"]
             if gap < NEAR_M and _is_askew(row, rows[leader["row"]]):
-                gap -= ASKEW_M
+                gap -= 0.5 * rows[leader["row"]]["width"]
             constraint = max(constraint, behind_entry(kind, speed, gap, leader))
         elif stops and steered:
             over = behind_over_line(roads, travel, row, kind, lane, way, distance, scratch)

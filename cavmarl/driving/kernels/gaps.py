@@ -1,8 +1,8 @@
 """Which gaps a driver takes at a junction: whether a foe is, or will be, where it would be.
 
 What a driver counts with is what SUMO's counts with: it gives a foe before its line, and itself,
-the whole way over the junction, and takes the foe's speed as it is. Foes on the junction are asked
-by the shared area alone.
+the whole way over the junction, and takes the foe to speed up as it does. Foes on the junction are
+asked by the shared area alone. Where one of two is steered, other times hold.
 """
 
 from __future__ import annotations
@@ -35,9 +35,11 @@ from cavmarl.driving.kernels.following import LINE_MARGIN_M
 BRISK_ACCEL = 2.5  # m/s², with which a driver may soon be in a shared area,
 GENTLE_ACCEL = 1.8  # and, to be safe, with which it and others are out of it
 HARD_STOP = 5.0  # m/s², a vehicle that needs more to stop before the line will not stop
-# s before a foe is at its line: SUMO's drivers take 1 s, of foes that do not speed up;
-AHEAD_S = 3.0
-MERGE_AHEAD_S = 1.5  # before one that leads into the same lane, which may fall in behind
+AHEAD_S = 1.0  # s before a foe is at its line, as SUMO's drivers have it,
+FASTER_AHEAD_S = 4.5  # and before one that leads into the same lane and is faster on it;
+STEERED_AHEAD_S = 3.0  # where one of both is steered: it may take longer than it seems,
+STEERED_MERGE_AHEAD_S = 1.5  # and where both lead into the same lane, which lets one fall in behind
+SPEEDING_UP_MPS2 = 0.1  # from which on a foe counts as one that goes on speeding up
 GAP_S = 1.0  # s between the last of one and the first of the other in a shared area
 ROOM_M = 3.0  # free way left behind a vehicle that clears a junction
 IMPATIENCE_S = 180.0  # after which a vehicle that gives way counts on others to brake,
@@ -199,6 +201,36 @@ def stays_inside(foe: np.void) -> bool:
     return stays
 
 
+@inlined_kernel
+def _comes(
+    roads: RoadArrays,
+    rows: NDArray[np.void],
+    row: np.void,
+    conflict: np.void,
+    foe: np.void,
+    leaves_mps: float,
+    time_out: float,
+) -> bool:
+    """Whether an APPROACH is at its line too soon for a row that is out in `time_out` s."""
+    # With the speed that it has, or gets; one that has waited for long counts on it to brake.
+    to_line = foe["dist"] - foe["half"]
+    arrives = to_line / max(foe["speed"], STANDING_MPS)
+    faster_mps = foe["speed"] - leaves_mps
+    other = rows[foe["row"]]
+    ahead_s = FASTER_AHEAD_S if conflict["merging"] and faster_mps > 0.0 else AHEAD_S
+    if row["driver"] == DRIVER_AGENT or other["driver"] == DRIVER_AGENT:
+        ahead_s = STEERED_MERGE_AHEAD_S if conflict["merging"] else STEERED_AHEAD_S
+    elif other["accel"] > SPEEDING_UP_MPS2:
+        top = roads.lanes[roads.links[conflict["foe"]]["from_lane"]]["speed_mps"]
+        arrives = _earliest(to_line, foe["speed"], top, other["accel"])
+    arrives *= 1.0 + min(row["wait_s"] / IMPATIENCE_S, 1.0)
+    if conflict["merging"] and row["driver"] == DRIVER_AGENT and faster_mps > 0.0:
+        # A steered car comes slowly out of a turn: one that is fast needs the way to brake.
+        ahead_s = max(ahead_s, faster_mps * faster_mps / (2.0 * FORCED_STOP * foe["speed"]))
+    comes: bool = arrives < time_out + ahead_s
+    return comes
+
+
 @kernel
 def foe_blocks(
     roads: RoadArrays,
@@ -257,13 +289,6 @@ def foe_blocks(
     leaves_mps = min(reached, max(limit, speed))
     time_out = _earliest(distance - half, speed, limit, GENTLE_ACCEL)
     time_out += 2.0 * (over + row["length"]) / max(speed + leaves_mps, STANDING_MPS)
-    # With the speed that it has; vehicles that have waited for long count on it to brake.
-    arrives = (foe["dist"] - foe["half"]) / max(foe["speed"], STANDING_MPS)
-    arrives *= 1.0 + min(row["wait_s"] / IMPATIENCE_S, 1.0)
-    ahead_s = MERGE_AHEAD_S if conflict["merging"] else AHEAD_S
-    faster_mps = foe["speed"] - leaves_mps
-    if conflict["merging"] and row["driver"] == DRIVER_AGENT and faster_mps > 0.0:
-        # A steered car comes slowly out of a turn: one that is fast needs the way to brake.
-        ahead_s = max(ahead_s, faster_mps * faster_mps / (2.0 * FORCED_STOP * foe["speed"]))
-    comes = arrives < time_out + ahead_s
-    return HOLD_YIELD if comes else HOLD_NONE
+    return (
+        HOLD_YIELD if _comes(roads, rows, row, conflict, foe, leaves_mps, time_out) else HOLD_NONE
+    )

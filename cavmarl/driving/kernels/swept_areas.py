@@ -69,6 +69,7 @@ def swept_stop(
             continue
         if own == STEERED and room_m > 0.0 and -MOST_BACK_M < sweep["enter_m"] <= 0.0:
             stop = min(stop, max(sweep["enter_m"], place))  # it waits where no other will sweep
+        same_lane = roads.links[sweep["foe"]]["from_lane"] == roads.links[link]["from_lane"]
         for n in range(scratch.link_start[sweep["foe"]], scratch.link_end[sweep["foe"]]):
             foe = scratch.approach[n]
             other = size_of(foe["half"])
@@ -76,6 +77,8 @@ def swept_stop(
                 other = STEERED
             if foe["row"] == i or other != sweep["other"]:
                 continue
+            if same_lane and foe["half"] - foe["dist"] < place:
+                continue  # it comes behind the row
             if own == STEERED and _stands_in_the_way(roads, row, link, place, sweep, foe):
                 continue  # that one brakes hard for it anyway: it does not stop there
             if _is_in_the_way(rows, row, foe, sweep, place, room_m):

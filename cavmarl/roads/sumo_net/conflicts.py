@@ -99,13 +99,13 @@ def overlap(path: LinkPath, foe: LinkPath, *, merging: bool) -> Overlap | None:
     return Overlap(*map(float, found))
 
 
-def grazing(path: LinkPath, foe: LinkPath) -> Overlap | None:
+def grazing(path: LinkPath, foe: LinkPath, way: LinkPath, foe_way: LinkPath) -> Overlap | None:
     """Where cars on two paths would touch as they stand askew in their bends, or None.
 
-    The answer is in places of a front bumper that comes and a rear bumper that leaves, as in
-    `overlap`.
+    The ways are the paths with some metres of the lanes at their ends. The answer is in places of
+    a front bumper that comes and a rear bumper that leaves, as in `overlap`.
     """
-    mine, theirs = poses(path), poses(foe)
+    mine, theirs = poses(path, way), poses(foe, foe_way)
     apart = mine.xyz[:, None, :] - theirs.xyz[None, :, :]
     square = apart[..., 0] * apart[..., 0] + apart[..., 1] * apart[..., 1]
     level = np.abs(apart[..., 2]) <= CLEARANCE_M
@@ -120,28 +120,21 @@ def grazing(path: LinkPath, foe: LinkPath) -> Overlap | None:
     return Overlap(*map(float, (*_from_centres(path, here), *_from_centres(foe, there))))
 
 
-def poses(path: LinkPath) -> Poses:
-    """How a car stands along a path: as a chord of it, both bumpers on the path.
-
-    Before and behind its ends the path goes on straight.
-    """
-    ends = [path.s[0] - 2.0 * HALF_LENGTH_M, *path.s, path.s[-1] + 2.0 * HALF_LENGTH_M]
-    first, last = path.xyz[1] - path.xyz[0], path.xyz[-1] - path.xyz[-2]
-    reach = 2.0 * HALF_LENGTH_M
-    xyz = np.concatenate(
-        [
-            [path.xyz[0] - first * reach / max(float(np.hypot(*first[:2])), 1e-6)],
-            path.xyz,
-            [path.xyz[-1] + last * reach / max(float(np.hypot(*last[:2])), 1e-6)],
-        ]
-    )
-
-    def at(s: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.stack([np.interp(s, ends, xyz[:, axis]) for axis in range(3)], axis=1)
-
-    front, rear = at(path.s + HALF_LENGTH_M), at(path.s - HALF_LENGTH_M)
+def poses(path: LinkPath, way: LinkPath) -> Poses:
+    """How a car stands along a path, a part of its way: as a chord, both bumpers on the way."""
+    front, rear = places_on(way, path.s + HALF_LENGTH_M), places_on(way, path.s - HALF_LENGTH_M)
     chord = front - rear
     return Poses(0.5 * (front + rear), np.arctan2(chord[:, 1], chord[:, 0]))
+
+
+def places_on(way: LinkPath, at: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n, 3) places on a way, which goes on straight before and behind its ends."""
+    ends = np.concatenate([[way.s[0] - 100.0], way.s, [way.s[-1] + 100.0]])
+    first, last = way.xyz[1] - way.xyz[0], way.xyz[-1] - way.xyz[-2]
+    first = first / max(float(np.hypot(*first[:2])), 1e-6)
+    last = last / max(float(np.hypot(*last[:2])), 1e-6)
+    xyz = np.concatenate([[way.xyz[0] - 100.0 * first], way.xyz, [way.xyz[-1] + 100.0 * last]])
+    return np.stack([np.interp(at, ends, xyz[:, axis]) for axis in range(3)], axis=1)
 
 
 def touching(
@@ -214,6 +207,7 @@ def stop_back(
     junction: Sequence[int],
     paths: Sequence[LinkPath | None],
     approaches: Sequence[LinkPath | None],
+    ways: Sequence[LinkPath | None],
 ) -> NDArray[np.float64]:
     """How far before its end a lane has its stop line, in m.
 
@@ -225,6 +219,7 @@ def stop_back(
         paths: (K,) the path of each link, None where the map has none.
         approaches: (K,) the same with the last metres before the junction: vehicles from another
             road is asked about there, too.
+        ways: (K,) the same with some metres of the lanes at both ends.
 
     Returns:
         (L,), 0 for lanes that no path of another lane's links comes near. Where `MOST_M` is not
@@ -236,8 +231,8 @@ def stop_back(
         if paths[link] is not None:
             at[row].append(link)
     for links in at.values():
-        inside = {link: poses(path) for link in links if (path := paths[link]) is not None}
-        coming = {link: poses(path) for link in links if (path := approaches[link]) is not None}
+        inside = {link: _poses(paths[link], ways[link]) for link in links}
+        coming = {link: _poses(approaches[link], ways[link]) for link in links}
         for lane in {from_lane[link] for link in links}:
             others = [
                 (inside if edge[from_lane[link]] == edge[lane] else coming)[link]
@@ -247,6 +242,12 @@ def stop_back(
             if others:
                 back[lane] = _first_free(ends[lane], others)
     return back
+
+
+def _poses(path: LinkPath | None, way: LinkPath | None) -> Poses:
+    assert path is not None
+    assert way is not None
+    return poses(path, way)
 
 
 def _first_free(end: NDArray[np.float64], others: Sequence[Poses]) -> float:
@@ -274,7 +275,10 @@ Row = tuple[int, bool, bool, float, float, float, float]
 
 
 def conflict_rows(
-    movements: Sequence[Movement], paths: Sequence[LinkPath | None], left_hand: bool
+    movements: Sequence[Movement],
+    paths: Sequence[LinkPath | None],
+    ways: Sequence[LinkPath | None],
+    left_hand: bool,
 ) -> tuple[NDArray[np.void], NDArray[np.int32], list[int]]:
     """All conflicts of all links, each link's first row with the end as last entry, unruled links.
 
@@ -287,6 +291,7 @@ def conflict_rows(
     Args:
         movements: one a LINK row.
         paths: the path of each link; None where the map has no internal lanes.
+        ways: the same with some metres of the lanes at both ends.
         left_hand: whether one drives on the left, where turns to the right lead across the road.
 
     Raises:
@@ -309,7 +314,7 @@ def conflict_rows(
                     unruled.append(one)
                     shared = _shared(paths[one], paths[other], merging=True)
                 else:
-                    shared = _grazing(paths[one], paths[other])
+                    shared = _grazing(paths, ways, one, other)
                 crosses = _turns_across(a, left_hand), _turns_across(b, left_hand)
                 yields = crosses[0] and not crosses[1], crosses[1]
                 if merging and not any(yields):
@@ -351,8 +356,13 @@ def _turns_across(movement: Movement, left_hand: bool) -> bool:
     return str(movement.connection.getDirection()) in across
 
 
-def _grazing(path: LinkPath | None, foe: LinkPath | None) -> Overlap | None:
-    return None if path is None or foe is None else grazing(path, foe)
+def _grazing(
+    paths: Sequence[LinkPath | None], ways: Sequence[LinkPath | None], one: int, other: int
+) -> Overlap | None:
+    path, foe, way, foe_way = paths[one], paths[other], ways[one], ways[other]
+    if path is None or foe is None or way is None or foe_way is None:
+        return None
+    return grazing(path, foe, way, foe_way)
 
 
 def _shared(path: LinkPath | None, foe: LinkPath | None, *, merging: bool) -> Overlap | None:

@@ -94,6 +94,7 @@ def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
             "no lane that a road vehicle may use: check the lanes' permissions, or what "
             "netconvert kept (--keep-edges.by-vclass)"
         )
+    movements = chosen.movements
     lane_row = {id(lane): row for row, lane in enumerate(chosen.lanes)}
     signal_rows = read_signals(parsed.programs)
     nodes = net.getNodes()
@@ -108,10 +109,11 @@ def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
     points, first_point = point_rows(shapes)
 
     lanes = _lane_rows(chosen, edges, points, first_point, outer, parsed.left_hand)
-    links = _link_rows(chosen.movements, lane_row, lanes, node_row, signal_rows)
-    into = _connect(lanes, links, chosen.movements, lane_row)
-    paths = [_path(move, lane_row, lanes, points) for move in chosen.movements]
-    conflicts, first_conflict, unruled = conflict_rows(chosen.movements, paths, parsed.left_hand)
+    links = _link_rows(movements, lane_row, lanes, node_row, signal_rows)
+    into = _connect(lanes, links, movements, lane_row)
+    paths = [_path(move, lane_row, lanes, points) for move in movements]
+    ways = [_path(move, lane_row, lanes, points, AHEAD_M, AHEAD_M) for move in movements]
+    conflicts, first_conflict, unruled = conflict_rows(movements, paths, ways, parsed.left_hand)
     fork_m = fork_lengths(links["from_lane"].tolist(), paths)
     links["fork_m"] = np.minimum(fork_m, links["length_m"] + FORK_BEYOND_M)
     _map_neighbors(lanes, points)
@@ -121,11 +123,11 @@ def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
         links["from_lane"].tolist(),
         links["junction"].tolist(),
         paths,
-        [_path(move, lane_row, lanes, points, APPROACH_M) for move in chosen.movements],
+        [_path(move, lane_row, lanes, points, APPROACH_M) for move in movements],
+        ways,
     )
     links["first_conflict"] = first_conflict[:-1]
     links["num_conflicts"] = np.diff(first_conflict)
-    ways = [_path(move, lane_row, lanes, points, AHEAD_M, AHEAD_M) for move in chosen.movements]
     sweeps = _fill_sweeps(Movements(links, conflicts, ways))
     junctions, kinds = _junction_rows(nodes, links)
     junctions["unruled"][links["junction"][unruled]] = True

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from cavmarl.core.records.rows import SIZE_BODIES_M, SIZE_LENGTHS_M, WAIT_SLACK_M
 from cavmarl.roads.kernels.swept_range import swept_range
 from cavmarl.roads.network import SWEEP
-from cavmarl.roads.sumo_net.conflicts import CLEARANCE_M, LINE_MARGIN_M, LinkPath
+from cavmarl.roads.sumo_net.conflicts import CLEARANCE_M, LINE_MARGIN_M, LinkPath, places_on
 
 
 class SweptBody(NamedTuple):
@@ -184,18 +184,8 @@ def is_near(mine: NDArray[np.float64], theirs: NDArray[np.float64]) -> bool:
 def poses_on_rails(way: LinkPath, half_m: float, length_m: float) -> NDArray[np.float64]:
     """(n, 6) place of the centre, x, y, z, cosine and sine of bodies with both bumpers on a way."""
     at = np.arange(-(BEFORE_M + half_m), length_m + BEYOND_M + half_m + STEP_M, STEP_M)
-    front, rear = _points(way, at + half_m), _points(way, at - half_m)
+    front, rear = places_on(way, at + half_m), places_on(way, at - half_m)
     chord = front - rear
     size = np.maximum(np.hypot(chord[:, 0], chord[:, 1]), 1e-6)
     middle = 0.5 * (front + rear)
     return np.column_stack([at, middle, chord[:, 0] / size, chord[:, 1] / size])
-
-
-def _points(way: LinkPath, at: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n, 3) places on a way, which goes on straight before and behind its ends."""
-    ends = np.concatenate([[way.s[0] - 100.0], way.s, [way.s[-1] + 100.0]])
-    first, last = way.xyz[1] - way.xyz[0], way.xyz[-1] - way.xyz[-2]
-    first = first / max(float(np.hypot(*first[:2])), 1e-6)
-    last = last / max(float(np.hypot(*last[:2])), 1e-6)
-    xyz = np.concatenate([[way.xyz[0] - 100.0 * first], way.xyz, [way.xyz[-1] + 100.0 * last]])
-    return np.stack([np.interp(at, ends, xyz[:, axis]) for axis in range(3)], axis=1)

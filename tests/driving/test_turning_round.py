@@ -1,0 +1,103 @@
+"""Vehicles that turn round on roads of two lanes: what meets them, and where others wait."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cavmarl.core.records.codes import DRIVER_BACKGROUND, HOLD_YIELD
+from cavmarl.driving.kernels.approach import register_links
+from cavmarl.driving.kernels.drivers import decide
+from cavmarl.driving.kernels.lane_index import index_lanes
+from cavmarl.driving.kernels.swept_areas import swept_stop
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.routing import PLAN
+from cavmarl.roads.sumo_net.reader import read_network
+from tests.support.netgenerate import netgenerate
+from tests.support.traffic import on_lane, scratch, travel_by
+
+STRAIGHT, ROUND = map(ord, "st")
+BUS = 2  # a size class
+BUS_M = 12.0
+
+
+@pytest.fixture(scope="module")
+def network(tmp_path_factory: pytest.TempPathFactory) -> RoadNetwork:
+    path = tmp_path_factory.mktemp("round") / "grid.net.xml"
+    options = ("--grid", "--grid.number=2", "--grid.attach-length=100", "--grid.length=110", "-L=2")
+    return read_network(netgenerate(path, *options, "--default-junction-type=allway_stop"))
+
+
+def beside(network: RoadNetwork) -> tuple[int, int]:
+    """A link that leads straight on, and one that turns round from the lane beside."""
+    for link, row in enumerate(network.links):
+        lane = network.lanes[row["from_lane"]]
+        if row["direction"] == STRAIGHT and lane["left"] >= 0:
+            left = network.lanes[lane["left"]]
+            for other in range(left["first_link"], left["first_link"] + left["num_links"]):
+                if network.links["direction"][other] == ROUND:
+                    return link, other
+    raise AssertionError("nothing turns round beside a lane that leads on")
+
+
+def test_one_that_turns_round_is_in_no_conflict_with_the_lane_beside_it(
+    network: RoadNetwork,
+) -> None:
+    """Its rear is still on its own lane, which leads straight to the junction."""
+    link, turn = beside(network)
+    row = network.links[link]
+    foes = network.conflicts["foe"][row["first_conflict"] :][: row["num_conflicts"]]
+    assert len(foes) > 0
+    assert turn not in foes
+
+
+@pytest.mark.parametrize(("foe_m", "waits"), [(-20.0, False), (2.0, True)])
+def test_one_leaves_room_for_a_bus_that_turns_round_before_it_and_not_behind_it(
+    network: RoadNetwork, foe_m: float, waits: bool
+) -> None:
+    _, turn = beside(network)
+    row = network.links[turn]
+    sweeps = network.sweeps[row["first_sweep"] :][: row["num_sweeps"]]
+    (sweep,) = sweeps[(sweeps["foe"] == turn) & (sweeps["own"] == BUS) & (sweeps["other"] == BUS)]
+    lane, own_m = int(row["from_lane"]), float(sweep["enter_m"]) - 1.0
+    length_m = float(network.lanes["length_m"][lane])
+    plan = np.zeros(len(network.lanes), PLAN)
+    plan["next"], plan["link"] = row["next_lane"], turn
+    travel = travel_by(plan)
+    places = [own_m, foe_m]
+    rows = np.concatenate(
+        [on_lane(network, lane, length_m + min(m, 0.0) - 0.5 * BUS_M, travel, id=k, length=BUS_M)
+         for k, m in enumerate(places)]
+    )  # fmt: skip
+    room = scratch(network, 2)
+    register_links(network.arrays, travel, rows, 2, np.zeros(2, PLAN), np.zeros(2, np.int64), room)
+    room.approach["dist"][room.approach["row"] == 1] = 0.5 * BUS_M - foe_m
+    stop = swept_stop(network.arrays, rows, 0, turn, own_m, np.inf, room)
+    assert stop == (sweep["enter_m"] if waits else np.inf)
+
+
+@pytest.mark.parametrize(("place_m", "stands_at_sign"), [(-9.5, True), (-16.0, False)])
+def test_a_bus_that_leaves_room_far_before_a_stop_sign_stands_at_it(
+    network: RoadNetwork, place_m: float, stands_at_sign: bool
+) -> None:
+    link, turn = beside(network)
+    plan = np.zeros(len(network.lanes), PLAN)
+    for way in (link, turn):
+        lane = network.links["from_lane"][way]
+        plan["next"][lane], plan["link"][lane] = network.links["next_lane"][way], way
+    travel = travel_by(plan)
+    lanes = network.links["from_lane"][[link, turn]].tolist()
+    ends_m = network.lanes["length_m"][lanes] - 0.5 * BUS_M
+    common = {"length": BUS_M, "driver": DRIVER_BACKGROUND, "stopped_at": -1, "hold": HOLD_YIELD}
+    rows = np.concatenate(
+        [on_lane(network, lane, end_m + front_m, travel, id=k, **common)
+         for k, (lane, end_m, front_m) in enumerate(
+             zip(lanes, ends_m.tolist(), (place_m, -1.0), strict=True))]
+    )  # fmt: skip
+    room, step = scratch(network, 2), np.zeros(2, PLAN)
+    index_lanes(network.arrays, travel, rows, 2, room)
+    register_links(network.arrays, travel, rows, 2, step, np.zeros(2, np.int64), room)
+    phase = np.zeros(0, np.int32)
+    decide(network.arrays, travel, rows, 2, DRIVER_BACKGROUND, 0, 0.1, phase, step, room)
+    assert room.hold[0] == HOLD_YIELD
+    assert (room.link_ahead[0] == link) == stands_at_sign
