@@ -106,7 +106,7 @@ def test_one_that_comes_first_and_a_full_road_are_causes_to_stand() -> None:
     vec.reset(seed=1)
     network, watch = vec.network, yardstick._Standing(vec)
     others = vec.simulation.vehicles(0)[1:]
-    yields = np.flatnonzero(network.conflicts["must_yield"])
+    yields = np.flatnonzero(network.conflicts["must_yield"] & ~network.conflicts["merging"])
     link = int(np.searchsorted(network.links["first_conflict"], yields[0], side="right")) - 1
     foe = network.links[network.conflicts["foe"][yields[0]]]
 
@@ -116,6 +116,9 @@ def test_one_that_comes_first_and_a_full_road_are_causes_to_stand() -> None:
 
     assert waits(foe["from_lane"], network.lanes["length_m"][foe["from_lane"]] - 5.0)
     assert waits(foe["next_lane"], 0.5)
+    others["length"] = 5.0
+    assert waits(foe["to_lane"], 2.0), "its rear is still in the junction"
+    assert not waits(foe["to_lane"], 3.0)
     behind = network.links["to_lane"][link]
     assert waits(behind, 5.0)
     assert not waits(behind, yardstick.NEAR_AHEAD_M + 1.0)

@@ -15,6 +15,7 @@ from cavmarl.core.errors import ConfigError, MissingExtraError
 from cavmarl.evaluate.traffic import world_runs
 from cavmarl.evaluate.traffic.world_rows import (
     Row,
+    comparable,
     deviation,
     has_own_lock,
     in_spread,
@@ -67,6 +68,11 @@ def test_a_deviation_is_ours_over_the_mean_of_sumos_seeds() -> None:
     assert deviation(a_row(mean_speed_mps=11.5), "mean_speed_mps") == pytest.approx(0.15)
     assert deviation(a_row(arrived=60), "arrived") == pytest.approx(-0.25)
     assert deviation(a_row(mean_delay_s=None), "mean_delay_s") is None
+
+
+def test_worlds_that_differ_by_design_are_told_by_their_features() -> None:
+    rows = [a_row() | {"features": ["grid", name]} for name in ("priority", "priority_stop")]
+    assert comparable([*rows, a_row() | {"features": ["stub_lanes"]}]) == rows[:1]
 
 
 def test_near_is_within_a_share_or_sumos_own_spread() -> None:

@@ -98,22 +98,13 @@ def test_a_node_speaks_for_its_own_zones() -> None:
     others.close()
 
 
-def test_each_bit_of_a_frame_is_guarded() -> None:
-    """None of them makes another frame of it, or lets the receiver wait for more."""
-    sent = frame(FrameKind.SYNC, b"abc")
-    for bit in range(8 * len(sent)):
-        changed = bytearray(sent)
-        changed[bit // 8] ^= 1 << bit % 8
-        links, far = pair()
-        far.sendall(changed)
-        with pytest.raises(LinkLostError, match="frame"):
-            links.take([0], WAIT_S)
-        far.close()
-
-
-def test_a_large_frame_is_guarded_likewise() -> None:
-    sent = frame(FrameKind.SYNC, np.random.default_rng(0).bytes(9999))
-    for bit in np.random.default_rng(1).integers(8 * len(sent), size=99).tolist():
+@pytest.mark.parametrize(("size", "bits"), [(3, None), (9999, 99)])
+def test_each_bit_of_a_frame_is_guarded(size: int, bits: int | None) -> None:
+    """None makes another frame of it, or lets the receiver wait for more."""
+    drawn = np.random.default_rng(size)
+    sent = frame(FrameKind.SYNC, drawn.bytes(size))
+    every = 8 * len(sent)
+    for bit in range(every) if bits is None else drawn.integers(every, size=bits).tolist():
         changed = bytearray(sent)
         changed[bit // 8] ^= 1 << bit % 8
         links, far = pair()

@@ -147,7 +147,7 @@ def test_what_is_foreseen_is_not_sent() -> None:
         sizes.append((len(data) // 8 - LIKE) / ghosts - 2)
     vec.close()
     assert sizes[0] > VEHICLE.itemsize // 8
-    assert np.median(sizes) < 6, "words of a vehicle"
+    assert np.median(sizes) < 4, "words of a vehicle"
 
 
 def harmed(words: NDArray[np.int64], harm: str) -> NDArray[np.int64]:

@@ -16,8 +16,6 @@ from cavmarl.core.progress import counting
 if TYPE_CHECKING:
     from cavmarl.evaluate.traffic.world_rows import Row
 
-STOP_SIGNS = "priority_stop"
-
 
 def compare_worlds(
     worlds: int,
@@ -30,19 +28,23 @@ def compare_worlds(
     maps: Path | None,
 ) -> None:
     """Run the worlds that have no row yet; print what all rows come to, and the worst."""
-    from cavmarl.evaluate.traffic.world_rows import by_feature, summary, worst
+    from cavmarl.evaluate.traffic.world_rows import (
+        BY_DESIGN,
+        by_feature,
+        comparable,
+        summary,
+        worst,
+    )
     from cavmarl.evaluate.traffic.world_runs import KEPT, WorldSeries, run_worlds
-    from cavmarl.maps.shared_ground import GROUND_FEATURES
 
     job = WorldSeries(out, worlds, first_seed, seconds, dt, without, maps)
     console = Console()
     with counting(console, "worlds") as bar:
         rows = run_worlds(job, bar)
     found, parts = summary(rows), by_feature(rows)
-    others = sorted((*GROUND_FEATURES, STOP_SIGNS))  # differ by design, see docs/realism.md
-    sound = [row for row in rows if not set(others).intersection(row["features"])]
+    sound = comparable(rows)
     console.print(_shares(found))
-    console.print(_shares(summary(sound), f", without {', '.join(others)}"))
+    console.print(_shares(summary(sound), f", without {', '.join(sorted(BY_DESIGN))}"))
     console.print(_features(parts))
     console.print(_worst(worst(rows, KEPT), out))
     found_sound = summary(sound)

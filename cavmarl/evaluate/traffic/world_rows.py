@@ -10,8 +10,12 @@ import numpy as np
 
 from cavmarl.evaluate.traffic.traffic_comparison import TrafficComparison
 from cavmarl.evaluate.traffic.world_draw import WorldDraw
+from cavmarl.maps.shared_ground import GROUND_FEATURES
 
 Row = dict[str, Any]  # a line of worlds.jsonl
+
+# Features of worlds in which ours differs by design, see docs/realism.md.
+BY_DESIGN = GROUND_FEATURES | {"priority_stop"}
 
 # How far ours may be from SUMO's mean, as a share of it; delay also by seconds.
 SPEED_SHARE, COUNT_SHARE, DELAY_SHARE, DELAY_S = 0.15, 0.05, 0.25, 3.0
@@ -142,6 +146,11 @@ def by_feature(rows: Sequence[Row]) -> dict[str, Row]:
     """Feature → the summary of the worlds that have it."""
     names = sorted({name for row in rows for name in row["features"]})
     return {name: summary([row for row in rows if name in row["features"]]) for name in names}
+
+
+def comparable(rows: Sequence[Row]) -> list[Row]:
+    """The worlds in which ours is meant to be as SUMO: none has a feature of `BY_DESIGN`."""
+    return [row for row in rows if BY_DESIGN.isdisjoint(row["features"])]
 
 
 def _known(values: Sequence[float | None]) -> list[float]:

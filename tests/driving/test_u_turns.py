@@ -1,4 +1,4 @@
-"""Vehicles that turn round on roads of two lanes: what meets them, and where others wait."""
+"""U-turns on roads of two lanes: what meets them, and where others wait."""
 
 from __future__ import annotations
 
@@ -16,31 +16,31 @@ from cavmarl.roads.sumo_net.reader import read_network
 from tests.support.netgenerate import netgenerate
 from tests.support.traffic import on_lane, scratch, travel_by
 
-STRAIGHT, ROUND = map(ord, "st")
+STRAIGHT, U_TURN = map(ord, "st")
 BUS = 2  # a size class
 BUS_M = 12.0
 
 
 @pytest.fixture(scope="module")
 def network(tmp_path_factory: pytest.TempPathFactory) -> RoadNetwork:
-    path = tmp_path_factory.mktemp("round") / "grid.net.xml"
+    path = tmp_path_factory.mktemp("u_turns") / "grid.net.xml"
     options = ("--grid", "--grid.number=2", "--grid.attach-length=100", "--grid.length=110", "-L=2")
     return read_network(netgenerate(path, *options, "--default-junction-type=allway_stop"))
 
 
 def beside(network: RoadNetwork) -> tuple[int, int]:
-    """A link that leads straight on, and one that turns round from the lane beside."""
+    """A link that leads straight on, and a U-turn from the lane beside."""
     for link, row in enumerate(network.links):
         lane = network.lanes[row["from_lane"]]
         if row["direction"] == STRAIGHT and lane["left"] >= 0:
             left = network.lanes[lane["left"]]
             for other in range(left["first_link"], left["first_link"] + left["num_links"]):
-                if network.links["direction"][other] == ROUND:
+                if network.links["direction"][other] == U_TURN:
                     return link, other
-    raise AssertionError("nothing turns round beside a lane that leads on")
+    raise AssertionError("there is no U-turn beside a lane that leads on")
 
 
-def test_one_that_turns_round_is_in_no_conflict_with_the_lane_beside_it(
+def test_a_u_turn_does_not_conflict_with_the_lane_beside_it(
     network: RoadNetwork,
 ) -> None:
     """Its rear is still on its own lane, which leads straight to the junction."""
@@ -52,7 +52,7 @@ def test_one_that_turns_round_is_in_no_conflict_with_the_lane_beside_it(
 
 
 @pytest.mark.parametrize(("foe_m", "waits"), [(-20.0, False), (2.0, True)])
-def test_one_leaves_room_for_a_bus_that_turns_round_before_it_and_not_behind_it(
+def test_a_bus_leaves_room_for_a_u_turn_ahead_of_it_and_not_behind_it(
     network: RoadNetwork, foe_m: float, waits: bool
 ) -> None:
     _, turn = beside(network)
@@ -101,3 +101,33 @@ def test_a_bus_that_leaves_room_far_before_a_stop_sign_stands_at_it(
     decide(network.arrays, travel, rows, 2, DRIVER_BACKGROUND, 0, 0.1, phase, step, room)
     assert room.hold[0] == HOLD_YIELD
     assert (room.link_ahead[0] == link) == stands_at_sign
+
+
+@pytest.mark.parametrize(("turned_rad", "nearer"), [(1.6, True), (-1.6, True), (0.5, False)])
+def test_a_leader_that_has_turned_is_half_its_width_nearer(
+    network: RoadNetwork, turned_rad: float, nearer: bool
+) -> None:
+    link, _ = beside(network)
+    lane, ahead = (int(network.links[name][link]) for name in ("from_lane", "next_lane"))
+    plan = np.zeros(len(network.lanes), PLAN)
+    plan["next"][lane], plan["link"][lane] = ahead, link
+    travel, length_m = travel_by(plan), float(network.lanes["length_m"][lane])
+
+    def accel(turned: float, back_m: float) -> float:
+        places = [(lane, length_m - 3.0), (ahead, 7.0 - back_m)]
+        rows = np.concatenate(
+            [on_lane(network, at, s, travel, id=k, driver=DRIVER_BACKGROUND)
+             for k, (at, s) in enumerate(places)]
+        )  # fmt: skip
+        rows["heading"][1] += turned
+        room, step = scratch(network, 2), np.zeros(2, PLAN)
+        index_lanes(network.arrays, travel, rows, 2, room)
+        room.link_start[:] = room.link_end[:] = 0  # nothing is asked of the junction
+        step[0] = plan[lane]
+        decide(network.arrays, travel, rows, 2, DRIVER_BACKGROUND, 0, 0.1,
+               np.zeros(0, np.int32), step, room)  # fmt: skip
+        return float(room.accel[0])
+
+    half_m = 0.5 * float(on_lane(network, lane, 0.0)["width"][0])
+    assert accel(turned_rad, 0.0) == pytest.approx(accel(0.0, half_m if nearer else 0.0))
+    assert accel(0.0, 0.0) > accel(0.0, half_m)
