@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from statistics import fmean
 
 import numpy as np
 
-HOPS = 3  # one after the other in a tick: the lease, the share of another node, the report
+from cavmarl.driving.vehicles import VEHICLE
+
+CACHE_BYTES = 1 << 20  # of a core's own cache, where the system does not tell
+CACHE = Path("/sys/devices/system/cpu/cpu0/cache/index2/size")
+ROW_BYTES = 2 * VEHICLE.itemsize  # of a vehicle: a tick reads one table and writes another
 
 
 @dataclass(frozen=True)
@@ -17,13 +23,15 @@ class NodeSample:
 
     vehicles: int  # in all
     nodes: int  # that host them
-    latency_s: float  # that was added to each connection
     tick_s: float  # by the clock
     node_s: float  # time of the processor a tick, of the dearest node; undivided: of the process
     caller_s: float  # the same of the caller
     own: float  # vehicles of the dearest node
     ghosts: float  # that it sees
-    memory_bytes: float  # resident, of the largest node
+    crossings: float  # vehicles that change their node, a step
+    memory_bytes: float  # resident, of the largest process
+    latency_s: float  # that was added to each connection
+    ticks_per_step: float
 
     def to_dict(self) -> dict[str, float]:
         return asdict(self)
@@ -34,31 +42,56 @@ class NodeCosts:
     """The parameters."""
 
     tick_s: float  # of a node's processor in each tick, whatever it has
-    vehicle_s: float  # for each vehicle that it owns
-    ghost_s: float  # for each that it sees
+    ghost_s: float  # for each vehicle of others that it sees
     whole_s: float  # of an undivided tick, whatever there is
-    whole_vehicle_s: float  # for each vehicle
+    vehicle_s: float  # for each vehicle, of a node or undivided
+    far_s: float  # more for each row, of a ghost, too, beyond those that stay in a core's cache
+    near: float  # how many that are
     caller_s: float  # of the caller in each tick
     caller_node_s: float  # for each node
     wake_s: float  # from one process to another, without latency
+    uneven: float  # how much longer the last of several nodes takes in a tick, as a share
     base_bytes: float  # of a node, whatever there is
     city_bytes: float  # for each vehicle that the city has room for: map and tables, at every node
     own_bytes: float  # for each vehicle that a node owns or sees
     ghost_factor: float  # ghosts over the square root of a node's vehicles, per border
+    crossing_share: float  # of a node's ghosts change their node in a step
+    ticks_per_step: float
 
     def ghosts(self, vehicles: float, nodes: int) -> float:
         """How many vehicles of others a node in the middle of the city sees."""
         return self.ghost_factor * borders(nodes) * math.sqrt(vehicles / max(nodes, 1))
 
+    def hops(self, vehicles: float, nodes: int) -> float:
+        """Frames of a tick that go one after the other, on average.
+
+        Of a step these are the command, the report, and of several nodes what they tell each other
+        of each tick and of the agents. Where a vehicle has crossed, an offer and its answer come in
+        the place of the report.
+        """
+        if nodes < 2:
+            return 2.0 / self.ticks_per_step
+        crossings = self.crossing_share * self.ghosts(vehicles, nodes) * nodes
+        offers = 1.0 - math.exp(-crossings)
+        return (self.ticks_per_step + 3.0 + offers) / self.ticks_per_step
+
+    def work(self, vehicles: float, ghosts: float = 0.0) -> float:
+        """Seconds of a core for the vehicles that it steps in a tick, beside what ghosts cost.
+
+        Of more rows than its cache holds, as many as it holds come from there.
+        """
+        return self.vehicle_s * vehicles + self.far_s * max(vehicles + ghosts - self.near, 0.0)
+
     def tick(self, vehicles: float, nodes: int, latency_s: float, cores: int) -> float:
-        """Seconds of a tick; nodes beyond `cores` take turns."""
+        """Seconds of a tick; nodes beyond `cores` take turns, and share a core's cache."""
         if nodes == 0:
-            return self.whole_s + self.whole_vehicle_s * vehicles
-        own = vehicles / nodes
-        node_s = self.tick_s + self.vehicle_s * own + self.ghost_s * self.ghosts(vehicles, nodes)
+            return self.whole_s + self.work(vehicles)
+        turns = math.ceil(nodes / cores)
+        own, ghosts = turns * vehicles / nodes, turns * self.ghosts(vehicles, nodes)
+        node_s = turns * self.tick_s + self.ghost_s * ghosts + self.work(own, ghosts)
+        node_s *= 1.0 + (self.uneven if nodes > 1 else 0.0)
         caller_s = self.caller_s + self.caller_node_s * nodes
-        hops = HOPS if nodes > 1 else HOPS - 1
-        return node_s * math.ceil(nodes / cores) + caller_s + hops * (self.wake_s + latency_s)
+        return node_s + caller_s + self.hops(vehicles, nodes) * (self.wake_s + latency_s)
 
     def memory(self, vehicles: float, nodes: int) -> float:
         """Bytes of a node, or of the undivided world."""
@@ -71,52 +104,80 @@ def borders(nodes: int) -> float:
     return 0.0 if nodes < 2 else 4.0 - 4.0 / math.sqrt(nodes)
 
 
-def fitted(samples: Sequence[NodeSample]) -> NodeCosts:
+def near_rows() -> float:
+    """How many vehicles' rows this machine's cores have in the cache that is each one's own."""
+    try:
+        text = CACHE.read_text(encoding="ascii").strip()
+        return int(text.removesuffix("K")) * 1024 / ROW_BYTES
+    except (OSError, ValueError):
+        return CACHE_BYTES / ROW_BYTES
+
+
+def fitted(samples: Sequence[NodeSample], near: float) -> NodeCosts:
     """The parameters that fit runs best; of several sizes, over 0 and more nodes.
+
+    `near`: rows that stay in a core's cache.
 
     Raises:
         ValueError: too few runs to tell them.
     """
     whole = [s for s in samples if s.nodes == 0]
-    over = [s for s in samples if s.nodes > 0]
-    calm = [s for s in over if s.latency_s == 0.0]
+    calm = [s for s in samples if s.nodes > 0 and s.latency_s == 0.0]
+    divided = [s for s in calm if s.nodes > 1]
     if len({s.vehicles for s in whole}) < 2 or len({(s.vehicles, s.nodes) for s in calm}) < 3:
         raise ValueError("a fit needs two sizes undivided, and three runs over nodes")
-    whole_s = _solve([[1.0, s.vehicles] for s in whole], [s.node_s for s in whole])
-    node = _solve([[1.0, s.own, s.ghosts] for s in calm], [s.node_s for s in calm])
+    work = [
+        [s.nodes == 0, s.nodes > 0, s.ghosts, s.own, max(s.own + s.ghosts - near, 0.0)]
+        for s in (*whole, *calm)
+    ]
+    whole_s, tick_s, ghost_s, vehicle_s, far_s = _solve(work, [s.node_s for s in (*whole, *calm)])
     caller = _solve([[1.0, s.nodes] for s in calm], [s.caller_s for s in calm])
-    ghosts = [s.ghosts / (borders(s.nodes) * math.sqrt(s.own)) for s in calm if s.nodes > 1]
     memory = _solve(
         [[1.0, s.vehicles, s.own + s.ghosts] for s in (*whole, *calm)],
         [s.memory_bytes for s in (*whole, *calm)],
     )
-    least = min(calm, key=lambda s: s.tick_s)
-    hops = HOPS if least.nodes > 1 else HOPS - 1
-    wake_s = max(0.0, (least.tick_s - least.node_s - least.caller_s) / hops)
-    return NodeCosts(
-        tick_s=node[0],
-        vehicle_s=node[1],
-        ghost_s=node[2],
-        whole_s=whole_s[0],
-        whole_vehicle_s=whole_s[1],
+    costs = NodeCosts(
+        tick_s=tick_s,
+        ghost_s=ghost_s,
+        whole_s=whole_s,
+        vehicle_s=vehicle_s,
+        far_s=far_s,
+        near=near,
         caller_s=caller[0],
         caller_node_s=caller[1],
-        wake_s=wake_s,
+        wake_s=0.0,
+        uneven=0.0,
         base_bytes=memory[0],
         city_bytes=memory[1],
         own_bytes=memory[2],
-        ghost_factor=float(np.mean(ghosts or [0.0])),
+        ghost_factor=_mean([s.ghosts / (borders(s.nodes) * math.sqrt(s.own)) for s in divided]),
+        crossing_share=_mean([s.crossings / (s.ghosts * s.nodes) for s in divided if s.ghosts]),
+        ticks_per_step=samples[0].ticks_per_step,
     )
+    # what is left of the clock's time: waking a process, and waiting for the last node
+    waits = [s.tick_s - s.node_s - s.caller_s for s in calm]
+    hops = [costs.hops(s.vehicles, s.nodes) for s in calm]
+    rows = [[n, s.node_s if s.nodes > 1 else 0.0] for n, s in zip(hops, calm, strict=True)]
+    wake_s, uneven = _solve(rows, waits, [s.tick_s for s in calm])
+    return replace(costs, wake_s=wake_s, uneven=uneven)
 
 
-def _solve(rows: Sequence[Sequence[float]], values: Sequence[float]) -> list[float]:
+def _mean(values: Sequence[float]) -> float:
+    return fmean(values or [0.0])
+
+
+def _solve(
+    rows: Sequence[Sequence[float]],
+    values: Sequence[float],
+    scales: Sequence[float] = (),  # what deviations are relative to; none: to the values
+) -> list[float]:
     """Non-negative least squares of relative deviations."""
-    weights = 1.0 / np.maximum(np.array(values), 1e-12)
-    matrix = np.array(rows) * weights[:, None]
+    weights = 1.0 / np.maximum(np.array(scales or values), 1e-12)
+    matrix, wanted = np.array(rows, dtype=np.float64) * weights[:, None], values * weights
     chosen = list(range(matrix.shape[1]))
     while True:  # what would be negative is none
         found = np.zeros(matrix.shape[1])
-        found[chosen] = np.linalg.lstsq(matrix[:, chosen], np.ones(len(values)), rcond=None)[0]
+        found[chosen] = np.linalg.lstsq(matrix[:, chosen], wanted, rcond=None)[0]
         below = [n for n in chosen if found[n] < 0.0]
         if not below:
             return [float(value) for value in found]

@@ -2,33 +2,22 @@
 
 from __future__ import annotations
 
-import math
 import os
-import subprocess
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack, closing
 from pathlib import Path
 from statistics import median
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
-from benchmarks.harness import Report, Say, about, numbers_of, run, silent
-from benchmarks.node_costs import NodeCosts, NodeSample, fitted
-from cavmarl.config.registry import load_config
-from cavmarl.core.errors import ConfigError, require
-from cavmarl.engine.world_setup import make_world
-from cavmarl.env.vector import CavVectorEnv
-from cavmarl.parallel.local_worlds import LocalWorlds
-from cavmarl.parallel.nodes.node_worlds import NodeWorlds
-from cavmarl.shards.shard import Commands
-from cavmarl.verify.faulty_network import FaultyNetwork
+from benchmarks.harness import Report, Say, about, numbers_of, paired_interval, run, silent
+from benchmarks.node_costs import NodeCosts, NodeSample, fitted, near_rows
+from benchmarks.world_processes import PER_JUNCTION, Turn, WorldProcess, make_city
+from cavmarl.core.errors import ConfigError
 
-PER_JUNCTION = 25  # vehicles
-EDGE_M = 200
 PREDICTED = (10_000, 100_000, 1_000_000, 10_000_000)
 OVER = (1, 2, 4, 16, 64, 256)
-WARM_STEPS = 3
 
 
 def measure(
@@ -39,11 +28,22 @@ def measure(
     latencies: Annotated[
         str, about("Latencies in ms that are added to all connections, too.", metavar="MS,…")
     ] = "",
-    steps: Annotated[int, about("Steps of each turn.")] = 10,
-    repeats: Annotated[int, about("Turns of each world, one after the other.")] = 5,
+    steps: Annotated[int, about("Steps of each turn.")] = 5,
+    repeats: Annotated[int, about("Turns of each world, one after the other.")] = 40,
+    realtime: Annotated[
+        bool,
+        about(
+            "Turns have real-time priority, and after each round other programs have as long.",
+            "--realtime",
+        ),
+    ] = False,
     say: Say = silent,
 ) -> Report:
-    """Measure worlds by turns, fit a model to the runs with 0 to 2 nodes, and compare the rest."""
+    """Measure worlds by turns, fit a model to the runs with 0 to 2 nodes, and compare the rest.
+
+    Each world is in processes of its own, and has its heap in huge pages. They take turns in one
+    order, then in the other. A turn begins with steps that do not count: others have had the cache.
+    """
     if steps < 1 or repeats < 1:
         raise ConfigError(f"{steps} steps, {repeats} turns: must be at least 1")
     sizes, counts = numbers_of("--vehicles", vehicles), numbers_of("--nodes", nodes)
@@ -53,18 +53,13 @@ def measure(
             f"--vehicles {vehicles} --nodes {nodes}: name two sizes from {PER_JUNCTION * 16} on, "
             "and among the nodes 1 and 2: the model is fitted to these"
         )
-    samples: list[NodeSample] = []
-    with tempfile.TemporaryDirectory() as folder:
-        for size in sizes:
-            net = make_city(Path(folder), size)
-            say(f"a city of {size:,} vehicles")
-            samples += _turns(net, size, counts, 0.0, steps, repeats)
-            for latency_s in added if size == sizes[0] else []:
-                say(f"with {1e3 * latency_s:g} ms of latency")
-                samples += _turns(net, size, [2], latency_s, steps, repeats)
-    known = [s for s in samples if s.nodes <= 2 and s.latency_s == 0.0]
-    costs, cores = fitted(known), os.cpu_count() or 1
-    rows = [_row(s, samples, costs, cores) for s in samples]
+    sides = [_Side(size, n, s) for size in sizes for s in (0.0, *added) for n in counts]
+    sides += [_Side(size, 0, 0.0) for size in sizes]  # the last: nodes have put maps in the cache
+    turns = _turns(sides, steps, repeats, realtime, say)
+    samples = {side: _sample(side, turns[side]) for side in sorted(sides)}
+    known = [s for s in samples.values() if s.nodes <= 2 and s.latency_s == 0.0]
+    costs, cores = fitted(known, near_rows()), os.cpu_count() or 1
+    rows = [_row(side, samples, turns, costs, cores) for side in samples]
     return Report(
         f"a city over nodes, {cores} cores",
         {
@@ -73,6 +68,7 @@ def measure(
             "+ ms": "latency_ms:g",
             "ms": "tick_ms:.3g",
             "faster": "ratio:.2f",
+            "±": "interval:.2f",
             "model": "model_ms:.3g",
             "off": "off:+.0%",
             "MB": "memory_mb:.0f",
@@ -81,29 +77,76 @@ def measure(
         },
         rows,
         notes=[
-            "ms: a tick, median; + ms: latency added to each connection; faster: than undivided; "
-            "MB: resident, the largest node; the models are fitted to runs with at most 2 nodes",
+            "ms: a tick, median; + ms: latency added to each connection; faster: than undivided, "
+            "by the turns that follow each other, with an interval of 95 %; MB: resident, the "
+            "largest process; the models are fitted to runs with at most 2 nodes",
             *_predictions(costs, max(cores, max(OVER))),
         ],
-        facts={"costs": costs.__dict__, "samples": [s.to_dict() for s in samples]},
+        facts={
+            "costs": costs.__dict__,
+            "samples": [s.to_dict() for s in samples.values()],
+            "turns": [[*side, [turn.tick_s for turn in turns[side]]] for side in samples],
+        },
     )
 
 
+class _Side(NamedTuple):
+    """What takes turns."""
+
+    vehicles: int
+    nodes: int  # 0: undivided
+    latency_s: float  # that is asked for
+
+
+def _turns(
+    sides: Sequence[_Side], steps: int, repeats: int, is_realtime: bool, say: Say
+) -> dict[_Side, list[Turn]]:
+    found: dict[_Side, list[Turn]] = {side: [] for side in sides}
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        nets = {size: make_city(Path(folder), size) for size in {side.vehicles for side in sides}}
+        worlds: dict[_Side, WorldProcess] = {}
+        for side in sides:
+            say(f"{side.vehicles:,} vehicles, {side.nodes or 'no'} nodes")
+            made = WorldProcess(nets[side.vehicles], *side, is_realtime)
+            worlds[side] = stack.enter_context(closing(made))
+        for number in range(repeats):
+            say(f"turn {number + 1} of {repeats}")
+            began_s = time.perf_counter()
+            for side in sides if number % 2 == 0 else sides[::-1]:
+                found[side].append(worlds[side].turn(steps))
+            if is_realtime:
+                time.sleep(time.perf_counter() - began_s)
+    return found
+
+
+def _sample(side: _Side, turns: Sequence[Turn]) -> NodeSample:
+    found = Turn(*(median(values) for values in zip(*turns, strict=True)))
+    return NodeSample(side.vehicles, side.nodes, **found._asdict())
+
+
 def _row(
-    sample: NodeSample, samples: Sequence[NodeSample], costs: NodeCosts, cores: int
+    side: _Side,
+    samples: dict[_Side, NodeSample],
+    turns: dict[_Side, list[Turn]],
+    costs: NodeCosts,
+    cores: int,
 ) -> dict[str, Any]:
-    whole = next(s for s in samples if s.vehicles == sample.vehicles and s.nodes == 0)
+    sample, alone = samples[side], _Side(side.vehicles, 0, 0.0)
     model_s = costs.tick(sample.vehicles, sample.nodes, sample.latency_s, cores)
+    times = [[turn.tick_s for turn in turns[one]] for one in (alone, side)]
+    ratio, interval = paired_interval(*times)
     return {
         "vehicles": sample.vehicles,
         "nodes": sample.nodes or "undivided",
-        "latency_ms": 1e3 * sample.latency_s,
+        "latency_ms": 1e3 * side.latency_s,
+        "latency_measured_ms": 1e3 * sample.latency_s,
         "tick_ms": 1e3 * sample.tick_s,
-        "ratio": whole.tick_s / sample.tick_s,
+        "ratio": ratio,
+        "interval": interval,
         "model_ms": 1e3 * model_s,
         "off": model_s / sample.tick_s - 1.0,
         "memory_mb": sample.memory_bytes / 1e6,
-        "memory_share": sample.memory_bytes / whole.memory_bytes,
+        "memory_share": sample.memory_bytes / samples[alone].memory_bytes,
         "model_mb": costs.memory(sample.vehicles, sample.nodes) / 1e6,
     }
 
@@ -121,103 +164,6 @@ def _predictions(costs: NodeCosts, cores: int) -> list[str]:
         pays = f"{best} nodes are the fastest" if best else "dividing does not pay"
         lines.append(f"{vehicles:,} vehicles by the model, a core for each node: {shown}; {pays}")
     return lines
-
-
-def make_city(folder: Path, vehicles: int) -> Path:
-    """A grid with room for so many."""
-    require("sumo", "sumo")
-    import sumo
-
-    side = max(4, round(math.sqrt(vehicles / PER_JUNCTION)))
-    path = folder / f"city{vehicles}.net.xml"
-    command = [
-        str(Path(sumo.SUMO_HOME) / "bin" / "netgenerate"), "--grid", "--grid.number", str(side),
-        "--grid.length", str(EDGE_M), "--default.lanenumber", "2", "--output-file", str(path),
-    ]  # fmt: skip
-    subprocess.run(command, check=True, capture_output=True)
-    return path
-
-
-class _Side:
-    """One world, that takes turns."""
-
-    def __init__(self, net: Path, vehicles: int, nodes: int, network: FaultyNetwork | None) -> None:
-        config, base_dir = load_config(
-            net, zones=max(1, nodes), agents=1, background=vehicles - 1, max_cycles=1_000_000
-        )
-        world = make_world(config, base_dir)
-        self.nodes = nodes
-        self._worlds: LocalWorlds | NodeWorlds
-        if nodes == 0:
-            self._worlds = LocalWorlds(world, 1)
-        elif network is None:
-            self._worlds = NodeWorlds(world, base_dir, 1, nodes)
-        else:
-            self._worlds = NodeWorlds(world, base_dir, 1, nodes, route=network.route)
-        self._ticks = config.clock.ticks_per_step
-        self.vec = CavVectorEnv(self._worlds)
-        self.vec.reset(seed=1)
-        arrays = self.vec.worlds.arrays
-        self._commands = Commands(arrays.controls, arrays.meta_actions)
-        self._step(WARM_STEPS)
-        self.turns: list[tuple[float, ...]] = []
-
-    def _step(self, steps: int) -> None:
-        for _ in range(steps):
-            self._worlds.step(self._commands)
-
-    def turn(self, steps: int) -> None:
-        if isinstance(self._worlds, NodeWorlds):
-            self._worlds.node_loads()
-        cpu_s, wall_s, ticks = time.process_time(), time.perf_counter(), steps * self._ticks
-        self._step(steps)
-        wall_s, cpu_s = time.perf_counter() - wall_s, time.process_time() - cpu_s
-        if isinstance(self._worlds, NodeWorlds):
-            loads = self._worlds.node_loads()
-            dear = max(loads, key=lambda load: load.cpu_s)
-            memory = max(load.memory_bytes for load in loads)
-            parts = (dear.cpu_s / ticks, cpu_s / ticks, dear.vehicles, dear.ghosts, memory)
-        else:
-            parts = (cpu_s / ticks, 0.0, int(self.vec.simulation.running()[0]), 0, _resident())
-        self.turns.append((wall_s / ticks, *map(float, parts)))
-
-    def sample(self, vehicles: int, latency_s: float) -> NodeSample:
-        found = (median(values) for values in zip(*self.turns, strict=True))
-        return NodeSample(vehicles, self.nodes, latency_s, *found)
-
-
-def _turns(
-    net: Path, vehicles: int, counts: Sequence[int], latency_s: float, steps: int, repeats: int
-) -> list[NodeSample]:
-    """The undivided world and those over nodes, one turn after the other."""
-    with _network(latency_s) as network:
-        wanted = [0, *counts] if network is None else counts
-        sides = [_Side(net, vehicles, n, network) for n in wanted]
-        try:
-            for _ in range(repeats):
-                for side in sides:
-                    side.turn(steps)
-            return [side.sample(vehicles, latency_s) for side in sides]
-        finally:
-            for side in sides:
-                side.vec.close()
-
-
-@contextmanager
-def _network(latency_s: float) -> Iterator[FaultyNetwork | None]:
-    if latency_s == 0.0:
-        yield None
-        return
-    network = FaultyNetwork(seed=0, latency_s=latency_s)
-    try:
-        yield network
-    finally:
-        network.close()
-
-
-def _resident() -> int:
-    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE")
 
 
 if __name__ == "__main__":

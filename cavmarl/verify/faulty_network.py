@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import random
+import select
 import socket
 import threading
 import time
-from collections import Counter
-from collections.abc import Callable
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from enum import StrEnum
 from functools import partial
@@ -118,14 +119,27 @@ class FaultyNetwork:
                 for direction in (0, 1):
                     self._start(partial(self._carry, connection, direction))
 
+    def _late(self, source: socket.socket) -> Iterator[bytes]:
+        """What comes, each piece so much later than it has come."""
+        due: deque[tuple[float, bytes]] = deque()
+        while True:
+            wait_s = max(due[0][0] - time.perf_counter(), 0.0) if due else None
+            if not due or select.select([source], [], [], wait_s)[0]:
+                if not (data := source.recv(CHUNK)):
+                    break
+                due.append((time.perf_counter() + self._latency_s, data))
+            while due and due[0][0] <= time.perf_counter():
+                yield due.popleft()[1]
+        for due_s, data in due:
+            time.sleep(max(due_s - time.perf_counter(), 0.0))
+            yield data
+
     def _carry(self, connection: _Connection, direction: int) -> None:
         """Carry the bytes of one direction until one end closes."""
         source, target = connection.ends[direction], connection.ends[1 - direction]
         is_mute = False
         with suppress(OSError):
-            while data := source.recv(CHUNK):
-                if self._latency_s:
-                    time.sleep(self._latency_s)
+            for data in self._late(source):
                 fault, connection.due[direction] = connection.due[direction], None
                 if fault is NetworkFault.DELAY:
                     time.sleep(self._random.uniform(0.001, LONGEST_DELAY_S))

@@ -4,48 +4,56 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import pytest
 
+from benchmarks import node_costs
 from benchmarks import nodes as benchmark
-from benchmarks.node_costs import NodeCosts, NodeSample, borders, fitted
+from benchmarks.node_costs import NodeCosts, NodeSample, borders, fitted, near_rows
 from cavmarl.core.errors import ConfigError
 
 KNOWN = NodeCosts(
     tick_s=2e-4,
-    vehicle_s=1.5e-6,
     ghost_s=5e-7,
     whole_s=5e-5,
-    whole_vehicle_s=1.4e-6,
+    vehicle_s=3e-7,
+    far_s=4e-7,
+    near=4_000.0,
     caller_s=8e-5,
     caller_node_s=4e-5,
     wake_s=3e-5,
+    uneven=0.05,
     base_bytes=2e8,
     city_bytes=1e3,
     own_bytes=2e3,
     ghost_factor=4.0,
+    crossing_share=1e-3,
+    ticks_per_step=2.0,
 )
 
 
 def sample(vehicles: int, nodes: int, latency_s: float = 0.0) -> NodeSample:
     own, ghosts = vehicles / max(nodes, 1), KNOWN.ghosts(vehicles, nodes) if nodes else 0.0
-    node_s = KNOWN.tick_s + KNOWN.vehicle_s * own + KNOWN.ghost_s * ghosts
+    node_s = KNOWN.tick_s + KNOWN.ghost_s * ghosts if nodes else KNOWN.whole_s
     return NodeSample(
         vehicles=vehicles,
         nodes=nodes,
-        latency_s=latency_s,
         tick_s=KNOWN.tick(vehicles, nodes, latency_s, cores=64),
-        node_s=node_s if nodes else KNOWN.whole_s + KNOWN.whole_vehicle_s * vehicles,
+        node_s=node_s + KNOWN.work(own, ghosts),
         caller_s=KNOWN.caller_s + KNOWN.caller_node_s * nodes if nodes else 0.0,
         own=own,
         ghosts=ghosts,
+        crossings=KNOWN.crossing_share * ghosts * nodes,
         memory_bytes=KNOWN.memory(vehicles, nodes),
+        latency_s=latency_s,
+        ticks_per_step=KNOWN.ticks_per_step,
     )
 
 
 def test_the_parameters_are_found() -> None:
     samples = [sample(size, nodes) for size in (1_000, 5_000, 20_000) for nodes in (0, 1, 2)]
-    found = asdict(fitted(samples))
+    found = asdict(fitted(samples, KNOWN.near))
     assert found == pytest.approx(asdict(KNOWN), rel=1e-6)
     costs = NodeCosts(**found)
     assert costs.tick(10**6, 16, 1e-3, 64) == pytest.approx(KNOWN.tick(10**6, 16, 1e-3, 64))
@@ -54,14 +62,30 @@ def test_the_parameters_are_found() -> None:
 def test_what_would_be_negative_is_none() -> None:
     samples = [sample(size, nodes) for size in (1_000, 5_000, 20_000) for nodes in (0, 1, 2)]
     cheap = [replace(s, caller_s=1e-4 / max(s.nodes, 1)) for s in samples]
-    assert fitted(cheap).caller_node_s == 0.0
+    assert fitted(cheap, KNOWN.near).caller_node_s == 0.0
 
 
 def test_latency_counts_once_for_each_hop() -> None:
-    near, far = (KNOWN.tick(5_000, 4, latency_s, 64) for latency_s in (0.0, 1e-3))
-    assert far - near == pytest.approx(3e-3)
+    """A step of two ticks: a command, a share of each tick and one of agents, a report."""
+    for vehicles, offers in ((100, 0.0), (10**10, 1.0)):
+        near, far = (KNOWN.tick(vehicles, 4, latency_s, 64) for latency_s in (0.0, 1e-3))
+        assert far - near == pytest.approx(1e-3 * (5.0 + offers) / 2.0, rel=0.05)
     alone = KNOWN.tick(5_000, 1, 1e-3, 64) - KNOWN.tick(5_000, 1, 0.0, 64)
-    assert alone == pytest.approx(2e-3)
+    assert alone == pytest.approx(1e-3)
+
+
+def test_vehicles_beyond_the_cache_cost_more() -> None:
+    assert KNOWN.work(4_000) == pytest.approx(4_000 * 3e-7)
+    assert KNOWN.work(10_000) - KNOWN.work(9_000) == pytest.approx(1_000 * 7e-7)
+    assert KNOWN.work(4_000, ghosts=100) - KNOWN.work(4_000) == pytest.approx(100 * 4e-7)
+
+
+def test_rows_that_stay_in_the_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told = tmp_path / "size"
+    monkeypatch.setattr(node_costs, "CACHE", told)
+    assert near_rows() == node_costs.CACHE_BYTES / node_costs.ROW_BYTES
+    told.write_text("512K\n", encoding="ascii")
+    assert near_rows() == 512 * 1024 / node_costs.ROW_BYTES
 
 
 def test_nodes_beyond_the_cores_take_turns() -> None:
@@ -80,7 +104,7 @@ def test_borders_of_a_square_of_zones(side: int) -> None:
 
 def test_too_few_runs_are_refused() -> None:
     with pytest.raises(ValueError, match="two sizes undivided"):
-        fitted([sample(1_000, nodes) for nodes in (0, 1, 2)])
+        fitted([sample(1_000, nodes) for nodes in (0, 1, 2)], 4e3)
 
 
 @pytest.mark.parametrize(

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import closing
+from pathlib import Path
+
 import pytest
 
 from benchmarks import node_latencies, node_limit
 from benchmarks.__main__ import programs
-from benchmarks.nodes import PER_JUNCTION
+from benchmarks.world_processes import PER_JUNCTION, WorldProcess, make_city
 from cavmarl.core.errors import ConfigError
 
 
@@ -39,6 +42,19 @@ def test_two_halves_run_beside_one_another() -> None:
     assert all(row["cpu_ms"] > 0.0 for row in found.rows)
     with pytest.raises(ConfigError, match="--vehicles 1: at least"):
         node_limit.measure(vehicles=1)
+
+
+def test_a_city_over_nodes_takes_turns(tmp_path: Path) -> None:
+    least = PER_JUNCTION * 16
+    latency_s = 2e-3
+    with closing(WorldProcess(make_city(tmp_path, least), least, 2, latency_s)) as city:
+        turn = city.turn(steps=1)
+    assert turn.latency_s > latency_s / 2.0
+    assert turn.tick_s > 2.0 * latency_s  # a step of two ticks has five hops at least
+    assert 0.0 < turn.node_s < turn.tick_s
+    assert least / 2 <= turn.own < least
+    assert turn.ghosts > 0
+    assert turn.ticks_per_step == 2
 
 
 def test_both_are_listed() -> None:

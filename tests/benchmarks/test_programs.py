@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import random
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,7 @@ import pytest
 
 from benchmarks import balance, moving, profile, scope, selection, sumo
 from benchmarks.__main__ import KEPT, main, programs
-from benchmarks.harness import Report, run
+from benchmarks.harness import Report, paired_interval, run
 from cavmarl.cli.bench import app
 from cavmarl.core.errors import ConfigError
 from tests.support.sumo_worlds import tiny_file
@@ -95,3 +97,17 @@ def test_a_coupled_world_is_measured_beside_libsumo(tmp_path: Path) -> None:
     alone, coupled = found.rows
     assert 0.0 < alone["low_ms"] <= alone["high_ms"]
     assert coupled["median_ms"] > 0.0
+
+
+def test_a_ratio_by_pairs_has_an_interval() -> None:
+    turns = [1.0, 3.0, 2.0, 5.0]
+    assert paired_interval([2.0 * x for x in turns], turns) == pytest.approx((2.0, 0.0))
+    assert paired_interval([3.0], [2.0]) == (pytest.approx(1.5), math.inf)
+    draws = random.Random(0)
+    within = 0
+    for _ in range(200):
+        others = [math.exp(draws.gauss(0.0, 1.0)) for _ in range(40)]  # what falls on both sides
+        ones = [1.3 * x * math.exp(draws.gauss(0.0, 0.2)) for x in others]
+        ratio, interval = paired_interval(ones, others)
+        within += abs(ratio - 1.3) < interval
+    assert within > 180

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -90,6 +91,29 @@ def test_a_cut_ends_both_ends(ends: tuple[FaultyNetwork, socket.socket, socket.s
     network, one, other = ends
     network.strike(NetworkFault.CUT)
     assert one.recv(100) == other.recv(100) == b""
+
+
+def test_pieces_are_late_side_by_side() -> None:
+    num, apart_s, latency_s = 20, 0.005, 0.05
+    network = FaultyNetwork(seed=0, latency_s=latency_s)
+    try:
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            with socket.create_connection(network.route(server.getsockname())) as one:
+                other, _ = server.accept()
+                with other:
+                    began_s = time.perf_counter()
+                    for _ in range(num):
+                        one.sendall(b"word")
+                        time.sleep(apart_s)
+                    one.shutdown(socket.SHUT_WR)
+                    came = b""
+                    while data := other.recv(100):
+                        came += data
+                    took_s = time.perf_counter() - began_s
+    finally:
+        network.close()
+    assert came == num * b"word"
+    assert latency_s <= took_s < num * latency_s
 
 
 def test_nothing_stays_behind() -> None:
