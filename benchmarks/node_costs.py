@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import fmean
+from typing import NamedTuple
 
 import numpy as np
 
 from cavmarl.driving.vehicles import VEHICLE
 
-CACHE_BYTES = 1 << 20  # of a core's own cache, where the system does not tell
-CACHE = Path("/sys/devices/system/cpu/cpu0/cache/index2/size")
+CACHES = Path("/sys/devices/system/cpu/cpu0/cache")
+CACHE_BYTES = {"index2": 1 << 20, "index3": 32 << 20}  # where the system does not tell
 ROW_BYTES = 2 * VEHICLE.itemsize  # of a vehicle: a tick reads one table and writes another
 
 
@@ -37,6 +39,19 @@ class NodeSample:
         return asdict(self)
 
 
+class Caches(NamedTuple):
+    """Of how many vehicles they hold the rows, and how many cores share the larger one."""
+
+    own: float  # of a core
+    shared: float  # of all cores
+    cores: int
+
+    def beyond(self, rows: float, busy: int) -> tuple[float, float]:
+        """How many rows of a core are not in its own cache, and not in its share of the other."""
+        share = self.shared / max(min(busy, self.cores), 1)
+        return max(rows - self.own, 0.0), max(rows - share, 0.0)
+
+
 @dataclass(frozen=True)
 class NodeCosts:
     """The parameters."""
@@ -45,8 +60,9 @@ class NodeCosts:
     ghost_s: float  # for each vehicle of others that it sees
     whole_s: float  # of an undivided tick, whatever there is
     vehicle_s: float  # for each vehicle, of a node or undivided
-    far_s: float  # more for each row, of a ghost, too, beyond those that stay in a core's cache
-    near: float  # how many that are
+    far_s: float  # more for each row, of a ghost, too, that is not in a core's own cache
+    memory_s: float  # more for each that is in no cache
+    caches: Caches
     caller_s: float  # of the caller in each tick
     caller_node_s: float  # for each node
     wake_s: float  # from one process to another, without latency
@@ -75,20 +91,22 @@ class NodeCosts:
         offers = 1.0 - math.exp(-crossings)
         return (self.ticks_per_step + 3.0 + offers) / self.ticks_per_step
 
-    def work(self, vehicles: float, ghosts: float = 0.0) -> float:
+    def work(self, vehicles: float, ghosts: float, busy: int) -> float:
         """Seconds of a core for the vehicles that it steps in a tick, beside what ghosts cost.
 
-        Of more rows than its cache holds, as many as it holds come from there.
+        Of more rows than a cache holds, as many as it holds come from there. `busy`: cores at work.
         """
-        return self.vehicle_s * vehicles + self.far_s * max(vehicles + ghosts - self.near, 0.0)
+        far, farthest = self.caches.beyond(vehicles + ghosts, busy)
+        return self.vehicle_s * vehicles + self.far_s * far + self.memory_s * farthest
 
     def tick(self, vehicles: float, nodes: int, latency_s: float, cores: int) -> float:
-        """Seconds of a tick; nodes beyond `cores` take turns, and share a core's cache."""
+        """Seconds of a tick; nodes beyond `cores` take turns, and share a core's caches."""
         if nodes == 0:
-            return self.whole_s + self.work(vehicles)
+            return self.whole_s + self.work(vehicles, 0.0, 1)
         turns = math.ceil(nodes / cores)
         own, ghosts = turns * vehicles / nodes, turns * self.ghosts(vehicles, nodes)
-        node_s = turns * self.tick_s + self.ghost_s * ghosts + self.work(own, ghosts)
+        node_s = turns * self.tick_s + self.ghost_s * ghosts
+        node_s += self.work(own, ghosts, min(nodes, cores))
         node_s *= 1.0 + (self.uneven if nodes > 1 else 0.0)
         caller_s = self.caller_s + self.caller_node_s * nodes
         return node_s + caller_s + self.hops(vehicles, nodes) * (self.wake_s + latency_s)
@@ -104,19 +122,22 @@ def borders(nodes: int) -> float:
     return 0.0 if nodes < 2 else 4.0 - 4.0 / math.sqrt(nodes)
 
 
-def near_rows() -> float:
-    """How many vehicles' rows this machine's cores have in the cache that is each one's own."""
+def caches_here() -> Caches:
+    """Those of this machine."""
+    own, shared = (_cache_bytes(level) / ROW_BYTES for level in CACHE_BYTES)
+    return Caches(own, shared, os.cpu_count() or 1)
+
+
+def _cache_bytes(level: str) -> int:
     try:
-        text = CACHE.read_text(encoding="ascii").strip()
-        return int(text.removesuffix("K")) * 1024 / ROW_BYTES
+        text = (CACHES / level / "size").read_text(encoding="ascii").strip()
+        return int(text.removesuffix("K")) * 1024
     except (OSError, ValueError):
-        return CACHE_BYTES / ROW_BYTES
+        return CACHE_BYTES[level]
 
 
-def fitted(samples: Sequence[NodeSample], near: float) -> NodeCosts:
+def fitted(samples: Sequence[NodeSample], caches: Caches) -> NodeCosts:
     """The parameters that fit runs best; of several sizes, over 0 and more nodes.
-
-    `near`: rows that stay in a core's cache.
 
     Raises:
         ValueError: too few runs to tell them.
@@ -127,10 +148,11 @@ def fitted(samples: Sequence[NodeSample], near: float) -> NodeCosts:
     if len({s.vehicles for s in whole}) < 2 or len({(s.vehicles, s.nodes) for s in calm}) < 3:
         raise ValueError("a fit needs two sizes undivided, and three runs over nodes")
     work = [
-        [s.nodes == 0, s.nodes > 0, s.ghosts, s.own, max(s.own + s.ghosts - near, 0.0)]
+        [s.nodes == 0, s.nodes > 0, s.ghosts, s.own, *caches.beyond(s.own + s.ghosts, s.nodes)]
         for s in (*whole, *calm)
     ]
-    whole_s, tick_s, ghost_s, vehicle_s, far_s = _solve(work, [s.node_s for s in (*whole, *calm)])
+    spent = _solve(work, [s.node_s for s in (*whole, *calm)])
+    whole_s, tick_s, ghost_s, vehicle_s, far_s, memory_s = spent
     caller = _solve([[1.0, s.nodes] for s in calm], [s.caller_s for s in calm])
     memory = _solve(
         [[1.0, s.vehicles, s.own + s.ghosts] for s in (*whole, *calm)],
@@ -142,7 +164,8 @@ def fitted(samples: Sequence[NodeSample], near: float) -> NodeCosts:
         whole_s=whole_s,
         vehicle_s=vehicle_s,
         far_s=far_s,
-        near=near,
+        memory_s=memory_s,
+        caches=caches,
         caller_s=caller[0],
         caller_node_s=caller[1],
         wake_s=0.0,

@@ -7,12 +7,13 @@ import tempfile
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
+from dataclasses import asdict
 from pathlib import Path
 from statistics import median
 from typing import Annotated, Any, NamedTuple
 
 from benchmarks.harness import Report, Say, about, numbers_of, paired_interval, run, silent
-from benchmarks.node_costs import NodeCosts, NodeSample, fitted, near_rows
+from benchmarks.node_costs import NodeCosts, NodeSample, caches_here, fitted
 from benchmarks.world_processes import PER_JUNCTION, Turn, WorldProcess, make_city
 from cavmarl.core.errors import ConfigError
 
@@ -58,7 +59,7 @@ def measure(
     turns = _turns(sides, steps, repeats, realtime, say)
     samples = {side: _sample(side, turns[side]) for side in sorted(sides)}
     known = [s for s in samples.values() if s.nodes <= 2 and s.latency_s == 0.0]
-    costs, cores = fitted(known, near_rows()), os.cpu_count() or 1
+    costs, cores = fitted(known, caches_here()), os.cpu_count() or 1
     rows = [_row(side, samples, turns, costs, cores) for side in samples]
     return Report(
         f"a city over nodes, {cores} cores",
@@ -83,7 +84,7 @@ def measure(
             *_predictions(costs, max(cores, max(OVER))),
         ],
         facts={
-            "costs": costs.__dict__,
+            "costs": asdict(costs),
             "samples": [s.to_dict() for s in samples.values()],
             "turns": [[*side, [turn.tick_s for turn in turns[side]]] for side in samples],
         },

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks import node_costs
 from benchmarks import nodes as benchmark
-from benchmarks.node_costs import NodeCosts, NodeSample, borders, fitted, near_rows
+from benchmarks.node_costs import Caches, NodeCosts, NodeSample, borders, caches_here, fitted
 from cavmarl.core.errors import ConfigError
 
 KNOWN = NodeCosts(
@@ -19,7 +19,8 @@ KNOWN = NodeCosts(
     whole_s=5e-5,
     vehicle_s=3e-7,
     far_s=4e-7,
-    near=4_000.0,
+    memory_s=5e-7,
+    caches=Caches(own=4_000.0, shared=12_000.0, cores=64),
     caller_s=8e-5,
     caller_node_s=4e-5,
     wake_s=3e-5,
@@ -40,7 +41,7 @@ def sample(vehicles: int, nodes: int, latency_s: float = 0.0) -> NodeSample:
         vehicles=vehicles,
         nodes=nodes,
         tick_s=KNOWN.tick(vehicles, nodes, latency_s, cores=64),
-        node_s=node_s + KNOWN.work(own, ghosts),
+        node_s=node_s + KNOWN.work(own, ghosts, nodes),
         caller_s=KNOWN.caller_s + KNOWN.caller_node_s * nodes if nodes else 0.0,
         own=own,
         ghosts=ghosts,
@@ -53,16 +54,16 @@ def sample(vehicles: int, nodes: int, latency_s: float = 0.0) -> NodeSample:
 
 def test_the_parameters_are_found() -> None:
     samples = [sample(size, nodes) for size in (1_000, 5_000, 20_000) for nodes in (0, 1, 2)]
-    found = asdict(fitted(samples, KNOWN.near))
-    assert found == pytest.approx(asdict(KNOWN), rel=1e-6)
-    costs = NodeCosts(**found)
+    costs = fitted(samples, KNOWN.caches)
+    found, known = ({**asdict(one), "caches": 0.0} for one in (costs, KNOWN))
+    assert found == pytest.approx(known, rel=1e-6)
     assert costs.tick(10**6, 16, 1e-3, 64) == pytest.approx(KNOWN.tick(10**6, 16, 1e-3, 64))
 
 
 def test_what_would_be_negative_is_none() -> None:
     samples = [sample(size, nodes) for size in (1_000, 5_000, 20_000) for nodes in (0, 1, 2)]
     cheap = [replace(s, caller_s=1e-4 / max(s.nodes, 1)) for s in samples]
-    assert fitted(cheap, KNOWN.near).caller_node_s == 0.0
+    assert fitted(cheap, KNOWN.caches).caller_node_s == 0.0
 
 
 def test_latency_counts_once_for_each_hop() -> None:
@@ -74,18 +75,27 @@ def test_latency_counts_once_for_each_hop() -> None:
     assert alone == pytest.approx(1e-3)
 
 
-def test_vehicles_beyond_the_cache_cost_more() -> None:
-    assert KNOWN.work(4_000) == pytest.approx(4_000 * 3e-7)
-    assert KNOWN.work(10_000) - KNOWN.work(9_000) == pytest.approx(1_000 * 7e-7)
-    assert KNOWN.work(4_000, ghosts=100) - KNOWN.work(4_000) == pytest.approx(100 * 4e-7)
+def test_rows_beyond_the_caches_cost_more() -> None:
+    def work(vehicles: float, ghosts: float = 0.0, busy: int = 1) -> float:
+        return KNOWN.work(vehicles, ghosts, busy)
+
+    assert work(4_000) == pytest.approx(4_000 * 3e-7)
+    assert work(10_000) - work(9_000) == pytest.approx(1_000 * 7e-7)
+    assert work(4_000, ghosts=100) - work(4_000) == pytest.approx(100 * 4e-7)
+    assert work(14_000) - work(13_000) == pytest.approx(1_000 * 12e-7)
+    assert work(10_000, busy=2) - work(10_000) == pytest.approx(4_000 * 5e-7)
 
 
-def test_rows_that_stay_in_the_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    told = tmp_path / "size"
-    monkeypatch.setattr(node_costs, "CACHE", told)
-    assert near_rows() == node_costs.CACHE_BYTES / node_costs.ROW_BYTES
-    told.write_text("512K\n", encoding="ascii")
-    assert near_rows() == 512 * 1024 / node_costs.ROW_BYTES
+def test_rows_that_caches_of_this_machine_hold(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(node_costs, "CACHES", tmp_path)
+    row = node_costs.ROW_BYTES
+    assert caches_here()[:2] == ((1 << 20) / row, (32 << 20) / row)
+    for level, size in (("index2", "512K\n"), ("index3", "16384K\n")):
+        (tmp_path / level).mkdir()
+        (tmp_path / level / "size").write_text(size, encoding="ascii")
+    assert caches_here()[:2] == ((1 << 19) / row, (16 << 20) / row)
 
 
 def test_nodes_beyond_the_cores_take_turns() -> None:
@@ -104,7 +114,7 @@ def test_borders_of_a_square_of_zones(side: int) -> None:
 
 def test_too_few_runs_are_refused() -> None:
     with pytest.raises(ValueError, match="two sizes undivided"):
-        fitted([sample(1_000, nodes) for nodes in (0, 1, 2)], 4e3)
+        fitted([sample(1_000, nodes) for nodes in (0, 1, 2)], KNOWN.caches)
 
 
 @pytest.mark.parametrize(
