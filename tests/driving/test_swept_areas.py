@@ -8,9 +8,16 @@ import numpy as np
 import pytest
 
 from cavmarl.core.records.arrays import Scratch
-from cavmarl.core.records.codes import HOLD_NONE, HOLD_SIGNAL, HOLD_YIELD
+from cavmarl.core.records.codes import (
+    DRIVER_BACKGROUND,
+    HOLD_NONE,
+    HOLD_SIGNAL,
+    HOLD_YIELD,
+)
 from cavmarl.driving.kernels.approach import APPROACH
+from cavmarl.driving.kernels.drivers import decide
 from cavmarl.driving.kernels.following import behind, no_constraint
+from cavmarl.driving.kernels.lane_index import index_lanes
 from cavmarl.driving.kernels.swept_areas import (
     behind_fork,
     room_m,
@@ -20,11 +27,12 @@ from cavmarl.driving.kernels.swept_areas import (
 )
 from cavmarl.driving.vehicle_types import generated_types
 from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.routing import PLAN
 from cavmarl.roads.sumo_net.reader import read_network
 from tests.support.demand_worlds import make
 from tests.support.driving import drive, start
 from tests.support.netgenerate import netgenerate
-from tests.support.traffic import on_lane, scratch
+from tests.support.traffic import on_lane, scratch, travel_by
 
 GRID = ("--grid", "--grid.number=3", "--grid.length=80", "--no-turnarounds.except-deadend")
 CLOCK = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.5}
@@ -159,6 +167,48 @@ def test_of_two_before_it_the_one_further_along_goes_first(network: RoadNetwork)
     assert meeting.stop(0, places) == np.inf
     meeting.rows["speed"][1] = 15.0  # it cannot stop any more
     assert meeting.stop(0, (bus_enter_m - 9.0, enter_m - 6.0)) == bus_enter_m
+
+
+def test_one_that_stands_before_the_area_without_a_reason_of_its_own_is_not_waited_for(
+    network: RoadNetwork,
+) -> None:
+    """A leader keeps it, which may wait for the one that asks: none of the three would go."""
+    meeting = Meeting(network)
+    enter_m, bus_enter_m = meeting.sweep["foe_enter_m"], meeting.sweep["enter_m"]
+    meeting.rows["wait_s"][0] = 4.0
+    assert meeting.stop(1, (bus_enter_m - 1.0, enter_m - 1.0)) == np.inf
+    assert meeting.stop(1, (bus_enter_m + 1.0, enter_m - 1.0)) == enter_m, "it is in the area"
+    meeting.rows["speed"][0] = 1.0
+    assert meeting.stop(1, (bus_enter_m - 1.0, enter_m - 1.0)) == enter_m, "it drives on"
+
+
+@pytest.mark.parametrize(("bus_m", "brakes"), [(1.0, True), (40.0, False)])
+def test_one_whose_trip_ends_on_a_lane_waits_where_others_turn_over_its_end(
+    network: RoadNetwork, bus_m: float, brakes: bool
+) -> None:
+    meeting = Meeting(network)
+    link, other = meeting.sweep["foe"], meeting.link
+    lane = int(network.links["from_lane"][link])
+    length_m = float(network.lanes["length_m"][lane])
+    plan = np.zeros(len(network.lanes), PLAN)
+    plan["next"], plan["link"], plan["to_go"], plan["room"] = -1, -1, length_m, length_m
+    travel = travel_by(plan)
+    front_m = float(meeting.sweep["foe_enter_m"]) - 8.0
+    rows = on_lane(network, lane, length_m + front_m - 0.5 * CAR_M, travel, speed=6.0)
+    rows["driver"], rows["length"], rows["width"] = DRIVER_BACKGROUND, CAR_M, 1.8
+    rows = np.concatenate([rows, meeting.rows[:1]])
+    rows["id"] = 0, 1
+    room, step = scratch(network, 2), np.zeros(2, PLAN)
+    index_lanes(network.arrays, travel, rows, 1, room)
+    entry = room.approach[0]
+    entry["link"], entry["row"], entry["id"], entry["half"] = other, 1, 1, 0.5 * BUS_M
+    entry["dist"], entry["speed"] = 0.5 * BUS_M - (meeting.sweep["enter_m"] + bus_m), 3.0
+    room.link_start[:] = room.link_end[:] = 0
+    room.link_end[other] = 1
+    step[0] = plan[lane]
+    decide(network.arrays, travel, rows, 1, DRIVER_BACKGROUND, 0, 0.1,
+           np.zeros(0, np.int32), step, room)  # fmt: skip
+    assert (room.accel[0] < -1.0) == brakes
 
 
 def test_no_car_enters_where_a_bus_sweeps_that_is_there_or_cannot_stop(

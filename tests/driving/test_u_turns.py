@@ -8,8 +8,10 @@ import pytest
 from cavmarl.core.records.codes import DRIVER_BACKGROUND, HOLD_YIELD
 from cavmarl.driving.kernels.approach import register_links
 from cavmarl.driving.kernels.drivers import decide
+from cavmarl.driving.kernels.lane_choice import _change_is_safe
 from cavmarl.driving.kernels.lane_index import index_lanes
 from cavmarl.driving.kernels.swept_areas import swept_stop
+from cavmarl.driving.vehicle_types import generated_types
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN
 from cavmarl.roads.sumo_net.reader import read_network
@@ -131,3 +133,51 @@ def test_a_leader_that_has_turned_is_half_its_width_nearer(
     half_m = 0.5 * float(on_lane(network, lane, 0.0)["width"][0])
     assert accel(turned_rad, 0.0) == pytest.approx(accel(0.0, half_m if nearer else 0.0))
     assert accel(0.0, 0.0) > accel(0.0, half_m)
+
+
+@pytest.mark.parametrize(("rest_m", "announced"), [(6.0, True), (20.0, False)])
+def test_one_that_changes_lanes_before_the_line_is_seen_on_both(
+    network: RoadNetwork, rest_m: float, announced: bool
+) -> None:
+    """Else a bus that turns round from the lane that it has left sweeps over it."""
+    link, turn = beside(network)
+    lane, left = (int(network.links["from_lane"][k]) for k in (link, turn))
+    plan = np.zeros(len(network.lanes), PLAN)
+    plan["next"][lane], plan["link"][lane] = network.links["next_lane"][link], link
+    travel, length_m = travel_by(plan), float(network.lanes["length_m"][lane])
+    row = on_lane(network, lane, length_m - rest_m, travel, id=7, side_lane=left)
+    room = scratch(network, 1)
+    register_links(network.arrays, travel, row, 1, np.zeros(1, PLAN), np.zeros(1, np.int64), room)
+    first = int(network.lanes["first_link"][left])
+    found = room.approach[room.link_start[first] : room.link_end[first]]
+    assert found["id"].tolist() == ([7] if announced else [])
+    assert found["dist"].tolist() == pytest.approx([rest_m] if announced else [], abs=0.1)
+
+
+@pytest.mark.parametrize(("gap_m", "over_m", "safe"), [
+    (1.5, -8.0, True), (1.5, 1.0, False), (1.5, 4.0, False), (3.0, 1.0, True), (3.0, 4.0, True),
+])  # fmt: skip
+def test_no_lane_change_ends_close_behind_one_whose_front_is_over_the_line(
+    network: RoadNetwork, gap_m: float, over_m: float, safe: bool
+) -> None:
+    """Where that one turns round its body sticks out behind the place of its rear."""
+    link, turn = beside(network)
+    lane, left = (int(network.links["from_lane"][k]) for k in (link, turn))
+    plan = np.zeros(len(network.lanes), PLAN)
+    for way in (link, turn):
+        at = network.links["from_lane"][way]
+        plan["next"][at], plan["link"][at] = network.links["next_lane"][way], way
+    types = generated_types().copy()
+    types["min_gap"] = 2.5
+    travel, length_m = travel_by(plan, types), float(network.lanes["length_m"][lane])
+    ahead = length_m + over_m - 2.5
+    place = (left, ahead) if ahead < length_m else (int(plan["next"][left]), ahead - length_m)
+    cars = [place, (lane, ahead - 5.0 - gap_m)]
+    rows = np.concatenate(
+        [on_lane(network, at, s, travel, id=k, length=5.0, link=turn if k == 0 else -1)
+         for k, (at, s) in enumerate(cars)]
+    )  # fmt: skip
+    room = scratch(network, 2)
+    index_lanes(network.arrays, travel, rows, 2, room)
+    register_links(network.arrays, travel, rows, 2, np.zeros(2, PLAN), np.zeros(2, np.int64), room)
+    assert _change_is_safe(network.arrays, travel, rows, 1, left, 0.0, True, room) == safe

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cavmarl.core.records.arrays import Travel
+from cavmarl.driving.kernels.lane_index import beside_s
 from cavmarl.roads.network import RoadNetwork
 
 Entry = tuple[int, int, float]  # link, vehicle's id, m of its centre to the stop line
@@ -34,6 +35,11 @@ def announcements(roads: RoadNetwork, travel: Travel, row: np.void) -> list[Entr
         rear = float(link["length_m"] + row["s"] - 0.5 * row["length"])
         if rear < max(link["length_m"], link["fork_m"], link["swept_m"]):
             found.append((came_by, name, -float(link["length_m"] + row["s"])))
+    beside = roads.lanes[row["side_lane"]]
+    if row["side_lane"] >= 0 and not here["internal"] and beside["num_links"]:
+        at = beside_s(roads.arrays, lane, int(row["side_lane"]), float(row["s"]))
+        if (rest := float(beside["length_m"]) - at) < 15.0:
+            found.append((int(beside["first_link"]), name, max(rest, 0.0)))
     sight = min(30.0 + 8.0 * float(row["speed"]), 150.0)
     to_end = float(here["length_m"] - row["s"])
     ahead: list[tuple[int, float]] = []

@@ -133,7 +133,17 @@ def test_given_places_are_of_the_front_bumper_from_either_end() -> None:
     assert place(room, pos_code=codes.POS_GIVEN, pos=40.0) == 37.5
     assert place(room, pos_code=codes.POS_GIVEN, pos=-40.0) == pytest.approx(LENGTH - 42.5)
     assert place(room, pos_code=codes.POS_GIVEN, pos=1.0) == 2.5, "the whole body is on the lane"
-    assert place(room, pos_code=codes.POS_GIVEN, pos=LENGTH) == pytest.approx(LENGTH - 2.5)
+    assert place(room, pos_code=codes.POS_GIVEN, pos=LENGTH) == pytest.approx(LENGTH - 3.5)
+
+
+def test_no_front_enters_over_the_line_not_even_of_a_bus_that_is_longer_than_the_lane() -> None:
+    _, room = traffic()
+    bus = generated_types().copy()[0]
+    bus["length"] = LENGTH + 5.0
+    for code in (codes.POS_GIVEN, codes.POS_BASE, codes.POS_LAST, codes.POS_RANDOM):
+        car = departure(pos_code=code, pos=LENGTH)
+        s = entry_place(ROADS.arrays, KEY, car, bus, MAIN[0], 0, room, VIEW_M)
+        assert s + 0.5 * bus["length"] == pytest.approx(LENGTH - 1.0)
 
 
 def test_base_puts_the_rear_at_the_start_and_last_a_gap_behind_the_last() -> None:
@@ -142,7 +152,7 @@ def test_base_puts_the_rear_at_the_start_and_last_a_gap_behind_the_last() -> Non
     last = place(room, pos_code=codes.POS_LAST)
     assert last == pytest.approx(60.0 - 2.5 - KIND["min_gap"] - 2.5)
     _, room = traffic()
-    assert place(room, pos_code=codes.POS_LAST) == pytest.approx(LENGTH - 2.5)
+    assert place(room, pos_code=codes.POS_LAST) == pytest.approx(LENGTH - 3.5)
 
 
 @pytest.mark.parametrize("code", [codes.POS_RANDOM, codes.POS_FREE, codes.POS_RANDOM_FREE])

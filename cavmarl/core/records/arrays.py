@@ -196,8 +196,8 @@ class Scratch(NamedTuple):
     links: Lists  # by link, lists of approach
     link_start: NDArray[np.int32]  # approach of link k: [link_start[k], link_end[k])
     link_end: NDArray[np.int32]
-    approach: NDArray[np.void]  # APPROACH (3 C,) vehicles on or before links, by link
-    pairs: NDArray[np.void]  # APPROACH (3 C,) the same before sorting
+    approach: NDArray[np.void]  # APPROACH (4 C,) vehicles on or before links, by link
+    pairs: NDArray[np.void]  # APPROACH (4 C,) the same before sorting
     order: NDArray[np.int32]  # (C,) the owned rows as they lie along the lanes
     accel: NDArray[np.float64]  # (C,) decided accelerations
     link_ahead: NDArray[np.int32]  # (C,) the link whose stop line each row is next to

@@ -15,6 +15,7 @@ from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
 from cavmarl.core.records.codes import DRIVER_SCRIPTED
 from cavmarl.core.records.rows import SWEPT_BEYOND_M, is_lost
 from cavmarl.driving.kernels.announcing import announced_m
+from cavmarl.driving.kernels.lane_index import beside_s
 from cavmarl.driving.kernels.ways import leave, next_step, own_step
 
 MAX_LINKS_AHEAD = 2
@@ -150,6 +151,13 @@ def _announce(
             minded = max(left["length_m"], left["fork_m"], left["swept_m"])
             if left["length_m"] + s - 0.5 * row["length"] < minded:
                 pairs = _note(scratch, pairs, link, row, i, -(left["length_m"] + s))
+    side = row["side_lane"]
+    if side >= 0 and not here["internal"] and roads.lanes[side]["num_links"] > 0:
+        # Its body still covers the lane beside, or covers it already: it is in the way of both.
+        to_end = roads.lanes[side]["length_m"] - beside_s(roads, lane, side, s)
+        if to_end < STANDS_BEFORE_M:
+            link = roads.lanes[side]["first_link"]
+            pairs = _note(scratch, pairs, link, row, i, max(to_end, 0.0))
     reach = announced_m(row["speed"])
     distance = here["length_m"] - s
     way = row["way"]

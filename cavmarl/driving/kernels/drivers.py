@@ -253,6 +253,11 @@ def _road_ahead(
             # A vehicle that has left that lane by any link may still have its rear over the end.
             leaving = behind_fork(roads, kind, row, before, -1, distance, scratch)
             constraint = max(constraint, end, leaving)
+            if not steered and roads.lanes[before]["num_links"] > 0 and distance < see:
+                # Others turn over that end, wherever it goes from there.
+                first, front = roads.lanes[before]["first_link"], distance - half
+                swept = before_swept(roads, rows, i, kind, first, front, HOLD_NONE, dt, scratch)
+                constraint = max(constraint, swept)
             break
         stops = False
         if link >= 0 and distance < see:

@@ -100,13 +100,16 @@ def wish_on_lane(
 
 
 @inlined_kernel
-def _is_left_slowly(scratch: Scratch, lane: np.void, front: float) -> bool:
-    """Whether a rear still covers the end of a lane, which is `front` m ahead, wherever it goes."""
+def _is_left_slowly(scratch: Scratch, lane: np.void, front: float, gap_m: float) -> bool:
+    """Whether a rear before the end of a lane, wherever it goes, is within a gap.
+
+    `front`: how far that end is ahead.
+    """
     for link in range(lane["first_link"], lane["first_link"] + lane["num_links"]):
         for k in range(scratch.link_start[link], scratch.link_end[link]):
             leaves = scratch.approach[k]
             rear = -leaves["dist"] - leaves["half"]
-            if leaves["dist"] <= 0.0 and rear < 0.0 and front + rear < SIDE_GAP_M:
+            if leaves["dist"] <= 0.0 and rear < 0.0 and front + rear < gap_m:
                 return True
     return False
 
@@ -160,13 +163,15 @@ def _change_is_safe(
         ahead = scratch.entries[j]["s"] - s
     else:
         j, ahead = _next_beyond(roads, travel, row, target, lane["length_m"] - s, scratch)
-        if _is_left_slowly(scratch, lane, lane["length_m"] - s - half):
+        if _is_left_slowly(scratch, lane, lane["length_m"] - s - half, kind["min_gap"]):
             return False
     after = wish(kind, speed, desired, no_constraint(kind))
     if j >= 0:
         leader = scratch.entries[j]
         net = ahead - half - leader["half"]
-        if net < SIDE_GAP_M:
+        # In a turn a body sticks out behind the place of its rear on its way.
+        turns = s + ahead + leader["half"] > lane["length_m"]
+        if net < (kind["min_gap"] if turns else SIDE_GAP_M):
             return False
         after = accel_behind(kind, speed, desired, net, leader["speed"], leader["decel"])
     follower_before = 0.0

@@ -16,7 +16,7 @@ from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays, Scratch
 from cavmarl.core.records.codes import DRIVER_AGENT, HOLD_NONE, MODEL_KRAUSS
 from cavmarl.core.records.rows import SIZE_BODIES_M, SIZE_LENGTHS_M, STEERED
-from cavmarl.driving.kernels.announcing import APPROACH_STANDING_M, STANDING_MPS
+from cavmarl.driving.kernels.announcing import APPROACH_STANDING_M, STANDING_MPS, is_let_stand
 from cavmarl.driving.kernels.following import before_line, behind, no_constraint
 
 VAN_M, BUS_M = SIZE_LENGTHS_M
@@ -221,8 +221,10 @@ def _is_in_the_way(
     ):
         return True
     soon = to_area < SOON_M or _needs(foe["speed"], to_area, EASY_STOP)
-    comes = unaware and foe["speed"] > STANDING_MPS
-    return soon and (comes or _is_ahead(foe, foe_place, row, place))
+    if unaware:
+        return soon and (foe["speed"] > STANDING_MPS or _is_ahead(foe, foe_place, row, place))
+    # One that is ahead and stands is kept there by a leader, be it one that waits for this row.
+    return soon and not is_let_stand(rows[foe["row"]]) and _is_ahead(foe, foe_place, row, place)
 
 
 @inlined_kernel

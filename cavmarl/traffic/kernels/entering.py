@@ -30,7 +30,7 @@ from cavmarl.core.records.codes import (
 )
 from cavmarl.core.records.rows import ENTER_REACH_M
 from cavmarl.driving.kernels.beside import askew_beside
-from cavmarl.driving.kernels.following import accel_behind, speed_behind
+from cavmarl.driving.kernels.following import LINE_MARGIN_M, accel_behind, speed_behind
 from cavmarl.driving.kernels.lane_index import ahead_on, behind_on, comes_over, last_on
 from cavmarl.driving.kernels.ways import next_step
 
@@ -119,7 +119,11 @@ def entry_place(
     scratch: Scratch,
     view_m: float,
 ) -> float:
-    """Where on its lane the centre of a departure enters, in m: its whole body is on the lane."""
+    """Where on its lane the centre of a departure enters, in m.
+
+    Its whole body is on the lane, its front before the line; on one that is too short for both, its
+    rear is behind the start.
+    """
     length = roads.lanes[lane]["length_m"]
     half = 0.5 * kind["length"]
     most = max(length - half, half)
@@ -137,7 +141,7 @@ def entry_place(
             s = last["s"] - last["half"] - kind["min_gap"] - half
     else:
         s = half + (most - half) * uniform(key, departure["id"], tick, STREAM_PLACE)
-    return float(min(max(s, half), most, length))
+    return float(min(max(s, half), max(length - half - LINE_MARGIN_M, 0.0)))
 
 
 @kernel
