@@ -9,7 +9,6 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import lane_grid
 
 CAR_LENGTH_M, CAR_WIDTH_M = 5.0, 1.8
-GROUND_FEATURES = frozenset(("shared_ground", "stub_lanes"))
 LEVEL_M = 3.0  # lanes that differ more in height are a bridge and the road below it
 STEP_M = 1.0
 
@@ -47,12 +46,6 @@ def stub_lanes(network: RoadNetwork) -> NDArray[np.int64]:
     edges = network.edges[network.lanes["edge"]]
     stubs = ~network.lanes["internal"] & (edges["num_lanes"] > 1)
     return np.flatnonzero(stubs & (network.lanes["length_m"] < CAR_LENGTH_M))
-
-
-def ground_features(network: RoadNetwork) -> tuple[str, ...]:
-    """The names of the rules that a network falls under."""
-    found = {"shared_ground": bool(shared_ground(network)), "stub_lanes": stub_lanes(network).size}
-    return tuple(name for name, holds in found.items() if holds)
 
 
 def _touch(mine: NDArray[np.float64], theirs: NDArray[np.float64]) -> bool:

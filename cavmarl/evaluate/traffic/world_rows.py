@@ -10,12 +10,12 @@ import numpy as np
 
 from cavmarl.evaluate.traffic.traffic_comparison import TrafficComparison
 from cavmarl.evaluate.traffic.world_draw import WorldDraw
-from cavmarl.maps.shared_ground import GROUND_FEATURES
+from cavmarl.maps.map_features import MAP_FEATURES
 
 Row = dict[str, Any]  # a line of worlds.jsonl
 
 # Features of worlds in which ours differs by design, see docs/realism.md.
-BY_DESIGN = GROUND_FEATURES | {"priority_stop"}
+BY_DESIGN = MAP_FEATURES | {"priority_stop"}
 
 # How far ours may be from SUMO's mean, as a share of it; delay also by seconds.
 SPEED_SHARE, COUNT_SHARE, DELAY_SHARE, DELAY_S = 0.15, 0.05, 0.25, 3.0
@@ -23,15 +23,15 @@ LOCK_S = 120.0
 _SPREAD_OF = ("departed", "arrived", "mean_speed_mps", "mean_delay_s", "queue", "longest_lock_s")
 
 
-def row_of(draw: WorldDraw, found: TrafficComparison, ground: Sequence[str] = ()) -> Row:
+def row_of(draw: WorldDraw, found: TrafficComparison, of_map: Sequence[str] = ()) -> Row:
     """What is kept of a comparison: all figures, and SUMO's of each of its seeds.
 
-    `ground`: names of `ground_features` that the net turned out to have.
+    `of_map`: names of `map_features` that the net turned out to have.
     """
     sumo = [asdict(figures) for figures in (found.sumo.figures, *found.sumo_others)]
     return {
         "seed": draw.seed,
-        "features": [*draw.features, *ground],
+        "features": [*draw.features, *of_map],
         "seconds": found.seconds,
         "dt_s": found.dt_s,
         "ours": asdict(found.ours.figures),

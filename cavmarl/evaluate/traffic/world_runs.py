@@ -18,7 +18,7 @@ from cavmarl.evaluate.traffic.traffic_plot import plot_fundamental_diagram
 from cavmarl.evaluate.traffic.world_draw import WorldDraw, check_features, draw_world
 from cavmarl.evaluate.traffic.world_files import NET_FILE, ROUTES_FILE, cut_maps, make_files
 from cavmarl.evaluate.traffic.world_rows import Row, failed_row, row_of, worst
-from cavmarl.maps.shared_ground import ground_features
+from cavmarl.maps.map_features import map_features
 from cavmarl.render.topdown import WorldView
 from cavmarl.roads.cache import load_network
 
@@ -142,7 +142,7 @@ def _run_world(job: WorldSeries, seed: int) -> Row:
     except CavmarlError as error:
         return failed_row(draw, job.seconds, job.dt_s, error)
     plot_fundamental_diagram(found, folder / "flow.png")
-    return row_of(draw, found, ground_features(load_network(net)))
+    return row_of(draw, found, map_features(load_network(net)))
 
 
 def _write_commands(job: WorldSeries, draw: WorldDraw, folder: Path) -> None:

@@ -1,0 +1,19 @@
+"""Names of rules that a map falls under, by which worlds are told apart."""
+
+from __future__ import annotations
+
+from cavmarl.maps.circular_priority import circular_priority
+from cavmarl.maps.shared_ground import shared_ground, stub_lanes
+from cavmarl.roads.network import RoadNetwork
+
+MAP_FEATURES = frozenset(("circular_priority", "shared_ground", "stub_lanes"))
+
+
+def map_features(network: RoadNetwork) -> tuple[str, ...]:
+    """The names of the rules that a network falls under."""
+    found = {
+        "circular_priority": circular_priority(network).size,
+        "shared_ground": shared_ground(network),
+        "stub_lanes": stub_lanes(network).size,
+    }
+    return tuple(name for name, holds in found.items() if holds)
