@@ -52,7 +52,8 @@ def test_a_city_over_nodes_takes_turns(tmp_path: Path) -> None:
     assert turn.latency_s > latency_s / 2.0
     assert turn.tick_s > 2.0 * latency_s  # a step of two ticks has five hops at least
     assert 0.0 < turn.node_s < turn.tick_s
-    assert least / 2 <= turn.own < least
+    # The node that takes the most time need not have the most vehicles.
+    assert 0.4 * least < turn.own < 0.6 * least
     assert turn.ghosts > 0
     assert turn.ticks_per_step == 2
 
