@@ -179,6 +179,33 @@ def _at_line(
 
 
 @inlined_kernel
+def _over_end(
+    roads: RoadArrays,
+    rows: NDArray[np.void],
+    i: int,
+    kind: np.void,
+    lane: int,
+    distance: float,
+    is_near: bool,
+    dt: float,
+    scratch: Scratch,
+) -> float:
+    """Constraint of row i by bodies over the end of a lane, `distance` m ahead, that it stops at.
+
+    Wherever it goes from there, a vehicle that has left the lane by any link may still have its
+    rear over the end, and others, which a background driver minds where that `is_near`, turn over
+    it.
+    """
+    row = rows[i]
+    constraint = behind_fork(roads, kind, row, lane, -1, distance, scratch)
+    if is_near and row["driver"] != DRIVER_AGENT and roads.lanes[lane]["num_links"] > 0:
+        first, front = roads.lanes[lane]["first_link"], distance - 0.5 * row["length"]
+        swept = before_swept(roads, rows, i, kind, first, front, HOLD_NONE, dt, scratch)
+        constraint = max(constraint, swept)
+    return constraint
+
+
+@inlined_kernel
 def _road_ahead(
     roads: RoadArrays,
     travel: Travel,
@@ -250,14 +277,8 @@ def _road_ahead(
             lane, way, link = next_step(roads, travel, before, way)
         if lane < 0 or (steered and misses_change(roads, travel, before, before_way)):
             end = lane_end(roads, travel, row, kind, before, before_way, distance, merge_room_m, dt)
-            # A vehicle that has left that lane by any link may still have its rear over the end.
-            leaving = behind_fork(roads, kind, row, before, -1, distance, scratch)
-            constraint = max(constraint, end, leaving)
-            if not steered and roads.lanes[before]["num_links"] > 0 and distance < see:
-                # Others turn over that end, wherever it goes from there.
-                first, front = roads.lanes[before]["first_link"], distance - half
-                swept = before_swept(roads, rows, i, kind, first, front, HOLD_NONE, dt, scratch)
-                constraint = max(constraint, swept)
+            over = _over_end(roads, rows, i, kind, before, distance, distance < see, dt, scratch)
+            constraint = max(constraint, end, over)
             break
         stops = False
         if link >= 0 and distance < see:
