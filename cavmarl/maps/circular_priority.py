@@ -11,7 +11,7 @@ SIGNED = [ord(state) for state in "Mms"]  # states of links: major, minor, behin
 
 
 def circular_priority(network: RoadNetwork) -> NDArray[np.int64]:
-    """LINK rows that give way in a circle of three or more, or that lie between two such circles.
+    """LINK rows that give way in a circle, or that lie between two circles.
 
     Only junctions count where signs say which road comes first: among equals, at all-way stops and
     at signals drivers settle it another way.
@@ -21,10 +21,7 @@ def circular_priority(network: RoadNetwork) -> NDArray[np.int64]:
     foe = network.conflicts["foe"]
     signed = (links["signal"] < 0) & np.isin(links["state"], SIGNED)
     asked = network.conflicts["must_yield"] & signed[owner] & signed[foe]
-    edges = np.unique(np.stack([owner[asked], foe[asked]], axis=1), axis=0)
-    pairs = set(map(tuple, edges.tolist()))
-    one_way = np.array([(b, a) not in pairs for a, b in edges.tolist()], dtype=bool)
-    edges = edges[one_way]
+    edges = np.stack([owner[asked], foe[asked]], axis=1)
     while True:
         left = np.intersect1d(edges[:, 0], edges[:, 1])  # it gives way, and others to it
         inside = np.isin(edges, left).all(axis=1)
