@@ -23,12 +23,13 @@ def driving_reach_m(network: RoadNetwork, travel: Travel) -> float:
     """The farthest vehicle that a driver's decision can depend on.
 
     A driver looks `view_m` ahead. With a line within `see_m`, or on a junction, it asks about
-    vehicles that come to it, within `APPROACH_M` of the ends of the lanes that lead to it or are on
-    it, or stand behind it, within `EXIT_LOOK_M`.
+    vehicles that come to it, within `APPROACH_M`, or a lane's `merges_m`, of the ends of the lanes
+    that lead to it or are on it, or stand behind it, within `EXIT_LOOK_M`.
     """
     longest_m = float(network.links["length_m"].max(initial=0.0))
     junction_m = max(travel.see_m, longest_m)
-    beyond_m = max(APPROACH_M, EXIT_LOOK_M, longest_m)
+    merges_m = float(network.lanes["merges_m"].max(initial=0.0))
+    beyond_m = max(APPROACH_M, merges_m, EXIT_LOOK_M, longest_m)
     stretch, jump_m = _jumps(network)
     bodies_m = 2.0 * float(travel.types["length"].max())
     roads_m = stretch * max(travel.view_m, junction_m + beyond_m) + 2.0 * jump_m

@@ -108,8 +108,8 @@ def test_one_that_comes_is_let_over_the_whole_junction(
     assert not blocks(over_s + 0.05, "line", 20.0)
 
 
-@pytest.mark.parametrize(("driver", "ahead_s"), [(DRIVER_BACKGROUND, 1.0), (DRIVER_AGENT, 3.0)])
-def test_before_one_that_comes_to_its_line_it_is_a_second_and_before_a_steered_one_three(
+@pytest.mark.parametrize(("driver", "ahead_s"), [(DRIVER_BACKGROUND, 1.3), (DRIVER_AGENT, 3.0)])
+def test_before_one_that_comes_to_its_line_it_is_over_a_second_and_before_a_steered_one_three(
     blocks: Blocks, driver: int, ahead_s: float
 ) -> None:
     # Its front reaches its line in 5 s.
@@ -119,39 +119,40 @@ def test_before_one_that_comes_to_its_line_it_is_a_second_and_before_a_steered_o
 
 def test_one_that_speeds_up_comes_earlier(blocks: Blocks) -> None:
     # From 4 m/s with 2 m/s² it has 10 m/s, the limit, after 3 s and 21 m, and 50 m after 5.9 s.
-    assert blocks(4.95, "out", 50.0, speed=4.0, accel=2.0)
-    assert not blocks(4.85, "out", 50.0, speed=4.0, accel=2.0)
-    assert not blocks(4.95, "out", 50.0, speed=4.0), "at the speed that it has it takes 12.5 s"
-
-
-@pytest.mark.parametrize(("wait_s", "arrives_s"), [(90.0, 3.0), (180.0, 4.0), (900.0, 4.0)])
-def test_one_that_has_waited_for_long_counts_on_others_to_brake(
-    blocks: Blocks, wait_s: float, arrives_s: float
-) -> None:
-    assert blocks(arrives_s - 0.95, "out", 20.0, wait_s)
-    assert not blocks(arrives_s - 1.05, "out", 20.0, wait_s)
+    assert blocks(4.65, "out", 50.0, speed=4.0, accel=2.0)
+    assert not blocks(4.55, "out", 50.0, speed=4.0, accel=2.0)
+    assert not blocks(4.65, "out", 50.0, speed=4.0), "at the speed that it has it takes 12.5 s"
 
 
 @pytest.mark.parametrize(
-    ("driver", "foe_mps", "ahead_s"),
+    ("wait_s", "least_m"),
     [
-        (DRIVER_BACKGROUND, 4.0, 1.0),  # it is as fast as that one
-        (DRIVER_BACKGROUND, 10.0, 4.5),
-        (DRIVER_BACKGROUND, 30.0, 4.5),
-        (DRIVER_AGENT, 4.0, 1.5),
-        (DRIVER_AGENT, 10.0, 1.5),
-        (DRIVER_AGENT, 30.0, 2.3),  # (30 - 5)² / (2 · 4.5 · 30): the way to brake behind it
+        (0.0, 28.0),  # out in 1.5 s, with 1.3 s more
+        (90.0, 21.2),  # braking with 2.25 m/s² all along, half of what it loses counts: 0.69 s
+        (180.0, 11.1),  # with 4.5 m/s² it would stop
+        (900.0, 11.1),
     ],
 )
-def test_before_one_that_comes_fast_into_the_same_lane_it_takes_longer(
-    network: RoadNetwork, driver: int, foe_mps: float, ahead_s: float
+def test_one_that_has_waited_for_long_counts_on_others_to_brake(
+    blocks: Blocks, network: RoadNetwork, wait_s: float, least_m: float
 ) -> None:
+    over_s = (float(network.links["length_m"][FROM_SOUTH]) + 2.0 * HALF_M) / SPEED_MPS
+    assert over_s == 1.5, "its front is at its line"
+    assert blocks(over_s, "out", least_m - 0.2, wait_s)
+    assert not blocks(over_s, "out", least_m + 0.2, wait_s)
+
+
+def least_ahead(network: RoadNetwork, driver: int, wait_s: float, foe_mps: float) -> Any:
+    """Of one that comes into the same lane: the least way to its line, and the own one over, in m.
+
+    The other one has 5 m/s, its front 2.5 m to its line, and drives no faster.
+    """
     own = np.repeat(np.arange(len(network.links)), network.links["num_conflicts"])
     shared = next(k for k in np.flatnonzero(network.conflicts["merging"])
                   if network.conflicts["must_yield"][k])  # fmt: skip
     conflict, link = network.conflicts[shared], int(own[shared])
     rows = np.concatenate([on_lane(network, 0, 0.0, speed=5.0, driver=driver)] * 2)
-    rows["speed"][1] = foe_mps
+    rows["speed"][1], rows["wait_s"][0] = foe_mps, wait_s
     foe = np.zeros(1, APPROACH)
     foe["link"], foe["row"], foe["half"], foe["speed"] = conflict["foe"], 1, HALF_M, foe_mps
     length_m = float(rows["length"][0])
@@ -162,8 +163,34 @@ def test_before_one_that_comes_fast_into_the_same_lane_it_takes_longer(
         return foe_blocks(network.arrays, rows, rows[0], link, 5.0, 5.0, conflict, foe[0],
                           True, np.zeros(1, np.int32))  # fmt: skip
 
-    least_m = next(m for m in np.arange(1.0, 400.0, 0.1) if not waits(m))
+    return next(m for m in np.arange(1.0, 400.0, 0.1) if not waits(m)), over_m
+
+
+@pytest.mark.parametrize(
+    ("driver", "foe_mps", "ahead_s"),
+    [
+        (DRIVER_BACKGROUND, 4.0, 1.3),
+        (DRIVER_BACKGROUND, 10.0, 1.3),
+        (DRIVER_AGENT, 4.0, 1.5),
+        (DRIVER_AGENT, 10.0, 1.5),
+        (DRIVER_AGENT, 30.0, 2.3),  # (30 - 5)² / (2 · 4.5 · 30): the way to brake behind it
+    ],
+)
+def test_before_one_that_comes_into_the_same_lane_it_goes_a_little_earlier(
+    network: RoadNetwork, driver: int, foe_mps: float, ahead_s: float
+) -> None:
+    least_m, over_m = least_ahead(network, driver, 0.0, foe_mps)
     assert least_m / foe_mps == pytest.approx(over_m / 5.0 + ahead_s, abs=0.1)
+
+
+@pytest.mark.parametrize(("wait_s", "brakes_m"), [(15.0, 100.0), (20.0, 75.0)])
+def test_one_that_has_stood_goes_before_a_faster_one_that_need_hardly_brake(
+    network: RoadNetwork, wait_s: float, brakes_m: float
+) -> None:
+    # From 10 to 5 m/s with 4.5 m/s² times the share of 180 s that it has waited: it begins when the
+    # other one is at its line, in 0.5 s.
+    least_m, _ = least_ahead(network, DRIVER_BACKGROUND, wait_s, 10.0)
+    assert least_m == pytest.approx(brakes_m + 0.5 * 10.0, abs=0.1)
 
 
 def waiting_pair(**fields: Any) -> Any:

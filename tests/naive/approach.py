@@ -42,8 +42,9 @@ def announcements(roads: RoadNetwork, travel: Travel, row: np.void) -> list[Entr
             found.append((int(beside["first_link"]), name, max(rest, 0.0)))
     sight = min(30.0 + 8.0 * float(row["speed"]), 150.0)
     to_end = float(here["length_m"] - row["s"])
+    at_own_line = max(sight, float(here["merges_m"]))
     ahead: list[tuple[int, float]] = []
-    while to_end < sight and len(ahead) < 2:
+    while to_end < (sight if ahead else at_own_line) and len(ahead) < 2:
         if here["internal"]:
             lane = int(here["successor"])
         else:

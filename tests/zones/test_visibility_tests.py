@@ -157,7 +157,7 @@ def test_nobody_is_asked_about_further_away_than_the_farthest(
         s = np.arange(0.0, points["s"][-1], STEP_M)
         x, y = (np.interp(s, points["s"], points[axis]) for axis in ("x", "y"))
         asked = (s <= look["head"]) | (s >= look["tail"])
-        asked |= min(look["back"], look["line"]) - s < APPROACH_M
+        asked |= min(look["back"], look["line"]) - s < max(APPROACH_M, look["merges"])
         dx = np.maximum(np.maximum(rect[0] - x, x - rect[2]), 0.0)
         dy = np.maximum(np.maximum(rect[1] - y, y - rect[3]), 0.0)
         farthest = max(farthest, float(np.hypot(dx, dy)[asked].max(initial=0.0)))

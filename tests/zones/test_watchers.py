@@ -89,12 +89,14 @@ def expected_of(
     for row in naive.within(partition.reaching[zone], SEEN_M, others):
         look, s = looks[zone, row["lane"]], row["s"]
         asked = s <= look["head"] or s >= look["tail"] or int(row["id"]) in near
-        coming = look["line"] - s < announced_m(row["speed"])
+        reach_m = announced_m(row["speed"])
+        line_m = max(reach_m, look["merges"])
+        coming = look["line"] - s < line_m
         idle = row["hold"] in (HOLD_SIGNAL, HOLD_EXIT_BLOCKED)
         idle |= row["hold"] == HOLD_NONE and row["wait_s"] > 3.0
         idle &= row["speed"] == 0.0 and row["driver"] == DRIVER_BACKGROUND
         coming &= not idle or look["line"] - s <= LINE_M
-        coming |= min(look["back"], look["room"]) - s < announced_m(row["speed"])
+        coming |= look["back"] - s < reach_m or look["room"] - s < line_m
         if asked or coming:
             found.append(int(row["id"]))
     return sorted(found)

@@ -159,10 +159,11 @@ def _announce(
             link = roads.lanes[side]["first_link"]
             pairs = _note(scratch, pairs, link, row, i, max(to_end, 0.0))
     reach = announced_m(row["speed"])
+    own_reach = max(reach, here["merges_m"])
     distance = here["length_m"] - s
     way = row["way"]
     found = 0
-    while distance < reach:
+    while distance < reach or (found == 0 and distance < own_reach):
         if lane == row["lane"] and way == row["way"]:
             lane, way, link = leave(roads, step, lane, way)
         else:

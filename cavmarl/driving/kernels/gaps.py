@@ -35,8 +35,8 @@ from cavmarl.driving.kernels.following import LINE_MARGIN_M
 BRISK_ACCEL = 2.5  # m/s², with which a driver may soon be in a shared area,
 GENTLE_ACCEL = 1.8  # and, to be safe, with which it and others are out of it
 HARD_STOP = 5.0  # m/s², a vehicle that needs more to stop before the line will not stop
-AHEAD_S = 1.0  # s before a foe is at its line, as SUMO's drivers have it,
-FASTER_AHEAD_S = 4.5  # and before one that leads into the same lane and is faster on it;
+AHEAD_S = 1.3  # s before a foe is at its line (SUMO's 1.0 start from nearer to their own);
+STOPPED_FOE_S = 30.0  # by which one that can stop comes later, if the other has waited for long;
 STEERED_AHEAD_S = 3.0  # where one of both is steered: it may take longer than it seems,
 STEERED_MERGE_AHEAD_S = 1.5  # and where both lead into the same lane, which lets one fall in behind
 SPEEDING_UP_MPS2 = 0.1  # from which on a foe counts as one that goes on speeding up
@@ -202,32 +202,60 @@ def stays_inside(foe: np.void) -> bool:
 
 
 @inlined_kernel
-def _comes(
-    roads: RoadArrays,
-    rows: NDArray[np.void],
-    row: np.void,
-    conflict: np.void,
-    foe: np.void,
-    leaves_mps: float,
-    time_out: float,
+def _comes_to_steered(
+    row: np.void, conflict: np.void, foe: np.void, leaves_mps: float, time_out: float
 ) -> bool:
-    """Whether an APPROACH is at its line too soon for a row that is out in `time_out` s."""
-    # With the speed that it has, or gets; one that has waited for long counts on it to brake.
-    to_line = foe["dist"] - foe["half"]
-    arrives = to_line / max(foe["speed"], STANDING_MPS)
-    faster_mps = foe["speed"] - leaves_mps
-    other = rows[foe["row"]]
-    ahead_s = FASTER_AHEAD_S if conflict["merging"] and faster_mps > 0.0 else AHEAD_S
-    if row["driver"] == DRIVER_AGENT or other["driver"] == DRIVER_AGENT:
-        ahead_s = STEERED_MERGE_AHEAD_S if conflict["merging"] else STEERED_AHEAD_S
-    elif other["accel"] > SPEEDING_UP_MPS2:
-        top = roads.lanes[roads.links[conflict["foe"]]["from_lane"]]["speed_mps"]
-        arrives = _earliest(to_line, foe["speed"], top, other["accel"])
+    """Whether, with one of both in an agent's seat, an APPROACH comes before a row is out."""
+    arrives = (foe["dist"] - foe["half"]) / max(foe["speed"], STANDING_MPS)
+    # One that has waited for long counts on the foe to brake.
     arrives *= 1.0 + min(row["wait_s"] / IMPATIENCE_S, 1.0)
+    ahead_s = STEERED_MERGE_AHEAD_S if conflict["merging"] else STEERED_AHEAD_S
+    faster_mps = foe["speed"] - leaves_mps
     if conflict["merging"] and row["driver"] == DRIVER_AGENT and faster_mps > 0.0:
         # A steered car comes slowly out of a turn: one that is fast needs the way to brake.
         ahead_s = max(ahead_s, faster_mps * faster_mps / (2.0 * FORCED_STOP * foe["speed"]))
     comes: bool = arrives < time_out + ahead_s
+    return comes
+
+
+@inlined_kernel
+def _comes(
+    roads: RoadArrays,
+    row: np.void,
+    conflict: np.void,
+    foe: np.void,
+    accel: float,
+    time_in: float,
+    time_out: float,
+    leaves_mps: float,
+) -> bool:
+    """Whether an APPROACH, which speeds up with `accel`, is at its line too soon for a row.
+
+    The row is at its own line in `time_in` s, and out of the junction in `time_out` s with
+    `leaves_mps`. One that waits counts on the foe to brake from when it goes, the harder the longer
+    it has waited; and before one that it would slow down in its lane it goes only if so much
+    braking is enough.
+    """
+    to_line = foe["dist"] - foe["half"]
+    if accel > SPEEDING_UP_MPS2:
+        top = roads.lanes[roads.links[conflict["foe"]]["from_lane"]]["speed_mps"]
+        arrives = _earliest(to_line, foe["speed"], top, accel)
+    else:
+        arrives = to_line / max(foe["speed"], STANDING_MPS)
+    mean_mps = max(to_line / max(arrives, 0.1), STANDING_MPS)
+    # One that stands may set off at once.
+    patience = min(row["wait_s"] / IMPATIENCE_S, 1.0) if foe["speed"] > STANDING_MPS else 0.0
+    brakes, left = FORCED_STOP, to_line
+    if patience > 0.0:
+        brakes, left = FORCED_STOP * patience, max(to_line - mean_mps * time_in, 0.0)
+    slow_mps = math.sqrt(max(mean_mps * mean_mps - 2.0 * brakes * left, 0.0))
+    if conflict["merging"] and leaves_mps <= slow_mps:
+        return True
+    later_s = STOPPED_FOE_S
+    if slow_mps > 0.0:
+        later_s = 2.0 * left / (mean_mps + slow_mps) - left / mean_mps
+    arrives += patience * later_s
+    comes: bool = arrives < time_out + AHEAD_S
     return comes
 
 
@@ -287,8 +315,11 @@ def foe_blocks(
     over += min(distance - half, 0.0)  # from a waiting position: the rest
     reached = math.sqrt(speed * speed + 2.0 * BRISK_ACCEL * max(over, 0.0))
     leaves_mps = min(reached, max(limit, speed))
-    time_out = _earliest(distance - half, speed, limit, GENTLE_ACCEL)
-    time_out += 2.0 * (over + row["length"]) / max(speed + leaves_mps, STANDING_MPS)
-    return (
-        HOLD_YIELD if _comes(roads, rows, row, conflict, foe, leaves_mps, time_out) else HOLD_NONE
-    )
+    time_line = _earliest(distance - half, speed, limit, GENTLE_ACCEL)
+    time_out = time_line + 2.0 * (over + row["length"]) / max(speed + leaves_mps, STANDING_MPS)
+    other = rows[foe["row"]]
+    if row["driver"] == DRIVER_AGENT or other["driver"] == DRIVER_AGENT:
+        comes = _comes_to_steered(row, conflict, foe, leaves_mps, time_out)
+    else:
+        comes = _comes(roads, row, conflict, foe, other["accel"], time_line, time_out, leaves_mps)
+    return HOLD_YIELD if comes else HOLD_NONE

@@ -40,6 +40,7 @@ from cavmarl.roads.sumo_net.xml_source import limit
 if TYPE_CHECKING:
     from cavmarl.roads.sumo_net.sumo_xml import ParsedNet
 
+MERGES_M = 300.0  # as far as SUMO's drivers that turn into a road look along its last lane
 APPROACH_M = 12.0  # before a junction, where bodies still stand askew to vehicles that wait
 MAX_CROSSING_M = 2000  # paths are compared point by point: memory goes by its square
 MOST_CROSSING = "CAVMARL_MAX_CROSSING_M"  # the environment's variable with another limit
@@ -128,6 +129,7 @@ def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
     )
     links["first_conflict"] = first_conflict[:-1]
     links["num_conflicts"] = np.diff(first_conflict)
+    _fill_merges(lanes, links, conflicts)
     sweeps = _fill_sweeps(Movements(links, conflicts, ways))
     junctions, kinds = _junction_rows(nodes, links)
     junctions["unruled"][links["junction"][unruled]] = True
@@ -309,6 +311,20 @@ def _link_rows(
         link["direction"] = ord(connection.getDirection()[0].replace("T", "t"))
         link["state"] = ord(connection.getState()[0])
     return links
+
+
+def _fill_merges(
+    lanes: NDArray[np.void], links: NDArray[np.void], conflicts: NDArray[np.void]
+) -> None:
+    """How far ahead vehicles are minded by those that give way to them and turn into their lane.
+
+    Not at signals, nor where they have to stand first.
+    """
+    owner = np.repeat(np.arange(len(links)), links["num_conflicts"])
+    asks = (links["signal"][owner] < 0) & conflicts["merging"] & conflicts["must_yield"]
+    asks &= links["state"][conflicts["foe"]] != ord("w")
+    minded = links["from_lane"][conflicts["foe"][asks]]
+    lanes["merges_m"][minded] = np.minimum(lanes["length_m"][minded], MERGES_M)
 
 
 def _fill_sweeps(movements: Movements) -> NDArray[np.void]:

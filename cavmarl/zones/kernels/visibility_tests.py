@@ -370,6 +370,7 @@ def _look_at_junctions(
             for other in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
                 line = scratch.to_line[lane] + roads.lanes[other]["length_m"]
                 looks[other]["line"] = min(looks[other]["line"], line - ROUNDING_M)
+                looks[other]["merges"] = roads.lanes[other]["merges_m"]
                 room = scratch.to_room[lane] + roads.lanes[other]["length_m"]
                 looks[other]["room"] = min(looks[other]["room"], room - ROUNDING_M)
 
@@ -393,6 +394,7 @@ def find_looks(
         looks[lane]["back"] = math.inf
         looks[lane]["line"] = math.inf
         looks[lane]["room"] = math.inf
+        looks[lane]["merges"] = 0.0
     _find_own(roads, rect, scratch)
     _look_along(roads, view_m, see_m, half_m, scratch, looks)
     _find_lines(roads, see_m, half_m, scratch)
@@ -444,6 +446,6 @@ def farthest_m(
             far = roads.points[k + 1]
             squared = _farther(near, far, -math.inf, look["head"], rects, zone, squared)
             squared = _farther(near, far, look["tail"], math.inf, rects, zone, squared)
-            announced = min(look["back"], look["line"]) - APPROACH_M
+            announced = min(look["back"], look["line"]) - max(APPROACH_M, look["merges"])
             squared = _farther(near, far, announced, math.inf, rects, zone, squared)
     return math.sqrt(squared)

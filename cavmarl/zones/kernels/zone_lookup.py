@@ -30,10 +30,11 @@ class ZoneArrays(NamedTuple):
     rects: NDArray[np.float64]  # (k, 4) min_x, min_y, max_x, max_y; infinite at the rim
 
 
-LOOK = np.dtype([(name, np.float32) for name in ("head", "tail", "back", "line", "room")])
+LOOK = np.dtype([(name, np.float32) for name in ("head", "tail", "back", "line", "room", "merges")])
 """Vehicles that a zone's drivers may ask about on a lane: those up to `head` m, those from `tail` m
 on, and those that announce themselves to a vehicle at `back` m that they follow, or to a line: at
-`line` m unless they are let stand before it, at `room` m even then (`kernels.visibility_tests`)."""
+`line` m unless they are let stand before it, at `room` m even then (`kernels.visibility_tests`).
+To a line they do so `merges` m ahead at least."""
 
 WATCH = np.dtype([("zone", np.int32), *((name, LOOK[name]) for name in LOOK.names or ())])
 """A LOOK, and whose it is."""
@@ -149,10 +150,11 @@ def is_asked_about(halo: Halo, watch: np.void, row: np.void) -> bool:
     s = row["s"]
     reach_m = announced_m(row["speed"])
     to_line = watch["line"] - s
+    line_m = max(reach_m, watch["merges"])
     is_let = (row["driver"] == DRIVER_BACKGROUND) & is_let_stand(row) & (to_line > halo.line_m)
-    comes = (to_line < reach_m) & (not is_let)
+    comes = (to_line < line_m) & (not is_let)
     follows = watch["back"] - s < reach_m
-    swept = watch["room"] - s < reach_m  # one that waits leaves it room, even where it is let stand
+    swept = watch["room"] - s < line_m  # one that waits leaves it room, even where it is let stand
     asked: bool = (s <= watch["head"]) | (s >= watch["tail"]) | follows | comes | swept
     return asked
 
