@@ -224,29 +224,30 @@ def _comes(
     row: np.void,
     conflict: np.void,
     foe: np.void,
-    accel: float,
+    other: np.void,
     time_in: float,
     time_out: float,
     leaves_mps: float,
 ) -> bool:
-    """Whether an APPROACH, which speeds up with `accel`, is at its line too soon for a row.
+    """Whether an APPROACH, of VEHICLE row `other`, is at its line too soon for a row.
 
     The row is at its own line in `time_in` s, and out of the junction in `time_out` s with
-    `leaves_mps`. One that waits counts on the foe to brake from when it goes, the harder the longer
-    it has waited; and before one that it would slow down in its lane it goes only if so much
-    braking is enough.
+    `leaves_mps`. One that waits counts on a foe that is on the last lane before its line to brake
+    from when it goes, the harder the longer it has waited; and before one that it would slow down
+    in its lane it goes only if so much braking is enough.
     """
     to_line = foe["dist"] - foe["half"]
-    if accel > SPEEDING_UP_MPS2:
-        top = roads.lanes[roads.links[conflict["foe"]]["from_lane"]]["speed_mps"]
-        arrives = _earliest(to_line, foe["speed"], top, accel)
+    last_lane = roads.links[conflict["foe"]]["from_lane"]
+    if other["accel"] > SPEEDING_UP_MPS2:
+        top = roads.lanes[last_lane]["speed_mps"]
+        arrives = _earliest(to_line, foe["speed"], top, other["accel"])
     else:
         arrives = to_line / max(foe["speed"], STANDING_MPS)
     mean_mps = max(to_line / max(arrives, 0.1), STANDING_MPS)
     # One that stands may set off at once.
     patience = min(row["wait_s"] / IMPATIENCE_S, 1.0) if foe["speed"] > STANDING_MPS else 0.0
     brakes, left = FORCED_STOP, to_line
-    if patience > 0.0:
+    if patience > 0.0 and other["lane"] == last_lane:
         brakes, left = FORCED_STOP * patience, max(to_line - mean_mps * time_in, 0.0)
     slow_mps = math.sqrt(max(mean_mps * mean_mps - 2.0 * brakes * left, 0.0))
     if conflict["merging"] and leaves_mps <= slow_mps:
@@ -321,5 +322,5 @@ def foe_blocks(
     if row["driver"] == DRIVER_AGENT or other["driver"] == DRIVER_AGENT:
         comes = _comes_to_steered(row, conflict, foe, leaves_mps, time_out)
     else:
-        comes = _comes(roads, row, conflict, foe, other["accel"], time_line, time_out, leaves_mps)
+        comes = _comes(roads, row, conflict, foe, other, time_line, time_out, leaves_mps)
     return HOLD_YIELD if comes else HOLD_NONE
