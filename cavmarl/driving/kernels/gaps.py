@@ -35,7 +35,7 @@ from cavmarl.driving.kernels.following import LINE_MARGIN_M
 BRISK_ACCEL = 2.5  # m/s², with which a driver may soon be in a shared area,
 GENTLE_ACCEL = 1.8  # and, to be safe, with which it and others are out of it
 HARD_STOP = 5.0  # m/s², a vehicle that needs more to stop before the line will not stop
-AHEAD_S = 1.3  # s before a foe is at its line (SUMO's 1.0 start from nearer to their own);
+AHEAD_S = 1.0  # s before a foe is at its line (SUMO's 1.0 start from nearer to their own);
 STOPPED_FOE_S = 30.0  # by which one that can stop comes later, if the other has waited for long;
 STEERED_AHEAD_S = 3.0  # where one of both is steered: it may take longer than it seems,
 STEERED_MERGE_AHEAD_S = 1.5  # and where both lead into the same lane, which lets one fall in behind
