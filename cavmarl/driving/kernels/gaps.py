@@ -41,6 +41,7 @@ STEERED_AHEAD_S = 3.0  # where one of both is steered: it may take longer than i
 STEERED_MERGE_AHEAD_S = 1.5  # and where both lead into the same lane, which lets one fall in behind
 SPEEDING_UP_MPS2 = 0.1  # from which on a foe counts as one that goes on speeding up
 GAP_S = 1.0  # s between the last of one and the first of the other in a shared area
+SET_OFF_S = 0.5
 ROOM_M = 3.0  # free way left behind a vehicle that clears a junction
 IMPATIENCE_S = 180.0  # after which a vehicle that gives way counts on others to brake,
 FORCED_STOP = 4.5  # m/s², and how hard at most
@@ -184,13 +185,9 @@ def _is_harmless(
     state, foe_state = roads.links[link]["state"], roads.links[conflict["foe"]]["state"]
     if ignores(row, rows[foe["row"]], link, conflict["foe"], signal, state, foe_state):
         return True
-    # A vehicle that has been let in goes on, where others can still brake for it. A stream that
-    # crawls bumper to bumper lets one in that has waited: the longer, the harder it brakes.
-    patience = 1.0 if _goes_on(row, link) else 0.0
-    if conflict["merging"] and STANDING_MPS < foe["speed"] < CRAWL_MPS:
-        patience = max(patience, min(row["wait_s"] / IMPATIENCE_S, 1.0))
-    brakes: bool = foe["speed"] * foe["speed"] < 2.0 * FORCED_STOP * patience * front
-    return brakes
+    # A vehicle that has been let in goes on, where others can still brake for it.
+    brakes: bool = foe["speed"] * foe["speed"] < 2.0 * FORCED_STOP * front
+    return brakes and _goes_on(row, link)
 
 
 @inlined_kernel
@@ -206,9 +203,14 @@ def _comes_to_steered(
     row: np.void, conflict: np.void, foe: np.void, leaves_mps: float, time_out: float
 ) -> bool:
     """Whether, with one of both in an agent's seat, an APPROACH comes before a row is out."""
-    arrives = (foe["dist"] - foe["half"]) / max(foe["speed"], STANDING_MPS)
-    # One that has waited for long counts on the foe to brake.
-    arrives *= 1.0 + min(row["wait_s"] / IMPATIENCE_S, 1.0)
+    # One that has waited for long counts on the foe to brake. A stream that crawls bumper to bumper
+    # lets it in.
+    patience = min(row["wait_s"] / IMPATIENCE_S, 1.0)
+    to_line = foe["dist"] - foe["half"]
+    if conflict["merging"] and STANDING_MPS < foe["speed"] < CRAWL_MPS:
+        if foe["speed"] * foe["speed"] < 2.0 * FORCED_STOP * patience * to_line:
+            return False
+    arrives = to_line / max(foe["speed"], STANDING_MPS) * (1.0 + patience)
     ahead_s = STEERED_MERGE_AHEAD_S if conflict["merging"] else STEERED_AHEAD_S
     faster_mps = foe["speed"] - leaves_mps
     if conflict["merging"] and row["driver"] == DRIVER_AGENT and faster_mps > 0.0:
@@ -247,7 +249,7 @@ def _comes(
     # One that stands may set off at once.
     patience = min(row["wait_s"] / IMPATIENCE_S, 1.0) if foe["speed"] > STANDING_MPS else 0.0
     brakes, left = FORCED_STOP, to_line
-    if patience > 0.0 and other["lane"] == last_lane:
+    if patience > 0.0:
         brakes, left = FORCED_STOP * patience, max(to_line - mean_mps * time_in, 0.0)
     slow_mps = math.sqrt(max(mean_mps * mean_mps - 2.0 * brakes * left, 0.0))
     if conflict["merging"] and leaves_mps <= slow_mps:
@@ -303,7 +305,9 @@ def foe_blocks(
         if foe["speed"] > STANDING_MPS:  # one that has just set off does not stay so slow
             top = roads.lanes[roads.links[conflict["foe"]]["next_lane"]]["speed_mps"]
             cleared = _earliest(to_clear, foe["speed"], top, GENTLE_ACCEL)
-        return HOLD_YIELD if cleared + 0.5 * GAP_S > time_in else HOLD_NONE
+        if row["speed"] <= STANDING_MPS and not _goes_on(row, link):
+            return HOLD_YIELD if cleared > SET_OFF_S else HOLD_NONE
+        return HOLD_YIELD if cleared > time_in else HOLD_NONE
     # A foe before its line, and the vehicle itself, are given the whole way over the junction.
     over = target["length_m"]
     if conflict["enter_m"] < target["wait_m"]:
