@@ -305,7 +305,8 @@ def foe_blocks(
         if foe["speed"] > STANDING_MPS:  # one that has just set off does not stay so slow
             top = roads.lanes[roads.links[conflict["foe"]]["next_lane"]]["speed_mps"]
             cleared = _earliest(to_clear, foe["speed"], top, GENTLE_ACCEL)
-        if row["speed"] <= STANDING_MPS and not _goes_on(row, link):
+        stands = row["speed"] <= STANDING_MPS and not _goes_on(row, link)
+        if stands and target["state"] != STATE_ALLWAY_STOP:
             return HOLD_YIELD if cleared > SET_OFF_S else HOLD_NONE
         return HOLD_YIELD if cleared > time_in else HOLD_NONE
     # A foe before its line, and the vehicle itself, are given the whole way over the junction.
