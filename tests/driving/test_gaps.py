@@ -50,12 +50,19 @@ def blocks(network: RoadNetwork) -> Blocks:
     (shared,) = conflicts[conflicts["foe"] == FROM_WEST]
     row = on_lane(network, network.lane_ids.index("s_0"), 0.0, speed=SPEED_MPS, length=2.0 * HALF_M)
 
-    def ask(own_s: float, end: str, foe_m: float, wait_s: float = 0.0, **foe_fields: float) -> int:
+    def ask(
+        own_s: float,
+        end: str,
+        foe_m: float,
+        wait_s: float = 0.0,
+        own: dict[str, float] | None = None,
+        **foe_fields: float,
+    ) -> int:
         """By how long and how far they are before what they share.
 
         `own_s`: until the own front enters the shared area or is at its `line`, or the own rear is
         `out` of the junction, as `end` says. `foe_m`: of the other one's front to its line;
-        negative: of its rear to the end of the shared area. `foe_fields`: of its record.
+        negative: of its rear to the end of the shared area. `own`, `foe_fields`: of their records.
         """
         foe = np.zeros(1, APPROACH)
         foe["link"], foe["row"], foe["half"] = FROM_WEST, 1, HALF_M
@@ -63,13 +70,14 @@ def blocks(network: RoadNetwork) -> Blocks:
         foe["dist"] = -shared["foe_leave_m"] - HALF_M - foe_m if inside else foe_m + HALF_M
         ahead = {"enter": shared["enter_m"] - HALF_M, "line": -HALF_M}
         ahead["out"] = link["length_m"] + HALF_M
-        row["wait_s"] = wait_s
+        row["wait_s"] = wait_s  # of both
         rows = np.concatenate([row, row])
-        for name, value in foe_fields.items():
-            rows[1][name] = value
+        for k, fields in enumerate((own or {}, foe_fields)):
+            for name, value in fields.items():
+                rows[k][name] = value
         foe["speed"] = rows[1]["speed"]
         return foe_blocks(
-            network.arrays, rows, row[0], FROM_SOUTH,
+            network.arrays, rows, rows[0], FROM_SOUTH,
             own_s * SPEED_MPS - float(ahead[end]), SPEED_MPS, shared, foe[0], True,
             np.zeros(1, np.int32),
         )  # fmt: skip
@@ -77,10 +85,25 @@ def blocks(network: RoadNetwork) -> Blocks:
     return ask
 
 
-def test_behind_one_that_is_on_the_junction_half_a_second_is_enough(blocks: Blocks) -> None:
+@pytest.mark.parametrize(("driver", "behind_s"), [(DRIVER_BACKGROUND, 0.0), (DRIVER_AGENT, 0.5)])
+def test_one_that_comes_enters_where_another_is_just_out(
+    blocks: Blocks, driver: int, behind_s: float
+) -> None:
     # Its rear leaves the shared area in 0.6 s.
-    assert blocks(1.05, "enter", -6.0)
-    assert not blocks(1.15, "enter", -6.0)
+    assert blocks(0.55 + behind_s, "enter", -6.0, driver=driver)
+    assert not blocks(0.65 + behind_s, "enter", -6.0, driver=driver)
+
+
+@pytest.mark.parametrize(
+    ("out_s", "hold", "waits"),
+    [(0.6, HOLD_YIELD, True), (0.4, HOLD_YIELD, False), (0.6, HOLD_NONE, False)],
+)
+def test_one_that_stands_sets_off_half_a_second_before_another_is_out(
+    blocks: Blocks, out_s: float, hold: int, waits: bool
+) -> None:
+    # It needs over a second to where the other one is. One that has set off goes on.
+    own = {"speed": 0.0, "hold": hold, "stopped_at": FROM_SOUTH}
+    assert blocks(0.2, "line", -out_s * SPEED_MPS, 2.0, own) == (HOLD_YIELD if waits else HOLD_NONE)
 
 
 @pytest.mark.parametrize(
@@ -108,8 +131,8 @@ def test_one_that_comes_is_let_over_the_whole_junction(
     assert not blocks(over_s + 0.05, "line", 20.0)
 
 
-@pytest.mark.parametrize(("driver", "ahead_s"), [(DRIVER_BACKGROUND, 1.3), (DRIVER_AGENT, 3.0)])
-def test_before_one_that_comes_to_its_line_it_is_over_a_second_and_before_a_steered_one_three(
+@pytest.mark.parametrize(("driver", "ahead_s"), [(DRIVER_BACKGROUND, 1.0), (DRIVER_AGENT, 3.0)])
+def test_before_one_that_comes_to_its_line_it_is_over_one_second_earlier_or_if_steered_three(
     blocks: Blocks, driver: int, ahead_s: float
 ) -> None:
     # Its front reaches its line in 5 s.
@@ -119,16 +142,16 @@ def test_before_one_that_comes_to_its_line_it_is_over_a_second_and_before_a_stee
 
 def test_one_that_speeds_up_comes_earlier(blocks: Blocks) -> None:
     # From 4 m/s with 2 m/s² it has 10 m/s, the limit, after 3 s and 21 m, and 50 m after 5.9 s.
-    assert blocks(4.65, "out", 50.0, speed=4.0, accel=2.0)
-    assert not blocks(4.55, "out", 50.0, speed=4.0, accel=2.0)
-    assert not blocks(4.65, "out", 50.0, speed=4.0), "at the speed that it has it takes 12.5 s"
+    assert blocks(4.95, "out", 50.0, speed=4.0, accel=2.0)
+    assert not blocks(4.85, "out", 50.0, speed=4.0, accel=2.0)
+    assert not blocks(4.95, "out", 50.0, speed=4.0), "at the speed that it has it takes 12.5 s"
 
 
 @pytest.mark.parametrize(
     ("wait_s", "least_m"),
     [
-        (0.0, 28.0),  # out in 1.5 s, with 1.3 s more
-        (90.0, 21.2),  # braking with 2.25 m/s² all along, half of what it loses counts: 0.69 s
+        (0.0, 25.0),  # out in 1.5 s, with 1.0 s more
+        (90.0, 19.9),  # braking with 2.25 m/s² all along, half of what it loses counts: 0.51 s
         (180.0, 11.1),  # with 4.5 m/s² it would stop
         (900.0, 11.1),
     ],
@@ -169,8 +192,8 @@ def least_ahead(network: RoadNetwork, driver: int, wait_s: float, foe_mps: float
 @pytest.mark.parametrize(
     ("driver", "foe_mps", "ahead_s"),
     [
-        (DRIVER_BACKGROUND, 4.0, 1.3),
-        (DRIVER_BACKGROUND, 10.0, 1.3),
+        (DRIVER_BACKGROUND, 4.0, 1.0),
+        (DRIVER_BACKGROUND, 10.0, 1.0),
         (DRIVER_AGENT, 4.0, 1.5),
         (DRIVER_AGENT, 10.0, 1.5),
         (DRIVER_AGENT, 30.0, 2.3),  # (30 - 5)² / (2 · 4.5 · 30): the way to brake behind it

@@ -41,7 +41,7 @@ STEERED_AHEAD_S = 3.0  # where one of both is steered: it may take longer than i
 STEERED_MERGE_AHEAD_S = 1.5  # and where both lead into the same lane, which lets one fall in behind
 SPEEDING_UP_MPS2 = 0.1  # from which on a foe counts as one that goes on speeding up
 GAP_S = 1.0  # s between the last of one and the first of the other in a shared area
-SET_OFF_S = 0.5
+SET_OFF_S = 0.5  # one that stands sets off this long before another is out of it
 ROOM_M = 3.0  # free way left behind a vehicle that clears a junction
 IMPATIENCE_S = 180.0  # after which a vehicle that gives way counts on others to brake,
 FORCED_STOP = 4.5  # m/s², and how hard at most
@@ -234,14 +234,13 @@ def _comes(
     """Whether an APPROACH, of VEHICLE row `other`, is at its line too soon for a row.
 
     The row is at its own line in `time_in` s, and out of the junction in `time_out` s with
-    `leaves_mps`. One that waits counts on a foe that is on the last lane before its line to brake
-    from when it goes, the harder the longer it has waited; and before one that it would slow down
-    in its lane it goes only if so much braking is enough.
+    `leaves_mps`. One that waits counts on the foe to brake from when it goes, the harder the longer
+    it has waited; and before one that it would slow down in its lane it goes only if so much
+    braking is enough.
     """
     to_line = foe["dist"] - foe["half"]
-    last_lane = roads.links[conflict["foe"]]["from_lane"]
     if other["accel"] > SPEEDING_UP_MPS2:
-        top = roads.lanes[last_lane]["speed_mps"]
+        top = roads.lanes[roads.links[conflict["foe"]]["from_lane"]]["speed_mps"]
         arrives = _earliest(to_line, foe["speed"], top, other["accel"])
     else:
         arrives = to_line / max(foe["speed"], STANDING_MPS)
@@ -294,10 +293,12 @@ def foe_blocks(
     apart = distance + conflict["leave_m"] - half - to_clear
     if _is_harmless(roads, rows, row, link, conflict, foe, front, apart, gives_way, phase):
         return HOLD_NONE
+    other = rows[foe["row"]]
+    steered = row["driver"] == DRIVER_AGENT or other["driver"] == DRIVER_AGENT
     cleared = to_clear / max(foe["speed"], 0.1)
     time_in = _earliest(distance + conflict["enter_m"] - half, row["speed"], limit, BRISK_ACCEL)
     if front <= 0.0:
-        if stays_inside(rows[foe["row"]]):
+        if stays_inside(other):
             return HOLD_EXIT_BLOCKED
         to_area = distance + conflict["enter_m"] - half
         if _in_turn(target["state"]) and _goes_on(row, link) and to_area > ROOM_M:
@@ -305,9 +306,11 @@ def foe_blocks(
         if foe["speed"] > STANDING_MPS:  # one that has just set off does not stay so slow
             top = roads.lanes[roads.links[conflict["foe"]]["next_lane"]]["speed_mps"]
             cleared = _earliest(to_clear, foe["speed"], top, GENTLE_ACCEL)
+        if steered:
+            time_in -= 0.5 * GAP_S
         stands = row["speed"] <= STANDING_MPS and not _goes_on(row, link)
         if stands and target["state"] != STATE_ALLWAY_STOP:
-            return HOLD_YIELD if cleared > SET_OFF_S else HOLD_NONE
+            time_in = SET_OFF_S
         return HOLD_YIELD if cleared > time_in else HOLD_NONE
     # A foe before its line, and the vehicle itself, are given the whole way over the junction.
     over = target["length_m"]
@@ -323,8 +326,7 @@ def foe_blocks(
     leaves_mps = min(reached, max(limit, speed))
     time_line = _earliest(distance - half, speed, limit, GENTLE_ACCEL)
     time_out = time_line + 2.0 * (over + row["length"]) / max(speed + leaves_mps, STANDING_MPS)
-    other = rows[foe["row"]]
-    if row["driver"] == DRIVER_AGENT or other["driver"] == DRIVER_AGENT:
+    if steered:
         comes = _comes_to_steered(row, conflict, foe, leaves_mps, time_out)
     else:
         comes = _comes(roads, row, conflict, foe, other, time_line, time_out, leaves_mps)
