@@ -45,6 +45,8 @@ SET_OFF_S = 0.5  # one that stands sets off this long before another is out of i
 ROOM_M = 3.0  # free way left behind a vehicle that clears a junction
 IMPATIENCE_S = 180.0  # after which a vehicle that gives way counts on others to brake,
 FORCED_STOP = 4.5  # m/s², and how hard at most
+# of the way to a line, on which one that speeds up need not brake for it yet
+UNBRAKED_SHARE = FORCED_STOP / (FORCED_STOP + BRISK_ACCEL)
 CRAWL_MPS = 5.0  # a stream that is slower lets others in
 STUCK_S = 90.0  # after which it passes others that stand and give way, too
 STOP_SIGN_S = 0.5  # how long one stands at a stop sign, and before a tie is broken;
@@ -150,6 +152,13 @@ def ignores(
     return longer or (row["wait_s"] == foe["wait_s"] and row["id"] < foe["id"])
 
 
+@inlined_kernel
+def _is_committed(foe: np.void, front: float) -> bool:
+    """Whether an APPROACH with its front so many m before a line does not stop there any more."""
+    committed: bool = foe["speed"] * foe["speed"] > 2.0 * HARD_STOP * max(front, 0.01)
+    return committed
+
+
 @kernel
 def _is_harmless(
     roads: RoadArrays,
@@ -176,8 +185,7 @@ def _is_harmless(
         # Behind one that is faster and leads into the same lane, one can follow.
         follows: bool = conflict["merging"] and apart > ROOM_M and row["speed"] <= foe["speed"]
         return follows
-    committed = foe["speed"] * foe["speed"] > 2.0 * HARD_STOP * max(front, 0.01)
-    if committed:
+    if _is_committed(foe, front):
         return False
     if not (gives_way and conflict["must_yield"]):
         return True
@@ -283,11 +291,12 @@ def foe_blocks(
         return HOLD_NONE
     target = roads.links[link]
     foe_link = roads.links[conflict["foe"]]
-    # Its front before the line that it can still stop at: the stop line, or, where the shared
-    # area lies beyond that, its waiting position inside.
+    # Its front before the line that it can still stop at: the stop line, or, where it passes that
+    # and the shared area lies further on, its waiting position inside.
     front = foe["dist"] - foe["half"] - roads.lanes[foe_link["from_lane"]]["stop_back_m"]
     wait_m = foe_link["wait_m"]
-    if front <= 0.0 and conflict["foe_enter_m"] >= wait_m - LINE_MARGIN_M:
+    passes = front <= 0.0 or _is_committed(foe, front)
+    if passes and conflict["foe_enter_m"] >= wait_m - LINE_MARGIN_M:
         front += wait_m + WAIT_SLACK_M
     half = 0.5 * row["length"]
     apart = distance + conflict["leave_m"] - half - to_clear
@@ -311,6 +320,9 @@ def foe_blocks(
         stands = row["speed"] <= STANDING_MPS and not _goes_on(row, link)
         if stands and target["state"] != STATE_ALLWAY_STOP:
             time_in = SET_OFF_S
+        elif stands and not steered:
+            free = (to_area - LINE_MARGIN_M) * UNBRAKED_SHARE
+            time_in = _earliest(free, row["speed"], limit, BRISK_ACCEL)
         return HOLD_YIELD if cleared > time_in else HOLD_NONE
     # A foe before its line, and the vehicle itself, are given the whole way over the junction.
     over = target["length_m"]

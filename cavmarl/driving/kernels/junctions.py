@@ -346,7 +346,7 @@ def constraint_inside(
             foe = scratch.approach[k]
             if foe["row"] == i:
                 continue
-            found = _constraint_of(roads, kind, row, conflict, foe, place, dt)
+            found = _constraint_of(roads, rows, kind, row, conflict, foe, place, dt)
             if found > no_constraint(kind):
                 constraint = max(constraint, found)
                 if hold == HOLD_NONE and stays_inside(rows[foe["row"]]):
@@ -357,6 +357,7 @@ def constraint_inside(
 @kernel
 def _constraint_of(
     roads: RoadArrays,
+    rows: NDArray[np.void],
     kind: np.void,
     row: np.void,
     conflict: np.void,
@@ -370,10 +371,11 @@ def _constraint_of(
     foe_front = foe["half"] - foe["dist"]
     foe_rear = -foe["half"] - foe["dist"]
     wait_m = roads.links[foe["link"]]["wait_m"]
+    stops = foe["speed"] < STANDING_MPS or rows[foe["row"]]["hold"] == HOLD_YIELD
     waits = (
         foe_front <= wait_m + WAIT_SLACK_M
         and conflict["foe_enter_m"] >= wait_m - LINE_MARGIN_M
-        and foe["speed"] < STANDING_MPS
+        and stops
     )
     if foe_front <= 0.0 or foe_rear > conflict["foe_leave_m"] or waits:
         return no_constraint(kind)
