@@ -80,8 +80,11 @@ def entry_lane(
     first = edge["first_lane"]
     end = first + edge["num_lanes"]
     usable = 0
+    fewest = 1 << 20  # lane changes on its way
     for lane in range(first, end):
-        usable += _may_use(travel, departure, lane)
+        if _may_use(travel, departure, lane):
+            usable += 1
+            fewest = min(fewest, int(travel.steps[departure["way"] + lane]["changes"]))
     pick = -1
     if code == LANE_RANDOM and usable > 0:
         pick = below(key, departure["id"], 0, STREAM_DEPARTURE + DRAW_LANE, usable)
@@ -97,11 +100,10 @@ def entry_lane(
             continue
         if code == LANE_FIRST:
             return -1 if taken[lane] else lane
-        if taken[lane]:
-            continue
+        changes = int(travel.steps[departure["way"] + lane]["changes"])
+        if taken[lane] or (code == LANE_BEST and changes > fewest):
+            continue  # where another one tries on the best, it waits
         rank = ranks[lane - first]
-        if code == LANE_BEST:
-            rank += int(travel.steps[departure["way"] + lane]["changes"]) * (1 << 20)
         if rank < best_rank:
             best = lane
             best_rank = rank
