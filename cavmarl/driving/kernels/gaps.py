@@ -295,15 +295,15 @@ def foe_blocks(
     # and the shared area lies further on, its waiting position inside.
     front = foe["dist"] - foe["half"] - roads.lanes[foe_link["from_lane"]]["stop_back_m"]
     wait_m = foe_link["wait_m"]
-    passes = front <= 0.0 or _is_committed(foe, front)
+    other = rows[foe["row"]]
+    steered = row["driver"] == DRIVER_AGENT or other["driver"] == DRIVER_AGENT
+    passes = front <= 0.0 or (not steered and _is_committed(foe, front))
     if passes and conflict["foe_enter_m"] >= wait_m - LINE_MARGIN_M:
         front += wait_m + WAIT_SLACK_M
     half = 0.5 * row["length"]
     apart = distance + conflict["leave_m"] - half - to_clear
     if _is_harmless(roads, rows, row, link, conflict, foe, front, apart, gives_way, phase):
         return HOLD_NONE
-    other = rows[foe["row"]]
-    steered = row["driver"] == DRIVER_AGENT or other["driver"] == DRIVER_AGENT
     cleared = to_clear / max(foe["speed"], 0.1)
     time_in = _earliest(distance + conflict["enter_m"] - half, row["speed"], limit, BRISK_ACCEL)
     if front <= 0.0:
