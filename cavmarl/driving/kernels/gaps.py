@@ -30,6 +30,7 @@ from cavmarl.core.records.codes import (
 )
 from cavmarl.core.records.rows import WAIT_SLACK_M
 from cavmarl.driving.kernels.announcing import IMPATIENT_S, STANDING_MPS, is_let_stand
+from cavmarl.driving.kernels.circles import STATE_EQUAL, on_equal_road
 from cavmarl.driving.kernels.following import LINE_MARGIN_M
 
 BRISK_ACCEL = 2.5  # m/s², with which a driver may soon be in a shared area,
@@ -52,7 +53,6 @@ STUCK_S = 90.0  # after which it passes others that stand and give way, too
 STOP_SIGN_S = 0.5  # how long one stands at a stop sign, and before a tie is broken;
 STOOD_S = 0.1  # background vehicles, as SUMO's, only for a moment
 STATE_MAJOR = ord("M")
-STATE_EQUAL = ord("=")
 STATE_STOP = ord("s")
 STATE_ALLWAY_STOP = ord("w")
 
@@ -159,6 +159,14 @@ def _is_committed(foe: np.void, front: float) -> bool:
     return committed
 
 
+@inlined_kernel
+def _equal_roads(roads: RoadArrays, row: np.void, link: int, other: np.void) -> bool:
+    """Whether two background vehicles meet where none of the roads has the right of way."""
+    steered = (row["driver"] == DRIVER_AGENT) | (other["driver"] == DRIVER_AGENT)
+    equal: bool = on_equal_road(roads, link)
+    return equal and not steered
+
+
 @kernel
 def _is_harmless(
     roads: RoadArrays,
@@ -189,9 +197,12 @@ def _is_harmless(
         return False
     if not (gives_way and conflict["must_yield"]):
         return True
-    signal = link_signal(roads, conflict["foe"], phase)
-    state, foe_state = roads.links[link]["state"], roads.links[conflict["foe"]]["state"]
-    if ignores(row, rows[foe["row"]], link, conflict["foe"], signal, state, foe_state):
+    other, foe_link = rows[foe["row"]], conflict["foe"]
+    if _equal_roads(roads, row, link, other) and row["wait_s"] < STUCK_S:
+        return is_let_stand(other)  # one that waits in a circle is left out before
+    signal = link_signal(roads, foe_link, phase)
+    state, foe_state = roads.links[link]["state"], roads.links[foe_link]["state"]
+    if ignores(row, other, link, foe_link, signal, state, foe_state):
         return True
     # A vehicle that has been let in goes on, where others can still brake for it.
     brakes: bool = foe["speed"] * foe["speed"] < 2.0 * FORCED_STOP * front
@@ -297,6 +308,7 @@ def foe_blocks(
     wait_m = foe_link["wait_m"]
     other = rows[foe["row"]]
     steered = row["driver"] == DRIVER_AGENT or other["driver"] == DRIVER_AGENT
+    equal = _equal_roads(roads, row, link, other)
     passes = front <= 0.0 or (not steered and _is_committed(foe, front))
     if passes and conflict["foe_enter_m"] >= wait_m - LINE_MARGIN_M:
         front += wait_m + WAIT_SLACK_M
@@ -309,6 +321,8 @@ def foe_blocks(
     if front <= 0.0:
         if stays_inside(other):
             return HOLD_EXIT_BLOCKED
+        if equal and conflict["merging"]:
+            return HOLD_YIELD if apart < ROOM_M else HOLD_NONE  # in its lane there is no room yet
         to_area = distance + conflict["enter_m"] - half
         if _in_turn(target["state"]) and _goes_on(row, link) and to_area > ROOM_M:
             return HOLD_NONE  # it lost its turn if it stood once more, and can wait before the area
@@ -317,7 +331,7 @@ def foe_blocks(
             cleared = _earliest(to_clear, foe["speed"], top, GENTLE_ACCEL)
         if steered:
             time_in -= 0.5 * GAP_S
-        stands = row["speed"] <= STANDING_MPS and not _goes_on(row, link)
+        stands = row["speed"] <= STANDING_MPS and not _goes_on(row, link) and not equal
         if stands and target["state"] != STATE_ALLWAY_STOP:
             time_in = SET_OFF_S
         elif stands and not steered:

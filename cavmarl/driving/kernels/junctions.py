@@ -31,6 +31,7 @@ from cavmarl.core.records.codes import (
 )
 from cavmarl.core.records.rows import WAIT_SLACK_M
 from cavmarl.driving.kernels.announcing import STANDING_MPS
+from cavmarl.driving.kernels.circles import lets_go
 from cavmarl.driving.kernels.following import LINE_MARGIN_M, before_line, behind, no_constraint
 from cavmarl.driving.kernels.gaps import (
     ROOM_M,
@@ -92,6 +93,9 @@ def _blocked_by_foes(
         for k in range(begin, end):
             foe = scratch.approach[k]
             if foe["row"] == i:
+                continue
+            waits = conflict["must_yield"] and foe["dist"] > foe["half"]
+            if waits and lets_go(roads, rows, rows[foe["row"]], conflict["foe"], row, scratch):
                 continue
             found = foe_blocks(
                 roads, rows, row, link, distance, limit, conflict, foe, gives_way, phase
@@ -176,6 +180,8 @@ def may_enter(
     if target["num_conflicts"] == 0:
         return HOLD_NONE
     if must_stop(roads, link, signal) and row["stopped_at"] != link:
+        return HOLD_YIELD
+    if lets_go(roads, rows, row, link, row, scratch):
         return HOLD_YIELD
     gives_way = signal != SIGNAL_GREEN_MAJOR and signal != SIGNAL_OFF
     hold = _blocked_by_foes(
