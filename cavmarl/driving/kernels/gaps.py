@@ -333,7 +333,7 @@ def foe_blocks(
             time_in -= 0.5 * GAP_S
         stands = row["speed"] <= STANDING_MPS and not _goes_on(row, link) and not equal
         if stands and target["state"] != STATE_ALLWAY_STOP:
-            time_in = SET_OFF_S
+            time_in = min(SET_OFF_S, time_in)
         elif stands and not steered:
             free = (to_area - LINE_MARGIN_M) * UNBRAKED_SHARE
             time_in = _earliest(free, row["speed"], limit, BRISK_ACCEL)
