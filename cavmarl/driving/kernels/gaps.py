@@ -326,8 +326,8 @@ def foe_blocks(
         to_area = distance + conflict["enter_m"] - half
         if _in_turn(target["state"]) and _goes_on(row, link) and to_area > ROOM_M:
             return HOLD_NONE  # it lost its turn if it stood once more, and can wait before the area
+        top = roads.lanes[foe_link["next_lane"]]["speed_mps"]
         if foe["speed"] > STANDING_MPS:  # one that has just set off does not stay so slow
-            top = roads.lanes[roads.links[conflict["foe"]]["next_lane"]]["speed_mps"]
             cleared = _earliest(to_clear, foe["speed"], top, GENTLE_ACCEL)
         if steered:
             time_in -= 0.5 * GAP_S
@@ -337,6 +337,8 @@ def foe_blocks(
         elif stands and not steered:
             free = (to_area - LINE_MARGIN_M) * UNBRAKED_SHARE
             time_in = _earliest(free, row["speed"], limit, BRISK_ACCEL)
+            if other["accel"] > SPEEDING_UP_MPS2:
+                cleared = _earliest(to_clear, foe["speed"], top, other["accel"])
         return HOLD_YIELD if cleared > time_in else HOLD_NONE
     # A foe before its line, and the vehicle itself, are given the whole way over the junction.
     over = target["length_m"]

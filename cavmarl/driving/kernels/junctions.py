@@ -179,7 +179,8 @@ def may_enter(
     target = roads.links[link]
     if target["num_conflicts"] == 0:
         return HOLD_NONE
-    if must_stop(roads, link, signal) and row["stopped_at"] != link:
+    stands = row["driver"] != DRIVER_AGENT and row["wait_s"] > 0.0 and front < STOP_LINE_M
+    if must_stop(roads, link, signal) and row["stopped_at"] != link and not stands:
         return HOLD_YIELD
     if lets_go(roads, rows, row, link, row, scratch):
         return HOLD_YIELD
