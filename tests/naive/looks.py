@@ -68,6 +68,17 @@ class Looks:
             if {int(sweep["own"]), int(sweep["other"])} <= sizes
         }
         foes |= swept
+        following = foes
+        while following:  # on equal roads, along circles of those that give way
+            following = {
+                int(conflict["foe"])
+                for link in following
+                if self.network.links["state"][link] == ord("=")
+                and self.network.links["signal"][link] < 0
+                for conflict in self._conflicts(link)
+                if conflict["must_yield"]
+            } - foes
+            foes = foes | following
         self._at_lines(foes, self.line)
         self._at_lines(swept, self.room)
         for link in asked | foes:

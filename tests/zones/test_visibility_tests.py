@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from cavmarl.zones.kernels.visibility_tests import (
 from cavmarl.zones.kernels.zone_lookup import LOOK
 from tests.naive.looks import STEP_M, Looks
 from tests.support.junction_scenes import build_crossing, with_shorter_lane
+from tests.support.netgenerate import netgenerate
 from tests.support.traffic import network
 
 VIEW_M, SEE_M, HALF_M = 90.0, 40.0, 6.0
@@ -87,6 +89,33 @@ def test_kernel_sees_what_sets_of_lanes_see(
     # On these maps vans, buses and steered cars alone sweep over ways beside theirs.
     sweeps = name == "grid4x4" and (half_m == HALF_M or steered)
     assert np.isfinite(found["room"]).any() == sweeps
+
+
+@pytest.mark.parametrize(("junctions", "seen"), [("right_before_left", 4), ("priority", 1)])
+def test_on_equal_roads_those_are_seen_that_foes_give_way_to(
+    tmp_path: Path, junctions: str, seen: int
+) -> None:
+    """One asks whether it waits in a circle: along those that each gives way to."""
+    roads = read_network(netgenerate(tmp_path / "net.net.xml", "-g", "-j", junctions))
+    links, conflicts = roads.links.copy(), roads.conflicts.copy()
+    middle = np.bincount(links["junction"]).argmax()
+    one, other, *rest = ends = np.unique(links["from_lane"][links["junction"] == middle])
+    assert len(rest) == 2
+    # Those from the one lane give way to one from another lane alone, which gives way to most.
+    owner = np.repeat(np.arange(len(links)), links["num_conflicts"])
+    yields = np.bincount(owner[conflicts["must_yield"]], minlength=len(links))
+    conflicts["foe"][links["from_lane"][owner] == one] = np.argmax(
+        np.where(links["from_lane"] == other, yields, -1)
+    )
+    links["num_sweeps"] = 0
+    roads = replace(roads, links=links, conflicts=conflicts)
+    lane = roads.lanes[one]
+    x, y, *_ = roads.points[lane["first_point"] + lane["num_points"] - 1].tolist()
+    rect = (x - 0.5, y - 0.5, x + 0.5, y + 0.5)
+    found, twin = looks_of(roads, rect), Looks(roads, rect, VIEW_M, SEE_M, HALF_M)
+    expected = np.array([twin.line[k] for k in range(len(roads.lanes))])
+    np.testing.assert_allclose(found["line"], expected, atol=2.0 * STEP_M)
+    assert np.isfinite(found["line"][ends]).sum() == seen
 
 
 @pytest.mark.parametrize("from_line_m", [-40.0, 10.0, 95.0, 120.0])

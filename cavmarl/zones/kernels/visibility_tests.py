@@ -21,6 +21,7 @@ from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays
 from cavmarl.core.records.rows import ENTER_REACH_M, STEERED, SWEPT_BEYOND_M
 from cavmarl.driving.kernels.announcing import APPROACH_M
+from cavmarl.driving.kernels.circles import on_equal_road
 from cavmarl.driving.kernels.junctions import EXIT_LOOK_M
 from cavmarl.driving.kernels.lane_choice import LOOK_BACK_M
 from cavmarl.driving.kernels.lane_index import goes_on_m
@@ -321,6 +322,18 @@ def _find_lines(roads: RoadArrays, see_m: float, half_m: float, scratch: Visibil
                 if known and (sweep["other"] <= largest or sweep["other"] == STEERED):
                     scratch.foe[sweep["foe"]] = True
                     scratch.swept[sweep["foe"]] = True
+    grown = True
+    while grown:  # on equal roads drivers ask along circles of those that give way
+        grown = False
+        for link in range(roads.links.shape[0]):
+            if not (scratch.foe[link] and on_equal_road(roads, link)):
+                continue
+            first = roads.links[link]["first_conflict"]
+            for c in range(first, first + roads.links[link]["num_conflicts"]):
+                foe = roads.conflicts[c]["foe"]
+                if roads.conflicts[c]["must_yield"] and not scratch.foe[foe]:
+                    scratch.foe[foe] = True
+                    grown = True
 
 
 @kernel
