@@ -211,9 +211,9 @@ def test_one_that_has_stood_goes_before_a_faster_one_that_need_hardly_brake(
     network: RoadNetwork, wait_s: float, brakes_m: float
 ) -> None:
     # From 10 to 5 m/s with 4.5 m/s² times the share of 180 s that it has waited: it begins when the
-    # other one is at its line, in 0.5 s.
+    # other one is 1 m before its line, in 0.3 s.
     least_m, _ = least_ahead(network, DRIVER_BACKGROUND, wait_s, 10.0)
-    assert least_m == pytest.approx(brakes_m + 0.5 * 10.0, abs=0.1)
+    assert least_m == pytest.approx(brakes_m + 0.3 * 10.0, abs=0.1)
 
 
 def waiting_pair(**fields: Any) -> Any:

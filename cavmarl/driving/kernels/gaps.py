@@ -252,7 +252,7 @@ def _comes(
 ) -> bool:
     """Whether an APPROACH, of VEHICLE row `other`, is at its line too soon for a row.
 
-    The row is at its own line in `time_in` s, and out of the junction in `time_out` s with
+    The row is where others wait at its line in `time_in` s, and out of the junction in `time_out` s with
     `leaves_mps`. One that waits counts on the foe to brake from when it goes, the harder the longer
     it has waited; and before one that it would slow down in its lane it goes only if so much
     braking is enough.
@@ -357,5 +357,7 @@ def foe_blocks(
     if steered:
         comes = _comes_to_steered(row, conflict, foe, leaves_mps, time_out)
     else:
-        comes = _comes(roads, row, conflict, foe, other, time_line, time_out, leaves_mps)
+        # One that waits is as good as at its line: SUMO's stand there.
+        time_in = _earliest(distance - half - LINE_MARGIN_M, speed, limit, GENTLE_ACCEL)
+        comes = _comes(roads, row, conflict, foe, other, time_in, time_out, leaves_mps)
     return HOLD_YIELD if comes else HOLD_NONE
