@@ -252,9 +252,9 @@ def _comes(
 ) -> bool:
     """Whether an APPROACH, of VEHICLE row `other`, is at its line too soon for a row.
 
-    The row is where others wait at its line in `time_in` s, and out of the junction in `time_out` s with
-    `leaves_mps`. One that waits counts on the foe to brake from when it goes, the harder the longer
-    it has waited; and before one that it would slow down in its lane it goes only if so much
+    The row is where one waits at its line in `time_in` s, and out of the junction in `time_out` s
+    with `leaves_mps`. One that waits counts on the foe to brake from when it goes, the harder the
+    longer it has waited; and before one that it would slow down in its lane it goes only if so much
     braking is enough.
     """
     to_line = foe["dist"] - foe["half"]
