@@ -12,13 +12,20 @@ import pytest
 from numpy.typing import NDArray
 
 from cavmarl.core.records.arrays import Scratch
-from cavmarl.core.records.codes import DRIVER_AGENT, HOLD_NONE, HOLD_YIELD
-from cavmarl.driving.kernels.circles import lets_go, waits_in_circle
+from cavmarl.core.records.codes import (
+    DRIVER_AGENT,
+    DRIVER_BACKGROUND,
+    HOLD_NONE,
+    HOLD_YIELD,
+    MODEL_IDM,
+    MODEL_KRAUSS,
+)
+from cavmarl.driving.kernels.circles import breaks_circles, lets_go, waits_in_circle
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network
 from tests.support.builders import vehicles
-from tests.support.junction_scenes import Scene, build_crossing
-from tests.support.traffic import scratch
+from tests.support.junction_scenes import build_crossing
+from tests.support.traffic import scratch, travel
 
 AHEAD = {"W": "E", "E": "W", "S": "N", "N": "S"}
 LEFT = {"W": "N", "N": "E", "E": "S", "S": "W"}
@@ -103,23 +110,37 @@ def test_in_a_circle_one_lets_the_others_go_in_some_ticks_and_all_agree_when(
 
 @pytest.mark.parametrize(
     "fields",
-    [{"hold": HOLD_NONE}, {"speed": 1.0}, {"wait_s": 0.0}, {"driver": DRIVER_AGENT}],
+    [{"hold": HOLD_NONE}, {"speed": 1.0}, {"wait_s": 0.0}],
 )
-def test_one_that_does_not_wait_or_is_steered_lets_nobody_go(
+def test_one_that_does_not_wait_lets_nobody_go(
     queue: Callable[..., Queue], fields: dict[str, Any]
 ) -> None:
     here = queue("WSEN", AHEAD, **fields)
     assert not any(here.lets_go(tick) for tick in range(100))
 
 
-def test_without_a_circle_the_one_on_the_right_comes_first_while_it_waits_itself(
-    crossing: Callable[[str], Path],
+@pytest.mark.parametrize(
+    ("kind", "driver", "model", "breaks"),
+    [
+        ("right_before_left", DRIVER_BACKGROUND, MODEL_KRAUSS, True),
+        ("right_before_left", DRIVER_BACKGROUND, MODEL_IDM, False),
+        ("right_before_left", DRIVER_AGENT, MODEL_KRAUSS, False),
+        ("priority", DRIVER_BACKGROUND, MODEL_KRAUSS, False),
+    ],
+)
+def test_circles_are_for_sumo_s_drivers_on_equal_roads(
+    crossing: Callable[[str], Path], kind: str, driver: int, model: int, breaks: bool
 ) -> None:
-    # The one from the north gives way to the one from the west, and that to those from the south.
-    here = Scene(crossing("right_before_left"))
-    for k in range(4):
-        here.put(f"S{k}", "S_in_0", 10.0 + 10.0 * k, "N_out", speed=5.0)
-    here.put("W", "W_in_0", 15.0, "E_out", speed=5.0)
-    here.put("N", "N_in_0", 15.0, "S_out", speed=5.0)
-    times = here.entries(40.0)
-    assert times["S3"] < times["W"] < times["N"]
+    network = read_network(crossing(kind))
+    tables = travel("grid4x4")
+    types = np.array(tables.types)
+    types["model"] = model
+    (row,) = vehicles([(0.0, 0.0, 0.0)], driver=driver)
+    lanes = [network.lane_ids[lane] for lane in network.links["to_lane"]]
+    links = [
+        k
+        for k, lane in enumerate(network.links["from_lane"])
+        if network.lane_ids[lane] == "S_in_0" and lanes[k] == "N_out_0"
+    ]
+    tables = tables._replace(types=types)
+    assert breaks_circles(network.arrays, tables, row, links[0]) == breaks

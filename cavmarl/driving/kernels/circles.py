@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from cavmarl.core.math.rng import STREAM_DRIVER, quick_uniform
 from cavmarl.core.numba import inlined_kernel, kernel
-from cavmarl.core.records.arrays import RoadArrays, Scratch
-from cavmarl.core.records.codes import DRIVER_AGENT, HOLD_YIELD
+from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
+from cavmarl.core.records.codes import DRIVER_BACKGROUND, HOLD_YIELD, MODEL_KRAUSS
 from cavmarl.driving.kernels.announcing import STANDING_MPS, is_let_stand
 
 CIRCLE_LINKS = 8  # looked along for a circle
@@ -30,6 +30,18 @@ def on_equal_road(roads: RoadArrays, link: int) -> bool:
     target = roads.links[link]
     equal: bool = (target["state"] == STATE_EQUAL) & (target["signal"] < 0)
     return equal
+
+
+@inlined_kernel
+def breaks_circles(roads: RoadArrays, travel: Travel, row: np.void, link: int) -> bool:
+    """Whether a vehicle is one whose driver counts with circles where it takes `link` next.
+
+    They are the drivers that SUMO has, Krauss's, before a junction without any right of way.
+    """
+    if not on_equal_road(roads, link) or row["driver"] != DRIVER_BACKGROUND:
+        return False
+    krauss: bool = travel.types[row["vtype"]]["model"] == MODEL_KRAUSS
+    return krauss
 
 
 @kernel
@@ -82,10 +94,7 @@ def lets_go(
     asking: np.void,  # VEHICLE that asks: itself, or one that gives way to it
     scratch: Scratch,
 ) -> bool:
-    """Whether a background vehicle that stands in a circle before `link` lets the others go."""
-    steered = row["driver"] == DRIVER_AGENT or asking["driver"] == DRIVER_AGENT
-    if steered or not on_equal_road(roads, link):
-        return False
+    """Whether one that `breaks_circles` stands in one before `link`, and lets the others go."""
     if row["hold"] != HOLD_YIELD or row["speed"] > STANDING_MPS or row["wait_s"] == 0.0:
         return False
     share = STRAIGHT_SHARE if roads.links[link]["direction"] == STRAIGHT else TURNING_SHARE

@@ -28,7 +28,7 @@ from cavmarl.core.records.codes import (
 from cavmarl.core.records.rows import is_lost
 from cavmarl.driving.kernels.bends import LIMIT_DECEL, bend_speed
 from cavmarl.driving.kernels.beside import behind_askew, behind_entry, beside
-from cavmarl.driving.kernels.circles import on_equal_road
+from cavmarl.driving.kernels.circles import breaks_circles
 from cavmarl.driving.kernels.courtesy import COURTESY_DECEL, let_merge
 from cavmarl.driving.kernels.following import (
     LINE_MARGIN_M,
@@ -68,7 +68,7 @@ from cavmarl.driving.kernels.swept_areas import (
 from cavmarl.driving.kernels.ways import leave, next_step
 
 SEE_LINE_M = 8.0
-CLOSER_M = 0.9  # than `LINE_MARGIN_M` a driver on an equal road stands before its line
+CLOSER_M = 0.9  # than `LINE_MARGIN_M` one that breaks circles stands before its line
 SEE_FOES_M = 4.5  # before a line, a driver that gives way is ready to stop, as SUMO's are
 NEAR_M = 8.0  # to a leader so near the corner between matters,
 ASKEW_RAD = 0.7  # if it turns by so much: the gap is half a width less
@@ -172,7 +172,7 @@ def _at_line(
             swept = before_line_gently(kind, row, stop, dt)
             return max(swept, merging), HOLD_NONE, stop if stop <= front else math.inf
     if hold != HOLD_NONE:
-        closer = CLOSER_M if row["driver"] != DRIVER_AGENT and on_equal_road(roads, link) else 0.0
+        closer = CLOSER_M if breaks_circles(roads, travel, row, link) else 0.0
         return before_line(kind, speed, min(to_line + closer, stop), dt), hold, to_line
     if front > SEE_FOES_M and kind["model"] == MODEL_KRAUSS and is_minor(roads, link, phase):
         return before_line(kind, speed, front + LINE_MARGIN_M, dt), HOLD_NONE, math.inf

@@ -30,7 +30,7 @@ from cavmarl.core.records.codes import (
 )
 from cavmarl.core.records.rows import WAIT_SLACK_M
 from cavmarl.driving.kernels.announcing import IMPATIENT_S, STANDING_MPS, is_let_stand
-from cavmarl.driving.kernels.circles import STATE_EQUAL, on_equal_road
+from cavmarl.driving.kernels.circles import STATE_EQUAL
 from cavmarl.driving.kernels.following import LINE_MARGIN_M
 
 BRISK_ACCEL = 2.5  # m/s², with which a driver may soon be in a shared area,
@@ -159,14 +159,6 @@ def _is_committed(foe: np.void, front: float) -> bool:
     return committed
 
 
-@inlined_kernel
-def _equal_roads(roads: RoadArrays, row: np.void, link: int, other: np.void) -> bool:
-    """Whether two background vehicles meet where none of the roads has the right of way."""
-    steered = (row["driver"] == DRIVER_AGENT) | (other["driver"] == DRIVER_AGENT)
-    equal: bool = on_equal_road(roads, link)
-    return equal and not steered
-
-
 @kernel
 def _is_harmless(
     roads: RoadArrays,
@@ -179,6 +171,7 @@ def _is_harmless(
     apart: float,
     gives_way: bool,
     phase: NDArray[np.int32],
+    equal: bool,
 ) -> bool:
     """Whether an APPROACH need not be minded, whenever it comes to the shared area.
 
@@ -198,7 +191,7 @@ def _is_harmless(
     if not (gives_way and conflict["must_yield"]):
         return True
     other, foe_link = rows[foe["row"]], conflict["foe"]
-    if _equal_roads(roads, row, link, other) and row["wait_s"] < STUCK_S:
+    if equal and row["wait_s"] < STUCK_S:
         return is_let_stand(other)  # one that waits in a circle is left out before
     signal = link_signal(roads, foe_link, phase)
     state, foe_state = roads.links[link]["state"], roads.links[foe_link]["state"]
@@ -292,6 +285,7 @@ def foe_blocks(
     foe: np.void,
     gives_way: bool,
     phase: NDArray[np.int32],
+    equal: bool = False,  # whether both break circles of equal roads; see `circles`
 ) -> int:
     """Whether one APPROACH is, or will be, in the shared area while `row` is, or goes first.
 
@@ -308,13 +302,12 @@ def foe_blocks(
     wait_m = foe_link["wait_m"]
     other = rows[foe["row"]]
     steered = row["driver"] == DRIVER_AGENT or other["driver"] == DRIVER_AGENT
-    equal = _equal_roads(roads, row, link, other)
     passes = front <= 0.0 or (not steered and _is_committed(foe, front))
     if passes and conflict["foe_enter_m"] >= wait_m - LINE_MARGIN_M:
         front += wait_m + WAIT_SLACK_M
     half = 0.5 * row["length"]
     apart = distance + conflict["leave_m"] - half - to_clear
-    if _is_harmless(roads, rows, row, link, conflict, foe, front, apart, gives_way, phase):
+    if _is_harmless(roads, rows, row, link, conflict, foe, front, apart, gives_way, phase, equal):
         return HOLD_NONE
     cleared = to_clear / max(foe["speed"], 0.1)
     time_in = _earliest(distance + conflict["enter_m"] - half, row["speed"], limit, BRISK_ACCEL)

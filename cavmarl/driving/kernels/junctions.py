@@ -31,7 +31,7 @@ from cavmarl.core.records.codes import (
 )
 from cavmarl.core.records.rows import WAIT_SLACK_M
 from cavmarl.driving.kernels.announcing import STANDING_MPS
-from cavmarl.driving.kernels.circles import lets_go
+from cavmarl.driving.kernels.circles import breaks_circles, lets_go
 from cavmarl.driving.kernels.following import LINE_MARGIN_M, before_line, behind, no_constraint
 from cavmarl.driving.kernels.gaps import (
     ROOM_M,
@@ -62,6 +62,7 @@ STOP_SIGN_M = MOST_BACK_M + 2.0 * LINE_MARGIN_M
 @kernel
 def _blocked_by_foes(
     roads: RoadArrays,
+    travel: Travel,
     rows: NDArray[np.void],
     i: int,
     link: int,
@@ -83,6 +84,7 @@ def _blocked_by_foes(
     limit = roads.lanes[roads.links[link]["next_lane"]]["speed_mps"]
     if row["driver"] == DRIVER_AGENT:
         limit = min(limit, STEERED_MPS)
+    equal = breaks_circles(roads, travel, row, link)
     first = roads.links[link]["first_conflict"]
     for c in range(first, first + roads.links[link]["num_conflicts"]):
         conflict = roads.conflicts[c]
@@ -94,11 +96,13 @@ def _blocked_by_foes(
             foe = scratch.approach[k]
             if foe["row"] == i:
                 continue
-            waits = conflict["must_yield"] and foe["dist"] > foe["half"]
-            if waits and lets_go(roads, rows, rows[foe["row"]], conflict["foe"], row, scratch):
+            other = rows[foe["row"]]
+            both = equal and breaks_circles(roads, travel, other, conflict["foe"])
+            waits = both and conflict["must_yield"] and foe["dist"] > foe["half"]
+            if waits and lets_go(roads, rows, other, conflict["foe"], row, scratch):
                 continue
             found = foe_blocks(
-                roads, rows, row, link, distance, limit, conflict, foe, gives_way, phase
+                roads, rows, row, link, distance, limit, conflict, foe, gives_way, phase, both
             )
             if found == HOLD_NONE:
                 continue
@@ -182,11 +186,12 @@ def may_enter(
     stands = row["driver"] != DRIVER_AGENT and row["wait_s"] > 0.0 and front < STOP_LINE_M
     if must_stop(roads, link, signal) and row["stopped_at"] != link and not stands:
         return HOLD_YIELD
-    if lets_go(roads, rows, row, link, row, scratch):
+    circles = breaks_circles(roads, travel, row, link)
+    if circles and lets_go(roads, rows, row, link, row, scratch):
         return HOLD_YIELD
     gives_way = signal != SIGNAL_GREEN_MAJOR and signal != SIGNAL_OFF
     hold = _blocked_by_foes(
-        roads, rows, i, link, distance, target["wait_m"], False, gives_way, phase, scratch
+        roads, travel, rows, i, link, distance, target["wait_m"], False, gives_way, phase, scratch
     )
     if hold != HOLD_NONE:
         return hold
@@ -301,7 +306,9 @@ def waits_inside(
         return HOLD_NONE
     signal = link_signal(roads, link, phase)
     gives_way = signal != SIGNAL_GREEN_MAJOR and signal != SIGNAL_OFF
-    hold = _blocked_by_foes(roads, rows, i, link, distance, wait_m, True, gives_way, phase, scratch)
+    hold = _blocked_by_foes(
+        roads, travel, rows, i, link, distance, wait_m, True, gives_way, phase, scratch
+    )
     if hold != HOLD_NONE:
         return hold
     if _exit_blocked(roads, travel, rows[i], link, way, scratch):
