@@ -1,4 +1,4 @@
-"""Equal roads: who waits for whom, and how a circle of vehicles that wait is broken."""
+"""Equal roads: circles of vehicles that wait for one another, and how they are broken."""
 
 from __future__ import annotations
 

@@ -274,6 +274,48 @@ def _comes(
 
 
 @kernel
+def _blocks_inside(
+    roads: RoadArrays,
+    row: np.void,
+    link: int,
+    distance: float,
+    limit: float,
+    conflict: np.void,
+    foe: np.void,
+    other: np.void,
+    to_clear: float,
+    steered: bool,
+    equal: bool,
+) -> int:
+    """`foe_blocks` of one on the junction, VEHICLE row `other`, that has `to_clear` m to go."""
+    target, half = roads.links[link], 0.5 * row["length"]
+    to_area = distance + conflict["enter_m"] - half
+    cleared = to_clear / max(foe["speed"], 0.1)
+    time_in = _earliest(to_area, row["speed"], limit, BRISK_ACCEL)
+    if stays_inside(other):
+        return HOLD_EXIT_BLOCKED
+    if equal and conflict["merging"]:
+        apart = distance + conflict["leave_m"] - half - to_clear
+        return HOLD_YIELD if apart < ROOM_M else HOLD_NONE  # in its lane there is no room yet
+    if _in_turn(target["state"]) and _goes_on(row, link) and to_area > ROOM_M:
+        return HOLD_NONE  # it lost its turn if it stood once more, and can wait before the area
+    top = roads.lanes[roads.links[conflict["foe"]]["next_lane"]]["speed_mps"]
+    if foe["speed"] > STANDING_MPS:  # one that has just set off does not stay so slow
+        cleared = _earliest(to_clear, foe["speed"], top, GENTLE_ACCEL)
+    if steered:
+        time_in -= 0.5 * GAP_S
+    stands = row["speed"] <= STANDING_MPS and not _goes_on(row, link) and not equal
+    if stands and target["state"] != STATE_ALLWAY_STOP:
+        time_in = min(SET_OFF_S, time_in)
+    elif stands and not steered:
+        free = (to_area - LINE_MARGIN_M) * UNBRAKED_SHARE
+        time_in = _earliest(free, row["speed"], limit, BRISK_ACCEL)
+        if other["accel"] > SPEEDING_UP_MPS2:
+            cleared = _earliest(to_clear, foe["speed"], top, other["accel"])
+    return HOLD_YIELD if cleared > time_in else HOLD_NONE
+
+
+@kernel
 def foe_blocks(
     roads: RoadArrays,
     rows: NDArray[np.void],
@@ -309,30 +351,10 @@ def foe_blocks(
     apart = distance + conflict["leave_m"] - half - to_clear
     if _is_harmless(roads, rows, row, link, conflict, foe, front, apart, gives_way, phase, equal):
         return HOLD_NONE
-    cleared = to_clear / max(foe["speed"], 0.1)
-    time_in = _earliest(distance + conflict["enter_m"] - half, row["speed"], limit, BRISK_ACCEL)
     if front <= 0.0:
-        if stays_inside(other):
-            return HOLD_EXIT_BLOCKED
-        if equal and conflict["merging"]:
-            return HOLD_YIELD if apart < ROOM_M else HOLD_NONE  # in its lane there is no room yet
-        to_area = distance + conflict["enter_m"] - half
-        if _in_turn(target["state"]) and _goes_on(row, link) and to_area > ROOM_M:
-            return HOLD_NONE  # it lost its turn if it stood once more, and can wait before the area
-        top = roads.lanes[foe_link["next_lane"]]["speed_mps"]
-        if foe["speed"] > STANDING_MPS:  # one that has just set off does not stay so slow
-            cleared = _earliest(to_clear, foe["speed"], top, GENTLE_ACCEL)
-        if steered:
-            time_in -= 0.5 * GAP_S
-        stands = row["speed"] <= STANDING_MPS and not _goes_on(row, link) and not equal
-        if stands and target["state"] != STATE_ALLWAY_STOP:
-            time_in = min(SET_OFF_S, time_in)
-        elif stands and not steered:
-            free = (to_area - LINE_MARGIN_M) * UNBRAKED_SHARE
-            time_in = _earliest(free, row["speed"], limit, BRISK_ACCEL)
-            if other["accel"] > SPEEDING_UP_MPS2:
-                cleared = _earliest(to_clear, foe["speed"], top, other["accel"])
-        return HOLD_YIELD if cleared > time_in else HOLD_NONE
+        return _blocks_inside(
+            roads, row, link, distance, limit, conflict, foe, other, to_clear, steered, equal
+        )
     # A foe before its line, and the vehicle itself, are given the whole way over the junction.
     over = target["length_m"]
     if conflict["enter_m"] < target["wait_m"]:
