@@ -35,6 +35,7 @@ from cavmarl.driving.kernels.circles import breaks_circles, lets_go
 from cavmarl.driving.kernels.following import LINE_MARGIN_M, before_line, behind, no_constraint
 from cavmarl.driving.kernels.gaps import (
     ROOM_M,
+    STOOD_S,
     STOP_SIGN_S,
     foe_blocks,
     link_signal,
@@ -183,7 +184,7 @@ def may_enter(
     target = roads.links[link]
     if target["num_conflicts"] == 0:
         return HOLD_NONE
-    stands = row["driver"] != DRIVER_AGENT and row["wait_s"] > 0.0 and front < STOP_LINE_M
+    stands = row["driver"] != DRIVER_AGENT and row["wait_s"] >= STOOD_S and front < STOP_LINE_M
     if must_stop(roads, link, signal) and row["stopped_at"] != link and not stands:
         return HOLD_YIELD
     circles = breaks_circles(roads, travel, row, link)
