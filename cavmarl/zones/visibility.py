@@ -9,7 +9,8 @@ import numpy as np
 from cavmarl.core.huge_pages import huge_copy
 from cavmarl.core.records.arrays import Travel
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.zones.kernels.visibility_tests import AT_LINE_M, farthest_m, find_looks, make_scratch
+from cavmarl.zones.kernels.visibility_scratch import make_scratch
+from cavmarl.zones.kernels.visibility_tests import AT_LINE_M, farthest_m, find_looks
 from cavmarl.zones.kernels.zone_lookup import LOOK, Halo
 from cavmarl.zones.partition.zone_halo import inner_parts, lane_watchers, zone_halo
 from cavmarl.zones.partition.zone_partition import ZonePartition

@@ -15,7 +15,8 @@ from cavmarl.driving.kernels.motion import LATERAL_MPS, MAX_SPEED_MPS
 from cavmarl.engine.world_setup import find_map
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.zones.kernels.visibility_tests import farthest_m, find_looks, make_scratch
+from cavmarl.zones.kernels.visibility_scratch import make_scratch
+from cavmarl.zones.kernels.visibility_tests import farthest_m, find_looks
 from cavmarl.zones.kernels.zone_lookup import LOOK
 from cavmarl.zones.partition.zone_layouts import cut_map
 from cavmarl.zones.reach import (

@@ -15,12 +15,12 @@ from cavmarl.engine.world_setup import find_map
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network
+from cavmarl.zones.kernels.visibility_scratch import make_scratch
 from cavmarl.zones.kernels.visibility_tests import (
     ASIDE_M,
     ROUNDING_M,
     farthest_m,
     find_looks,
-    make_scratch,
 )
 from cavmarl.zones.kernels.zone_lookup import LOOK
 from tests.naive.looks import STEP_M, Looks

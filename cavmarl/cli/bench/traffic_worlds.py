@@ -29,13 +29,13 @@ def compare_worlds(
 ) -> None:
     """Run the worlds that have no row yet; print what all rows come to, and the worst."""
     from cavmarl.evaluate.traffic.world_rows import (
-        BY_DESIGN,
         by_feature,
         comparable,
         summary,
         worst,
     )
     from cavmarl.evaluate.traffic.world_runs import KEPT, WorldSeries, run_worlds
+    from cavmarl.maps.map_features import MAP_FEATURES
 
     job = WorldSeries(out, worlds, first_seed, seconds, dt, without, maps)
     console = Console()
@@ -44,7 +44,7 @@ def compare_worlds(
     found, parts = summary(rows), by_feature(rows)
     sound = comparable(rows)
     console.print(_shares(found))
-    console.print(_shares(summary(sound), f", without {', '.join(sorted(BY_DESIGN))}"))
+    console.print(_shares(summary(sound), f", without {', '.join(sorted(MAP_FEATURES))}"))
     console.print(_features(parts))
     console.print(_worst(worst(rows, KEPT), out))
     found_sound = summary(sound)

@@ -14,9 +14,6 @@ from cavmarl.maps.map_features import MAP_FEATURES
 
 Row = dict[str, Any]  # a line of worlds.jsonl
 
-# Features of worlds in which ours differs by design, see docs/realism.md.
-BY_DESIGN = MAP_FEATURES | {"priority_stop"}
-
 # How far ours may be from SUMO's mean, as a share of it; delay also by seconds.
 SPEED_SHARE, COUNT_SHARE, DELAY_SHARE, DELAY_S = 0.15, 0.05, 0.25, 3.0
 LOCK_S = 120.0
@@ -149,8 +146,8 @@ def by_feature(rows: Sequence[Row]) -> dict[str, Row]:
 
 
 def comparable(rows: Sequence[Row]) -> list[Row]:
-    """The worlds in which ours is meant to be as SUMO: none has a feature of `BY_DESIGN`."""
-    return [row for row in rows if BY_DESIGN.isdisjoint(row["features"])]
+    """The worlds in which ours is meant to be as SUMO: none has one of `MAP_FEATURES`."""
+    return [row for row in rows if MAP_FEATURES.isdisjoint(row["features"])]
 
 
 def _known(values: Sequence[float | None]) -> list[float]:

@@ -127,9 +127,7 @@ def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
         [_path(move, lane_row, lanes, points, APPROACH_M) for move in movements],
         ways,
     )
-    links["first_conflict"] = first_conflict[:-1]
-    links["num_conflicts"] = np.diff(first_conflict)
-    _fill_merges(lanes, links, conflicts)
+    _fill_conflicts(lanes, links, conflicts, first_conflict)
     sweeps = _fill_sweeps(Movements(links, conflicts, ways))
     junctions, kinds = _junction_rows(nodes, links)
     junctions["unruled"][links["junction"][unruled]] = True
@@ -313,13 +311,15 @@ def _link_rows(
     return links
 
 
-def _fill_merges(
-    lanes: NDArray[np.void], links: NDArray[np.void], conflicts: NDArray[np.void]
+def _fill_conflicts(
+    lanes: NDArray[np.void],
+    links: NDArray[np.void],
+    conflicts: NDArray[np.void],
+    first_conflict: NDArray[np.int32],
 ) -> None:
-    """How far ahead vehicles are minded by those that give way to them and turn into their lane.
-
-    Not at signals, nor where they have to stand first.
-    """
+    """The conflicts of each link; where those that need not stand first turn in, `merges_m`."""
+    links["first_conflict"] = first_conflict[:-1]
+    links["num_conflicts"] = np.diff(first_conflict)
     owner = np.repeat(np.arange(len(links)), links["num_conflicts"])
     asks = (links["signal"][owner] < 0) & conflicts["merging"] & conflicts["must_yield"]
     asks &= links["state"][conflicts["foe"]] != ord("w")
