@@ -212,17 +212,20 @@ def stays_inside(foe: np.void) -> bool:
 
 @inlined_kernel
 def _comes_to_steered(
-    row: np.void, conflict: np.void, foe: np.void, leaves_mps: float, time_out: float
+    row: np.void, conflict: np.void, foe: np.void, front: float, leaves_mps: float, time_out: float
 ) -> bool:
-    """Whether, with one of both in an agent's seat, an APPROACH comes before a row is out."""
+    """Whether, with one of both in an agent's seat, an APPROACH comes before a row is out.
+
+    Its `front` has so many m to where it can still stop.
+    """
     # One that has waited for long counts on the foe to brake. A stream that crawls bumper to bumper
     # lets it in.
     patience = min(row["wait_s"] / IMPATIENCE_S, 1.0)
-    to_line = foe["dist"] - foe["half"]
     if conflict["merging"] and STANDING_MPS < foe["speed"] < CRAWL_MPS:
-        if foe["speed"] * foe["speed"] < 2.0 * FORCED_STOP * patience * to_line:
+        if foe["speed"] * foe["speed"] < 2.0 * FORCED_STOP * patience * front:
             return False
-    arrives = to_line / max(foe["speed"], STANDING_MPS) * (1.0 + patience)
+    arrives = (foe["dist"] - foe["half"]) / max(foe["speed"], STANDING_MPS)
+    arrives *= 1.0 + patience
     ahead_s = STEERED_MERGE_AHEAD_S if conflict["merging"] else STEERED_AHEAD_S
     faster_mps = foe["speed"] - leaves_mps
     if conflict["merging"] and row["driver"] == DRIVER_AGENT and faster_mps > 0.0:
@@ -304,14 +307,14 @@ def _blocks_inside(
         cleared = _earliest(to_clear, foe["speed"], top, GENTLE_ACCEL)
     if steered:
         time_in -= 0.5 * GAP_S
-    stands = row["speed"] <= STANDING_MPS and not _goes_on(row, link) and not equal
-    if stands and target["state"] != STATE_ALLWAY_STOP:
-        time_in = min(SET_OFF_S, time_in)
-    elif stands and not steered:
-        free = (to_area - LINE_MARGIN_M) * UNBRAKED_SHARE
-        time_in = _earliest(free, row["speed"], limit, BRISK_ACCEL)
-        if other["accel"] > SPEEDING_UP_MPS2:
-            cleared = _earliest(to_clear, foe["speed"], top, other["accel"])
+    elif row["speed"] <= STANDING_MPS and not equal and not _goes_on(row, link):
+        if target["state"] != STATE_ALLWAY_STOP:
+            time_in = min(SET_OFF_S, time_in)
+        else:
+            free = (to_area - LINE_MARGIN_M) * UNBRAKED_SHARE
+            time_in = _earliest(free, row["speed"], limit, BRISK_ACCEL)
+            if other["accel"] > SPEEDING_UP_MPS2:
+                cleared = _earliest(to_clear, foe["speed"], top, other["accel"])
     return HOLD_YIELD if cleared > time_in else HOLD_NONE
 
 
@@ -370,7 +373,7 @@ def foe_blocks(
     time_line = _earliest(distance - half, speed, limit, GENTLE_ACCEL)
     time_out = time_line + 2.0 * (over + row["length"]) / max(speed + leaves_mps, STANDING_MPS)
     if steered:
-        comes = _comes_to_steered(row, conflict, foe, leaves_mps, time_out)
+        comes = _comes_to_steered(row, conflict, foe, front, leaves_mps, time_out)
     else:
         # One that waits is as good as at its line: SUMO's stand there.
         time_in = _earliest(distance - half - LINE_MARGIN_M, speed, limit, GENTLE_ACCEL)

@@ -386,7 +386,10 @@ def _constraint_of(
     foe_front = foe["half"] - foe["dist"]
     foe_rear = -foe["half"] - foe["dist"]
     wait_m = roads.links[foe["link"]]["wait_m"]
-    stops = foe["speed"] < STANDING_MPS or rows[foe["row"]]["hold"] == HOLD_YIELD
+    other = rows[foe["row"]]
+    stops = foe["speed"] < STANDING_MPS
+    if row["driver"] != DRIVER_AGENT and other["driver"] != DRIVER_AGENT:
+        stops |= other["hold"] == HOLD_YIELD
     waits = (
         foe_front <= wait_m + WAIT_SLACK_M
         and conflict["foe_enter_m"] >= wait_m - LINE_MARGIN_M
