@@ -8,6 +8,7 @@ import pytest
 from cavmarl.driving.kernels.lane_choice import (
     MERGE_ROOM_M,
     SWAP_ROOM_M,
+    _rear_is_inside,
     room_for_more,
     wish_on_lane,
 )
@@ -54,3 +55,18 @@ def test_a_leader_beyond_the_view_is_none(view_m: float, minds: bool) -> None:
         first = int(room.lane_start[lane])
         wishes.append(wish_on_lane(roads.arrays, tables, rows[0], first, room))
     assert (wishes[1] < wishes[0]) == minds
+
+
+@pytest.mark.parametrize(("length_m", "waits"), [(4.0, False), (11.2, False), (13.2, True)])
+def test_one_changes_lanes_when_its_rear_is_out_of_the_junction(
+    length_m: float, waits: bool
+) -> None:
+    """Where a lane is so short that it waits to change with its rear inside, it changes there.
+
+    On a lane of 11 m of Town10HD a car waited 8 m before its end for 12 minutes.
+    """
+    lane, row = np.zeros(1, LANE)[0], blank_vehicle()[0]
+    lane["length_m"], row["length"], row["s"] = length_m, 5.0, 2.4
+    assert _rear_is_inside(lane, row) == waits
+    row["s"] = 2.6
+    assert not _rear_is_inside(lane, row)

@@ -209,10 +209,11 @@ def _change_is_safe(
 def _rear_is_inside(lane: np.void, row: np.void) -> bool:
     """Whether a vehicle's rear is still in the junction, where others turn into the lane beside it.
 
-    On lanes too short for the vehicle that does not count: it would never change.
+    On lanes so short that it is where a vehicle waits to change that does not count: it would never
+    change.
     """
     half = 0.5 * row["length"]
-    inside: bool = row["s"] < half and lane["length_m"] > 2.0 * row["length"]
+    inside: bool = row["s"] < half and lane["length_m"] > 2.0 * row["length"] + SWAP_ROOM_M
     return inside
 
 
