@@ -46,7 +46,7 @@ SET_OFF_S = 0.5  # one that stands sets off this long before another is out of i
 ROOM_M = 3.0  # free way left behind a vehicle that clears a junction
 IMPATIENCE_S = 180.0  # after which a vehicle that gives way counts on others to brake,
 FORCED_STOP = 4.5  # m/s², and how hard at most
-# of the way to a line, on which one that speeds up need not brake for it yet
+# Of the way to where one may have to stop, on which it speeds up and need not brake for that yet.
 UNBRAKED_SHARE = FORCED_STOP / (FORCED_STOP + BRISK_ACCEL)
 CRAWL_MPS = 5.0  # a stream that is slower lets others in
 STUCK_S = 90.0  # after which it passes others that stand and give way, too
@@ -310,7 +310,7 @@ def _blocks_inside(
     elif row["speed"] <= STANDING_MPS and not equal and not _goes_on(row, link):
         if target["state"] != STATE_ALLWAY_STOP:
             time_in = min(SET_OFF_S, time_in)
-        else:
+        else:  # in turn: it sets off so that it need not brake on its way
             free = (to_area - LINE_MARGIN_M) * UNBRAKED_SHARE
             time_in = _earliest(free, row["speed"], limit, BRISK_ACCEL)
             if other["accel"] > SPEEDING_UP_MPS2:
