@@ -86,7 +86,7 @@ def queue(crossing: Callable[[str], Path]) -> Callable[..., Queue]:
     [
         ("WSEN", AHEAD, True),
         ("WS", AHEAD, False),
-        ("WSE", AHEAD, False),  # the one from the east gives way to nobody
+        ("WSE", AHEAD, False),  # the one from the east gives way to none
         ("WE", LEFT, False),
         ("WSE", LEFT, True),  # from the east to the left, that is before the one from the west
     ],
@@ -112,7 +112,7 @@ def test_in_a_circle_one_lets_the_others_go_in_some_ticks_and_all_agree_when(
     "fields",
     [{"hold": HOLD_NONE}, {"speed": 1.0}, {"wait_s": 0.0}],
 )
-def test_one_that_does_not_wait_lets_nobody_go(
+def test_one_that_does_not_wait_lets_none_go(
     queue: Callable[..., Queue], fields: dict[str, Any]
 ) -> None:
     here = queue("WSEN", AHEAD, **fields)

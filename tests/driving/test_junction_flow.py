@@ -1,4 +1,4 @@
-"""Nobody loses time at a junction: who waits sets off in time, and who goes on does not brake."""
+"""Vehicles lose no time at a junction: one that waits sets off in time, others do not brake."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def scene(crossing: Callable[[str], Path]) -> Make:
 
 
 @pytest.mark.parametrize(("speed", "left_m", "straight_m"), [(0.0, 1.0, 3.0), (8.0, 10.0, 20.0)])
-def test_nobody_brakes_for_a_left_turn_that_goes_to_its_place_inside(
+def test_no_car_brakes_for_a_left_turn_that_goes_to_its_place_inside(
     scene: Make, speed: float, left_m: float, straight_m: float
 ) -> None:
     here = scene("traffic_light")
@@ -46,7 +46,7 @@ def test_nobody_brakes_for_a_left_turn_that_goes_to_its_place_inside(
     assert hardest > -0.5
 
 
-def test_at_an_all_way_stop_nobody_sets_off_too_early_and_brakes_inside(scene: Make) -> None:
+def test_at_an_all_way_stop_no_car_sets_off_too_early_and_brakes_inside(scene: Make) -> None:
     here = scene("allway_stop")
     ways = {"W": "N", "S": "W", "E": "S", "N": "E"}  # left turns, each across the next
     for k, (arm, goal) in enumerate(ways.items()):

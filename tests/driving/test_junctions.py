@@ -128,7 +128,7 @@ def test_a_stop_sign_makes_one_stand_even_if_nobody_comes(scene: Make) -> None:
         if lane == "S_in_0":
             slowest = min(slowest, float(here["side"]["speed"]))
             stood = max(stood, float(here["side"]["wait_s"]))
-    assert slowest < 0.1
+    assert slowest < 0.1, "it stands, as SUMO counts it"
     assert stood >= 0.1
     assert here.simulation.network.lane_ids[here["side"]["lane"]] != "S_in_0", "then it goes on"
 

@@ -42,6 +42,23 @@ def test_a_border_through_or_beside_a_junction_that_is_blocked_changes_nothing(
     assert {name for name, row in vehicles.items() if lanes[row["lane"]] == "W_out_0"} == {"east"}
 
 
+@pytest.mark.parametrize("corner_m", [(0.0, 0.0), (1.6, -1.6), (-9.0, 9.0), (20.0, 14.0)])
+def test_a_border_through_a_circle_of_vehicles_that_wait_on_equal_roads_changes_nothing(
+    tmp_path: Path, corner_m: tuple[float, float]
+) -> None:
+    """Each gives way to the one on its right; which of them lets the others go is by chance."""
+    here = DividedScene(build_crossing(tmp_path, "right_before_left"), tmp_path, corner_m, ("car",))
+    for arm, goal in {"W": "E", "S": "N", "E": "W", "N": "S"}.items():
+        here.put(arm, f"{arm}_in_0 {goal}_out_0", -0.2, wait_s=1.0, hold=HOLD_YIELD)
+    here.begin()
+    order: list[str] = []
+    lanes = here.whole.network.lane_ids
+    for vehicles in here.run(11.0):
+        gone = {name for name, row in vehicles.items() if not lanes[row["lane"]].endswith("in_0")}
+        order += sorted(gone - set(order))
+    assert set(order[:4]) == set("WSEN")
+
+
 def test_no_driver_waits_for_one_that_cannot_come_which_its_zone_does_not_see(
     tmp_path: Path,
 ) -> None:

@@ -40,7 +40,7 @@ def asked_at_random(
     looks = blank_looks((partition.count, len(roads.lanes)))
     length = roads.lanes["length_m"]
     for field in LOOK.names or ():
-        nothing = -np.inf if field == "head" else np.inf
+        nothing = {"head": -np.inf, "merges": 0.0}.get(field, np.inf)
         place = rng.uniform(0.0, 1.0, looks.shape) * length
         looks[field] = np.where(rng.random(looks.shape) < 0.2, place, nothing)
     start, watchers = lane_watchers(partition, roads.lanes, looks, SURE_M + ASIDE_M)
