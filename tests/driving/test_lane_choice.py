@@ -58,15 +58,12 @@ def test_a_leader_beyond_the_view_is_none(view_m: float, minds: bool) -> None:
 
 
 @pytest.mark.parametrize(
-    ("length_m", "waits"), [(4.0, False), (11.2, False), (15.9, False), (16.1, True)]
+    ("length_m", "waits"), [(4.0, False), (11.2, False), (12.9, False), (13.1, True)]
 )
 def test_one_changes_lanes_when_its_rear_is_out_of_the_junction(
     length_m: float, waits: bool
 ) -> None:
-    """Where a lane is so short that it waits to change with its rear inside, it changes there.
-
-    It waits 11 m before the end: two cars' lengths less half of one, 2 m, 3 m, and 1 m before that.
-    """
+    """Where two cars do not fit behind one another it changes where it waits."""
     lane, row = np.zeros(1, LANE)[0], blank_vehicle()[0]
     lane["length_m"], row["length"], row["s"] = length_m, 5.0, 2.4
     assert _rear_is_inside(lane, row) == waits

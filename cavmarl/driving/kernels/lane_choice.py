@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
 from cavmarl.core.records.codes import DRIVER_AGENT
-from cavmarl.driving.kernels.following import LINE_MARGIN_M, accel_behind, no_constraint, wish
+from cavmarl.driving.kernels.following import accel_behind, no_constraint, wish
 from cavmarl.driving.kernels.lane_change import (
     LANE_CHANGE_DELAY_S,
     MAX_BRAKING_IMPOSED,
@@ -209,12 +209,11 @@ def _change_is_safe(
 def _rear_is_inside(lane: np.void, row: np.void) -> bool:
     """Whether a vehicle's rear is still in the junction, where others turn into the lane beside it.
 
-    On lanes so short that the rear is there where a vehicle waits to change to the left
-    (`lane_ends.lane_end`) that does not count: it would never change.
+    On lanes so short that two do not fit behind one another, with room to swap, that does not
+    count: a vehicle waits to change with its rear inside, and would never change.
     """
     half = 0.5 * row["length"]
-    waits = lane["length_m"] - half - row["length"] - MERGE_ROOM_M - SWAP_ROOM_M - LINE_MARGIN_M
-    inside: bool = row["s"] < half <= waits
+    inside: bool = row["s"] < half and lane["length_m"] > 2.0 * row["length"] + SWAP_ROOM_M
     return inside
 
 
