@@ -309,7 +309,7 @@ def _road_ahead(
             if gap < NEAR_M and _is_askew(row, rows[leader["row"]]):
                 gap -= 0.5 * rows[leader["row"]]["width"]
             constraint = max(constraint, behind_entry(kind, speed, gap, leader))
-        elif stops and steered:
+        elif stops:
             over = behind_over_line(roads, travel, row, kind, lane, way, distance, scratch)
             constraint = max(constraint, over)
         if steered:
