@@ -11,11 +11,11 @@ from cavmarl.core.records.arrays import Scratch
 from cavmarl.driving.kernels.lane_index import (
     VIEW_M,
     ahead_on,
+    behind_by,
     behind_on,
     beside_s,
     index_lanes,
     last_on,
-    neighbor_behind,
 )
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.roads.network import RoadNetwork
@@ -63,6 +63,21 @@ def test_the_index_lists_everybody_on_every_lane_he_covers(
             assert copied == (row["speed"], 0.5 * row["length"], decel)
 
 
+def nearest_behind(
+    roads: RoadNetwork,
+    room: Scratch,
+    lane: int,
+    s: float,
+    own_id: int,
+    reach_m: float,
+    view_m: float,
+) -> tuple[int, float]:
+    """The nearest of all followers; at equal distances the one with the smallest id."""
+    asked = range(max(1, int(roads.lanes[lane]["num_into"])))
+    found = [behind_by(roads.arrays, room, lane, s, own_id, n, reach_m, view_m) for n in asked]
+    return min(found, key=lambda one: (one[1], room.entries[one[0]]["id"]))
+
+
 def seen(room: Scratch, k: int) -> tuple[int, float]:
     """Row and place of an entry, as the twin answers."""
     return (int(room.entries[k]["row"]), float(room.entries[k]["s"])) if k >= 0 else (-1, np.inf)
@@ -78,7 +93,7 @@ def test_neighbours_equal_twin(case: tuple[str, NDArray[np.void]], reach_m: floa
         assert seen(room, ahead_on(room, lane, s, own_id, VIEW_M)) == naive.ahead(
             roads, rows, i, lane, s
         )
-        found, distance = neighbor_behind(roads.arrays, room, lane, s, own_id, reach_m, VIEW_M)
+        found, distance = nearest_behind(roads, room, lane, s, own_id, reach_m, VIEW_M)
         expected, true_distance = naive.behind(roads, rows, i, lane, s, reach_m)
         assert seen(room, found)[0] == expected
         assert distance == pytest.approx(true_distance)
@@ -110,8 +125,7 @@ def test_the_order_of_rows_does_not_matter(
         own_id = rows[i]["id"]
         assert ahead_on(tidy, lane, s, own_id, VIEW_M) == ahead_on(room, lane, s, own_id, VIEW_M)
         one, other = (
-            neighbor_behind(roads.arrays, index, lane, s, own_id, 60.0, VIEW_M)
-            for index in (tidy, room)
+            nearest_behind(roads, index, lane, s, own_id, 60.0, VIEW_M) for index in (tidy, room)
         )
         assert one == other
 
@@ -126,7 +140,7 @@ def test_nobody_sees_further_than_the_view() -> None:
         rows["s"] = [0.0, apart]
         room = indexed("ring", rows)
         assert (ahead_on(room, lane, 0.0, 0, view_m) >= 0) == sees
-        behind, _ = neighbor_behind(roads.arrays, room, lane, apart, 1, 60.0, view_m)
+        behind, _ = nearest_behind(roads, room, lane, apart, 1, 60.0, view_m)
         assert (behind >= 0) == sees
         rows["s"] = [apart - 15.0, 50.0]
         room = indexed("ring", rows)
@@ -140,7 +154,7 @@ def test_of_two_at_one_place_the_larger_id_leads() -> None:
     room = indexed("ring", rows)
     assert seen(room, ahead_on(room, 0, 10.0, 3, VIEW_M)) == (0, 10.0)
     assert ahead_on(room, 0, 10.0, 7, VIEW_M) == -1
-    k, distance = neighbor_behind(roads.arrays, room, 0, 10.0, 7, 60.0, VIEW_M)
+    k, distance = nearest_behind(roads, room, 0, 10.0, 7, 60.0, VIEW_M)
     assert (seen(room, k)[0], distance) == (1, 0.0)
 
 
@@ -159,7 +173,7 @@ def test_who_stands_far_behind_a_border_is_passed_over() -> None:
     ):
         rows["s"], rows["speed"] = length + 1.0 - np.array(apart), speeds
         room = indexed("grid4x4", rows)
-        k, gap = neighbor_behind(roads.arrays, room, lane, 1.0, 9, 60.0, VIEW_M)
+        k, gap = nearest_behind(roads, room, lane, 1.0, 9, 60.0, VIEW_M)
         assert seen(room, k)[0] == expected
         assert gap == (pytest.approx(apart[expected]) if expected >= 0 else np.inf)
 

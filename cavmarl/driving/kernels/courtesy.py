@@ -9,7 +9,7 @@ from cavmarl.core.numba import kernel
 from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
 from cavmarl.driving.kernels.following import accel_behind
 from cavmarl.driving.kernels.lane_choice import LOOK_BACK_M, SIDE_GAP_M
-from cavmarl.driving.kernels.lane_index import behind_on, beside_s, comes_over
+from cavmarl.driving.kernels.lane_index import behind_by, beside_s
 
 COURTESY_DECEL = 3.0  # m/s², the hardest braking to let a vehicle merge, or to fall in behind
 
@@ -27,15 +27,8 @@ def let_merge(
     if target < 0:
         return
     s = beside_s(roads, row["lane"], target, row["s"])
-    k = behind_on(scratch, target, s, row["id"])
-    if k >= 0:
-        _soften(roads, travel, rows, row, target, k, s - scratch.entries[k]["s"], scratch)
-        return
-    first = roads.lanes[target]["first_into"]
-    for n in range(first, first + roads.lanes[target]["num_into"]):
-        k, apart = comes_over(
-            roads, scratch, roads.into[n], s, row["id"], LOOK_BACK_M, travel.view_m
-        )
+    for n in range(max(1, roads.lanes[target]["num_into"])):
+        k, apart = behind_by(roads, scratch, target, s, row["id"], n, LOOK_BACK_M, travel.view_m)
         if k >= 0:
             _soften(roads, travel, rows, row, target, k, apart, scratch)
 

@@ -54,7 +54,7 @@ from cavmarl.driving.kernels.lane_choice import (
     thinks_of_lanes,
     wish_on_lane,
 )
-from cavmarl.driving.kernels.lane_ends import behind_over_line, lane_end, misses_change
+from cavmarl.driving.kernels.lane_ends import behind_over_line, lane_end, misses_change, over_end
 from cavmarl.driving.kernels.lane_index import VIEW_M, last_on
 from cavmarl.driving.kernels.stopping import way_to_stop
 from cavmarl.driving.kernels.swept_areas import (
@@ -183,33 +183,6 @@ def _at_line(
 
 
 @inlined_kernel
-def _over_end(
-    roads: RoadArrays,
-    rows: NDArray[np.void],
-    i: int,
-    kind: np.void,
-    lane: int,
-    distance: float,
-    is_near: bool,
-    dt: float,
-    scratch: Scratch,
-) -> float:
-    """Constraint of row i by bodies over the end of a lane, `distance` m ahead, that it stops at.
-
-    Wherever it goes from there, a vehicle that has left the lane by any link may still have its
-    rear over the end, and others, which a background driver minds where that `is_near`, turn over
-    it.
-    """
-    row = rows[i]
-    constraint = behind_fork(roads, kind, row, lane, -1, distance, scratch)
-    if is_near and row["driver"] != DRIVER_AGENT and roads.lanes[lane]["num_links"] > 0:
-        first, front = roads.lanes[lane]["first_link"], distance - 0.5 * row["length"]
-        swept = before_swept(roads, rows, i, kind, first, front, HOLD_NONE, dt, scratch)
-        constraint = max(constraint, swept)
-    return constraint
-
-
-@inlined_kernel
 def _road_ahead(
     roads: RoadArrays,
     travel: Travel,
@@ -281,7 +254,7 @@ def _road_ahead(
             lane, way, link = next_step(roads, travel, before, way)
         if lane < 0 or (steered and misses_change(roads, travel, before, before_way)):
             end = lane_end(roads, travel, row, kind, before, before_way, distance, merge_room_m, dt)
-            over = _over_end(roads, rows, i, kind, before, distance, distance < see, dt, scratch)
+            over = over_end(roads, rows, i, kind, before, distance, distance < see, dt, scratch)
             constraint = max(constraint, end, over)
             break
         stops = False

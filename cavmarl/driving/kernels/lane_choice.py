@@ -21,7 +21,7 @@ from cavmarl.driving.kernels.lane_change import (
     MIN_ACCEL_GAIN,
     mobil_accepts,
 )
-from cavmarl.driving.kernels.lane_index import ahead_on, beside_s, last_on, neighbor_behind
+from cavmarl.driving.kernels.lane_index import ahead_on, behind_by, beside_s, last_on
 from cavmarl.driving.kernels.stopping import STAY, lane_to_stop
 from cavmarl.driving.kernels.ways import next_step
 
@@ -137,6 +137,42 @@ def _next_beyond(
 
 
 @kernel
+def _asked_of_followers(
+    roads: RoadArrays,
+    travel: Travel,
+    rows: NDArray[np.void],
+    row: np.void,
+    target: int,
+    s: float,
+    scratch: Scratch,
+) -> float:
+    """The least acceleration in m/s² that a change to place `s` of `target` asks of a follower.
+
+    -inf where one is beside that place. A far one that is fast may have to brake harder than a near
+    one that stands: every lane that leads there is asked.
+    """
+    kind = travel.types[row["vtype"]]
+    half = 0.5 * row["length"]
+    least = 0.0
+    for n in range(max(1, roads.lanes[target]["num_into"])):
+        k, gap = behind_by(roads, scratch, target, s, row["id"], n, LOOK_BACK_M, travel.view_m)
+        if k < 0:
+            continue
+        follower = scratch.entries[k]
+        if gap < half + follower["half"] + SIDE_GAP_M:
+            return -math.inf
+        other = rows[follower["row"]]
+        theirs = travel.types[other["vtype"]]
+        pace = follower["speed"]
+        limit = _desired(roads, theirs, other, target)
+        net = gap - follower["half"] - half
+        asked = accel_behind(theirs, pace, limit, net, row["speed"], kind["decel"])
+        # A standing or creeping vehicle cannot brake for long, whatever the model answers.
+        least = min(least, max(asked, -pace / BRAKE_TIME_S))
+    return least
+
+
+@kernel
 def _change_is_safe(
     roads: RoadArrays,
     travel: Travel,
@@ -174,35 +210,13 @@ def _change_is_safe(
         if net < (kind["min_gap"] if turns else SIDE_GAP_M):
             return False
         after = accel_behind(kind, speed, desired, net, leader["speed"], leader["decel"])
-    follower_before = 0.0
-    follower_after = 0.0
-    k, gap = neighbor_behind(roads, scratch, target, s, row["id"], LOOK_BACK_M, travel.view_m)
-    if k >= 0:
-        follower = scratch.entries[k]
-        other = rows[follower["row"]]
-        if gap < half + follower["half"] + SIDE_GAP_M:
-            return False
-        theirs = travel.types[other["vtype"]]
-        pace = follower["speed"]
-        limit = _desired(roads, theirs, other, target)
-        follower_before = wish(theirs, pace, limit, no_constraint(theirs))
-        if j >= 0:
-            leader = scratch.entries[j]
-            net = gap + ahead - follower["half"] - leader["half"]
-            follower_before = accel_behind(
-                theirs, pace, limit, net, leader["speed"], leader["decel"]
-            )
-        net = gap - follower["half"] - half
-        follower_after = accel_behind(theirs, pace, limit, net, speed, kind["decel"])
-        # A standing or creeping vehicle cannot brake for long, whatever the model answers.
-        follower_after = max(follower_after, -pace / BRAKE_TIME_S)
+    followers = _asked_of_followers(roads, travel, rows, row, target, s, scratch)
     after = max(after, -speed / BRAKE_TIME_S)
     if after < -MAX_BRAKING_ACCEPTED:
         return False
     most = MAX_BRAKING_NEEDED if mandatory else MAX_BRAKING_IMPOSED
-    return mobil_accepts(
-        own_wish, after, follower_before, follower_after, 0.0, 0.0, mandatory, most
-    )
+    # What followers gain or lose has no weight (POLITENESS), so what they do now is not asked.
+    return mobil_accepts(own_wish, after, 0.0, followers, 0.0, 0.0, mandatory, most)
 
 
 @inlined_kernel

@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
-from cavmarl.core.numba import kernel
+from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
+from cavmarl.core.records.codes import DRIVER_AGENT, HOLD_NONE
 from cavmarl.driving.kernels.beside import behind_entry
-from cavmarl.driving.kernels.following import LINE_MARGIN_M, before_line, no_constraint
+from cavmarl.driving.kernels.following import LINE_MARGIN_M, before_line, behind, no_constraint
 from cavmarl.driving.kernels.lane_choice import MERGE_ROOM_SHARE, SWAP_ROOM_M
 from cavmarl.driving.kernels.lane_index import last_on
+from cavmarl.driving.kernels.swept_areas import VAN_M, before_swept, behind_fork
 from cavmarl.driving.kernels.ways import next_step
 
 LONGEST_HALF_M = 10.0  # of vehicles: a rear over a line belongs to a centre that is no further
@@ -41,6 +44,33 @@ def lane_end(
         room += row["length"] + SWAP_ROOM_M
     place = max(length - half - room, min(2.0 * LINE_MARGIN_M, 0.5 * length))
     return before_line(kind, row["speed"], distance - length + place, dt)
+
+
+@kernel
+def _behind_turning(
+    roads: RoadArrays, kind: np.void, row: np.void, lane: int, distance: float, scratch: Scratch
+) -> float:
+    """The constraint of long vehicles that turn off from beside a lane that leads nowhere.
+
+    `distance`: of the row's centre to the end of that lane, in m. Their rears swing out over
+    it, and without a link it has no swept areas.
+    """
+    constraint = no_constraint(kind)
+    for beside in (roads.lanes[lane]["left"], roads.lanes[lane]["right"]):
+        if beside < 0:
+            continue
+        first = roads.lanes[beside]["first_link"]
+        for link in range(first, first + roads.lanes[beside]["num_links"]):
+            for k in range(scratch.link_start[link], scratch.link_end[link]):
+                other = scratch.approach[k]
+                rear = -other["dist"] - other["half"]
+                gap = distance - 0.5 * row["length"] + rear
+                if 2.0 * other["half"] <= VAN_M or gap < 0.0 or rear > 0.0:
+                    continue
+                if other["half"] > other["dist"]:
+                    found = behind(kind, row["speed"], gap, other["speed"], kind["decel"])
+                    constraint = max(constraint, found)
+    return constraint
 
 
 @kernel
@@ -85,3 +115,32 @@ def behind_over_line(
                 return behind_entry(kind, row["speed"], rear - 0.5 * row["length"], leader)
             break
     return no_constraint(kind)
+
+
+@inlined_kernel
+def over_end(
+    roads: RoadArrays,
+    rows: NDArray[np.void],
+    i: int,
+    kind: np.void,
+    lane: int,
+    distance: float,
+    is_near: bool,
+    dt: float,
+    scratch: Scratch,
+) -> float:
+    """Constraint of row i by bodies over the end of a lane, `distance` m ahead, that it stops at.
+
+    Wherever it goes from there, a vehicle that has left the lane by any link may still have its
+    rear over the end, and others, which a background driver minds where that `is_near`, turn over
+    it.
+    """
+    row = rows[i]
+    constraint = behind_fork(roads, kind, row, lane, -1, distance, scratch)
+    if not is_near or row["driver"] == DRIVER_AGENT:
+        return constraint
+    if roads.lanes[lane]["num_links"] == 0:
+        return max(constraint, _behind_turning(roads, kind, row, lane, distance, scratch))
+    first, front = roads.lanes[lane]["first_link"], distance - 0.5 * row["length"]
+    swept = before_swept(roads, rows, i, kind, first, front, HOLD_NONE, dt, scratch)
+    return max(constraint, swept)

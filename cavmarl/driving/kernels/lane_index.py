@@ -237,7 +237,7 @@ def comes_over(
 ) -> tuple[int, float]:
     """The nearest vehicle that comes from lane `before` to a place `s` m behind its end.
 
-    Answers as `neighbor_behind`. A vehicle that stands or creeps far from here does not announce
+    Answers as `behind_by`. A vehicle that stands or creeps far from here does not announce
     itself, and is passed over.
     """
     distance = s
@@ -262,32 +262,28 @@ def comes_over(
 
 
 @kernel
-def neighbor_behind(
+def behind_by(
     roads: RoadArrays,
     scratch: Scratch,
     lane: int,
     s: float,
     own_id: int,
+    n: int,  # of the lanes that lead to `lane`; 0 where none does
     reach_m: float,
     view_m: float,
 ) -> tuple[int, float]:
     """The nearest vehicle behind place `s` of `lane`: (position in the index, distance in m).
 
-    Looks back over lane borders that are up to `reach_m` away, along every lane that leads here,
-    for those that announce themselves (`announced_m`); of several the nearest counts, at equal
-    distances the smallest id. (-1, inf) where there is none within `view_m`.
+    Where the lane is free behind that place, it looks back along the n-th lane that leads there,
+    over lane borders that are up to `reach_m` away, for one that announces itself (`announced_m`).
+    One that is on the lane itself is the answer for n = 0 alone, so that all n together give every
+    follower once. (-1, inf) where there is none within `view_m`.
     """
-    best = behind_on(scratch, lane, s, own_id)
-    if best >= 0:
-        apart = s - scratch.entries[best]["s"]
-        return (best, apart) if apart <= view_m else (-1, math.inf)
-    best_distance = math.inf
+    k = behind_on(scratch, lane, s, own_id)
+    if k >= 0:
+        apart = s - scratch.entries[k]["s"]
+        return (k, apart) if n == 0 and apart <= view_m else (-1, math.inf)
     row = roads.lanes[lane]
-    for k in range(row["first_into"], row["first_into"] + row["num_into"]):
-        other, gap = comes_over(roads, scratch, roads.into[k], s, own_id, reach_m, view_m)
-        if other < 0 or gap > best_distance:
-            continue
-        if gap < best_distance or scratch.entries[other]["id"] < scratch.entries[best]["id"]:
-            best = other
-            best_distance = gap
-    return best, best_distance
+    if n >= row["num_into"]:
+        return -1, math.inf
+    return comes_over(roads, scratch, roads.into[row["first_into"] + n], s, own_id, reach_m, view_m)
