@@ -23,6 +23,7 @@ VAN_M, BUS_M = SIZE_LENGTHS_M
 CAR_BODY_M, VAN_BODY_M, BUS_BODY_M = SIZE_BODIES_M
 EASY_STOP = 2.0  # m/s², of one that needs more to stop before the area it is said that it comes;
 HARD_STOP = 3.5  # one that needs more goes first
+MIN_STOP_M = 0.01  # a distance below counts as this
 SOON_M = 3.5  # one that is so near to the area may be in it at once
 LONG_FORK_M = 6.0  # how much further long vehicles need to be clear of one another at a fork
 WAIT_EARLIER_M = 3.0  # how much before the map's position a long vehicle waits inside, at most
@@ -216,15 +217,22 @@ def _is_in_the_way(
     unaware = sweep["own"] == STEERED and sweep["other"] != STEERED
     to_area = sweep["foe_enter_m"] - foe_place
     own_to_area = sweep["enter_m"] - place
-    if _needs(foe["speed"], to_area, HARD_STOP) and not _needs(
-        row["speed"], own_to_area, HARD_STOP
-    ):
-        return True
+    # Of two that are late to stop the one that has to brake less waits, until the other has passed.
+    foe_needs = _decel_to_stop(foe["speed"], to_area)
+    own_needs = _decel_to_stop(row["speed"], own_to_area)
+    if max(foe_needs, own_needs) > HARD_STOP and foe_needs != own_needs:
+        return bool(foe_needs > own_needs)
     soon = to_area < SOON_M or _needs(foe["speed"], to_area, EASY_STOP)
     if unaware:
         return soon and (foe["speed"] > STANDING_MPS or _is_ahead(foe, foe_place, row, place))
     # One that is ahead and stands is kept there by a leader, be it one that waits for this row.
     return soon and not is_let_stand(rows[foe["row"]]) and _is_ahead(foe, foe_place, row, place)
+
+
+@inlined_kernel
+def _decel_to_stop(speed: float, distance: float) -> float:
+    """The braking in m/s² with which a vehicle stops within a distance."""
+    return float(speed * speed / (2.0 * max(distance, MIN_STOP_M)))
 
 
 @inlined_kernel
