@@ -98,6 +98,7 @@ def _find_pair(
                 found[other].append((one, foe, own, *there, *here))
 
 
+Range = tuple[float, float, float, float]
 Area = tuple[float, float]  # in places of a front that comes and of a rear that leaves, m
 
 
@@ -118,22 +119,41 @@ def find_pair(
         row = area[0]
         mine_m = _begin_m(a, row["enter_m"]), float(row["leave_m"])
         theirs_m = _begin_m(b, row["foe_enter_m"]), float(row["foe_leave_m"])
-    if a["to_lane"] == b["to_lane"]:  # behind the junction one follows the other
-        mine = mine[mine[:, 0] <= a["length_m"]]
-        theirs = theirs[theirs[:, 0] <= b["length_m"]]
-    first, last, foe_first, foe_last = swept_range(
-        mine,
-        theirs,
-        (*body, float(a["length_m"]), *mine_m),
-        (*foe_body, float(b["length_m"]), *theirs_m),
-        CLEARANCE_M,
-        foes,
-    )
+    extents = (*body, float(a["length_m"]), *mine_m), (*foe_body, float(b["length_m"]), *theirs_m)
+    if a["to_lane"] != b["to_lane"]:
+        found = swept_range(mine, theirs, *extents, CLEARANCE_M, foes)
+    else:  # behind the junction one follows the other
+        mine, beyond = _before_and_beyond(mine, float(a["length_m"]))
+        theirs, foe_beyond = _before_and_beyond(theirs, float(b["length_m"]))
+        found = swept_range(mine, theirs, *extents, CLEARANCE_M, foes)
+        # One that turns round comes near those that have just left, on their way the other way.
+        if a["direction"] == TURNAROUND and body.half_m > BODIES[0].half_m:
+            turns = mine[mine[:, 0] + body.half_m <= a["length_m"]]
+            found = _hull(found, swept_range(turns, foe_beyond, *extents, CLEARANCE_M, foes))
+        if b["direction"] == TURNAROUND and foe_body.half_m > BODIES[0].half_m:
+            turns = theirs[theirs[:, 0] + foe_body.half_m <= b["length_m"]]
+            found = _hull(found, swept_range(beyond, turns, *extents, CLEARANCE_M, foes))
+    first, last, foe_first, foe_last = found
     if first == np.inf:
         return None
     here = (first + body.half_m - MARGIN_M, last - body.half_m + MARGIN_M)
     there = (foe_first + foe_body.half_m - MARGIN_M, foe_last - foe_body.half_m + MARGIN_M)
     return here, there
+
+
+def _before_and_beyond(
+    poses: NDArray[np.float64], length_m: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The poses with their centres before the end of a junction, and those behind it."""
+    before = poses[:, 0] <= length_m
+    return poses[before], poses[~before]
+
+
+def _hull(one: Range, other: Range) -> Range:
+    """The range that holds both, each as `swept_range` answers."""
+    return (
+        min(one[0], other[0]), max(one[1], other[1]), min(one[2], other[2]), max(one[3], other[3]),
+    )  # fmt: skip
 
 
 def _begin_m(link: np.void, enter_m: float) -> float:
