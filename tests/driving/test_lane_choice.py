@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from cavmarl.driving.kernels.lane_choice import (
+    MAX_BRAKING_NEEDED,
     MERGE_ROOM_M,
     SWAP_ROOM_M,
+    _asked_of_followers,
     _rear_is_inside,
     room_for_more,
     wish_on_lane,
@@ -69,3 +71,23 @@ def test_one_changes_lanes_when_its_rear_is_out_of_the_junction(
     assert _rear_is_inside(lane, row) == waits
     row["s"] = 2.6
     assert not _rear_is_inside(lane, row)
+
+
+@pytest.mark.parametrize(("far_mps", "asks"), [(25.0, True), (0.0, False)])
+def test_a_change_of_lanes_asks_those_of_every_lane_that_leads_there(
+    far_mps: float, asks: bool
+) -> None:
+    """One that stands near, before another line, does not hide one that comes fast."""
+    roads, tables = network("grid4x4"), travel("grid4x4")
+    lane = int(roads.lanes["num_into"].argmax())
+    first = int(roads.lanes["first_into"][lane])
+    near, far = (int(k) for k in roads.arrays.into[first : first + 2])
+    cars = [(lane, 6.0, 10.0), (near, float(roads.lanes["length_m"][near]) - 3.0, 0.0),
+            (far, float(roads.lanes["length_m"][far]) - 8.0, far_mps)]  # fmt: skip
+    rows = np.concatenate(
+        [on_lane(roads, at, s, tables, id=k, speed=mps) for k, (at, s, mps) in enumerate(cars)]
+    )
+    room = scratch(roads, 3)
+    index_lanes(roads.arrays, tables, rows, 3, room)
+    least = _asked_of_followers(roads.arrays, tables, rows, rows[0], lane, 6.0, room)
+    assert (least < -MAX_BRAKING_NEEDED) == asks

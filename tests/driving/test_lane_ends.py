@@ -7,12 +7,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cavmarl.core.records.codes import DRIVER_AGENT
+from cavmarl.core.records.codes import (
+    DRIVER_AGENT,
+    DRIVER_BACKGROUND,
+    HOLD_SIGNAL,
+    SIGNAL_RED,
+)
 from cavmarl.driving.kernels.beside import behind_askew
+from cavmarl.driving.kernels.drivers import decide
 from cavmarl.driving.kernels.following import no_constraint
-from cavmarl.driving.kernels.lane_ends import LONGEST_HALF_M, behind_over_line, misses_change
+from cavmarl.driving.kernels.gaps import link_signal
+from cavmarl.driving.kernels.lane_ends import (
+    LONGEST_HALF_M,
+    _behind_turning,
+    behind_over_line,
+    misses_change,
+)
 from cavmarl.driving.kernels.lane_index import index_lanes
 from cavmarl.driving.vehicle_types import generated_types
+from cavmarl.roads.routing import PLAN
 from tests.support.dead_ends import before_dead_end, put
 from tests.support.driving import suggested
 from tests.support.traffic import network, on_lane, scratch, travel
@@ -60,6 +73,61 @@ def test_a_rear_over_the_line_is_a_leader_behind_a_short_first_lane(over_m: floa
         roads.arrays, tables, rows[0], kind, first, int(rows["way"][0]), 20.0, room
     )
     assert (found > no_constraint(kind)) == (over_m > 0.0)
+
+
+@pytest.mark.parametrize("over_m", [0.5, -0.5])
+def test_one_that_stops_at_a_line_minds_a_rear_over_it(over_m: float) -> None:
+    roads, tables = network("grid4x4"), travel("grid4x4")
+    inside = np.where(roads.lanes["internal"], roads.lanes["length_m"], np.inf)
+    first = int(inside.argmin())
+    link = int(roads.lanes["link"][first])
+    before, beyond = int(roads.links["from_lane"][link]), int(roads.lanes["successor"][first])
+    end_m = float(roads.lanes["length_m"][before])
+    half = float(roads.lanes["length_m"][first]) + 1.0 + over_m
+    rows = np.concatenate(
+        [on_lane(roads, before, end_m - 4.5, tables, id=0, speed=1.0),
+         on_lane(roads, beyond, 1.0, tables, id=1, length=2.0 * half)]
+    )  # fmt: skip
+    room, step = scratch(roads, 2), np.zeros(2, PLAN)
+    step["next"], step["link"] = (first, -1), (link, -1)
+    index_lanes(roads.arrays, tables, rows, 2, room)
+    room.link_start[:] = room.link_end[:] = 0  # nothing is asked of the junction
+    signal, index = roads.links["signal"][link], roads.links["signal_index"][link]
+    letters = roads.phase_states[roads.phases["first_state"] + index]
+    phase = np.full(len(roads.signals), int((letters == SIGNAL_RED).argmax()), np.int32)
+    assert link_signal(roads.arrays, link, phase) == SIGNAL_RED, signal
+    decide(roads.arrays, tables, rows, 2, DRIVER_BACKGROUND, 0, 0.1, phase, step, room)
+    alone = scratch(roads, 1)
+    index_lanes(roads.arrays, tables, rows, 1, alone)
+    alone.link_start[:] = alone.link_end[:] = 0
+    decide(roads.arrays, tables, rows, 1, DRIVER_BACKGROUND, 0, 0.1, phase, step, alone)
+    assert room.hold[0] == alone.hold[0] == HOLD_SIGNAL
+    assert (room.accel[0] < alone.accel[0]) == (over_m > 0.0)
+
+
+@pytest.mark.parametrize(("length_m", "over_m", "minds"), [
+    (12.0, 2.0, True), (12.0, -1.0, False), (12.0, 13.0, False), (5.0, 2.0, False),
+])  # fmt: skip
+def test_a_long_vehicle_that_turns_beside_a_lane_without_a_link_is_a_leader(
+    length_m: float, over_m: float, minds: bool
+) -> None:
+    """`over_m`: of its front, beyond its line; its rear swings out over the lane that ends."""
+    roads, tables = network("merge"), travel("merge")
+    lanes = roads.lanes.copy()
+    leads = (lanes["num_links"] > 0) & (lanes["left"] >= 0)
+    lane = next(int(k) for k in np.flatnonzero(leads) if lanes["num_links"][lanes["left"][k]] > 0)
+    beside = int(lanes["left"][lane])
+    lanes["num_links"][lane] = 0
+    row = on_lane(roads, lane, 10.0, tables, id=0, speed=8.0)[0]
+    room = scratch(roads, 2)
+    room.link_start[:] = room.link_end[:] = 0
+    link = int(roads.lanes["first_link"][beside])
+    room.link_end[link] = 1
+    room.approach["half"][0] = 0.5 * length_m
+    room.approach["dist"][0] = 0.5 * length_m - over_m
+    kind = generated_types()[0]
+    found = _behind_turning(roads.arrays._replace(lanes=lanes), kind, row, lane, 20.0, room)
+    assert (found > no_constraint(kind)) == minds
 
 
 @pytest.mark.parametrize("askew", [0.5, 0.0])

@@ -169,6 +169,19 @@ def test_of_two_before_it_the_one_further_along_goes_first(network: RoadNetwork)
     assert meeting.stop(0, (bus_enter_m - 9.0, enter_m - 6.0)) == bus_enter_m
 
 
+def test_of_two_that_are_late_to_stop_the_one_that_brakes_less_waits(
+    network: RoadNetwork,
+) -> None:
+    """Neither stops in time if both try, or if one changes its mind as it comes near."""
+    meeting = Meeting(network)
+    enter_m, bus_enter_m = meeting.sweep["foe_enter_m"], meeting.sweep["enter_m"]
+    meeting.rows["speed"] = 4.0, 12.0
+    for bus_m, car_m, car_waits in ((1.0, 15.0, True), (1.8, 15.0, False), (1.0, 8.0, False)):
+        places = (bus_enter_m - bus_m, enter_m - car_m)
+        assert meeting.stop(1, places) == (enter_m if car_waits else np.inf)
+        assert meeting.stop(0, places) == (np.inf if car_waits else bus_enter_m)
+
+
 def test_one_that_stands_before_the_area_without_a_reason_of_its_own_is_not_waited_for(
     network: RoadNetwork,
 ) -> None:

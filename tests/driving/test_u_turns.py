@@ -53,6 +53,21 @@ def test_a_u_turn_does_not_conflict_with_the_lane_beside_it(
     assert turn not in foes
 
 
+@pytest.mark.parametrize(("size", "reaches"), [(0, False), (BUS, True)])
+def test_only_a_long_vehicle_that_turns_round_minds_those_that_have_left_beside_it(
+    network: RoadNetwork, size: int, reaches: bool
+) -> None:
+    """They drive back along its flank, on the lane that it comes to."""
+    links, beyond_m = network.links, []
+    for turn in np.flatnonzero(links["direction"] == U_TURN):
+        row = links[turn]
+        sweeps = network.sweeps[row["first_sweep"] :][: row["num_sweeps"]]
+        same = links["to_lane"][sweeps["foe"]] == row["to_lane"]
+        asked = sweeps[(sweeps["own"] == size) & same & (sweeps["foe"] != turn)]
+        beyond_m += (asked["foe_leave_m"] - links["length_m"][asked["foe"]]).tolist()
+    assert (max(beyond_m, default=0.0) > 2.0) == reaches
+
+
 @pytest.mark.parametrize(("foe_m", "waits"), [(-20.0, False), (2.0, True)])
 def test_a_bus_leaves_room_for_a_u_turn_ahead_of_it_and_not_behind_it(
     network: RoadNetwork, foe_m: float, waits: bool
