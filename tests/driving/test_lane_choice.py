@@ -5,16 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from cavmarl.core.records.codes import MODEL_KRAUSS
 from cavmarl.driving.kernels.lane_choice import (
     MAX_BRAKING_NEEDED,
     MERGE_ROOM_M,
     SWAP_ROOM_M,
     _asked_of_followers,
+    _change_is_safe,
     _rear_is_inside,
     room_for_more,
     wish_on_lane,
 )
 from cavmarl.driving.kernels.lane_index import index_lanes
+from cavmarl.driving.vehicle_types import generated_types
 from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.roads.network import LANE
 from cavmarl.roads.routing import PLAN
@@ -91,3 +94,20 @@ def test_a_change_of_lanes_asks_those_of_every_lane_that_leads_there(
     index_lanes(roads.arrays, tables, rows, 3, room)
     least = _asked_of_followers(roads.arrays, tables, rows, rows[0], lane, 6.0, room)
     assert (least < -MAX_BRAKING_NEEDED) == asks
+
+
+@pytest.mark.parametrize(("gap_m", "safe"), [(1.2, False), (2.0, True)])
+def test_no_change_of_lanes_ends_where_a_crawl_cannot_stop(gap_m: float, safe: bool) -> None:
+    """Krauss's driver asks for its speed in a reaction time, whatever the gap: -3.5 m/s² here."""
+    roads, types = network("merge"), generated_types().copy()
+    types["model"], types["tau"] = MODEL_KRAUSS, 1.0
+    tables = travel("merge")._replace(types=types)
+    lane = int(np.flatnonzero(~roads.lanes["internal"] & (roads.lanes["left"] >= 0))[0])
+    left = int(roads.lanes["left"][lane])
+    cars = [(lane, 30.0, 3.5), (left, 35.0 + gap_m, 0.0)]
+    rows = np.concatenate(
+        [on_lane(roads, at, s, tables, id=k, speed=mps) for k, (at, s, mps) in enumerate(cars)]
+    )
+    room = scratch(roads, 2)
+    index_lanes(roads.arrays, tables, rows, 2, room)
+    assert _change_is_safe(roads.arrays, tables, rows, 0, left, 0.0, True, room) == safe
