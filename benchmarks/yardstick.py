@@ -2,9 +2,9 @@
 
 Every trip counts, those that the end of the run cuts, too. A vehicle stands without a cause if it
 has stood for `STANDS_S`, its signal is not red, no other vehicle is near ahead of it or behind the
-junction, and none is, or has its rear, on a way that crosses its own, or is near a line where it
-has to give way. What touches on ground that the map gives two roads is counted apart
-(`maps.shared_ground`).
+junction, and none is, or has its rear, on a way that crosses its own, or comes to a line where it
+has to give way, as near as drivers announce themselves. What touches on ground that the map gives
+two roads is counted apart (`maps.shared_ground`).
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from benchmarks.harness import Report, Say, about, check_range, numbers_of, run,
 from cavmarl.cli.output import Seed
 from cavmarl.core.errors import CavmarlError, ConfigError
 from cavmarl.core.records.codes import SIGNAL_NONE
+from cavmarl.driving.kernels.announcing import announced_m
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.evaluate.recorder import Recorder
@@ -40,7 +41,6 @@ from cavmarl.roads.sumo_net.reader import map_name
 MOST_SHARE = 0.0005  # of the trips that may end off the road, and with a collision
 STANDS_S = 120.0
 NEAR_AHEAD_M = 20.0  # another vehicle whose centre is so near ahead is a cause to stand
-COMES_M = 100.0  # as is one so near to a line that has the right of way
 AXIS_PLACES = 9  # of a vehicle, between which and those of another a touch is looked for
 NEAR_AXIS_M = 4.0  # nearer than that are the axes of two that touch
 TOGETHER = 100  # vehicles that are stepped at once, about
@@ -308,7 +308,8 @@ class _Standing:
         crosses |= np.isin(others["lane"], into) & (others["s"] < 0.5 * others["length"])
         first = network.links["from_lane"][conflicts["foe"][conflicts["must_yield"]]]
         to_line = lanes["length_m"][others["lane"]] - others["s"]
-        comes = np.isin(others["lane"], first) & (to_line < COMES_M)
+        announced = np.array([announced_m(speed) for speed in others["speed"].tolist()])
+        comes = np.isin(others["lane"], first) & (to_line < announced)
         return bool((crosses | comes).any())
 
 

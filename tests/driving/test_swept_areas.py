@@ -141,6 +141,9 @@ def test_a_car_that_has_to_stop_anyway_leaves_room_for_a_bus(network: RoadNetwor
     assert meeting.stop(1, (-20.0, -12.0), red) == enter_m
     assert meeting.stop(1, (-40.0, -12.0), red) == np.inf
     assert meeting.stop(1, (-40.0, -12.0), inside) == enter_m, "it cannot go back later"
+    meeting.rows["speed"][0] = 15.0  # as far away it comes soon
+    assert meeting.stop(1, (-40.0, -12.0), red) == enter_m
+    meeting.rows["speed"][0] = 0.0
     assert meeting.stop(1, (-2.0, -12.0)) == np.inf, "it drives on where nothing stops it"
 
 

@@ -207,7 +207,9 @@ def _is_in_the_way(
         return True
     if inside and not foe_inside:
         return False
-    if not inside and foe_place > -room_m:
+    to_area = sweep["foe_enter_m"] - foe_place
+    comes = room_m > 0.0 and _needs(foe["speed"], to_area, EASY_STOP)
+    if not inside and (comes or foe_place > -room_m):
         return True  # it loses nothing if it leaves room
     if rows[foe["row"]]["hold"] != HOLD_NONE:
         return False
@@ -215,7 +217,6 @@ def _is_in_the_way(
         return _is_ahead(foe, foe_place, row, place)
     # One that does not know of this area does not wait before it.
     unaware = sweep["own"] == STEERED and sweep["other"] != STEERED
-    to_area = sweep["foe_enter_m"] - foe_place
     own_to_area = sweep["enter_m"] - place
     # Of two that are late to stop the one that has to brake less waits, until the other has passed.
     foe_needs = _decel_to_stop(foe["speed"], to_area)
