@@ -211,7 +211,8 @@ def _change_is_safe(
             return False
         after = accel_behind(kind, speed, desired, net, leader["speed"], leader["decel"])
         # Models that answer for a reaction time ask for less than it takes at a crawl.
-        if (speed * speed - leader["speed"] ** 2) > 2.0 * MAX_BRAKING_ACCEPTED * net:
+        faster = speed - leader["speed"]
+        if faster > 0.0 and faster * faster > 2.0 * MAX_BRAKING_ACCEPTED * net:
             return False
     followers = _asked_of_followers(roads, travel, rows, row, target, s, scratch)
     after = max(after, -speed / BRAKE_TIME_S)

@@ -47,7 +47,7 @@ MIXES = {
     "all": {"passenger": 0.72, "truck": 0.1, "bus": 0.05, "motorcycle": 0.13},
 }
 DEPARTURES = (
-    {"departLane": "first", "departSpeed": "0", "departPos": "base"},  # SUMO's own
+    {"departLane": "first", "departSpeed": "0", "departPos": "base"},
     {"departLane": "best", "departSpeed": "max", "departPos": "base"},
     {"departLane": "best", "departSpeed": "0", "departPos": "random_free"},
 )

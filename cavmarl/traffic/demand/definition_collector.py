@@ -25,13 +25,13 @@ from cavmarl.traffic.demand.demand_records import (
     FLOW_EXPONENTIAL,
     FLOW_PROBABILITY,
     FLOW_REGULAR,
+    LANE_BEST,
     LANE_CURRENT,
-    LANE_FIRST,
     POS_BASE,
     POS_GIVEN,
     POS_MAX,
+    SPEED_AVERAGE,
     SPEED_CURRENT,
-    SPEED_GIVEN,
 )
 from cavmarl.traffic.demand.element import MAX_TIME_MS, DemandReport, Element
 from cavmarl.traffic.demand.rerouting_device import device
@@ -302,11 +302,11 @@ def _key(element: Element) -> tuple[object, ...]:
 
 
 def _how(element: Element) -> tuple[float, ...]:
-    """The last fields of ELEMENT: how a vehicle enters and leaves."""
+    """The last fields of ELEMENT: how a vehicle enters and leaves; not given, as SUMO 1.28's do."""
     return (
-        _lane(element, "departLane", LANE_FIRST),
+        _lane(element, "departLane", LANE_BEST),
         *_coded(element, "departPos", POS_BASE),
-        *_coded(element, "departSpeed", SPEED_GIVEN, least=0.0),
+        *_coded(element, "departSpeed", SPEED_AVERAGE, least=0.0),
         _lane(element, "arrivalLane", LANE_CURRENT),
         *_coded(element, "arrivalPos", POS_MAX),
         *_coded(element, "arrivalSpeed", SPEED_CURRENT, least=0.0),

@@ -16,7 +16,7 @@ from cavmarl.core.records import record
 from cavmarl.traffic.demand.element import Element
 
 # Lanes: a LANE row (in an ORDER) or SUMO's index on the edge (in an ELEMENT), or one of these.
-LANE_FIRST = -1  # the one nearest to the kerb that the class may use (SUMO's default)
+LANE_FIRST = -1  # the one nearest to the kerb that the class may use
 LANE_RANDOM = -2
 LANE_FREE = -3  # the least occupied one
 LANE_ALLOWED = -4  # the least occupied one of those the class may use

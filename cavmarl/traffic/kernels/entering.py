@@ -26,6 +26,7 @@ from cavmarl.core.records.codes import (
     SPEED_GIVEN,
     SPEED_LAST,
     SPEED_LIMIT,
+    SPEED_MAX,
     SPEED_RANDOM,
 )
 from cavmarl.core.records.rows import ENTER_REACH_M
@@ -186,7 +187,9 @@ def entry_speed(
         wanted *= uniform(key, departure["id"], 0, STREAM_DEPARTURE + DRAW_SPEED)
     elif code == SPEED_LIMIT:
         wanted = min(wanted, here["speed_mps"])
-    elif (code == SPEED_LAST or code == SPEED_AVERAGE) and j >= 0:
+    elif code == SPEED_AVERAGE:
+        wanted = min(wanted, _mean_speed(here["speed_mps"], lane, s, travel.view_m, scratch))
+    elif code == SPEED_LAST and j >= 0:
         wanted = min(wanted, scratch.entries[j]["speed"])
     wanted = speed_at(roads, kind, lane, s, wanted)
     safe = math.inf
@@ -196,9 +199,22 @@ def entry_speed(
         k, apart = askew_beside(roads, travel, rows, lane, s, departure["id"], to_left, scratch)
         if k >= 0:
             safe = min(safe, _safe_behind(kind, scratch.entries[k], apart - half))
-    if safe < 0.0 or (code == SPEED_GIVEN and safe < wanted):
+    slows = code == SPEED_MAX or code == SPEED_RANDOM  # the others wait until theirs is safe
+    if safe < 0.0 or (safe < wanted and not slows):
         return -1.0
     return min(wanted, safe)
+
+
+@kernel
+def _mean_speed(limit_mps: float, lane: int, s: float, view_m: float, scratch: Scratch) -> float:
+    """Mean speed in m/s of those on a lane, in view of place `s`; none: the limit."""
+    total, number = 0.0, 0
+    for k in range(scratch.lane_start[lane], scratch.lane_end[lane]):
+        other = scratch.entries[k]
+        if not other["side"] and abs(other["s"] - s) <= view_m:
+            total += other["speed"]
+            number += 1
+    return total / number if number > 0 else limit_mps
 
 
 @kernel
