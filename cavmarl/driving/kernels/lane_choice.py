@@ -21,7 +21,7 @@ from cavmarl.driving.kernels.lane_change import (
     MIN_ACCEL_GAIN,
     mobil_accepts,
 )
-from cavmarl.driving.kernels.lane_index import ahead_on, behind_by, beside_s, last_on
+from cavmarl.driving.kernels.lane_index import ahead_on, behind_by, beside_s, last_on, num_ahead
 from cavmarl.driving.kernels.stopping import STAY, lane_to_stop
 from cavmarl.driving.kernels.ways import next_step
 
@@ -30,6 +30,7 @@ CHANGE_EARLY_M = 80.0  # a change that the route needs is made this far before i
 CHANGE_EARLY_S = 12.0  # plus the way of this time
 MAX_BRAKING_ACCEPTED = 4.0  # m/s², harder braking behind the new leader is never worth it
 MAX_BRAKING_NEEDED = 4.0  # m/s², what a change that the way needs may ask of the one behind
+QUEUED_M = 7.5  # of lane that a vehicle takes in a queue
 CREEP_MPS = 1.0  # so slow, a driver that has to change does so to the very end of its lane
 SIDEWAYS_S = 2.5  # a lane change takes about this long, and has to end before the lane does
 BRAKE_TIME_S = 0.5  # a braking that ends within this time is not felt
@@ -273,8 +274,11 @@ def _may_change(
         if row["driver"] == DRIVER_AGENT and beyond["turnarounds"] > turns:
             return False
         early = (CHANGE_EARLY_M + CHANGE_EARLY_S * row["speed"]) * beyond["changes"]
-        if beyond["change"] != 0 and beyond["room"] - row["s"] < 2.0 * early:
-            return False
+        if beyond["change"] != 0:
+            # Back into its own lane it gets behind those that are on it now.
+            queue_m = QUEUED_M * num_ahead(scratch, row["lane"], row["s"], row["id"], travel.view_m)
+            if beyond["room"] - row["s"] - queue_m < 2.0 * early:
+                return False
     return _change_is_safe(roads, travel, rows, i, target, own_wish, needed != 0, scratch)
 
 

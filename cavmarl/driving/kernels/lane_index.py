@@ -202,6 +202,12 @@ def ahead_on(scratch: Scratch, lane: int, s: float, own_id: int, view_m: float) 
     return k if k < end and scratch.entries[k]["s"] - s <= view_m else -1
 
 
+@kernel
+def num_ahead(scratch: Scratch, lane: int, s: float, own_id: int, view_m: float) -> int:
+    """How many others are on `lane` ahead of place `s`, at most `view_m`."""
+    return _first_after(scratch, lane, s + view_m, own_id) - _first_after(scratch, lane, s, own_id)
+
+
 @inlined_kernel
 def last_on(scratch: Scratch, lane: int, own_id: int, distance: float, view_m: float) -> int:
     """Position in the index of the rearmost other vehicle on `lane`, or -1.
