@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cavmarl.core.records.codes import MODEL_KRAUSS
+from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_BACKGROUND, MODEL_KRAUSS
 from cavmarl.driving.kernels.lane_choice import (
     MAX_BRAKING_NEEDED,
     MERGE_ROOM_M,
@@ -63,13 +63,22 @@ def test_a_leader_beyond_the_view_is_none(view_m: float, minds: bool) -> None:
 
 
 @pytest.mark.parametrize(
-    ("length_m", "waits"), [(4.0, False), (11.2, False), (12.9, False), (13.1, True)]
+    ("driver", "length_m", "waits"),
+    [
+        (DRIVER_BACKGROUND, 4.0, False),
+        (DRIVER_BACKGROUND, 11.2, False),
+        (DRIVER_BACKGROUND, 14.4, False),
+        (DRIVER_BACKGROUND, 14.6, True),
+        (DRIVER_AGENT, 12.9, False),
+        (DRIVER_AGENT, 13.1, True),
+    ],
 )
 def test_one_changes_lanes_when_its_rear_is_out_of_the_junction(
-    length_m: float, waits: bool
+    driver: int, length_m: float, waits: bool
 ) -> None:
     """Where two cars do not fit behind one another it changes where it waits."""
     lane, row = np.zeros(1, LANE)[0], blank_vehicle()[0]
+    row["driver"] = driver
     lane["length_m"], row["length"], row["s"] = length_m, 5.0, 2.4
     assert _rear_is_inside(lane, row) == waits
     row["s"] = 2.6

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
 from cavmarl.core.records.codes import DRIVER_AGENT
-from cavmarl.driving.kernels.following import accel_behind, no_constraint, wish
+from cavmarl.driving.kernels.following import LINE_MARGIN_M, accel_behind, no_constraint, wish
 from cavmarl.driving.kernels.lane_change import (
     LANE_CHANGE_DELAY_S,
     MAX_BRAKING_IMPOSED,
@@ -39,6 +39,8 @@ SIDE_GAP_M = 1.0  # m between bumpers, the least with which a lane change starts
 # length further back to change left: two that want to swap do not stand side by side for ever.
 MERGE_ROOM_M = 2.0
 SWAP_ROOM_M = 3.0
+LEAST_SWAP_M = SIDE_GAP_M + 0.2  # of a background vehicle whose rear is in the junction otherwise
+LINE_SLACK_M = 0.3  # so far before the place where it waits a vehicle may stand
 MERGE_ROOM_SHARE = 0.25  # to the right at most this share of the lane's length
 
 
@@ -229,10 +231,13 @@ def _rear_is_inside(lane: np.void, row: np.void) -> bool:
     """Whether a vehicle's rear is still in the junction, where others turn into the lane beside it.
 
     On lanes so short that two do not fit behind one another, with room to swap, that does not
-    count: a vehicle waits to change with its rear inside, and would never change.
+    count: a vehicle waits to change with its rear inside (`lane_ends`), and would never change.
     """
-    half = 0.5 * row["length"]
-    inside: bool = row["s"] < half and lane["length_m"] > 2.0 * row["length"] + SWAP_ROOM_M
+    room = SWAP_ROOM_M
+    if row["driver"] != DRIVER_AGENT:
+        room = MERGE_ROOM_M + LEAST_SWAP_M + LINE_MARGIN_M + LINE_SLACK_M
+    is_short = lane["length_m"] <= 2.0 * row["length"] + room
+    inside: bool = row["s"] < 0.5 * row["length"] and not is_short
     return inside
 
 

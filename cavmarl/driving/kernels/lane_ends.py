@@ -12,7 +12,7 @@ from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
 from cavmarl.core.records.codes import DRIVER_AGENT, HOLD_NONE
 from cavmarl.driving.kernels.beside import behind_entry
 from cavmarl.driving.kernels.following import LINE_MARGIN_M, before_line, behind, no_constraint
-from cavmarl.driving.kernels.lane_choice import MERGE_ROOM_SHARE, SWAP_ROOM_M
+from cavmarl.driving.kernels.lane_choice import LEAST_SWAP_M, MERGE_ROOM_SHARE, SWAP_ROOM_M
 from cavmarl.driving.kernels.lane_index import last_on
 from cavmarl.driving.kernels.swept_areas import VAN_M, before_swept, behind_fork
 from cavmarl.driving.kernels.ways import next_step
@@ -41,7 +41,11 @@ def lane_end(
     half = 0.5 * row["length"]
     room = min(merge_room_m, MERGE_ROOM_SHARE * length)
     if step["change"] > 0 and merge_room_m > 0.0:
-        room += row["length"] + SWAP_ROOM_M
+        swap = SWAP_ROOM_M
+        if row["driver"] != DRIVER_AGENT:  # it steers without room: on short lanes its rear counts
+            swap = min(swap, length - room - 2.0 * (row["length"] + LINE_MARGIN_M))
+            swap = max(swap, LEAST_SWAP_M)
+        room += row["length"] + swap
     place = max(length - half - room, min(2.0 * LINE_MARGIN_M, 0.5 * length))
     return before_line(kind, row["speed"], distance - length + place, dt)
 
