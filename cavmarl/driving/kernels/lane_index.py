@@ -203,6 +203,16 @@ def ahead_on(scratch: Scratch, lane: int, s: float, own_id: int, view_m: float) 
 
 
 @kernel
+def first_from(scratch: Scratch, lane: int, s: float, own_id: int) -> int:
+    """Position in the index of the rearmost other vehicle on `lane` from place `s` on, or -1."""
+    k = _first_after(scratch, lane, s, -1)
+    end = scratch.lane_end[lane]
+    while k < end and scratch.entries[k]["id"] == own_id:
+        k += 1
+    return k if k < end else -1
+
+
+@kernel
 def num_ahead(scratch: Scratch, lane: int, s: float, own_id: int, view_m: float) -> int:
     """How many others are on `lane` ahead of place `s`, at most `view_m`."""
     return _first_after(scratch, lane, s + view_m, own_id) - _first_after(scratch, lane, s, own_id)

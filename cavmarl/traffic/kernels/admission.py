@@ -58,7 +58,7 @@ def rank_lanes(
     starts: it alone sees all that could be the last.
 
     `zone`: the shard's own. `gate`: `ranks` and `last_s` are written where a place, or a lane's
-    start, lies in this zone. `worlds`: `next_rows` is read.
+    end, lies in this zone. `worlds`: `next_rows` is read.
     """
     for w in range(worlds.ticks.shape[0]):
         indexed = False
@@ -73,26 +73,27 @@ def rank_lanes(
             first = edge["first_lane"]
             s = max(departure["pos"], 0.0)
             for lane in range(first, first + edge["num_lanes"]):
-                on_lane = min(s, roads.lanes[lane]["length_m"])
+                length = roads.lanes[lane]["length_m"]
+                on_lane = length if last else min(s, length)
                 ranked = chooses and _zone_on(roads, zones, lane, on_lane) == zone
-                placed = last and _zone_on(roads, zones, lane, 0.0) == zone
+                placed = last and _zone_on(roads, zones, lane, length) == zone
                 if (ranked or placed) and not indexed:
                     rows = worlds.next_rows[w]
                     index_lanes(roads, travel, rows, worlds.num_rows[w], scratch)
                     indexed = True
                 if ranked:
-                    gate.ranks[w, q, lane - first] = crowd(scratch, lane, s, travel.view_m)
+                    gate.ranks[w, q, lane - first] = crowd(scratch, lane, on_lane, travel.view_m)
                 if placed:
                     kind = travel.types[departure["vtype"]]
                     gate.last_s[w, q, lane - first] = entry_place(
                         roads,
+                        travel,
                         worlds.keys[w],
                         departure,
                         kind,
                         lane,
                         worlds.ticks[w],
                         scratch,
-                        travel.view_m,
                     )
 
 
@@ -193,9 +194,7 @@ def propose(
                 edge = roads.edges[roads.lanes[lane]["edge"]]
                 s = gate.last_s[w, q, lane - edge["first_lane"]]
             else:
-                s = entry_place(
-                    roads, key, departure, kind, lane, worlds.ticks[w], scratch, travel.view_m
-                )
+                s = entry_place(roads, travel, key, departure, kind, lane, worlds.ticks[w], scratch)
             if _zone_on(roads, zones, lane, s) != zone:
                 continue
             if not indexed:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.math.rng import STREAM_DEPARTURE, STREAM_PLACE, below, uniform
-from cavmarl.core.numba import kernel
+from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
 from cavmarl.core.records.codes import (
     LANE_BEST,
@@ -32,11 +32,14 @@ from cavmarl.core.records.codes import (
 from cavmarl.core.records.rows import ENTER_REACH_M
 from cavmarl.driving.kernels.beside import askew_beside
 from cavmarl.driving.kernels.following import LINE_MARGIN_M, accel_behind, speed_behind
-from cavmarl.driving.kernels.lane_index import ahead_on, behind_on, comes_over, last_on
+from cavmarl.driving.kernels.lane_index import ahead_on, behind_on, comes_over, first_from, last_on
 from cavmarl.driving.kernels.ways import next_step
 
 ENTER_GAP_M = 1.0  # m between bumpers, the least with which a vehicle enters
+LEADER_M = 150.0  # how far ahead a leader is looked for
 ENTER_DECEL = 2.0  # m/s², braking that an entering vehicle may impose, or need at the lane's end
+BEST_LANE_M = 3000.0  # lanes on which a way goes on so far are equally good, as for SUMO,
+SAME_LENGTH = 0.99  # as are those where it goes on for this share of that: in bends they differ
 DRAW_LANE = 0  # draws of STREAM_DEPARTURE
 DRAW_SPEED = 1
 
@@ -68,8 +71,7 @@ def entry_lane(
     """The LANE where a departure enters in this tick, or -1 if another one tries there.
 
     Whose lane is chosen by traffic takes the one with the fewest vehicles of those that it may use
-    (`best`: from which its way goes on without a lane change, or with the fewest), the right one of
-    two.
+    (`best`: on which its way goes on the furthest without a lane change), the right one of two.
 
     `departure`: that enters. `ranks`: how crowded each lane of its edge is; read where traffic
     chooses. `taken`: (L,) lanes on which another one tries in this tick.
@@ -81,11 +83,12 @@ def entry_lane(
     first = edge["first_lane"]
     end = first + edge["num_lanes"]
     usable = 0
-    fewest = 1 << 20  # lane changes on its way
+    furthest = 0.0  # m from the start of a lane that a way goes on without a lane change
     for lane in range(first, end):
         if _may_use(travel, departure, lane):
             usable += 1
-            fewest = min(fewest, int(travel.steps[departure["way"] + lane]["changes"]))
+            furthest = max(furthest, travel.steps[departure["way"] + lane]["room"])
+    furthest = SAME_LENGTH * min(furthest, BEST_LANE_M)
     pick = -1
     if code == LANE_RANDOM and usable > 0:
         pick = below(key, departure["id"], 0, STREAM_DEPARTURE + DRAW_LANE, usable)
@@ -101,9 +104,10 @@ def entry_lane(
             continue
         if code == LANE_FIRST:
             return -1 if taken[lane] else lane
-        changes = int(travel.steps[departure["way"] + lane]["changes"])
-        if taken[lane] or (code == LANE_BEST and changes > fewest):
+        if taken[lane]:
             continue  # where another one tries on the best, it waits
+        if code == LANE_BEST and travel.steps[departure["way"] + lane]["room"] < furthest:
+            continue
         rank = ranks[lane - first]
         if rank < best_rank:
             best = lane
@@ -114,13 +118,13 @@ def entry_lane(
 @kernel
 def entry_place(
     roads: RoadArrays,
+    travel: Travel,
     key: np.uint64,
     departure: np.void,
     kind: np.void,
     lane: int,
     tick: int,
     scratch: Scratch,
-    view_m: float,
 ) -> float:
     """Where on its lane the centre of a departure enters, in m.
 
@@ -137,11 +141,7 @@ def entry_place(
     elif code == POS_BASE:
         s = half
     elif code == POS_LAST:
-        k = last_on(scratch, lane, departure["id"], 0.0, view_m)
-        s = most
-        if k >= 0:
-            last = scratch.entries[k]
-            s = last["s"] - last["half"] - kind["min_gap"] - half
+        s = most - _behind_last_m(roads, travel, key, departure, kind, lane, most, scratch)
     else:
         s = half + (most - half) * uniform(key, departure["id"], tick, STREAM_PLACE)
     return float(min(max(s, half), max(length - half - LINE_MARGIN_M, 0.0)))
@@ -152,6 +152,100 @@ def speed_at(roads: RoadArrays, kind: np.void, lane: int, s: float, wanted: floa
     """At most `wanted`, at most the machine's, and slow before the end of the lane."""
     rest = max(roads.lanes[lane]["length_m"] - s - 0.5 * kind["length"] - 2.0, 0.0)
     return float(min(wanted, kind["max_speed"], math.sqrt(2.0 * ENTER_DECEL * rest)))
+
+
+@kernel
+def _line_speed(
+    roads: RoadArrays,
+    travel: Travel,
+    departure: np.void,
+    kind: np.void,
+    lane: int,
+    s: float,
+    wanted: float,
+) -> float:
+    """At most `wanted`, and slow before a line where it may have to stop, or a lower limit."""
+    way = departure["way"]
+    wanted = min(wanted, kind["max_speed"])
+    rest = max(roads.lanes[lane]["length_m"] - s - 0.5 * kind["length"] - 2.0, 0.0)
+    while wanted * wanted > 2.0 * ENTER_DECEL * rest:
+        lane, way, link = next_step(roads, travel, lane, way)
+        stops = lane < 0
+        if link >= 0:
+            stops |= roads.links[link]["num_conflicts"] > 0 or roads.links[link]["signal"] >= 0
+        limit = 0.0 if stops else roads.lanes[lane]["speed_mps"] * departure["speed_factor"]
+        wanted = min(wanted, math.sqrt(limit * limit + 2.0 * ENTER_DECEL * rest))
+        if stops:
+            break
+        rest += roads.lanes[lane]["length_m"]
+    return float(wanted)
+
+
+@kernel
+def _wanted_speed(
+    roads: RoadArrays,
+    travel: Travel,
+    key: np.uint64,
+    departure: np.void,
+    kind: np.void,
+    lane: int,
+    s: float,
+    leader: int,
+    scratch: Scratch,
+) -> float:
+    """The speed in m/s with which a departure would enter at place `s`, whatever is ahead.
+
+    `leader`: the entry that it would follow, or -1.
+    """
+    here = roads.lanes[lane]
+    code = departure["speed_code"]
+    wanted = here["speed_mps"] * departure["speed_factor"]
+    if code == SPEED_GIVEN:
+        wanted = min(departure["speed"], wanted)
+    elif code == SPEED_RANDOM:
+        wanted *= uniform(key, departure["id"], 0, STREAM_DEPARTURE + DRAW_SPEED)
+    elif code == SPEED_LIMIT:
+        wanted = min(wanted, here["speed_mps"])
+    elif code == SPEED_AVERAGE:
+        wanted = min(wanted, _mean_speed(here["speed_mps"], lane, s, travel.view_m, scratch))
+    elif code == SPEED_LAST and leader >= 0:
+        wanted = min(wanted, scratch.entries[leader]["speed"])
+    return _line_speed(roads, travel, departure, kind, lane, s, wanted)
+
+
+@kernel
+def _behind_last_m(
+    roads: RoadArrays,
+    travel: Travel,
+    key: np.uint64,
+    departure: np.void,
+    kind: np.void,
+    lane: int,
+    most: float,
+    scratch: Scratch,
+) -> float:
+    """How far before place `most`, the last one of its lane, a departure enters with `last`, in m.
+
+    Behind the last vehicle in view of the end it keeps the gap from which it could stop; without
+    one it keeps its reaction time to the end, beyond which there may be others.
+    """
+    length = roads.lanes[lane]["length_m"]
+    k = first_from(scratch, lane, length - travel.view_m, departure["id"])
+    speed = _wanted_speed(roads, travel, key, departure, kind, lane, most, k, scratch)
+    if k < 0:
+        return float(speed * kind["tau"])
+    last = scratch.entries[k]
+    free = _wanted_speed(roads, travel, key, departure, kind, lane, 0.0, k, scratch)
+    gap = kind["min_gap"] + _secure_m(kind, free, last)
+    return float(most - (last["s"] - last["half"] - gap - 0.5 * kind["length"]))
+
+
+@inlined_kernel
+def _secure_m(kind: np.void, speed: float, leader: np.void) -> float:
+    """The gap in m, beyond the least one, to stop behind a leader that stops."""
+    stops_m = speed * speed / (2.0 * kind["decel"])
+    leader_m = leader["speed"] * leader["speed"] / (2.0 * leader["decel"])
+    return float(max(speed * kind["tau"] + stops_m - leader_m, 0.0))
 
 
 @kernel
@@ -170,28 +264,16 @@ def entry_speed(
 
     A steered vehicle that sticks out into its lane as it changes to the next one is a leader, too.
     """
-    here = roads.lanes[lane]
-    code = departure["speed_code"]
-    wanted = here["speed_mps"] * departure["speed_factor"]
     half = 0.5 * kind["length"]
     j = ahead_on(scratch, lane, s, departure["id"], travel.view_m)
-    distance = -s
-    if j < 0:
-        beyond, _, _ = next_step(roads, travel, lane, departure["way"])
-        if beyond >= 0:
-            distance += here["length_m"]
-            j = last_on(scratch, beyond, departure["id"], distance, travel.view_m)
-    if code == SPEED_GIVEN:
-        wanted = min(departure["speed"], wanted)
-    elif code == SPEED_RANDOM:
-        wanted *= uniform(key, departure["id"], 0, STREAM_DEPARTURE + DRAW_SPEED)
-    elif code == SPEED_LIMIT:
-        wanted = min(wanted, here["speed_mps"])
-    elif code == SPEED_AVERAGE:
-        wanted = min(wanted, _mean_speed(here["speed_mps"], lane, s, travel.view_m, scratch))
-    elif code == SPEED_LAST and j >= 0:
-        wanted = min(wanted, scratch.entries[j]["speed"])
-    wanted = speed_at(roads, kind, lane, s, wanted)
+    distance, beyond, way = -s, lane, departure["way"]
+    while j < 0:
+        distance += roads.lanes[beyond]["length_m"]
+        beyond, way, _ = next_step(roads, travel, beyond, way)
+        if beyond < 0 or distance > LEADER_M:
+            break
+        j = last_on(scratch, beyond, departure["id"], distance, travel.view_m)
+    wanted = _wanted_speed(roads, travel, key, departure, kind, lane, s, j, scratch)
     safe = math.inf
     if j >= 0:
         safe = _safe_behind(kind, scratch.entries[j], distance + scratch.entries[j]["s"] - half)
@@ -199,7 +281,9 @@ def entry_speed(
         k, apart = askew_beside(roads, travel, rows, lane, s, departure["id"], to_left, scratch)
         if k >= 0:
             safe = min(safe, _safe_behind(kind, scratch.entries[k], apart - half))
-    slows = code == SPEED_MAX or code == SPEED_RANDOM  # the others wait until theirs is safe
+    # Behind the last vehicle, and with other speeds, it waits until what it wants is safe.
+    code = departure["speed_code"]
+    slows = (code == SPEED_MAX or code == SPEED_RANDOM) and departure["pos_code"] != POS_LAST
     if safe < 0.0 or (safe < wanted and not slows):
         return -1.0
     return min(wanted, safe)
