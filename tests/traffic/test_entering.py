@@ -109,6 +109,17 @@ def test_free_is_the_emptiest_lane_and_the_right_one_of_two(code: int) -> None:
     assert lane_of(code, room, taken=[WEAVE[1]]) == WEAVE[2]
 
 
+@pytest.mark.parametrize(("way_m", "counts"), [(2900.0, False), (3100.0, True)])
+def test_lanes_that_a_way_can_be_followed_on_for_3_km_are_equally_good(
+    way_m: float, counts: bool
+) -> None:
+    plan = PLAN.copy()
+    plan[0]["room"][WEAVE] = way_m, 5000.0, 4000.0
+    _, room = traffic()
+    lane = lane_of(codes.LANE_BEST, room, travel=travel_by(plan))
+    assert lane == (WEAVE[0] if counts else WEAVE[1])
+
+
 def test_best_is_the_emptiest_of_the_lanes_that_need_no_change() -> None:
     assert PLAN[0][WEAVE[0]]["changes"] > 0
     _, room = traffic((WEAVE[1], 20.0, 5.0))
@@ -125,7 +136,8 @@ def test_no_lane_that_leads_nowhere_is_taken() -> None:
 
 
 def place(room: Scratch, tick: int = 0, **fields: Any) -> float:
-    return entry_place(ROADS.arrays, KEY, departure(**fields), KIND, MAIN[0], tick, room, VIEW_M)
+    waiting = departure(**fields)
+    return entry_place(ROADS.arrays, TRAVEL, KEY, waiting, KIND, MAIN[0], tick, room)
 
 
 def test_given_places_are_of_the_front_bumper_from_either_end() -> None:
@@ -142,17 +154,41 @@ def test_no_front_enters_over_the_line_not_even_of_a_bus_that_is_longer_than_the
     bus["length"] = LENGTH + 5.0
     for code in (codes.POS_GIVEN, codes.POS_BASE, codes.POS_LAST, codes.POS_RANDOM):
         car = departure(pos_code=code, pos=LENGTH)
-        s = entry_place(ROADS.arrays, KEY, car, bus, MAIN[0], 0, room, VIEW_M)
+        s = entry_place(ROADS.arrays, TRAVEL, KEY, car, bus, MAIN[0], 0, room)
         assert s + 0.5 * bus["length"] == pytest.approx(LENGTH - 1.0)
 
 
-def test_base_puts_the_rear_at_the_start_and_last_a_gap_behind_the_last() -> None:
-    _, room = traffic((MAIN[0], 100.0, 5.0), (MAIN[0], 60.0, 5.0))
+def test_base_puts_the_rear_at_the_start() -> None:
+    _, room = traffic((MAIN[0], 100.0, 5.0))
     assert place(room, pos_code=codes.POS_BASE) == 2.5
-    last = place(room, pos_code=codes.POS_LAST)
-    assert last == pytest.approx(60.0 - 2.5 - KIND["min_gap"] - 2.5)
+
+
+@pytest.mark.parametrize("wanted_mps", [0.0, 5.0, 10.0])
+def test_last_keeps_the_gap_to_stop_behind_the_last(wanted_mps: float) -> None:
+    _, room = traffic((MAIN[0], 100.0, 6.0), (MAIN[0], 80.0, 3.0))
+    words = {"pos_code": codes.POS_LAST, "speed_code": codes.SPEED_GIVEN, "speed": wanted_mps}
+    decel = float(KIND["decel"])
+    gap = wanted_mps * KIND["tau"] + (wanted_mps**2 - 3.0**2) / (2.0 * decel)
+    expected = 80.0 - 2.5 - KIND["min_gap"] - max(gap, 0.0) - 2.5
+    assert place(room, **words) == pytest.approx(expected)
+    _, room = traffic((MAIN[0], 60.0, 0.0))
+    words["speed"] = LIMIT
+    assert place(room, **words) == 2.5, "there it waits"
+
+
+def test_last_on_an_empty_lane_is_its_end() -> None:
+    """At the speed with which it may come to the line; at rest it is at the line itself."""
     _, room = traffic()
-    assert place(room, pos_code=codes.POS_LAST) == pytest.approx(LENGTH - 3.5)
+    words = {"pos_code": codes.POS_LAST, "speed_code": codes.SPEED_GIVEN}
+    assert place(room, **words, speed=0.0) == pytest.approx(LENGTH - 3.5)
+    assert place(room, **words, speed=LIMIT) < LENGTH - 3.5
+
+
+def test_behind_the_last_a_departure_waits_until_its_speed_is_safe() -> None:
+    _, room = traffic((MAIN[0], 50.0, 3.0))
+    slower = {"speed_code": codes.SPEED_MAX}
+    assert 0.0 < speed(room, **slower) < LIMIT
+    assert speed(room, **slower, pos_code=codes.POS_LAST) == -1.0
 
 
 @pytest.mark.parametrize("code", [codes.POS_RANDOM, codes.POS_FREE, codes.POS_RANDOM_FREE])
@@ -183,10 +219,11 @@ def test_on_a_free_lane_each_word_means_its_speed(factor: float) -> None:
     _, room = traffic()
     wanted = {"speed_factor": factor}
     assert speed(room, speed_code=codes.SPEED_GIVEN, speed=5.0, **wanted) == 5.0
-    for code in (codes.SPEED_MAX, codes.SPEED_DESIRED, codes.SPEED_LAST, codes.SPEED_AVERAGE):
+    for code in (codes.SPEED_MAX, codes.SPEED_DESIRED, codes.SPEED_LAST):
         assert speed(room, speed_code=code, **wanted) == pytest.approx(factor * LIMIT)
-    limit = speed(room, speed_code=codes.SPEED_LIMIT, **wanted)
-    assert limit == pytest.approx(min(factor, 1.0) * LIMIT)
+    for code in (codes.SPEED_LIMIT, codes.SPEED_AVERAGE):
+        limit = speed(room, speed_code=code, **wanted)
+        assert limit == pytest.approx(min(factor, 1.0) * LIMIT)
     drawn = np.array(
         [speed(room, vehicle=k, speed_code=codes.SPEED_RANDOM, **wanted) for k in range(400)]
     )
@@ -195,10 +232,17 @@ def test_on_a_free_lane_each_word_means_its_speed(factor: float) -> None:
     assert drawn.mean() == pytest.approx(0.5 * factor * LIMIT, rel=0.1)
 
 
-@pytest.mark.parametrize("code", [codes.SPEED_LAST, codes.SPEED_AVERAGE])
-def test_who_takes_the_speed_of_the_last_one_drives_as_it_does(code: int) -> None:
-    _, room = traffic((MAIN[0], 120.0, 6.0))
-    assert speed(room, speed_code=code) == 6.0
+def test_last_is_the_speed_of_the_leader_and_average_the_mean_of_the_lane() -> None:
+    _, room = traffic((MAIN[0], 120.0, 6.0), (MAIN[0], 150.0, 10.0))
+    assert speed(room, speed_code=codes.SPEED_LAST) == 6.0
+    assert speed(room, speed_code=codes.SPEED_AVERAGE) == 8.0
+
+
+@pytest.mark.parametrize("code", [codes.SPEED_DESIRED, codes.SPEED_LIMIT, codes.SPEED_AVERAGE])
+def test_only_max_and_random_enter_slower_than_they_say(code: int) -> None:
+    _, room = traffic((MAIN[0], 50.0, 3.0), (MAIN[0], 60.0, 2.0 * LIMIT))
+    assert 0.0 < speed(room, speed_code=codes.SPEED_MAX) < LIMIT
+    assert speed(room, speed_code=code) == -1.0
 
 
 def test_a_leader_makes_slower_but_a_given_speed_waits() -> None:
@@ -244,6 +288,28 @@ def test_before_the_end_of_a_lane_nobody_enters_fast() -> None:
     slow = speed_at(ROADS.arrays, KIND, MAIN[0], LENGTH - 6.5, 20.0)
     assert slow == pytest.approx(np.sqrt(2.0 * 2.0 * 2.0))
     assert speed_at(ROADS.arrays, KIND, MAIN[0], 10.0, 20.0) == 20.0
+
+
+def test_only_a_line_where_it_may_have_to_stop_makes_a_departure_slow() -> None:
+    """Behind it a lower limit does."""
+    _, room = traffic()
+    place_m = LENGTH - 12.0
+    link = int(PLAN[0][MAIN[0]]["link"])
+    words = (TRAVEL, traffic()[0], KEY, departure(speed_code=codes.SPEED_MAX), KIND, MAIN[0])
+    links = ROADS.links.copy()
+    links["num_conflicts"], links["signal"] = 0, -1
+    free = ROADS.arrays._replace(links=links)
+    assert entry_speed(free, *words, place_m, room) == pytest.approx(LIMIT)
+    for field, value in (("num_conflicts", 1), ("signal", 0)):
+        changed = links.copy()
+        changed[field][link] = value
+        slow = entry_speed(free._replace(links=changed), *words, place_m, room)
+        assert slow == pytest.approx(speed_at(ROADS.arrays, KIND, MAIN[0], place_m, LIMIT))
+        assert slow < LIMIT
+    lanes = ROADS.lanes.copy()
+    lanes["speed_mps"][PLAN[0][MAIN[0]]["next"]] = 2.0
+    lower = entry_speed(free._replace(lanes=lanes), *words, place_m, room)
+    assert lower == pytest.approx(np.hypot(2.0, np.sqrt(2.0 * 2.0 * 7.5)))
 
 
 @pytest.mark.parametrize(
