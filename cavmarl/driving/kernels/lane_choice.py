@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
-from cavmarl.core.records.codes import DRIVER_AGENT
+from cavmarl.core.records.codes import DRIVER_AGENT, MODEL_KRAUSS
 from cavmarl.driving.kernels.following import LINE_MARGIN_M, accel_behind, no_constraint, wish
 from cavmarl.driving.kernels.lane_change import (
     LANE_CHANGE_DELAY_S,
@@ -213,8 +213,8 @@ def _change_is_safe(
         if net < (kind["min_gap"] if turns else SIDE_GAP_M):
             return False
         after = accel_behind(kind, speed, desired, net, leader["speed"], leader["decel"])
-        # Models that answer for a reaction time ask for less than it takes at a crawl.
-        faster = speed - leader["speed"]
+        # Krauss's answers for a reaction time, and asks for less than it takes at a crawl.
+        faster = speed - leader["speed"] if kind["model"] == MODEL_KRAUSS else 0.0
         if faster > 0.0 and faster * faster > 2.0 * MAX_BRAKING_ACCEPTED * net:
             return False
     followers = _asked_of_followers(roads, travel, rows, row, target, s, scratch)
