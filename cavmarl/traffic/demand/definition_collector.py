@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import re
 from array import array
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -143,7 +143,12 @@ class DefinitionCollector:
     """
 
     def __init__(
-        self, report: DemandReport, begin_ms: int, end_ms: int, max_departures: int
+        self,
+        report: DemandReport,
+        begin_ms: int,
+        end_ms: int,
+        max_departures: int,
+        departs: Mapping[str, str],  # attributes of departures that name none
     ) -> None:
         self.report = report
         self.named: dict[str, dict[str, Element]] = {}
@@ -158,6 +163,7 @@ class DefinitionCollector:
         self._rows = array("d")
         self._begin_ms, self._end_ms = begin_ms, end_ms
         self._max_departures = max_departures
+        self._departs = departs
         self._departures = 0.0
         self._latest_ms: dict[str, int] = {}  # by file
 
@@ -214,6 +220,8 @@ class DefinitionCollector:
         for old, new in _RENAMED.items():
             if old in element.attrs:
                 element.attrs.setdefault(new, element.attrs.pop(old))
+        if self._departs:
+            element.attrs = {**self._departs, **element.attrs}
         for key in _UNUSED:
             if key in element.attrs:
                 what = f"attribute {key} of {element.name} is not modelled"

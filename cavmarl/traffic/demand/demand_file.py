@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
@@ -215,8 +215,8 @@ def read_demand(
     if on_bad_route not in ("error", "skip"):
         raise DemandError(f"on_bad_route='{on_bad_route}': choose 'error' or 'skip'")
     report = DemandReport()
-    files, begin_ms, end_ms, step_ms, device = _files(paths)
-    collector = DefinitionCollector(report, begin_ms, end_ms, max_departures)
+    files, begin_ms, end_ms, step_ms, device, departs = _files(paths)
+    collector = DefinitionCollector(report, begin_ms, end_ms, max_departures, departs)
     for path in files:
         read_elements(path, report, collector.take)
     index = MapIndex(network)
@@ -247,18 +247,24 @@ def read_demand(
     )
 
 
-def _files(paths: Sequence[Path]) -> tuple[list[Path], int, int, int, DeviceOptions]:
-    """The files to read; begin, end and step of their simulation, ms; the rerouting device."""
+def _files(
+    paths: Sequence[Path],
+) -> tuple[list[Path], int, int, int, DeviceOptions, Mapping[str, str]]:
+    """The files to read, and what configurations say of all vehicles.
+
+    Begin, end and step of the simulation, ms; the rerouting device; attributes of departures.
+    """
     files: list[Path] = []
     begin_ms, end_ms, step_ms, device = 0, -1, 1000, DeviceOptions()
+    departs: Mapping[str, str] = {}
     for path in map(Path, paths):
         if path.suffix == ".sumocfg":
             config = read_sumo_config(path)
             files.extend(config.files)
             begin_ms, end_ms, step_ms = config.begin_ms, config.end_ms, config.step_ms
-            device = config.rerouting
+            device, departs = config.rerouting, config.departs
         else:
             files.append(path)
     if not files:
         raise DemandError("no file of demand was given: name a .rou.xml or a .sumocfg")
-    return files, begin_ms, end_ms, step_ms, device
+    return files, begin_ms, end_ms, step_ms, device, departs

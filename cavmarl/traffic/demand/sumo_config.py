@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from xml.sax.handler import ContentHandler
 
 from cavmarl.core.errors import DemandError
 from cavmarl.roads.sumo_net.xml_source import read_xml
+from cavmarl.traffic.demand.demand_records import CODES
 from cavmarl.traffic.demand.element import Element
 from cavmarl.traffic.demand.rerouting_device import DeviceOptions
 
@@ -33,6 +35,7 @@ class SumoConfigFile:
     end_ms: int  # its end; -1: when the demand has ended
     step_ms: int  # length of its step
     rerouting: DeviceOptions  # options of the rerouting device
+    departs: Mapping[str, str]  # departLane and departSpeed of vehicles that name none
 
 
 class _Handler(ContentHandler):
@@ -87,4 +90,18 @@ def read_sumo_config(path: Path) -> SumoConfigFile:
         end_ms=time_ms("end", -1),
         step_ms=step_ms,
         rerouting=DeviceOptions.of(options),
+        departs=_departs(options),
     )
+
+
+def _departs(options: Mapping[str, Element]) -> dict[str, str]:
+    """The attributes of departures that a configuration names for all."""
+    found = {}
+    for key in ("departLane", "departSpeed"):
+        element = options.get(f"default.{key.lower()}")
+        if element is None:
+            continue
+        found[key] = element.attrs["value"].strip()
+        if found[key] not in CODES[key]:
+            element.number("value", 0.0, least=0.0)
+    return found
