@@ -278,11 +278,28 @@ BEHIND_THE_LAST = """<routes>
 
 
 def test_who_enters_behind_the_last_enters_once_however_far_the_last_is(tmp_path: Path) -> None:
-    # The zone at the end of the road sees nobody on it, the one at its start does.
+    # The zone at the end of the road says where, another one sees the last that is far from there.
     road, demand = tmp_path / "long.net.xml", tmp_path / "x.rou.xml"
     road.write_text(LONG_ROAD, encoding="utf-8")
     demand.write_text(BEHIND_THE_LAST, encoding="utf-8")
     hashes_agree(lambda zones: make(road, [demand], overrides=FAST | zones), 300, (2, 4))
+
+
+SLOW_AT_THE_START = """<routes>
+  <vType id="slow" maxSpeed="8" sigma="0"/><vType id="car"/><route id="r" edges="road"/>
+  <vehicle id="first" type="slow" route="r" depart="0" departPos="2700"/>
+  <flow id="b" type="slow" route="r" begin="0" end="100" period="9" departSpeed="max"/>
+  <flow id="f" type="car" route="r" begin="1" end="100" period="9" departPos="last"/>
+</routes>"""
+
+
+def test_the_mean_speed_behind_the_last_is_that_at_the_end_of_the_lane(tmp_path: Path) -> None:
+    # The zone there does not know the slow ones that enter at the start.
+    road, demand = tmp_path / "long.net.xml", tmp_path / "x.rou.xml"
+    road.write_text(LONG_ROAD, encoding="utf-8")
+    demand.write_text(SLOW_AT_THE_START, encoding="utf-8")
+    whole = hashes_agree(lambda zones: make(road, [demand], overrides=FAST | zones), 300, (2, 4))
+    assert whole.traffic_stats().departed > 5
 
 
 @pytest.mark.parametrize("halo_m", [0.0, 12.0])

@@ -217,10 +217,10 @@ def _change_is_safe(
         faster = speed - leader["speed"] if kind["model"] == MODEL_KRAUSS else 0.0
         if faster > 0.0 and faster * faster > 2.0 * MAX_BRAKING_ACCEPTED * net:
             return False
-    followers = _asked_of_followers(roads, travel, rows, row, target, s, scratch)
     after = max(after, -speed / BRAKE_TIME_S)
     if after < -MAX_BRAKING_ACCEPTED:
         return False
+    followers = _asked_of_followers(roads, travel, rows, row, target, s, scratch)
     most = MAX_BRAKING_NEEDED if mandatory else MAX_BRAKING_IMPOSED
     # What followers gain or lose has no weight (POLITENESS), so what they do now is not asked.
     return mobil_accepts(own_wish, after, 0.0, followers, 0.0, 0.0, mandatory, most)

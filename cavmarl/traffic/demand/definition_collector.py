@@ -310,7 +310,7 @@ def _key(element: Element) -> tuple[object, ...]:
 
 
 def _how(element: Element) -> tuple[float, ...]:
-    """The last fields of ELEMENT: how a vehicle enters and leaves; not given, as SUMO 1.28's do."""
+    """The last fields of ELEMENT: how a vehicle enters and leaves, by default as in SUMO 1.28."""
     return (
         _lane(element, "departLane", LANE_BEST),
         *_coded(element, "departPos", POS_BASE),

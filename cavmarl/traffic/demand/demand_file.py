@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Literal
 
@@ -27,7 +27,7 @@ from cavmarl.traffic.demand.map_index import MapIndex
 from cavmarl.traffic.demand.rerouters import Rerouters
 from cavmarl.traffic.demand.rerouting_device import DeviceOptions
 from cavmarl.traffic.demand.resolver import Resolver
-from cavmarl.traffic.demand.sumo_config import read_sumo_config
+from cavmarl.traffic.demand.sumo_config import SumoConfigFile, read_sumo_config
 from cavmarl.traffic.demand.xml_files import read_elements
 
 MAX_DEPARTURES = 2_000_000
@@ -215,9 +215,10 @@ def read_demand(
     if on_bad_route not in ("error", "skip"):
         raise DemandError(f"on_bad_route='{on_bad_route}': choose 'error' or 'skip'")
     report = DemandReport()
-    files, begin_ms, end_ms, step_ms, device, departs = _files(paths)
-    collector = DefinitionCollector(report, begin_ms, end_ms, max_departures, departs)
-    for path in files:
+    config = _configuration(paths)
+    begin_ms, end_ms = config.begin_ms, config.end_ms
+    collector = DefinitionCollector(report, begin_ms, end_ms, max_departures, config.departs)
+    for path in config.files:
         read_elements(path, report, collector.take)
     index = MapIndex(network)
     resolver = Resolver(collector, index, skip=on_bad_route == "skip")
@@ -238,33 +239,25 @@ def read_demand(
         route_choices=resolver.route_choices(),
         bad_pairs=resolver.bad_pairs(),
         rerouters=rerouters,
-        device=device,
+        device=config.rerouting,
         lane_table=index.lane_table,
         begin_ms=begin_ms,
         end_ms=end_ms if end_ms >= 0 else MAX_TIME_MS,
-        step_ms=step_ms,
+        step_ms=config.step_ms,
         report=report,
     )
 
 
-def _files(
-    paths: Sequence[Path],
-) -> tuple[list[Path], int, int, int, DeviceOptions, Mapping[str, str]]:
-    """The files to read, and what configurations say of all vehicles.
-
-    Begin, end and step of the simulation, ms; the rerouting device; attributes of departures.
-    """
+def _configuration(paths: Sequence[Path]) -> SumoConfigFile:
+    """All files to read, with what the last configuration among `paths` says of their vehicles."""
     files: list[Path] = []
-    begin_ms, end_ms, step_ms, device = 0, -1, 1000, DeviceOptions()
-    departs: Mapping[str, str] = {}
+    config = SumoConfigFile(None, (), 0, -1, 1000, DeviceOptions(), {})
     for path in map(Path, paths):
         if path.suffix == ".sumocfg":
             config = read_sumo_config(path)
             files.extend(config.files)
-            begin_ms, end_ms, step_ms = config.begin_ms, config.end_ms, config.step_ms
-            device, departs = config.rerouting, config.departs
         else:
             files.append(path)
     if not files:
         raise DemandError("no file of demand was given: name a .rou.xml or a .sumocfg")
-    return files, begin_ms, end_ms, step_ms, device, departs
+    return replace(config, files=tuple(files))

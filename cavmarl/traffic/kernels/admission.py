@@ -54,8 +54,8 @@ def rank_lanes(
 ) -> None:
     """Count vehicles around the places in this zone where departures may enter that choose a lane.
 
-    A departure behind the last vehicle of a lane gets its place from the zone where the lane
-    starts: it alone sees all that could be the last.
+    A departure behind the last vehicle of a lane gets its place from the zone where the lane ends:
+    it alone sees all that are in view of the end.
 
     `zone`: the shard's own. `gate`: `ranks` and `last_s` are written where a place, or a lane's
     end, lies in this zone. `worlds`: `next_rows` is read.

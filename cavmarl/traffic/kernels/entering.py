@@ -32,7 +32,7 @@ from cavmarl.core.records.codes import (
 from cavmarl.core.records.rows import ENTER_REACH_M
 from cavmarl.driving.kernels.beside import askew_beside
 from cavmarl.driving.kernels.following import LINE_MARGIN_M, accel_behind, speed_behind
-from cavmarl.driving.kernels.lane_index import ahead_on, behind_on, comes_over, first_from, last_on
+from cavmarl.driving.kernels.lane_index import ahead_on, behind_by, first_from, last_on
 from cavmarl.driving.kernels.ways import next_step
 
 ENTER_GAP_M = 1.0  # m between bumpers, the least with which a vehicle enters
@@ -104,10 +104,9 @@ def entry_lane(
             continue
         if code == LANE_FIRST:
             return -1 if taken[lane] else lane
-        if taken[lane]:
-            continue  # where another one tries on the best, it waits
-        if code == LANE_BEST and travel.steps[departure["way"] + lane]["room"] < furthest:
-            continue
+        is_good = code != LANE_BEST or travel.steps[departure["way"] + lane]["room"] >= furthest
+        if taken[lane] or not is_good:
+            continue  # where others try on all of the best, it waits
         rank = ranks[lane - first]
         if rank < best_rank:
             best = lane
@@ -166,7 +165,6 @@ def _line_speed(
 ) -> float:
     """At most `wanted`, and slow before a line where it may have to stop, or a lower limit."""
     way = departure["way"]
-    wanted = min(wanted, kind["max_speed"])
     rest = max(roads.lanes[lane]["length_m"] - s - 0.5 * kind["length"] - 2.0, 0.0)
     while wanted * wanted > 2.0 * ENTER_DECEL * rest:
         lane, way, link = next_step(roads, travel, lane, way)
@@ -193,7 +191,7 @@ def _wanted_speed(
     leader: int,
     scratch: Scratch,
 ) -> float:
-    """The speed in m/s with which a departure would enter at place `s`, whatever is ahead.
+    """The speed in m/s with which a departure would enter at place `s` of a lane without an end.
 
     `leader`: the entry that it would follow, or -1.
     """
@@ -210,7 +208,7 @@ def _wanted_speed(
         wanted = min(wanted, _mean_speed(here["speed_mps"], lane, s, travel.view_m, scratch))
     elif code == SPEED_LAST and leader >= 0:
         wanted = min(wanted, scratch.entries[leader]["speed"])
-    return _line_speed(roads, travel, departure, kind, lane, s, wanted)
+    return float(min(wanted, kind["max_speed"]))
 
 
 @kernel
@@ -227,16 +225,17 @@ def _behind_last_m(
     """How far before place `most`, the last one of its lane, a departure enters with `last`, in m.
 
     Behind the last vehicle in view of the end it keeps the gap from which it could stop; without
-    one it keeps its reaction time to the end, beyond which there may be others.
+    one it keeps its reaction time to the end, beyond which there may be others. It asks about
+    nothing further from the end: the zone there does not know it.
     """
-    length = roads.lanes[lane]["length_m"]
-    k = first_from(scratch, lane, length - travel.view_m, departure["id"])
-    speed = _wanted_speed(roads, travel, key, departure, kind, lane, most, k, scratch)
+    k = first_from(scratch, lane, roads.lanes[lane]["length_m"] - travel.view_m, departure["id"])
+    wanted = _wanted_speed(roads, travel, key, departure, kind, lane, most, k, scratch)
     if k < 0:
-        return float(speed * kind["tau"])
+        at_end = _line_speed(roads, travel, departure, kind, lane, most, wanted)
+        return float(at_end * kind["tau"])
     last = scratch.entries[k]
-    free = _wanted_speed(roads, travel, key, departure, kind, lane, 0.0, k, scratch)
-    gap = kind["min_gap"] + _secure_m(kind, free, last)
+    speed = _line_speed(roads, travel, departure, kind, lane, 0.0, wanted)
+    gap = kind["min_gap"] + _secure_m(kind, speed, last)
     return float(most - (last["s"] - last["half"] - gap - 0.5 * kind["length"]))
 
 
@@ -274,6 +273,7 @@ def entry_speed(
             break
         j = last_on(scratch, beyond, departure["id"], distance, travel.view_m)
     wanted = _wanted_speed(roads, travel, key, departure, kind, lane, s, j, scratch)
+    wanted = _line_speed(roads, travel, departure, kind, lane, s, wanted)
     safe = math.inf
     if j >= 0:
         safe = _safe_behind(kind, scratch.entries[j], distance + scratch.entries[j]["s"] - half)
@@ -323,17 +323,10 @@ def follower_brakes(
     scratch: Scratch,
 ) -> bool:
     """Whether a follower, by whichever lane it comes, would have to brake hard for an entrant."""
-    own_id = departure["id"]
     half = 0.5 * kind["length"]
-    k = behind_on(scratch, lane, s, own_id)
-    if k >= 0:
-        apart = s - scratch.entries[k]["s"]
-        seen = apart <= travel.view_m
-        return seen and _brakes(roads, travel, rows, kind, lane, k, apart - half, speed, scratch)
-    row = roads.lanes[lane]
-    for n in range(row["first_into"], row["first_into"] + row["num_into"]):
-        k, apart = comes_over(
-            roads, scratch, roads.into[n], s, own_id, ENTER_REACH_M, travel.view_m
+    for n in range(max(1, roads.lanes[lane]["num_into"])):
+        k, apart = behind_by(
+            roads, scratch, lane, s, departure["id"], n, ENTER_REACH_M, travel.view_m
         )
         if k >= 0 and _brakes(roads, travel, rows, kind, lane, k, apart - half, speed, scratch):
             return True

@@ -10,6 +10,7 @@ import pytest
 
 from cavmarl.core.errors import DemandError
 from cavmarl.core.math.rng import world_key
+from cavmarl.roads.network import RoadNetwork
 from cavmarl.traffic.demand import Choices, read_demand
 from cavmarl.traffic.demand.demand_records import (
     LANE_BEST,
@@ -185,25 +186,23 @@ def test_reroute_chances_are_drawn(demand: Reader) -> None:
      ('<default.departspeed value="max"/>', 'departSpeed="2"', LANE_BEST, (SPEED_GIVEN, 2.0))],
 )  # fmt: skip
 def test_departures_that_name_no_lane_and_speed_have_sumos_or_the_configurations(
-    demand: Reader, tmp_path: Path, options: str, own: str, lane: int, speed: tuple[int, float]
+    town: RoadNetwork, tmp_path: Path, options: str, own: str, lane: int, speed: tuple[int, float]
 ) -> None:
-    network = demand('<vehicle id="a" depart="0"><route edges="AB"/></vehicle>').network
     car = f'<vehicle id="a" depart="0" {own}><route edges="AB"/></vehicle>'
     (tmp_path / "x.rou.xml").write_text(f"<routes>{car}</routes>", encoding="utf-8")
     path = tmp_path / "run.sumocfg"
     files = '<route-files value="x.rou.xml"/>'
     path.write_text(f"<configuration>{files}{options}</configuration>", encoding="utf-8")
-    element = read_demand([path], network).elements[0]
+    element = read_demand([path], town).elements[0]
     assert element["depart_lane"] == lane
     assert (element["depart_speed_code"], element["depart_speed"]) == speed
 
 
 def test_a_speed_of_departures_that_is_none_is_an_error_of_the_configuration(
-    demand: Reader, tmp_path: Path
+    town: RoadNetwork, tmp_path: Path
 ) -> None:
-    network = demand('<vehicle id="a" depart="0"><route edges="AB"/></vehicle>').network
     path = tmp_path / "run.sumocfg"
     text = '<configuration>\n<default.departspeed value="fast"/></configuration>'
     path.write_text(text, encoding="utf-8")
     with pytest.raises(DemandError, match=r"run\.sumocfg, line 2.*fast"):
-        read_demand([path], network)
+        read_demand([path], town)
