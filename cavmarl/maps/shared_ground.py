@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,29 +16,27 @@ STEP_M = 1.0
 
 
 def shared_ground(network: RoadNetwork) -> list[tuple[int, int]]:
-    """Pairs of LANE rows of two roads that lie nearer to each other than cars are wide.
+    """Pairs of LANE rows that lie nearer to each other than cars are wide, without a rule.
 
-    Asked is outside junctions, and not where the one road leads into the other.
+    Those are of two roads of which neither leads into the other, of movements over two junctions
+    of which neither leads to the road that the other leaves, or of a road and a junction elsewhere.
     """
     grid = lane_grid(network)
     links = network.links[network.links["direction"] != ord("t")]
     pairs = zip(links["from_lane"].tolist(), links["to_lane"].tolist(), strict=True)
     asked = {(min(pair), max(pair)) for pair in pairs}
-    places = {
-        int(lane): _places(network, int(lane))
-        for lane in np.flatnonzero(~network.lanes["internal"])
-    }
+    places = [_places(network, lane) for lane in range(len(network.lanes))]
+    owners = _owners(network)
     found = []
     for first, end in zip(grid.cell_start[:-1], grid.cell_start[1:], strict=True):
-        here = [int(lane) for lane in grid.cell_lanes[first:end] if int(lane) in places]
+        here = [int(lane) for lane in grid.cell_lanes[first:end]]
         for n, one in enumerate(here):
             for other in here[n + 1 :]:
                 pair = (min(one, other), max(one, other))
                 if pair in asked:
                     continue
                 asked.add(pair)
-                roads = network.lanes["edge"][list(pair)]
-                if roads[0] != roads[1] and _touch(places[one], places[other]):
+                if _are_apart(owners, *pair) and _touch(places[one], places[other]):
                     found.append(pair)
     return sorted(found)
 
@@ -46,6 +46,40 @@ def stub_lanes(network: RoadNetwork) -> NDArray[np.int64]:
     edges = network.edges[network.lanes["edge"]]
     stubs = ~network.lanes["internal"] & (edges["num_lanes"] > 1)
     return np.flatnonzero(stubs & (network.lanes["length_m"] < CAR_LENGTH_M))
+
+
+class _Owners(NamedTuple):
+    """Of each lane: its road or junction, and what lies before and beyond it."""
+
+    inside: list[bool]  # it is part of a junction
+    ground: list[int]  # EDGE, or JUNCTION row
+    before: list[int]  # JUNCTION row before a road, EDGE row before a movement over a junction
+    beyond: list[int]
+
+
+def _owners(network: RoadNetwork) -> _Owners:
+    inside, edge = network.lanes["internal"], network.lanes["edge"]
+    link = network.links[np.where(inside, network.lanes["link"], 0)]
+    road = network.edges[edge]
+    return _Owners(
+        inside.tolist(),
+        np.where(inside, link["junction"], edge).tolist(),
+        np.where(inside, edge[link["from_lane"]], road["from_junction"]).tolist(),
+        np.where(inside, edge[link["to_lane"]], road["to_junction"]).tolist(),
+    )
+
+
+def _are_apart(owners: _Owners, one: int, other: int) -> bool:
+    """Whether two lanes are of two roads or junctions of which neither leads to the other."""
+    inside, ground, before, beyond = owners
+    if inside[one] != inside[other]:
+        road, junction = (other, one) if inside[one] else (one, other)
+        return ground[junction] not in (before[road], beyond[road])
+    if ground[one] == ground[other]:
+        return False
+    if not inside[one]:
+        return True
+    return beyond[one] != before[other] and beyond[other] != before[one]
 
 
 def _touch(mine: NDArray[np.float64], theirs: NDArray[np.float64]) -> bool:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from cavmarl.maps.map_features import MAP_FEATURES, map_features
 from cavmarl.maps.shared_ground import shared_ground, stub_lanes
+from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network
-from tests.support.netgenerate import netgenerate
+from tests.support.netgenerate import netconvert, netgenerate
 
 GRID = ("--grid", "--grid.number=3", "--grid.length=80")
 
@@ -25,6 +28,48 @@ def test_both_directions_on_one_lane_share_their_ground(tmp_path: Path) -> None:
     for one, other in pairs:
         assert network.lanes["edge"][one] != network.lanes["edge"][other]
     assert map_features(network) == ("shared_ground",)
+
+
+@pytest.mark.parametrize(("apart_m", "meet"), [(2.0, True), (12.0, False)])
+def test_two_junctions_share_the_ground_of_the_ways_over_them(
+    tmp_path: Path, apart_m: float, meet: bool
+) -> None:
+    """Two bends, back to back: the one leads from west to south, the other from east to north."""
+    far = 60.0 + apart_m
+    nodes = {"b": (apart_m, apart_m), "e": (far, apart_m), "n": (apart_m, far)}
+    network = bend_beside(tmp_path, nodes, ("eb", "be", "bn", "nb"))
+    pairs = shared_ground(network)
+    assert bool(pairs) == meet
+    for pair in pairs:
+        assert network.lanes["internal"][list(pair)].any()
+
+
+@pytest.mark.parametrize(("apart_m", "meet"), [(0.0, True), (12.0, False)])
+def test_a_road_over_a_junction_elsewhere_shares_its_ground(
+    tmp_path: Path, apart_m: float, meet: bool
+) -> None:
+    """It leads past the outer side of a bend."""
+    nodes = {"b": (20.0 + apart_m, -20.0 + apart_m), "e": (-20.0 + apart_m, 20.0 + apart_m)}
+    network = bend_beside(tmp_path, nodes, ("be",))
+    inside = network.lanes["internal"]
+    pairs = shared_ground(network)
+    assert bool(pairs) == meet
+    for one, other in pairs:
+        assert inside[one] != inside[other]
+
+
+def bend_beside(
+    tmp_path: Path, nodes: dict[str, tuple[float, float]], others: tuple[str, ...]
+) -> RoadNetwork:
+    """A bend from west to south around the origin, and other roads, each from a node to another."""
+    nodes = {"a": (0.0, 0.0), "w": (-60.0, 0.0), "s": (0.0, -60.0), **nodes}
+    roads = ("wa", "aw", "as", "sa", *others)
+    points = "".join(f'<node id="{name}" x="{x}" y="{y}"/>' for name, (x, y) in nodes.items())
+    lines = "".join(f'<edge id="{a}{b}" from="{a}" to="{b}"/>' for a, b in roads)
+    (tmp_path / "bends.nod.xml").write_text(f"<nodes>{points}</nodes>")
+    (tmp_path / "bends.edg.xml").write_text(f"<edges>{lines}</edges>")
+    (tmp_path / "bends.con.xml").write_text("<connections/>")
+    return read_network(netconvert(tmp_path, "bends"))
 
 
 def test_turn_lanes_shorter_than_a_car_are_stubs(tmp_path: Path) -> None:
