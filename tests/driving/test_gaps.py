@@ -94,6 +94,15 @@ def test_one_that_comes_enters_where_another_is_just_out(
     assert not blocks(0.65 + behind_s, "enter", -6.0, driver=driver)
 
 
+@pytest.mark.parametrize(("accel", "waits"), [(0.0, False), (-1.7, False), (-1.9, True)])
+def test_one_that_brakes_on_the_junction_does_not_speed_up(
+    blocks: Blocks, accel: float, waits: bool
+) -> None:
+    """Its rear has 6 m to go: 0.6 s, or 1 s at the 6 m/s to which it has slowed down."""
+    blocked = blocks(0.93, "enter", -6.0, own={"speed": SPEED_MPS}, speed=6.0, accel=accel)
+    assert blocked == (HOLD_YIELD if waits else HOLD_NONE)
+
+
 @pytest.mark.parametrize(
     ("out_s", "hold", "waits"),
     [(0.6, HOLD_YIELD, True), (0.4, HOLD_YIELD, False), (0.6, HOLD_NONE, False)],
@@ -138,6 +147,14 @@ def test_before_one_that_comes_to_its_line_it_is_over_one_second_earlier_or_if_s
     # Its front reaches its line in 5 s.
     assert blocks(5.05 - ahead_s, "out", 50.0, driver=driver)
     assert not blocks(4.95 - ahead_s, "out", 50.0, driver=driver)
+
+
+@pytest.mark.parametrize(("to_go_m", "waits"), [(52.4, False), (60.0, True), (0.0, True)])
+def test_one_whose_trip_ends_before_its_line_is_not_waited_for(
+    blocks: Blocks, to_go_m: float, waits: bool
+) -> None:
+    """Its centre has 52.5 m to its line; 0 says a row that knows no end of its way."""
+    assert bool(blocks(4.5, "out", 50.0, to_go=to_go_m)) == waits
 
 
 def test_one_that_speeds_up_comes_earlier(blocks: Blocks) -> None:

@@ -410,7 +410,7 @@ def test_who_gives_way_follows_a_faster_one_into_the_same_lane_and_waits_for_a_s
     here.put("main", "W_in_0", -3.0, "E_out", speed=pace)
     here.put("side", "N_in_0", 8.0, "E_out", speed=6.0)
     slowest = min(float(here["side"]["speed"]) for _ in here.run(3.0))
-    assert (slowest < 5.9) == brakes
+    assert (slowest < 5.0) == brakes, "it slows down a little to follow, more to wait"
 
 
 @pytest.mark.parametrize(("place_m", "blocked"), [(74.0, True), (76.0, False)])

@@ -85,6 +85,17 @@ def test_one_changes_lanes_when_its_rear_is_out_of_the_junction(
     assert not _rear_is_inside(lane, row)
 
 
+@pytest.mark.parametrize(("length_m", "near_m"), [(16.4, 0.0), (18.5, 2.0), (100.0, 5.0)])
+def test_behind_a_junction_it_stays_in_its_lane_where_long_vehicles_turn_in(
+    length_m: float, near_m: float
+) -> None:
+    lane, row = np.zeros(1, LANE)[0], blank_vehicle()[0]
+    row["driver"], row["length"], lane["length_m"] = DRIVER_BACKGROUND, 5.0, length_m
+    for rear_m, stays in ((near_m - 0.1, True), (near_m + 0.1, False)):
+        row["s"] = 2.5 + rear_m
+        assert _rear_is_inside(lane, row) == stays
+
+
 @pytest.mark.parametrize(("far_mps", "asks"), [(25.0, True), (0.0, False)])
 def test_a_change_of_lanes_asks_those_of_every_lane_that_leads_there(
     far_mps: float, asks: bool

@@ -1,6 +1,9 @@
-"""A steered car before a junction, and one that turns into its lane."""
+"""A vehicle before a junction, and one that turns into its lane."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,11 +11,18 @@ import pytest
 from cavmarl.driving.kernels.following import no_constraint
 from cavmarl.driving.kernels.junctions import behind_merging
 from cavmarl.driving.vehicle_types import generated_types
+from tests.support.junction_scenes import Scene, build_crossing
 from tests.support.traffic import network, on_lane, scratch
 
 
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Scene]:
+    folder: Path = tmp_path_factory.mktemp("merging")
+    return lambda kind: Scene(build_crossing(folder, kind))
+
+
 @pytest.mark.parametrize(("merging", "front_m"), [(True, 3.0), (False, 3.0), (True, -3.0)])
-def test_a_steered_car_brakes_early_behind_one_that_turns_into_its_lane(
+def test_one_that_is_fast_brakes_early_behind_one_that_turns_into_its_lane(
     merging: bool, front_m: float
 ) -> None:
     # By the shared area alone it would brake when no braking is enough any more.
@@ -32,3 +42,20 @@ def test_a_steered_car_brakes_early_behind_one_that_turns_into_its_lane(
         assert found > 5.0
     else:
         assert found == no_constraint(kind)
+
+
+@pytest.mark.parametrize(("speed", "minds"), [(13.9, True), (4.9, False)])
+def test_a_fast_background_driver_slows_down_for_one_that_turns_in_ahead(
+    scene: Callable[[str], Scene], speed: float, minds: bool
+) -> None:
+    """It will be out of the shared area before the other one comes, but much slower than that."""
+    accels = []
+    for others in (False, True):
+        here = scene("priority")
+        here.clear()
+        here.put("main", "W_in_0", 40.0, "E_out", speed=speed)
+        if others:
+            here.put("side", "N_in_0", -6.0, "E_out", speed=5.0)
+        next(here.run(0.05))
+        accels.append(float(here["main"]["accel"]))
+    assert (accels[1] < accels[0] - 0.5) == minds

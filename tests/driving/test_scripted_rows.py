@@ -174,7 +174,10 @@ def riding() -> Actor:
 
 
 def test_who_rides_announces_itself_to_junctions_as_a_driver_does() -> None:
-    """The twin is a background car in the same place, with a way over the same link."""
+    """The twin is a background car in the same place, with a way over the same link.
+
+    Its trip ends on the lane behind that, as the ride's does not.
+    """
     actor = riding()
     ride = actor.acts[0]
     assert isinstance(ride, Ride)
@@ -183,6 +186,7 @@ def test_who_rides_announces_itself_to_junctions_as_a_driver_does() -> None:
     tables, rows = scripted(actor, goals=goals)
     tables = tables._replace(steps=make_plans(ROADS, [actor.released_to]).reshape(-1))
     row = rows[0]
+    end = int(ROADS.lanes["first_link"][ride.lanes[-1]])
     for _ in range(80):
         follow(tables, row, True, 5)
         if row["driver"] != DRIVER_SCRIPTED:
@@ -190,7 +194,7 @@ def test_who_rides_announces_itself_to_junctions_as_a_driver_does() -> None:
         twin = on_lane(ROADS, int(row["lane"]), float(row["s"]), tables, id=10, goal=0,
                        speed=row["speed"], link=int(row["link"]))  # fmt: skip
         assert (row["x"], row["y"]) == pytest.approx((twin["x"][0], twin["y"][0]), abs=0.3)
-        assert announced(tables, rows) == announced(tables, twin)
+        assert announced(tables, rows) == [at for at in announced(tables, twin) if at[0] != end]
         assert entries(tables, rows).keys() >= entries(tables, twin).keys()
     assert row["driver"] == DRIVER_BACKGROUND
     assert row["to_go"] == pytest.approx(STREETS.length_m(int(row["lane"])) - row["s"], abs=1e-6)

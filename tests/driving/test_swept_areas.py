@@ -147,6 +147,17 @@ def test_a_car_that_has_to_stop_anyway_leaves_room_for_a_bus(network: RoadNetwor
     assert meeting.stop(1, (-2.0, -12.0)) == np.inf, "it drives on where nothing stops it"
 
 
+@pytest.mark.parametrize(("over_m", "goes"), [(0.0, False), (1e-9, False), (0.1, True)])
+def test_one_that_stands_right_before_the_area_is_not_in_it(
+    network: RoadNetwork, over_m: float, goes: bool
+) -> None:
+    """However its place was rounded; the other one is in the area."""
+    meeting = Meeting(network)
+    enter_m, car_m = (float(meeting.sweep[name]) for name in ("enter_m", "foe_enter_m"))
+    stop_m = meeting.stop(0, (enter_m + over_m, car_m + 0.5))
+    assert (stop_m == np.inf) == goes
+
+
 def test_long_vehicles_wait_inside_before_what_others_sweep(network: RoadNetwork) -> None:
     """The place that a bus waits at lies before every area that begins between there and there."""
     earlier = 0

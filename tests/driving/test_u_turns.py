@@ -6,15 +6,19 @@ import numpy as np
 import pytest
 
 from cavmarl.core.records.codes import DRIVER_BACKGROUND, HOLD_YIELD
+from cavmarl.core.records.rows import SWEPT_BEYOND_M
 from cavmarl.driving.kernels.approach import register_links
 from cavmarl.driving.kernels.drivers import decide
+from cavmarl.driving.kernels.following import no_constraint
 from cavmarl.driving.kernels.lane_choice import _change_is_safe
+from cavmarl.driving.kernels.lane_ends import behind_beside
 from cavmarl.driving.kernels.lane_index import index_lanes
 from cavmarl.driving.kernels.swept_areas import swept_stop
 from cavmarl.driving.vehicle_types import generated_types
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN
 from cavmarl.roads.sumo_net.reader import read_network
+from cavmarl.traffic.kernels.admission import _is_swept, _may_be_swept
 from tests.support.netgenerate import netgenerate
 from tests.support.traffic import on_lane, scratch, travel_by
 
@@ -69,6 +73,46 @@ def test_only_a_long_vehicle_that_turns_round_minds_those_that_have_left_beside_
     assert (min(beyond_m) > 2.0) == reaches
 
 
+def test_a_bus_that_turns_round_reaches_far_over_the_lane_beside(network: RoadNetwork) -> None:
+    """Over one whose rear is 5 m behind the junction, and no further than others announce it."""
+    links, beyond_m = network.links, []
+    for turn in np.flatnonzero(links["direction"] == U_TURN):
+        sweeps = network.sweeps[links["first_sweep"][turn] :][: links["num_sweeps"][turn]]
+        foes = sweeps["foe"][sweeps["own"] == BUS]
+        beside = links["to_lane"][foes] != links["to_lane"][turn]
+        leave_m = sweeps["foe_leave_m"][sweeps["own"] == BUS] - links["length_m"][foes]
+        beyond_m += leave_m[beside].tolist()
+    assert 5.0 < max(beyond_m) < SWEPT_BEYOND_M
+
+
+@pytest.mark.parametrize(("bus_m", "brakes"), [(6.0, True), (40.0, False)])
+def test_one_that_leaves_a_lane_minds_those_at_its_end_while_its_body_covers_it(
+    network: RoadNetwork, bus_m: float, brakes: bool
+) -> None:
+    """A car between two lanes, and a bus that sweeps over the end of the one that it leaves."""
+    link, turn = beside(network)
+    row = network.links[link]
+    sweeps = network.sweeps[row["first_sweep"] :][: row["num_sweeps"]]
+    picked = (sweeps["foe"] == turn) & (sweeps["own"] == 0) & (sweeps["other"] == BUS)
+    (enter_m,) = sweeps["enter_m"][picked]
+    lane, left = int(row["from_lane"]), int(network.lanes["left"][row["from_lane"]])
+    length_m = float(network.lanes["length_m"][lane])
+    travel = travel_by(np.zeros(len(network.lanes), PLAN))
+    s = length_m + float(enter_m) - 6.0 - 2.5
+    rows = on_lane(network, left, s, travel, id=0, length=5.0, speed=6.0, side_lane=lane)
+    room = scratch(network, 1)
+    room.link_start[:] = room.link_end[:] = 0
+    rows = np.concatenate([rows, rows])
+    rows["id"], rows["hold"] = (0, 1), 0
+    room.link_end[turn] = 1
+    bus = room.approach[0]
+    bus["row"], bus["id"], bus["half"] = 1, 1, 0.5 * BUS_M
+    bus["dist"], bus["speed"] = 0.5 * BUS_M - bus_m, 2.0
+    kind = generated_types()[0]
+    found = behind_beside(network.arrays, travel, rows, 0, kind, 100.0, 0.1, room)
+    assert (found > no_constraint(kind)) == brakes
+
+
 @pytest.mark.parametrize(("foe_m", "waits"), [(-20.0, False), (2.0, True)])
 def test_a_bus_leaves_room_for_a_u_turn_ahead_of_it_and_not_behind_it(
     network: RoadNetwork, foe_m: float, waits: bool
@@ -92,6 +136,84 @@ def test_a_bus_leaves_room_for_a_u_turn_ahead_of_it_and_not_behind_it(
     room.approach["dist"][room.approach["row"] == 1] = 0.5 * BUS_M - foe_m
     stop = swept_stop(network.arrays, rows, 0, turn, own_m, np.inf, room)
     assert stop == (sweep["enter_m"] if waits else np.inf)
+
+
+def test_a_rear_that_comes_back_reaches_those_behind_it_before_it_has_left_its_lane(
+    network: RoadNetwork,
+) -> None:
+    """A car does not: its way is hardly shorter than itself."""
+    _, turn = beside(network)
+    row = network.links[turn]
+    sweeps = network.sweeps[row["first_sweep"] :][: row["num_sweeps"]]
+    behind = sweeps[(sweeps["foe"] == turn) & (sweeps["own"] == 0)]
+    (bus,) = behind[behind["other"] == BUS]
+    assert not (behind["other"] == 0).any()
+    assert 0.0 < bus["foe_enter_m"] < BUS_M - 3.0, "its rear is still before the line"
+    assert bus["enter_m"] < bus["foe_enter_m"] - BUS_M + 1.0, "up to where its rear was"
+
+
+@pytest.mark.parametrize("turns", [True, False])
+def test_one_follows_a_bus_that_turns_round_from_further_back(
+    network: RoadNetwork, turns: bool
+) -> None:
+    link, turn = beside(network)
+    taken = turn if turns else link
+    lane = int(network.links["from_lane"][taken])
+    plan = np.zeros(len(network.lanes), PLAN)
+    plan["next"][lane], plan["link"][lane] = network.links["next_lane"][taken], taken
+    travel, length_m = travel_by(plan), float(network.lanes["length_m"][lane])
+    kind = generated_types()[0]
+
+    def stands_m(length: float) -> float:
+        """How far behind its leader it does not speed up from rest, to a quarter of a metre."""
+        for gap_m in np.arange(0.25, 9.0, 0.25):
+            rear_m = length_m - 1.0 - length
+            places = [(rear_m - gap_m - 2.5, 5.0), (rear_m + 0.5 * length, length)]
+            rows = np.concatenate(
+                [on_lane(network, lane, s, travel, id=k, length=long, driver=DRIVER_BACKGROUND,
+                         speed=0.0) for k, (s, long) in enumerate(places)]
+            )  # fmt: skip
+            room, step = scratch(network, 2), np.zeros(2, PLAN)
+            index_lanes(network.arrays, travel, rows, 2, room)
+            register_links(network.arrays, travel, rows, 2, step, np.zeros(2, np.int64), room)
+            phase = np.zeros(0, np.int32)
+            decide(network.arrays, travel, rows, 1, DRIVER_BACKGROUND, 0, 0.1, phase, step, room)
+            if room.accel[0] > 0.1:
+                return float(gap_m)
+        raise AssertionError("it never goes")
+
+    further_m = stands_m(BUS_M) - stands_m(kind["length"])
+    assert further_m == pytest.approx(3.0 if turns else 0.0, abs=0.3)
+
+
+@pytest.mark.parametrize(("bus_m", "swept"), [(6.0, True), (40.0, False), (None, False)])
+def test_nothing_enters_at_the_start_of_a_lane_where_a_bus_turns_round_beside_it(
+    network: RoadNetwork, bus_m: float | None, swept: bool
+) -> None:
+    """`bus_m`: of its front beyond its line; it reaches over the start of the lane beside it."""
+    links, sweeps = network.links, network.sweeps
+    owner = np.repeat(np.arange(len(links)), links["num_sweeps"])
+    reaches = (sweeps["own"] == 0) & (sweeps["other"] == BUS)
+    reaches &= links["direction"][sweeps["foe"]] == U_TURN
+    reaches &= sweeps["leave_m"] > links["length_m"][owner] + 0.5
+    picked = int(np.flatnonzero(reaches)[0])
+    lane, turn = int(links["to_lane"][owner[picked]]), int(sweeps["foe"][picked])
+    nowhere = np.zeros(len(network.lanes), PLAN)
+    nowhere["next"], nowhere["link"] = -1, -1
+    travel = travel_by(nowhere)
+    row = on_lane(network, lane, 2.5, travel, id=0)[0]
+    room = scratch(network, 2)
+    inside = int(links["first_internal"][turn])
+    buses = on_lane(network, inside, 1.0, travel, id=1, length=BUS_M)
+    index_lanes(network.arrays, travel, buses, 0 if bus_m is None else 1, room)
+    room.link_start[:] = room.link_end[:] = 0
+    if bus_m is not None:
+        room.link_end[turn] = 1
+        room.approach["half"][0], room.approach["dist"][0] = 0.5 * BUS_M, 0.5 * BUS_M - bus_m
+    assert bus_m is None or _may_be_swept(network.arrays, travel, row, room)
+    assert _is_swept(network.arrays, travel, row, room) == swept
+    row["s"] = 30.0
+    assert not _is_swept(network.arrays, travel, row, room), "it enters further on"
 
 
 @pytest.mark.parametrize(("place_m", "stands_at_sign"), [(-9.5, True), (-16.0, False)])

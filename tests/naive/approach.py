@@ -50,7 +50,8 @@ def announcements(roads: RoadNetwork, travel: Travel, row: np.void) -> list[Entr
         else:
             step = travel.steps[way + lane]
             if step["next"] < 0:
-                if not ahead and to_end < 15.0 and here["num_links"]:
+                is_minded = to_end < 15.0 or step["change"] == 0  # or its trip ends there
+                if not ahead and is_minded and here["num_links"]:
                     found.append((int(here["first_link"]), name, max(to_end, 0.0)))
                 break
             ahead.append((int(step["link"]), to_end))

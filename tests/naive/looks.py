@@ -143,9 +143,17 @@ class Looks:
                 lanes.add(lane)
             if ahead.get(lane, math.inf) + self.lengths[lane] <= see_m:
                 lanes.add(lane)
+            if lane in self.own and self.own[lane][0] <= SWEPT_BEYOND_M + self.half_m:
+                lanes |= self._leads_to(lane)
         return {
             link for lane in lanes for beside in self._beside(lane) for link in self._links(beside)
         }
+
+    def _leads_to(self, lane: int) -> set[int]:
+        """The lanes before the junction at the start of a lane."""
+        links = self.network.links
+        here = (links["to_lane"] == lane) & (links["first_internal"] >= 0)
+        return set(links["from_lane"][here].tolist())
 
     def _at_lines(self, foes: set[int], places: dict[int, float]) -> None:
         """See who announces itself at the lines of foes."""

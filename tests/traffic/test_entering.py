@@ -15,6 +15,7 @@ from cavmarl.core.records.arrays import Scratch, Travel
 from cavmarl.driving.kernels.following import speed_behind
 from cavmarl.driving.kernels.lane_index import VIEW_M, index_lanes
 from cavmarl.driving.vehicle_types import generated_types
+from cavmarl.roads.routing import PLAN as _PLAN
 from cavmarl.roads.routing import make_plans
 from cavmarl.traffic.departure_queue import DEPARTURE
 from cavmarl.traffic.kernels.entering import (
@@ -345,3 +346,60 @@ def test_all_who_come_are_asked_not_only_the_nearest() -> None:
         cars[1]["speed"] = 0.0
         index_lanes(roads.arrays, ways, cars, 2, room)
         assert not follower_brakes(*asked)
+
+
+@pytest.mark.parametrize(("rear_m", "safe"), [(-1.0, False), (30.0, True)])
+def test_one_that_has_turned_off_elsewhere_is_a_leader_while_its_rear_is_before_the_fork(
+    rear_m: float, safe: bool
+) -> None:
+    """The departure goes straight on; `rear_m`: of the other one, beyond the line of both."""
+    roads, plans = network("grid4x4"), travel("grid4x4")
+    lane, link, other = _fork(roads)
+    plan = np.zeros(len(roads.lanes), _PLAN)
+    plan["next"], plan["link"], plan["to_go"] = roads.links["next_lane"][link], link, 500.0
+    ahead = int(roads.links["next_lane"][other])
+    end_m = float(roads.lanes["length_m"][lane])
+    place_m = min(rear_m + 2.5, float(roads.lanes["length_m"][ahead]))
+    rows = on_lane(roads, ahead, place_m, plans, speed=0.0)
+    room = scratch(roads, 1)
+    index_lanes(roads.arrays, plans, rows, 1, room)
+    waiting = departure(lane, speed_code=codes.SPEED_GIVEN, speed=6.0)
+    found = entry_speed(
+        roads.arrays, travel_by(plan), rows, KEY, waiting, KIND, lane, end_m - 14.0, room
+    )
+    assert (found == 6.0) == safe
+
+
+@pytest.mark.parametrize(
+    ("to_start_m", "fork_m", "brakes"), [(2.0, 3.0, True), (60.0, 3.0, False), (2.0, 1.0, False)]
+)
+def test_nothing_enters_before_one_that_turns_into_the_lane_beside_from_the_same_lane(
+    to_start_m: float, fork_m: float, brakes: bool
+) -> None:
+    """`to_start_m`: of its front, at 10 m/s, on a way of 8 m that runs beside the own for so far.
+
+    A long one is in the way for 6 m more.
+    """
+    roads, plans = network("grid4x4"), travel("grid4x4")
+    _, link, other = _fork(roads)
+    links = roads.links.copy()
+    links["length_m"][[link, other]], links["fork_m"][[link, other]] = 8.0, fork_m
+    inside = int(links["first_internal"][other])
+    rows = on_lane(roads, inside, 8.0 - to_start_m - 2.5, plans, speed=10.0)
+    room = scratch(roads, 1)
+    index_lanes(roads.arrays, plans, rows, 1, room)
+    lane = int(links["to_lane"][link])
+    arrays = roads.arrays._replace(links=links)
+    waiting = departure(lane)
+    assert follower_brakes(arrays, plans, rows, waiting, KIND, lane, 2.5, 8.0, room) == brakes
+
+
+def _fork(roads: Any) -> tuple[int, int, int]:
+    """A lane, and two links that leave it: one over the junction straight on, and another."""
+    for lane in np.flatnonzero(roads.lanes["num_links"] > 1).tolist():
+        first, num = roads.lanes["first_link"][lane], roads.lanes["num_links"][lane]
+        links = range(first, first + num)
+        straight = [link for link in links if roads.links["direction"][link] == ord("s")]
+        if straight:
+            return lane, straight[0], next(link for link in links if link not in straight)
+    raise AssertionError("no lane forks")

@@ -16,7 +16,7 @@ SIZE_BODIES_M = (
 )  # the length that a vehicle of each class is taken to have at least
 STEERED = 3  # the class of a car that is steered, of SWEEP rows that say where it sweeps
 WAIT_SLACK_M = 0.5  # a front this far beyond a waiting position inside a junction still waits there
-SWEPT_BEYOND_M = 5.0  # how far beyond a junction others may still mind a vehicle's rear
+SWEPT_BEYOND_M = 9.0  # how far beyond a junction others may still mind a vehicle's rear
 FORK_BEYOND_M = 3.0  # how far beyond a junction paths from one lane can still run together
 LOST_M = (
     10.0  # from its place on its lane: a vehicle that is steered off further is no longer there

@@ -164,14 +164,18 @@ def _announce(
     way = row["way"]
     found = 0
     while distance < reach or (found == 0 and distance < own_reach):
+        before, before_way = lane, way
         if lane == row["lane"] and way == row["way"]:
             lane, way, link = leave(roads, step, lane, way)
         else:
             lane, way, link = next_step(roads, travel, lane, way)
         if lane < 0:
-            # It has to change lanes before the end, in the way of vehicles that turn beside it.
-            if distance < STANDS_BEFORE_M and found == 0 and here["num_links"] > 0:
-                pairs = _note(scratch, pairs, here["first_link"], row, i, max(distance, 0.0))
+            # It has to change lanes before the end, in the way of vehicles that turn beside it, or
+            # its trip ends there.
+            last = roads.lanes[before]
+            ends = travel.steps[before_way + before]["change"] == 0
+            if (ends or distance < STANDS_BEFORE_M) and found == 0 and last["num_links"] > 0:
+                pairs = _note(scratch, pairs, last["first_link"], row, i, max(distance, 0.0))
             break
         if link >= 0:
             if roads.links[link]["num_conflicts"] + roads.links[link]["num_sweeps"] > 0:

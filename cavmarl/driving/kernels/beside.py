@@ -10,18 +10,37 @@ from numpy.typing import NDArray
 from cavmarl.core.math.geometry import lane_pose
 from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
-from cavmarl.core.records.codes import DRIVER_AGENT
+from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_SCRIPTED
 from cavmarl.driving.kernels.following import behind, no_constraint
 from cavmarl.driving.kernels.lane_index import ahead_on, beside_s, last_on
+from cavmarl.driving.kernels.swept_areas import BUS_M
 
 STICKS_OUT_M = 0.1  # over the side of its lane, so far that others have to mind it
 ASKEW_RAD = 0.15  # a vehicle that stands less askew does not stick out
+SWINGS_BACK_M = 3.0  # both bumpers on its way, a bus of 12 m that turns round stands further back
+TURNAROUND = ord("t")
 
 
 @inlined_kernel
 def behind_entry(kind: np.void, speed: float, gap: float, leader: np.void) -> float:
     """The constraint of a leader by its ENTRY in the index of lanes; `gap`: between bumpers, m."""
     return behind(kind, speed, gap, leader["speed"], leader["decel"])
+
+
+@inlined_kernel
+def swings_back_m(
+    roads: RoadArrays, travel: Travel, rows: NDArray[np.void], leader: np.void
+) -> float:
+    """How far a leader's rear may come back, in m: that of a bus does while it turns round."""
+    if leader["half"] <= 0.5 * BUS_M:
+        return 0.0
+    other = rows[leader["row"]]
+    if other["driver"] == DRIVER_SCRIPTED:
+        return 0.0
+    here = roads.lanes[other["lane"]]
+    link = here["link"] if here["internal"] else travel.steps[other["way"] + other["lane"]]["link"]
+    turns: bool = link >= 0 and roads.links[link]["direction"] == TURNAROUND
+    return SWINGS_BACK_M if turns else 0.0
 
 
 @kernel

@@ -27,7 +27,7 @@ from cavmarl.core.records.codes import (
 )
 from cavmarl.core.records.rows import is_lost
 from cavmarl.driving.kernels.bends import LIMIT_DECEL, bend_speed
-from cavmarl.driving.kernels.beside import behind_askew, behind_entry, beside
+from cavmarl.driving.kernels.beside import behind_askew, behind_entry, beside, swings_back_m
 from cavmarl.driving.kernels.circles import breaks_circles
 from cavmarl.driving.kernels.courtesy import COURTESY_DECEL, let_merge
 from cavmarl.driving.kernels.following import (
@@ -54,8 +54,15 @@ from cavmarl.driving.kernels.lane_choice import (
     thinks_of_lanes,
     wish_on_lane,
 )
-from cavmarl.driving.kernels.lane_ends import behind_over_line, lane_end, misses_change, over_end
+from cavmarl.driving.kernels.lane_ends import (
+    behind_beside,
+    behind_over_line,
+    lane_end,
+    misses_change,
+    over_end,
+)
 from cavmarl.driving.kernels.lane_index import VIEW_M, last_on
+from cavmarl.driving.kernels.room_beside import STAYS_ASIDE, stays_aside
 from cavmarl.driving.kernels.stopping import way_to_stop
 from cavmarl.driving.kernels.swept_areas import (
     before_line_gently,
@@ -80,6 +87,7 @@ FALL_IN_M = 100.0  # before the place where a lane change must be made
 CHANGING_ROOM_M = -0.8
 MISSED_ROOM_M = 1.5  # more, where its lane goes on to a turn that it cannot take
 ROW_LINES = 3  # of a VEHICLE row that drivers ask for
+FAST_MPS = 5.0  # a slower background driver need not slow down for one that turns in ahead
 RETURN_MPS = 5.0  # at which a lost vehicle looks for its lane
 
 
@@ -156,7 +164,7 @@ def _at_line(
         swept = before_swept(roads, rows, i, kind, link, front, waits, dt, scratch)
         return max(constraint, swept), hold, math.inf
     merging = no_constraint(kind)
-    if row["driver"] == DRIVER_AGENT:
+    if row["driver"] == DRIVER_AGENT or speed > FAST_MPS:
         merging = behind_merging(roads, kind, row, link, distance, scratch)
     hold = may_enter(roads, travel, rows, i, link, distance, way, phase, scratch)
     waits = HOLD_NONE
@@ -239,10 +247,9 @@ def _road_ahead(
     # any more once the leader has passed it.
     if k + 1 < scratch.lane_end[lane] and (scratch.entries[k + 1]["s"] - row["s"] <= travel.view_m):
         leader = scratch.entries[k + 1]
-        constraint = max(
-            constraint,
-            behind_entry(kind, speed, leader["s"] - row["s"] - half - leader["half"], leader),
-        )
+        gap = leader["s"] - row["s"] - half - leader["half"]
+        gap -= swings_back_m(roads, travel, rows, leader)
+        constraint = max(constraint, behind_entry(kind, speed, gap, leader))
         look = min(look, half + NEXT_LINE_M + speed + 0.5 * speed * speed / kind["decel"])
     way = row["way"]
     while distance < look:
@@ -281,6 +288,7 @@ def _road_ahead(
             gap = distance + leader["s"] - half - leader["half"]
             if gap < NEAR_M and _is_askew(row, rows[leader["row"]]):
                 gap -= 0.5 * rows[leader["row"]]["width"]
+            gap -= swings_back_m(roads, travel, rows, leader)
             constraint = max(constraint, behind_entry(kind, speed, gap, leader))
         elif stops:
             over = behind_over_line(roads, travel, row, kind, lane, way, distance, scratch)
@@ -370,9 +378,9 @@ def decide(
             askew = behind_askew(roads, travel, rows, kind, row, row["lane"], row["s"], scratch)
             constraint = max(constraint, askew)
         if row["side_lane"] >= 0:
-            constraint = max(
-                constraint, beside(roads, travel, kind, row, row["side_lane"], scratch)
-            )
+            see = min(see_line_m(kind, speed), travel.see_m)
+            aside = behind_beside(roads, travel, rows, i, kind, see, dt, scratch)
+            constraint = max(constraint, aside)
         needed = needed_change(roads, travel, row, step[i])
         change = 0
         if thinks_of_lanes(row, needed, tick, dt):
@@ -404,6 +412,8 @@ def decide(
                     kind, speed, allowed, beside(roads, travel, kind, row, target, scratch)
                 )
                 accel = min(accel, max(fall_in, -COURTESY_DECEL))
+        if driver == DRIVER_BACKGROUND and stays_aside(roads, rows, row, scratch):
+            change = STAYS_ASIDE
         scratch.accel[i] = accel
         scratch.lane_change[i] = change
         scratch.blinker[i] = needed

@@ -52,6 +52,7 @@ CRAWL_MPS = 5.0  # a stream that is slower lets others in
 STUCK_S = 90.0  # after which it passes others that stand and give way, too
 STOP_SIGN_S = 0.5  # how long one stands at a stop sign, and before a tie is broken;
 STOOD_S = 0.1  # background vehicles, as SUMO's, only for a moment
+ARRIVES_M = 1.0  # a trip that ends no further behind a line leads over no junction
 STATE_MAJOR = ord("M")
 STATE_STOP = ord("s")
 STATE_ALLWAY_STOP = ord("w")
@@ -186,6 +187,8 @@ def _is_harmless(
         # Behind one that is faster and leads into the same lane, one can follow.
         follows: bool = conflict["merging"] and apart > ROOM_M and row["speed"] <= foe["speed"]
         return follows
+    if 0.0 < rows[foe["row"]]["to_go"] < foe["dist"] + ARRIVES_M:
+        return True  # its trip ends before its line
     if _is_committed(foe, front):
         return False
     if not (gives_way and conflict["must_yield"]):
@@ -303,7 +306,8 @@ def _blocks_inside(
     if _in_turn(target["state"]) and _goes_on(row, link) and to_area > ROOM_M:
         return HOLD_NONE  # it lost its turn if it stood once more, and can wait before the area
     top = roads.lanes[roads.links[conflict["foe"]]["next_lane"]]["speed_mps"]
-    if foe["speed"] > STANDING_MPS:  # one that has just set off does not stay so slow
+    if foe["speed"] > STANDING_MPS and other["accel"] > -GENTLE_ACCEL:
+        # One that has just set off does not stay so slow; one that brakes may have to stop.
         cleared = _earliest(to_clear, foe["speed"], top, GENTLE_ACCEL)
     if steered:
         time_in -= 0.5 * GAP_S

@@ -22,6 +22,7 @@ from cavmarl.driving.kernels.lane_change import (
     mobil_accepts,
 )
 from cavmarl.driving.kernels.lane_index import ahead_on, behind_by, beside_s, last_on, num_ahead
+from cavmarl.driving.kernels.room_beside import has_room
 from cavmarl.driving.kernels.stopping import STAY, lane_to_stop
 from cavmarl.driving.kernels.ways import next_step
 
@@ -31,6 +32,9 @@ CHANGE_EARLY_S = 12.0  # plus the way of this time
 MAX_BRAKING_ACCEPTED = 4.0  # m/s², harder braking behind the new leader is never worth it
 MAX_BRAKING_NEEDED = 4.0  # m/s², what a change that the way needs may ask of the one behind
 QUEUED_M = 7.5  # of lane that a vehicle takes in a queue
+TURN_IN_M = 5.0  # behind a junction, where long vehicles still turn into the lanes beside,
+SPARE_M = 2.0  # on lanes that are longer by this than what two that want to swap need
+SLOW_MPS = 2.0  # with which one minds the corners of those that stand beside the lane it comes to
 CREEP_MPS = 1.0  # so slow, a driver that has to change does so to the very end of its lane
 SIDEWAYS_S = 2.5  # a lane change takes about this long, and has to end before the lane does
 BRAKE_TIME_S = 0.5  # a braking that ends within this time is not felt
@@ -228,7 +232,7 @@ def _change_is_safe(
 
 @inlined_kernel
 def _rear_is_inside(lane: np.void, row: np.void) -> bool:
-    """Whether a vehicle's rear is still in the junction, where others turn into the lane beside it.
+    """Whether a vehicle's rear is in the junction or near it, where others turn in beside it.
 
     On lanes so short that two do not fit behind one another, with room to swap, that does not
     count: a vehicle waits to change with its rear inside (`lane_ends`), and would never change.
@@ -236,8 +240,9 @@ def _rear_is_inside(lane: np.void, row: np.void) -> bool:
     room = SWAP_ROOM_M
     if row["driver"] != DRIVER_AGENT:
         room = MERGE_ROOM_M + LEAST_SWAP_M + LINE_MARGIN_M + LINE_SLACK_M
-    is_short = lane["length_m"] <= 2.0 * row["length"] + room
-    inside: bool = row["s"] < 0.5 * row["length"] and not is_short
+    spare = lane["length_m"] - 2.0 * row["length"] - room
+    near_m = min(TURN_IN_M, max(spare - SPARE_M, 0.0))
+    inside: bool = spare > 0.0 and row["s"] < 0.5 * row["length"] + near_m
     return inside
 
 
@@ -284,7 +289,12 @@ def _may_change(
             queue_m = QUEUED_M * num_ahead(scratch, row["lane"], row["s"], row["id"], travel.view_m)
             if beyond["room"] - row["s"] - queue_m < 2.0 * early:
                 return False
-    return _change_is_safe(roads, travel, rows, i, target, own_wish, needed != 0, scratch)
+    if not _change_is_safe(roads, travel, rows, i, target, own_wish, needed != 0, scratch):
+        return False
+    # One that is so slow goes sideways where it is.
+    place = beside_s(roads, row["lane"], target, row["s"])
+    slow: bool = row["speed"] < SLOW_MPS and row["driver"] != DRIVER_AGENT
+    return not slow or has_room(roads, rows, row, target, place, 0.0, side, scratch)
 
 
 @inlined_kernel

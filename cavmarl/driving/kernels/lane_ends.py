@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
 from cavmarl.core.records.codes import DRIVER_AGENT, HOLD_NONE
-from cavmarl.driving.kernels.beside import behind_entry
+from cavmarl.driving.kernels.beside import behind_entry, beside
 from cavmarl.driving.kernels.following import LINE_MARGIN_M, before_line, behind, no_constraint
 from cavmarl.driving.kernels.lane_choice import LEAST_SWAP_M, MERGE_ROOM_SHARE, SWAP_ROOM_M
-from cavmarl.driving.kernels.lane_index import last_on
+from cavmarl.driving.kernels.lane_index import beside_s, last_on
 from cavmarl.driving.kernels.swept_areas import VAN_M, before_swept, behind_fork
 from cavmarl.driving.kernels.ways import next_step
 
@@ -60,11 +60,11 @@ def _behind_turning(
     it, and without a link it has no swept areas.
     """
     constraint = no_constraint(kind)
-    for beside in (roads.lanes[lane]["left"], roads.lanes[lane]["right"]):
-        if beside < 0:
+    for neighbor in (roads.lanes[lane]["left"], roads.lanes[lane]["right"]):
+        if neighbor < 0:
             continue
-        first = roads.lanes[beside]["first_link"]
-        for link in range(first, first + roads.lanes[beside]["num_links"]):
+        first = roads.lanes[neighbor]["first_link"]
+        for link in range(first, first + roads.lanes[neighbor]["num_links"]):
             for k in range(scratch.link_start[link], scratch.link_end[link]):
                 other = scratch.approach[k]
                 rear = -other["dist"] - other["half"]
@@ -148,3 +148,28 @@ def over_end(
     first, front = roads.lanes[lane]["first_link"], distance - 0.5 * row["length"]
     swept = before_swept(roads, rows, i, kind, first, front, HOLD_NONE, dt, scratch)
     return max(constraint, swept)
+
+
+@kernel
+def behind_beside(
+    roads: RoadArrays,
+    travel: Travel,
+    rows: NDArray[np.void],
+    i: int,
+    kind: np.void,
+    see_m: float,
+    dt: float,
+    scratch: Scratch,
+) -> float:
+    """The constraint of the lane beside that row i's body still covers, up to the end of it.
+
+    `see_m`: how far a line is that it asks about others at.
+    """
+    row = rows[i]
+    lane = row["side_lane"]
+    constraint = beside(roads, travel, kind, row, lane, scratch)
+    distance = roads.lanes[lane]["length_m"] - beside_s(roads, row["lane"], lane, row["s"])
+    if distance > 0.5 * row["length"]:
+        over = over_end(roads, rows, i, kind, lane, distance, distance < see_m, dt, scratch)
+        constraint = max(constraint, over)
+    return constraint

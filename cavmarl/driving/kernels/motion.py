@@ -21,6 +21,7 @@ from cavmarl.core.records.codes import EVENT_ARRIVED, EVENT_RED_LIGHT, SIGNAL_RE
 from cavmarl.driving.kernels.bicycle import bicycle_step
 from cavmarl.driving.kernels.gaps import link_signal
 from cavmarl.driving.kernels.lane_index import beside_s
+from cavmarl.driving.kernels.room_beside import STAYS_ASIDE
 from cavmarl.driving.kernels.stopping import make_stop
 from cavmarl.driving.kernels.tracking import locate, side_lane
 from cavmarl.driving.kernels.ways import next_step, own_step, way_left
@@ -189,7 +190,7 @@ def move_background(
     row: np.void,  # VEHICLE, the committed record, which becomes the next one
     step: np.void,  # PLAN, its own step before the tick
     accel: float,  # decided acceleration in m/s²
-    lane_change: int,  # 1 to the left, -1 to the right, 0 none
+    lane_change: int,  # 1 to the left, -1 to the right, 0 none, or STAYS_ASIDE
     dt: float,  # seconds of the tick
 ) -> None:
     """Advance a background vehicle by one tick.
@@ -206,7 +207,7 @@ def move_background(
     row["throttle"] = accel
     row["speed"] = speed
     row["s"] += speed * dt
-    if lane_change != 0:
+    if abs(lane_change) == 1:
         lane = roads.lanes[before.lane]
         target = lane["left"] if lane_change > 0 else lane["right"]
         row["s"] = beside_s(roads, before.lane, target, row["s"])
@@ -218,6 +219,8 @@ def move_background(
     if not _cross_borders(roads, travel, row):
         row["speed"] = 0.0
     sideways = min(LATERAL_MPS, max(LATERAL_RATIO * speed, LATERAL_MIN_MPS)) * dt
+    if lane_change == STAYS_ASIDE:
+        sideways = 0.0
     offset = row["d"]
     row["d"] = offset - clamp(offset, -sideways, sideways)
     row["side_lane"] = side_lane(roads, row)

@@ -23,6 +23,7 @@ VAN_M, BUS_M = SIZE_LENGTHS_M
 CAR_BODY_M, VAN_BODY_M, BUS_BODY_M = SIZE_BODIES_M
 EASY_STOP = 2.0  # m/s², of one that needs more to stop before the area it is said that it comes;
 HARD_STOP = 3.5  # one that needs more goes first
+AT_AREA_M = 0.01  # one that stands right before an area is not in it, however places are rounded
 MIN_STOP_M = 0.01  # a distance below counts as this
 SOON_M = 3.5  # one that is so near to the area may be in it at once
 LONG_FORK_M = 6.0  # how much further long vehicles need to be clear of one another at a fork
@@ -201,8 +202,8 @@ def _is_in_the_way(
     foe_rear = foe_place - _body_m(foe["half"], sweep["other"])
     if foe_rear > sweep["foe_leave_m"] or row["wait_s"] > GIVE_UP_S:
         return False
-    inside = place > sweep["enter_m"]
-    foe_inside = foe_place > sweep["foe_enter_m"]
+    inside = place > sweep["enter_m"] + AT_AREA_M
+    foe_inside = foe_place > sweep["foe_enter_m"] + AT_AREA_M
     if foe_inside and not inside:
         return True
     if inside and not foe_inside:

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 
 MERGES_M = 300.0  # as far as SUMO's drivers that turn into a road look along its last lane
 APPROACH_M = 12.0  # before a junction, where bodies still stand askew to vehicles that wait
+FORK_MINDED_M = 5.0  # behind a junction, where a rear is minded by those that turn off beside it
 MAX_CROSSING_M = 2000  # paths are compared point by point: memory goes by its square
 MOST_CROSSING = "CAVMARL_MAX_CROSSING_M"  # the environment's variable with another limit
 _ENDINGS = (".gz", ".xml", ".net", ".osm", ".xodr")
@@ -335,7 +336,8 @@ def _fill_sweeps(movements: Movements) -> NDArray[np.void]:
     links["swept_m"] = links["length_m"]
     np.maximum.at(links["swept_m"], sweeps["foe"], sweeps["foe_leave_m"])
     forks = np.bincount(links["from_lane"])[links["from_lane"]] > 1
-    links["swept_m"][forks] += SWEPT_BEYOND_M
+    minded = np.where(forks, links["length_m"] + FORK_MINDED_M, 0.0)
+    links["swept_m"] = np.maximum(links["swept_m"], minded)
     links["swept_m"] = np.minimum(links["swept_m"], links["length_m"] + SWEPT_BEYOND_M)
     return sweeps
 

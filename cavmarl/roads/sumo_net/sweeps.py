@@ -32,8 +32,11 @@ class SweptBody(NamedTuple):
 BODIES = tuple(map(SweptBody, (0.5 * m for m in SIZE_BODIES_M), (0.95, 1.25, 1.3)))
 STEP_M = 0.5
 BEFORE_M = 10.0  # of the front to its line, and
-BEYOND_M = 4.0  # of the rear behind the junction: where bodies are asked about
+BEYOND_M = 4.0  # of the rear behind the junction: where bodies are asked about;
+TURN_BEYOND_M = 8.0  # beside one that turns round, which reaches so far over the lane beside
 MARGIN_M = STEP_M
+BEHIND_M = 1.0  # one that follows is at least so far behind a rear on its way
+LEAST_ASIDE_M = 0.5  # from its place on its way: the centre of a body that its rear comes back
 TURNAROUND = ord("t")
 AHEAD_M = BEFORE_M + 2.0 * BODIES[-1][0]  # of a way that `along` has to know
 assert len(BODIES) == len(SIZE_LENGTHS_M) + 1
@@ -54,18 +57,20 @@ def sweep_rows(movements: Movements) -> tuple[NDArray[np.void], NDArray[np.int32
         if way is not None:
             by_junction[int(movements.links["junction"][link])].append(link)
     found: list[list[tuple[float, ...]]] = [[] for _ in movements.ways]
+    turns = movements.links["direction"] == TURNAROUND
     poses = {}
     for links in by_junction.values():
+        beyond_m = TURN_BEYOND_M if turns[links].any() else BEYOND_M
         for link in links:
             way = movements.ways[link]
             assert way is not None
             length = float(movements.links["length_m"][link])
-            poses[link] = [poses_on_rails(way, half, length) for half, _ in BODIES]
+            poses[link] = [poses_on_rails(way, half, length, beyond_m) for half, _ in BODIES]
         for one, other in combinations(links, 2):
             if movements.links["from_lane"][one] != movements.links["from_lane"][other]:
                 _find_pair(movements, one, other, poses, found)
         for turn in links:
-            if movements.links["direction"][turn] == TURNAROUND:
+            if turns[turn]:
                 _find_behind(movements, turn, links, poses, found)
         poses.clear()
     counts = [len(rows) for rows in found]
@@ -88,10 +93,16 @@ def _find_pair(
 ) -> None:
     if not is_near(poses[one][0], poses[other][0]):
         return
+    turns = bool((movements.links["direction"][[one, other]] == TURNAROUND).any())
+    beyond_m = (TURN_BEYOND_M if turns else BEYOND_M) + STEP_M
+    length_m, foe_length_m = movements.links["length_m"][[one, other]]
     for own, body in enumerate(BODIES):
+        mine = poses[one][own]
+        mine = mine[mine[:, 0] - body.half_m < length_m + beyond_m]
         for foe, foe_body in enumerate(BODIES):
-            mine, theirs = (poses[one][own], body), (poses[other][foe], foe_body)
-            row = find_pair(movements, (one, other), mine, theirs)
+            theirs = poses[other][foe]
+            theirs = theirs[theirs[:, 0] - foe_body.half_m < foe_length_m + beyond_m]
+            row = find_pair(movements, (one, other), (mine, body), (theirs, foe_body))
             if row is not None:
                 here, there = row
                 found[one].append((other, own, foe, *here, *there))
@@ -169,22 +180,27 @@ def _find_behind(
     poses: dict[int, list[NDArray[np.float64]]],
     found: list[list[tuple[float, ...]]],
 ) -> None:
-    """One that turns round comes back beside those that stand behind it."""
+    """One that turns round comes back beside those that stand behind it, its rear before that."""
+    way = movements.ways[turn]
+    assert way is not None
     length = float(movements.links["length_m"][turn])
     for foe, (foe_half, foe_wide) in enumerate(BODIES[1:], 1):
         theirs = poses[turn][foe]
-        theirs = theirs[theirs[:, 0] >= foe_half]  # it has left their lane
+        theirs = theirs[theirs[:, 0] + foe_half >= 0.0]
+        aside = theirs[:, 1:3] - places_on(way, theirs[:, 0])[:, :2]
+        bends = np.hypot(aside[:, 0], aside[:, 1]) > LEAST_ASIDE_M
+        has_left = theirs[:, 0] >= foe_half
+        other = (foe_half, foe_wide, length, 0.0, 0.0)
         for own, (half, wide) in enumerate(BODIES):
             mine = poses[turn][own]
             mine = mine[mine[:, 0] <= -half]
-            first, last, foe_first, foe_last = swept_range(
-                mine,
-                theirs,
-                (half, wide, 0.0, 0.0, 0.0),
-                (foe_half, foe_wide, length, 0.0, 0.0),
-                CLEARANCE_M,
-                False,
-            )
+            body = (half, wide, 0.0, 0.0, 0.0)
+            range_m = swept_range(mine, theirs[has_left], body, other, CLEARANCE_M, False)
+            for pose in theirs[bends & ~has_left]:
+                behind = mine[mine[:, 0] + half + BEHIND_M <= pose[0] - foe_half]
+                comes_back = swept_range(behind, pose[None], body, other, CLEARANCE_M, False)
+                range_m = _hull(range_m, comes_back)
+            first, last, foe_first, foe_last = range_m
             if first == np.inf:
                 continue
             here = (first + half - MARGIN_M, last - half + MARGIN_M)
@@ -201,9 +217,11 @@ def is_near(mine: NDArray[np.float64], theirs: NDArray[np.float64]) -> bool:
     return bool(square.min() < 6.0 * 6.0)
 
 
-def poses_on_rails(way: LinkPath, half_m: float, length_m: float) -> NDArray[np.float64]:
+def poses_on_rails(
+    way: LinkPath, half_m: float, length_m: float, beyond_m: float = BEYOND_M
+) -> NDArray[np.float64]:
     """(n, 6) place of the centre, x, y, z, cosine and sine of bodies with both bumpers on a way."""
-    at = np.arange(-(BEFORE_M + half_m), length_m + BEYOND_M + half_m + STEP_M, STEP_M)
+    at = np.arange(-(BEFORE_M + half_m), length_m + beyond_m + half_m + STEP_M, STEP_M)
     front, rear = places_on(way, at + half_m), places_on(way, at - half_m)
     chord = front - rear
     size = np.maximum(np.hypot(chord[:, 0], chord[:, 1]), 1e-6)

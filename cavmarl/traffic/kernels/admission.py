@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from cavmarl.core.math.geometry import boxes_overlap, lane_pose
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M
-from cavmarl.core.numba import kernel
+from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import Demand, Gate, RoadArrays, Scratch, Travel, Worlds
 from cavmarl.core.records.codes import COUNT_DEPARTED, LANE_FIRST, LANE_GIVEN, LANE_RANDOM, POS_LAST
+from cavmarl.core.records.rows import SWEPT_BEYOND_M
 from cavmarl.driving.kernels.approach import register_links
 from cavmarl.driving.kernels.lane_index import index_lanes
 from cavmarl.driving.kernels.swept_areas import would_be_swept
@@ -161,6 +162,61 @@ def _link_ahead(roads: RoadArrays, travel: Travel, row: np.void) -> int:
     return here["first_link"] if link < 0 and here["num_links"] > 0 else link
 
 
+@inlined_kernel
+def _link_behind(roads: RoadArrays, row: np.void, n: int) -> int:
+    """The n-th link into an entrant's lane, -1 where it is far from the start of that lane."""
+    here = roads.lanes[row["lane"]]
+    if n >= here["num_into"] or row["s"] - 0.5 * row["length"] > SWEPT_BEYOND_M:
+        return -1
+    before = roads.lanes[roads.into[here["first_into"] + n]]
+    return int(before["link"]) if before["internal"] else -1
+
+
+@kernel
+def _may_be_swept(roads: RoadArrays, travel: Travel, row: np.void, scratch: Scratch) -> bool:
+    """Whether there are swept areas where a vehicle enters: ahead, or behind with one in them."""
+    to_line = roads.lanes[row["lane"]]["length_m"] - row["s"]
+    ahead = _link_ahead(roads, travel, row) if to_line <= travel.see_m else -1
+    if ahead >= 0 and roads.links[ahead]["num_sweeps"] > 0:
+        return True
+    for n in range(roads.lanes[row["lane"]]["num_into"]):
+        link = _link_behind(roads, row, n)
+        if link < 0:
+            continue
+        first = roads.links[link]["first_sweep"]
+        for k in range(first, first + roads.links[link]["num_sweeps"]):
+            foe = roads.links[roads.sweeps[k]["foe"]]
+            inside = foe["next_lane"]
+            while roads.lanes[inside]["internal"]:
+                if scratch.lane_start[inside] < scratch.lane_end[inside]:
+                    return True
+                inside = roads.lanes[inside]["successor"]
+            last = scratch.lane_end[foe["from_lane"]] - 1
+            if last >= scratch.lane_start[foe["from_lane"]]:
+                to_end = roads.lanes[foe["from_lane"]]["length_m"] - scratch.entries[last]["s"]
+                if to_end < scratch.entries[last]["half"]:
+                    return True
+    return False
+
+
+@kernel
+def _is_swept(roads: RoadArrays, travel: Travel, row: np.void, scratch: Scratch) -> bool:
+    """Whether a vehicle enters where another one sweeps, ahead or at the start of its lane."""
+    here = roads.lanes[row["lane"]]
+    half = 0.5 * row["length"]
+    to_line = here["length_m"] - row["s"]
+    ahead = _link_ahead(roads, travel, row) if to_line <= travel.see_m else -1
+    if ahead >= 0 and would_be_swept(roads, row, ahead, half - to_line, scratch):
+        return True
+    for n in range(here["num_into"]):
+        link = _link_behind(roads, row, n)
+        if link >= 0:
+            place = roads.links[link]["length_m"] + row["s"] + half
+            if would_be_swept(roads, row, link, place, scratch):
+                return True
+    return False
+
+
 @kernel
 def propose(
     demand: Demand,
@@ -211,15 +267,12 @@ def propose(
             enter(roads, travel, worlds, w, departure, lane, s, speed, row)
             if _touches_any(rows, num, row):
                 continue
-            to_line = roads.lanes[lane]["length_m"] - s
-            link = _link_ahead(roads, travel, row) if to_line <= travel.see_m else -1
-            if link >= 0 and roads.links[link]["num_sweeps"] > 0:
+            if _may_be_swept(roads, travel, row, scratch):
                 if not announced:
                     step, step_at = worlds.step[w], worlds.step_at[w]
                     register_links(roads, travel, rows, num, step, step_at, scratch)
                     announced = True
-                place = 0.5 * row["length"] - to_line
-                if would_be_swept(roads, row, link, place, scratch):
+                if _is_swept(roads, travel, row, scratch):
                     continue
             gate.places[w, n] = q
             gate.num_passing[w] = n + 1

@@ -33,6 +33,7 @@ from cavmarl.core.records.rows import ENTER_REACH_M
 from cavmarl.driving.kernels.beside import askew_beside
 from cavmarl.driving.kernels.following import LINE_MARGIN_M, accel_behind, speed_behind
 from cavmarl.driving.kernels.lane_index import ahead_on, behind_by, first_from, last_on
+from cavmarl.driving.kernels.swept_areas import LONG_FORK_M
 from cavmarl.driving.kernels.ways import next_step
 
 ENTER_GAP_M = 1.0  # m between bumpers, the least with which a vehicle enters
@@ -265,6 +266,9 @@ def entry_speed(
     """
     half = 0.5 * kind["length"]
     j = ahead_on(scratch, lane, s, departure["id"], travel.view_m)
+    safe = math.inf
+    if j < 0:
+        safe = _safe_at_fork(roads, travel, departure, kind, lane, s, scratch)
     distance, beyond, way = -s, lane, departure["way"]
     while j < 0:
         distance += roads.lanes[beyond]["length_m"]
@@ -274,9 +278,9 @@ def entry_speed(
         j = last_on(scratch, beyond, departure["id"], distance, travel.view_m)
     wanted = _wanted_speed(roads, travel, key, departure, kind, lane, s, j, scratch)
     wanted = _line_speed(roads, travel, departure, kind, lane, s, wanted)
-    safe = math.inf
     if j >= 0:
-        safe = _safe_behind(kind, scratch.entries[j], distance + scratch.entries[j]["s"] - half)
+        ahead = distance + scratch.entries[j]["s"] - half
+        safe = min(safe, _safe_behind(kind, scratch.entries[j], ahead))
     for to_left in (True, False):
         k, apart = askew_beside(roads, travel, rows, lane, s, departure["id"], to_left, scratch)
         if k >= 0:
@@ -287,6 +291,37 @@ def entry_speed(
     if safe < 0.0 or (safe < wanted and not slows):
         return -1.0
     return min(wanted, safe)
+
+
+@kernel
+def _safe_at_fork(
+    roads: RoadArrays,
+    travel: Travel,
+    departure: np.void,
+    kind: np.void,
+    lane: int,
+    s: float,
+    scratch: Scratch,
+) -> float:
+    """The speed in m/s that is safe behind those that have just turned off from a lane; -1: none.
+
+    Their rears are before the place where their ways part, wherever the departure goes.
+    """
+    here = roads.lanes[lane]
+    to_end = here["length_m"] - s
+    safe = math.inf
+    if to_end > LEADER_M:
+        return safe
+    for link in range(here["first_link"], here["first_link"] + here["num_links"]):
+        beyond = roads.links[link]["next_lane"]
+        k = last_on(scratch, beyond, departure["id"], to_end, travel.view_m)
+        if k < 0:
+            continue
+        other = scratch.entries[k]
+        if other["s"] - other["half"] < roads.links[link]["fork_m"]:
+            found = _safe_behind(kind, other, to_end + other["s"] - 0.5 * kind["length"])
+            safe = min(safe, found)
+    return safe
 
 
 @kernel
@@ -330,6 +365,44 @@ def follower_brakes(
         )
         if k >= 0 and _brakes(roads, travel, rows, kind, lane, k, apart - half, speed, scratch):
             return True
+    return _one_that_turns_off_brakes(roads, travel, rows, kind, lane, s, speed, scratch)
+
+
+@kernel
+def _one_that_turns_off_brakes(
+    roads: RoadArrays,
+    travel: Travel,
+    rows: NDArray[np.void],
+    kind: np.void,
+    lane: int,
+    s: float,
+    speed: float,
+    scratch: Scratch,
+) -> bool:
+    """`follower_brakes` for those on a junction that come from a lane that leads here.
+
+    They drive to another lane, and their bodies are not yet out of the way of this one.
+    """
+    half = 0.5 * kind["length"]
+    here = roads.lanes[lane]
+    for n in range(here["num_into"]):
+        into = roads.lanes[roads.into[here["first_into"] + n]]
+        if not into["internal"]:
+            continue
+        own = into["link"]
+        rear = roads.links[own]["length_m"] + s - half
+        start = roads.lanes[roads.links[own]["from_lane"]]
+        for link in range(start["first_link"], start["first_link"] + start["num_links"]):
+            if link == own or rear > roads.links[link]["fork_m"] + LONG_FORK_M:
+                continue
+            inside = roads.links[link]["next_lane"]
+            while roads.lanes[inside]["internal"]:
+                offset = roads.lanes[inside]["link_offset_m"]
+                for k in range(scratch.lane_start[inside], scratch.lane_end[inside]):
+                    apart = rear - offset - scratch.entries[k]["s"]
+                    if _brakes(roads, travel, rows, kind, lane, k, apart, speed, scratch):
+                        return True
+                inside = roads.lanes[inside]["successor"]
     return False
 
 

@@ -284,6 +284,8 @@ def _find_lines(roads: RoadArrays, see_m: float, half_m: float, scratch: Visibil
             scratch.ahead[lane] + row["length_m"] <= see_m
         ):
             _ask(roads, lane, scratch)
+        if own and not row["internal"] and scratch.first[lane] <= SWEPT_BEYOND_M + half_m:
+            _ask_behind(roads, lane, scratch)
     for link in range(roads.links.shape[0]):
         if scratch.asked[link]:
             first = roads.links[link]["first_conflict"]
@@ -318,6 +320,15 @@ def _ask(roads: RoadArrays, lane: int, scratch: VisibilityScratch) -> None:
         first = roads.lanes[other]["first_link"]
         for link in range(first, first + roads.lanes[other]["num_links"]):
             scratch.asked[link] = True
+
+
+@kernel
+def _ask_behind(roads: RoadArrays, lane: int, scratch: VisibilityScratch) -> None:
+    """All links beside those that lead to a lane: whose vehicles may be in the way at its start."""
+    for k in range(roads.lanes[lane]["num_into"]):
+        before = roads.lanes[roads.into[roads.lanes[lane]["first_into"] + k]]
+        if before["internal"]:
+            _ask(roads, roads.links[before["link"]]["from_lane"], scratch)
 
 
 @kernel
