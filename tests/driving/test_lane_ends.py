@@ -130,18 +130,22 @@ def test_a_long_vehicle_that_turns_beside_a_lane_without_a_link_is_a_leader(
     assert (found > no_constraint(kind)) == minds
 
 
-@pytest.mark.parametrize("askew", [0.5, 0.0])
-def test_a_car_that_sticks_out_beyond_the_border_of_a_lane_is_a_leader(askew: float) -> None:
+@pytest.mark.parametrize(("askew", "hidden"), [(0.5, False), (0.5, True), (0.0, False)])
+def test_a_car_that_sticks_out_beyond_the_border_of_a_lane_is_a_leader(
+    askew: float, hidden: bool
+) -> None:
+    """`hidden`: behind it on its lane another one stands straight."""
     roads, tables = network("merge"), travel("merge")
     lane = roads.lane_ids.index("weave_1")
     before = int(roads.arrays.into[roads.lanes["first_into"][lane]])
     rows = np.concatenate(
         [on_lane(roads, before, 10.0, tables, id=0, speed=8.0, driver=DRIVER_AGENT),
-         on_lane(roads, int(roads.lanes["left"][lane]), 6.0, tables, id=1, driver=DRIVER_AGENT)]
-    )  # fmt: skip
+         on_lane(roads, int(roads.lanes["left"][lane]), 16.0, tables, id=1, driver=DRIVER_AGENT),
+         on_lane(roads, int(roads.lanes["left"][lane]), 6.0, tables, id=2, driver=DRIVER_AGENT)]
+    )[: 3 if hidden else 2]  # fmt: skip
     rows["heading"][1] += askew
-    room = scratch(roads, 2)
-    index_lanes(roads.arrays, tables, rows, 2, room)
+    room = scratch(roads, 3)
+    index_lanes(roads.arrays, tables, rows, len(rows), room)
     kind = generated_types()[0]
     found = behind_askew(roads.arrays, tables, rows, kind, rows[0], lane, -20.0, room)
     assert (found > no_constraint(kind)) == (askew > 0.0)

@@ -110,12 +110,16 @@ def askew_beside(
         return -1, math.inf
     place = beside_s(roads, lane, neighbor, s)
     k = ahead_on(scratch, neighbor, place, own_id, travel.view_m)
-    if k < 0 or scratch.entries[k]["side"]:
-        return -1, math.inf
-    other = rows[scratch.entries[k]["row"]]
-    if other["driver"] != DRIVER_AGENT or not _sticks_out(roads, other, not to_left):
-        return -1, math.inf
-    return k, scratch.entries[k]["s"] - place
+    while 0 <= k < scratch.lane_end[neighbor]:
+        entry = scratch.entries[k]
+        if entry["s"] - place > travel.view_m:
+            break
+        other = rows[entry["row"]]
+        passed_over = entry["side"] or entry["id"] == own_id or other["driver"] != DRIVER_AGENT
+        if not passed_over and _sticks_out(roads, other, not to_left):
+            return k, entry["s"] - place
+        k += 1
+    return -1, math.inf
 
 
 @kernel
