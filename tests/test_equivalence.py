@@ -23,6 +23,7 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 from tests.support.actuated import actuated_grid
 from tests.support.demand_worlds import make, tiny
 from tests.support.driving import drive, start
+from tests.support.netgenerate import netgenerate
 from tests.support.rerouting import CARS, DEVICE, FLOW, make_map, rerouter, write_demand
 
 ZONES = (2, 3, 4, 9)
@@ -279,10 +280,39 @@ BEHIND_THE_LAST = """<routes>
 
 def test_who_enters_behind_the_last_enters_once_however_far_the_last_is(tmp_path: Path) -> None:
     # The zone at the end of the road says where, another one sees the last that is far from there.
+    on_a_long_road(tmp_path, BEHIND_THE_LAST)
+
+
+def on_a_long_road(tmp_path: Path, routes: str) -> Simulation:
     road, demand = tmp_path / "long.net.xml", tmp_path / "x.rou.xml"
     road.write_text(LONG_ROAD, encoding="utf-8")
-    demand.write_text(BEHIND_THE_LAST, encoding="utf-8")
-    hashes_agree(lambda zones: make(road, [demand], overrides=FAST | zones), 300, (2, 4))
+    demand.write_text(routes, encoding="utf-8")
+    return hashes_agree(lambda zones: make(road, [demand], overrides=FAST | zones), 300, (2, 4))
+
+
+TURNING_ROUND = """<routes>
+  <vType id="bus" vClass="bus" length="12" width="2.5" sigma="0.5"/><vType id="car" sigma="0.5"/>
+  {flows}
+</routes>"""
+TURNS = ("A1B1 B1A1", "C1B1 B1C1", "B0B1 B1B0", "B2B1 B1B2")
+BETWEEN = ("A1B1 B1C1", "C1B1 B1B2", "B0B1 B1A1", "B2B1 B1B0", "B1A1 A1A2", "B1C1 C1C0")
+
+
+def test_beside_buses_that_turn_round_all_drive_and_enter_alike(tmp_path: Path) -> None:
+    # Departures at the starts of lanes, in the middle of the map, ask about those on the junction.
+    options = ("--grid", "--grid.number=3", "--grid.length=110", "-L=2")
+    net = netgenerate(tmp_path / "grid.net.xml", *options, "-j=allway_stop")
+    ways = {"bus": (TURNS, 11), "car": ((*TURNS, *BETWEEN), 4)}
+    flows = "".join(
+        f'<flow id="{kind}{n}" type="{kind}" begin="{n}" end="100" period="{period}">'
+        f'<route edges="{edges}"/></flow>'
+        for kind, (routes, period) in ways.items()
+        for n, edges in enumerate(routes)
+    )
+    demand = tmp_path / "turns.rou.xml"
+    demand.write_text(TURNING_ROUND.format(flows=flows), encoding="utf-8")
+    whole = hashes_agree(lambda zones: make(net, [demand], overrides=FAST | zones), 500)
+    assert whole.traffic_stats().departed > 100
 
 
 SLOW_AT_THE_START = """<routes>
@@ -295,11 +325,7 @@ SLOW_AT_THE_START = """<routes>
 
 def test_the_mean_speed_behind_the_last_is_that_at_the_end_of_the_lane(tmp_path: Path) -> None:
     # The zone there does not know the slow ones that enter at the start.
-    road, demand = tmp_path / "long.net.xml", tmp_path / "x.rou.xml"
-    road.write_text(LONG_ROAD, encoding="utf-8")
-    demand.write_text(SLOW_AT_THE_START, encoding="utf-8")
-    whole = hashes_agree(lambda zones: make(road, [demand], overrides=FAST | zones), 300, (2, 4))
-    assert whole.traffic_stats().departed > 5
+    assert on_a_long_road(tmp_path, SLOW_AT_THE_START).traffic_stats().departed > 5
 
 
 @pytest.mark.parametrize("halo_m", [0.0, 12.0])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from cavmarl.core.records.codes import DRIVER_BACKGROUND, HOLD_YIELD
 from cavmarl.core.records.rows import SWEPT_BEYOND_M
@@ -46,6 +47,11 @@ def beside(network: RoadNetwork) -> tuple[int, int]:
     raise AssertionError("there is no U-turn beside a lane that leads on")
 
 
+def sweeps_of(network: RoadNetwork, link: int) -> NDArray[np.void]:
+    row = network.links[link]
+    return network.sweeps[row["first_sweep"] :][: row["num_sweeps"]]
+
+
 def test_a_u_turn_does_not_conflict_with_the_lane_beside_it(
     network: RoadNetwork,
 ) -> None:
@@ -64,9 +70,8 @@ def test_only_a_long_vehicle_that_turns_round_minds_those_that_have_left_beside_
     """They drive back along its flank, on the lane that it comes to."""
     links, beyond_m = network.links, []
     for turn in np.flatnonzero(links["direction"] == U_TURN):
-        row = links[turn]
-        sweeps = network.sweeps[row["first_sweep"] :][: row["num_sweeps"]]
-        same = links["to_lane"][sweeps["foe"]] == row["to_lane"]
+        sweeps = sweeps_of(network, turn)
+        same = links["to_lane"][sweeps["foe"]] == links["to_lane"][turn]
         asked = sweeps[(sweeps["own"] == size) & same & (sweeps["foe"] != turn)]
         beyond_m += (asked["foe_leave_m"] - links["length_m"][asked["foe"]]).tolist()
     assert beyond_m
@@ -77,7 +82,7 @@ def test_a_bus_that_turns_round_reaches_far_over_the_lane_beside(network: RoadNe
     """Over one whose rear is 5 m behind the junction, and no further than others announce it."""
     links, beyond_m = network.links, []
     for turn in np.flatnonzero(links["direction"] == U_TURN):
-        sweeps = network.sweeps[links["first_sweep"][turn] :][: links["num_sweeps"][turn]]
+        sweeps = sweeps_of(network, turn)
         foes = sweeps["foe"][sweeps["own"] == BUS]
         beside = links["to_lane"][foes] != links["to_lane"][turn]
         leave_m = sweeps["foe_leave_m"][sweeps["own"] == BUS] - links["length_m"][foes]
@@ -91,8 +96,7 @@ def test_one_that_leaves_a_lane_minds_those_at_its_end_while_its_body_covers_it(
 ) -> None:
     """A car between two lanes, and a bus that sweeps over the end of the one that it leaves."""
     link, turn = beside(network)
-    row = network.links[link]
-    sweeps = network.sweeps[row["first_sweep"] :][: row["num_sweeps"]]
+    row, sweeps = network.links[link], sweeps_of(network, link)
     picked = (sweeps["foe"] == turn) & (sweeps["own"] == 0) & (sweeps["other"] == BUS)
     (enter_m,) = sweeps["enter_m"][picked]
     lane, left = int(row["from_lane"]), int(network.lanes["left"][row["from_lane"]])
@@ -118,8 +122,7 @@ def test_a_bus_leaves_room_for_a_u_turn_ahead_of_it_and_not_behind_it(
     network: RoadNetwork, foe_m: float, waits: bool
 ) -> None:
     _, turn = beside(network)
-    row = network.links[turn]
-    sweeps = network.sweeps[row["first_sweep"] :][: row["num_sweeps"]]
+    row, sweeps = network.links[turn], sweeps_of(network, turn)
     (sweep,) = sweeps[(sweeps["foe"] == turn) & (sweeps["own"] == BUS) & (sweeps["other"] == BUS)]
     lane, own_m = int(row["from_lane"]), float(sweep["enter_m"]) - 1.0
     length_m = float(network.lanes["length_m"][lane])
@@ -143,8 +146,7 @@ def test_a_rear_that_comes_back_reaches_those_behind_it_before_it_has_left_its_l
 ) -> None:
     """A car does not: its way is hardly shorter than itself."""
     _, turn = beside(network)
-    row = network.links[turn]
-    sweeps = network.sweeps[row["first_sweep"] :][: row["num_sweeps"]]
+    sweeps = sweeps_of(network, turn)
     behind = sweeps[(sweeps["foe"] == turn) & (sweeps["own"] == 0)]
     (bus,) = behind[behind["other"] == BUS]
     assert not (behind["other"] == 0).any()

@@ -201,7 +201,7 @@ class Scratch(NamedTuple):
     order: NDArray[np.int32]  # (C,) the owned rows as they lie along the lanes
     accel: NDArray[np.float64]  # (C,) decided accelerations
     link_ahead: NDArray[np.int32]  # (C,) the link whose stop line each row is next to
-    lane_change: NDArray[np.int32]  # (C,) decided lane changes: 1 left, -1 right
+    lane_change: NDArray[np.int32]  # (C,) decided lane changes: 1 left, -1 right, or STAYS_ASIDE
     blinker: NDArray[np.int32]  # (C,)
     hold: NDArray[np.int32]  # (C,)
     hit: NDArray[np.int64]  # (C,) id of the vehicle each row touches

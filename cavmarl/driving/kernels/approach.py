@@ -171,7 +171,7 @@ def _announce(
             lane, way, link = next_step(roads, travel, lane, way)
         if lane < 0:
             # It has to change lanes before the end, in the way of vehicles that turn beside it, or
-            # its trip ends there.
+            # its way ends there.
             last = roads.lanes[before]
             ends = travel.steps[before_way + before]["change"] == 0
             if (ends or distance < STANDS_BEFORE_M) and found == 0 and last["num_links"] > 0:

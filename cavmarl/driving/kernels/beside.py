@@ -14,11 +14,11 @@ from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_SCRIPTED
 from cavmarl.driving.kernels.following import behind, no_constraint
 from cavmarl.driving.kernels.lane_index import ahead_on, beside_s, last_on
 from cavmarl.driving.kernels.swept_areas import BUS_M
+from cavmarl.roads.kernels.plans import TURNAROUND
 
 STICKS_OUT_M = 0.1  # over the side of its lane, so far that others have to mind it
 ASKEW_RAD = 0.15  # a vehicle that stands less askew does not stick out
 SWINGS_BACK_M = 3.0  # both bumpers on its way, a bus of 12 m that turns round stands further back
-TURNAROUND = ord("t")
 
 
 @inlined_kernel

@@ -14,10 +14,9 @@ from cavmarl.driving.kernels.beside import behind_entry, beside
 from cavmarl.driving.kernels.following import LINE_MARGIN_M, before_line, behind, no_constraint
 from cavmarl.driving.kernels.lane_choice import LEAST_SWAP_M, MERGE_ROOM_SHARE, SWAP_ROOM_M
 from cavmarl.driving.kernels.lane_index import beside_s, last_on
+from cavmarl.driving.kernels.room_beside import LONGEST_HALF_M
 from cavmarl.driving.kernels.swept_areas import VAN_M, before_swept, behind_fork
 from cavmarl.driving.kernels.ways import next_step
-
-LONGEST_HALF_M = 10.0  # of vehicles: a rear over a line belongs to a centre that is no further
 
 
 @kernel
@@ -163,7 +162,7 @@ def behind_beside(
 ) -> float:
     """The constraint of the lane beside that row i's body still covers, up to the end of it.
 
-    `see_m`: how far a line is that it asks about others at.
+    `see_m`: how near the end has to be, for those that turn over it to be asked about.
     """
     row = rows[i]
     lane = row["side_lane"]

@@ -11,7 +11,7 @@ from cavmarl.core.records.arrays import RoadArrays, Scratch
 from cavmarl.driving.kernels.announcing import STANDING_MPS
 from cavmarl.driving.kernels.lane_index import beside_s
 
-LONGEST_HALF_M = 10.0  # of vehicles
+LONGEST_HALF_M = 10.0  # of vehicles: a body reaches no further from its centre
 STAYS_ASIDE = 2  # a lane change that waits between the two lanes
 MARGIN_M = 0.1  # on each side of the own body
 

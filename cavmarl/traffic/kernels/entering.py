@@ -303,9 +303,9 @@ def _safe_at_fork(
     s: float,
     scratch: Scratch,
 ) -> float:
-    """The speed in m/s that is safe behind those that have just turned off from a lane; -1: none.
+    """The speed in m/s that is safe behind those that have just turned off from a lane.
 
-    Their rears are before the place where their ways part, wherever the departure goes.
+    Their rears are before the place where the ways part. -1: one is too near; inf: there is none.
     """
     here = roads.lanes[lane]
     to_end = here["length_m"] - s
