@@ -132,6 +132,7 @@ CONFLICT = record(
     ("foe", np.int32),  # LINK whose path crosses or merges with this link's path (a `foes` bit)
     ("merging", np.bool_),  # both lead into one lane
     ("must_yield", np.bool_),  # this link has to give way to the foe (a `response` bit)
+    ("near", np.bool_),  # False: a foe by the map's rules only, the paths keep apart
     ("enter_m", np.float64),  # where on this link's path the shared area begins and ends,
     ("leave_m", np.float64),  # from the stop line; leave = the whole length where both merge
     ("foe_enter_m", np.float64),  # the same area on the foe's path

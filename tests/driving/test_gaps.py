@@ -56,6 +56,7 @@ def blocks(network: RoadNetwork) -> Blocks:
         foe_m: float,
         wait_s: float = 0.0,
         own: dict[str, float] | None = None,
+        near: bool = True,
         **foe_fields: float,
     ) -> int:
         """By how long and how far they are before what they share.
@@ -64,8 +65,9 @@ def blocks(network: RoadNetwork) -> Blocks:
         `out` of the junction, as `end` says. `foe_m`: of the other one's front to its line;
         negative: of its rear to the end of the shared area. `own`, `foe_fields`: of their records.
         """
-        foe = np.zeros(1, APPROACH)
+        foe, asked = np.zeros(1, APPROACH), np.array([shared])
         foe["link"], foe["row"], foe["half"] = FROM_WEST, 1, HALF_M
+        asked["near"] = near
         inside = foe_m < 0.0
         foe["dist"] = -shared["foe_leave_m"] - HALF_M - foe_m if inside else foe_m + HALF_M
         ahead = {"enter": shared["enter_m"] - HALF_M, "line": -HALF_M}
@@ -78,7 +80,7 @@ def blocks(network: RoadNetwork) -> Blocks:
         foe["speed"] = rows[1]["speed"]
         return foe_blocks(
             network.arrays, rows, rows[0], FROM_SOUTH,
-            own_s * SPEED_MPS - float(ahead[end]), SPEED_MPS, shared, foe[0], True,
+            own_s * SPEED_MPS - float(ahead[end]), SPEED_MPS, asked[0], foe[0], True,
             np.zeros(1, np.int32),
         )  # fmt: skip
 
@@ -131,6 +133,15 @@ def test_one_that_stays_on_the_junction_keeps_others_before_it(
     assert blocks(9.0, "enter", -40.0, speed=0.0, wait_s=9.0) == HOLD_NONE, "it stands before it"
 
 
+def test_one_on_a_path_that_keeps_apart_counts_before_its_line_only(
+    blocks: Blocks, network: RoadNetwork
+) -> None:
+    assert blocks(0.2, "enter", -6.0)
+    assert blocks(0.2, "line", 20.0)
+    assert not blocks(0.2, "enter", -6.0, near=False)
+    assert blocks(0.2, "line", 20.0, near=False), "the map says that it gives way"
+
+
 def test_one_that_comes_is_let_over_the_whole_junction(
     blocks: Blocks, network: RoadNetwork
 ) -> None:
@@ -164,22 +175,25 @@ def test_one_that_speeds_up_comes_earlier(blocks: Blocks) -> None:
     assert not blocks(4.95, "out", 50.0, speed=4.0), "at the speed that it has it takes 12.5 s"
 
 
-@pytest.mark.parametrize(
-    ("wait_s", "least_m"),
-    [
-        (0.0, 25.0),  # out in 1.5 s, with 1.0 s more
-        (90.0, 19.9),  # braking with 2.25 m/s² all along, half of what it loses counts: 0.51 s
-        (180.0, 11.1),  # with 4.5 m/s² it would stop
-        (900.0, 11.1),
-    ],
-)
-def test_one_that_has_waited_for_long_counts_on_others_to_brake(
-    blocks: Blocks, network: RoadNetwork, wait_s: float, least_m: float
+@pytest.mark.parametrize("wait_s", [0.0, 90.0, 180.0, 900.0])
+def test_one_that_crosses_does_not_count_on_others_to_brake_however_long_it_has_waited(
+    blocks: Blocks, network: RoadNetwork, wait_s: float
 ) -> None:
     over_s = (float(network.links["length_m"][FROM_SOUTH]) + 2.0 * HALF_M) / SPEED_MPS
     assert over_s == 1.5, "its front is at its line"
-    assert blocks(over_s, "out", least_m - 0.2, wait_s)
-    assert not blocks(over_s, "out", least_m + 0.2, wait_s)
+    # Out in 1.5 s, with 1.0 s more.
+    assert blocks(over_s, "out", 24.8, wait_s)
+    assert not blocks(over_s, "out", 25.2, wait_s)
+
+
+def test_one_that_stands_before_its_line_counts_as_one_at_it(blocks: Blocks) -> None:
+    """With 1.8 m/s² it needs 1.05 s for a metre, and without that it would be out too late."""
+    own = {"speed": 0.0}
+    at_line = next(m for m in np.arange(1.0, 99.0, 0.1) if not blocks(0.0, "line", m, own=own))
+    before = next(m for m in np.arange(1.0, 99.0, 0.1) if not blocks(0.1, "line", m, own=own))
+    assert before == at_line
+    later = next(m for m in np.arange(1.0, 99.0, 0.1) if not blocks(0.2, "line", m, own=own))
+    assert later > at_line + 8.0
 
 
 def least_ahead(network: RoadNetwork, driver: int, wait_s: float, foe_mps: float) -> Any:
@@ -196,7 +210,8 @@ def least_ahead(network: RoadNetwork, driver: int, wait_s: float, foe_mps: float
     foe = np.zeros(1, APPROACH)
     foe["link"], foe["row"], foe["half"], foe["speed"] = conflict["foe"], 1, HALF_M, foe_mps
     length_m = float(rows["length"][0])
-    over_m = 5.0 + 0.5 * length_m + min(network.links[["length_m", "wait_m"]][link].tolist())
+    over_m = 5.0 + 0.5 * length_m + float(network.links["length_m"][link])
+    assert conflict["enter_m"] > network.links["wait_m"][link] - 1.0, "it is asked about inside"
 
     def waits(front_m: float) -> int:
         foe["dist"] = front_m + HALF_M

@@ -82,6 +82,31 @@ def test_who_gives_way_can_stop_until_it_sees_the_others(
     assert slowest > 1.0, "nobody comes: it need not stand"
 
 
+def test_a_left_turn_comes_ready_to_stop_to_its_place_inside(tmp_path: Path) -> None:
+    """As SUMO's: slowest 4.5 m before the place, where it sees that none comes."""
+    path = netgenerate(tmp_path / "net.net.xml", *GRID, "-j", "traffic_light")
+    network = read_network(path)
+    links = network.links
+    (turn,) = np.flatnonzero(
+        (links["from_lane"] == network.lane_ids.index("B0B1_0")) & (links["direction"] == ord("l"))
+    )
+    goal = network.edge_ids[network.lanes["edge"][links["to_lane"][turn]]]
+    routes = tmp_path / "one.rou.xml"
+    routes.write_text(ALONE.replace("B1B2", goal), encoding="utf-8")
+    world = only(path, routes)
+    lane = links["from_lane"][turn]
+    place_m = float(network.lanes["length_m"][lane] + links["wait_m"][turn])
+    slowest = np.inf, 0.0
+    for _ in range(600):
+        drive(world)
+        for row in world.vehicles()[world.vehicles()["lane"] == lane]:
+            to_place_m = place_m - float(row["s"] + 0.5 * row["length"])
+            if row["wait_s"] == 0.0 and 0.0 < to_place_m < 10.0:
+                slowest = min(slowest, (float(row["speed"]), to_place_m))
+    assert 5.0 < slowest[0] < 7.0
+    assert 3.5 < slowest[1] < 4.5
+
+
 def is_minor_to(network: RoadNetwork, before: str, after: str) -> bool:
     pair = (network.lane_ids.index(before), network.lane_ids.index(after))
     links = network.links

@@ -46,7 +46,13 @@ def test_a_corner_over_the_lane_beside_leaves_no_room(
 
 @pytest.mark.parametrize(
     ("d", "speed", "stays"),
-    [(-1.0, 0.0, False), (-0.1, 0.0, True), (-0.1, 1.0, False), (0.0, 0.0, False)],
+    [
+        (-1.0, 0.0, False),
+        (-0.1, 0.0, True),
+        (-0.1, 4.9, True),
+        (-0.1, 5.1, False),
+        (0.0, 0.0, False),
+    ],
 )
 def test_one_that_stands_aside_of_its_lane_goes_on_until_it_would_touch(
     d: float, speed: float, stays: bool

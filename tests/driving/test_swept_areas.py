@@ -13,9 +13,10 @@ from cavmarl.core.records.codes import (
     HOLD_NONE,
     HOLD_SIGNAL,
     HOLD_YIELD,
+    MODEL_KRAUSS,
 )
 from cavmarl.driving.kernels.approach import APPROACH
-from cavmarl.driving.kernels.drivers import decide
+from cavmarl.driving.kernels.drivers import _at_line, decide
 from cavmarl.driving.kernels.following import behind, no_constraint
 from cavmarl.driving.kernels.lane_index import index_lanes
 from cavmarl.driving.kernels.swept_areas import (
@@ -171,6 +172,48 @@ def test_long_vehicles_wait_inside_before_what_others_sweep(network: RoadNetwork
         assert wait_place(network.arrays, link, 0.5 * CAR_M) == row["wait_m"]
         earlier += place < row["wait_m"]
     assert earlier > 0
+
+
+def test_one_that_stops_for_a_bus_still_comes_ready_to_stop_to_its_place_inside(
+    network: RoadNetwork,
+) -> None:
+    """The bus sweeps beyond that place, and may be gone when the car is there."""
+    links, sweeps, conflicts = network.links, network.sweeps.copy(), network.conflicts.copy()
+    owner = np.repeat(np.arange(len(links)), links["num_sweeps"])
+    picked = (sweeps["own"] == CAR) & (sweeps["other"] == BUS)
+    place = int(np.flatnonzero(picked & np.isfinite(links["wait_m"][owner]))[0])
+    link, sweep = int(owner[place]), sweeps[place]
+    sweep["enter_m"], sweep["leave_m"] = links["wait_m"][link] + 8.0, links["length_m"][link]
+    conflicts["must_yield"] = False
+    roads = network.arrays._replace(sweeps=sweeps, conflicts=conflicts)
+    nowhere = np.zeros(len(network.lanes), PLAN)
+    nowhere["next"], nowhere["link"] = -1, -1
+    types = np.array(generated_types())
+    types["model"], types["decel"] = MODEL_KRAUSS, 4.5
+    travel, lane = travel_by(nowhere, types), int(links["from_lane"][link])
+    front_m = 9.0
+    s = float(network.lanes["length_m"][lane]) - front_m - 0.5 * CAR_M
+    rows = [on_lane(network, lane, s, travel, id=k, length=CAR_M, speed=10.0) for k in (0, 1)]
+    rows = np.concatenate(rows)
+    rows["hold"] = rows["wait_s"] = 0
+    phase = network.signals["program"].astype(np.int32)
+
+    def held(bus: bool) -> float:
+        room = scratch(network, 1)
+        room.link_start[:] = room.link_end[:] = 0
+        room.link_end[sweep["foe"]] = int(bus)
+        entry = room.approach[0]
+        entry["link"], entry["row"], entry["id"], entry["half"] = sweep["foe"], 1, 1, 0.5 * BUS_M
+        entry["dist"] = 0.5 * BUS_M - float(sweep["foe_enter_m"]) - 1.0
+        entry["speed"] = 2.0
+        found, hold, _ = _at_line(
+            roads, travel, rows, 0, types[0], link, front_m + 0.5 * CAR_M, 0, phase, 0.1, room,
+        )  # fmt: skip
+        assert hold == HOLD_NONE
+        return float(found)
+
+    assert held(bus=False) > no_constraint(types[0])
+    assert held(bus=True) >= held(bus=False)
 
 
 def test_of_two_before_it_the_one_further_along_goes_first(network: RoadNetwork) -> None:

@@ -218,6 +218,58 @@ def test_nothing_enters_at_the_start_of_a_lane_where_a_bus_turns_round_beside_it
     assert not _is_swept(network.arrays, travel, row, room), "it enters further on"
 
 
+def dead_end(network: RoadNetwork) -> tuple[int, int]:
+    """A U-turn, and the lane beside the one behind it, into which no link leads."""
+    for turn in np.flatnonzero(network.links["direction"] == U_TURN).tolist():
+        right = int(network.lanes["right"][network.links["to_lane"][turn]])
+        if right >= 0 and network.lanes["num_into"][right] == 0:
+            return turn, right
+    raise AssertionError("no U-turn leads to a road of two lanes alone")
+
+
+@pytest.mark.parametrize(("s", "listed"), [(3.0, True), (30.0, False)])
+def test_one_that_has_entered_where_no_link_leads_is_listed_on_the_one_beside(
+    network: RoadNetwork, s: float, listed: bool
+) -> None:
+    turn, lane = dead_end(network)
+    nowhere = np.zeros(len(network.lanes), PLAN)
+    nowhere["next"], nowhere["link"] = -1, -1
+    travel = travel_by(nowhere)
+    rows = on_lane(network, lane, s, travel, id=0, length=5.0, speed=0.0)
+    room, step = scratch(network, 1), np.zeros(1, PLAN)
+    register_links(network.arrays, travel, rows, 1, step, np.zeros(1, np.int64), room)
+    assert (room.link_end[turn] > room.link_start[turn]) == listed
+    if listed:
+        entry = room.approach[room.link_start[turn]]
+        assert entry["dist"] == pytest.approx(-network.links["length_m"][turn] - s)
+
+
+@pytest.mark.parametrize("size", [0, BUS])
+def test_a_bus_that_turns_round_at_a_dead_end_minds_those_that_have_entered_beside_it(
+    network: RoadNetwork, size: int
+) -> None:
+    """And they enter only where no bus turns: the area is known from both sides."""
+    turn, lane = dead_end(network)
+    length_m = float(network.links["length_m"][turn])
+    sweeps = sweeps_of(network, turn)
+    own = sweeps[(sweeps["foe"] == turn) & (sweeps["own"] == BUS) & (sweeps["other"] == size)]
+    (area,) = own[own["foe_leave_m"] >= length_m]
+    assert area["enter_m"] < length_m + 0.5 * BUS_M
+    assert area["foe_enter_m"] >= length_m
+    rows = np.concatenate([on_lane(network, lane, 0.0, id=k, length=BUS_M) for k in (0, 1)])
+    rows["wait_s"] = 0.0
+    room = scratch(network, 1)
+    room.link_start[:] = room.link_end[:] = 0
+    room.link_end[turn] = 1
+    half_m = 0.5 * (BUS_M if size == BUS else 5.0)
+    other = room.approach[0]
+    other["row"], other["id"], other["half"] = 1, 1, half_m
+    for s, waits in ((half_m + 0.5, True), (half_m + 20.0, False)):
+        other["dist"] = -length_m - s
+        stop_m = swept_stop(network.arrays, rows, 0, turn, -5.0, -np.inf, room)
+        assert (stop_m < np.inf) == waits
+
+
 @pytest.mark.parametrize(("place_m", "stands_at_sign"), [(-9.5, True), (-16.0, False)])
 def test_a_bus_that_leaves_room_far_before_a_stop_sign_stands_at_it(
     network: RoadNetwork, place_m: float, stands_at_sign: bool

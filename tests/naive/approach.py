@@ -12,10 +12,12 @@ Entry = tuple[int, int, float]  # link, vehicle's id, m of its centre to the sto
 
 
 def link_into(roads: RoadNetwork, row: np.void) -> int:
-    """The link that leads to its lane, its own one if it does; -1 without junction."""
+    """The link that leads to its lane or beside it, its own one if it does; -1: there is none."""
     if row["link"] >= 0 and roads.links[row["link"]]["to_lane"] == row["lane"]:
         return int(row["link"])
     own = roads.lanes[row["lane"]]
+    sides = [roads.lanes[side] for side in (own["left"], own["right"]) if side >= 0]
+    own = next((lane for lane in (own, *sides) if lane["num_into"]), own)
     into = roads.into[own["first_into"] :][: own["num_into"]]
     return (
         int(roads.lanes[into[0]]["link"]) if into.size and roads.lanes[into[0]]["internal"] else -1

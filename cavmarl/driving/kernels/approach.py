@@ -16,7 +16,7 @@ from cavmarl.core.records.codes import DRIVER_SCRIPTED
 from cavmarl.core.records.rows import SWEPT_BEYOND_M, is_lost
 from cavmarl.driving.kernels.announcing import announced_m
 from cavmarl.driving.kernels.lane_index import beside_s
-from cavmarl.driving.kernels.ways import leave, next_step, own_step
+from cavmarl.driving.kernels.ways import fed_lane, leave, next_step, own_step
 
 MAX_LINKS_AHEAD = 2
 STANDS_BEFORE_M = 15.0  # the centre of one that waits before the end of a lane to leave it
@@ -113,12 +113,13 @@ def _announce_claims(travel: Travel, row: np.void, i: int, pairs: int, scratch: 
 def _link_into(roads: RoadArrays, row: np.void) -> int:
     """The link by which a vehicle has come to its lane, or -1.
 
-    For one that has entered the road there, or has changed lanes, the first that leads there.
+    For one that has entered the road there, or has changed lanes, the first that leads there, or
+    beside it.
     """
     link = int(row["link"])
     if link >= 0 and roads.links[link]["to_lane"] == row["lane"]:
         return link
-    here = roads.lanes[row["lane"]]
+    here = roads.lanes[fed_lane(roads, row["lane"])]
     if here["num_into"] == 0:
         return -1
     before = roads.lanes[roads.into[here["first_into"]]]

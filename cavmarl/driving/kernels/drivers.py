@@ -39,7 +39,9 @@ from cavmarl.driving.kernels.following import (
 )
 from cavmarl.driving.kernels.gaps import is_minor
 from cavmarl.driving.kernels.junctions import (
+    SEE_FOES_M,
     STOP_LINE_M,
+    before_waiting,
     behind_merging,
     constraint_inside,
     has_crept,
@@ -70,13 +72,11 @@ from cavmarl.driving.kernels.swept_areas import (
     behind_fork,
     room_m,
     swept_stop,
-    wait_place,
 )
 from cavmarl.driving.kernels.ways import leave, next_step
 
-SEE_LINE_M = 8.0
+SEE_LINE_M = 12.0  # at rest: swept areas begin up to 10.5 m before a line
 CLOSER_M = 0.9  # than `LINE_MARGIN_M` one that breaks circles stands before its line
-SEE_FOES_M = 4.5  # before a line, a driver that gives way is ready to stop, as SUMO's are
 NEAR_M = 8.0  # to a leader so near the corner between matters,
 ASKEW_RAD = 0.7  # if it turns by so much: the gap is half a width less
 NEXT_LINE_M = 5.0  # and braking way: so near a line is minded by a vehicle with a leader
@@ -174,20 +174,20 @@ def _at_line(
     if roads.links[link]["num_sweeps"] > 0:
         room = room_m(hold, waits)
         stop = front + swept_stop(roads, rows, i, link, -front, room, scratch)
-        if hold != HOLD_NONE:
-            to_line = min(to_line, max(stop, 0.0))
-        elif stop < math.inf:
-            swept = before_line_gently(kind, row, stop, dt)
-            return max(swept, merging), HOLD_NONE, stop if stop <= front else math.inf
     if hold != HOLD_NONE:
+        to_line = min(to_line, max(stop, 0.0))
         closer = CLOSER_M if breaks_circles(roads, travel, row, link) else 0.0
         return before_line(kind, speed, min(to_line + closer, stop), dt), hold, to_line
-    if front > SEE_FOES_M and kind["model"] == MODEL_KRAUSS and is_minor(roads, link, phase):
-        return before_line(kind, speed, front + LINE_MARGIN_M, dt), HOLD_NONE, math.inf
-    if waits != HOLD_NONE:
-        to_wait = front + wait_place(roads, link, 0.5 * row["length"])
-        return max(before_line(kind, speed, to_wait, dt), merging), HOLD_NONE, math.inf
-    return merging, HOLD_NONE, math.inf
+    constraint = merging
+    minor = kind["model"] == MODEL_KRAUSS and is_minor(roads, link, phase)
+    if roads.links[link]["wait_m"] < math.inf:
+        inside = before_waiting(roads, kind, row, link, -front, waits, minor, dt)
+        constraint = max(constraint, inside)
+    elif minor and front > SEE_FOES_M:
+        constraint = max(constraint, before_line(kind, speed, front + LINE_MARGIN_M, dt))
+    if stop < math.inf:
+        constraint = max(constraint, before_line_gently(kind, row, stop, dt))
+    return constraint, HOLD_NONE, stop if stop <= front else math.inf
 
 
 @inlined_kernel

@@ -90,9 +90,9 @@ def must_stop(roads: RoadArrays, link: int, signal: int) -> bool:
 
 @inlined_kernel
 def is_minor(roads: RoadArrays, link: int, phase: NDArray[np.int32]) -> bool:
-    """Whether vehicles on `link` give way to others already before the junction."""
+    """Whether vehicles on `link` give way to others."""
     target = roads.links[link]
-    if target["num_conflicts"] == 0 or target["wait_m"] < math.inf:
+    if target["num_conflicts"] == 0:
         return False
     signal = link_signal(roads, link, phase)
     gives_way: bool = signal == SIGNAL_GREEN_MINOR
@@ -252,9 +252,8 @@ def _comes(
     """Whether an APPROACH, of VEHICLE row `other`, is at its line too soon for a row.
 
     The row is where one waits at its line in `time_in` s, and out of the junction in `time_out` s
-    with `leaves_mps`. One that waits counts on the foe to brake from when it goes, the harder the
-    longer it has waited; and before one that it would slow down in its lane it goes only if so much
-    braking is enough.
+    with `leaves_mps`. Into the lane of a foe that it would slow down it goes only if braking is
+    enough; one that waits counts on that from when it goes, the harder the longer it has waited.
     """
     to_line = foe["dist"] - foe["half"]
     if other["accel"] > SPEEDING_UP_MPS2:
@@ -262,19 +261,20 @@ def _comes(
         arrives = _earliest(to_line, foe["speed"], top, other["accel"])
     else:
         arrives = to_line / max(foe["speed"], STANDING_MPS)
-    mean_mps = max(to_line / max(arrives, 0.1), STANDING_MPS)
-    # One that stands may set off at once.
-    patience = min(row["wait_s"] / IMPATIENCE_S, 1.0) if foe["speed"] > STANDING_MPS else 0.0
-    brakes, left = FORCED_STOP, to_line
-    if patience > 0.0:
-        brakes, left = FORCED_STOP * patience, max(to_line - mean_mps * time_in, 0.0)
-    slow_mps = math.sqrt(max(mean_mps * mean_mps - 2.0 * brakes * left, 0.0))
-    if conflict["merging"] and leaves_mps <= slow_mps:
-        return True
-    later_s = STOPPED_FOE_S
-    if slow_mps > 0.0:
-        later_s = 2.0 * left / (mean_mps + slow_mps) - left / mean_mps
-    arrives += patience * later_s
+    if conflict["merging"]:
+        mean_mps = max(to_line / max(arrives, 0.1), STANDING_MPS)
+        # One that stands may set off at once.
+        patience = min(row["wait_s"] / IMPATIENCE_S, 1.0) if foe["speed"] > STANDING_MPS else 0.0
+        brakes, left = FORCED_STOP, to_line
+        if patience > 0.0:
+            brakes, left = FORCED_STOP * patience, max(to_line - mean_mps * time_in, 0.0)
+        slow_mps = math.sqrt(max(mean_mps * mean_mps - 2.0 * brakes * left, 0.0))
+        if leaves_mps <= slow_mps:
+            return True
+        later_s = STOPPED_FOE_S
+        if slow_mps > 0.0:
+            later_s = 2.0 * left / (mean_mps + slow_mps) - left / mean_mps
+        arrives += patience * later_s
     comes: bool = arrives < time_out + AHEAD_S
     return comes
 
@@ -341,7 +341,7 @@ def foe_blocks(
     HOLD_EXIT_BLOCKED says that it stays there; HOLD_YIELD that it will come, or leave.
     """
     to_clear = foe["dist"] + conflict["foe_leave_m"] + foe["half"]
-    if to_clear <= 0.0:
+    if to_clear <= 0.0 or (foe["dist"] < foe["half"] and not conflict["near"]):
         return HOLD_NONE
     target = roads.links[link]
     foe_link = roads.links[conflict["foe"]]
@@ -364,22 +364,26 @@ def foe_blocks(
         )
     # A foe before its line, and the vehicle itself, are given the whole way over the junction.
     over = target["length_m"]
-    if conflict["enter_m"] < target["wait_m"]:
+    if conflict["enter_m"] < target["wait_m"] - LINE_MARGIN_M:
         over = min(over, target["wait_m"])
     passed = (foe["dist"] + foe_link["length_m"] + foe["half"]) / max(foe["speed"], 0.1)
     after_s = GAP_S if conflict["merging"] else 0.0
     if passed + after_s < _earliest(distance - half, row["speed"], limit, BRISK_ACCEL):
         return HOLD_NONE
-    speed = row["speed"]
-    over += min(distance - half, 0.0)  # from a waiting position: the rest
+    speed, to_line = row["speed"], distance - half
+    if not (steered or conflict["merging"]) and speed <= STANDING_MPS:
+        # One that waits is as good as at its line, or its place inside: SUMO's stand there.
+        inside = to_line < 0.0 and target["wait_m"] < math.inf
+        ahead = to_line + target["wait_m"] if inside else to_line
+        to_line -= min(max(ahead, 0.0), LINE_MARGIN_M)
+    over += min(to_line, 0.0)  # from a waiting position: the rest
     reached = math.sqrt(speed * speed + 2.0 * BRISK_ACCEL * max(over, 0.0))
     leaves_mps = min(reached, max(limit, speed))
-    time_line = _earliest(distance - half, speed, limit, GENTLE_ACCEL)
+    time_line = _earliest(to_line, speed, limit, GENTLE_ACCEL)
     time_out = time_line + 2.0 * (over + row["length"]) / max(speed + leaves_mps, STANDING_MPS)
     if steered:
         comes = _comes_to_steered(row, conflict, foe, front, leaves_mps, time_out)
     else:
-        # One that waits is as good as at its line: SUMO's stand there.
         time_in = _earliest(distance - half - LINE_MARGIN_M, speed, limit, GENTLE_ACCEL)
         comes = _comes(roads, row, conflict, foe, other, time_in, time_out, leaves_mps)
     return HOLD_YIELD if comes else HOLD_NONE

@@ -38,6 +38,7 @@ from cavmarl.driving.kernels.gaps import (
     STOOD_S,
     STOP_SIGN_S,
     foe_blocks,
+    is_minor,
     link_signal,
     must_stop,
     stays_inside,
@@ -48,6 +49,7 @@ from cavmarl.driving.kernels.ways import next_step
 # m/s², a driver stops for yellow where this braking is enough; Krauss's brakes as hard as it can
 COMFORT_STOP = 3.0
 STEERED_MPS = 5.0  # a steered car is taken to turn no faster than this
+SEE_FOES_M = 4.5  # before a line, a driver that gives way is ready to stop, as SUMO's are
 LAST_CHANCE_M = 3.0  # with the front this near to the line
 STUB_LANES = 4  # looked along for a stop sign
 EXIT_LANES = 4  # looked along for room,
@@ -317,6 +319,26 @@ def waits_inside(
     return HOLD_NONE
 
 
+@inlined_kernel
+def before_waiting(
+    roads: RoadArrays,
+    kind: np.void,
+    row: np.void,
+    link: int,
+    place: float,  # of its front, m beyond its stop line
+    waits: int,  # why it stops at the waiting position inside, HOLD_*
+    minor: bool,  # whether it comes to that ready to stop, as SUMO's do that give way
+    dt: float,
+) -> float:
+    """The constraint of the waiting position inside."""
+    to_wait = wait_place(roads, link, 0.5 * row["length"]) - place
+    if waits == HOLD_NONE:
+        if not minor or to_wait <= SEE_FOES_M:
+            return no_constraint(kind)
+        to_wait += LINE_MARGIN_M
+    return before_line(kind, row["speed"], to_wait, dt)
+
+
 @kernel
 def constraint_inside(
     roads: RoadArrays,
@@ -346,16 +368,15 @@ def constraint_inside(
     front = place + half
     constraint, waits = no_constraint(kind), HOLD_NONE
     target = roads.links[link]
-    if front <= target["wait_m"] + WAIT_SLACK_M:
+    if target["wait_m"] < math.inf and front <= target["wait_m"] + WAIT_SLACK_M:
         waits = waits_inside(roads, travel, rows, i, link, -place, way, phase, scratch)
-        if waits != HOLD_NONE:
-            to_wait = wait_place(roads, link, half) - front
-            constraint = before_line(kind, row["speed"], to_wait, dt)
+        minor = kind["model"] == MODEL_KRAUSS and is_minor(roads, link, phase)
+        constraint = before_waiting(roads, kind, row, link, front, waits, minor, dt)
     hold = waits
     first = target["first_conflict"]
     for c in range(first, first + target["num_conflicts"]):
         conflict = roads.conflicts[c]
-        if place - half > conflict["leave_m"]:
+        if place - half > conflict["leave_m"] or not conflict["near"]:
             continue
         for k in range(scratch.link_start[conflict["foe"]], scratch.link_end[conflict["foe"]]):
             foe = scratch.approach[k]

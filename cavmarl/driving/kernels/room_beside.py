@@ -14,6 +14,7 @@ from cavmarl.driving.kernels.lane_index import beside_s
 LONGEST_HALF_M = 10.0  # of vehicles: a body reaches no further from its centre
 STAYS_ASIDE = 2  # a lane change that waits between the two lanes
 MARGIN_M = 0.1  # on each side of the own body
+ASIDE_MPS = 5.0  # up to here one that sets off between two lanes minds what stands beside it
 
 
 @kernel
@@ -88,8 +89,8 @@ def _is_touched(
 
 @inlined_kernel
 def stays_aside(roads: RoadArrays, rows: NDArray[np.void], row: np.void, scratch: Scratch) -> bool:
-    """Whether one that stands aside of its lane stays there: it would touch another that stands."""
-    if row["d"] == 0.0 or row["speed"] > STANDING_MPS:
+    """Whether one between two lanes stays aside: it would touch another that stands."""
+    if row["d"] == 0.0 or row["speed"] > ASIDE_MPS:
         return False
     side = -1 if row["d"] > 0.0 else 1
     d = row["d"] + side * min(abs(row["d"]), MARGIN_M)

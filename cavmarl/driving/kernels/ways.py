@@ -47,6 +47,17 @@ def next_step(roads: RoadArrays, travel: Travel, lane: int, way: int) -> tuple[i
 
 
 @inlined_kernel
+def fed_lane(roads: RoadArrays, lane: int) -> int:
+    """A lane, or where no link leads into it the one beside it into which one does."""
+    row = roads.lanes[lane]
+    if row["num_into"] == 0:
+        for side in (row["left"], row["right"]):
+            if side >= 0 and roads.lanes[side]["num_into"] > 0:
+                return int(side)
+    return lane
+
+
+@inlined_kernel
 def way_left(roads: RoadArrays, row: np.void, step: np.void) -> float:
     """Metres from a vehicle's centre to the end of its way; inf where it has none.
 

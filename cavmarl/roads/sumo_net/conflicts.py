@@ -33,6 +33,8 @@ HALF_WIDTH_M = 1.1
 CLEARANCE_M = 3.0
 # The half length of the stretch where foes never come near each other in the plane.
 TOUCH_M = 1.0
+MERGES_M = 300.0  # as far as SUMO's drivers that turn into a road look along its last lane
+WAITS_BACK_M = 3.0  # before netconvert's waiting position inside, at most
 
 
 class LinkPath(NamedTuple):
@@ -56,6 +58,7 @@ class Overlap(NamedTuple):
     leave_m: float
     foe_enter_m: float
     foe_leave_m: float
+    near: bool = True  # False: the paths keep apart, and this is where they are nearest
 
 
 def sample_path(s: NDArray[np.float64], xyz: NDArray[np.float64]) -> LinkPath:
@@ -93,10 +96,12 @@ def overlap(path: LinkPath, foe: LinkPath, *, merging: bool) -> Overlap | None:
         found = Overlap(
             *_stretch(path, mine - TOUCH_M, mine + TOUCH_M),
             *_stretch(foe, theirs - TOUCH_M, theirs + TOUCH_M),
+            near=False,
         )
     if merging:
-        found = found._replace(leave_m=path.s[-1], foe_leave_m=foe.s[-1])
-    return Overlap(*map(float, found))
+        found = found._replace(leave_m=path.s[-1], foe_leave_m=foe.s[-1], near=True)
+    enter_m, leave_m, foe_enter_m, foe_leave_m = map(float, found[:4])
+    return Overlap(enter_m, leave_m, foe_enter_m, foe_leave_m, found.near)
 
 
 def grazing(path: LinkPath, foe: LinkPath, way: LinkPath, foe_way: LinkPath) -> Overlap | None:
@@ -117,7 +122,7 @@ def grazing(path: LinkPath, foe: LinkPath, way: LinkPath, foe_way: LinkPath) -> 
     if not meet.any():
         return None
     here, there = path.s[rows[meet]], foe.s[columns[meet]]
-    return Overlap(*map(float, (*_from_centres(path, here), *_from_centres(foe, there))))
+    return Overlap(*_from_centres(path, here), *_from_centres(foe, there))
 
 
 def poses(path: LinkPath, way: LinkPath) -> Poses:
@@ -160,11 +165,11 @@ def _from_centres(path: LinkPath, centres: NDArray[np.float64]) -> tuple[float, 
     """The stretch that a car covers of the shared area, from the places of its centre there."""
     enter, leave = centres.min() + HALF_LENGTH_M, centres.max() - HALF_LENGTH_M
     middle = 0.5 * (enter + leave)
-    return _stretch(path, min(enter, middle), max(leave, middle))
+    return _stretch(path, float(min(enter, middle)), float(max(leave, middle)))
 
 
 def _stretch(path: LinkPath, start: float, end: float) -> tuple[float, float]:
-    return max(0.0, start), min(path.s[-1], end)
+    return max(0.0, float(start)), min(float(path.s[-1]), float(end))
 
 
 def fork_lengths(from_lane: Sequence[int], paths: Sequence[LinkPath | None]) -> NDArray[np.float64]:
@@ -271,7 +276,7 @@ def _meets(body: Poses, other: Poses) -> bool:
     return bool(touching(apart, own, other.heading[level]).any())
 
 
-Row = tuple[int, bool, bool, float, float, float, float]
+Row = tuple[int, bool, bool, bool, float, float, float, float]
 
 
 def conflict_rows(
@@ -323,15 +328,59 @@ def conflict_rows(
                 continue
             if shared is None:
                 continue
-            mine, theirs = shared[:2], shared[2:]
-            found[one].append((other, merging, yields[0], *mine, *theirs))
-            found[other].append((one, merging, yields[1], *theirs, *mine))
+            mine, theirs = shared[:2], shared[2:4]
+            found[one].append((other, merging, yields[0], shared.near, *mine, *theirs))
+            found[other].append((one, merging, yields[1], shared.near, *theirs, *mine))
 
     counts = [len(rows) for rows in found]
     conflicts = np.zeros(sum(counts), CONFLICT)
     conflicts[:] = [row for rows in found for row in sorted(rows)]
     first = np.concatenate([[0], np.cumsum(counts, dtype=np.int32)]).astype(np.int32)
     return conflicts, first, unruled
+
+
+def fill_conflicts(
+    lanes: NDArray[np.void],
+    links: NDArray[np.void],
+    conflicts: NDArray[np.void],
+    first_conflict: NDArray[np.int32],
+) -> None:
+    """Write the conflicts of each LINK, where it waits inside, and `merges_m` of each LANE.
+
+    LANE["merges_m"] is as long where those turn in that need not stand first.
+    """
+    links["first_conflict"] = first_conflict[:-1]
+    links["num_conflicts"] = np.diff(first_conflict)
+    owner = np.repeat(np.arange(len(links)), links["num_conflicts"])
+    links["wait_m"] = _wait_places(links["wait_m"], owner, conflicts)
+    asks = (links["signal"][owner] < 0) & conflicts["merging"] & conflicts["must_yield"]
+    asks &= links["state"][conflicts["foe"]] != ord("w")
+    minded = links["from_lane"][conflicts["foe"][asks]]
+    lanes["merges_m"][minded] = np.minimum(lanes["length_m"][minded], MERGES_M)
+
+
+def _wait_places(
+    wait_m: NDArray[np.float64], owner: NDArray[np.intp], conflicts: NDArray[np.void]
+) -> NDArray[np.float64]:
+    """Where drivers wait inside, in m from the stop line: out of the way of those that pass.
+
+    netconvert's places are for its own margins. Where one lies up to `WAITS_BACK_M` within an area
+    of vehicles that drive on while it waits for them, drivers wait before that area.
+
+    Args:
+        wait_m: (K,) netconvert's places; inf: none.
+        owner: (num_conflicts,) LINK row that each conflict is of.
+        conflicts: CONFLICT (num_conflicts,).
+    """
+    place = conflicts["enter_m"] + LINE_MARGIN_M
+    back = wait_m[owner] - place
+    # Rows lie in the order of their links and foes: sorted by foes and links are the foes' own.
+    mirror = np.argsort(np.lexsort((owner, conflicts["foe"])))
+    drives_on = conflicts["must_yield"] & ~conflicts["must_yield"][mirror]
+    moved = drives_on & (back > 0.0) & (back <= WAITS_BACK_M)
+    places = wait_m.copy()
+    np.minimum.at(places, owner[moved], place[moved])
+    return places
 
 
 def _bit(mine: Movement, foe: Movement, requests: dict[int, str]) -> bool:

@@ -27,6 +27,7 @@ from cavmarl.roads.sumo_net.backward_paths import Way, mend_backward_paths
 from cavmarl.roads.sumo_net.conflicts import (
     LinkPath,
     conflict_rows,
+    fill_conflicts,
     fork_lengths,
     sample_path,
     stop_back,
@@ -34,13 +35,12 @@ from cavmarl.roads.sumo_net.conflicts import (
 from cavmarl.roads.sumo_net.detectors import DetectorRoads, place_detectors
 from cavmarl.roads.sumo_net.selection import Movement, NetworkSelection, permission_bits, select
 from cavmarl.roads.sumo_net.signal_rows import SignalRows, read_signals
-from cavmarl.roads.sumo_net.sweeps import AHEAD_M, Movements, sweep_rows
+from cavmarl.roads.sumo_net.sweeps import AHEAD_M, Movements, sweep_rows, unfed_beside
 from cavmarl.roads.sumo_net.xml_source import limit
 
 if TYPE_CHECKING:
     from cavmarl.roads.sumo_net.sumo_xml import ParsedNet
 
-MERGES_M = 300.0  # as far as SUMO's drivers that turn into a road look along its last lane
 APPROACH_M = 12.0  # before a junction, where bodies still stand askew to vehicles that wait
 FORK_MINDED_M = 5.0  # behind a junction, where a rear is minded by those that turn off beside it
 MAX_CROSSING_M = 2000  # paths are compared point by point: memory goes by its square
@@ -128,8 +128,9 @@ def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
         [_path(move, lane_row, lanes, points, APPROACH_M) for move in movements],
         ways,
     )
-    _fill_conflicts(lanes, links, conflicts, first_conflict)
-    sweeps = _fill_sweeps(Movements(links, conflicts, ways))
+    fill_conflicts(lanes, links, conflicts, first_conflict)
+    unfed = unfed_beside(links, lanes, points)
+    sweeps = _fill_sweeps(Movements(links, conflicts, ways, unfed))
     junctions, kinds = _junction_rows(nodes, links)
     junctions["unruled"][links["junction"][unruled]] = True
     detectors, phase_detectors = place_detectors(
@@ -310,22 +311,6 @@ def _link_rows(
         link["direction"] = ord(connection.getDirection()[0].replace("T", "t"))
         link["state"] = ord(connection.getState()[0])
     return links
-
-
-def _fill_conflicts(
-    lanes: NDArray[np.void],
-    links: NDArray[np.void],
-    conflicts: NDArray[np.void],
-    first_conflict: NDArray[np.int32],
-) -> None:
-    """The conflicts of each link; where those that need not stand first turn in, `merges_m`."""
-    links["first_conflict"] = first_conflict[:-1]
-    links["num_conflicts"] = np.diff(first_conflict)
-    owner = np.repeat(np.arange(len(links)), links["num_conflicts"])
-    asks = (links["signal"][owner] < 0) & conflicts["merging"] & conflicts["must_yield"]
-    asks &= links["state"][conflicts["foe"]] != ord("w")
-    minded = links["from_lane"][conflicts["foe"][asks]]
-    lanes["merges_m"][minded] = np.minimum(lanes["length_m"][minded], MERGES_M)
 
 
 def _fill_sweeps(movements: Movements) -> NDArray[np.void]:

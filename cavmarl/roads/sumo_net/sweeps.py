@@ -8,8 +8,9 @@ pair of sizes the bodies are laid along both ways, some metres before and behind
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,13 @@ from numpy.typing import NDArray
 from cavmarl.core.records.rows import SIZE_BODIES_M, SIZE_LENGTHS_M, WAIT_SLACK_M
 from cavmarl.roads.kernels.swept_range import swept_range
 from cavmarl.roads.network import SWEEP
-from cavmarl.roads.sumo_net.conflicts import CLEARANCE_M, LINE_MARGIN_M, LinkPath, places_on
+from cavmarl.roads.sumo_net.conflicts import (
+    CLEARANCE_M,
+    LINE_MARGIN_M,
+    LinkPath,
+    places_on,
+    sample_path,
+)
 
 
 class SweptBody(NamedTuple):
@@ -48,6 +55,29 @@ class Movements(NamedTuple):
     links: NDArray[np.void]  # LINK (K,), conflicts filled
     conflicts: NDArray[np.void]  # CONFLICT
     ways: Sequence[LinkPath | None]  # over the junction, with `AHEAD_M` of the lanes at its ends
+    # of links that turn round: lanes beside the one behind, on which vehicles only enter; see
+    # `unfed_beside`
+    unfed: Mapping[int, Sequence[LinkPath]] = MappingProxyType({})
+
+
+def unfed_beside(
+    links: NDArray[np.void], lanes: NDArray[np.void], points: NDArray[np.void]
+) -> dict[int, list[LinkPath]]:
+    """Of each LINK that turns round, the lanes beside that it leads to, into which no link leads.
+
+    Their places are those of the link: a lane begins at the link's length.
+    """
+    fed = np.zeros(len(lanes), dtype=np.bool_)
+    fed[links["to_lane"]] = True
+    found: dict[int, list[LinkPath]] = {}
+    for link in np.flatnonzero(links["direction"] == TURNAROUND).tolist():
+        sides = lanes[["left", "right"]][links["to_lane"][link]].tolist()
+        for row in (lanes[side] for side in sides if side >= 0 and not fed[side]):
+            part = points[row["first_point"] : row["first_point"] + row["num_points"]]
+            xyz = np.stack([part["x"], part["y"], part["z"]], axis=1)
+            path = sample_path(links["length_m"][link] + part["s"], xyz)
+            found.setdefault(link, []).append(path)
+    return found
 
 
 def sweep_rows(movements: Movements) -> tuple[NDArray[np.void], NDArray[np.int32]]:
@@ -72,6 +102,8 @@ def sweep_rows(movements: Movements) -> tuple[NDArray[np.void], NDArray[np.int32
         for turn in links:
             if turns[turn]:
                 _find_behind(movements, turn, links, poses, found)
+                for path in movements.unfed.get(turn, ()):
+                    _find_beside(movements, turn, path, poses, found)
         poses.clear()
     counts = [len(rows) for rows in found]
     sweeps = np.zeros(sum(counts), SWEEP)
@@ -123,7 +155,7 @@ def find_pair(
     a, b = (movements.links[link] for link in pair)
     (mine, body), (theirs, foe_body) = one, other
     conflicts = movements.conflicts[a["first_conflict"] :][: a["num_conflicts"]]
-    area = conflicts[conflicts["foe"] == pair[1]]
+    area = conflicts[(conflicts["foe"] == pair[1]) & conflicts["near"]]
     foes = bool(area.size)
     mine_m = theirs_m = (0.0, 0.0)
     if foes:
@@ -208,6 +240,34 @@ def _find_behind(
             for link in links:
                 if movements.links["from_lane"][link] == movements.links["from_lane"][turn]:
                     found[link].append((turn, own, foe, *here, *there))
+
+
+def _find_beside(
+    movements: Movements,
+    turn: int,
+    path: LinkPath,  # of a lane beside, into which no link leads
+    poses: dict[int, list[NDArray[np.float64]]],
+    found: list[list[tuple[float, ...]]],
+) -> None:
+    """One that turns round swings over the start of a lane on which others have entered.
+
+    They are listed on its link, as if they had come by that.
+    """
+    length = float(movements.links["length_m"][turn])
+    for foe, (foe_half, foe_wide) in enumerate(BODIES):
+        theirs = poses_on_rails(path, foe_half, length, TURN_BEYOND_M)
+        theirs = theirs[theirs[:, 0] - foe_half >= length]
+        other = (foe_half, foe_wide, length, 0.0, 0.0)
+        for own, (half, wide) in enumerate(BODIES):
+            body = (half, wide, length, 0.0, 0.0)
+            found_m = swept_range(poses[turn][own], theirs, body, other, CLEARANCE_M, False)
+            first, last, foe_first, foe_last = found_m
+            if first == np.inf:
+                continue
+            here = (first + half - MARGIN_M, last - half + MARGIN_M)
+            there = (foe_first + foe_half - MARGIN_M, foe_last - foe_half + MARGIN_M)
+            found[turn].append((turn, own, foe, *here, *there))
+            found[turn].append((turn, foe, own, *there, *here))
 
 
 def is_near(mine: NDArray[np.float64], theirs: NDArray[np.float64]) -> bool:

@@ -22,7 +22,7 @@ from cavmarl.core.records.rows import SWEPT_BEYOND_M
 from cavmarl.driving.kernels.approach import register_links
 from cavmarl.driving.kernels.lane_index import index_lanes
 from cavmarl.driving.kernels.swept_areas import would_be_swept
-from cavmarl.driving.kernels.ways import next_step
+from cavmarl.driving.kernels.ways import fed_lane, next_step
 from cavmarl.traffic.kernels.demand_generator import enter
 from cavmarl.traffic.kernels.entering import (
     crowd,
@@ -164,8 +164,8 @@ def _link_ahead(roads: RoadArrays, travel: Travel, row: np.void) -> int:
 
 @inlined_kernel
 def _link_behind(roads: RoadArrays, row: np.void, n: int) -> int:
-    """The n-th link into an entrant's lane, -1 where it is far from the start of that lane."""
-    here = roads.lanes[row["lane"]]
+    """The n-th link into an entrant's lane, or beside it; -1 where it is far from its start."""
+    here = roads.lanes[fed_lane(roads, row["lane"])]
     if n >= here["num_into"] or row["s"] - 0.5 * row["length"] > SWEPT_BEYOND_M:
         return -1
     before = roads.lanes[roads.into[here["first_into"] + n]]
@@ -179,7 +179,7 @@ def _may_be_swept(roads: RoadArrays, travel: Travel, row: np.void, scratch: Scra
     ahead = _link_ahead(roads, travel, row) if to_line <= travel.see_m else -1
     if ahead >= 0 and roads.links[ahead]["num_sweeps"] > 0:
         return True
-    for n in range(roads.lanes[row["lane"]]["num_into"]):
+    for n in range(roads.lanes[fed_lane(roads, row["lane"])]["num_into"]):
         link = _link_behind(roads, row, n)
         if link < 0:
             continue
@@ -208,7 +208,7 @@ def _is_swept(roads: RoadArrays, travel: Travel, row: np.void, scratch: Scratch)
     ahead = _link_ahead(roads, travel, row) if to_line <= travel.see_m else -1
     if ahead >= 0 and would_be_swept(roads, row, ahead, half - to_line, scratch):
         return True
-    for n in range(here["num_into"]):
+    for n in range(roads.lanes[fed_lane(roads, row["lane"])]["num_into"]):
         link = _link_behind(roads, row, n)
         if link >= 0:
             place = roads.links[link]["length_m"] + row["s"] + half
