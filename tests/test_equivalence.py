@@ -296,13 +296,28 @@ TURNING_ROUND = """<routes>
 </routes>"""
 TURNS = ("A1B1 B1A1", "C1B1 B1C1", "B0B1 B1B0", "B2B1 B1B2")
 BETWEEN = ("A1B1 B1C1", "C1B1 B1B2", "B0B1 B1A1", "B2B1 B1B0", "B1A1 A1A2", "B1C1 C1C0")
+AT_DEAD_ENDS = ("B0A0 A0left0 left0A0 A0A1", "A1B1 B1top1 top1B1 B1B0")
+FROM_DEAD_ENDS = (
+    *("left0A0 A0A1", "left0A0 A0B0 B0right0", "top1B1 B1right1", "B0A0 A0left0"),
+    *("top1B1 B1B0 B0bottom1", "right0B0 B0A0", "top0A1 A1A0", "bottom1B0 B0B1"),
+)
 
 
-def test_beside_buses_that_turn_round_all_drive_and_enter_alike(tmp_path: Path) -> None:
-    # Departures at the starts of lanes, in the middle of the map, ask about those on the junction.
-    options = ("--grid", "--grid.number=3", "--grid.length=110", "-L=2")
-    net = netgenerate(tmp_path / "grid.net.xml", *options, "-j=allway_stop")
-    ways = {"bus": (TURNS, 11), "car": ((*TURNS, *BETWEEN), 4)}
+@pytest.mark.parametrize(
+    ("grid", "buses", "cars"),
+    [
+        # Departures at the starts of lanes, in the middle of the map, ask about those on junctions.
+        ("--grid.number=3 -j=allway_stop", TURNS, (*TURNS, *BETWEEN)),
+        # At dead ends they enter where no link leads; before left turns they wait inside.
+        ("--grid.number=2 --grid.attach-length=90 -j=priority", AT_DEAD_ENDS, FROM_DEAD_ENDS),
+    ],
+)
+def test_beside_buses_that_turn_round_all_drive_and_enter_alike(
+    tmp_path: Path, grid: str, buses: tuple[str, ...], cars: tuple[str, ...]
+) -> None:
+    options = ("--grid", "--grid.length=110", "-L=2", *grid.split())
+    net = netgenerate(tmp_path / "grid.net.xml", *options)
+    ways = {"bus": (buses, 11), "car": (cars, 4)}
     flows = "".join(
         f'<flow id="{kind}{n}" type="{kind}" begin="{n}" end="100" period="{period}">'
         f'<route edges="{edges}"/></flow>'

@@ -99,9 +99,9 @@ def overlap(path: LinkPath, foe: LinkPath, *, merging: bool) -> Overlap | None:
             near=False,
         )
     if merging:
-        found = found._replace(leave_m=path.s[-1], foe_leave_m=foe.s[-1], near=True)
-    enter_m, leave_m, foe_enter_m, foe_leave_m = map(float, found[:4])
-    return Overlap(enter_m, leave_m, foe_enter_m, foe_leave_m, found.near)
+        ends = {"leave_m": float(path.s[-1]), "foe_leave_m": float(foe.s[-1])}
+        found = found._replace(**ends, near=True)
+    return found
 
 
 def grazing(path: LinkPath, foe: LinkPath, way: LinkPath, foe_way: LinkPath) -> Overlap | None:
@@ -165,7 +165,7 @@ def _from_centres(path: LinkPath, centres: NDArray[np.float64]) -> tuple[float, 
     """The stretch that a car covers of the shared area, from the places of its centre there."""
     enter, leave = centres.min() + HALF_LENGTH_M, centres.max() - HALF_LENGTH_M
     middle = 0.5 * (enter + leave)
-    return _stretch(path, float(min(enter, middle)), float(max(leave, middle)))
+    return _stretch(path, min(enter, middle), max(leave, middle))
 
 
 def _stretch(path: LinkPath, start: float, end: float) -> tuple[float, float]:
@@ -345,9 +345,9 @@ def fill_conflicts(
     conflicts: NDArray[np.void],
     first_conflict: NDArray[np.int32],
 ) -> None:
-    """Write the conflicts of each LINK, where it waits inside, and `merges_m` of each LANE.
+    """Write which conflicts each LINK has and where one waits inside for them, into `links`.
 
-    LANE["merges_m"] is as long where those turn in that need not stand first.
+    And `merges_m` of each LANE at whose end others turn into its road without standing first.
     """
     links["first_conflict"] = first_conflict[:-1]
     links["num_conflicts"] = np.diff(first_conflict)
@@ -374,7 +374,7 @@ def _wait_places(
     """
     place = conflicts["enter_m"] + LINE_MARGIN_M
     back = wait_m[owner] - place
-    # Rows lie in the order of their links and foes: sorted by foes and links are the foes' own.
+    # Rows are sorted by link, then by foe; sorted by foe, then by link, they are the other sides.
     mirror = np.argsort(np.lexsort((owner, conflicts["foe"])))
     drives_on = conflicts["must_yield"] & ~conflicts["must_yield"][mirror]
     moved = drives_on & (back > 0.0) & (back <= WAITS_BACK_M)

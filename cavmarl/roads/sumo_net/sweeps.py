@@ -176,12 +176,7 @@ def find_pair(
         if b["direction"] == TURNAROUND and foe_body.half_m > BODIES[0].half_m:
             turns = theirs[theirs[:, 0] + foe_body.half_m <= b["length_m"]]
             found = _hull(found, swept_range(beyond, turns, *extents, CLEARANCE_M, foes))
-    first, last, foe_first, foe_last = found
-    if first == np.inf:
-        return None
-    here = (first + body.half_m - MARGIN_M, last - body.half_m + MARGIN_M)
-    there = (foe_first + foe_body.half_m - MARGIN_M, foe_last - foe_body.half_m + MARGIN_M)
-    return here, there
+    return _areas(found, body.half_m, foe_body.half_m)
 
 
 def _before_and_beyond(
@@ -197,6 +192,15 @@ def _hull(one: Range, other: Range) -> Range:
     return (
         min(one[0], other[0]), max(one[1], other[1]), min(one[2], other[2]), max(one[3], other[3]),
     )  # fmt: skip
+
+
+def _areas(found: Range, half_m: float, foe_half_m: float) -> tuple[Area, Area] | None:
+    """The areas on both ways, of centres that touch as `swept_range` answers; None: none do."""
+    first, last, foe_first, foe_last = found
+    if first == np.inf:
+        return None
+    here = (first + half_m - MARGIN_M, last - half_m + MARGIN_M)
+    return here, (foe_first + foe_half_m - MARGIN_M, foe_last - foe_half_m + MARGIN_M)
 
 
 def _begin_m(link: np.void, enter_m: float) -> float:
@@ -232,11 +236,10 @@ def _find_behind(
                 behind = mine[mine[:, 0] + half + BEHIND_M <= pose[0] - foe_half]
                 comes_back = swept_range(behind, pose[None], body, other, CLEARANCE_M, False)
                 range_m = _hull(range_m, comes_back)
-            first, last, foe_first, foe_last = range_m
-            if first == np.inf:
+            areas = _areas(range_m, half, foe_half)
+            if areas is None:
                 continue
-            here = (first + half - MARGIN_M, last - half + MARGIN_M)
-            there = (foe_first + foe_half - MARGIN_M, foe_last - foe_half + MARGIN_M)
+            here, there = areas
             for link in links:
                 if movements.links["from_lane"][link] == movements.links["from_lane"][turn]:
                     found[link].append((turn, own, foe, *here, *there))
@@ -260,12 +263,11 @@ def _find_beside(
         other = (foe_half, foe_wide, length, 0.0, 0.0)
         for own, (half, wide) in enumerate(BODIES):
             body = (half, wide, length, 0.0, 0.0)
-            found_m = swept_range(poses[turn][own], theirs, body, other, CLEARANCE_M, False)
-            first, last, foe_first, foe_last = found_m
-            if first == np.inf:
+            range_m = swept_range(poses[turn][own], theirs, body, other, CLEARANCE_M, False)
+            areas = _areas(range_m, half, foe_half)
+            if areas is None:
                 continue
-            here = (first + half - MARGIN_M, last - half + MARGIN_M)
-            there = (foe_first + foe_half - MARGIN_M, foe_last - foe_half + MARGIN_M)
+            here, there = areas
             found[turn].append((turn, own, foe, *here, *there))
             found[turn].append((turn, foe, own, *there, *here))
 

@@ -163,11 +163,16 @@ def _link_ahead(roads: RoadArrays, travel: Travel, row: np.void) -> int:
 
 
 @inlined_kernel
+def _num_behind(roads: RoadArrays, row: np.void) -> int:
+    """How many lanes lead to an entrant's lane, or beside it; 0 where it is far from its start."""
+    far = row["s"] - 0.5 * row["length"] > SWEPT_BEYOND_M
+    return 0 if far else int(roads.lanes[fed_lane(roads, row["lane"])]["num_into"])
+
+
+@inlined_kernel
 def _link_behind(roads: RoadArrays, row: np.void, n: int) -> int:
-    """The n-th link into an entrant's lane, or beside it; -1 where it is far from its start."""
+    """The link that the n-th of these lanes is part of, -1: none."""
     here = roads.lanes[fed_lane(roads, row["lane"])]
-    if n >= here["num_into"] or row["s"] - 0.5 * row["length"] > SWEPT_BEYOND_M:
-        return -1
     before = roads.lanes[roads.into[here["first_into"] + n]]
     return int(before["link"]) if before["internal"] else -1
 
@@ -179,7 +184,7 @@ def _may_be_swept(roads: RoadArrays, travel: Travel, row: np.void, scratch: Scra
     ahead = _link_ahead(roads, travel, row) if to_line <= travel.see_m else -1
     if ahead >= 0 and roads.links[ahead]["num_sweeps"] > 0:
         return True
-    for n in range(roads.lanes[fed_lane(roads, row["lane"])]["num_into"]):
+    for n in range(_num_behind(roads, row)):
         link = _link_behind(roads, row, n)
         if link < 0:
             continue
@@ -208,7 +213,7 @@ def _is_swept(roads: RoadArrays, travel: Travel, row: np.void, scratch: Scratch)
     ahead = _link_ahead(roads, travel, row) if to_line <= travel.see_m else -1
     if ahead >= 0 and would_be_swept(roads, row, ahead, half - to_line, scratch):
         return True
-    for n in range(roads.lanes[fed_lane(roads, row["lane"])]["num_into"]):
+    for n in range(_num_behind(roads, row)):
         link = _link_behind(roads, row, n)
         if link >= 0:
             place = roads.links[link]["length_m"] + row["s"] + half
