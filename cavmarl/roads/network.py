@@ -80,7 +80,8 @@ LANE = record(
     # internal lanes: path length of the link before this lane starts
     ("link_offset_m", np.float64),
     ("stop_back_m", np.float64),  # from the stop line to the end, where paths of others sweep
-    # so far before its end a vehicle is minded by those that give way to it and turn into its lane
+    # so far before its end a vehicle is minded by those that give way to it and turn into its lane:
+    # `MERGES_M`, or 0 where none do
     ("merges_m", np.float64),
     # into[first_into : first_into + num_into]: LANE rows whose ends lead here (internal lanes where
     # the map has them)

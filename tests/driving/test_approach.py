@@ -5,20 +5,29 @@ import pytest
 from numpy.typing import NDArray
 
 from cavmarl.core.records.arrays import Scratch
+from cavmarl.core.records.codes import HOLD_EXIT_BLOCKED
 from cavmarl.driving.kernels.approach import register_links
 from cavmarl.engine.simulation import Simulation
 from cavmarl.roads.routing import PLAN
 from tests.naive import approach as naive
 from tests.support.driving import drive, make_traffic, start
+from tests.support.netgenerate import netgenerate
 from tests.support.traffic import scratch
 
-CROWDS = {"merge": 30, "grid4x4": 40, "ring": 20}
+CROWDS = {"merge": 30, "grid4x4": 40, "ring": 20, "blocks": 60}
 
 
 @pytest.fixture(params=CROWDS, scope="module")
-def world(request: pytest.FixtureRequest) -> Simulation:
-    """Traffic, some seconds after its start."""
-    simulation = make_traffic(request.param, background=CROWDS[request.param])
+def world(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Simulation:
+    """Traffic, some seconds after its start; the blocks are streets with signs, and short."""
+    env = request.param
+    if env == "blocks":
+        env = netgenerate(
+            tmp_path_factory.mktemp("blocks") / "blocks.net.xml",
+            "--grid", "--grid.number", "5", "--grid.length", "110",
+            "--default-junction-type", "priority_stop", "--default.speed", "20",
+        )  # fmt: skip
+    simulation = make_traffic(env, background=CROWDS[request.param])
     start(simulation, seed=4)
     for _ in range(round(8.0 / simulation.config.clock.ctrl_dt_s)):
         drive(simulation)
@@ -40,12 +49,16 @@ def entries(room: Scratch, link: int) -> list[tuple[int, float, float, float]]:
     return sorted((int(e["id"]), float(e["dist"]), e["speed"], e["half"]) for e in found)
 
 
-def test_every_link_lists_who_is_on_it_and_who_comes(world: Simulation) -> None:
+@pytest.mark.parametrize("stand", [False, True])
+def test_every_link_lists_who_is_on_it_and_who_comes(world: Simulation, stand: bool) -> None:
+    """Of vehicles that are kept where they are, too."""
     travel, roads = world._tick.traffic.travel, world.network
     for step in range(0, 12, 2):
         for _ in range(step):
             drive(world)
         rows = world.vehicles()
+        if stand:
+            rows["speed"], rows["hold"] = 0.0, HOLD_EXIT_BLOCKED
         room = listed(world, rows)
         expected: dict[int, list[tuple[int, float, float, float]]] = {}
         for row in rows:

@@ -3,28 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from cavmarl.core.records.arrays import Travel
 from cavmarl.core.records.codes import (
     DRIVER_AGENT,
     DRIVER_BACKGROUND,
     HOLD_EXIT_BLOCKED,
     HOLD_NONE,
     HOLD_YIELD,
+    MODEL_IDM,
+    MODEL_KRAUSS,
     SIGNAL_NONE,
     SIGNAL_OFF_BLINKING,
 )
 from cavmarl.driving.kernels.approach import APPROACH
-from cavmarl.driving.kernels.gaps import foe_blocks, ignores
+from cavmarl.driving.kernels.gaps import STUCK_S, foe_blocks, ignores
+from cavmarl.driving.vehicle_types import generated_types
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network
 from tests.support.builders import vehicles
 from tests.support.crossing import crossing
-from tests.support.traffic import on_lane
+from tests.support.traffic import on_lane, travel
 
 __all__ = ["crossing"]
 
@@ -32,6 +37,7 @@ SPEED_MPS = 10.0  # of both, all along: it is the limit
 HALF_M = 2.5
 FROM_WEST, FROM_SOUTH = 0, 1  # LINK rows
 
+CARS = travel("merge")
 Blocks = Callable[..., int]
 ALLWAY_STOP, EQUAL, MINOR, STOP = map(ord, "w=ms")
 
@@ -57,6 +63,7 @@ def blocks(network: RoadNetwork) -> Blocks:
         wait_s: float = 0.0,
         own: dict[str, float] | None = None,
         near: bool = True,
+        travel: Travel = CARS,
         **foe_fields: float,
     ) -> int:
         """By how long and how far they are before what they share.
@@ -79,7 +86,7 @@ def blocks(network: RoadNetwork) -> Blocks:
                 rows[k][name] = value
         foe["speed"] = rows[1]["speed"]
         return foe_blocks(
-            network.arrays, rows, rows[0], FROM_SOUTH,
+            network.arrays, travel, rows, rows[0], FROM_SOUTH,
             own_s * SPEED_MPS - float(ahead[end]), SPEED_MPS, asked[0], foe[0], True,
             np.zeros(1, np.int32),
         )  # fmt: skip
@@ -186,6 +193,21 @@ def test_one_that_crosses_does_not_count_on_others_to_brake_however_long_it_has_
     assert not blocks(over_s, "out", 25.2, wait_s)
 
 
+@pytest.mark.parametrize("accel", [1.2, 2.5, 5.0])
+def test_one_that_speeds_up_slowly_needs_a_longer_gap(
+    blocks: Blocks, network: RoadNetwork, accel: float
+) -> None:
+    """Out of the junction from a stand, with 2.5 m/s² at most, and 1 s more."""
+    types = CARS.types.copy()
+    types["accel"] = accel
+    length_m = float(network.links["length_m"][FROM_SOUTH])
+    leaves_mps = np.sqrt(2.0 * min(accel, 2.5) * length_m)
+    out_s = 2.0 * (length_m + 2.0 * HALF_M) / leaves_mps
+    asked = partial(blocks, 0.0, "line", own={"speed": 0.0}, travel=CARS._replace(types=types))
+    assert asked((out_s + 0.95) * SPEED_MPS)
+    assert not asked((out_s + 1.05) * SPEED_MPS)
+
+
 def test_one_that_stands_before_its_line_counts_as_one_at_it(blocks: Blocks) -> None:
     """With 1.8 m/s² it needs 1.05 s for a metre, and without that it would be out too late."""
     own = {"speed": 0.0}
@@ -215,7 +237,7 @@ def least_ahead(network: RoadNetwork, driver: int, wait_s: float, foe_mps: float
 
     def waits(front_m: float) -> int:
         foe["dist"] = front_m + HALF_M
-        return foe_blocks(network.arrays, rows, rows[0], link, 5.0, 5.0, conflict, foe[0],
+        return foe_blocks(network.arrays, CARS, rows, rows[0], link, 5.0, 5.0, conflict, foe[0],
                           True, np.zeros(1, np.int32))  # fmt: skip
 
     return next(m for m in np.arange(1.0, 400.0, 0.1) if not waits(m)), over_m
@@ -269,7 +291,7 @@ def test_at_an_all_way_stop_the_one_goes_that_has_stood_longer(
 ) -> None:
     waits = [own_wait_s, foe_wait_s]
     row, foe = waiting_pair(id=[own_id, 3], wait_s=waits, speed=[speed, 0.0])
-    assert ignores(row, foe, 0, 1, SIGNAL_NONE, ALLWAY_STOP, ALLWAY_STOP) == goes
+    assert ignores(row, foe, 0, 1, SIGNAL_NONE, ALLWAY_STOP, ALLWAY_STOP, STUCK_S) == goes
 
 
 @pytest.mark.parametrize(("stopped_at", "goes"), [(1, False), (-1, True)])
@@ -279,23 +301,37 @@ def test_at_an_all_way_stop_one_that_has_not_stood_yet_is_not_waited_for(
     row, foe = vehicles(
         [(0.0, 0.0, 0.0)] * 2, speed=[0.0, 8.0], wait_s=[0.6, 0.0], stopped_at=[0, stopped_at]
     )
-    assert ignores(row, foe, 0, 1, SIGNAL_NONE, ALLWAY_STOP, ALLWAY_STOP) == goes
-    assert not ignores(row, foe, 0, 1, SIGNAL_NONE, STOP, STOP), "a stop sign of a side road"
+    assert ignores(row, foe, 0, 1, SIGNAL_NONE, ALLWAY_STOP, ALLWAY_STOP, STUCK_S) == goes
+    assert not ignores(row, foe, 0, 1, SIGNAL_NONE, STOP, STOP, STUCK_S), (
+        "a stop sign of a side road"
+    )
 
 
 def test_equals_that_wait_do_not_stop_one_another() -> None:
     row, foe = waiting_pair(id=[5, 3], wait_s=[3.1, 9.0], speed=0.0)
-    assert ignores(row, foe, 0, 1, SIGNAL_NONE, EQUAL, EQUAL)
+    assert ignores(row, foe, 0, 1, SIGNAL_NONE, EQUAL, EQUAL, STUCK_S)
     row["wait_s"] = 2.9
-    assert not ignores(row, foe, 0, 1, SIGNAL_NONE, EQUAL, EQUAL), "first the longer one"
+    assert not ignores(row, foe, 0, 1, SIGNAL_NONE, EQUAL, EQUAL, STUCK_S), "first the longer one"
 
 
-@pytest.mark.parametrize(("wait_s", "goes"), [(89.0, False), (91.0, True)])
+@pytest.mark.parametrize(
+    ("model", "driver", "most_s"),
+    [
+        (MODEL_KRAUSS, DRIVER_BACKGROUND, 300.0),
+        (MODEL_KRAUSS, DRIVER_AGENT, 90.0),
+        (MODEL_IDM, DRIVER_BACKGROUND, 90.0),
+    ],
+)
+@pytest.mark.parametrize(("later_s", "goes"), [(-1.0, False), (1.0, True)])
 def test_a_road_comes_first_while_it_waits_itself_but_not_for_ever(
-    wait_s: float, goes: bool
+    blocks: Blocks, model: int, driver: int, most_s: float, later_s: float, goes: bool
 ) -> None:
-    row, foe = waiting_pair(id=[5, 3], wait_s=[wait_s, 9.0], speed=0.0)
-    assert ignores(row, foe, 0, 1, SIGNAL_NONE, MINOR, MINOR) == goes
+    """Of drivers as SUMO has them as long as there, of others not so long."""
+    cars = CARS._replace(types=generated_types(model))
+    own = {"wait_s": most_s + later_s, "hold": HOLD_YIELD, "stopped_at": -1, "driver": driver}
+    foe = {"speed": 0.0, "wait_s": 9.0, "hold": HOLD_YIELD, "stopped_at": FROM_WEST}
+    asked = blocks(0.0, "line", 0.5, own={"speed": 0.0, **own}, travel=cars, **foe)
+    assert (asked == HOLD_NONE) == goes
 
 
 @pytest.mark.parametrize(
@@ -307,7 +343,7 @@ def test_where_signals_blink_of_two_that_give_way_the_one_goes_that_has_stood_lo
 ) -> None:
     row, foe = waiting_pair(id=[5, 3], wait_s=[own_wait_s, 2.0], speed=0.0)
     foe["hold"] = foe_hold  # HOLD_NONE: it is about to go
-    assert ignores(row, foe, 0, 1, SIGNAL_OFF_BLINKING, MINOR, MINOR) == goes
+    assert ignores(row, foe, 0, 1, SIGNAL_OFF_BLINKING, MINOR, MINOR, STUCK_S) == goes
 
 
 @pytest.mark.parametrize(("stopped_at", "goes"), [(1, True), (2, False)])
@@ -320,4 +356,4 @@ def test_an_agent_that_stands_at_its_stop_line_gives_way(stopped_at: int, goes: 
         driver=[DRIVER_BACKGROUND, DRIVER_AGENT],
         stopped_at=[-1, stopped_at],
     )
-    assert ignores(row, foe, 0, 1, SIGNAL_NONE, ALLWAY_STOP, STOP) == goes
+    assert ignores(row, foe, 0, 1, SIGNAL_NONE, ALLWAY_STOP, STOP, STUCK_S) == goes

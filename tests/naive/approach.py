@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cavmarl.core.records.arrays import Travel
+from cavmarl.core.records.codes import HOLD_EXIT_BLOCKED, HOLD_NONE, HOLD_SIGNAL
 from cavmarl.driving.kernels.lane_index import beside_s
 from cavmarl.roads.network import RoadNetwork
 
@@ -44,9 +45,17 @@ def announcements(roads: RoadNetwork, travel: Travel, row: np.void) -> list[Entr
             found.append((int(beside["first_link"]), name, max(rest, 0.0)))
     sight = min(30.0 + 8.0 * float(row["speed"]), 150.0)
     to_end = float(here["length_m"] - row["s"])
-    at_own_line = max(sight, float(here["merges_m"]))
+    inside = bool(here["internal"])
+    idle = row["hold"] in (HOLD_SIGNAL, HOLD_EXIT_BLOCKED)
+    idle |= row["hold"] == HOLD_NONE and row["wait_s"] > 3.0
     ahead: list[tuple[int, float]] = []
-    while to_end < (sight if ahead else at_own_line) and len(ahead) < 2:
+    while len(ahead) < 2:
+        # By those that turn into its lane it is minded from farther away, unless it stands, or has
+        # to give way before that.
+        may_stop = any(inside or roads.links[link]["state"] != ord("M") for link, _ in ahead)
+        stands = idle and row["speed"] <= 0.5
+        if to_end >= (sight if may_stop or stands else max(sight, float(here["merges_m"]))):
+            break
         if here["internal"]:
             lane = int(here["successor"])
         else:

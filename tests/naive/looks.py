@@ -10,7 +10,13 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.records.rows import ENTER_REACH_M, SIZE_LENGTHS_M, STEERED, SWEPT_BEYOND_M
+from cavmarl.core.records.rows import (
+    ENTER_REACH_M,
+    MERGES_M,
+    SIZE_LENGTHS_M,
+    STEERED,
+    SWEPT_BEYOND_M,
+)
 from cavmarl.driving.kernels.announcing import APPROACH_M
 from cavmarl.driving.kernels.junctions import EXIT_LOOK_M
 from cavmarl.driving.kernels.lane_choice import LOOK_BACK_M
@@ -51,6 +57,7 @@ class Looks:
         self.back: dict[int, float] = defaultdict(lambda: math.inf)
         self.line: dict[int, float] = defaultdict(lambda: math.inf)
         self.room: dict[int, float] = defaultdict(lambda: math.inf)
+        self.merge: dict[int, float] = defaultdict(lambda: math.inf)
         self.into: dict[int, list[int]] = defaultdict(list)
         for lane in range(len(self.lengths)):
             for other in self._after(lane):
@@ -81,6 +88,7 @@ class Looks:
             foes = foes | following
         self._at_lines(foes, self.line)
         self._at_lines(swept, self.room)
+        self._at_merges(foes)
         for link in asked | foes:
             *inside, lane = self._path(link)
             for each in inside:
@@ -164,6 +172,27 @@ class Looks:
             for beside in self._beside(lane):
                 line = way + self.lengths[beside] - ROUNDING_M
                 places[beside] = min(places[beside], line)
+
+    def _at_merges(self, foes: set[int]) -> None:
+        """See those that are minded from farther away at the lines of foes."""
+        lanes, links = self.network.lanes, self.network.links
+        before = {k for link in foes for k in self._beside(int(links["from_lane"][link]))}
+        for lane in before:
+            if not lanes["merges_m"][lane]:
+                continue
+            places = [(lane, self.lengths[lane])]
+            for link in np.flatnonzero(links["to_lane"] == lane).tolist():
+                *inside, _ = self._path(link)
+                way = self.lengths[lane]
+                for each in reversed(inside):
+                    way += self.lengths[each]
+                    places.append((each, way))
+                if links["state"][link] == ord("M"):
+                    beside = self._beside(int(links["from_lane"][link]))
+                    places += [(each, way + self.lengths[each]) for each in beside]
+            for each, place in places:
+                if place - self.lengths[each] < MERGES_M:
+                    self.merge[each] = min(self.merge[each], place - ROUNDING_M)
 
     def _see(self, lane: int, first: float, last: float) -> None:
         for beside in self._beside(lane):

@@ -14,7 +14,7 @@ def blank_looks(shape: int | tuple[int, ...]) -> NDArray[np.void]:
     """LOOK of drivers who ask about nobody."""
     looks = np.zeros(shape, dtype=LOOK)
     looks["head"] = -np.inf
-    for place in ("tail", "back", "line", "room"):
+    for place in ("tail", "back", "line", "room", "merge"):
         looks[place] = np.inf
     return looks
 

@@ -70,16 +70,16 @@ def test_the_monitor_asks_for_those_who_are_seen(blocks: Path) -> None:
     assert ghosts(driven(blocks, **{"zones.check_invariants": True})) > 0
 
 
-@pytest.mark.parametrize("field", ["head", "line"])
+@pytest.mark.parametrize("fields", [("head",), ("line", "merge")])
 def test_a_look_less_makes_another_world(
-    blocks: Path, field: str, monkeypatch: pytest.MonkeyPatch
+    blocks: Path, fields: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Leaders ahead, and foes of the right of way: who is not seen is driven into."""
     seen = Visibility.halo
 
     def blind(sight: Visibility, partition: ZonePartition) -> Halo:
         halo = seen(sight, partition)
-        if partition.count > 1:
+        for field in fields if partition.count > 1 else ():
             halo.watchers[field] = -np.inf if field == "head" else np.inf
         return halo
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from cavmarl.core.records.rows import MERGES_M
 from cavmarl.driving.kernels.announcing import APPROACH_M
 from cavmarl.driving.steered_sweeps import load_steered
 from cavmarl.engine.world_setup import find_map
@@ -60,6 +61,20 @@ def looks_of(
     return looks
 
 
+def same_looks(found: NDArray[np.void], twin: Looks) -> None:
+    """As finely as the twin looks at lanes."""
+    for field, told in (
+        ("head", twin.head),
+        ("tail", twin.tail),
+        ("back", twin.back),
+        ("line", twin.line),
+        ("room", twin.room),
+        ("merge", twin.merge),
+    ):
+        expected = np.array([told[lane] for lane in range(len(found))])
+        np.testing.assert_allclose(found[field], expected, atol=2.0 * STEP_M, err_msg=field)
+
+
 @pytest.mark.parametrize("name", ["merge", "grid4x4"])
 @pytest.mark.parametrize(
     "part", [(0.0, 0.0, 0.4, 1.0), (0.3, 0.45, 0.8, 0.7), (0.5, 0.5, 0.6, 0.6)]
@@ -76,19 +91,31 @@ def test_kernel_sees_what_sets_of_lanes_see(
     low, high = np.array([min_x, min_y] * 2), np.array([max_x, max_y] * 2)
     rect = tuple((low + np.array(part) * (high - low)).tolist())
     found, twin = looks_of(roads, rect, half_m), Looks(roads, rect, VIEW_M, SEE_M, half_m)
-    for field, told in (
-        ("head", twin.head),
-        ("tail", twin.tail),
-        ("back", twin.back),
-        ("line", twin.line),
-        ("room", twin.room),
-    ):
-        expected = np.array([told[lane] for lane in range(len(roads.lanes))])
-        np.testing.assert_allclose(found[field], expected, atol=2.0 * STEP_M, err_msg=field)
+    same_looks(found, twin)
     assert np.isfinite(found["line"]).any() == (name == "grid4x4")
     # On these maps vans, buses and steered cars alone sweep over ways beside theirs.
     sweeps = name == "grid4x4" and (half_m == HALF_M or steered)
     assert np.isfinite(found["room"]).any() == sweeps
+
+
+@pytest.mark.parametrize("side_m", [60.0, 140.0])
+@pytest.mark.parametrize("part", [(0.0, 0.0, 0.2, 0.2), (0.45, 0.45, 0.55, 0.55)])
+def test_those_that_turn_into_a_lane_see_over_the_junction_before_it(
+    tmp_path: Path, side_m: float, part: tuple[float, float, float, float]
+) -> None:
+    """Along one lane more, where nothing has to stop before that."""
+    options = ("--grid.number", "7", "--grid.length", str(side_m), "-L", "2")
+    net = netgenerate(tmp_path / "net.net.xml", "-g", "-j", "priority_stop", *options)
+    roads = read_network(net)
+    min_x, min_y, max_x, max_y = roads.extent_m
+    low, high = np.array([min_x, min_y] * 2), np.array([max_x, max_y] * 2)
+    rect = tuple((low + np.array(part) * (high - low)).tolist())
+    found, twin = looks_of(roads, rect), Looks(roads, rect, VIEW_M, SEE_M, HALF_M)
+    same_looks(found, twin)
+    length_m = roads.lanes["length_m"]
+    over = np.isfinite(found["merge"]) & (found["merge"] > length_m + ROUNDING_M)
+    assert over.any()
+    assert (found["merge"][over] - length_m[over] < MERGES_M).all()
 
 
 @pytest.mark.parametrize(("junctions", "seen"), [("right_before_left", 4), ("priority", 1)])
@@ -130,7 +157,7 @@ def test_behind_a_shorter_lane_those_are_seen_that_may_cover_the_longer_one(
     rect = (140.0, y - 10.0, 160.0, y - 9.0)
     found, twin = looks_of(roads, rect), Looks(roads, rect, VIEW_M, SEE_M, HALF_M)
     for field, told in (("head", twin.head), ("back", twin.back), ("tail", twin.tail)):
-        expected = np.array([told[lane] for lane in range(len(roads.lanes))])
+        expected = np.array([told[lane] for lane in range(len(found))])
         np.testing.assert_allclose(found[field], expected, atol=2.0 * STEP_M, err_msg=field)
     assert (found["head"][turn] > 8.0 + HALF_M) == (from_line_m < 120.0)
     assert (found["back"][turn] < np.inf) == (from_line_m < 0.0)
@@ -186,7 +213,8 @@ def test_nobody_is_asked_about_further_away_than_the_farthest(
         s = np.arange(0.0, points["s"][-1], STEP_M)
         x, y = (np.interp(s, points["s"], points[axis]) for axis in ("x", "y"))
         asked = (s <= look["head"]) | (s >= look["tail"])
-        asked |= min(look["back"], look["line"]) - s < max(APPROACH_M, look["merges"])
+        asked |= min(look["back"], look["line"]) - s < APPROACH_M
+        asked |= look["merge"] - s < MERGES_M
         dx = np.maximum(np.maximum(rect[0] - x, x - rect[2]), 0.0)
         dy = np.maximum(np.maximum(rect[1] - y, y - rect[3]), 0.0)
         farthest = max(farthest, float(np.hypot(dx, dy)[asked].max(initial=0.0)))

@@ -14,6 +14,7 @@ from cavmarl.core.records.codes import (
     HOLD_SIGNAL,
     HOLD_YIELD,
 )
+from cavmarl.core.records.rows import MERGES_M
 from cavmarl.driving.kernels.announcing import announced_m
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.zones.kernels.borders import Borders
@@ -40,7 +41,7 @@ def asked_at_random(
     looks = blank_looks((partition.count, len(roads.lanes)))
     length = roads.lanes["length_m"]
     for field in LOOK.names or ():
-        nothing = {"head": -np.inf, "merges": 0.0}.get(field, np.inf)
+        nothing = -np.inf if field == "head" else np.inf
         place = rng.uniform(0.0, 1.0, looks.shape) * length
         looks[field] = np.where(rng.random(looks.shape) < 0.2, place, nothing)
     start, watchers = lane_watchers(partition, roads.lanes, looks, SURE_M + ASIDE_M)
@@ -90,13 +91,14 @@ def expected_of(
         look, s = looks[zone, row["lane"]], row["s"]
         asked = s <= look["head"] or s >= look["tail"] or int(row["id"]) in near
         reach_m = announced_m(row["speed"])
-        line_m = max(reach_m, look["merges"])
-        coming = look["line"] - s < line_m
+        coming = look["line"] - s < reach_m
         idle = row["hold"] in (HOLD_SIGNAL, HOLD_EXIT_BLOCKED)
         idle |= row["hold"] == HOLD_NONE and row["wait_s"] > 3.0
-        idle &= row["speed"] == 0.0 and row["driver"] == DRIVER_BACKGROUND
-        coming &= not idle or look["line"] - s <= LINE_M
-        coming |= look["back"] - s < reach_m or look["room"] - s < line_m
+        idle &= row["speed"] == 0.0
+        unseen = idle and row["driver"] == DRIVER_BACKGROUND
+        coming &= not unseen or look["line"] - s <= LINE_M
+        coming |= look["back"] - s < reach_m or look["room"] - s < reach_m
+        coming |= not idle and look["merge"] - s < MERGES_M
         if asked or coming:
             found.append(int(row["id"]))
     return sorted(found)

@@ -16,6 +16,7 @@ SIZE_BODIES_M = (
 )  # the length that a vehicle of each class is taken to have at least
 STEERED = 3  # the class of a car that is steered, of SWEEP rows that say where it sweeps
 WAIT_SLACK_M = 0.5  # a front this far beyond a waiting position inside a junction still waits there
+MERGES_M = 300.0  # before its line one is minded by those that turn into its lane
 SWEPT_BEYOND_M = 9.0  # how far beyond a junction others may still mind a vehicle's rear
 FORK_BEYOND_M = 3.0  # how far beyond a junction paths from one lane can still run together
 LOST_M = (

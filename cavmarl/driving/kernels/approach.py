@@ -14,7 +14,8 @@ from cavmarl.core.numba.prefetch import SOON, prefetch
 from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
 from cavmarl.core.records.codes import DRIVER_SCRIPTED
 from cavmarl.core.records.rows import SWEPT_BEYOND_M, is_lost
-from cavmarl.driving.kernels.announcing import announced_m
+from cavmarl.driving.kernels.announcing import announced_m, is_let_stand
+from cavmarl.driving.kernels.gaps import STATE_MAJOR
 from cavmarl.driving.kernels.lane_index import beside_s
 from cavmarl.driving.kernels.ways import fed_lane, leave, next_step, own_step
 
@@ -160,11 +161,11 @@ def _announce(
             link = roads.lanes[side]["first_link"]
             pairs = _note(scratch, pairs, link, row, i, max(to_end, 0.0))
     reach = announced_m(row["speed"])
-    own_reach = max(reach, here["merges_m"])
     distance = here["length_m"] - s
     way = row["way"]
     found = 0
-    while distance < reach or (found == 0 and distance < own_reach):
+    far = not is_let_stand(row)  # it may be minded by those that turn into its lane
+    while distance < reach or (far and distance < roads.lanes[lane]["merges_m"]):
         before, before_way = lane, way
         if lane == row["lane"] and way == row["way"]:
             lane, way, link = leave(roads, step, lane, way)
@@ -182,6 +183,7 @@ def _announce(
             if roads.links[link]["num_conflicts"] + roads.links[link]["num_sweeps"] > 0:
                 pairs = _note(scratch, pairs, link, row, i, max(distance, 0.0))
             found += 1
+            far &= roads.links[link]["state"] == STATE_MAJOR and not here["internal"]
             if found == MAX_LINKS_AHEAD:
                 break
         distance += roads.lanes[lane]["length_m"]

@@ -21,8 +21,10 @@ from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
 from cavmarl.core.records.codes import (
     DRIVER_AGENT,
     DRIVER_BACKGROUND,
+    HOLD_EXIT_BLOCKED,
     HOLD_NONE,
     HOLD_SIGNAL,
+    HOLD_YIELD,
     MODEL_KRAUSS,
 )
 from cavmarl.core.records.rows import is_lost
@@ -86,6 +88,7 @@ FALL_IN_M = 100.0  # before the place where a lane change must be made
 # before the end, nearer than to a line.
 CHANGING_ROOM_M = -0.8
 MISSED_ROOM_M = 1.5  # more, where its lane goes on to a turn that it cannot take
+KEPT_MPS = 0.1  # a leader that leaves less keeps one where it is
 ROW_LINES = 3  # of a VEHICLE row that drivers ask for
 FAST_MPS = 5.0  # a slower background driver need not slow down for one that turns in ahead
 RETURN_MPS = 5.0  # at which a lost vehicle looks for its lane
@@ -231,6 +234,7 @@ def _road_ahead(
         allowed = min(allowed, bend_speed(roads, lane, lane, -row["s"]))
     constraint = no_constraint(kind)
     hold = HOLD_NONE
+    kept = no_constraint(kind)  # by a leader
     link_ahead = -1
     if here["internal"]:
         place = here["link_offset_m"] + row["s"]
@@ -249,7 +253,8 @@ def _road_ahead(
         leader = scratch.entries[k + 1]
         gap = leader["s"] - row["s"] - half - leader["half"]
         gap -= swings_back_m(roads, travel, rows, leader)
-        constraint = max(constraint, behind_entry(kind, speed, gap, leader))
+        kept = behind_entry(kind, speed, gap, leader)
+        constraint = max(constraint, kept)
         look = min(look, half + NEXT_LINE_M + speed + 0.5 * speed * speed / kind["decel"])
     way = row["way"]
     while distance < look:
@@ -274,6 +279,7 @@ def _road_ahead(
             to_line = distance - half - roads.lanes[before]["stop_back_m"]
             if min(to_line, to_stop) < STOP_LINE_M:
                 link_ahead = link if link_ahead < 0 else link_ahead
+            kept = max(kept, fork)
             constraint = max(constraint, fork, at_line)
             hold = found if found != HOLD_NONE else hold
         ahead = roads.lanes[lane]
@@ -289,7 +295,8 @@ def _road_ahead(
             if gap < NEAR_M and _is_askew(row, rows[leader["row"]]):
                 gap -= 0.5 * rows[leader["row"]]["width"]
             gap -= swings_back_m(roads, travel, rows, leader)
-            constraint = max(constraint, behind_entry(kind, speed, gap, leader))
+            kept = max(kept, behind_entry(kind, speed, gap, leader))
+            constraint = max(constraint, kept)
         elif stops:
             over = behind_over_line(roads, travel, row, kind, lane, way, distance, scratch)
             constraint = max(constraint, over)
@@ -299,6 +306,9 @@ def _road_ahead(
         if j >= 0 or stops:
             break
         distance += ahead["length_m"]
+    if hold == HOLD_YIELD and speed < KEPT_MPS and -kept < KEPT_MPS:
+        if kind["model"] == MODEL_KRAUSS and not here["internal"]:
+            hold = HOLD_EXIT_BLOCKED  # whatever it gives way to: it will not come
     return constraint, allowed, hold, link_ahead
 
 

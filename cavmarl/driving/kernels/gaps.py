@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.numba import inlined_kernel, kernel
-from cavmarl.core.records.arrays import RoadArrays
+from cavmarl.core.records.arrays import RoadArrays, Travel
 from cavmarl.core.records.codes import (
     DRIVER_AGENT,
     HOLD_EXIT_BLOCKED,
     HOLD_NONE,
     HOLD_YIELD,
+    MODEL_KRAUSS,
     SIGNAL_GREEN_MINOR,
     SIGNAL_NONE,
     SIGNAL_OFF_BLINKING,
@@ -34,7 +35,8 @@ from cavmarl.driving.kernels.circles import STATE_EQUAL
 from cavmarl.driving.kernels.following import LINE_MARGIN_M
 
 BRISK_ACCEL = 2.5  # m/s², with which a driver may soon be in a shared area,
-GENTLE_ACCEL = 1.8  # and, to be safe, with which it and others are out of it
+GENTLE_ACCEL = 1.8  # and, to be safe, with which it and others are out of it,
+GENTLE_SHARE = GENTLE_ACCEL / BRISK_ACCEL  # or such a share of what a slower one has
 HARD_STOP = 5.0  # m/s², a vehicle that needs more to stop before the line will not stop
 AHEAD_S = 1.0  # s before a foe is at its line (SUMO's 1.0 start from nearer to their own);
 STOPPED_FOE_S = 30.0  # by which one that can stop comes later, if the other has waited for long;
@@ -49,7 +51,8 @@ FORCED_STOP = 4.5  # m/s², and how hard at most
 # Of the way to where one may have to stop, on which it speeds up and need not brake for that yet.
 UNBRAKED_SHARE = FORCED_STOP / (FORCED_STOP + BRISK_ACCEL)
 CRAWL_MPS = 5.0  # a stream that is slower lets others in
-STUCK_S = 90.0  # after which it passes others that stand and give way, too
+STUCK_S = 90.0  # after which it passes others that stand and give way, too;
+RESCUED_S = 300.0  # of Krauss's drivers when SUMO would put one elsewhere
 STOP_SIGN_S = 0.5  # how long one stands at a stop sign, and before a tie is broken;
 STOOD_S = 0.1  # background vehicles, as SUMO's, only for a moment
 ARRIVES_M = 1.0  # a trip that ends no further behind a line leads over no junction
@@ -123,11 +126,19 @@ def _in_turn(state: int) -> bool:
 
 @kernel
 def ignores(
-    row: np.void, foe: np.void, link: int, foe_link: int, signal: int, state: int, foe_state: int
+    row: np.void,
+    foe: np.void,
+    link: int,
+    foe_link: int,
+    signal: int,
+    state: int,
+    foe_state: int,
+    stuck_s: float,
 ) -> bool:
     """Whether a driver at `link` need not wait for a foe at `foe_link` that has the right of way.
 
     `signal` is what the foe's own signal shows, `state` and `foe_state` are those of the links.
+    After `stuck_s` it passes one that stands and gives way, too.
     """
     if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW:
         return True
@@ -141,7 +152,7 @@ def ignores(
         return False
     # Where its signal is off and blinks, the foe has to give way, too.
     in_turn = _in_turn(state) or signal == SIGNAL_OFF_BLINKING
-    if not (in_turn or row["wait_s"] > STUCK_S):
+    if not (in_turn or row["wait_s"] > stuck_s):
         return False  # the other road comes first even while it waits itself
     # Among equals each may wait for the next all around: those that wait do not stop one another.
     if (state == STATE_EQUAL and row["wait_s"] > IMPATIENT_S) or _goes_on(row, link):
@@ -160,9 +171,19 @@ def _is_committed(foe: np.void, front: float) -> bool:
     return committed
 
 
+@inlined_kernel
+def _are_krauss(travel: Travel, row: np.void, other: np.void) -> bool:
+    """Whether two vehicles have the drivers that SUMO has."""
+    steered = row["driver"] == DRIVER_AGENT or other["driver"] == DRIVER_AGENT
+    models = travel.types[row["vtype"]]["model"], travel.types[other["vtype"]]["model"]
+    alike: bool = not steered and models[0] == models[1] == MODEL_KRAUSS
+    return alike
+
+
 @kernel
 def _is_harmless(
     roads: RoadArrays,
+    travel: Travel,
     rows: NDArray[np.void],
     row: np.void,
     link: int,
@@ -198,11 +219,21 @@ def _is_harmless(
         return is_let_stand(other)  # one that waits in a circle is left out before
     signal = link_signal(roads, foe_link, phase)
     state, foe_state = roads.links[link]["state"], roads.links[foe_link]["state"]
-    if ignores(row, other, link, foe_link, signal, state, foe_state):
+    stuck_s = RESCUED_S if _are_krauss(travel, row, other) else STUCK_S
+    if ignores(row, other, link, foe_link, signal, state, foe_state, stuck_s):
         return True
     # A vehicle that has been let in goes on, where others can still brake for it.
     brakes: bool = foe["speed"] * foe["speed"] < 2.0 * FORCED_STOP * front
     return brakes and _goes_on(row, link)
+
+
+@inlined_kernel
+def _brisk(travel: Travel, row: np.void) -> float:
+    """How hard a vehicle speeds up, in m/s²: long ones less."""
+    brisk: float = BRISK_ACCEL
+    if row["driver"] != DRIVER_AGENT:
+        brisk = min(BRISK_ACCEL, travel.types[row["vtype"]]["accel"])
+    return brisk
 
 
 @inlined_kernel
@@ -282,6 +313,7 @@ def _comes(
 @kernel
 def _blocks_inside(
     roads: RoadArrays,
+    travel: Travel,
     row: np.void,
     link: int,
     distance: float,
@@ -290,14 +322,14 @@ def _blocks_inside(
     foe: np.void,
     other: np.void,
     to_clear: float,
-    steered: bool,
     equal: bool,
 ) -> int:
     """`foe_blocks` of one on the junction, VEHICLE row `other`, that has `to_clear` m to go."""
     target, half = roads.links[link], 0.5 * row["length"]
     to_area = distance + conflict["enter_m"] - half
     cleared = to_clear / max(foe["speed"], 0.1)
-    time_in = _earliest(to_area, row["speed"], limit, BRISK_ACCEL)
+    brisk = _brisk(travel, row)
+    time_in = _earliest(to_area, row["speed"], limit, brisk)
     if stays_inside(other):
         return HOLD_EXIT_BLOCKED
     if equal and conflict["merging"]:
@@ -308,15 +340,15 @@ def _blocks_inside(
     top = roads.lanes[roads.links[conflict["foe"]]["next_lane"]]["speed_mps"]
     if foe["speed"] > STANDING_MPS and other["accel"] > -GENTLE_ACCEL:
         # One that has just set off does not stay so slow; one that brakes may have to stop.
-        cleared = _earliest(to_clear, foe["speed"], top, GENTLE_ACCEL)
-    if steered:
+        cleared = _earliest(to_clear, foe["speed"], top, GENTLE_SHARE * _brisk(travel, other))
+    if row["driver"] == DRIVER_AGENT or other["driver"] == DRIVER_AGENT:
         time_in -= 0.5 * GAP_S
     elif row["speed"] <= STANDING_MPS and not equal and not _goes_on(row, link):
         if target["state"] != STATE_ALLWAY_STOP:
             time_in = min(SET_OFF_S, time_in)
         else:  # in turn: it sets off so that it need not brake on its way
             free = (to_area - LINE_MARGIN_M) * UNBRAKED_SHARE
-            time_in = _earliest(free, row["speed"], limit, BRISK_ACCEL)
+            time_in = _earliest(free, row["speed"], limit, brisk)
             if other["accel"] > SPEEDING_UP_MPS2:
                 cleared = _earliest(to_clear, foe["speed"], top, other["accel"])
     return HOLD_YIELD if cleared > time_in else HOLD_NONE
@@ -325,6 +357,7 @@ def _blocks_inside(
 @kernel
 def foe_blocks(
     roads: RoadArrays,
+    travel: Travel,
     rows: NDArray[np.void],
     row: np.void,
     link: int,
@@ -356,19 +389,21 @@ def foe_blocks(
         front += wait_m + WAIT_SLACK_M
     half = 0.5 * row["length"]
     apart = distance + conflict["leave_m"] - half - to_clear
-    if _is_harmless(roads, rows, row, link, conflict, foe, front, apart, gives_way, phase, equal):
+    if _is_harmless(
+        roads, travel, rows, row, link, conflict, foe, front, apart, gives_way, phase, equal
+    ):
         return HOLD_NONE
     if front <= 0.0:
         return _blocks_inside(
-            roads, row, link, distance, limit, conflict, foe, other, to_clear, steered, equal
+            roads, travel, row, link, distance, limit, conflict, foe, other, to_clear, equal
         )
     # A foe before its line, and the vehicle itself, are given the whole way over the junction.
-    over = target["length_m"]
+    over, brisk = target["length_m"], _brisk(travel, row)
     if conflict["enter_m"] < target["wait_m"] - LINE_MARGIN_M:
         over = min(over, target["wait_m"])
     passed = (foe["dist"] + foe_link["length_m"] + foe["half"]) / max(foe["speed"], 0.1)
     after_s = GAP_S if conflict["merging"] else 0.0
-    if passed + after_s < _earliest(distance - half, row["speed"], limit, BRISK_ACCEL):
+    if passed + after_s < _earliest(distance - half, row["speed"], limit, brisk):
         return HOLD_NONE
     speed, to_line = row["speed"], distance - half
     if not (steered or conflict["merging"]) and speed <= STANDING_MPS:
@@ -377,13 +412,13 @@ def foe_blocks(
         ahead = to_line + target["wait_m"] if inside else to_line
         to_line -= min(max(ahead, 0.0), LINE_MARGIN_M)
     over += min(to_line, 0.0)  # from a waiting position: the rest
-    reached = math.sqrt(speed * speed + 2.0 * BRISK_ACCEL * max(over, 0.0))
+    reached = math.sqrt(speed * speed + 2.0 * brisk * max(over, 0.0))
     leaves_mps = min(reached, max(limit, speed))
-    time_line = _earliest(to_line, speed, limit, GENTLE_ACCEL)
+    time_line = _earliest(to_line, speed, limit, GENTLE_SHARE * brisk)
     time_out = time_line + 2.0 * (over + row["length"]) / max(speed + leaves_mps, STANDING_MPS)
     if steered:
         comes = _comes_to_steered(row, conflict, foe, front, leaves_mps, time_out)
     else:
-        time_in = _earliest(distance - half - LINE_MARGIN_M, speed, limit, GENTLE_ACCEL)
+        time_in = _earliest(distance - half - LINE_MARGIN_M, speed, limit, GENTLE_SHARE * brisk)
         comes = _comes(roads, row, conflict, foe, other, time_in, time_out, leaves_mps)
     return HOLD_YIELD if comes else HOLD_NONE

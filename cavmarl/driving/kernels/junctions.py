@@ -105,7 +105,18 @@ def _blocked_by_foes(
             if waits and lets_go(roads, rows, other, conflict["foe"], row, scratch):
                 continue
             found = foe_blocks(
-                roads, rows, row, link, distance, limit, conflict, foe, gives_way, phase, both
+                roads,
+                travel,
+                rows,
+                row,
+                link,
+                distance,
+                limit,
+                conflict,
+                foe,
+                gives_way,
+                phase,
+                both,
             )
             if found == HOLD_NONE:
                 continue

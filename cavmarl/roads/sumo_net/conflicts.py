@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import MapError
-from cavmarl.core.records.rows import FORK_BEYOND_M
+from cavmarl.core.records.rows import FORK_BEYOND_M, MERGES_M
 from cavmarl.roads.network import CONFLICT
 from cavmarl.roads.sumo_net.selection import Movement
 
@@ -33,7 +33,6 @@ HALF_WIDTH_M = 1.1
 CLEARANCE_M = 3.0
 # The half length of the stretch where foes never come near each other in the plane.
 TOUCH_M = 1.0
-MERGES_M = 300.0  # as far as SUMO's drivers that turn into a road look along its last lane
 WAITS_BACK_M = 3.0  # before netconvert's waiting position inside, at most
 
 
@@ -356,7 +355,7 @@ def fill_conflicts(
     asks = (links["signal"][owner] < 0) & conflicts["merging"] & conflicts["must_yield"]
     asks &= links["state"][conflicts["foe"]] != ord("w")
     minded = links["from_lane"][conflicts["foe"][asks]]
-    lanes["merges_m"][minded] = np.minimum(lanes["length_m"][minded], MERGES_M)
+    lanes["merges_m"][minded] = MERGES_M
 
 
 def _wait_places(

@@ -3,8 +3,8 @@
 A halo is as wide as the farthest look in any direction. But a driver looks along its way, at those
 beside it, and at vehicles that come to the lines before it; most of the lanes within the halo are
 none of these. This file walks the roads from a zone's own ones and says for every lane from where
-on, or up
-to where, a vehicle can matter: a place too many is a copy too many, a place too few is an error.
+on, or up to where, a vehicle can matter: a place too many is a copy too many, a place too few is
+an error.
 
 None of this is part of a tick: it is done once for a partition.
 """
@@ -18,13 +18,15 @@ from numpy.typing import NDArray
 
 from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays
-from cavmarl.core.records.rows import ENTER_REACH_M, STEERED, SWEPT_BEYOND_M
+from cavmarl.core.records.rows import ENTER_REACH_M, MERGES_M, STEERED, SWEPT_BEYOND_M
 from cavmarl.driving.kernels.announcing import APPROACH_M
 from cavmarl.driving.kernels.circles import on_equal_road
+from cavmarl.driving.kernels.gaps import STATE_MAJOR
 from cavmarl.driving.kernels.junctions import EXIT_LOOK_M
 from cavmarl.driving.kernels.lane_choice import LOOK_BACK_M
 from cavmarl.driving.kernels.lane_index import goes_on_m
 from cavmarl.driving.kernels.swept_areas import size_of
+from cavmarl.zones.kernels.lane_ways import begin_ways, spread_ways
 from cavmarl.zones.kernels.visibility_scratch import VisibilityScratch
 from cavmarl.zones.kernels.zone_lookup import squared_distance
 
@@ -86,80 +88,6 @@ def _find_own(roads: RoadArrays, rect: NDArray[np.float64], scratch: VisibilityS
             length = roads.lanes[lane]["length_m"]
             scratch.first[lane] = min(max(first - ASIDE_M, 0.0), length)
             scratch.last[lane] = min(last + ASIDE_M, length)
-
-
-@inlined_kernel
-def _num_next(roads: RoadArrays, lane: int, forwards: bool) -> int:
-    """How many lanes follow a lane, or lead to it."""
-    row = roads.lanes[lane]
-    if not forwards:
-        return int(row["num_into"])
-    return 1 if row["internal"] else int(row["num_links"])
-
-
-@inlined_kernel
-def _next(roads: RoadArrays, lane: int, forwards: bool, k: int) -> int:
-    """One of them."""
-    row = roads.lanes[lane]
-    if not forwards:
-        return int(roads.into[row["first_into"] + k])
-    if row["internal"]:
-        return int(row["successor"])
-    return int(roads.links[row["first_link"] + k]["next_lane"])
-
-
-@kernel
-def _begin(
-    roads: RoadArrays, lane: int, forwards: bool, way: float, ways: NDArray[np.float64]
-) -> None:
-    """Let ways begin on a lane, `way` m before its end, or behind its start."""
-    for k in range(_num_next(roads, lane, forwards)):
-        other = _next(roads, lane, forwards, k)
-        ways[other] = min(ways[other], way)
-
-
-@kernel
-def _spread(
-    roads: RoadArrays,
-    # in the direction of driving, to the starts of lanes; if not, back to their ends
-    forwards: bool,
-    limit_m: float,  # of a way
-    # (L,) m, finite where ways begin, inf elsewhere; those that are longer are left as they are
-    ways: NDArray[np.float64],
-    scratch: VisibilityScratch,  # `waits` and `following` are used
-) -> None:
-    """Shortest ways along the roads, from where they begin to all lanes within a limit."""
-    head = -1
-    tail = -1
-    for lane in range(ways.size):
-        if ways[lane] > limit_m:
-            continue
-        scratch.waits[lane] = True
-        if head < 0:
-            head = lane
-        else:
-            scratch.following[tail] = lane
-        tail = lane
-    while head >= 0:
-        lane = head
-        head = scratch.following[lane] if lane != tail else -1
-        scratch.waits[lane] = False
-        way = ways[lane] + roads.lanes[lane]["length_m"]
-        if way > limit_m:
-            continue
-        for k in range(_num_next(roads, lane, forwards)):
-            other = _next(roads, lane, forwards, k)
-            if way >= ways[other]:
-                continue
-            ways[other] = way
-            if scratch.waits[other]:
-                continue
-            scratch.waits[other] = True
-            if head < 0:
-                head = other
-            else:
-                scratch.following[tail] = other
-            tail = other
 
 
 @inlined_kernel
@@ -247,15 +175,15 @@ def _look_along(
     for lane in range(roads.lanes.shape[0]):
         if scratch.first[lane] <= scratch.last[lane]:
             left = roads.lanes[lane]["length_m"] - scratch.last[lane]
-            _begin(roads, lane, True, left, scratch.ahead)
-            _begin(roads, lane, False, scratch.first[lane], scratch.behind)
+            begin_ways(roads, lane, True, left, scratch.ahead)
+            begin_ways(roads, lane, False, scratch.first[lane], scratch.behind)
             first, last = scratch.first[lane] - view_m, scratch.last[lane] + view_m
             _see(roads, lane, first, last, half_m, looks)
-    _spread(roads, True, view_m, scratch.ahead, scratch)
+    spread_ways(roads, True, view_m, scratch.ahead, scratch)
     for lane in range(roads.lanes.shape[0]):
         if scratch.ahead[lane] <= view_m:
             _see(roads, lane, 0.0, view_m - scratch.ahead[lane], half_m, looks)
-    _spread(roads, False, BACK_M, scratch.behind, scratch)
+    spread_ways(roads, False, BACK_M, scratch.behind, scratch)
     for lane in range(roads.lanes.shape[0]):
         if scratch.behind[lane] <= BACK_M:
             back = scratch.behind[lane] + roads.lanes[lane]["length_m"] - ROUNDING_M
@@ -357,9 +285,9 @@ def _look_at_junctions(
                 scratch.to_line[other] = 0.0
                 if scratch.swept[link]:
                     scratch.to_room[other] = 0.0
-    _spread(roads, False, APPROACH_M, scratch.to_line, scratch)
-    _spread(roads, False, APPROACH_M, scratch.to_room, scratch)
-    _spread(roads, True, EXIT_LOOK_M, scratch.beyond, scratch)
+    spread_ways(roads, False, APPROACH_M, scratch.to_line, scratch)
+    spread_ways(roads, False, APPROACH_M, scratch.to_room, scratch)
+    spread_ways(roads, True, EXIT_LOOK_M, scratch.beyond, scratch)
     for lane in range(roads.lanes.shape[0]):
         if scratch.beyond[lane] <= EXIT_LOOK_M:
             _see(roads, lane, 0.0, EXIT_LOOK_M - scratch.beyond[lane], half_m, looks)
@@ -368,9 +296,45 @@ def _look_at_junctions(
             for other in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
                 line = scratch.to_line[lane] + roads.lanes[other]["length_m"]
                 looks[other]["line"] = min(looks[other]["line"], line - ROUNDING_M)
-                looks[other]["merges"] = roads.lanes[other]["merges_m"]
                 room = scratch.to_room[lane] + roads.lanes[other]["length_m"]
                 looks[other]["room"] = min(looks[other]["room"], room - ROUNDING_M)
+
+
+@inlined_kernel
+def _merge_from(roads: RoadArrays, lane: int, way: float, looks: NDArray[np.void]) -> None:
+    """Let vehicles on the edge of a lane, `way` m before the line, be seen from `MERGES_M` on."""
+    edge = roads.edges[roads.lanes[lane]["edge"]]
+    for other in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
+        place = way + roads.lanes[other]["length_m"] - ROUNDING_M
+        looks[other]["merge"] = min(looks[other]["merge"], place)
+
+
+@kernel
+def _look_at_merges(roads: RoadArrays, scratch: VisibilityScratch, looks: NDArray[np.void]) -> None:
+    """Vehicles that come to foes' lines from farther away, where others turn into their lane.
+
+    From the lanes before those lines, and those from which one need not stop before that.
+    """
+    for lane in range(roads.lanes.shape[0]):
+        if scratch.to_line[lane] == 0.0 and roads.lanes[lane]["merges_m"] > 0.0:
+            place = roads.lanes[lane]["length_m"] - ROUNDING_M
+            looks[lane]["merge"] = min(looks[lane]["merge"], place)
+    for link in range(roads.links.shape[0]):
+        row = roads.links[link]
+        way = roads.lanes[row["to_lane"]]["length_m"]
+        if scratch.to_line[row["to_lane"]] > 0.0 or way > roads.lanes[row["to_lane"]]["merges_m"]:
+            continue
+        inside = row["next_lane"]
+        while roads.lanes[inside]["internal"]:
+            way += roads.lanes[inside]["length_m"]
+            inside = roads.lanes[inside]["successor"]
+        inside = row["next_lane"]
+        while roads.lanes[inside]["internal"]:
+            place = way - roads.lanes[inside]["link_offset_m"] - ROUNDING_M
+            looks[inside]["merge"] = min(looks[inside]["merge"], place)
+            inside = roads.lanes[inside]["successor"]
+        if row["state"] == STATE_MAJOR:
+            _merge_from(roads, row["from_lane"], way, looks)
 
 
 @kernel
@@ -392,11 +356,12 @@ def find_looks(
         looks[lane]["back"] = math.inf
         looks[lane]["line"] = math.inf
         looks[lane]["room"] = math.inf
-        looks[lane]["merges"] = 0.0
+        looks[lane]["merge"] = math.inf
     _find_own(roads, rect, scratch)
     _look_along(roads, view_m, see_m, half_m, scratch, looks)
     _find_lines(roads, see_m, half_m, scratch)
     _look_at_junctions(roads, half_m, scratch, looks)
+    _look_at_merges(roads, scratch, looks)
 
 
 @kernel
@@ -444,6 +409,7 @@ def farthest_m(
             far = roads.points[k + 1]
             squared = _farther(near, far, -math.inf, look["head"], rects, zone, squared)
             squared = _farther(near, far, look["tail"], math.inf, rects, zone, squared)
-            announced = min(look["back"], look["line"]) - max(APPROACH_M, look["merges"])
+            announced = min(look["back"], look["line"]) - APPROACH_M
+            announced = min(announced, look["merge"] - MERGES_M)
             squared = _farther(near, far, announced, math.inf, rects, zone, squared)
     return math.sqrt(squared)

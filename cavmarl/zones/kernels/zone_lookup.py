@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.codes import DRIVER_BACKGROUND
+from cavmarl.core.records.rows import MERGES_M
 from cavmarl.driving.kernels.announcing import announced_m, is_let_stand
 
 
@@ -30,11 +31,11 @@ class ZoneArrays(NamedTuple):
     rects: NDArray[np.float64]  # (k, 4) min_x, min_y, max_x, max_y; infinite at the rim
 
 
-LOOK = np.dtype([(name, np.float32) for name in ("head", "tail", "back", "line", "room", "merges")])
+LOOK = np.dtype([(name, np.float32) for name in ("head", "tail", "back", "line", "room", "merge")])
 """Vehicles that a zone's drivers may ask about on a lane: those up to `head` m, those from `tail` m
 on, and those that announce themselves to a vehicle at `back` m that they follow, or to a line: at
 `line` m unless they are let stand before it, at `room` m even then (`kernels.visibility_tests`).
-To a line they do so `merges` m ahead at least."""
+To a line at `merge` m, where others turn into their lane, they do so `MERGES_M` ahead at least."""
 
 WATCH = np.dtype([("zone", np.int32), *((name, LOOK[name]) for name in LOOK.names or ())])
 """A LOOK, and whose it is."""
@@ -150,12 +151,13 @@ def is_asked_about(halo: Halo, watch: np.void, row: np.void) -> bool:
     s = row["s"]
     reach_m = announced_m(row["speed"])
     to_line = watch["line"] - s
-    line_m = max(reach_m, watch["merges"])
-    is_let = (row["driver"] == DRIVER_BACKGROUND) & is_let_stand(row) & (to_line > halo.line_m)
-    comes = (to_line < line_m) & (not is_let)
+    stands = is_let_stand(row)
+    is_let = (row["driver"] == DRIVER_BACKGROUND) & stands & (to_line > halo.line_m)
+    comes = (to_line < reach_m) & (not is_let)
+    merges = (watch["merge"] - s < MERGES_M) & (not stands)
     follows = watch["back"] - s < reach_m
-    swept = watch["room"] - s < line_m  # one that waits leaves it room, even where it is let stand
-    asked: bool = (s <= watch["head"]) | (s >= watch["tail"]) | follows | comes | swept
+    swept = watch["room"] - s < reach_m  # one that waits leaves it room, even where it is let stand
+    asked: bool = (s <= watch["head"]) | (s >= watch["tail"]) | follows | comes | merges | swept
     return asked
 
 

@@ -46,7 +46,7 @@ def lane_watchers(
 ) -> tuple[NDArray[np.int32], NDArray[np.void]]:
     """`watcher_start` and `watchers` of a `Halo`."""
     asked = looks["head"] > -np.inf
-    for place in ("tail", "back", "line", "room"):
+    for place in ("tail", "back", "line", "room", "merge"):
         asked |= looks[place] < np.inf
     min_x, min_y, max_x, max_y = partition.arrays.rects.T[:, :, None]
     dx = np.maximum(np.maximum(min_x - lanes["max_x"], lanes["min_x"] - max_x), 0.0)
