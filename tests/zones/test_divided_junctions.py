@@ -9,6 +9,7 @@ import pytest
 from cavmarl.core.records.codes import HOLD_EXIT_BLOCKED, HOLD_YIELD
 from tests.support.divided_scenes import TICK_S, DividedScene
 from tests.support.junction_scenes import build_crossing, with_shorter_lane
+from tests.support.netgenerate import netconvert
 
 CRAWLS = 1e-3  # of the limit: for others such a vehicle stands
 
@@ -139,3 +140,41 @@ def test_one_that_has_left_a_shorter_lane_is_seen_on_the_longer_one_that_it_stil
         covered += int(vehicles["changed"]["side_lane"]) == right
     assert covered > 20
     assert vehicles["follows"]["speed"] > 3.0, "and goes on where it has room"
+
+
+@pytest.fixture
+def streets(tmp_path: Path) -> Path:
+    """A crossing, another one on its western arm: 115 m of a street that leads here alone."""
+    places = {"W": "-150 0", "m": "-115 0", "n": "-115 90", "c": "0 0"}
+    places |= {"E": "150 0", "S": "0 -150", "N": "0 150"}
+    ways = [("far", "W", "m"), ("beside", "n", "m"), ("W_in", "m", "c")]
+    ways += [(f"{arm}_in", arm, "c") for arm in "ESN"] + [(f"{arm}_out", "c", arm) for arm in "ESN"]
+    nodes = "".join(
+        f'<node id="{node}" x="{place.split()[0]}" y="{place.split()[1]}" type="priority"/>'
+        for node, place in places.items()
+    )
+    edges = "".join(
+        f'<edge id="{name}" from="{begin}" to="{end}" speed="14" numLanes="1" '
+        f'priority="{9 if {begin, end} <= set("WmcE") else 1}"/>'
+        for name, begin, end in ways
+    )
+    for kind, rows in (("nod", f"<nodes>{nodes}</nodes>"), ("edg", f"<edges>{edges}</edges>")):
+        (tmp_path / f"streets.{kind}.xml").write_text(rows)
+    (tmp_path / "streets.con.xml").write_text("<connections/>")
+    return netconvert(tmp_path, "streets")
+
+
+@pytest.mark.parametrize("corner_m", [(-5.0, 4.0), (-2.0, 9.0)])
+def test_one_that_turns_in_waits_for_one_behind_a_border_before_the_junction_before(
+    streets: Path, tmp_path: Path, corner_m: tuple[float, float]
+) -> None:
+    """At 11 m/s it has 130 m to the line: it would not be listed so far from others."""
+    way = """<vehicle id="w" type="car" depart="900"><route edges="far W_in E_out"/></vehicle>"""
+    here = DividedScene(streets, tmp_path, corner_m, ("car",), {"w": way})
+    here.put("side", "S_in_0 E_out_0", -1.0, wait_s=2.0, hold=HOLD_YIELD)
+    here.put("main", "far_0 W_in_0", -15.0, speed=11.0, speed_factor=11.0 / 14.0)
+    here.begin()
+    here.departs.clear()
+    for vehicles in here.run(2.0):
+        assert "main" in here.ghosts("side")
+        assert vehicles["side"]["hold"] == HOLD_YIELD

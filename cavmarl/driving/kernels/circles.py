@@ -33,15 +33,22 @@ def on_equal_road(roads: RoadArrays, link: int) -> bool:
 
 
 @inlined_kernel
-def breaks_circles(roads: RoadArrays, travel: Travel, row: np.void, link: int) -> bool:
-    """Whether a vehicle is one whose driver counts with circles where it takes `link` next.
-
-    They are the drivers that SUMO has, Krauss's, before a junction without any right of way.
-    """
-    if not on_equal_road(roads, link) or row["driver"] != DRIVER_BACKGROUND:
+def drives_as_sumo(travel: Travel, row: np.void) -> bool:
+    """Whether a vehicle has a driver that SUMO has, too: Krauss's, in the background."""
+    if row["driver"] != DRIVER_BACKGROUND:
         return False
     krauss: bool = travel.types[row["vtype"]]["model"] == MODEL_KRAUSS
     return krauss
+
+
+@inlined_kernel
+def breaks_circles(roads: RoadArrays, travel: Travel, row: np.void, link: int) -> bool:
+    """Whether a vehicle is one whose driver counts with circles where it takes `link` next.
+
+    They are the drivers that SUMO has, before a junction without any right of way.
+    """
+    breaks: bool = on_equal_road(roads, link) and drives_as_sumo(travel, row)
+    return breaks
 
 
 @kernel

@@ -19,7 +19,6 @@ from cavmarl.core.records.codes import (
     HOLD_EXIT_BLOCKED,
     HOLD_NONE,
     HOLD_YIELD,
-    MODEL_KRAUSS,
     SIGNAL_GREEN_MINOR,
     SIGNAL_NONE,
     SIGNAL_OFF_BLINKING,
@@ -31,7 +30,7 @@ from cavmarl.core.records.codes import (
 )
 from cavmarl.core.records.rows import WAIT_SLACK_M
 from cavmarl.driving.kernels.announcing import IMPATIENT_S, STANDING_MPS, is_let_stand
-from cavmarl.driving.kernels.circles import STATE_EQUAL
+from cavmarl.driving.kernels.circles import STATE_EQUAL, drives_as_sumo
 from cavmarl.driving.kernels.following import LINE_MARGIN_M
 
 BRISK_ACCEL = 2.5  # m/s², with which a driver may soon be in a shared area,
@@ -52,7 +51,7 @@ FORCED_STOP = 4.5  # m/s², and how hard at most
 UNBRAKED_SHARE = FORCED_STOP / (FORCED_STOP + BRISK_ACCEL)
 CRAWL_MPS = 5.0  # a stream that is slower lets others in
 STUCK_S = 90.0  # after which it passes others that stand and give way, too;
-RESCUED_S = 300.0  # of Krauss's drivers when SUMO would put one elsewhere
+RESCUED_S = 300.0  # if both drive as SUMO's do: then that would put one elsewhere
 STOP_SIGN_S = 0.5  # how long one stands at a stop sign, and before a tie is broken;
 STOOD_S = 0.1  # background vehicles, as SUMO's, only for a moment
 ARRIVES_M = 1.0  # a trip that ends no further behind a line leads over no junction
@@ -171,15 +170,6 @@ def _is_committed(foe: np.void, front: float) -> bool:
     return committed
 
 
-@inlined_kernel
-def _are_krauss(travel: Travel, row: np.void, other: np.void) -> bool:
-    """Whether two vehicles have the drivers that SUMO has."""
-    steered = row["driver"] == DRIVER_AGENT or other["driver"] == DRIVER_AGENT
-    models = travel.types[row["vtype"]]["model"], travel.types[other["vtype"]]["model"]
-    alike: bool = not steered and models[0] == models[1] == MODEL_KRAUSS
-    return alike
-
-
 @kernel
 def _is_harmless(
     roads: RoadArrays,
@@ -219,7 +209,8 @@ def _is_harmless(
         return is_let_stand(other)  # one that waits in a circle is left out before
     signal = link_signal(roads, foe_link, phase)
     state, foe_state = roads.links[link]["state"], roads.links[foe_link]["state"]
-    stuck_s = RESCUED_S if _are_krauss(travel, row, other) else STUCK_S
+    alike = drives_as_sumo(travel, row) and drives_as_sumo(travel, other)
+    stuck_s = RESCUED_S if alike else STUCK_S
     if ignores(row, other, link, foe_link, signal, state, foe_state, stuck_s):
         return True
     # A vehicle that has been let in goes on, where others can still brake for it.
