@@ -66,6 +66,8 @@ LANE = record(
     ("speed_mps", np.float64),  # speed limit
     ("width_m", np.float64),
     ("internal", np.bool_),  # lies inside a junction
+    # at its end others give way that turn into its road: they look `MERGES_M` before it
+    ("merges", np.bool_),
     ("left", np.int32),  # LANE row of the neighbour to the left in the same direction
     ("right", np.int32),
     ("successor", np.int32),  # internal lanes: the one LANE that follows (internal or normal)
@@ -80,9 +82,6 @@ LANE = record(
     # internal lanes: path length of the link before this lane starts
     ("link_offset_m", np.float64),
     ("stop_back_m", np.float64),  # from the stop line to the end, where paths of others sweep
-    # so far before its end a vehicle is minded by those that give way to it and turn into its lane:
-    # `MERGES_M`, or 0 where none do
-    ("merges_m", np.float64),
     # into[first_into : first_into + num_into]: LANE rows whose ends lead here (internal lanes where
     # the map has them)
     ("first_into", np.int32),
@@ -126,6 +125,7 @@ LINK = record(
     ("num_conflicts", np.int32),
     ("first_sweep", np.int32),  # SWEEP rows, sorted by the foe's LINK row and sizes
     ("num_sweeps", np.int32),
+    ("swept_by", np.int32),  # the least size class of those that sweep over its cars
     ("swept_m", np.float64),  # up to where a rear, m from the stop line, is minded by others
 )
 

@@ -121,7 +121,7 @@ class Shard:
         self.cut(zones, halo)
         # One after the other works in it: what the last one has left is still near in memory.
         self.scratch: Scratch = (
-            _make_scratch(len(network.lanes), len(network.links), capacity, travel.scripts.room)
+            _make_scratch(network, capacity, travel.scripts.room)
             if first is None
             else first.scratch
         )
@@ -322,14 +322,15 @@ def _seen(
     )
 
 
-def _make_scratch(num_lanes: int, num_links: int, capacity: int, covers: int = 0) -> Scratch:
+def _make_scratch(network: RoadNetwork, capacity: int, covers: int = 0) -> Scratch:
     def integers(size: int) -> NDArray[np.int32]:
         return huge_zeros(size, dtype=np.int32)
 
     def floats(size: int) -> NDArray[np.float64]:
         return huge_zeros(size, dtype=np.float64)
 
-    lanes, links = make_lists(num_lanes + 1, huge_zeros), make_lists(num_links, huge_zeros)
+    lanes = make_lists(len(network.lanes) + 1, huge_zeros)
+    links = make_lists(len(network.links), huge_zeros)
     return Scratch(
         lanes=lanes,
         lane_start=lanes.bounds[:, 0],
@@ -339,6 +340,7 @@ def _make_scratch(num_lanes: int, num_links: int, capacity: int, covers: int = 0
         link_start=links.bounds[:, 0],
         link_end=links.bounds[:, 1],
         approach=huge_zeros(4 * capacity, dtype=APPROACH),
+        largest=np.zeros(len(network.junctions), dtype=np.int8),
         pairs=huge_zeros(4 * capacity, dtype=APPROACH),
         order=integers(capacity),
         accel=floats(capacity),

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.records.arrays import Travel
-from cavmarl.core.records.rows import LOST_M
+from cavmarl.core.records.rows import LOST_M, MERGES_M
 from cavmarl.driving.kernels.announcing import APPROACH_M
 from cavmarl.driving.kernels.junctions import EXIT_LOOK_M
 from cavmarl.driving.kernels.motion import CROSSINGS_PER_TICK, LATERAL_MPS, MAX_SPEED_MPS
@@ -23,12 +23,12 @@ def driving_reach_m(network: RoadNetwork, travel: Travel) -> float:
     """The farthest vehicle that a driver's decision can depend on.
 
     A driver looks `view_m` ahead. With a line within `see_m`, or on a junction, it asks about
-    vehicles that come to it, within `APPROACH_M`, or a lane's `merges_m`, of the ends of the lanes
-    that lead to it or are on it, or stand behind it, within `EXIT_LOOK_M`.
+    vehicles that come to it, within `APPROACH_M` of the ends of the lanes that lead to it or are on
+    it, or `MERGES_M` where others turn into a lane, or stand behind it, within `EXIT_LOOK_M`.
     """
     longest_m = float(network.links["length_m"].max(initial=0.0))
     junction_m = max(travel.see_m, longest_m)
-    merges_m = float(network.lanes["merges_m"].max(initial=0.0))
+    merges_m = MERGES_M if network.lanes["merges"].any() else 0.0
     beyond_m = max(APPROACH_M, merges_m, EXIT_LOOK_M, longest_m)
     stretch, jump_m = _jumps(network)
     bodies_m = 2.0 * float(travel.types["length"].max())

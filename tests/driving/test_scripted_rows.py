@@ -116,7 +116,7 @@ def covered(row: np.void, at: tuple[float, float]) -> dict[int, tuple[float, flo
 
 def entries(tables: Travel, rows: NDArray[np.void]) -> dict[int, list[tuple[int, float, float]]]:
     """(id, start, end) on each lane, as the index has them."""
-    room = _make_scratch(len(ROADS.lanes), len(ROADS.links), len(rows), tables.scripts.room)
+    room = _make_scratch(ROADS, len(rows), tables.scripts.room)
     index_lanes(ROADS.arrays, tables, rows, len(rows), room)
     return {
         lane: [
@@ -201,7 +201,7 @@ def test_who_rides_announces_itself_to_junctions_as_a_driver_does() -> None:
 
 
 def announced(tables: Travel, rows: NDArray[np.void]) -> list[tuple[int, float]]:
-    room = _make_scratch(len(ROADS.lanes), len(ROADS.links), 1, tables.scripts.room)
+    room = _make_scratch(ROADS, 1, tables.scripts.room)
     step, step_at = np.zeros(1, PLAN), np.zeros(1, np.int64)
     register_links(ROADS.arrays, tables, rows, 1, step, step_at, room)
     return [

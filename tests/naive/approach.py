@@ -54,7 +54,8 @@ def announcements(roads: RoadNetwork, travel: Travel, row: np.void) -> list[Entr
         # to give way before that.
         may_stop = any(inside or roads.links[link]["state"] != ord("M") for link, _ in ahead)
         stands = idle and row["speed"] <= 0.5
-        if to_end >= (sight if may_stop or stands else max(sight, float(here["merges_m"]))):
+        far = max(sight, 300.0) if here["merges"] else sight
+        if to_end >= (sight if may_stop or stands else far):
             break
         if here["internal"]:
             lane = int(here["successor"])

@@ -178,7 +178,7 @@ class Looks:
         lanes, links = self.network.lanes, self.network.links
         before = {k for link in foes for k in self._beside(int(links["from_lane"][link]))}
         for lane in before:
-            if not lanes["merges_m"][lane]:
+            if not lanes["merges"][lane]:
                 continue
             places = [(lane, self.lengths[lane])]
             for link in np.flatnonzero(links["to_lane"] == lane).tolist():

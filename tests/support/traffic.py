@@ -66,7 +66,7 @@ def travel(name: str) -> Travel:
 
 def scratch(roads: RoadNetwork, capacity: int) -> Scratch:
     """Room for the kernels."""
-    return _make_scratch(len(roads.lanes), len(roads.links), capacity)
+    return _make_scratch(roads, capacity)
 
 
 def on_lane(

@@ -101,9 +101,9 @@ def make_grid(
 def _slot(offset: float, cells_per_m: float, count: int) -> int:
     """The cell along one axis; the first or last one outside of the area, the first one for NaN."""
     cells = offset * cells_per_m
-    if not cells > 0.0:
-        return 0
-    return int(cells) if cells < count else count - 1
+    cells = cells if cells > 0.0 else 0.0  # NaN, too
+    last = count - 1.0
+    return int(cells if cells < last else last)
 
 
 @kernel

@@ -197,6 +197,7 @@ class Scratch(NamedTuple):
     link_start: NDArray[np.int32]  # approach of link k: [link_start[k], link_end[k])
     link_end: NDArray[np.int32]
     approach: NDArray[np.void]  # APPROACH (4 C,) vehicles on or before links, by link
+    largest: NDArray[np.int8]  # (J,) the largest size class of those, by the links' junctions
     pairs: NDArray[np.void]  # APPROACH (4 C,) the same before sorting
     order: NDArray[np.int32]  # (C,) the owned rows as they lie along the lanes
     accel: NDArray[np.float64]  # (C,) decided accelerations

@@ -13,10 +13,11 @@ from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.numba.prefetch import SOON, prefetch
 from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
 from cavmarl.core.records.codes import DRIVER_SCRIPTED
-from cavmarl.core.records.rows import SWEPT_BEYOND_M, is_lost
+from cavmarl.core.records.rows import MERGES_M, SWEPT_BEYOND_M, is_lost
 from cavmarl.driving.kernels.announcing import announced_m, is_let_stand
 from cavmarl.driving.kernels.gaps import STATE_MAJOR
 from cavmarl.driving.kernels.lane_index import beside_s
+from cavmarl.driving.kernels.swept_areas import size_of
 from cavmarl.driving.kernels.ways import fed_lane, leave, next_step, own_step
 
 MAX_LINKS_AHEAD = 2
@@ -46,13 +47,15 @@ def register_links(
     # PLAN (C,) of each row the step of its lane; written where it is another one
     step: NDArray[np.void],
     step_at: NDArray[np.int64],  # (C,) which one that is, see `Worlds`; written
-    scratch: Scratch,  # the lists by link and approach are written
+    scratch: Scratch,  # the lists by link, approach and largest are written
 ) -> None:
     """List for every link the vehicles that are on it or will reach it, into `scratch.approach`.
 
     Only links with conflicts list those that approach.
     """
     pairs = 0
+    for junction in range(scratch.largest.size):
+        scratch.largest[junction] = 0
     for first in range(0, num, BLOCK):
         last = min(first + BLOCK, num)
         # One look for all that follows: in a city the steps lie far apart, each is a cache miss,
@@ -72,7 +75,7 @@ def register_links(
             prefetch(roads.links, step[i]["link"], 1)
         for i in range(first, last):
             if rows[i]["driver"] == DRIVER_SCRIPTED:
-                pairs = _announce_claims(travel, rows[i], i, pairs, scratch)
+                pairs = _announce_claims(roads, travel, rows[i], i, pairs, scratch)
                 continue
             if is_lost(rows[i]):
                 continue
@@ -89,7 +92,15 @@ def register_links(
 
 
 @inlined_kernel
-def _note(scratch: Scratch, pairs: int, link: int, row: np.void, i: int, dist: float) -> int:
+def _note(
+    roads: RoadArrays,
+    scratch: Scratch,
+    pairs: int,
+    link: int,
+    row: np.void,
+    i: int,
+    dist: float,
+) -> int:
     pair = scratch.pairs[pairs]
     pair["link"] = link
     pair["row"] = i
@@ -97,16 +108,22 @@ def _note(scratch: Scratch, pairs: int, link: int, row: np.void, i: int, dist: f
     pair["speed"] = row["speed"]
     pair["half"] = 0.5 * row["length"]
     pair["id"] = row["id"]
+    size = size_of(pair["half"])
+    if size > 0:
+        junction = roads.links[link]["junction"]
+        scratch.largest[junction] = max(scratch.largest[junction], size)
     return pairs + 1
 
 
 @kernel
-def _announce_claims(travel: Travel, row: np.void, i: int, pairs: int, scratch: Scratch) -> int:
+def _announce_claims(
+    roads: RoadArrays, travel: Travel, row: np.void, i: int, pairs: int, scratch: Scratch
+) -> int:
     """`_announce` for a row that follows a script, which says where it will be."""
     frame = travel.scripts.frames[row["goal"]]
     for c in range(frame["first_claim"], frame["first_claim"] + frame["num_claims"]):
         claim = travel.scripts.claims[c]
-        pairs = _note(scratch, pairs, claim["link"], row, i, claim["dist"])
+        pairs = _note(roads, scratch, pairs, claim["link"], row, i, claim["dist"])
     return pairs
 
 
@@ -143,7 +160,7 @@ def _announce(
     s = row["s"]
     if here["internal"]:
         driven_m = max(here["link_offset_m"] + s, LEAST_M)
-        pairs = _note(scratch, pairs, here["link"], row, i, -driven_m)
+        pairs = _note(roads, scratch, pairs, here["link"], row, i, -driven_m)
     elif s - 0.5 * row["length"] < SWEPT_BEYOND_M:
         # Its centre has left the junction, its rear has not, or not the fork before it, or where
         # others wait for it.
@@ -152,20 +169,20 @@ def _announce(
             left = roads.links[link]
             minded = max(left["length_m"], left["fork_m"], left["swept_m"])
             if left["length_m"] + s - 0.5 * row["length"] < minded:
-                pairs = _note(scratch, pairs, link, row, i, -(left["length_m"] + s))
+                pairs = _note(roads, scratch, pairs, link, row, i, -(left["length_m"] + s))
     side = row["side_lane"]
     if side >= 0 and not here["internal"] and roads.lanes[side]["num_links"] > 0:
         # Its body still covers the lane beside, or covers it already: it is in the way of both.
         to_end = roads.lanes[side]["length_m"] - beside_s(roads, lane, side, s)
         if to_end < STANDS_BEFORE_M:
             link = roads.lanes[side]["first_link"]
-            pairs = _note(scratch, pairs, link, row, i, max(to_end, 0.0))
+            pairs = _note(roads, scratch, pairs, link, row, i, max(to_end, 0.0))
     reach = announced_m(row["speed"])
     distance = here["length_m"] - s
     way = row["way"]
     found = 0
     far = not is_let_stand(row)  # it may be minded by those that turn into its lane
-    while distance < reach or (far and distance < roads.lanes[lane]["merges_m"]):
+    while distance < reach or (far and distance < MERGES_M and roads.lanes[lane]["merges"]):
         before, before_way = lane, way
         if lane == row["lane"] and way == row["way"]:
             lane, way, link = leave(roads, step, lane, way)
@@ -177,11 +194,11 @@ def _announce(
             last = roads.lanes[before]
             ends = travel.steps[before_way + before]["change"] == 0
             if (ends or distance < STANDS_BEFORE_M) and found == 0 and last["num_links"] > 0:
-                pairs = _note(scratch, pairs, last["first_link"], row, i, max(distance, 0.0))
+                pairs = _note(roads, scratch, pairs, last["first_link"], row, i, max(distance, 0.0))
             break
         if link >= 0:
             if roads.links[link]["num_conflicts"] + roads.links[link]["num_sweeps"] > 0:
-                pairs = _note(scratch, pairs, link, row, i, max(distance, 0.0))
+                pairs = _note(roads, scratch, pairs, link, row, i, max(distance, 0.0))
             found += 1
             far &= roads.links[link]["state"] == STATE_MAJOR and not here["internal"]
             if found == MAX_LINKS_AHEAD:

@@ -11,6 +11,8 @@ from cavmarl.core.math.geometry import boxes_overlap
 from cavmarl.core.math.neighbors import Grid, aim, cell_at, cell_columns, cell_rows
 from cavmarl.core.numba import inlined_kernel, kernel
 
+APART_M = 1e-6  # more than rounding makes of a distance
+
 
 @kernel
 def _bodies_touch(one: np.void, other: np.void) -> bool:
@@ -18,13 +20,21 @@ def _bodies_touch(one: np.void, other: np.void) -> bool:
 
     Vehicles on and under a bridge do not touch: their `z` differ by half the sum of their heights.
     """
+    cos, sin = math.cos(one["heading"]), math.sin(one["heading"])
+    # The quick answer for those side by side on two lanes: how far the other one reaches towards
+    # the one, be it turned by so much. No sine is larger than its angle.
+    turn = abs(one["heading"] - other["heading"])
+    reach = 0.5 * (one["width"] + other["width"] + turn * other["length"])
+    across = (other["y"] - one["y"]) * cos - (other["x"] - one["x"]) * sin
+    if abs(across) > reach + APART_M:
+        return False
     if not abs(one["z"] - other["z"]) < 0.5 * (one["height"] + other["height"]):
         return False
     return boxes_overlap(
         one["x"],
         one["y"],
-        math.cos(one["heading"]),
-        math.sin(one["heading"]),
+        cos,
+        sin,
         0.5 * one["length"],
         0.5 * one["width"],
         other["x"],

@@ -45,6 +45,17 @@ def _body_m(half: float, size: int) -> float:
     return float(max(2.0 * half, least))
 
 
+@inlined_kernel
+def _nothing_sweeps(roads: RoadArrays, size: int, link: int, scratch: Scratch) -> bool:
+    """Whether a vehicle on `link` is a car, and none at the junction so large as to sweep over it.
+
+    The answer for most, without a look at the areas.
+    """
+    row = roads.links[link]
+    nothing: bool = size == 0 and row["swept_by"] > scratch.largest[row["junction"]]
+    return nothing
+
+
 @kernel
 def swept_stop(
     roads: RoadArrays,
@@ -62,6 +73,8 @@ def swept_stop(
     rear = place - _body_m(0.5 * row["length"], size)
     own = STEERED if size == 0 and row["driver"] == DRIVER_AGENT else size
     stop = math.inf
+    if _nothing_sweeps(roads, own, link, scratch):
+        return stop
     first = roads.links[link]["first_sweep"]
     for k in range(first, first + roads.links[link]["num_sweeps"]):
         sweep = roads.sweeps[k]
@@ -107,6 +120,8 @@ def would_be_swept(
     Areas of steered cars do not count: where roads share ground, none could enter any more.
     """
     own = size_of(0.5 * row["length"])
+    if _nothing_sweeps(roads, own, link, scratch):
+        return False
     rear = place - _body_m(0.5 * row["length"], own)
     first = roads.links[link]["first_sweep"]
     for k in range(first, first + roads.links[link]["num_sweeps"]):

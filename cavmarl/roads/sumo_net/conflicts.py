@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import MapError
-from cavmarl.core.records.rows import FORK_BEYOND_M, MERGES_M
+from cavmarl.core.records.rows import FORK_BEYOND_M
 from cavmarl.roads.network import CONFLICT
 from cavmarl.roads.sumo_net.selection import Movement
 
@@ -346,7 +346,7 @@ def fill_conflicts(
 ) -> None:
     """Write which conflicts each LINK has and where one waits inside for them, into `links`.
 
-    And `merges_m` of each LANE at whose end others turn into its road without standing first.
+    And `merges` of each LANE at whose end others turn into its road without standing first.
     """
     links["first_conflict"] = first_conflict[:-1]
     links["num_conflicts"] = np.diff(first_conflict)
@@ -355,7 +355,7 @@ def fill_conflicts(
     asks = (links["signal"][owner] < 0) & conflicts["merging"] & conflicts["must_yield"]
     asks &= links["state"][conflicts["foe"]] != ord("w")
     minded = links["from_lane"][conflicts["foe"][asks]]
-    lanes["merges_m"][minded] = MERGES_M
+    lanes["merges"][minded] = True
 
 
 def _wait_places(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import MapError
 from cavmarl.core.math.geometry import project
-from cavmarl.core.records.rows import FORK_BEYOND_M, SWEPT_BEYOND_M
+from cavmarl.core.records.rows import FORK_BEYOND_M, STEERED, SWEPT_BEYOND_M
 from cavmarl.roads.network import EDGE, JUNCTION, LANE, LINK, GeoReference, RoadNetwork
 from cavmarl.roads.polylines import (
     Shape,
@@ -318,6 +318,10 @@ def _fill_sweeps(movements: Movements) -> NDArray[np.void]:
     sweeps, first = sweep_rows(movements)
     links = movements.links
     links["first_sweep"], links["num_sweeps"] = first[:-1], np.diff(first)
+    links["swept_by"] = STEERED
+    over_cars = sweeps["own"] == 0
+    own = np.repeat(np.arange(len(links)), np.diff(first))[over_cars]
+    np.minimum.at(links["swept_by"], own, sweeps["other"][over_cars])
     links["swept_m"] = links["length_m"]
     np.maximum.at(links["swept_m"], sweeps["foe"], sweeps["foe_leave_m"])
     forks = np.bincount(links["from_lane"])[links["from_lane"]] > 1

@@ -316,13 +316,14 @@ def _look_at_merges(roads: RoadArrays, scratch: VisibilityScratch, looks: NDArra
     From the lanes before those lines, and those from which one need not stop before that.
     """
     for lane in range(roads.lanes.shape[0]):
-        if scratch.to_line[lane] == 0.0 and roads.lanes[lane]["merges_m"] > 0.0:
+        if scratch.to_line[lane] == 0.0 and roads.lanes[lane]["merges"]:
             place = roads.lanes[lane]["length_m"] - ROUNDING_M
             looks[lane]["merge"] = min(looks[lane]["merge"], place)
     for link in range(roads.links.shape[0]):
         row = roads.links[link]
-        way = roads.lanes[row["to_lane"]]["length_m"]
-        if scratch.to_line[row["to_lane"]] > 0.0 or way > roads.lanes[row["to_lane"]]["merges_m"]:
+        beyond = roads.lanes[row["to_lane"]]
+        way = beyond["length_m"]
+        if scratch.to_line[row["to_lane"]] > 0.0 or not beyond["merges"] or way > MERGES_M:
             continue
         inside = row["next_lane"]
         while roads.lanes[inside]["internal"]:
