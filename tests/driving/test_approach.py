@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.records.arrays import Scratch
 from cavmarl.core.records.codes import HOLD_EXIT_BLOCKED
+from cavmarl.core.records.rows import SIZE_LENGTHS_M
 from cavmarl.driving.kernels.approach import register_links
 from cavmarl.engine.simulation import Simulation
 from cavmarl.roads.routing import PLAN
@@ -70,6 +71,19 @@ def test_every_link_lists_who_is_on_it_and_who_comes(world: Simulation, stand: b
             assert len(entries(room, link)) == len(twin), link
             for mine, other in zip(entries(room, link), twin, strict=True):
                 assert mine == pytest.approx(other)
+
+
+def test_each_junction_knows_the_largest_of_those_that_are_listed_there(world: Simulation) -> None:
+    rows, links = world.vehicles(), world.network.links
+    rows["length"], rows["length"][::2] = 7.5, 12.0
+    room = listed(world, rows)
+    largest = np.zeros(len(world.network.junctions), np.int64)
+    for link, junction in enumerate(links["junction"].tolist()):
+        for _, _, _, half in entries(room, link):
+            size = sum(2.0 * half > length for length in SIZE_LENGTHS_M)
+            largest[junction] = max(largest[junction], size)
+    assert largest.any()
+    np.testing.assert_array_equal(room.largest, largest)
 
 
 def test_the_order_of_rows_does_not_matter(world: Simulation) -> None:

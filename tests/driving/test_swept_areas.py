@@ -15,6 +15,7 @@ from cavmarl.core.records.codes import (
     HOLD_YIELD,
     MODEL_KRAUSS,
 )
+from cavmarl.core.records.rows import STEERED
 from cavmarl.driving.kernels.approach import APPROACH
 from cavmarl.driving.kernels.drivers import _at_line, decide
 from cavmarl.driving.kernels.following import behind, no_constraint
@@ -78,6 +79,16 @@ def test_each_sweep_is_known_from_both_sides(network: RoadNetwork) -> None:
     assert len(rows) == len(network.sweeps) > 100
     for link, foe, size, other, enter, leave, foe_enter, foe_leave in rows:
         assert (foe, link, other, size, foe_enter, foe_leave, enter, leave) in rows
+
+
+def test_each_link_says_the_least_size_that_sweeps_over_its_cars(network: RoadNetwork) -> None:
+    found = set()
+    for row in network.links:
+        sweeps = network.sweeps[row["first_sweep"] :][: row["num_sweeps"]]
+        over_cars = sweeps["other"][sweeps["own"] == CAR].tolist()
+        assert row["swept_by"] == min(over_cars, default=STEERED)
+        found.add(int(row["swept_by"]))
+    assert found >= {BUS, STEERED}
 
 
 def test_stop_lines_are_clear_of_cars_but_not_of_buses(network: RoadNetwork) -> None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.registry import load_config, resolve_map
 from cavmarl.core.records.arrays import Scratch, Travel
+from cavmarl.core.records.rows import SIZE_LENGTHS_M
 from cavmarl.driving.kernels.lane_index import VIEW_M
 from cavmarl.driving.kernels.motion import place_on_lane
 from cavmarl.driving.vehicle_types import generated_types
@@ -65,8 +66,10 @@ def travel(name: str) -> Travel:
 
 
 def scratch(roads: RoadNetwork, capacity: int) -> Scratch:
-    """Room for the kernels."""
-    return _make_scratch(roads, capacity)
+    """Room for the kernels; as long as no vehicle is listed, buses are looked for at junctions."""
+    room = _make_scratch(roads, capacity)
+    room.largest[:] = len(SIZE_LENGTHS_M)
+    return room
 
 
 def on_lane(

@@ -181,14 +181,14 @@ def _is_harmless(
     foe: np.void,
     front: float,
     apart: float,
-    gives_way: bool,
+    comes_last: bool,
     phase: NDArray[np.int32],
     equal: bool,
 ) -> bool:
     """Whether an APPROACH need not be minded, whenever it comes to the shared area.
 
     Its `front` has so many m to where it can still stop; its rear leaves the shared area `apart` m
-    before the own one.
+    before the own one. `comes_last`: it has to give way.
     """
     if front <= 0.0:
         # Another vehicle keeps one that stands before the shared area out of it.
@@ -202,7 +202,7 @@ def _is_harmless(
         return True  # its trip ends before its line
     if _is_committed(foe, front):
         return False
-    if not (gives_way and conflict["must_yield"]):
+    if comes_last:
         return True
     other, foe_link = rows[foe["row"]], conflict["foe"]
     if equal and row["wait_s"] < STUCK_S:
@@ -372,6 +372,9 @@ def foe_blocks(
     # Its front before the line that it can still stop at: the stop line, or, where it passes that
     # and the shared area lies further on, its waiting position inside.
     front = foe["dist"] - foe["half"] - roads.lanes[foe_link["from_lane"]]["stop_back_m"]
+    comes_last = not (gives_way and conflict["must_yield"])
+    if comes_last and front > 0.0 and not _is_committed(foe, front):
+        return HOLD_NONE  # the answer for most, without a look at its VEHICLE row
     wait_m = foe_link["wait_m"]
     other = rows[foe["row"]]
     steered = row["driver"] == DRIVER_AGENT or other["driver"] == DRIVER_AGENT
@@ -381,7 +384,7 @@ def foe_blocks(
     half = 0.5 * row["length"]
     apart = distance + conflict["leave_m"] - half - to_clear
     if _is_harmless(
-        roads, travel, rows, row, link, conflict, foe, front, apart, gives_way, phase, equal
+        roads, travel, rows, row, link, conflict, foe, front, apart, comes_last, phase, equal
     ):
         return HOLD_NONE
     if front <= 0.0:
