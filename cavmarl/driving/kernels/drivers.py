@@ -71,6 +71,7 @@ from cavmarl.driving.kernels.stopping import way_to_stop
 from cavmarl.driving.kernels.swept_areas import (
     before_line_gently,
     before_swept,
+    before_swept_behind,
     behind_fork,
     room_m,
     swept_stop,
@@ -245,6 +246,8 @@ def _road_ahead(
         )
         swept = before_swept(roads, rows, i, kind, here["link"], -place - half, waits, dt, scratch)
         constraint = max(constraint, fork, swept)
+    else:
+        constraint = before_swept_behind(roads, rows, i, kind, dt, scratch)
     look = min(look_ahead_m(kind, speed), travel.view_m)
     see = min(see_line_m(kind, speed) + half, travel.see_m)
     # Behind a leader on its own lane a driver minds the next line only where it could not stop

@@ -332,6 +332,8 @@ def _blocks_inside(
     if foe["speed"] > STANDING_MPS and other["accel"] > -GENTLE_ACCEL:
         # One that has just set off does not stay so slow; one that brakes may have to stop.
         cleared = _earliest(to_clear, foe["speed"], top, GENTLE_SHARE * _brisk(travel, other))
+    elif foe["speed"] * foe["speed"] < -2.0 * other["accel"] * to_clear:
+        cleared = math.inf  # it brakes so hard that it stops before it is out
     if row["driver"] == DRIVER_AGENT or other["driver"] == DRIVER_AGENT:
         time_in -= 0.5 * GAP_S
     elif row["speed"] <= STANDING_MPS and not equal and not _goes_on(row, link):

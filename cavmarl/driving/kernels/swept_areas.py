@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays, Scratch
 from cavmarl.core.records.codes import DRIVER_AGENT, HOLD_NONE, MODEL_KRAUSS
-from cavmarl.core.records.rows import SIZE_BODIES_M, SIZE_LENGTHS_M, STEERED
+from cavmarl.core.records.rows import SIZE_BODIES_M, SIZE_LENGTHS_M, STEERED, SWEPT_BEYOND_M
 from cavmarl.driving.kernels.announcing import APPROACH_STANDING_M, STANDING_MPS, is_let_stand
 from cavmarl.driving.kernels.following import before_line, behind, no_constraint
 
@@ -75,6 +75,7 @@ def swept_stop(
     stop = math.inf
     if _nothing_sweeps(roads, own, link, scratch):
         return stop
+    has_left = place > roads.links[link]["length_m"] + 0.5 * row["length"]
     first = roads.links[link]["first_sweep"]
     for k in range(first, first + roads.links[link]["num_sweeps"]):
         sweep = roads.sweeps[k]
@@ -82,6 +83,8 @@ def swept_stop(
             break  # they are sorted by it
         if sweep["own"] != own or rear > sweep["leave_m"]:
             continue
+        if has_left and place > sweep["enter_m"] + AT_AREA_M:
+            continue  # it clears the area, as it has left the junction
         if own == STEERED and room_m > 0.0 and -MOST_BACK_M < sweep["enter_m"] <= 0.0:
             stop = min(stop, max(sweep["enter_m"], place))  # it waits where no other will sweep
         same_lane = roads.links[sweep["foe"]]["from_lane"] == roads.links[link]["from_lane"]
@@ -289,6 +292,19 @@ def before_swept(
         if stop == math.inf
         else before_line_gently(kind, rows[i], stop + front, dt)
     )
+
+
+@kernel
+def before_swept_behind(
+    roads: RoadArrays, rows: NDArray[np.void], i: int, kind: np.void, dt: float, scratch: Scratch
+) -> float:
+    """The constraint of areas that begin behind the junction that row i has just left."""
+    row = rows[i]
+    link, half = row["link"], 0.5 * row["length"]
+    if row["s"] - half >= SWEPT_BEYOND_M or link < 0 or roads.links[link]["to_lane"] != row["lane"]:
+        return no_constraint(kind)
+    place = roads.links[link]["length_m"] + row["s"] + half
+    return before_swept(roads, rows, i, kind, link, -place, HOLD_NONE, dt, scratch)
 
 
 @inlined_kernel
