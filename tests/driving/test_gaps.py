@@ -112,6 +112,15 @@ def test_one_that_brakes_on_the_junction_does_not_speed_up(
     assert blocked == (HOLD_YIELD if waits else HOLD_NONE)
 
 
+@pytest.mark.parametrize(("accel", "waits"), [(-2.9, False), (-3.1, True)])
+def test_one_that_brakes_to_a_stop_on_the_junction_is_waited_for_from_afar(
+    blocks: Blocks, accel: float, waits: bool
+) -> None:
+    """Its rear has 6 m to go; it stops within 6.2 m, or 5.8."""
+    blocked = blocks(9.0, "enter", -6.0, own={"speed": SPEED_MPS}, speed=6.0, accel=accel)
+    assert blocked == (HOLD_YIELD if waits else HOLD_NONE)
+
+
 @pytest.mark.parametrize(
     ("out_s", "hold", "waits"),
     [(0.6, HOLD_YIELD, True), (0.4, HOLD_YIELD, False), (0.6, HOLD_NONE, False)],

@@ -263,6 +263,47 @@ def test_one_that_stands_before_the_area_without_a_reason_of_its_own_is_not_wait
     assert meeting.stop(1, (bus_enter_m - 1.0, enter_m - 1.0)) == enter_m, "it drives on"
 
 
+@pytest.mark.parametrize(
+    ("front_m", "bus_m", "brakes"),
+    [(-2.0, 1.0, True), (-2.0, 40.0, False), (0.5, 1.0, False)],
+)
+def test_one_that_has_left_the_junction_waits_before_an_area_that_begins_behind_it(
+    network: RoadNetwork, front_m: float, bus_m: float, brakes: bool
+) -> None:
+    """`front_m`, `bus_m`: how far the car's front and the bus's are in the area."""
+    meeting = Meeting(network)
+    link, bus_link = int(meeting.sweep["foe"]), meeting.link
+    row, sweeps = network.links[link], network.sweeps.copy()
+    owner = np.repeat(np.arange(len(network.links)), network.links["num_sweeps"])
+    picked = (owner == link) & (sweeps["foe"] == bus_link) & (sweeps["own"] == CAR)
+    picked &= sweeps["other"] == BUS
+    assert picked.sum() == 1
+    enter_m = float(row["length_m"]) + 0.5 * CAR_M + 3.0
+    sweeps["enter_m"][picked], sweeps["leave_m"][picked] = enter_m, enter_m
+    roads = network.arrays._replace(sweeps=sweeps)
+    lane = int(row["to_lane"])
+    nowhere = np.zeros(len(network.lanes), PLAN)
+    nowhere["next"], nowhere["link"] = -1, -1
+    nowhere["to_go"] = nowhere["room"] = 1000.0
+    travel = travel_by(nowhere)
+    s = 3.0 + front_m
+    rows = on_lane(network, lane, s, travel, id=0, length=CAR_M, speed=2.0, link=link, way=0)
+    rows["driver"] = DRIVER_BACKGROUND
+    rows = np.concatenate([rows, meeting.rows[:1]])
+    rows["id"], rows["hold"] = (0, 1), HOLD_NONE
+    room, step = scratch(network, 2), np.zeros(2, PLAN)
+    index_lanes(roads, travel, rows, 1, room)
+    entry = room.approach[0]
+    entry["link"], entry["row"], entry["id"], entry["half"] = bus_link, 1, 1, 0.5 * BUS_M
+    entry["dist"], entry["speed"] = 0.5 * BUS_M - (meeting.sweep["enter_m"] + bus_m), 3.0
+    room.link_start[:] = room.link_end[:] = 0
+    room.link_end[bus_link] = 1
+    step[0] = nowhere[lane]
+    phase = network.signals["program"].astype(np.int32)
+    decide(roads, travel, rows, 1, DRIVER_BACKGROUND, 0, 0.1, phase, step, room)
+    assert (room.accel[0] < -0.5) == brakes
+
+
 @pytest.mark.parametrize(("bus_m", "brakes"), [(1.0, True), (40.0, False)])
 def test_one_whose_trip_ends_on_a_lane_waits_where_others_turn_over_its_end(
     network: RoadNetwork, bus_m: float, brakes: bool
