@@ -265,7 +265,7 @@ def test_one_that_stands_before_the_area_without_a_reason_of_its_own_is_not_wait
 
 @pytest.mark.parametrize(
     ("front_m", "bus_m", "brakes"),
-    [(-2.0, 1.0, True), (-2.0, 40.0, False), (0.5, 1.0, False)],
+    [(-2.0, 1.0, True), (-2.0, 80.0, False), (0.5, 40.0, False)],
 )
 def test_one_that_has_left_the_junction_waits_before_an_area_that_begins_behind_it(
     network: RoadNetwork, front_m: float, bus_m: float, brakes: bool
@@ -280,6 +280,7 @@ def test_one_that_has_left_the_junction_waits_before_an_area_that_begins_behind_
     assert picked.sum() == 1
     enter_m = float(row["length_m"]) + 0.5 * CAR_M + 3.0
     sweeps["enter_m"][picked], sweeps["leave_m"][picked] = enter_m, enter_m
+    sweeps["foe_leave_m"][picked] = meeting.sweep["enter_m"] + 50.0
     roads = network.arrays._replace(sweeps=sweeps)
     lane = int(row["to_lane"])
     nowhere = np.zeros(len(network.lanes), PLAN)
