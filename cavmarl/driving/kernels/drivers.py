@@ -51,7 +51,9 @@ from cavmarl.driving.kernels.junctions import (
     waits_inside,
 )
 from cavmarl.driving.kernels.lane_choice import (
+    CREEP_MPS,
     MERGE_ROOM_M,
+    SIDEWAYS_S,
     choose_lane,
     needed_change,
     room_for_more,
@@ -89,6 +91,9 @@ FALL_IN_M = 100.0  # before the place where a lane change must be made
 # before the end, nearer than to a line.
 CHANGING_ROOM_M = -0.8
 MISSED_ROOM_M = 1.5  # more, where its lane goes on to a turn that it cannot take
+STEERED_ROOM_M = (
+    3.0  # more with Krauss's model, which stops right there, from where it has to steer
+)
 KEPT_MPS = 0.1  # a leader that leaves less keeps one where it is
 ROW_LINES = 3  # of a VEHICLE row that drivers ask for
 FAST_MPS = 5.0  # a slower background driver need not slow down for one that turns in ahead
@@ -380,6 +385,8 @@ def decide(
         room_m = MERGE_ROOM_M + further_m
         if driver == DRIVER_AGENT and misses_change(roads, travel, row["lane"], row["way"]):
             room_m += MISSED_ROOM_M
+        if driver == DRIVER_AGENT and kind["model"] == MODEL_KRAUSS:
+            room_m += STEERED_ROOM_M
         constraint, allowed, hold, link_ahead = _road_ahead(
             roads, travel, rows, k, step[i], phase, room_m, dt, scratch
         )
@@ -405,12 +412,19 @@ def decide(
             # A steered vehicle on its way into a neighbour lane still minds its own lane, to the
             # very end, and already the leader in the other one. Standing, it could not steer.
             lane = roads.lanes[row["lane"]]
+            room_m = CHANGING_ROOM_M + further_m
+            if change * row["d"] > 0.25 * lane["width_m"]:
+                room_m -= 0.5 * row["length"]  # its front is over the other lane
             constraint, allowed, _, _ = _road_ahead(
-                roads, travel, rows, k, step[i], phase, CHANGING_ROOM_M + further_m, dt, scratch
+                roads, travel, rows, k, step[i], phase, room_m, dt, scratch
             )
             target = lane["left"] if change > 0 else lane["right"]
             aside = beside(roads, travel, kind, row, target, scratch)
             constraint = max(constraint, askew, aside)
+            if lane["length_m"] - row["s"] < 0.5 * row["length"] + SIDEWAYS_S * CREEP_MPS:
+                allowed = min(
+                    allowed, 0.8 * CREEP_MPS
+                )  # faster, it would not go on with the change
         share = 0.0
         if kind["sigma"] > 0.0:
             share = quick_uniform(row["rng_key"], row["id"], tick, STREAM_DRIVER)
