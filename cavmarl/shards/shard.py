@@ -226,7 +226,7 @@ class Shard:
             self.discrete,
             self.target_speeds,
             SUGGESTED_HORIZON_S,
-            self.config.clock.sim_dt_s,
+            self.config.clock.ctrl_dt_s,
             out,
         )
 

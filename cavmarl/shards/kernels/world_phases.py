@@ -304,7 +304,7 @@ def suggest(
     discrete: bool,  # whether to answer with meta-actions
     target_speeds: NDArray[np.float64],  # m/s, rising; discrete only
     lookahead_s: float,  # horizon in which a target speed is to be reached; discrete only
-    dt: float,  # seconds of a tick
+    dt: float,  # seconds of a step, in which an answer holds
     # (W, A, 2): throttle in m/s² and steering in rad, or the meta-action in [..., 0]. Rows of
     # absent agents are left as they are
     out: NDArray[np.float64],
