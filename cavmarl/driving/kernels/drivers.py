@@ -91,9 +91,6 @@ FALL_IN_M = 100.0  # before the place where a lane change must be made
 # before the end, nearer than to a line.
 CHANGING_ROOM_M = -0.8
 MISSED_ROOM_M = 1.5  # more, where its lane goes on to a turn that it cannot take
-STEERED_ROOM_M = (
-    3.0  # more with Krauss's model, which stops right there, from where it has to steer
-)
 KEPT_MPS = 0.1  # a leader that leaves less keeps one where it is
 ROW_LINES = 3  # of a VEHICLE row that drivers ask for
 FAST_MPS = 5.0  # a slower background driver need not slow down for one that turns in ahead
@@ -385,8 +382,6 @@ def decide(
         room_m = MERGE_ROOM_M + further_m
         if driver == DRIVER_AGENT and misses_change(roads, travel, row["lane"], row["way"]):
             room_m += MISSED_ROOM_M
-        if driver == DRIVER_AGENT and kind["model"] == MODEL_KRAUSS:
-            room_m += STEERED_ROOM_M
         constraint, allowed, hold, link_ahead = _road_ahead(
             roads, travel, rows, k, step[i], phase, room_m, dt, scratch
         )
