@@ -92,6 +92,20 @@ def test_a_turning_circle_is_that_of_the_wheelbase() -> None:
             assert row["yaw_rate"] == pytest.approx(row["speed"] * np.sin(slip) / 3.0, rel=0.02)
 
 
+def test_krauss_keeps_to_a_limit_though_what_it_does_holds_for_several_ticks() -> None:
+    vec = make("highway", types=["car"], overrides={"traffic.model": "Krauss"})
+    assert vec.config.clock.ticks_per_step > 1
+    vec.reset(seed=2)
+    accels = []
+    for step in range(100):
+        vec.step(vec.suggest_actions())
+        rows = vec.worlds.simulation.vehicles(0)
+        fast = (rows["agent"] >= 0) & (rows["speed"] > 20.0)
+        accels += np.abs(rows["accel"][fast]).tolist() if step > 50 else []
+    assert len(accels) > 50
+    assert np.median(accels) < 0.5
+
+
 def test_zones_change_nothing() -> None:
     def drive(**keywords: Any) -> list[bytes]:
         vec = make("grid4x4", **keywords)

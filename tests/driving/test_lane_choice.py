@@ -96,6 +96,20 @@ def test_behind_a_junction_it_stays_in_its_lane_where_long_vehicles_turn_in(
         assert _rear_is_inside(lane, row) == stays
 
 
+@pytest.mark.parametrize(
+    ("driver", "speed", "stays"),
+    [(DRIVER_AGENT, 1.1, True), (DRIVER_AGENT, 0.9, False), (DRIVER_BACKGROUND, 0.9, True)],
+)
+def test_a_steered_one_that_creeps_changes_there_too(
+    driver: int, speed: float, stays: bool
+) -> None:
+    """Where it waits to change, on a lane of 20 m, is no further from the junction."""
+    lane, row = np.zeros(1, LANE)[0], blank_vehicle()[0]
+    row["driver"], row["length"], lane["length_m"] = driver, 5.0, 20.0
+    row["s"], row["speed"] = 2.5 + 3.0, speed
+    assert _rear_is_inside(lane, row) == stays
+
+
 @pytest.mark.parametrize(("far_mps", "asks"), [(25.0, True), (0.0, False)])
 def test_a_change_of_lanes_asks_those_of_every_lane_that_leads_there(
     far_mps: float, asks: bool

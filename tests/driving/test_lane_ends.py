@@ -52,6 +52,37 @@ def test_a_steered_car_stops_before_the_end_of_a_lane_to_a_turn_that_it_cannot_t
     assert throttle[1] > throttle[0]
 
 
+@pytest.mark.parametrize("speed", [0.0, 0.5])
+def test_a_steered_car_minds_the_end_of_its_lane_until_its_front_is_over_the_other_one(
+    tmp_path: Path, speed: float
+) -> None:
+    world, right, _, goal = before_dead_end(tmp_path, length_m=200.0)
+    rows = world.vehicles(0)
+    end = float(world.network.lanes["length_m"][right])
+    width_m = float(world.network.lanes["width_m"][right])
+    found = []
+    for share in (0.2, 0.3):  # of the lane's width to the left
+        put(world, rows[0], right, end - 2.6, speed, goal)
+        put(world, rows[1], right, 20.0, 0.0, goal)
+        rows[0]["d"] = share * width_m
+        found.append(float(suggested(world)[0, rows["agent"][0], 0]))
+    assert found[0] <= 0.0
+    assert found[1] > 0.0
+
+
+def test_a_steered_car_creeps_into_the_other_lane_near_the_end_of_its_own(tmp_path: Path) -> None:
+    """Faster, it would be too late for the change, brake, and begin anew."""
+    world, right, _, goal = before_dead_end(tmp_path, length_m=200.0)
+    rows = world.vehicles(0)
+    end = float(world.network.lanes["length_m"][right])
+    for to_end_m, speed, faster in ((6.0, 0.9, True), (4.9, 0.3, True), (4.9, 0.9, False)):
+        put(world, rows[0], right, end - to_end_m, speed, goal)
+        put(world, rows[1], right, 20.0, 0.0, goal)
+        throttle, steering = suggested(world)[0, rows["agent"][0]]
+        assert steering > 0.0
+        assert (throttle > 0.0) == faster
+
+
 @pytest.mark.parametrize("over_m", [0.5, -0.5])
 def test_a_rear_over_the_line_is_a_leader_behind_a_short_first_lane(over_m: float) -> None:
     roads, tables = network("grid4x4"), travel("grid4x4")

@@ -417,9 +417,8 @@ def decide(
             aside = beside(roads, travel, kind, row, target, scratch)
             constraint = max(constraint, askew, aside)
             if lane["length_m"] - row["s"] < 0.5 * row["length"] + SIDEWAYS_S * CREEP_MPS:
-                allowed = min(
-                    allowed, 0.8 * CREEP_MPS
-                )  # faster, it would not go on with the change
+                # Faster, it would be too late for the change, and brake.
+                allowed = min(allowed, 0.8 * CREEP_MPS)
         share = 0.0
         if kind["sigma"] > 0.0:
             share = quick_uniform(row["rng_key"], row["id"], tick, STREAM_DRIVER)
