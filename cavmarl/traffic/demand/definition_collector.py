@@ -324,7 +324,7 @@ def _how(element: Element) -> tuple[float, ...]:
 
 def _lane(element: Element, key: str, default: int) -> int:
     code = CODES[key].get(element.attrs.get(key, ""))
-    return element.whole(key, default, least=0) if code is None else code
+    return element.whole(key, default, least=0, words=CODES[key]) if code is None else code
 
 
 def _coded(element: Element, key: str, default: int, least: float = -math.inf) -> tuple[int, float]:
@@ -335,4 +335,4 @@ def _coded(element: Element, key: str, default: int, least: float = -math.inf) -
     if code is not None:
         return code, 0.0
     # POS_GIVEN and SPEED_GIVEN are one number.
-    return POS_GIVEN, element.number(key, 0.0, least=least)
+    return POS_GIVEN, element.number(key, 0.0, least=least, words=CODES[key])

@@ -41,6 +41,10 @@ def near(name: str, known: Iterable[str]) -> str:
     return f"near it: {', '.join(matches)}" if matches else "there is none"
 
 
+def _or(words: Iterable[str]) -> str:
+    return "".join(f" or {word}" for word in words)
+
+
 @dataclass(slots=True)
 class Element:
     """An XML element."""
@@ -82,26 +86,31 @@ class Element:
         least: float = -math.inf,
         above: float = -math.inf,
         most: float = math.inf,
+        words: Iterable[str] = (),
     ) -> float:
-        """A finite number in [least, most] and greater than `above`."""
+        """A finite number in [least, most] and greater than `above`.
+
+        `words`: what else may stand there, for the error.
+        """
         if key not in self.attrs:
             return default
         text = self.attrs[key]
         value = float(text) if _NUMBER.fullmatch(text.strip()) else math.nan
         if not math.isfinite(value):
-            raise self.error(f"has {key}='{text}'", "write a finite number")
+            raise self.error(f"has {key}='{text}'", "write a finite number" + _or(words))
         if value < least or value > most or value <= above:
             low = f"above {above:g}" if above > least else f"at least {least:g}"
             high = f" and at most {most:g}" if most < math.inf else ""
             raise self.error(f"has {key}='{text}'", f"it must be {low}{high}")
         return value
 
-    def whole(self, key: str, default: int, *, least: int) -> int:
+    def whole(self, key: str, default: int, *, least: int, words: Iterable[str] = ()) -> int:
         if key not in self.attrs:
             return default
         text = self.attrs[key].strip()
         if not _WHOLE.fullmatch(text) or int(text) < least:
-            raise self.error(f"has {key}='{text}'", f"write a whole number of at least {least}")
+            cure = f"write a whole number of at least {least}" + _or(words)
+            raise self.error(f"has {key}='{text}'", cure)
         return int(text)
 
     def flag(self, key: str, default: bool) -> bool:

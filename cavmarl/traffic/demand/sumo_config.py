@@ -103,5 +103,5 @@ def _departs(options: Mapping[str, Element]) -> dict[str, str]:
             continue
         found[key] = element.attrs["value"].strip()
         if found[key] not in CODES[key]:
-            element.number("value", 0.0, least=0.0)
+            element.number("value", 0.0, least=0.0, words=CODES[key])
     return found
