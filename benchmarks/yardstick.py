@@ -287,12 +287,15 @@ class _Standing:
     def _has_cause(self, rows: NDArray[np.void], i: int, shown: NDArray[np.uint8]) -> bool:
         row = rows[i]
         others = rows[np.arange(len(rows)) != i]
-        link = int(self._vec.simulation.plans[row["goal"], row["lane"]]["link"])
+        lane = self._vec.network.lanes[row["lane"]]
+        inside = bool(lane["internal"])  # then a signal does not concern it any more
+        step = self._vec.simulation.plans[row["goal"], row["lane"]]
+        link = int(lane["link"] if inside else step["link"])
         along_x, along_y = math.cos(row["heading"]), math.sin(row["heading"])
         to_x, to_y = others["x"] - row["x"], others["y"] - row["y"]
         ahead = along_x * to_x + along_y * to_y > 0.0
         near = ahead & (np.hypot(to_x, to_y) < NEAR_AHEAD_M)
-        if near.any() or (link >= 0 and shown[link] not in GREEN):
+        if near.any() or (link >= 0 and not inside and shown[link] not in GREEN):
             return True
         return link >= 0 and self._gives_way(others, link)
 

@@ -124,6 +124,21 @@ def test_one_that_comes_first_and_a_full_road_are_causes_to_stand() -> None:
     assert not waits(behind, yardstick.NEAR_AHEAD_M + 1.0)
 
 
+def test_one_inside_a_junction_waits_for_room_behind_it_and_for_no_signal() -> None:
+    vec = CavVectorEnv(LocalWorlds(load_world("grid4x4", agents=2, background=0), 1))
+    vec.reset(seed=1)
+    network, rows = vec.network, vec.simulation.vehicles(0)
+    link = int(np.flatnonzero(network.links["first_internal"] >= 0)[0])
+    rows["x"], rows["y"] = [0.0, 500.0], 0.0
+    rows["lane"] = network.links[["first_internal", "to_lane"]][link].tolist()
+    watch = yardstick._Standing(vec)
+    red = np.full(len(network.links), yardstick.SIGNAL_STATES.index("r"), dtype=np.uint8)
+    rows["s"] = 5.0
+    assert watch._has_cause(rows, 0, red)
+    rows["s"][1] = yardstick.NEAR_AHEAD_M + 1.0
+    assert not watch._has_cause(rows, 0, red)
+
+
 def test_no_map_is_refused() -> None:
     with pytest.raises(ConfigError, match="no map: name some"):
         yardstick.measure()
