@@ -18,7 +18,7 @@ MODES = ("closed", "open", "respawn")
 
 def make(mode: str = "closed", kind: str = "flat", **arguments: Any) -> gymnasium.Env[Any, Any]:
     overrides = {"population.mode": mode, "observation.kind": kind}
-    return gymnasium.make("cavmarl/merge-v4", max_cycles=40, overrides=overrides, **arguments)
+    return gymnasium.make("cavmarl/merge-v5", max_cycles=40, overrides=overrides, **arguments)
 
 
 @pytest.mark.parametrize("kind", ["flat", "dict"])
@@ -91,7 +91,7 @@ def test_the_infos_say_what_highway_envs_say() -> None:
     ends = {"crashed": 0, "is_success": 0}
     for seed in range(4):
         driven = seed % 2 == 0
-        world = gymnasium.make("cavmarl/merge-v4", background=0 if driven else 24)
+        world = gymnasium.make("cavmarl/merge-v5", background=0 if driven else 24)
         _, info = world.reset(seed=seed)
         env, done = world.unwrapped._env, False
         while not done:
@@ -119,6 +119,6 @@ def test_config_holds_nested_keys_of_the_entry() -> None:
     assert made.sensors.lanes == entry.sensors.lanes, "what it does not name stays"
     assert made.terms.weights == {**entry.terms.weights, "collision": -9.0}
     with pytest.raises(ConfigError, match="lanes_count"):
-        gymnasium.make("cavmarl/merge-v4", config={"lanes_count": 4})
+        gymnasium.make("cavmarl/merge-v5", config={"lanes_count": 4})
     with pytest.raises(ConfigError, match="must be a mapping of keys"):
-        gymnasium.make("cavmarl/merge-v4", config=[1])
+        gymnasium.make("cavmarl/merge-v5", config=[1])

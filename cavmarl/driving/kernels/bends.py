@@ -1,13 +1,17 @@
-"""How fast a steered car may be before the bends of its way."""
+"""How fast a vehicle may be before a lower limit, and a steered car before the bends of its way."""
 
 from __future__ import annotations
 
 import math
 
-from cavmarl.core.numba import kernel
+import numpy as np
+
+from cavmarl.core.numba import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays
+from cavmarl.core.records.codes import MODEL_KRAUSS
 
 LIMIT_DECEL = 2.0  # m/s², how a driver slows for a bend, or a lower limit ahead
+LIMIT_LEAD_S = 1.0  # to be down this time before it, as the model lags behind what is allowed
 LATERAL_ACCEL = 2.5  # m/s², with which a steered car takes a bend: where a lane turns
 MIN_BEND_RAD = 0.2  # by more than this
 BEND_M = 6.0  # within this length
@@ -47,3 +51,14 @@ def bend_speed(roads: RoadArrays, before: int, lane: int, distance: float) -> fl
             squared = LATERAL_ACCEL * BEND_M / bend + 2.0 * LIMIT_DECEL * max(to_bend, 0.0)
             slowest = min(slowest, math.sqrt(squared))
     return slowest
+
+
+@inlined_kernel
+def slowing_to(kind: np.void, limit: float, distance: float, speed: float, dt: float) -> float:
+    """The speed in m/s from which a driver gets down to a limit `distance` m ahead."""
+    decel = LIMIT_DECEL
+    lead_s = LIMIT_LEAD_S
+    if kind["model"] == MODEL_KRAUSS:
+        decel = kind["decel"]
+        lead_s = dt
+    return math.sqrt(limit * limit + 2.0 * decel * max(distance - lead_s * speed, 0.0))

@@ -28,7 +28,7 @@ from cavmarl.core.records.codes import (
     MODEL_KRAUSS,
 )
 from cavmarl.core.records.rows import is_lost
-from cavmarl.driving.kernels.bends import LIMIT_DECEL, bend_speed
+from cavmarl.driving.kernels.bends import bend_speed, slowing_to
 from cavmarl.driving.kernels.beside import behind_askew, behind_entry, beside, swings_back_m
 from cavmarl.driving.kernels.circles import breaks_circles
 from cavmarl.driving.kernels.courtesy import COURTESY_DECEL, let_merge
@@ -85,7 +85,6 @@ CLOSER_M = 0.9  # than `LINE_MARGIN_M` one that breaks circles stands before its
 NEAR_M = 8.0  # to a leader so near the corner between matters,
 ASKEW_RAD = 0.7  # if it turns by so much: the gap is half a width less
 NEXT_LINE_M = 5.0  # and braking way: so near a line is minded by a vehicle with a leader
-LIMIT_LEAD_S = 1.0  # to be down this time before it, as the model lags behind what is allowed
 FALL_IN_M = 100.0  # before the place where a lane change must be made
 # `MERGE_ROOM_M` of a steered vehicle on its way into the other lane: its front comes to 0.2 m
 # before the end, nearer than to a line.
@@ -117,17 +116,6 @@ def see_line_m(kind: np.void, speed: float) -> float:
         braking = 0.6 * speed * speed / kind["decel"]
         return float(SEE_LINE_M + speed * (1.0 + kind["tau"]) + braking)
     return VIEW_M
-
-
-@inlined_kernel
-def _slowing_to(kind: np.void, limit: float, distance: float, speed: float, dt: float) -> float:
-    """The speed in m/s from which a driver gets down to a limit `distance` m ahead."""
-    decel = LIMIT_DECEL
-    lead_s = LIMIT_LEAD_S
-    if kind["model"] == MODEL_KRAUSS:
-        decel = kind["decel"]
-        lead_s = dt
-    return math.sqrt(limit * limit + 2.0 * decel * max(distance - lead_s * speed, 0.0))
 
 
 @kernel
@@ -292,7 +280,7 @@ def _road_ahead(
         if steered:
             allowed = min(allowed, bend_speed(roads, before, lane, distance))
         if limit < allowed:
-            allowed = min(allowed, _slowing_to(kind, limit, distance, speed, dt))
+            allowed = min(allowed, slowing_to(kind, limit, distance, speed, dt))
         j = last_on(scratch, lane, row["id"], distance, travel.view_m)
         if j >= 0:
             leader = scratch.entries[j]
