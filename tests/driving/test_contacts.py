@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -34,6 +35,19 @@ def test_the_order_of_rows_does_not_matter(rows: NDArray[np.void], random: objec
     random.shuffle(order)  # type: ignore[attr-defined]
     hits = contacts(rows)
     assert contacts(rows[order]) == [hits[row] for row in order]
+
+
+@pytest.mark.parametrize(
+    ("heading", "reach_m"), [(0.0, 2.0), (0.3, 2.69), (-0.3, 2.69), (7.0, 3.396)]
+)
+def test_side_by_side_they_touch_up_to_half_their_widths_and_what_one_is_turned(
+    heading: float, reach_m: float
+) -> None:
+    for apart_m, touch in ((reach_m - 0.02, [1, 0]), (reach_m + 0.02, [-1, -1])):
+        for sign in (1.0, -1.0):
+            rows = vehicles([(0.0, 0.0, 0.0), (0.0, sign * apart_m, heading)])
+            rows["length"], rows["width"] = 5.0, 2.0
+            assert contacts(rows) == touch
 
 
 def test_a_bridge_is_no_crash() -> None:
