@@ -99,18 +99,19 @@ class MapTrips:
         edges = set(self._drivable_edges(MIN_ORIGIN_M))
         named = [self._edge(name, "origins") for name in self.traffic.origins]
         start = self._lanes_of(named or sorted(edges))
-        entries = [e for e in edges if self._is_way_in(e)]
-        enter = self._lanes_of(sorted(entries)) if entries else self._lanes_of(sorted(edges))
+        entries = self._lanes_of(sorted(e for e in edges if self._is_way_in(e)))
         anywhere = self._lanes_of(sorted(edges))
         copies = np.ceil(lanes["length_m"][anywhere] / DENSITY_M).astype(np.int64)
         goals = np.arange(num_goals)
         targets = goals[: len(self.traffic.destinations)] if self.traffic.destinations else goals
         minimum, maximum = self.traffic.min_trip_m, self.traffic.max_trip_m
+        has_ways_in = self._fitting(plans, entries, goals, 0.0, 0.0).size > 0
+        enter = entries if has_ways_in else anywhere
         return DrawnTrips(
             at_start=self._trips(plans, np.repeat(anywhere, copies), goals, 0.0, 0.0),
             of_agents=self._trips(plans, start, targets, minimum, maximum),
             entering=self._trips(plans, enter, goals, 0.0, 0.0),
-            has_ways_in=bool(entries),
+            has_ways_in=has_ways_in,
         )
 
     @cached_property
@@ -167,6 +168,40 @@ class MapTrips:
         least_m: float,
         most_m: float,
     ) -> NDArray[np.int32]:
+        """`_fitting`, if there are any, and not too many."""
+        trips = self._fitting(plans, origins, goals, least_m, most_m)
+        if not len(trips):
+            to_go = plans["to_go"][np.ix_(goals, origins)]
+            reachable = to_go[np.isfinite(to_go)]
+            name = self.network.name_of(self.number)
+            if (reachable >= least_m).any() and most_m == 0.0:
+                raise ConfigError(
+                    f"map '{name}': every way begins with a lane change, or has a turn that is too "
+                    "tight for a car; change traffic.origins or traffic.destinations, or mend the "
+                    "map"
+                )
+            longest = (
+                f"the longest way is {reachable.max():.0f} m"
+                if reachable.size
+                else "no way leads to a goal"
+            )
+            raise ConfigError(
+                f"traffic.min_trip_m = {least_m:g}, traffic.max_trip_m = {most_m:g}: no trip of "
+                f"that length on the map '{name}' ({longest}); change the limits, "
+                "traffic.origins or traffic.destinations"
+            )
+        if len(trips) > MAX_TRIPS:
+            trips = trips[:: -(-len(trips) // MAX_TRIPS)]
+        return np.ascontiguousarray(trips)
+
+    def _fitting(
+        self,
+        plans: NDArray[np.void],
+        origins: NDArray[np.int64],
+        goals: NDArray[np.int64],
+        least_m: float,
+        most_m: float,
+    ) -> NDArray[np.int32]:
         """(P, 2) pairs of origin lane and goal whose way has a length from `least_m` to `most_m`.
 
         Vehicles start on a lane that their way can follow: no trip begins with a lane change. And
@@ -179,19 +214,4 @@ class MapTrips:
         if most_m > 0.0:
             fits &= to_go <= most_m
         goal, origin = np.nonzero(fits)
-        if not len(goal):
-            reachable = to_go[np.isfinite(to_go)]
-            longest = (
-                f"the longest way is {reachable.max():.0f} m"
-                if reachable.size
-                else "no way leads to a goal"
-            )
-            raise ConfigError(
-                f"traffic.min_trip_m = {least_m:g}, traffic.max_trip_m = {most_m:g}: no trip of "
-                f"that length on the map '{self.network.name_of(self.number)}' ({longest}); change "
-                "the limits, traffic.origins or traffic.destinations"
-            )
-        trips = np.stack([origins[origin], goals[goal]], axis=1).astype(np.int32)
-        if len(trips) > MAX_TRIPS:
-            trips = trips[:: -(-len(trips) // MAX_TRIPS)]
-        return np.ascontiguousarray(trips)
+        return np.stack([origins[origin], goals[goal]], axis=1).astype(np.int32)

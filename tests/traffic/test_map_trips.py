@@ -1,0 +1,29 @@
+"""Where trips of the generator begin."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cavmarl.core.errors import ConfigError
+from tests.support.driving import make_traffic
+
+
+def test_where_no_way_in_can_be_followed_vehicles_enter_anywhere() -> None:
+    traffic = make_traffic("grid4x4", background=4, overrides={"traffic.origins": []})._tick.traffic
+    trips, num_goals = traffic._trips_of(0), traffic.goal_edges.shape[1]
+    ways_in = np.flatnonzero(
+        ~traffic.network.lanes["internal"] & (traffic.network.lanes["num_into"] == 0)
+    )
+    drawn = trips.drawn(traffic.plans, num_goals)
+    assert drawn.has_ways_in
+    assert set(drawn.entering[:, 0]) <= set(ways_in)
+    plans = traffic.plans.copy()
+    plans["change"][:, ways_in] = 1
+    drawn = trips.drawn(plans, num_goals)
+    assert not drawn.has_ways_in
+    assert len(drawn.entering) > 0
+    assert not set(drawn.entering[:, 0]) & set(ways_in)
+    plans["turnarounds"] = 1
+    with pytest.raises(ConfigError, match="every way begins with a lane change, or has"):
+        trips.drawn(plans, num_goals)
