@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,6 +21,8 @@ MIN_ORIGIN_M = 15.0  # lanes shorter than this are no place to start
 MIN_GOAL_M = 10.0  # nor to arrive
 DENSITY_M = 25.0  # a lane is drawn at reset once for each such length
 MAX_TRIPS = 200_000  # of a table; longer ones are thinned evenly
+
+ANY_LENGTH_M = (0.0, math.inf)
 
 T = TypeVar("T")
 
@@ -104,13 +107,13 @@ class MapTrips:
         copies = np.ceil(lanes["length_m"][anywhere] / DENSITY_M).astype(np.int64)
         goals = np.arange(num_goals)
         targets = goals[: len(self.traffic.destinations)] if self.traffic.destinations else goals
-        minimum, maximum = self.traffic.min_trip_m, self.traffic.max_trip_m
-        has_ways_in = self._fitting(plans, entries, goals, 0.0, 0.0).size > 0
+        limits_m = self.traffic.min_trip_m, self.traffic.max_trip_m or math.inf
+        has_ways_in = self._fitting(plans, entries, goals, ANY_LENGTH_M).size > 0
         enter = entries if has_ways_in else anywhere
         return DrawnTrips(
-            at_start=self._trips(plans, np.repeat(anywhere, copies), goals, 0.0, 0.0),
-            of_agents=self._trips(plans, start, targets, minimum, maximum),
-            entering=self._trips(plans, enter, goals, 0.0, 0.0),
+            at_start=self._trips(plans, np.repeat(anywhere, copies), goals, ANY_LENGTH_M),
+            of_agents=self._trips(plans, start, targets, limits_m),
+            entering=self._trips(plans, enter, goals, ANY_LENGTH_M),
             has_ways_in=has_ways_in,
         )
 
@@ -165,53 +168,57 @@ class MapTrips:
         plans: NDArray[np.void],
         origins: NDArray[np.int64],
         goals: NDArray[np.int64],
-        least_m: float,
-        most_m: float,
+        limits_m: tuple[float, float],
     ) -> NDArray[np.int32]:
-        """`_fitting`, if there are any, and not too many."""
-        trips = self._fitting(plans, origins, goals, least_m, most_m)
+        """`_fitting`, `MAX_TRIPS` of them at most.
+
+        Raises ConfigError: there are none.
+        """
+        trips = self._fitting(plans, origins, goals, limits_m)
         if not len(trips):
-            to_go = plans["to_go"][np.ix_(goals, origins)]
-            reachable = to_go[np.isfinite(to_go)]
-            name = self.network.name_of(self.number)
-            if (reachable >= least_m).any() and most_m == 0.0:
-                raise ConfigError(
-                    f"map '{name}': every way begins with a lane change, or has a turn that is too "
-                    "tight for a car; change traffic.origins or traffic.destinations, or mend the "
-                    "map"
-                )
-            longest = (
-                f"the longest way is {reachable.max():.0f} m"
-                if reachable.size
-                else "no way leads to a goal"
-            )
-            raise ConfigError(
-                f"traffic.min_trip_m = {least_m:g}, traffic.max_trip_m = {most_m:g}: no trip of "
-                f"that length on the map '{name}' ({longest}); change the limits, "
-                "traffic.origins or traffic.destinations"
-            )
+            raise self._no_trip(plans["to_go"][np.ix_(goals, origins)], limits_m)
         if len(trips) > MAX_TRIPS:
             trips = trips[:: -(-len(trips) // MAX_TRIPS)]
         return np.ascontiguousarray(trips)
+
+    def _no_trip(self, to_go: NDArray[np.float64], limits_m: tuple[float, float]) -> ConfigError:
+        """Why none of some ways, of so many m or inf, is a trip."""
+        name = self.network.name_of(self.number)
+        if _is_within(to_go, limits_m).any():
+            return ConfigError(
+                f"no trip on the map '{name}': every way between origins and destinations begins with a lane "
+                "change, or has a turn that is too tight for a car; change traffic.origins or "
+                "traffic.destinations, or mend the map"
+            )
+        reachable = to_go[np.isfinite(to_go)]
+        longest = "no way leads to a goal"
+        if reachable.size:
+            longest = f"the longest way is {reachable.max():.0f} m"
+        return ConfigError(
+            f"traffic.min_trip_m = {self.traffic.min_trip_m:g}, traffic.max_trip_m = "
+            f"{self.traffic.max_trip_m:g}: no trip of that length on the map '{name}' ({longest}); "
+            "change the limits, traffic.origins or traffic.destinations"
+        )
 
     def _fitting(
         self,
         plans: NDArray[np.void],
         origins: NDArray[np.int64],
         goals: NDArray[np.int64],
-        least_m: float,
-        most_m: float,
+        limits_m: tuple[float, float],
     ) -> NDArray[np.int32]:
-        """(P, 2) pairs of origin lane and goal whose way has a length from `least_m` to `most_m`.
+        """(P, 2) pairs of origin lane and goal whose way is as long as `limits_m` say.
 
         Vehicles start on a lane that their way can follow: no trip begins with a lane change. And
         no trip has a turn for which a car's turning circle is too wide.
         """
         pairs = np.ix_(goals, origins)
-        to_go = plans["to_go"][pairs]
-        fits = np.isfinite(to_go) & (to_go >= least_m)
+        fits = _is_within(plans["to_go"][pairs], limits_m)
         fits &= (plans["change"][pairs] == 0) & (plans["turnarounds"][pairs] == 0)
-        if most_m > 0.0:
-            fits &= to_go <= most_m
         goal, origin = np.nonzero(fits)
         return np.stack([origins[origin], goals[goal]], axis=1).astype(np.int32)
+
+
+def _is_within(way_m: NDArray[np.float64], limits_m: tuple[float, float]) -> NDArray[np.bool_]:
+    least_m, most_m = limits_m
+    return np.isfinite(way_m) & (way_m >= least_m) & (way_m <= most_m)

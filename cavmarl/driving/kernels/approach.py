@@ -54,8 +54,7 @@ def register_links(
     Only links with conflicts list those that approach.
     """
     pairs = 0
-    for junction in range(scratch.largest.size):
-        scratch.largest[junction] = 0
+    scratch.largest[:] = 0
     for first in range(0, num, BLOCK):
         last = min(first + BLOCK, num)
         # One look for all that follows: in a city the steps lie far apart, each is a cache miss,

@@ -90,6 +90,8 @@ FALL_IN_M = 100.0  # before the place where a lane change must be made
 # before the end, nearer than to a line.
 CHANGING_ROOM_M = -0.8
 MISSED_ROOM_M = 1.5  # more, where its lane goes on to a turn that it cannot take
+ACROSS_SHARE = 0.25  # of its lane's width to the side, from which its front is over the other lane,
+CREEPS_MPS = 0.8 * CREEP_MPS  # and how fast it gets there, near the end of its own
 KEPT_MPS = 0.1  # a leader that leaves less keeps one where it is
 ROW_LINES = 3  # of a VEHICLE row that drivers ask for
 FAST_MPS = 5.0  # a slower background driver need not slow down for one that turns in ahead
@@ -342,7 +344,7 @@ def decide(
     num: int,  # rows to decide for, the first of `rows`; all rows stand in the indices
     driver: int,  # DRIVER_* whose rows are decided for
     tick: int,  # of the committed state
-    dt: float,  # seconds of a tick
+    dt: float,  # seconds that a decision holds: a tick, or an agent's step
     phase: NDArray[np.int32],  # (num_signals,) PHASE rows that are on
     step: NDArray[np.void],  # PLAN (C,) of each row the step of its lane
     # with the lane and link indices of this tick; accel (m/s²), lane_change, blinker, hold and
@@ -396,8 +398,8 @@ def decide(
             # very end, and already the leader in the other one. Standing, it could not steer.
             lane = roads.lanes[row["lane"]]
             room_m = CHANGING_ROOM_M + further_m
-            if change * row["d"] > 0.25 * lane["width_m"]:
-                room_m -= 0.5 * row["length"]  # its front is over the other lane
+            if change * row["d"] > ACROSS_SHARE * lane["width_m"]:
+                room_m -= 0.5 * row["length"]
             constraint, allowed, _, _ = _road_ahead(
                 roads, travel, rows, k, step[i], phase, room_m, dt, scratch
             )
@@ -406,7 +408,7 @@ def decide(
             constraint = max(constraint, askew, aside)
             if lane["length_m"] - row["s"] < 0.5 * row["length"] + SIDEWAYS_S * CREEP_MPS:
                 # Faster, it would be too late for the change, and brake.
-                allowed = min(allowed, 0.8 * CREEP_MPS)
+                allowed = min(allowed, CREEPS_MPS)
         share = 0.0
         if kind["sigma"] > 0.0:
             share = quick_uniform(row["rng_key"], row["id"], tick, STREAM_DRIVER)
