@@ -186,8 +186,8 @@ class MapTrips:
         name = self.network.name_of(self.number)
         if _is_within(to_go, limits_m).any():
             return ConfigError(
-                f"no trip on the map '{name}': every way between origins and destinations begins with a lane "
-                "change, or has a turn that is too tight for a car; change traffic.origins or "
+                f"no trip on the map '{name}': every way between origins and "
+                "destinations begins with a lane change, or has a turn that is too tight for a car; change traffic.origins or "
                 "traffic.destinations, or mend the map"
             )
         reachable = to_go[np.isfinite(to_go)]
