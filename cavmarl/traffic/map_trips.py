@@ -187,8 +187,8 @@ class MapTrips:
         if _is_within(to_go, limits_m).any():
             return ConfigError(
                 f"no trip on the map '{name}': every way between origins and "
-                "destinations begins with a lane change, or has a turn that is too tight for a car; change traffic.origins or "
-                "traffic.destinations, or mend the map"
+                "destinations begins with a lane change, or has a turn that is too tight for a "
+                "car; change traffic.origins or traffic.destinations, or mend the map"
             )
         reachable = to_go[np.isfinite(to_go)]
         longest = "no way leads to a goal"
