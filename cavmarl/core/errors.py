@@ -12,6 +12,7 @@
     ├── MissingExtraError      an optional dependency is not installed
     ├── ActionError            refused before any state has changed
     ├── EpisodeError           the call does not fit the state of the episode: reset first
+    ├── KernelError            a kernel that has to be compiled, and may not or cannot be
     ├── CapacityError          more vehicles or seats than the world can take
     ├── EvaluationError        an evaluation that failed, or worlds that differ and must not
     │   └── ManifestError         results whose origin is not on record
@@ -93,6 +94,10 @@ class EpisodeError(CavmarlError):
 
     `step` before the first `reset`, or after every agent has left.
     """
+
+
+class KernelError(CavmarlError):
+    """A kernel that has to be compiled, and may not or cannot be."""
 
 
 class CapacityError(CavmarlError):

@@ -6,28 +6,22 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from pathlib import Path
 
-import numba.core.config
-from numba.core import event
-
-from cavmarl.core.cache_folder import tell_unwritable
-from cavmarl.core.numba import kernel_cache_dir
-
-_Listener: Any = event.Listener
+from cavmarl.core.cache_folder import cache_dir, tell_unwritable
+from cavmarl.core.compiled import IS_PLAIN, sources_digest
+from cavmarl.core.compiled.code import Listener, listeners
 
 
-class _Announcer(_Listener):  # type: ignore[misc]
-    """Told of each function that Numba compiles in this process; says so at the first kernel."""
+class _Announcer(Listener):
+    """Says so when the first kernel is compiled."""
 
     def __init__(self) -> None:
-        self.listens = False
         self.has_told = False
 
-    def on_start(self, event: Any) -> None:
-        module = event.data["dispatcher"].py_func.__module__
+    def on_compile(self, name: str) -> None:
         # Those of processes are small, and compiled in workers, after the caller has told.
-        is_long = module.startswith("cavmarl.") and not module.startswith("cavmarl.parallel.")
+        is_long = name.startswith("cavmarl.") and not name.startswith("cavmarl.parallel.")
         if is_long and not self.has_told:
             self.has_told = True
             print(
@@ -37,25 +31,23 @@ class _Announcer(_Listener):  # type: ignore[misc]
                 flush=True,
             )
 
-    def on_end(self, event: Any) -> None:
-        """Called by Numba."""
-
 
 _ANNOUNCER = _Announcer()
 
 
 def announce_compilation() -> None:
     """From now on say on standard error when the first kernel is compiled in this process."""
-    if not _ANNOUNCER.listens:
-        _ANNOUNCER.listens = True
-        register: Any = event.register
-        register("numba:compile", _ANNOUNCER)
+    if _ANNOUNCER not in listeners:
+        listeners.append(_ANNOUNCER)
 
 
 def compiled_before() -> bool:
     """Whether all kernels of this version are on this machine, or are never compiled."""
-    settings: Any = numba.core.config
-    return bool(settings.DISABLE_JIT) or (kernel_cache_dir() / "complete").exists()
+    return IS_PLAIN or _marker().exists()
+
+
+def _marker() -> Path:
+    return cache_dir() / "kernels" / sources_digest() / "complete"
 
 
 @contextmanager
@@ -78,8 +70,8 @@ def compiling_all() -> Iterator[None]:
     _ANNOUNCER.has_told = True
     yield
     try:
-        kernel_cache_dir().mkdir(parents=True, exist_ok=True)
-        (kernel_cache_dir() / "complete").touch()
+        _marker().parent.mkdir(parents=True, exist_ok=True)
+        _marker().touch()
     except OSError as error:
         tell_unwritable(error)
     print(f" done in {time.perf_counter() - started:.0f} s", file=sys.stderr, flush=True)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.numba.specialized import specialized
+from cavmarl.core.compiled import specialized
 from cavmarl.driving.kernels.scripted_rows import note_cues
 from cavmarl.handoff.division import Division
 from cavmarl.shards.shard import Commands, Shard

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.math.tallies import count_tick, occasions
-from cavmarl.core.numba.specialized import specialized
+from cavmarl.core.compiled import specialized
 from cavmarl.core.records.arrays import Gate
 from cavmarl.engine.component import Attached
 from cavmarl.engine.peers import Peers

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from typing import Any
 
 from cavmarl.config.env import EnvConfig
-from cavmarl.core.numba import kernel_cache_dir
+from cavmarl.core.compiled import sources_digest
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
@@ -34,7 +34,7 @@ def describe_world(
         "map_content_sha256": network.content_hash,
         "demand_content_sha256": None if demand is None else demand.content_hash,
         "sumo": demand.version if isinstance(demand, SumoDemand) else None,
-        "kernels": kernel_cache_dir().name,
+        "kernels": sources_digest(),
         "zones": partition.count,
         "zones_content_sha256": partition.content_hash,
         "equals_undivided": not (partition.count > 1 and config.zones.holds),

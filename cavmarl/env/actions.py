@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.action import ActionConfig
 from cavmarl.core.errors import ActionError
-from cavmarl.core.numba.specialized import specialized
+from cavmarl.core.compiled import specialized
 from cavmarl.core.records.codes import ACTION_IDLE
 from cavmarl.engine.kernels.decoding import decode_choices, decode_pairs
 from cavmarl.shards.shard import Commands

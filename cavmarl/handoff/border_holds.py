@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cavmarl.core.numba.specialized import specialized
+from cavmarl.core.compiled import specialized
 from cavmarl.handoff.coordinator.coordinator import Near
 from cavmarl.handoff.division import Division
 from cavmarl.ownership.messages import BorderWait

@@ -17,7 +17,7 @@ from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.math.buckets import make_lists
 from cavmarl.core.math.neighbors import make_grid
 from cavmarl.core.memory import Zeros
-from cavmarl.core.numba.specialized import specialized
+from cavmarl.core.compiled import specialized
 from cavmarl.core.records.arrays import (
     Common,
     Gate,

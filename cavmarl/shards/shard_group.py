@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.numba.specialized import specialized
+from cavmarl.core.compiled import specialized
 from cavmarl.core.records.arrays import Demand, Gate
 from cavmarl.core.records.codes import INSERT_OPEN
 from cavmarl.shards.kernels.group_phases import (

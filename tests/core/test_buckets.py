@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cavmarl.core.math.buckets import Lists, add, forget, lay_out, make_lists
-from cavmarl.core.numba import kernel
+from cavmarl.core.compiled import kernel
 from tests.naive import buckets as naive
 
 

@@ -14,8 +14,8 @@ from numba.core import config
 
 from cavmarl.core.cache_folder import cache_dir
 from cavmarl.core.math.bearings import rough_atan2
-from cavmarl.core.numba import kernel
-from cavmarl.core.numba import kernel_cache as kernels
+from cavmarl.core.compiled import kernel
+from cavmarl.core.compiled import kernel_cache as kernels
 
 SOURCES = kernels._sources()
 PACKAGE = Path(kernels.__file__).parents[2]

@@ -15,7 +15,7 @@ import pytest
 from numba.core import config
 from numba.core.errors import NumbaError
 
-from cavmarl.core.numba import allocating_kernel, kernel
+from cavmarl.core.compiled import allocating_kernel, kernel
 
 
 def _borrows_no_room() -> float:
@@ -38,7 +38,7 @@ def test_an_allocating_kernel_can_allocate() -> None:
 
 LOOKS = """
 import numpy as np
-from cavmarl.core.numba import allocating_kernel, kernel
+from cavmarl.core.compiled import allocating_kernel, kernel
 
 def at(a, i):
     return a[i]

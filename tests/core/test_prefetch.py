@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cavmarl.core.numba import kernel
-from cavmarl.core.numba.prefetch import prefetch
+from cavmarl.core.compiled import kernel
+from cavmarl.core.compiled.prefetch import prefetch
 
 RECORD = np.dtype([("a", np.float64), ("b", np.int64, (9,))])
 

@@ -10,9 +10,9 @@ from numba.core.errors import NumbaTypeError
 from numba.extending import typeof_impl
 from numpy.typing import NDArray
 
-from cavmarl.core.numba import kernel
-from cavmarl.core.numba import specialized as specialized_calls
-from cavmarl.core.numba.specialized import _kind, specialized
+from cavmarl.core.compiled import kernel
+from cavmarl.core.compiled import specialized as specialized_calls
+from cavmarl.core.compiled import _kind, specialized
 
 _typeof: Any = numba.typeof
 

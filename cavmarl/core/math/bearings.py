@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from cavmarl.core.math.geometry import PI
-from cavmarl.core.numba import kernel
+from cavmarl.core.compiled import kernel
 
 # `rough_atan2` is off by less than this.
 ANGLE_ERROR_RAD = 0.005

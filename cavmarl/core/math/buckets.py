@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.numba import inlined_kernel, kernel
+from cavmarl.core.compiled import inlined_kernel, kernel
 
 BLOCK_BITS = 3
 BLOCK = 1 << BLOCK_BITS

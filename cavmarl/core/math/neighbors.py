@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.numba import kernel
+from cavmarl.core.compiled import kernel
 
 LEVEL_HEIGHT_M = (
     4.0  # vehicles further apart in z are on different levels and do not see each other

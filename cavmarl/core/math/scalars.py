@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from cavmarl.core.numba import kernel
+from cavmarl.core.compiled import kernel
 
 NEAR_ZERO = 0.01
 

@@ -16,7 +16,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.numba import kernel
+from cavmarl.core.compiled import kernel
 
 
 @kernel

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.numba import kernel
+from cavmarl.core.compiled import kernel
 
 
 @kernel

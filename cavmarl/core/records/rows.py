@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cavmarl.core.numba import inlined_kernel
+from cavmarl.core.compiled import inlined_kernel
 from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_SCRIPTED
 
 ENTER_REACH_M = 80.0  # how far along its lane a departing vehicle looks for others

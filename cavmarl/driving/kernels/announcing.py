@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cavmarl.core.numba import inlined_kernel
+from cavmarl.core.compiled import inlined_kernel
 from cavmarl.core.records.codes import HOLD_EXIT_BLOCKED, HOLD_NONE, HOLD_SIGNAL
 
 APPROACH_M = 150.0  # how far ahead a vehicle announces itself at most,

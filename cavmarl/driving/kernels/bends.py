@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from cavmarl.core.numba import inlined_kernel, kernel
+from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays
 from cavmarl.core.records.codes import MODEL_KRAUSS
 

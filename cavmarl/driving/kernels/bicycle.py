@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 from cavmarl.core.math.geometry import wrap_angle
-from cavmarl.core.numba import kernel
+from cavmarl.core.compiled import kernel
 
 MAX_SPEED_MPS = 40.0  # beyond it the engine gives way
 MIN_SPEED_MPS = -40.0

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 
 from cavmarl.core.math.scalars import not_zero
-from cavmarl.core.numba import kernel
+from cavmarl.core.compiled import kernel
 
 ACCEL_MAX = 3.0  # m/s², desired acceleration from rest on a free road
 DECEL_COMFORT = 5.0  # m/s², braking that feels comfortable, a positive number

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.numba import kernel
+from cavmarl.core.compiled import kernel
 from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
 from cavmarl.driving.kernels.following import accel_behind
 from cavmarl.driving.kernels.lane_choice import LOOK_BACK_M, SIDE_GAP_M

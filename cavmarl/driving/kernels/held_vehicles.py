@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.numba import inlined_kernel, kernel
+from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.records import record
 from cavmarl.core.records.arrays import RoadArrays, Travel
 from cavmarl.driving.kernels.following import before_line, response

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from cavmarl.core.numba import kernel
+from cavmarl.core.compiled import kernel
 
 
 @kernel

@@ -6,7 +6,7 @@ Transportation Research Record 1999, 2007, with highway-env's defaults (`IDMVehi
 
 from __future__ import annotations
 
-from cavmarl.core.numba import kernel
+from cavmarl.core.compiled import kernel
 
 POLITENESS = 0.0  # weight of the followers' gains, from 0 (selfish) to 1
 MIN_ACCEL_GAIN = 0.2  # m/s², a change that gains less is not worth it

@@ -1,7 +1,7 @@
 """Driver models from outside of the package: kernels call them through a table of addresses.
 
-The table is a symbol of this process, by name: compiled kernels refer to the name and not to what
-stands there, so the cache on disk is the same whichever models are registered.
+The table is a symbol, by name: compiled kernels refer to the name and not to what stands there, so
+their code is the same whichever models are registered.
 """
 
 from __future__ import annotations
@@ -10,60 +10,40 @@ import ctypes
 from collections.abc import Callable
 from typing import Any
 
-import llvmlite.binding
-import numba
-import numba.core.config
-from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic, overload
+from cavmarl.core.compiled import IS_PLAIN
+from cavmarl.core.compiled.intrinsic import intrinsic
+from cavmarl.core.compiled.tables import define_table
 
 FIRST_REGISTERED = 16  # MODEL_* code of the first registered model
 MAX_REGISTERED = 64
 
 _NUM_NUMBERS = 8
 _SYMBOL = "cavmarl_driver_models"
-_ADDRESSES = (ctypes.c_int64 * MAX_REGISTERED)()
+_TABLE = define_table(_SYMBOL, MAX_REGISTERED)
 _MODELS: dict[int, Callable[..., float]] = {}
 _COMPILED: dict[int, Any] = {}  # keeps the machine code of the addresses
-_SIGNATURE = types.float64(*(types.float64,) * _NUM_NUMBERS)
-
-llvmlite.binding.add_symbol(_SYMBOL, ctypes.addressof(_ADDRESSES))
 
 
 def put_model(code: int, model: Callable[..., float]) -> None:
     """Let `ask_model` find a model; it is compiled now, and not kept on disk.
 
     Raises:
+        MissingExtraError: there is no Numba to compile the model with.
         numba.core.errors.NumbaError: it does not compile.
     """
-    settings: Any = numba.core.config
-    if not settings.DISABLE_JIT:
-        compiled: Any = numba.cfunc(_SIGNATURE, error_model="numpy")(
-            getattr(model, "py_func", model)
-        )
+    if not IS_PLAIN:
+        from cavmarl.core.compiled.compiler import compile_callback
+
+        compiled = compile_callback(getattr(model, "py_func", model), _NUM_NUMBERS)
         _COMPILED[code] = compiled
-        _ADDRESSES[code - FIRST_REGISTERED] = compiled.address
+        _TABLE.write(code - FIRST_REGISTERED, compiled.address)
     _MODELS[code] = model
 
 
-def ask_model(
-    code: int,
-    speed: float,
-    allowed: float,
-    gap: float,
-    front_speed: float,
-    min_gap: float,
-    tau: float,
-    accel: float,
-    decel: float,
-) -> float:
-    """The acceleration in m/s² that a registered model asks for."""
-    return float(_MODELS[code](speed, allowed, gap, front_speed, min_gap, tau, accel, decel))
-
-
-@intrinsic
-def _call(typing_context: Any, code: Any, *numbers: Any) -> Any:
+def _generate_call(typing: Any, code: Any, *numbers: Any) -> Any:
     """Call what the table holds for a code."""
+    from llvmlite import ir
+    from numba.core import types
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         place = ir.IntType(64)
@@ -86,29 +66,17 @@ def _call(typing_context: Any, code: Any, *numbers: Any) -> Any:
     return types.float64(types.int64, rest), generate
 
 
-@overload(ask_model)
-def _ask_model(
-    code: Any,
-    speed: Any,
-    allowed: Any,
-    gap: Any,
-    front_speed: Any,
-    min_gap: Any,
-    tau: Any,
-    accel: Any,
-    decel: Any,
-) -> Any:
-    def asked(
-        code: Any,
-        speed: Any,
-        allowed: Any,
-        gap: Any,
-        front_speed: Any,
-        min_gap: Any,
-        tau: Any,
-        accel: Any,
-        decel: Any,
-    ) -> Any:
-        return _call(code, speed, allowed, gap, front_speed, min_gap, tau, accel, decel)
-
-    return asked
+@intrinsic(_generate_call)
+def ask_model(
+    code: int,
+    speed: float,
+    allowed: float,
+    gap: float,
+    front_speed: float,
+    min_gap: float,
+    tau: float,
+    accel: float,
+    decel: float,
+) -> float:
+    """Return the acceleration in m/s² that a registered model asks for."""
+    return float(_MODELS[code](speed, allowed, gap, front_speed, min_gap, tau, accel, decel))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cavmarl.core.numba import inlined_kernel
+from cavmarl.core.compiled import inlined_kernel
 from cavmarl.core.records.arrays import RoadArrays, Travel
 from cavmarl.core.records.codes import UNTIL_DEPARTURE
 

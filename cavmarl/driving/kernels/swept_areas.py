@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.numba import inlined_kernel, kernel
+from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays, Scratch
 from cavmarl.core.records.codes import DRIVER_AGENT, HOLD_NONE, MODEL_KRAUSS
 from cavmarl.core.records.rows import SIZE_BODIES_M, SIZE_LENGTHS_M, STEERED, SWEPT_BEYOND_M

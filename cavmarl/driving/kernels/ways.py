@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cavmarl.core.numba import inlined_kernel, kernel
+from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays, Travel
 from cavmarl.roads.kernels.signal_phases import program_at
 

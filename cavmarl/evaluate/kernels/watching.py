@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.numba import kernel
+from cavmarl.core.compiled import kernel
 from cavmarl.core.records.arrays import RoadArrays
 
 MIN_SPEED_MPS = 1.0  # of a front that is followed back to where it entered

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import LostTickError, ProtocolError
-from cavmarl.core.numba import kernel_cache_dir
+from cavmarl.core.compiled import sources_digest
 from cavmarl.handoff.coordinator.coordinator import Coordinator
 from cavmarl.handoff.fault_injection.committed_store import CommittedStore
 from cavmarl.handoff.fault_injection.fault_plan import read_faults
@@ -87,7 +87,7 @@ def made_with() -> dict[str, str | None]:
         **{name: _version(name) for name in ("cavmarl", "numpy", "numba")},
         "python": platform.python_version(),
         "machine": platform.machine(),
-        "kernels": kernel_cache_dir().name,
+        "kernels": sources_digest(),
     }
 
 

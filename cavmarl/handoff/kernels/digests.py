@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.math.rng import mix
-from cavmarl.core.numba import inlined_kernel, kernel
+from cavmarl.core.compiled import inlined_kernel, kernel
 
 
 @inlined_kernel

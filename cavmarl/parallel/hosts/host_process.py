@@ -13,7 +13,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -59,7 +58,7 @@ def code_stamp() -> str:
         if not name.startswith("data/"):  # which only a wheel has
             digest.update(name.encode() + b"\0" + source.read_bytes())
     sources = digest.hexdigest()[:12]
-    return f"cavmarl of sources {sources}, numpy {np.__version__}, numba {numba.__version__}"
+    return f"cavmarl of sources {sources}, numpy {np.__version__}"
 
 
 class RemoteJob:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import MessageError
-from cavmarl.core.numba.specialized import specialized
+from cavmarl.core.compiled import specialized
 from cavmarl.parallel.nodes.link import Bytes
 from cavmarl.parallel.step_arrays import StepArrays
 from cavmarl.zones.kernels.agent_frames import UNOWNED, pack_actions, take_actions

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import MessageError, ProtocolError
-from cavmarl.core.numba.specialized import specialized
+from cavmarl.core.compiled import specialized
 from cavmarl.core.records.arrays import Gate
 from cavmarl.handoff.coordinator.coordinator import Coordinator
 from cavmarl.handoff.division import Division

@@ -20,15 +20,11 @@ import time
 from contextlib import suppress
 from typing import Any
 
-import numba.core.config
 import numpy as np
-from llvmlite import ir
-from numba.core import cgutils, types
-from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from cavmarl.core.numba import kernel
-from cavmarl.core.numba.specialized import specialized
+from cavmarl.core.compiled import IS_PLAIN, kernel, specialized
+from cavmarl.core.compiled.intrinsic import intrinsic
 
 Words = NDArray[np.int64]
 
@@ -46,8 +42,6 @@ NAP_S = 100e-6  # that it sleeps between them from then on
 WAKE = b"!"
 
 _PAUSE = {"x86_64": "llvm.x86.sse2.pause", "AMD64": "llvm.x86.sse2.pause"}.get(platform.machine())
-_settings: Any = numba.core.config
-_IS_PYTHON = bool(_settings.DISABLE_JIT)
 
 
 def usable_cores() -> set[int]:
@@ -57,16 +51,8 @@ def usable_cores() -> set[int]:
     return set(range(os.cpu_count() or 1))
 
 
-_external: Any = types.ExternalFunction
-_intrinsic: Any = intrinsic
-_function: Any = cgutils.get_or_insert_function
-_let_others_run = _external("sched_yield", types.int32())
-_core = _external("sched_getcpu", types.int32())
-
-
-@_intrinsic  # type: ignore[untyped-decorator]
-def _load(typing: Any, words: Any, at: Any) -> Any:
-    """`words[at]`, read anew, after all that this thread has written."""
+def _generate_load(typing: Any, words: Any, at: Any) -> Any:
+    from numba.core import types
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         array = context.make_array(signature.args[0])(context, builder, arguments[0])
@@ -76,9 +62,8 @@ def _load(typing: Any, words: Any, at: Any) -> Any:
     return types.int64(words, types.intp), generate
 
 
-@_intrinsic  # type: ignore[untyped-decorator]
-def _store(typing: Any, words: Any, at: Any, value: Any) -> Any:
-    """`words[at] = value`, seen by others after all that was written before."""
+def _generate_store(typing: Any, words: Any, at: Any, value: Any) -> Any:
+    from numba.core import types
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         array = context.make_array(signature.args[0])(context, builder, arguments[0])
@@ -89,17 +74,64 @@ def _store(typing: Any, words: Any, at: Any, value: Any) -> Any:
     return types.void(words, types.intp, types.int64), generate
 
 
-@_intrinsic  # type: ignore[untyped-decorator]
-def _pause(typing: Any) -> Any:
-    """Tell the processor that this is a loop of waiting."""
+def _generate_pause(typing: Any) -> Any:
+    from llvmlite import ir
+    from numba.core import cgutils, types
+
+    get_function: Any = cgutils.get_or_insert_function
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         if _PAUSE is not None:
             nothing = ir.FunctionType(ir.VoidType(), [])
-            builder.call(_function(builder.module, nothing, _PAUSE), [])
+            builder.call(get_function(builder.module, nothing, _PAUSE), [])
         return context.get_dummy_value()
 
     return types.void(), generate
+
+
+def _generate_system_call(name: str) -> Any:
+    """Return a generator of calls to a function of the C library that gives an int32."""
+
+    def generator(typing: Any) -> Any:
+        from llvmlite import ir
+        from numba.core import cgutils, types
+
+        get_function: Any = cgutils.get_or_insert_function
+
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            kind = ir.FunctionType(ir.IntType(32), [])
+            return builder.call(get_function(builder.module, kind, name), [])
+
+        return types.int32(), generate
+
+    return generator
+
+
+@intrinsic(_generate_load)
+def _load(words: Words, at: int) -> int:
+    """Read `words[at]` anew, after all that this thread has written."""
+    return int(words[at])
+
+
+@intrinsic(_generate_store)
+def _store(words: Words, at: int, value: int) -> None:
+    """Set `words[at] = value`, seen by others after all that was written before."""
+    words[at] = value
+
+
+@intrinsic(_generate_pause)
+def _pause() -> None:
+    """Tell the processor that this is a loop of waiting."""
+
+
+@intrinsic(_generate_system_call("sched_yield"))
+def _let_others_run() -> int:
+    return 0
+
+
+@intrinsic(_generate_system_call("sched_getcpu"))
+def _core() -> int:
+    return -1
 
 
 @kernel
@@ -160,7 +192,7 @@ def _plain_look(theirs: Words, number: int, yields: bool) -> bool:
 
 _has, _set, _look, _pass, present_core = (
     (_plain_has, _plain_set, _plain_look, _plain_pass, _plain_core)
-    if _IS_PYTHON
+    if IS_PLAIN
     else (
         specialized(_compiled_has, checks=False),
         specialized(_compiled_set, checks=False),

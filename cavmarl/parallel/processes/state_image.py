@@ -8,13 +8,11 @@ from collections.abc import Iterator, Sequence
 from operator import is_
 from typing import Any, NamedTuple
 
-import numba.core.config
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import WorkerError
-from cavmarl.core.numba import kernel
-from cavmarl.core.numba.specialized import specialized
+from cavmarl.core.compiled import IS_PLAIN, kernel, specialized
 from cavmarl.parallel.processes.shared_memory import Segment
 
 Array = NDArray[Any]
@@ -22,8 +20,6 @@ Arrays = Sequence[Array]
 
 _WORD = 8
 _HEAD = 3  # words: of everything, checksum, how many arrays
-_settings: Any = numba.core.config
-_IS_PYTHON = bool(_settings.DISABLE_JIT)
 
 
 class _Place(NamedTuple):
@@ -57,7 +53,7 @@ class Image:
             self._find_places(arrays)
         for target, source in self._copies:
             target[...] = source
-        if _IS_PYTHON:
+        if IS_PLAIN:
             self._words[1] = _checksum(self._words[2 : self._words.item(0)])
         else:
             self._seal(self._unsigned)
@@ -189,7 +185,7 @@ def _num_same(shapes: Sequence[tuple[int, ...]], places: Sequence[_Place]) -> in
 
 
 def _checksum(words: NDArray[np.int64]) -> int:
-    if _IS_PYTHON:
+    if IS_PLAIN:
         return zlib.crc32(words.data)
     return int(np.uint64(_mixed(words.view(np.uint64))).view(np.int64))
 

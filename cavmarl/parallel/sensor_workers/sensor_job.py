@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.numba.specialized import specialized
+from cavmarl.core.compiled import specialized
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.engine.simulation import Simulation
 from cavmarl.parallel.processes.worker_loop import Job

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.workers import WorkersConfig
 from cavmarl.core.errors import WorkerError
-from cavmarl.core.numba.specialized import specialized
+from cavmarl.core.compiled import specialized
 from cavmarl.parallel.processes.shared_memory import Segment, size_of
 from cavmarl.parallel.processes.worker_pool import Death, Pool, Program
 from cavmarl.parallel.sensor_workers.line_costs import LineCosts

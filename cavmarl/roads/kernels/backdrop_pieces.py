@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.math.neighbors import Grid, cell_columns, cell_rows
-from cavmarl.core.numba import kernel
+from cavmarl.core.compiled import kernel
 from cavmarl.core.records import record
 
 WALL = record(

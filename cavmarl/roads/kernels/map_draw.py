@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cavmarl.core.math.rng import STREAM_MAP, below
-from cavmarl.core.numba import kernel
+from cavmarl.core.compiled import kernel
 
 
 @kernel

@@ -7,14 +7,13 @@ that it is made early and where there is room.
 
 from __future__ import annotations
 
-import heapq
 import math
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.numba import allocating_kernel, kernel
+from cavmarl.core.compiled import kernel
 from cavmarl.core.records.arrays import RoadArrays
 
 LANE_CHANGE_COST_S = 5.0  # what a lane change is worth in travel time on a long lane, s;
@@ -128,7 +127,123 @@ def _settle(
         step["to_go"] = plan[beside]["to_go"]
 
 
-@allocating_kernel
+class _Search(NamedTuple):
+    """What a search keeps of each lane: a binary heap of lanes by cost, then by lane."""
+
+    cost: NDArray[np.float64]  # (L,) of the cheapest way found so far, s
+    heap: NDArray[np.int32]  # (L,) lanes that are found and not settled
+    place: NDArray[np.int32]  # (L,) of a lane in the heap; `_UNSEEN`, or `_SETTLED`
+
+
+_UNSEEN, _SETTLED = -1, -2
+
+
+@kernel
+def _comes_before(search: _Search, one: int, other: int) -> bool:
+    if search.cost[one] != search.cost[other]:
+        return bool(search.cost[one] < search.cost[other])
+    return one < other
+
+
+@kernel
+def _put_up(search: _Search, lane: int, at: int) -> None:
+    """Put a lane into the heap at a place, or above it."""
+    while at > 0:
+        above = search.heap[(at - 1) // 2]
+        if _comes_before(search, above, lane):
+            break
+        search.heap[at] = above
+        search.place[above] = at
+        at = (at - 1) // 2
+    search.heap[at] = lane
+    search.place[lane] = at
+
+
+@kernel
+def _put_down(search: _Search, lane: int, size: int) -> None:
+    """Put a lane into a heap of some size whose first place is empty."""
+    at = 0
+    while True:
+        below = 2 * at + 1
+        if below >= size:
+            break
+        right = below + 1
+        if right < size and _comes_before(search, search.heap[right], search.heap[below]):
+            below = right
+        if _comes_before(search, lane, search.heap[below]):
+            break
+        search.heap[at] = search.heap[below]
+        search.place[search.heap[at]] = at
+        at = below
+    search.heap[at] = lane
+    search.place[lane] = at
+
+
+@kernel
+def _offer(search: _Search, lane: int, cost: float, size: int) -> int:
+    """Note a way from a lane if it is the cheapest so far; return the new size of the heap."""
+    if search.place[lane] == _SETTLED or not cost < search.cost[lane]:
+        return size
+    search.cost[lane] = cost
+    if search.place[lane] == _UNSEEN:
+        _put_up(search, lane, size)
+        return size + 1
+    _put_up(search, lane, search.place[lane])
+    return size
+
+
+@kernel
+def _take_first(search: _Search, size: int) -> int:
+    """Take the cheapest lane out of a heap of some size, and settle it."""
+    first = search.heap[0]
+    if size > 1:
+        _put_down(search, search.heap[size - 1], size - 1)
+    search.place[first] = _SETTLED
+    return int(first)
+
+
+@kernel
+def _search_plan(
+    roads: RoadArrays,
+    goal_edge: int,
+    permission: int,
+    change_weight: float,
+    plan: NDArray[np.void],
+    search: _Search,
+) -> None:
+    for lane in range(roads.lanes.shape[0]):
+        step = plan[lane]
+        step["next"] = -1
+        step["link"] = -1
+        step["change"] = 0
+        step["changes"] = 0
+        step["turnarounds"] = 0
+        step["shift"] = 0
+        step["room"] = 0.0
+        step["to_go"] = math.inf
+    size = 0
+    edge = roads.edges[goal_edge]
+    for lane in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
+        row = roads.lanes[lane]
+        if row["permissions"] & permission:
+            size = _offer(search, lane, row["length_m"] / row["speed_mps"], size)
+    while size > 0:
+        lane = _take_first(search, size)
+        size -= 1
+        here = search.cost[lane]
+        _settle(roads, lane, goal_edge, change_weight, search.cost, plan)
+        row = roads.lanes[lane]
+        for k in range(row["first_into"], row["first_into"] + row["num_into"]):
+            before = roads.into[k]
+            other = roads.lanes[before]
+            if other["permissions"] & permission and _leads_to(roads, before, lane):
+                size = _offer(search, before, here + other["length_m"] / other["speed_mps"], size)
+        for beside in (row["left"], row["right"]):
+            if beside >= 0 and roads.lanes[beside]["permissions"] & permission:
+                reached = here + change_cost(roads, beside, change_weight)
+                size = _offer(search, beside, reached, size)
+
+
 def plan_goal(
     roads: RoadArrays, goal_edge: int, permission: int, change_weight: float, plan: NDArray[np.void]
 ) -> None:
@@ -143,49 +258,9 @@ def plan_goal(
             to_go = inf and next = -1.
     """
     num_lanes = roads.lanes.shape[0]
-    cost = np.full(num_lanes, math.inf)
-    settled = np.zeros(num_lanes, dtype=np.bool_)
-    for lane in range(num_lanes):
-        step = plan[lane]
-        step["next"] = -1
-        step["link"] = -1
-        step["change"] = 0
-        step["changes"] = 0
-        step["turnarounds"] = 0
-        step["shift"] = 0
-        step["room"] = 0.0
-        step["to_go"] = math.inf
-    heap: list[tuple[float, Any]] = [(0.0, -1)]  # tells the compiler the type; -1 is no lane
-    edge = roads.edges[goal_edge]
-    for lane in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
-        row = roads.lanes[lane]
-        if row["permissions"] & permission:
-            cost[lane] = row["length_m"] / row["speed_mps"]
-            heapq.heappush(heap, (cost[lane], lane))
-    while len(heap) > 0:
-        here, lane = heapq.heappop(heap)
-        if lane < 0 or settled[lane]:
-            continue
-        settled[lane] = True
-        _settle(roads, lane, goal_edge, change_weight, cost, plan)
-        row = roads.lanes[lane]
-        for k in range(row["first_into"], row["first_into"] + row["num_into"]):
-            before = roads.into[k]
-            other = roads.lanes[before]
-            if settled[before] or not other["permissions"] & permission:
-                continue
-            if not _leads_to(roads, before, lane):
-                continue
-            reached = here + other["length_m"] / other["speed_mps"]
-            if reached < cost[before]:
-                cost[before] = reached
-                heapq.heappush(heap, (reached, np.int64(before)))
-        for beside in (row["left"], row["right"]):
-            if beside < 0 or settled[beside]:
-                continue
-            if not roads.lanes[beside]["permissions"] & permission:
-                continue
-            reached = here + change_cost(roads, beside, change_weight)
-            if reached < cost[beside]:
-                cost[beside] = reached
-                heapq.heappush(heap, (reached, np.int64(beside)))
+    search = _Search(
+        cost=np.full(num_lanes, math.inf),
+        heap=np.zeros(num_lanes, dtype=np.int32),
+        place=np.full(num_lanes, _UNSEEN, dtype=np.int32),
+    )
+    _search_plan(roads, goal_edge, permission, change_weight, plan, search)

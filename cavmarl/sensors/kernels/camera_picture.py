@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.math.spans import row_span
-from cavmarl.core.numba import kernel
+from cavmarl.core.compiled import kernel
 from cavmarl.sensors.kernels.faces import (
     CameraPose,
     Faces,

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.numba import kernel
+from cavmarl.core.compiled import kernel
 from cavmarl.sensors.kernels.sense import ACCEL_SCALE, SPEED_SCALE, STEERING_SCALE, unit
 
 HISTORY_FEATURES = 3  # of a step

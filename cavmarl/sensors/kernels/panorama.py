@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
-from cavmarl.core.numba import kernel
+from cavmarl.core.compiled import kernel
 from cavmarl.core.records import record
 from cavmarl.roads.kernels.backdrop_pieces import Backdrop, gather_quads, gather_walls
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.math.geometry import TWO_PI
 from cavmarl.core.math.rng import mix, quick_uniform
-from cavmarl.core.numba import kernel
+from cavmarl.core.compiled import kernel
 from cavmarl.core.records import record
 from cavmarl.core.records.arrays import Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT

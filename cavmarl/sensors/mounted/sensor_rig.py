@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.rig import MountedConfig, SampledConfig, cadence
-from cavmarl.core.numba.specialized import specialized
+from cavmarl.core.compiled import specialized
 from cavmarl.sensors.kernels.rig_frames import (
     POSE,
     Due,

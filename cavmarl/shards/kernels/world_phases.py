@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from cavmarl.core.math.neighbors import Grid
 from cavmarl.core.math.scalars import clamp
-from cavmarl.core.numba import inlined_kernel, kernel
-from cavmarl.core.numba.prefetch import SOON, prefetch
+from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.compiled.prefetch import SOON, prefetch
 from cavmarl.core.records.arrays import LaneGrid, RoadArrays, Scratch, Travel, Worlds
 from cavmarl.core.records.codes import (
     ACTION_FASTER,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.math.geometry import project
-from cavmarl.core.numba import kernel
+from cavmarl.core.compiled import kernel
 
 
 @kernel

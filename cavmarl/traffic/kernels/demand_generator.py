@@ -19,7 +19,7 @@ from cavmarl.core.math.rng import (
     below,
     uniform,
 )
-from cavmarl.core.numba import kernel
+from cavmarl.core.compiled import kernel
 from cavmarl.core.records.arrays import Demand, Gate, RoadArrays, Travel, TripTable, Worlds
 from cavmarl.core.records.codes import (
     COUNT_ARRIVED,

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.numba import inlined_kernel, kernel
+from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.records.arrays import Zoned
 from cavmarl.zones.kernels.zone_lookup import ZoneArrays, squared_distance, zone_of
 

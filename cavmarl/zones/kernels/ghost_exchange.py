@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.numba import inlined_kernel, kernel
-from cavmarl.core.numba.prefetch import SOON, prefetch
+from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.compiled.prefetch import SOON, prefetch
 from cavmarl.core.records.arrays import Zoned
 from cavmarl.core.records.codes import DRIVER_BACKGROUND
 from cavmarl.zones.kernels.borders import Borders

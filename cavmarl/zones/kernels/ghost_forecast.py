@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.numba import inlined_kernel
+from cavmarl.core.compiled import inlined_kernel
 from cavmarl.driving.kernels.motion import MAX_SPEED_MPS, STANDING_MPS
 
 # Which words of a VEHICLE record fields are; the lane is in the low half of its word.

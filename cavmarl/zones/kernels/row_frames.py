@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.numba import inlined_kernel, kernel
+from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.records.codes import COUNT_REROUTED
 from cavmarl.zones.kernels.ghost_forecast import Forecast, foresee, is_told
 

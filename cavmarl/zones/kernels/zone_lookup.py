@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.numba import inlined_kernel, kernel
+from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.records.codes import DRIVER_BACKGROUND
 from cavmarl.core.records.rows import MERGES_M
 from cavmarl.driving.kernels.announcing import announced_m, is_let_stand

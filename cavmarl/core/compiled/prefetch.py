@@ -12,34 +12,33 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba.core.config
-from llvmlite import ir
-from numba.core import cgutils, types
-from numba.extending import intrinsic
 from numpy.typing import NDArray
+
+from cavmarl.core.compiled.intrinsic import intrinsic
 
 SOON = 8  # rounds of a loop over vehicles: about as long as memory takes to come
 
-_settings: Any = numba.core.config
-_intrinsic: Any = intrinsic
-_function: Any = cgutils.get_or_insert_function
-_item: Any = cgutils.get_item_pointer
 _FOR_READING, _INTO_ALL_CACHES, _DATA = 0, 3, 1
 _LINE = 64  # bytes
 
 
-@_intrinsic  # type: ignore[untyped-decorator]
-def _compiled_prefetch(typing: Any, array: Any, index: Any, line: Any) -> Any:
+def _generate_prefetch(typing: Any, array: Any, index: Any, line: Any) -> Any:
+    from llvmlite import ir
+    from numba.core import cgutils, types
+
+    get_function: Any = cgutils.get_or_insert_function
+    get_item: Any = cgutils.get_item_pointer
+
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         kind = signature.args[0]
         view = context.make_array(kind)(context, builder, arguments[0])
         at = [context.cast(builder, arguments[1], signature.args[1], types.intp)]
-        record = _item(context, builder, kind, view, at)
+        record = get_item(context, builder, kind, view, at)
         byte, word = ir.IntType(8).as_pointer(), ir.IntType(32)
-        further = builder.mul(arguments[2], arguments[2].type(_LINE))
-        place = builder.gep(builder.bitcast(record, byte), [further])
-        signature_ir = ir.FunctionType(ir.VoidType(), [byte, word, word, word])
-        call = _function(builder.module, signature_ir, "llvm.prefetch")
+        offset = builder.mul(arguments[2], arguments[2].type(_LINE))
+        place = builder.gep(builder.bitcast(record, byte), [offset])
+        function_type = ir.FunctionType(ir.VoidType(), [byte, word, word, word])
+        call = get_function(builder.module, function_type, "llvm.prefetch")
         how = [word(value) for value in (_FOR_READING, _INTO_ALL_CACHES, _DATA)]
         builder.call(call, [place, *how])
         return context.get_dummy_value()
@@ -47,9 +46,6 @@ def _compiled_prefetch(typing: Any, array: Any, index: Any, line: Any) -> Any:
     return types.void(array, index, line), generate
 
 
-def _plain_prefetch(array: NDArray[Any], index: int, line: int) -> None:
-    pass
-
-
-prefetch = _plain_prefetch if _settings.DISABLE_JIT else _compiled_prefetch
-"""`prefetch(array, i, n)`: software prefetch of the nth cache line of record i of a (N,) array."""
+@intrinsic(_generate_prefetch)
+def prefetch(array: NDArray[Any], index: int, line: int) -> None:
+    """Prefetch cache line `line` of record `index` of a (N,) array."""

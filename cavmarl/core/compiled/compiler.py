@@ -20,16 +20,18 @@ from __future__ import annotations
 
 import gc
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
+import numba
 from llvmlite import ir
-from llvmlite.binding import Linkage, ModuleRef, parse_assembly
+from llvmlite.binding import ModuleRef, Target, get_process_triple
 from numba.core.cgutils import alloca_once_value, gep_inbounds
 from numba.core.codegen import CodeLibrary, JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder, Flags
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.compiler_machinery import register_pass
 from numba.core.datamodel.models import TupleModel
 from numba.core.datamodel.registry import default_manager
@@ -37,9 +39,12 @@ from numba.core.ir import Assign
 from numba.core.lowering import Lower
 from numba.core.registry import CPUDispatcher
 from numba.core.typed_passes import InlineOverloads, NativeLowering, NopythonRewrites
-from numba.core.types import IntegerLiteral, NamedTuple, int32, intp
+from numba.core.types import IntegerLiteral, NamedTuple, float64, int32, intp
 from numba.core.untyped_passes import InlineClosureLikes, InlineInlinables
 from numba.np import arrayobj
+
+from cavmarl.core.compiled.entry_point import EntryPoint, result_text
+from cavmarl.core.compiled.store import CompiledKernel
 
 # Passes that look for what no kernel without arrays of its own has: array expressions, ...
 _NEEDLESS = {InlineClosureLikes, InlineInlinables, InlineOverloads, NopythonRewrites}
@@ -160,6 +165,10 @@ class _KernelLower(_Lower):  # type: ignore[misc]
                 return self._read(bundle.operands[0], kind.fields.index(expr.attr), resty)
         return super().lower_expr(resty, expr)
 
+    def create_cpython_wrapper(self, release_gil: bool = False) -> None:
+        """Make the entry point for calls from Python, in the place of Numba's wrapper."""
+        self.library.add_ir_module(EntryPoint(self.context, self.fndesc, _ENTRY).module)
+
     def _read(self, address: Any, place: int, kind: Any) -> Any:
         """A field of a bundle, once for all its uses, when the function begins."""
         if (address, place) not in self._fields:
@@ -195,21 +204,14 @@ class _KernelLower(_Lower):  # type: ignore[misc]
 
 
 _Library: Any = JITCodeLibrary
-_LOCAL = (Linkage.internal, Linkage.private)  # what other modules do not see
+_ENTRY = "cavmarl_entry"  # the entry point of a kernel, until its object is written
 
 
 class _Whole(_Library):  # type: ignore[misc]
-    """The code of a kernel that Python calls, with that of all kernels below it in one module."""
-
-    counts = True  # references
-
-    def finalize(self) -> None:
-        """Link all, and optimise it at once."""
-        self._own = {function.name for function in self.get_defined_functions()}
-        super().finalize()
+    """A kernel that Python calls, linked with all kernels below it into one module."""
 
     def add_linking_library(self, library: CodeLibrary) -> None:
-        """Link what is called; of a part, also what that one calls."""
+        """Link a library; for a part, also the libraries that it calls."""
         if not isinstance(library, _Part):
             super().add_linking_library(library)
         elif library not in self._linking_libraries:
@@ -218,36 +220,36 @@ class _Whole(_Library):  # type: ignore[misc]
                 self.add_linking_library(called)
 
     def _optimize_functions(self, module: ModuleRef) -> None:
-        if self.counts:
-            super()._optimize_functions(module)
-        else:
-            module.data_layout = self._codegen._data_layout
+        module.data_layout = self._codegen._data_layout
 
     def _optimize_final_module(self) -> None:
         for function in self.get_defined_functions():
-            if function.name not in self._own:
+            if function.name != _ENTRY:
                 function.linkage = "internal"
         super()._optimize_final_module()
 
-    def serialize_using_object_code(self) -> tuple[str, str, tuple[bytes, bytes]]:
-        """For the disk: the machine code, and in the place of LLVM's the names that it defines.
+    def _finalize_final_module(self) -> None:
+        """Leave the module out of Numba's engine, which runs it: only its object code is needed."""
+        self._finalized = True
 
-        Numba keeps both, and has both in memory as long as the process lives; but no kernel links
-        one that was kept (`call_as_part`).
-        """
-        module = self._final_module
-        names = [
-            f'define void @"{function.name}"() {{ unreachable }}'
-            for function in self.get_defined_functions()
-            if function.linkage not in _LOCAL
-        ]
-        names += [
-            f'@"{value.name}" = global i8 0'
-            for value in module.global_variables
-            if not value.is_declaration and value.linkage not in _LOCAL
-        ]
-        stub: Any = parse_assembly("\n".join(names))
-        return self.name, "object", (self._get_compiled_object(), stub.as_bitcode())
+    def emit_object(self, symbol: str) -> bytes:
+        """Return the machine code as a relocatable ELF object that defines one symbol."""
+        self.finalize()
+        self._final_module.get_function(_ENTRY).name = symbol
+        code: bytes = _position_independent(self._codegen).emit_object(self._final_module)
+        return code
+
+
+@cache
+def _position_independent(codegen: Any) -> Any:
+    """Return a target machine whose code can lie anywhere, and so in a shared library."""
+    return Target.from_triple(get_process_triple()).create_target_machine(
+        cpu=codegen._get_host_cpu_name(),
+        features=codegen._tm_features,
+        opt=3,
+        reloc="pic",
+        codemodel="default",
+    )
 
 
 class _Part(_Library):  # type: ignore[misc]
@@ -282,16 +284,14 @@ class _KernelLowering(NativeLowering):
         is_part = flags.no_cpython_wrapper
         library = _Part if is_part else _Whole
         state.library = library(state.targetctx.codegen(), state.func_id.func_qualname)
-        state.library.enable_object_caching()
-        state.library.counts = flags.nrt
-        flags.no_compile = is_part
+        flags.no_compile = True
         lower: Any = super().run_pass
-        with nullcontext() if flags.nrt else _from_the_front():
+        with _from_the_front():
             done = bool(lower(state))
+        key, lowered = object(), state["cr"]
         if is_part:
-            key, lowered = object(), state["cr"]
             state.targetctx.insert_user_function(key, lowered.fndesc, [state.library])
-            state["cr"] = lowered._replace(cfunc=key)
+        state["cr"] = lowered._replace(cfunc=key)
         return done
 
 
@@ -354,6 +354,7 @@ class KernelCompiler(_Compiler):  # type: ignore[misc]
 
 
 _Dispatcher: Any = CPUDispatcher
+_compiler_lock: Any = global_compiler_lock
 
 
 def _widened(kind: Any) -> Any:
@@ -364,7 +365,7 @@ def _widened(kind: Any) -> Any:
 
 
 class _PartDispatcher(_Dispatcher):  # type: ignore[misc]
-    """Compiles a kernel for its callers; Python cannot call what comes out."""
+    """Compiles a kernel for the kernels that call it."""
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """Do not compile it once more for another kind of whole number."""
@@ -376,16 +377,55 @@ class _PartDispatcher(_Dispatcher):  # type: ignore[misc]
         self.overloads[tuple(result.signature.args)] = result
 
 
-def call_as_part(kernel: Any) -> None:
-    """Let other kernels take in the code of this one, and not what Python calls."""
+_OPTIONS = {
+    "nopython": True,
+    "fastmath": False,
+    "parallel": False,
+    "nogil": True,
+    "error_model": "numpy",
+    "no_cfunc_wrapper": True,
+    "_nrt": False,
+}
 
-    @cache
-    def part() -> Any:
-        return _PartDispatcher(
-            kernel.py_func,
-            targetoptions={**kernel.targetoptions, "no_cpython_wrapper": True},
-            pipeline_class=KernelCompiler,
-        )
 
-    kernel.get_call_template = lambda args, kws: part().get_call_template(args, kws)
-    kernel.get_overload = lambda signature: part().get_overload(signature)
+def make_part(function: Callable[..., Any], is_inlined: bool) -> Any:
+    """Return what Numba takes for a kernel that is called in other kernels."""
+    options = {**_OPTIONS, "no_cpython_wrapper": True, "forceinline": is_inlined}
+    return _PartDispatcher(function, targetoptions=options, pipeline_class=KernelCompiler)
+
+
+def compile_kernel(
+    function: Callable[..., Any], arguments: Sequence[Any], symbol: str
+) -> CompiledKernel:
+    """Compile a kernel for the types of some arguments.
+
+    Args:
+        function: the Python function.
+        arguments: only their types count.
+        symbol: name of the entry point, see `entry_point`.
+
+    Raises:
+        numba.core.errors.NumbaError: Numba cannot compile the function.
+    """
+    typeof: Any = numba.typeof
+    kinds = tuple(map(typeof, arguments))
+    whole: Any = _Dispatcher(function, targetoptions=dict(_OPTIONS), pipeline_class=KernelCompiler)
+    with _compiler_lock:
+        whole.typingctx.refresh()
+        whole.targetctx.refresh()
+        compiled = whole._compiler.compile(kinds, None)
+        result = result_text(compiled.signature.return_type)
+        return CompiledKernel(symbol, result, compiled.library.emit_object(symbol))
+
+
+def compile_callback(function: Callable[..., Any], num_numbers: int) -> Any:
+    """Compile a function that takes and returns float64, for kernels that call it by address.
+
+    Returns:
+        An object with an `address`, which holds as long as the object lives.
+
+    Raises:
+        numba.core.errors.NumbaError: Numba cannot compile the function.
+    """
+    cfunc: Any = numba.cfunc
+    return cfunc(float64(*(float64,) * num_numbers), error_model="numpy")(function)

@@ -1,0 +1,278 @@
+"""The arguments of a compiled kernel: their types as text, and the 64-bit words that carry them.
+
+A compiled kernel is entered with the address of an array of words (`entry_point.py`). A number
+takes one word, an array the address of its Python object, a record the address of its data, a
+tuple or a bundle the words of its items in order, and `None` no word. The result follows in the
+words behind the arguments.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from functools import cache
+from itertools import repeat
+from typing import Any
+
+import numpy as np
+
+# Bits of `flags.num` that are part of the type of an array.
+_C, _F, _ALIGNED, _WRITEABLE = 0x1, 0x2, 0x100, 0x400
+_TYPED = _C | _F | _ALIGNED | _WRITEABLE
+# Of an array that is contiguous in both orders, as one with a single item, the first order counts.
+_FLAGS = {bits: bits & ~_F if bits & _C else bits for bits in range(_TYPED + 1)}
+_SIGNED_LIMIT = 1 << 63
+_VOID_DATA = tuple.__basicsize__  # offset of the data pointer in a NumPy record: after its head
+
+
+class Words:
+    """Memory for the arguments and the result of one call, viewed as integers and as floats."""
+
+    __slots__ = ("address", "floats", "last", "signed", "unsigned")
+
+    def __init__(self, count: int) -> None:
+        memory = np.zeros(max(count, 1), dtype=np.int64)
+        self.address: int = memory.ctypes.data
+        self.signed = memoryview(memory)
+        as_bytes = self.signed.cast("B")
+        self.floats = as_bytes.cast("d")
+        self.unsigned = as_bytes.cast("Q")
+        self.last: tuple[Any, ...] = ()  # the arguments that these words hold
+
+
+class ArgumentType:
+    """The type of one argument.
+
+    Attributes:
+        text: the type as text, the same in each process.
+        count: words that an argument takes.
+    """
+
+    __slots__ = ("count", "key", "text")
+
+    def __init__(self, key: Any, text: str, count: int = 1) -> None:
+        self.key = key  # what `type_key` returns for arguments of this type
+        self.text = text
+        self.count = count
+
+    def fits(self, new: Any, last: Any = None) -> bool:
+        """Return whether an argument has this type; of `last`, if there is one, it is known."""
+        return bool(type_of(new).text == self.text)
+
+    def write(self, words: Words, at: int, new: Any) -> None:
+        """Store an argument in the words from `at` on."""
+        raise NotImplementedError
+
+    def update(self, words: Words, at: int, new: Any, last: Any) -> None:
+        """Store an argument in words that hold `last`."""
+        self.write(words, at, new)
+
+
+class _NoneType(ArgumentType):
+    __slots__ = ()
+
+    def write(self, words: Words, at: int, new: Any) -> None:
+        """`None` takes no word."""
+
+
+class _Signed(ArgumentType):
+    __slots__ = ()
+
+    def write(self, words: Words, at: int, new: Any) -> None:
+        words.signed[at] = int(new)
+
+
+class _Unsigned(ArgumentType):
+    __slots__ = ()
+
+    def write(self, words: Words, at: int, new: Any) -> None:
+        words.unsigned[at] = int(new)
+
+
+class _Float(ArgumentType):
+    __slots__ = ()
+
+    def write(self, words: Words, at: int, new: Any) -> None:
+        words.floats[at] = new
+
+
+class _Array(ArgumentType):
+    __slots__ = ()
+
+    def fits(self, new: Any, last: Any = None) -> bool:
+        if type(new) is not np.ndarray:
+            return False
+        dtype, ndim, flags = self.key
+        return (
+            (new.dtype is dtype or new.dtype == dtype)
+            and new.ndim == ndim
+            and new.flags.num & flags == flags
+        )
+
+    def write(self, words: Words, at: int, new: Any) -> None:
+        words.signed[at] = id(new)
+
+
+class _Record(ArgumentType):
+    __slots__ = ()
+
+    def write(self, words: Words, at: int, new: Any) -> None:
+        words.signed[at] = ctypes.c_int64.from_address(id(new) + _VOID_DATA).value
+
+
+class _Tuple(ArgumentType):
+    """A tuple, or a bundle: a named tuple of arrays and numbers."""
+
+    __slots__ = ("_items", "_offsets", "_python")
+
+    def __init__(self, key: Any, python: type[Any], items: tuple[ArgumentType, ...]) -> None:
+        name = "" if python is tuple else f"{python.__module__}.{python.__qualname__}"
+        text = f"{name}({','.join(item.text for item in items)})"
+        super().__init__(key, text, sum(item.count for item in items))
+        self._python = python
+        self._items = items
+        self._offsets = offsets_of(items)
+
+    def fits(self, new: Any, last: Any = None) -> bool:
+        return (
+            type(new) is self._python
+            and len(new) == len(self._items)
+            and all(
+                value is known or item.fits(value, known)
+                for item, value, known in zip(
+                    self._items, new, repeat(None) if last is None else last, strict=False
+                )
+            )
+        )
+
+    def write(self, words: Words, at: int, new: Any) -> None:
+        for item, offset, value in zip(self._items, self._offsets, new, strict=True):
+            item.write(words, at + offset, value)
+
+    def update(self, words: Words, at: int, new: Any, last: Any) -> None:
+        for item, offset, value, known in zip(self._items, self._offsets, new, last, strict=True):
+            if value is not known:
+                item.update(words, at + offset, value, known)
+
+
+def offsets_of(types: tuple[ArgumentType, ...]) -> tuple[int, ...]:
+    """Return the first word of each argument."""
+    offsets, at = [], 0
+    for kind in types:
+        offsets.append(at)
+        at += kind.count
+    return tuple(offsets)
+
+
+_NUMBERS: dict[type[Any], tuple[type[ArgumentType], str]] = {
+    bool: (_Signed, "bool"),
+    np.bool_: (_Signed, "bool"),
+    float: (_Float, "float64"),
+    np.float64: (_Float, "float64"),
+    np.float32: (_Float, "float32"),
+    np.uint64: (_Unsigned, "uint64"),
+    **{
+        kind: (_Signed, np.dtype(kind).name)
+        for kind in (np.int8, np.int16, np.int32, np.int64, np.uint8, np.uint16, np.uint32)
+    },
+}
+
+
+def type_key(argument: Any) -> Any:
+    """Return a value that is equal for two arguments exactly if their types are."""
+    python = type(argument)
+    if python is np.ndarray:
+        return argument.dtype, argument.ndim, _FLAGS[argument.flags.num & _TYPED]
+    if python is int:
+        return -_SIGNED_LIMIT <= argument < _SIGNED_LIMIT
+    if issubclass(python, tuple):
+        return python, *map(type_key, argument)
+    if python is np.void:
+        return argument.dtype
+    return python
+
+
+_TYPES: dict[Any, ArgumentType] = {}
+
+
+def type_of(argument: Any) -> ArgumentType:
+    """Return the type of an argument.
+
+    Raises:
+        TypeError: kernels take no such argument.
+    """
+    key = type_key(argument)
+    found = _TYPES.get(key)
+    if found is None:
+        found = _TYPES[key] = _make_type(argument, key)
+    return found
+
+
+def _make_type(argument: Any, key: Any) -> ArgumentType:
+    python = type(argument)
+    if python is np.ndarray:
+        return _Array(key, _array_text(*key))
+    if python is int:
+        return _Signed(key, "int64") if key else _Unsigned(key, "uint64")
+    if issubclass(python, tuple):
+        return _Tuple(key, python, tuple(map(type_of, argument)))
+    if python is np.void:
+        return _Record(key, _dtype_text(argument.dtype))
+    if argument is None:
+        return _NoneType(key, "none", 0)
+    if python in _NUMBERS:
+        kind, text = _NUMBERS[python]
+        return kind(key, text)
+    raise TypeError(
+        f"a kernel got an argument of {python.__module__}.{python.__qualname__}: pass NumPy "
+        "arrays, numbers, None, or tuples of these"
+    )
+
+
+def _array_text(dtype: np.dtype[Any], ndim: int, flags: int) -> str:
+    """Describe the type of an array: items, dimensions, layout in memory."""
+    layout = "C" if flags & _C else "F" if flags & _F else "A"
+    extra = "" if flags & _WRITEABLE else " readonly"
+    extra += "" if flags & _ALIGNED else " unaligned"
+    return f"{_dtype_text(dtype)}[{ndim}{layout}{extra}]"
+
+
+@cache
+def _dtype_text(dtype: np.dtype[Any]) -> str:
+    if dtype.fields is None:
+        if dtype.subdtype is not None:
+            items, shape = dtype.subdtype
+            return f"{_dtype_text(items)}{list(shape)}"
+        return dtype.str
+    fields = ";".join(
+        f"{name}:{_dtype_text(dtype.fields[name][0])}@{dtype.fields[name][1]}"
+        for name in dtype.names or ()
+    )
+    return f"{{{fields}|{dtype.itemsize}}}"
+
+
+def result_reader(text: str, at: int) -> tuple[int, Callable[[Words], Any]]:
+    """Return how many words a result takes, and a function that reads it.
+
+    Args:
+        text: the type of the result, as `entry_point.result_text` describes it: `none`, `bool`,
+            `signed`, `unsigned`, `float`, or several of these, each with a comma, for a tuple.
+        at: the first word of the result.
+    """
+    if text == "none":
+        return 0, lambda words: None
+    if "," not in text:
+        return 1, _word_reader(text, at)
+    names = text.split(",")[:-1]
+    readers = [_word_reader(name, at + k) for k, name in enumerate(names)]
+    return len(names), lambda words: tuple([read(words) for read in readers])
+
+
+def _word_reader(name: str, at: int) -> Callable[[Words], Any]:
+    if name == "float":
+        return lambda words: words.floats[at]
+    if name == "bool":
+        return lambda words: words.signed[at] != 0
+    if name == "unsigned":
+        return lambda words: words.unsigned[at]
+    return lambda words: words.signed[at]

@@ -1,0 +1,45 @@
+"""Functions that kernels call and that are written in LLVM's instructions, not in Python."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import update_wrapper
+from typing import Any
+
+
+class Intrinsic:
+    """A function that is plain Python for Python, and generated code for compiled kernels.
+
+    Numba asks a global value for `_numba_type_`; so Numba is imported only to compile.
+    """
+
+    def __init__(self, plain: Callable[..., Any], generate: Callable[..., Any]) -> None:
+        update_wrapper(self, plain)
+        self._plain = plain
+        self._generate = generate
+        self._type: Any = None
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self._plain(*arguments)
+
+    @property
+    def _numba_type_(self) -> Any:
+        if self._type is None:
+            from numba.core import types
+            from numba.core.typing.templates import make_intrinsic_template
+
+            make: Any = make_intrinsic_template
+            function: Any = types.Function
+            self._type = function(make(self, self._generate, self._plain.__name__))
+        return self._type
+
+
+def intrinsic(generate: Callable[..., Any]) -> Callable[[Callable[..., Any]], Any]:
+    """Decorate the plain Python form of an intrinsic.
+
+    Args:
+        generate: called with Numba's typing context and the types of the arguments; returns the
+            signature and a function that generates code, as for `numba.extending.intrinsic`. It
+            imports what it needs of Numba and llvmlite itself.
+    """
+    return lambda plain: Intrinsic(plain, generate)

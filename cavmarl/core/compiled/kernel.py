@@ -1,0 +1,199 @@
+"""`Kernel`: a compiled function, called from Python or by other kernels."""
+
+from __future__ import annotations
+
+import inspect
+import os
+from collections.abc import Callable
+from functools import cached_property, update_wrapper
+from operator import is_
+from typing import Any, ParamSpec, TypeVar
+
+from cavmarl.core.compiled.arguments import (
+    ArgumentType,
+    Words,
+    offsets_of,
+    result_reader,
+    type_key,
+    type_of,
+)
+from cavmarl.core.compiled.code import find_code
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def is_on(name: str) -> bool:
+    """Return whether an environment variable of Numba's is switched on."""
+    return os.environ.get(name, "0") not in ("", "0")
+
+
+IS_PLAIN = is_on("NUMBA_DISABLE_JIT")  # kernels are plain Python functions
+CHECKS_INDICES = is_on("NUMBA_BOUNDSCHECK")
+
+
+class Kernel:
+    """A compiled function, for any argument types.
+
+    Each call finds out the types of all arguments; `specialized` saves that.
+    """
+
+    def __init__(self, function: Callable[..., Any], is_inlined: bool) -> None:
+        update_wrapper(self, function)
+        self.py_func = function
+        self._is_inlined = is_inlined
+        self._calls: dict[Any, Call] = {}
+
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
+        """Call the kernel.
+
+        Raises:
+            TypeError: a kernel takes no such arguments.
+            KernelError: the kernel has to be compiled, and may or can not be.
+        """
+        if named or len(arguments) != self._arity:
+            arguments = self._bind(arguments, named)
+        return self.call_for(arguments)(arguments)
+
+    def call_for(self, arguments: tuple[Any, ...]) -> Call:
+        """Return the kernel for the types of some arguments; it is compiled if need be."""
+        key = tuple(map(type_key, arguments))
+        call = self._calls.get(key)
+        if call is None:
+            call = self._calls[key] = Call(self.py_func, arguments)
+        return call
+
+    @cached_property
+    def _arity(self) -> int:
+        return len(self._signature.parameters)
+
+    @cached_property
+    def _signature(self) -> inspect.Signature:
+        return inspect.signature(self.py_func)
+
+    def _bind(self, arguments: tuple[Any, ...], named: dict[str, Any]) -> tuple[Any, ...]:
+        bound = self._signature.bind(*arguments, **named)
+        bound.apply_defaults()
+        return bound.args
+
+    @cached_property
+    def _part(self) -> Any:
+        from cavmarl.core.compiled.compiler import make_part
+
+        return make_part(self.py_func, self._is_inlined)
+
+    @property
+    def _numba_type_(self) -> Any:
+        """The kernel as Numba sees it while it compiles a kernel that calls this one."""
+        return self._part._numba_type_
+
+
+class Call:
+    """A kernel for arguments of certain types."""
+
+    __slots__ = ("enter", "name", "num_words", "offsets", "read_result", "types", "words")
+
+    def __init__(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
+        self.name = function.__name__
+        self.types: tuple[ArgumentType, ...] = tuple(map(type_of, arguments))
+        self.offsets = offsets_of(self.types)
+        code = find_code(function, arguments, self.types)
+        self.enter = code.enter
+        count = sum(kind.count for kind in self.types)
+        results, self.read_result = result_reader(code.result, count)
+        self.num_words = count + results
+        self.words: list[Words] = []  # that no call uses now; each thread takes its own
+
+    def __call__(self, arguments: tuple[Any, ...]) -> Any:
+        """Call with arguments that have these types; nothing refers to them afterwards."""
+        try:
+            words = self.words.pop()
+        except IndexError:
+            words = Words(self.num_words)
+        for kind, at, argument in zip(self.types, self.offsets, arguments, strict=True):
+            kind.write(words, at, argument)
+        if status := self.enter(words.address):
+            raise self.error(status)
+        result = self.read_result(words)
+        self.words.append(words)
+        return result
+
+    def check(self, kind: ArgumentType, new: Any, last: Any = None) -> None:
+        """Raise TypeError for an argument of another type than `last`, which has `kind`."""
+        if not kind.fits(new, last):
+            raise TypeError(
+                f"{self.name}: an argument has the type {type_of(new).text}, but had "
+                f"{kind.text} in the first call; make another specialized kernel for it"
+            )
+
+    def error(self, status: int) -> Exception:
+        """Return the error for a status: only kernels that check their indices have one."""
+        return IndexError(f"{self.name}: an index is out of bounds (status {status})")
+
+
+def specialized(kernel: Callable[P, R], checks: bool = True) -> Callable[P, R]:
+    """Return a kernel for one caller whose arguments have the same types in every call.
+
+    The types are those of the first call. A later call stores only the arguments, and items of
+    bundles, that are not the same objects as in the call before; for that, a call keeps its
+    arguments until the next one. An argument of another type is a TypeError. Without `checks`,
+    types are not compared: for loops in which one process waits for another, and for frames, whose
+    few callers see to the types.
+
+    With `NUMBA_DISABLE_JIT=1` this is the kernel itself.
+    """
+    if not isinstance(kernel, Kernel):
+        return kernel
+    call: Any = _Specialized(kernel, checks)
+    return call  # type: ignore[no-any-return]
+
+
+class _Specialized:
+    __slots__ = ("_call", "_checks", "_kernel", "_words")
+
+    def __init__(self, kernel: Kernel, checks: bool) -> None:
+        self._kernel = kernel
+        self._checks = checks
+        self._call: Call | None = None
+        self._words: list[Words] = []
+
+    def __call__(self, *arguments: Any) -> Any:
+        try:
+            words = self._words.pop()
+        except IndexError:
+            words = self._first_words(arguments)
+        last = words.last
+        call: Any = self._call
+        if not all(map(is_, arguments, last)) or len(arguments) != len(last):
+            self._update(words, arguments)
+        if status := call.enter(words.address):
+            raise call.error(status)
+        result = call.read_result(words)
+        self._words.append(words)
+        return result
+
+    def _first_words(self, arguments: tuple[Any, ...]) -> Words:
+        """Return new words that hold these arguments."""
+        call = self._call
+        if call is None:
+            call = self._call = self._kernel.call_for(arguments)
+        words = Words(call.num_words)
+        for kind, at, new in zip(call.types, call.offsets, arguments, strict=True):
+            if self._checks:
+                call.check(kind, new)
+            kind.write(words, at, new)
+        words.last = arguments
+        return words
+
+    def _update(self, words: Words, arguments: tuple[Any, ...]) -> None:
+        """Store the arguments that have changed; on an error the words are not used again."""
+        call: Any = self._call
+        for kind, at, new, last in zip(
+            call.types, call.offsets, arguments, words.last, strict=True
+        ):
+            if new is last:
+                continue
+            if self._checks:
+                call.check(kind, new, last)
+            kind.update(words, at, new, last)
+        words.last = arguments

@@ -1,0 +1,70 @@
+"""The sources of compiled kernels: a kernel's code is valid for the content of these files.
+
+Numba watches only the file that defines a function. A kernel's code also holds the kernels that it
+calls, so its digest covers each file of kernels that its file imports, directly or not.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from functools import cache
+from pathlib import Path
+
+# Every import of one file of kernels by another; a test holds that there is no other form of it.
+_IMPORT = re.compile(rb"^from cavmarl\.([\w.]+) import ", re.MULTILINE)
+_PACKAGE = Path(__file__).parents[2]
+_COMPILED = "core.compiled"
+# Files of that folder that decide about the code of all kernels; the others call what is compiled.
+_SHARED = tuple(f"{_COMPILED}.{name}" for name in ("arguments", "compiler", "entry_point"))
+_PARTS = (*_SHARED, f"{_COMPILED}.prefetch")
+
+
+@cache
+def kernel_sources() -> dict[str, bytes]:
+    """Return the content of each file of kernels, by its dotted name within the package."""
+    folders = (*_PACKAGE.rglob("kernels"), _PACKAGE / "core" / "math", _PACKAGE / "core" / "records")
+    paths = [path for folder in folders for path in folder.glob("*.py")]
+    paths += [_PACKAGE.joinpath(*name.split(".")).with_suffix(".py") for name in _PARTS]
+    return {_name_of(path): path.read_bytes() for path in paths}
+
+
+@cache
+def sources_digest() -> str:
+    """Return a digest of all kernel sources."""
+    return _digest_of(kernel_sources())
+
+
+@cache
+def module_digest(module: str) -> str:
+    """Return the digest of the sources that a module's kernels are made of.
+
+    For a module outside of the package this is the digest of all kernel sources, with the content
+    of the module's own file.
+    """
+    sources = kernel_sources()
+    name = module.removeprefix("cavmarl.")
+    if name not in sources:
+        return sources_digest()
+    found, to_read = set(_SHARED), [name]
+    while to_read:
+        name = to_read.pop()
+        if name not in found:
+            found.add(name)
+            imported = [other.decode() for other in _IMPORT.findall(sources[name])]
+            to_read += [
+                other for other in imported if other in _PARTS or not other.startswith(_COMPILED)
+            ]
+    return _digest_of({name: sources[name] for name in found})
+
+
+def _name_of(path: Path) -> str:
+    parts = path.relative_to(_PACKAGE).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def _digest_of(sources: dict[str, bytes]) -> str:
+    digest = hashlib.sha256()
+    for name, content in sorted(sources.items()):
+        digest.update(f"{name}.py".encode() + b"\0" + content)
+    return digest.hexdigest()[:16]

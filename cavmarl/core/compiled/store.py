@@ -1,0 +1,127 @@
+"""Compiled kernels on disk: one file for each kernel and list of argument types.
+
+A file's name holds a digest of everything that its machine code depends on, so a file is either
+right or never looked at. Its content is verified by a checksum before it is used; a damaged file
+is compiled again. Files are written whole, so processes that compile one kernel at the same time
+do no harm.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import marshal
+import os
+from collections.abc import Callable
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from cavmarl.core.cache_folder import cache_dir, tell_unwritable
+from cavmarl.core.compiled.sources import module_digest
+from cavmarl.core.whole_file import write_whole
+
+SUFFIX = ".kernel"
+_DIGEST_BYTES = 32
+_CONSTANTS = (bool, int, float, str, bytes, type(None))
+
+
+class CompiledKernel(NamedTuple):
+    """The machine code of a kernel for one list of argument types."""
+
+    symbol: str  # name of the entry point, the only symbol that the code defines
+    result: str  # type of the result, see `arguments.result_reader`
+    code: bytes  # a relocatable ELF object
+
+
+class KernelFile:
+    """The file of one kernel for one list of argument types.
+
+    Attributes:
+        symbol: name for the entry point of this kernel.
+    """
+
+    def __init__(self, function: Callable[..., Any], types: str) -> None:
+        module, name = function.__module__, function.__qualname__
+        self._frozen = _frozen_values(function)
+        parts = (module, name, repr(function.__code__.co_firstlineno), types, *_machine())
+        digest = hashlib.sha256("\0".join((*parts, self._frozen or "")).encode()).hexdigest()[:32]
+        self.symbol = f"cavmarl_{digest}"
+        folder = cache_dir() / "kernels" / module_digest(module)
+        readable = name.rpartition(".")[2].strip("<>")
+        self._path = folder / f"{readable}.{digest}{SUFFIX}"
+
+    def load(self) -> CompiledKernel | None:
+        """Return the kernel; None if there is no file, or a damaged one."""
+        if self._frozen is None:
+            return None
+        try:
+            content = self._path.read_bytes()
+        except OSError:
+            return None
+        return unpack(content)
+
+    def save(self, kernel: CompiledKernel) -> None:
+        """Write the file; if that is impossible, say so once and go on."""
+        if self._frozen is None:
+            return
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(self._path, pack(kernel))
+        except OSError as error:
+            tell_unwritable(error)
+
+
+def pack(kernel: CompiledKernel) -> bytes:
+    """Return the content of a kernel's file: checksum, symbol, type of the result, code."""
+    body = f"{kernel.symbol}\n{kernel.result}\n".encode() + kernel.code
+    return hashlib.sha256(body).digest() + body
+
+
+def unpack(content: bytes) -> CompiledKernel | None:
+    """Return what `pack` has written, or None where the content is damaged."""
+    body = content[_DIGEST_BYTES:]
+    if hashlib.sha256(body).digest() != content[:_DIGEST_BYTES]:
+        return None
+    symbol, result, code = body.split(b"\n", 2)
+    return CompiledKernel(symbol.decode(), result.decode(), code)
+
+
+@cache
+def _machine() -> tuple[str, ...]:
+    """Describe what the machine code depends on beside the sources: compiler and processor."""
+    from llvmlite import binding
+
+    processor = os.environ.get("NUMBA_CPU_NAME") or binding.get_host_cpu_name()
+    features = os.environ.get("NUMBA_CPU_FEATURES") or binding.get_host_cpu_features().flatten()
+    settings = [f"{name}={os.environ.get(name, '')}" for name in ("NUMBA_BOUNDSCHECK", "NUMBA_OPT")]
+    return (numba_version(), processor, features, *settings)
+
+
+@cache
+def numba_version() -> str:
+    """Return the version of Numba that is installed; empty: none."""
+    try:
+        return version("numba")
+    except PackageNotFoundError:
+        return ""
+
+
+def _frozen_values(function: Callable[..., Any]) -> str | None:
+    """Describe what a kernel of a module outside of the package was compiled with.
+
+    Numba turns closure variables into constants. None: one of them cannot be described, so this
+    kernel is not kept.
+    """
+    if function.__module__.startswith("cavmarl."):
+        return ""
+    try:
+        source = Path(function.__code__.co_filename).read_bytes()
+    except OSError:  # a notebook, or a string that was run
+        source = marshal.dumps(function.__code__)
+    values = []
+    for cell in function.__closure__ or ():
+        if not isinstance(cell.cell_contents, _CONSTANTS):
+            return None
+        values.append(repr(cell.cell_contents))
+    return hashlib.sha256(source).hexdigest() + ",".join(values)

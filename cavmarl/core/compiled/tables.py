@@ -1,0 +1,45 @@
+"""Tables of addresses that compiled kernels read by name, and that Python fills."""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+
+class AddressTable:
+    """A table that kernels know by its symbol.
+
+    Each place from which kernels are loaded has a copy of its own: LLVM's loader of objects takes
+    the one of this class, and a shared library brings its own.
+    """
+
+    def __init__(self, symbol: str, size: int) -> None:
+        self.symbol = symbol
+        self._size = size
+        self._copies: list[Any] = [(ctypes.c_int64 * size)()]
+
+    @property
+    def address(self) -> int:
+        """The address of the first copy."""
+        return ctypes.addressof(self._copies[0])
+
+    def write(self, row: int, address: int) -> None:
+        """Set a row of all copies."""
+        for copy in self._copies:
+            copy[row] = address
+
+    def add_copy(self, library: ctypes.CDLL) -> None:
+        """Fill the copy of a library, now and from now on."""
+        copy = (ctypes.c_int64 * self._size).in_dll(library, self.symbol)
+        copy[:] = self._copies[0][:]
+        self._copies.append(copy)
+
+
+tables: list[AddressTable] = []
+
+
+def define_table(symbol: str, size: int) -> AddressTable:
+    """Make a table of 64-bit addresses, all zero."""
+    table = AddressTable(symbol, size)
+    tables.append(table)
+    return table
