@@ -18,7 +18,7 @@ KERNELS = (HERE.parent / "cavmarl" / "kernels").glob("*.py")
 # Kernels are left out: Numba compiles the bytecode of their functions as it is.
 with atheris.instrument_imports(
     include=["cavmarl", "sumolib", "yaml"],
-    exclude=[f"cavmarl.core.numba.{path.stem}" for path in KERNELS],
+    exclude=[f"cavmarl.core.compiled.{path.stem}" for path in KERNELS],
 ):
     import cavmarl.roads.sumo_net.sumo_xml  # noqa: F401 - the reader imports it late
     from fuzz.targets import TARGETS

@@ -1,8 +1,9 @@
-"""The machine code of kernels in this process: from the package's library, the disk, or Numba.
+"""The machine code of kernels in this process: from the wheel's library, the disk, or Numba.
 
-`CAVMARL_KERNELS` says where code may come from. `prebuilt`: only from the library in the wheel,
-`native`: compiled for this processor, `auto` (the default): from the library where it can be used,
-else compiled. Compiled code is kept on disk.
+`CAVMARL_KERNELS` says where the code of the package's kernels may come from. `prebuilt`: only from
+the library, `native`: compiled for this processor, `auto` (the default): from the library where it
+can be used, else compiled. Compiled code is kept on disk. Kernels of modules outside of the package
+are always compiled.
 """
 
 from __future__ import annotations
@@ -15,14 +16,17 @@ from functools import cache
 from typing import Any, NamedTuple
 
 from cavmarl.core.compiled.arguments import ArgumentType
+from cavmarl.core.compiled.library import Library, UnusableLibraryError
+from cavmarl.core.compiled.sources import module_digest
 from cavmarl.core.compiled.store import CompiledKernel, KernelFile, numba_version
 from cavmarl.core.compiled.tables import tables
 from cavmarl.core.errors import KernelError
 
-SOURCES = ("auto", "prebuilt", "native")
 SETTING = "CAVMARL_KERNELS"
+CHOICES = ("auto", "prebuilt", "native")
 
-_ENTRY: Any = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p)  # releases the GIL
+_ENTRY: Any = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p)  # its calls release the GIL
+_INSTALL = "install Numba with `pip install 'cavmarl[compile]'`"
 
 
 class Code(NamedTuple):
@@ -33,25 +37,46 @@ class Code(NamedTuple):
 
 
 class Listener:
-    """Is told when this process compiles kernels; `engine.compilation` shows progress."""
+    """Is told when this process compiles a kernel."""
 
     def on_compile(self, name: str) -> None:
-        """Called before a kernel is compiled."""
+        """Called before the kernel of that name is compiled."""
 
 
 listeners: list[Listener] = []
 
 
-def kernel_source() -> str:
-    """Return what `CAVMARL_KERNELS` says, one of `SOURCES`.
+class Source(NamedTuple):
+    """Where the code of the package's kernels comes from."""
+
+    choice: str  # of `CHOICES`
+    library: Library | None
+    reason: str  # why there is no library, as a clause
+
+
+@cache
+def kernel_source() -> Source:
+    """Return where code comes from, by `CAVMARL_KERNELS` and what this machine can use.
 
     Raises:
-        KernelError: it says something else.
+        KernelError: the setting has another value, or asks for a library that cannot be used.
     """
-    chosen = os.environ.get(SETTING) or "auto"
-    if chosen not in SOURCES:
-        raise KernelError(f"{SETTING}={chosen}: must be one of {', '.join(SOURCES)}")
-    return chosen
+    choice = os.environ.get(SETTING) or "auto"
+    if choice not in CHOICES:
+        raise KernelError(f"{SETTING}={choice}: must be one of {', '.join(CHOICES)}")
+    if choice == "native":
+        return Source(choice, None, f"{SETTING} is native")
+    if os.environ.get("NUMBA_BOUNDSCHECK", "0") not in ("", "0"):
+        return Source(choice, None, "NUMBA_BOUNDSCHECK is set")
+    try:
+        return Source(choice, Library(), "")
+    except UnusableLibraryError as error:
+        if choice == "prebuilt":
+            raise KernelError(
+                f"{SETTING}=prebuilt: the library of compiled kernels cannot be used: {error}; "
+                f"set {SETTING}=auto to compile them"
+            ) from error
+        return Source(choice, None, str(error))
 
 
 def find_code(
@@ -60,28 +85,67 @@ def find_code(
     """Return the code of a kernel for the types of some arguments.
 
     Raises:
-        KernelError: the kernel has to be compiled, and may or can not be.
+        KernelError: the kernel has to be compiled, and may not or cannot be.
     """
     text = ";".join(kind.text for kind in types)
-    file = KernelFile(function, text)
+    name = f"{function.__module__}.{function.__qualname__}"
+    reason = "it is not one of the package"
+    if name.startswith("cavmarl."):
+        source = kernel_source()
+        reason = source.reason
+        if source.library is not None:
+            found = source.library.find(name, text, module_digest(function.__module__))
+            if found is not None:
+                return Code(_ENTRY(found.address), found.result)
+            reason = f"the wheel does not have it for arguments of the types {text}"
+        if source.choice == "prebuilt":
+            raise KernelError(
+                f"{SETTING}=prebuilt: the kernel {name} would have to be compiled, as {reason}; "
+                f"set {SETTING}=auto to allow that"
+            )
+    if not numba_version():
+        raise KernelError(
+            f"the kernel {name} has to be compiled, as {reason}, and Numba is not installed: "
+            f"{_INSTALL}"
+        )
+    return _compiled(KernelFile(function, text), function, arguments, reason)
+
+
+def _compiled(
+    file: KernelFile, function: Callable[..., Any], arguments: tuple[Any, ...], reason: str
+) -> Code:
+    """Return the code of a kernel from the disk, or compile it and keep it there."""
     kernel = file.load()
     if kernel is None:
-        kernel = _compile(function, arguments, file.symbol)
-        file.save(kernel)
+        with file.locked():  # another process may be compiling it
+            kernel = file.load()
+            if kernel is None:
+                _explain(reason)
+                kernel = _compile(file, function, arguments)
+                file.save(kernel)
     return Code(_ENTRY(_load_object(kernel)), kernel.result)
 
 
 def _compile(
-    function: Callable[..., Any], arguments: tuple[Any, ...], symbol: str
+    file: KernelFile, function: Callable[..., Any], arguments: tuple[Any, ...]
 ) -> CompiledKernel:
-    if not numba_version():
-        raise KernelError("todo")
     from cavmarl.core.compiled.compiler import compile_kernel
 
-    name = f"{function.__module__}.{function.__qualname__}"
     for listener in listeners:
-        listener.on_compile(name)
-    return compile_kernel(function, arguments, symbol)
+        listener.on_compile(file.name)
+    result, code = compile_kernel(function, arguments, file.symbol)
+    return CompiledKernel(file.name, file.types, result, file.symbol, code)
+
+
+@cache
+def _explain(reason: str) -> None:
+    """Say once why something is compiled although a wheel brings compiled kernels."""
+    if kernel_source().choice == "auto" and Library.is_there():
+        print(
+            f"cavmarl: a kernel is compiled on this machine, as {reason}",
+            file=sys.stderr,
+            flush=True,
+        )
 
 
 @cache
@@ -91,9 +155,8 @@ def _engine() -> Any:
 
     binding.initialize_native_target()
     binding.initialize_native_asmprinter()
-    machine = binding.Target.from_triple(binding.get_process_triple()).create_target_machine(
-        opt=0, jit=True
-    )
+    target = binding.Target.from_triple(binding.get_process_triple())
+    machine = target.create_target_machine(opt=0, jit=True)
     return binding.create_mcjit_compiler(binding.parse_assembly(""), machine)
 
 

@@ -44,7 +44,6 @@ from numba.core.untyped_passes import InlineClosureLikes, InlineInlinables
 from numba.np import arrayobj
 
 from cavmarl.core.compiled.entry_point import EntryPoint, result_text
-from cavmarl.core.compiled.store import CompiledKernel
 
 # Passes that look for what no kernel without arrays of its own has: array expressions, ...
 _NEEDLESS = {InlineClosureLikes, InlineInlinables, InlineOverloads, NopythonRewrites}
@@ -396,13 +395,16 @@ def make_part(function: Callable[..., Any], is_inlined: bool) -> Any:
 
 def compile_kernel(
     function: Callable[..., Any], arguments: Sequence[Any], symbol: str
-) -> CompiledKernel:
+) -> tuple[str, bytes]:
     """Compile a kernel for the types of some arguments.
 
     Args:
         function: the Python function.
         arguments: only their types count.
         symbol: name of the entry point, see `entry_point`.
+
+    Returns:
+        The type of the result, see `arguments.result_reader`, and a relocatable ELF object.
 
     Raises:
         numba.core.errors.NumbaError: Numba cannot compile the function.
@@ -415,7 +417,7 @@ def compile_kernel(
         whole.targetctx.refresh()
         compiled = whole._compiler.compile(kinds, None)
         result = result_text(compiled.signature.return_type)
-        return CompiledKernel(symbol, result, compiled.library.emit_object(symbol))
+        return result, compiled.library.emit_object(symbol)
 
 
 def compile_callback(function: Callable[..., Any], num_numbers: int) -> Any:

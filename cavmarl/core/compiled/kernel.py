@@ -18,6 +18,7 @@ from cavmarl.core.compiled.arguments import (
     type_of,
 )
 from cavmarl.core.compiled.code import find_code
+from cavmarl.core.compiled.signatures import record_call
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -97,6 +98,7 @@ class Call:
         self.name = function.__name__
         self.types: tuple[ArgumentType, ...] = tuple(map(type_of, arguments))
         self.offsets = offsets_of(self.types)
+        record_call(function, arguments)
         code = find_code(function, arguments, self.types)
         self.enter = code.enter
         count = sum(kind.count for kind in self.types)

@@ -9,9 +9,12 @@ do no harm.
 from __future__ import annotations
 
 import hashlib
+import json
 import marshal
 import os
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -21,6 +24,9 @@ from cavmarl.core.cache_folder import cache_dir, tell_unwritable
 from cavmarl.core.compiled.sources import module_digest
 from cavmarl.core.whole_file import write_whole
 
+if sys.platform != "win32":
+    import fcntl
+
 SUFFIX = ".kernel"
 _DIGEST_BYTES = 32
 _CONSTANTS = (bool, int, float, str, bytes, type(None))
@@ -29,8 +35,10 @@ _CONSTANTS = (bool, int, float, str, bytes, type(None))
 class CompiledKernel(NamedTuple):
     """The machine code of a kernel for one list of argument types."""
 
-    symbol: str  # name of the entry point, the only symbol that the code defines
+    name: str  # of the function, with its module
+    types: str  # of the arguments, see `arguments.ArgumentType`
     result: str  # type of the result, see `arguments.result_reader`
+    symbol: str  # name of the entry point, the only symbol that the code defines
     code: bytes  # a relocatable ELF object
 
 
@@ -38,11 +46,15 @@ class KernelFile:
     """The file of one kernel for one list of argument types.
 
     Attributes:
+        name: of the function, with its module.
+        types: of the arguments.
         symbol: name for the entry point of this kernel.
     """
 
     def __init__(self, function: Callable[..., Any], types: str) -> None:
         module, name = function.__module__, function.__qualname__
+        self.name = f"{module}.{name}"
+        self.types = types
         self._frozen = _frozen_values(function)
         parts = (module, name, repr(function.__code__.co_firstlineno), types, *_machine())
         digest = hashlib.sha256("\0".join((*parts, self._frozen or "")).encode()).hexdigest()[:32]
@@ -61,6 +73,26 @@ class KernelFile:
             return None
         return unpack(content)
 
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Let no other process compile this kernel meanwhile; its lock ends with the process."""
+        if self._frozen is None or sys.platform == "win32":
+            yield
+            return
+        path = self._path.with_suffix(".lock")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        except OSError:  # `save` says so
+            yield
+            return
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            yield
+        finally:
+            path.unlink(missing_ok=True)
+            os.close(lock)
+
     def save(self, kernel: CompiledKernel) -> None:
         """Write the file; if that is impossible, say so once and go on."""
         if self._frozen is None:
@@ -73,8 +105,9 @@ class KernelFile:
 
 
 def pack(kernel: CompiledKernel) -> bytes:
-    """Return the content of a kernel's file: checksum, symbol, type of the result, code."""
-    body = f"{kernel.symbol}\n{kernel.result}\n".encode() + kernel.code
+    """Return the content of a kernel's file: a checksum, what the kernel is, its code."""
+    about = json.dumps([kernel.name, kernel.types, kernel.result, kernel.symbol])
+    body = about.encode() + b"\n" + kernel.code
     return hashlib.sha256(body).digest() + body
 
 
@@ -83,8 +116,8 @@ def unpack(content: bytes) -> CompiledKernel | None:
     body = content[_DIGEST_BYTES:]
     if hashlib.sha256(body).digest() != content[:_DIGEST_BYTES]:
         return None
-    symbol, result, code = body.split(b"\n", 2)
-    return CompiledKernel(symbol.decode(), result.decode(), code)
+    about, _, code = body.partition(b"\n")
+    return CompiledKernel(*json.loads(about), code)
 
 
 @cache

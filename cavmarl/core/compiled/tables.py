@@ -15,7 +15,7 @@ class AddressTable:
 
     def __init__(self, symbol: str, size: int) -> None:
         self.symbol = symbol
-        self._size = size
+        self.size = size
         self._copies: list[Any] = [(ctypes.c_int64 * size)()]
 
     @property
@@ -30,7 +30,7 @@ class AddressTable:
 
     def add_copy(self, library: ctypes.CDLL) -> None:
         """Fill the copy of a library, now and from now on."""
-        copy = (ctypes.c_int64 * self._size).in_dll(library, self.symbol)
+        copy = (ctypes.c_int64 * self.size).in_dll(library, self.symbol)
         copy[:] = self._copies[0][:]
         self._copies.append(copy)
 

@@ -1,0 +1,4 @@
+"""Builds the library of compiled kernels that a wheel brings.
+
+Stands on `core`.
+"""

@@ -1,0 +1,72 @@
+"""Which kernels Python calls: they are entry points; the others are compiled into these."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+_PACKAGE = Path(__file__).parents[1]
+_DECORATORS = {"kernel", "inlined_kernel"}
+_CORE = ("core.math", "core.records")  # folders of kernels beside those named `kernels`
+
+
+def called_kernels() -> frozenset[str]:
+    """Return the names of all kernels that some module of the package calls from Python.
+
+    They are found in the sources: kernels that a module outside of the folders of kernels imports
+    or defines, and functions beside kernels that call them (`roads.kernels.plans.plan_goal`).
+    """
+    trees = {_module_of(path): ast.parse(path.read_bytes()) for path in _PACKAGE.rglob("*.py")}
+    defined = {module: set(_defined(tree)) for module, tree in trees.items()}
+    found: set[str] = set()
+    for module, tree in trees.items():
+        if not _is_of_kernels(module):
+            found |= {f"{module}.{name}" for name in defined[module]}
+            found |= {
+                f"{source}.{name}"
+                for source, name in _imported(tree)
+                if name in defined.get(source, ())
+            }
+        else:
+            found |= {f"{module}.{name}" for name in _called_by_plain(tree, defined[module])}
+    return frozenset(found)
+
+
+def _module_of(path: Path) -> str:
+    parts = path.relative_to(_PACKAGE.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def _is_of_kernels(module: str) -> bool:
+    return ".kernels." in f"{module}." or any(f"cavmarl.{core}." in module for core in _CORE)
+
+
+def _is_kernel(function: ast.FunctionDef) -> bool:
+    return any(
+        isinstance(name, ast.Name) and name.id in _DECORATORS for name in function.decorator_list
+    )
+
+
+def _functions(tree: ast.Module) -> Iterator[ast.FunctionDef]:
+    return (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
+
+
+def _defined(tree: ast.Module) -> Iterator[str]:
+    return (function.name for function in _functions(tree) if _is_kernel(function))
+
+
+def _imported(tree: ast.Module) -> Iterator[tuple[str, str]]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            for alias in node.names:
+                yield node.module, alias.name
+
+
+def _called_by_plain(tree: ast.Module, kernels: set[str]) -> Iterator[str]:
+    """Yield kernels that functions of the same file name and that are no kernels themselves."""
+    for function in _functions(tree):
+        if not _is_kernel(function):
+            for node in ast.walk(function):
+                if isinstance(node, ast.Name) and node.id in kernels:
+                    yield node.id
