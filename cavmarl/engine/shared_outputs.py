@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
+from cavmarl.core.compiled import specialized
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.memory import Zeros
-from cavmarl.core.compiled import specialized
 from cavmarl.core.records.arrays import Outputs, Worlds
 from cavmarl.roads.kernels.signal_phases import switch_signals
 from cavmarl.roads.network import RoadNetwork

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.tallies import count_tick, occasions
 from cavmarl.core.compiled import specialized
+from cavmarl.core.math.tallies import count_tick, occasions
 from cavmarl.core.records.arrays import Gate
 from cavmarl.engine.component import Attached
 from cavmarl.engine.peers import Peers

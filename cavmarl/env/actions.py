@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.action import ActionConfig
-from cavmarl.core.errors import ActionError
 from cavmarl.core.compiled import specialized
+from cavmarl.core.errors import ActionError
 from cavmarl.core.records.codes import ACTION_IDLE
 from cavmarl.engine.kernels.decoding import decode_choices, decode_pairs
 from cavmarl.shards.shard import Commands

@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.math.tallies import totals
-from cavmarl.core.compiled import specialized
 from cavmarl.core.records.arrays import Worlds, Zoned
 from cavmarl.handoff.coordinator.coordinator import Near
 from cavmarl.ownership.messages import Birth, Switch

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from cavmarl.balance.balance_plan import Plan
 from cavmarl.config.env import EnvConfig
+from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.extensions import extension_modules, load_extensions
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.memory import Zeros
-from cavmarl.core.compiled import specialized
 from cavmarl.engine.kernels.step_results import Results, keep_last, report, report_continuation
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.spaces import global_state, state_space, write_sensed

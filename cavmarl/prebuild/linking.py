@@ -128,7 +128,8 @@ def _add_level_function(module: ir.Module) -> None:
     function = ir.Function(module, kind, LEVEL_SYMBOL)
     builder = ir.IRBuilder(function.append_basic_block())
     four = ir.LiteralStructType([word] * 4)
-    constraint = "={ax},={bx},={cx},={dx},{ax},{cx},~{dirflag},~{fpsr},~{flags}"
+    changes = "~{dirflag},~{fpsr},~{flags}"
+    constraint = f"={{ax}},={{bx}},={{cx}},={{dx}},{{ax}},{{cx}},{changes}"
     question = ir.InlineAsm(ir.FunctionType(four, [word, word]), "cpuid", constraint, True)
 
     def ask(leaf: int, register: int) -> Any:
@@ -140,7 +141,10 @@ def _add_level_function(module: ir.Module) -> None:
     # Without OSXSAVE the instruction `xgetbv` does not exist.
     pair = ir.LiteralStructType([word, word])
     saved = ir.InlineAsm(
-        ir.FunctionType(pair, [word]), "xgetbv", "={ax},={dx},{cx},~{dirflag},~{fpsr},~{flags}", True
+        ir.FunctionType(pair, [word]),
+        "xgetbv",
+        "={ax},={dx},{cx},~{dirflag},~{fpsr},~{flags}",
+        True,
     )
     has_it = builder.trunc(builder.lshr(first, word(27)), ir.IntType(1))
     place = builder.alloca(word)

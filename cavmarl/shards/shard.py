@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
+from cavmarl.core.compiled import specialized
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.math.buckets import make_lists
 from cavmarl.core.math.neighbors import make_grid
 from cavmarl.core.memory import Zeros
-from cavmarl.core.compiled import specialized
 from cavmarl.core.records.arrays import (
     Common,
     Gate,

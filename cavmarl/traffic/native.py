@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from cavmarl.config.action import ActionConfig
 from cavmarl.config.population import PopulationConfig
 from cavmarl.config.traffic import TrafficConfig
+from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import CapacityError
 from cavmarl.core.memory import Zeros
-from cavmarl.core.compiled import specialized
 from cavmarl.core.records.arrays import Demand, Gate, Travel, Worlds
 from cavmarl.core.records.codes import MODEL_KRAUSS
 from cavmarl.driving.driver_models import model_code

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.config.v2x import V2xConfig, period_ticks
+from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.math.neighbors import make_grid
 from cavmarl.core.math.walls import make_walls
-from cavmarl.core.compiled import specialized
 from cavmarl.core.records.arrays import Common, RoadArrays, Zoned
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.v2x.channel import make_channel

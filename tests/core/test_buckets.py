@@ -3,8 +3,8 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cavmarl.core.math.buckets import Lists, add, forget, lay_out, make_lists
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.buckets import Lists, add, forget, lay_out, make_lists
 from tests.naive import buckets as naive
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import re
 from typing import Any
 
-import numba.core.config
+import numba
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cavmarl.core.compiled import kernel
+from cavmarl.core.compiled import IS_PLAIN, kernel
 from cavmarl.core.compiled.prefetch import prefetch
 
 RECORD = np.dtype([("a", np.float64), ("b", np.int64, (9,))])
@@ -42,10 +42,11 @@ def test_an_array_without_records_has_places_too() -> None:
 
 
 def test_the_processor_is_told() -> None:
-    settings: Any = numba.core.config
-    if settings.DISABLE_JIT:
+    if IS_PLAIN:
         pytest.skip("without the compiler there is no such instruction")
-    compiled: Any = numba.njit(total.py_func)  # the kernel itself may come from the cache
+    njit: Any = numba.njit
+    function: Any = total
+    compiled = njit(function.py_func)  # the kernel itself may come from the disk
     compiled(np.zeros(4, dtype=RECORD), np.arange(4, dtype=np.int64), 1)
     (code,) = compiled.inspect_asm().values()
     assert re.search(r"^\s+(prefetcht0|prfm)\s", code, re.MULTILINE)

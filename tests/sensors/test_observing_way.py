@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numba.core import config
 from numpy.typing import NDArray
 
 import cavmarl
 from cavmarl.config.sensors import ConflictsConfig, HistoryConfig, SensorsConfig, WayConfig
+from cavmarl.core.compiled import IS_PLAIN
 from cavmarl.core.math.neighbors import fill_grid, make_grid
 from cavmarl.core.math.walls import make_walls
 from cavmarl.driving.kernels.gaps import link_signal
@@ -182,7 +182,7 @@ def made(env: str = "grid4x4", **overrides: Any) -> Any:
     return cavmarl.make_vec(env, num_envs=2, agents=6, background=12, seed=1, overrides=settings)
 
 
-@pytest.mark.skipif(config.DISABLE_JIT, reason="compares no twin")
+@pytest.mark.skipif(IS_PLAIN, reason="compares no twin")
 def test_history_is_what_was_observed_before_and_begins_with_the_first() -> None:
     vec = made()
     place = layout(vec.config.sensors)["history"]
@@ -209,7 +209,7 @@ def test_history_is_what_was_observed_before_and_begins_with_the_first() -> None
     vec.close()
 
 
-@pytest.mark.skipif(config.DISABLE_JIT, reason="compares no twin")
+@pytest.mark.skipif(IS_PLAIN, reason="compares no twin")
 @pytest.mark.parametrize("indicators", [False, True])
 def test_a_divided_world_observes_the_same(indicators: bool) -> None:
     shown = {"sensors.conflicts.indicators": indicators}
@@ -226,7 +226,7 @@ def test_a_divided_world_observes_the_same(indicators: bool) -> None:
     divided.close()
 
 
-@pytest.mark.skipif(config.DISABLE_JIT, reason="compares no twin")
+@pytest.mark.skipif(IS_PLAIN, reason="compares no twin")
 def test_a_saved_state_keeps_the_history() -> None:
     vec = made()
     vec.reset()

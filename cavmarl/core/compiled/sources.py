@@ -23,7 +23,11 @@ _PARTS = (*_SHARED, f"{_COMPILED}.prefetch")
 @cache
 def kernel_sources() -> dict[str, bytes]:
     """Return the content of each file of kernels, by its dotted name within the package."""
-    folders = (*_PACKAGE.rglob("kernels"), _PACKAGE / "core" / "math", _PACKAGE / "core" / "records")
+    folders = (
+        *_PACKAGE.rglob("kernels"),
+        _PACKAGE / "core" / "math",
+        _PACKAGE / "core" / "records",
+    )
     paths = [path for folder in folders for path in folder.glob("*.py")]
     paths += [_PACKAGE.joinpath(*name.split(".")).with_suffix(".py") for name in _PARTS]
     return {_name_of(path): path.read_bytes() for path in paths}

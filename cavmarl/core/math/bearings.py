@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from cavmarl.core.math.geometry import PI
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.geometry import PI
 
 # `rough_atan2` is off by less than this.
 ANGLE_ERROR_RAD = 0.005

@@ -10,8 +10,7 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.compiled import inlined_kernel, kernel
-from cavmarl.core.compiled import specialized
+from cavmarl.core.compiled import inlined_kernel, kernel, specialized
 
 LARGE = 1 << 12  # bytes; of fewer the CRC is as fast
 _PRIME = np.uint64(0x9E3779B97F4A7C15)

@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import math
 
-from cavmarl.core.math.scalars import clamp
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.scalars import clamp
 from cavmarl.driving.kernels.krauss import safe_speed
 
 SPEED_MODE_S = 2.0  # time gap in s above which a leader does not count

@@ -8,9 +8,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.buckets import add, forget, lay_out
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.compiled.prefetch import SOON, prefetch
+from cavmarl.core.math.buckets import add, forget, lay_out
 from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
 from cavmarl.core.records.codes import DRIVER_SCRIPTED
 from cavmarl.core.records.rows import MERGES_M, SWEPT_BEYOND_M, is_lost

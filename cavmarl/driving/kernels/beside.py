@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.geometry import lane_pose
 from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.math.geometry import lane_pose
 from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
 from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_SCRIPTED
 from cavmarl.driving.kernels.following import behind, no_constraint

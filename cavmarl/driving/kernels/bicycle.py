@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 
-from cavmarl.core.math.geometry import wrap_angle
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.geometry import wrap_angle
 
 MAX_SPEED_MPS = 40.0  # beyond it the engine gives way
 MIN_SPEED_MPS = -40.0

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import math
 
-from cavmarl.core.math.scalars import not_zero
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.scalars import not_zero
 
 ACCEL_MAX = 3.0  # m/s², desired acceleration from rest on a free road
 DECEL_COMFORT = 5.0  # m/s², braking that feels comfortable, a positive number

@@ -11,8 +11,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.rng import STREAM_DRIVER, quick_uniform
 from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.math.rng import STREAM_DRIVER, quick_uniform
 from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
 from cavmarl.core.records.codes import DRIVER_BACKGROUND, HOLD_YIELD, MODEL_KRAUSS
 from cavmarl.driving.kernels.announcing import STANDING_MPS, is_let_stand

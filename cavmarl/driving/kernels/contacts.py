@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.math.geometry import boxes_overlap
 from cavmarl.core.math.neighbors import Grid, aim, cell_at, cell_columns, cell_rows
-from cavmarl.core.compiled import inlined_kernel, kernel
 
 APART_M = 1e-6  # more than rounding makes of a distance
 

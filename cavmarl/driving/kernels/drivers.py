@@ -13,10 +13,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.geometry import wrap_angle
-from cavmarl.core.math.rng import STREAM_DRIVER, quick_uniform
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.compiled.prefetch import SOON, prefetch
+from cavmarl.core.math.geometry import wrap_angle
+from cavmarl.core.math.rng import STREAM_DRIVER, quick_uniform
 from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
 from cavmarl.core.records.codes import (
     DRIVER_AGENT,

@@ -12,8 +12,8 @@ import math
 
 import numpy as np
 
-from cavmarl.core.math.scalars import clamp
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.scalars import clamp
 from cavmarl.core.records.codes import MODEL_ACC, MODEL_IDM, MODEL_KRAUSS
 from cavmarl.driving.kernels.acc import acc_acceleration
 from cavmarl.driving.kernels.car_following import ACCEL_LIMIT, idm_free, idm_interaction

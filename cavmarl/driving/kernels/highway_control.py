@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 
+from cavmarl.core.compiled import kernel
 from cavmarl.core.math.geometry import wrap_angle
 from cavmarl.core.math.scalars import clamp, not_zero
-from cavmarl.core.compiled import kernel
 
 KP_ACCEL = 1.0 / 0.6  # 1/s, gain from speed error to acceleration
 KP_HEADING = 1.0 / 0.2  # 1/s, gain from heading error to yaw rate

@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.math.geometry import lane_pose, segment_at, wrap_angle
 from cavmarl.core.math.scalars import clamp
-from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.records.arrays import LaneGrid, RoadArrays, Travel
 from cavmarl.core.records.codes import EVENT_ARRIVED, EVENT_RED_LIGHT, SIGNAL_RED, SIGNAL_RED_YELLOW
 from cavmarl.driving.kernels.bicycle import bicycle_step

@@ -6,7 +6,6 @@ their code is the same whichever models are registered.
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Callable
 from typing import Any
 

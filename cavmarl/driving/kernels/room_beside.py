@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.geometry import boxes_overlap, lane_pose
 from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.math.geometry import boxes_overlap, lane_pose
 from cavmarl.core.records.arrays import RoadArrays, Scratch
 from cavmarl.driving.kernels.announcing import STANDING_MPS
 from cavmarl.driving.kernels.lane_index import beside_s

@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.compiled import kernel
 from cavmarl.core.math.geometry import lane_pose, project, wrap_angle
 from cavmarl.core.math.scalars import clamp
-from cavmarl.core.compiled import kernel
 from cavmarl.core.records.arrays import RoadArrays
 from cavmarl.core.records.codes import (
     ACTION_FASTER,

@@ -12,8 +12,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.geometry import lane_pose, project, project_near
 from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.math.geometry import lane_pose, project, project_near
 from cavmarl.core.records.arrays import LaneGrid, RoadArrays
 from cavmarl.core.records.codes import EVENT_OFF_ROAD, EVENT_WRONG_WAY
 from cavmarl.driving.kernels.lane_index import beside_s, goes_on_m

@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.compiled import kernel
 from cavmarl.core.math.geometry import lane_pose, project
 from cavmarl.core.math.scalars import clamp
-from cavmarl.core.compiled import kernel
 from cavmarl.core.records.arrays import LaneGrid, RoadArrays
 from cavmarl.driving.kernels.bicycle import bicycle_step
 from cavmarl.driving.kernels.steering import steer_to_lane

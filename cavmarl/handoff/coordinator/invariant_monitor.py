@@ -13,8 +13,8 @@ from collections.abc import Callable, Container, Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import ProtocolError
 from cavmarl.core.compiled import specialized
+from cavmarl.core.errors import ProtocolError
 from cavmarl.driving.vehicles import GHOST_FIELDS
 from cavmarl.handoff.coordinator.handoff_log import OwnerChange
 from cavmarl.handoff.coordinator.row_digests import digest_tables

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cavmarl.config.env import EnvConfig
-from cavmarl.core.errors import LostTickError, ProtocolError
 from cavmarl.core.compiled import sources_digest
+from cavmarl.core.errors import LostTickError, ProtocolError
 from cavmarl.handoff.coordinator.coordinator import Coordinator
 from cavmarl.handoff.fault_injection.committed_store import CommittedStore
 from cavmarl.handoff.fault_injection.fault_plan import read_faults

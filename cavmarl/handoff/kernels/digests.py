@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.rng import mix
 from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.math.rng import mix
 
 
 @inlined_kernel

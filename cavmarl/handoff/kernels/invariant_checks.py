@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.rng import mix
 from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.math.rng import mix
 from cavmarl.core.records.arrays import Zoned
 from cavmarl.handoff.kernels.digests import row_digest
 from cavmarl.zones.kernels.zone_lookup import (

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import MessageError
 from cavmarl.core.compiled import specialized
+from cavmarl.core.errors import MessageError
 from cavmarl.parallel.nodes.link import Bytes
 from cavmarl.parallel.step_arrays import StepArrays
 from cavmarl.zones.kernels.agent_frames import UNOWNED, pack_actions, take_actions

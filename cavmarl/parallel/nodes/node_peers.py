@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import MessageError
 from cavmarl.core.huge_pages import forget
-from cavmarl.core.compiled import specialized
 from cavmarl.core.records.arrays import Gate, Outputs, Worlds
 from cavmarl.core.records.codes import (
     COUNT_REROUTED,

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import MessageError
 from cavmarl.core.huge_pages import huge_zeros
-from cavmarl.core.compiled import specialized
 from cavmarl.core.records.arrays import Gate, RoadArrays, Zoned
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.parallel.nodes.link import Bytes

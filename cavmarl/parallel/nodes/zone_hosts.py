@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import MessageError, ProtocolError
 from cavmarl.core.compiled import specialized
+from cavmarl.core.errors import MessageError, ProtocolError
 from cavmarl.core.records.arrays import Gate
 from cavmarl.handoff.coordinator.coordinator import Coordinator
 from cavmarl.handoff.division import Division

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import WorkerError
 from cavmarl.core.compiled import IS_PLAIN, kernel, specialized
+from cavmarl.core.errors import WorkerError
 from cavmarl.parallel.processes.shared_memory import Segment
 
 Array = NDArray[Any]

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.neighbors import Grid, cell_columns, cell_rows
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.neighbors import Grid, cell_columns, cell_rows
 from cavmarl.core.records import record
 
 WALL = record(

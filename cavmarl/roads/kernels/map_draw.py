@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from cavmarl.core.math.rng import STREAM_MAP, below
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.rng import STREAM_MAP, below
 
 
 @kernel

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.geometry import boxes_overlap
 from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.math.geometry import boxes_overlap
 
 
 @kernel

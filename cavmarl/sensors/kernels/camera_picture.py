@@ -11,8 +11,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.spans import row_span
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.spans import row_span
 from cavmarl.sensors.kernels.faces import (
     CameraPose,
     Faces,

@@ -17,11 +17,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.compiled import kernel
 from cavmarl.core.math.geometry import lane_pose, project, wrap_angle
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
 from cavmarl.core.math.rng import STREAM_SENSOR, below
 from cavmarl.core.math.scalars import clamp
-from cavmarl.core.compiled import kernel
 from cavmarl.core.records.arrays import RoadArrays
 from cavmarl.sensors.kernels.sensor_arrays import KinematicsSensor
 

@@ -14,9 +14,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.compiled import kernel
 from cavmarl.core.math.bearings import ANGLE_ERROR_RAD, rough_atan2
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
-from cavmarl.core.compiled import kernel
 from cavmarl.core.records import record
 
 # What a ray met first.

@@ -13,9 +13,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.compiled import kernel
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M
 from cavmarl.core.math.scalars import clamp
-from cavmarl.core.compiled import kernel
 from cavmarl.core.records import record
 from cavmarl.sensors.kernels.sensor_arrays import RoadgraphSensor, RoadPoints
 

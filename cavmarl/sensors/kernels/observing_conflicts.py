@@ -19,10 +19,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.compiled import kernel
 from cavmarl.core.math.geometry import lane_pose
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
 from cavmarl.core.math.walls import is_cut
-from cavmarl.core.compiled import kernel
 from cavmarl.core.records.arrays import RoadArrays, Travel
 from cavmarl.core.records.codes import (
     DRIVER_SCRIPTED,

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.scalars import clamp
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.scalars import clamp
 from cavmarl.core.records.arrays import RoadArrays, Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT, SIGNAL_GREEN_MAJOR, SIGNAL_GREEN_MINOR
 from cavmarl.sensors.kernels.output_reset import newest_frame

@@ -11,8 +11,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.geometry import lane_pose, wrap_angle
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.geometry import lane_pose, wrap_angle
 from cavmarl.core.records.arrays import RoadArrays, Travel
 from cavmarl.core.records.codes import (
     SIGNAL_GREEN_MAJOR,

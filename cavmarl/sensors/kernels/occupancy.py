@@ -12,10 +12,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.compiled import kernel
 from cavmarl.core.math.geometry import project
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
 from cavmarl.core.math.scalars import clamp
-from cavmarl.core.compiled import kernel
 from cavmarl.core.records.arrays import LaneGrid, RoadArrays
 from cavmarl.sensors.kernels.kinematics_observation import (
     FEATURE_ON_ROAD,

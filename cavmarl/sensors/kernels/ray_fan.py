@@ -18,9 +18,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.compiled import kernel
 from cavmarl.core.math.bearings import ANGLE_ERROR_RAD, rough_atan2
 from cavmarl.core.math.geometry import PI, TWO_PI
-from cavmarl.core.compiled import kernel
 from cavmarl.core.records import record
 
 # What a ray met first.

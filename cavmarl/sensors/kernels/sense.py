@@ -11,11 +11,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.compiled import kernel
 from cavmarl.core.math.geometry import lane_pose, wrap_angle
 from cavmarl.core.math.neighbors import Grid, fill_grid, nearest_bodies
 from cavmarl.core.math.scalars import clamp
 from cavmarl.core.math.walls import is_cut
-from cavmarl.core.compiled import kernel
 from cavmarl.core.records.arrays import Outputs, RoadArrays, Sensors, Travel, Worlds
 from cavmarl.core.records.codes import (
     DRIVER_AGENT,

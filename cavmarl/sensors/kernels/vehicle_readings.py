@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.geometry import lane_pose, project_near, wrap_angle
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.geometry import lane_pose, project_near, wrap_angle
 from cavmarl.core.records.arrays import RoadArrays, Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT, EVENT_COLLIDED
 from cavmarl.sensors.kernels.rig_frames import Due, Mount, Noise, add_errors, is_lost, sensor_pose

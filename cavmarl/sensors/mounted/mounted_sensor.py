@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from cavmarl.config.rig import MountedConfig, SampledConfig
-from cavmarl.core.math.neighbors import Grid
 from cavmarl.core.compiled import specialized
+from cavmarl.core.math.neighbors import Grid
 from cavmarl.core.records.arrays import LaneGrid, RoadArrays, Travel, Worlds
 from cavmarl.roads.kernels.backdrop_pieces import Backdrop
 from cavmarl.roads.network import RoadNetwork

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.neighbors import Grid
 from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.math.neighbors import Grid
 from cavmarl.core.records.arrays import (
     Common,
     Demand,

@@ -11,10 +11,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.neighbors import Grid
-from cavmarl.core.math.scalars import clamp
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.compiled.prefetch import SOON, prefetch
+from cavmarl.core.math.neighbors import Grid
+from cavmarl.core.math.scalars import clamp
 from cavmarl.core.records.arrays import LaneGrid, RoadArrays, Scratch, Travel, Worlds
 from cavmarl.core.records.codes import (
     ACTION_FASTER,

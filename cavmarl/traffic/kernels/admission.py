@@ -13,9 +13,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.math.geometry import boxes_overlap, lane_pose
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M
-from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.records.arrays import Demand, Gate, RoadArrays, Scratch, Travel, Worlds
 from cavmarl.core.records.codes import COUNT_DEPARTED, LANE_FIRST, LANE_GIVEN, LANE_RANDOM, POS_LAST
 from cavmarl.core.records.rows import SWEPT_BEYOND_M

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.geometry import project
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.geometry import project
 
 
 @kernel

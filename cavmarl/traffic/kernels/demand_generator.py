@@ -11,6 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.compiled import kernel
 from cavmarl.core.math.rng import (
     STREAM_ORIGIN,
     STREAM_PLACE,
@@ -19,7 +20,6 @@ from cavmarl.core.math.rng import (
     below,
     uniform,
 )
-from cavmarl.core.compiled import kernel
 from cavmarl.core.records.arrays import Demand, Gate, RoadArrays, Travel, TripTable, Worlds
 from cavmarl.core.records.codes import (
     COUNT_ARRIVED,

@@ -11,8 +11,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.rng import STREAM_DEPARTURE, STREAM_PLACE, below, uniform
 from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.math.rng import STREAM_DEPARTURE, STREAM_PLACE, below, uniform
 from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
 from cavmarl.core.records.codes import (
     LANE_BEST,

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.geometry import lane_pose, wrap_angle
 from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.math.geometry import lane_pose, wrap_angle
 from cavmarl.core.records.arrays import Gate, RoadArrays, Travel, Zoned
 from cavmarl.core.records.codes import COUNT_DEPARTED, DRIVER_SUMO, EVENT_ARRIVED
 from cavmarl.driving.kernels.motion import account, before_tick, lane_before

@@ -19,8 +19,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import CapacityError, SumoError
 from cavmarl.core.compiled import specialized
+from cavmarl.core.errors import CapacityError, SumoError
 from cavmarl.core.records.arrays import Gate, RoadArrays, Travel, Worlds, Zoned
 from cavmarl.core.records.codes import COUNT_REROUTED, LANE_GIVEN, POS_GIVEN, SPEED_MAX
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork

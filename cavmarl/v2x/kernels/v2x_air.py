@@ -14,10 +14,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.math.neighbors import cell_at, cell_columns, cell_rows
 from cavmarl.core.math.rng import mix
 from cavmarl.core.math.walls import is_cut
-from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.v2x.kernels.v2x_channel import Channel, chance_at, draw, gets_access, is_heard
 from cavmarl.v2x.kernels.v2x_inbox import find, insert, is_better
 from cavmarl.v2x.kernels.v2x_records import (

@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.compiled import kernel
 from cavmarl.core.math.rng import STREAM_V2X, mix, quick_uniform
 from cavmarl.core.math.walls import Walls, is_cut
-from cavmarl.core.compiled import kernel
 
 STREAM_ACCESS = STREAM_V2X + 16  # one a kind of packet
 STREAM_EQUIPPED = STREAM_V2X + 32

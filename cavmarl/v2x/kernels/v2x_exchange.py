@@ -11,8 +11,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.neighbors import cell_columns, cell_rows, fill_grid
 from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.math.neighbors import cell_columns, cell_rows, fill_grid
 from cavmarl.core.records.arrays import Common, RoadArrays, Zoned
 from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.v2x.kernels.v2x_air import (

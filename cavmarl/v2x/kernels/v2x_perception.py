@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
+from cavmarl.core.compiled import kernel
 from cavmarl.core.math.neighbors import nearest_bodies
 from cavmarl.core.math.walls import Walls, is_cut
-from cavmarl.core.compiled import kernel
 from cavmarl.v2x.kernels.v2x_records import MAX_NEAR, V2xScratch
 
 

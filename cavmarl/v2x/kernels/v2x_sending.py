@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.compiled import kernel
 from cavmarl.core.math.geometry import wrap_angle
 from cavmarl.core.math.walls import Walls
-from cavmarl.core.compiled import kernel
 from cavmarl.core.records.arrays import Common, RoadArrays, Zoned
 from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.roads.kernels.signal_phases import program_at

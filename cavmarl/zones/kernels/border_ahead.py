@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.math.geometry import lane_pose
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.geometry import lane_pose
 from cavmarl.core.records import record
 from cavmarl.core.records.arrays import RoadArrays, Travel, Zoned
 from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_BACKGROUND

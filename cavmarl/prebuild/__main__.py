@@ -1,0 +1,96 @@
+"""`python -m cavmarl.prebuild`: compile the kernels of the package, and keep their list.
+
+build FOLDER    compile all kernels for the wheel's processor, link them into a library
+record FOLDER   write the list of kernels anew, from calls in files that a run of the tests has
+                left with `CAVMARL_KERNEL_CALLS=FOLDER`
+add FOLDER      add such calls to the list
+check FOLDER    exit with 1 if such a call, or a kernel that Python calls, is not in the list
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Iterable
+from pathlib import Path
+
+from cavmarl.core.errors import KernelError
+from cavmarl.prebuild.kernel_list import called_kernels
+from cavmarl.prebuild.manifest import KernelCall, read_manifest, recorded_calls, write_manifest
+
+
+def build(folder: Path, processes: int) -> None:
+    """Compile each call of the list for the wheel's processor, and link the library."""
+    from cavmarl.prebuild.linking import FEATURES, PROCESSOR, link
+
+    # Numba reads these when it is imported, here and in the processes that compile.
+    os.environ["NUMBA_CPU_NAME"] = PROCESSOR
+    os.environ["NUMBA_CPU_FEATURES"] = FEATURES
+    from cavmarl.prebuild.compile_calls import compile_calls, usable_processes
+
+    started = time.monotonic()
+    calls = read_manifest()
+    if missing := called_kernels() - {call.name for call in calls}:
+        raise KernelError(
+            f"the list of kernels lacks {', '.join(sorted(missing))}: record it again with "
+            "`make kernels`"
+        )
+    kernels = list(compile_calls(calls, processes or usable_processes()))
+    link(kernels, folder)
+    size = sum(path.stat().st_size for path in folder.iterdir()) / 1e6
+    print(
+        f"cavmarl: {len(kernels)} kernels for {PROCESSOR} in {time.monotonic() - started:.0f} s, "
+        f"{size:.1f} MB in {folder}"
+    )
+
+
+def record(folder: Path, old: Iterable[KernelCall] = ()) -> None:
+    """Write the list anew: recorded calls and old ones, of kernels that still exist."""
+    known = called_kernels()
+    calls = {call for call in {*recorded_calls(folder), *old} if call.name in known}
+    write_manifest(calls)
+    print(f"{len(calls)} calls of {len({call.name for call in calls})} kernels")
+    if missing := known - {call.name for call in calls}:
+        print(f"never called: {', '.join(sorted(missing))}")
+
+
+def check(folder: Path) -> int:
+    """Say which recorded calls and which kernels are not in the list."""
+    calls = set(read_manifest())
+    unknown = {call.name for call in recorded_calls(folder) - calls}
+    unknown |= called_kernels() - {call.name for call in calls}
+    for name in sorted(unknown):
+        print(f"not in the list of kernels, or with other types: {name}")
+    if unknown:
+        print(f"run `python -m cavmarl.prebuild add {folder}`, and commit the list")
+    return int(bool(unknown))
+
+
+def main() -> int:
+    """Run one of the commands."""
+    parser = argparse.ArgumentParser(
+        prog="python -m cavmarl.prebuild",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("command", choices=("build", "record", "add", "check"))
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--processes", type=int, default=0, help="0: two, or one on a single core")
+    given = parser.parse_args()
+    try:
+        if given.command == "build":
+            build(given.folder, given.processes)
+        elif given.command in ("record", "add"):
+            record(given.folder, read_manifest() if given.command == "add" else ())
+        else:
+            return check(given.folder)
+    except KernelError as error:
+        print(f"cavmarl: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

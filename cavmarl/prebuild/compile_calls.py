@@ -1,0 +1,101 @@
+"""Compiles kernels in several processes, and says how far it is."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from typing import Any, TextIO
+
+from cavmarl.core.compiled.arguments import type_of
+from cavmarl.core.compiled.compiler import compile_kernel
+from cavmarl.core.compiled.signatures import example_arguments
+from cavmarl.core.compiled.store import CompiledKernel, KernelFile
+from cavmarl.prebuild.manifest import KernelCall
+
+_LINE_S = 5.0  # between two lines where the output is no terminal
+
+
+def kernel_file(call: KernelCall) -> KernelFile:
+    """Return where the code for a call is kept on this machine."""
+    types = ";".join(type_of(argument).text for argument in example_arguments(call.kinds))
+    return KernelFile(_function_of(call), types)
+
+
+def compile_calls(
+    calls: Iterable[KernelCall], processes: int, output: TextIO = sys.stderr
+) -> Iterator[CompiledKernel]:
+    """Compile kernels in other processes, the longest first; the order of the results is open."""
+    ordered = sorted(calls, key=_weight, reverse=True)
+    with (
+        _Progress(ordered, output) as progress,
+        ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool,
+    ):
+        running = {pool.submit(_compile, call): call for call in ordered}
+        for done in as_completed(running):
+            yield done.result()
+            progress.advance(running[done])
+
+
+def _compile(call: KernelCall) -> CompiledKernel:
+    file = kernel_file(call)
+    arguments = example_arguments(call.kinds)
+    result, code = compile_kernel(_function_of(call), arguments, file.symbol)
+    return CompiledKernel(file.name, file.types, result, file.symbol, code)
+
+
+def _function_of(call: KernelCall) -> Any:
+    module, _, name = call.name.rpartition(".")
+    return getattr(importlib.import_module(module), name).py_func
+
+
+def _weight(call: KernelCall) -> int:
+    """Return a measure of how long a kernel takes: what takes many arrays does much."""
+    return len(call.signature)
+
+
+class _Progress:
+    """A line about kernels that are done; the time left follows from the time they took."""
+
+    def __init__(self, calls: Sequence[KernelCall], output: TextIO) -> None:
+        self._count = len(calls)
+        self._weight = sum(map(_weight, calls))
+        self._output = output
+        self._is_terminal = output.isatty()
+        self._done = self._done_weight = 0
+        self._started = self._last = time.monotonic()
+
+    def __enter__(self) -> _Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._is_terminal:
+            print("\r\x1b[K", end="", file=self._output, flush=True)
+
+    def advance(self, call: KernelCall) -> None:
+        """Count a kernel that is done."""
+        self._done += 1
+        self._done_weight += _weight(call)
+        now = time.monotonic()
+        if self._is_terminal or now - self._last >= _LINE_S or self._done == self._count:
+            self._last = now
+            self._write(now - self._started)
+
+    def _write(self, elapsed_s: float) -> None:
+        left_s = elapsed_s * (self._weight - self._done_weight) / self._done_weight
+        text = (
+            f"cavmarl: compiled {self._done} of {self._count} kernels in {elapsed_s:.0f} s, "
+            f"about {left_s:.0f} s left"
+        )
+        start, end = ("\r\x1b[K", "") if self._is_terminal else ("", "\n")
+        print(f"{start}{text}", end=end, file=self._output, flush=True)
+
+
+def usable_processes() -> int:
+    """Return how many processes compile at the same time: two, or one on a single core."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return min(2, cores or 1)
