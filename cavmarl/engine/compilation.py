@@ -1,20 +1,21 @@
-"""Says when kernels are compiled: each when it is first used, and then kept on disk."""
+"""Sees to it that kernels are compiled before they are needed, and says so."""
 
 from __future__ import annotations
 
+import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from cavmarl.core.cache_folder import cache_dir, tell_unwritable
 from cavmarl.core.compiled import IS_PLAIN, sources_digest
-from cavmarl.core.compiled.code import Listener, listeners
+from cavmarl.core.compiled.code import Listener, kernel_source, listeners
+from cavmarl.core.compiled.store import machine_digest, numba_version
 
 
 class _Announcer(Listener):
-    """Says so when the first kernel is compiled."""
+    """Says so when the first kernel is compiled in this process."""
 
     def __init__(self) -> None:
         self.has_told = False
@@ -25,8 +26,7 @@ class _Announcer(Listener):
         if is_long and not self.has_told:
             self.has_told = True
             print(
-                "cavmarl: compiling the kernels that this world uses, once for this version: up to "
-                "20 s of one core before the first observation, and as long in the first steps",
+                "cavmarl: compiling more kernels for this machine, once for this version",
                 file=sys.stderr,
                 flush=True,
             )
@@ -35,43 +35,49 @@ class _Announcer(Listener):
 _ANNOUNCER = _Announcer()
 
 
-def announce_compilation() -> None:
-    """From now on say on standard error when the first kernel is compiled in this process."""
-    if _ANNOUNCER not in listeners:
-        listeners.append(_ANNOUNCER)
+def prepare_kernels() -> None:
+    """Compile the kernels of a plain world in two processes, if none are kept on this machine.
+
+    From now on say on standard error when a kernel is compiled in this process.
+    """
+    if _ANNOUNCER in listeners:
+        return
+    listeners.append(_ANNOUNCER)
+    if compiled_before() or not numba_version() or _marker("plain").exists():
+        return
+    print(
+        "cavmarl: compiling kernels for this machine, once for this version",
+        file=sys.stderr,
+        flush=True,
+    )
+    command = [sys.executable, "-m", "cavmarl.prebuild", "compile"]
+    if subprocess.run(command, check=False).returncode == 0:
+        _leave(_marker("plain"))
 
 
 def compiled_before() -> bool:
-    """Whether all kernels of this version are on this machine, or are never compiled."""
-    return IS_PLAIN or _marker().exists()
-
-
-def _marker() -> Path:
-    return cache_dir() / "kernels" / sources_digest() / "complete"
+    """Return whether all kernels of this version are on this machine, or are never compiled."""
+    return IS_PLAIN or kernel_source().library is not None or _marker("complete").exists()
 
 
 @contextmanager
 def compiling_all() -> Iterator[None]:
-    """Say that all kernels are compiled, and note it when that is done.
+    """Note that all kernels are compiled when the block ends.
 
     What runs inside has to call every kernel that a tick may need.
     """
-    if compiled_before():
-        yield
-        return
-    print(
-        "cavmarl: compiling all kernels of a tick, once for this version (about a minute of one "
-        "core) …",
-        end="",
-        file=sys.stderr,
-        flush=True,
-    )
-    started = time.perf_counter()
-    _ANNOUNCER.has_told = True
     yield
+    if not compiled_before():
+        _leave(_marker("complete"))
+
+
+def _marker(name: str) -> Path:
+    return cache_dir() / "kernels" / sources_digest() / f"{machine_digest()}.{name}"
+
+
+def _leave(marker: Path) -> None:
     try:
-        _marker().parent.mkdir(parents=True, exist_ok=True)
-        _marker().touch()
+        marker.parent.mkdir(parents=True, exist_ok=True)
+        marker.touch()
     except OSError as error:
         tell_unwritable(error)
-    print(f" done in {time.perf_counter() - started:.0f} s", file=sys.stderr, flush=True)

@@ -18,7 +18,7 @@ from cavmarl.core.memory import Zeros
 from cavmarl.core.records.codes import ACTION_IDLE
 from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.engine import world_snapshot as snapshot
-from cavmarl.engine.compilation import announce_compilation, compiling_all
+from cavmarl.engine.compilation import compiling_all, prepare_kernels
 from cavmarl.engine.peers import Peers
 from cavmarl.engine.shard_clock import ShardClock
 from cavmarl.engine.shared_outputs import SharedOutputs
@@ -87,7 +87,7 @@ class Simulation(WorldViews):
         self._recovery: Recovery | None = None
         self._keeper: Keeper | None = None
         self._recutter: Recutter | None = None
-        announce_compilation()
+        prepare_kernels()
         shared = SharedOutputs(config, network, num_worlds, observations, zeros)
         self._tick = make_tick(
             config,

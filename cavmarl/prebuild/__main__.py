@@ -1,5 +1,6 @@
 """`python -m cavmarl.prebuild`: compile the kernels of the package, and keep their list.
 
+compile         compile kernels for this machine, and keep them: those of a plain world, or --all
 build FOLDER    compile all kernels for the wheel's processor, link them into a library
 record FOLDER   write the list of kernels anew, from calls in files that a run of the tests has
                 left with `CAVMARL_KERNEL_CALLS=FOLDER`
@@ -11,14 +12,26 @@ from __future__ import annotations
 
 import argparse
 import os
+import subprocess
 import sys
 import time
 from collections.abc import Iterable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
+from cavmarl.core.cache_folder import cache_dir
+from cavmarl.core.compiled.signatures import CALLS_SETTING
 from cavmarl.core.errors import KernelError
 from cavmarl.prebuild.kernel_list import called_kernels
-from cavmarl.prebuild.manifest import KernelCall, read_manifest, recorded_calls, write_manifest
+from cavmarl.prebuild.manifest import (
+    KernelCall,
+    marked,
+    read_manifest,
+    recorded_calls,
+    write_manifest,
+)
+
+PLAIN_WORLDS = ("ring", "merge", "grid4x4")
 
 
 def build(folder: Path, processes: int) -> None:
@@ -46,19 +59,53 @@ def build(folder: Path, processes: int) -> None:
     )
 
 
+def compile_here(processes: int, is_all: bool) -> None:
+    """Compile kernels for this machine into the cache."""
+    from cavmarl.prebuild.compile_calls import compile_into_cache, usable_processes
+
+    calls = [call for call in read_manifest() if call.is_plain or is_all]
+    compile_into_cache(calls, processes or usable_processes())
+
+
 def record(folder: Path, old: Iterable[KernelCall] = ()) -> None:
     """Write the list anew: recorded calls and old ones, of kernels that still exist."""
     known = called_kernels()
-    calls = {call for call in {*recorded_calls(folder), *old} if call.name in known}
+    plain = _calls_of_plain_worlds()
+    found = {*recorded_calls(folder), *plain, *old}
+    calls = marked((call for call in found if call.name in known), plain)
     write_manifest(calls)
     print(f"{len(calls)} calls of {len({call.name for call in calls})} kernels")
     if missing := known - {call.name for call in calls}:
         print(f"never called: {', '.join(sorted(missing))}")
 
 
+_PLAIN_WORLD = """
+import sys, cavmarl
+env = cavmarl.parallel_env(sys.argv[1])
+observations, _ = env.reset(seed=0)
+env.step({agent: env.action_space(agent).sample() for agent in env.agents})
+"""
+
+
+def _calls_of_plain_worlds() -> set[KernelCall]:
+    """Return what the first step of each plain world calls, with its map read anew and not."""
+    with TemporaryDirectory() as folder:
+        calls, cache = Path(folder, "calls"), Path(folder, "cache")
+        calls.mkdir()
+        kernels = cache_dir() / "kernels"
+        kernels.mkdir(parents=True, exist_ok=True)
+        cache.mkdir()
+        (cache / "kernels").symlink_to(kernels)
+        environment = {**os.environ, CALLS_SETTING: str(calls), "CAVMARL_CACHE_DIR": str(cache)}
+        for name in (*PLAIN_WORLDS, *PLAIN_WORLDS):
+            command = [sys.executable, "-c", _PLAIN_WORLD, name]
+            subprocess.run(command, env=environment, check=True)
+        return recorded_calls(calls)
+
+
 def check(folder: Path) -> int:
     """Say which recorded calls and which kernels are not in the list."""
-    calls = set(read_manifest())
+    calls = marked(read_manifest(), set())
     unknown = {call.name for call in recorded_calls(folder) - calls}
     unknown |= called_kernels() - {call.name for call in calls}
     for name in sorted(unknown):
@@ -75,12 +122,17 @@ def main() -> int:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("command", choices=("build", "record", "add", "check"))
-    parser.add_argument("folder", type=Path)
+    parser.add_argument("command", choices=("compile", "build", "record", "add", "check"))
+    parser.add_argument("folder", type=Path, nargs="?")
+    parser.add_argument("--all", action="store_true", help="each kernel of the list")
     parser.add_argument("--processes", type=int, default=0, help="0: two, or one on a single core")
     given = parser.parse_args()
     try:
-        if given.command == "build":
+        if given.command == "compile":
+            compile_here(given.processes, given.all)
+        elif given.folder is None:
+            parser.error(f"{given.command} needs a FOLDER")
+        elif given.command == "build":
             build(given.folder, given.processes)
         elif given.command in ("record", "add"):
             record(given.folder, read_manifest() if given.command == "add" else ())

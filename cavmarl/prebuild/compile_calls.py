@@ -6,16 +6,18 @@ import importlib
 import os
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
-from typing import Any, TextIO
+from typing import Any, TextIO, TypeVar
 
 from cavmarl.core.compiled.arguments import type_of
 from cavmarl.core.compiled.compiler import compile_kernel
 from cavmarl.core.compiled.signatures import example_arguments
 from cavmarl.core.compiled.store import CompiledKernel, KernelFile
 from cavmarl.prebuild.manifest import KernelCall
+
+T = TypeVar("T")
 
 _LINE_S = 5.0  # between two lines where the output is no terminal
 
@@ -30,12 +32,26 @@ def compile_calls(
     calls: Iterable[KernelCall], processes: int, output: TextIO = sys.stderr
 ) -> Iterator[CompiledKernel]:
     """Compile kernels in other processes, the longest first; the order of the results is open."""
+    yield from _in_processes(_compile, calls, processes, output)
+
+
+def compile_into_cache(
+    calls: Iterable[KernelCall], processes: int, output: TextIO = sys.stderr
+) -> int:
+    """Compile the kernels that are not kept on this machine yet, and keep them; return how many."""
+    missing = [call for call in calls if kernel_file(call).load() is None]
+    return sum(1 for _ in _in_processes(_compile_and_keep, missing, processes, output))
+
+
+def _in_processes(
+    work: Callable[[KernelCall], T], calls: Iterable[KernelCall], processes: int, output: TextIO
+) -> Iterator[T]:
     ordered = sorted(calls, key=_weight, reverse=True)
     with (
         _Progress(ordered, output) as progress,
         ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool,
     ):
-        running = {pool.submit(_compile, call): call for call in ordered}
+        running = {pool.submit(work, call): call for call in ordered}
         for done in as_completed(running):
             yield done.result()
             progress.advance(running[done])
@@ -46,6 +62,13 @@ def _compile(call: KernelCall) -> CompiledKernel:
     arguments = example_arguments(call.kinds)
     result, code = compile_kernel(_function_of(call), arguments, file.symbol)
     return CompiledKernel(file.name, file.types, result, file.symbol, code)
+
+
+def _compile_and_keep(call: KernelCall) -> None:
+    file = kernel_file(call)
+    with file.locked():
+        if file.load() is None:
+            file.save(_compile(call))
 
 
 def _function_of(call: KernelCall) -> Any:

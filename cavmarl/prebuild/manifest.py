@@ -8,7 +8,7 @@ once.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Set
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +21,7 @@ class KernelCall(NamedTuple):
 
     name: str
     signature: str  # as JSON
+    is_plain: bool = False  # needed until the end of the first step of a plain world
 
     @property
     def kinds(self) -> list[Any]:
@@ -30,15 +31,17 @@ class KernelCall(NamedTuple):
 
 
 def read_manifest(path: Path = MANIFEST) -> list[KernelCall]:
-    """Return all calls of the file, the slowest to compile first."""
+    """Return all calls of the file."""
+    if not path.exists():
+        return []  # nothing has been recorded yet
     document = json.loads(path.read_text("utf-8"))
     bundles: list[Any] = []
     for bundle in document["bundles"]:  # each may contain earlier ones
         bundles.append(_expand(bundle, bundles))
     return [
-        KernelCall(name, json.dumps(_expand(kinds, bundles)))
+        KernelCall(name, json.dumps(_expand(kinds, bundles)), is_plain)
         for name, calls in document["kernels"].items()
-        for kinds in calls
+        for is_plain, kinds in calls
     ]
 
 
@@ -47,7 +50,8 @@ def write_manifest(calls: Iterable[KernelCall], path: Path = MANIFEST) -> None:
     bundles: dict[str, int] = {}
     kernels: dict[str, list[Any]] = {}
     for call in sorted(set(calls)):
-        kernels.setdefault(call.name, []).append(_fold(call.kinds, bundles))
+        row = [int(call.is_plain), _fold(call.kinds, bundles)]
+        kernels.setdefault(call.name, []).append(row)
     lines = [
         '{"bundles": [',
         ",\n".join(bundles),
@@ -69,6 +73,12 @@ def recorded_calls(folder: Path) -> set[KernelCall]:
             name, kinds = json.loads(line)
             found.add(KernelCall(name, json.dumps(kinds)))
     return found
+
+
+def marked(calls: Iterable[KernelCall], plain: Set[KernelCall]) -> set[KernelCall]:
+    """Return the calls, marked by whether plain worlds make them."""
+    unmarked = {call._replace(is_plain=False) for call in calls}
+    return {call._replace(is_plain=call in plain) for call in unmarked}
 
 
 def _fold(kind: Any, bundles: dict[str, int]) -> Any:

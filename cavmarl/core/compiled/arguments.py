@@ -31,7 +31,7 @@ class Words:
     __slots__ = ("address", "floats", "last", "signed", "unsigned")
 
     def __init__(self, count: int) -> None:
-        memory = np.zeros(max(count, 1), dtype=np.int64)
+        memory: Any = np.zeros(max(count, 1), dtype=np.int64)
         self.address: int = memory.ctypes.data
         self.signed = memoryview(memory)
         as_bytes = self.signed.cast("B")
@@ -103,7 +103,7 @@ class _Array(ArgumentType):
         if type(new) is not np.ndarray:
             return False
         dtype, ndim, flags = self.key
-        return (
+        return bool(
             (new.dtype is dtype or new.dtype == dtype)
             and new.ndim == ndim
             and new.flags.num & flags == flags

@@ -11,16 +11,15 @@ from __future__ import annotations
 from typing import Any
 
 from llvmlite import ir
-from numba.core import types
+from numba.core import types as numba_types
 from numba.core.cgutils import alloca_once, gep_inbounds
-from numba.core.datamodel.registry import default_manager
 
 _WORD = ir.IntType(64)
 _BYTE = ir.IntType(8)
 _DOUBLE = ir.DoubleType()
 _allocate: Any = alloca_once
 _field: Any = gep_inbounds
-_models: Any = default_manager
+types: Any = numba_types  # not all of it is typed
 
 # Offsets in `PyArrayObject`, in bytes behind the head of a Python object.
 _DATA, _SHAPE, _STRIDES = 0, 16, 24

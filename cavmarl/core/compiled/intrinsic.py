@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import update_wrapper
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 class Intrinsic:
@@ -34,7 +37,7 @@ class Intrinsic:
         return self._type
 
 
-def intrinsic(generate: Callable[..., Any]) -> Callable[[Callable[..., Any]], Any]:
+def intrinsic(generate: Callable[..., Any]) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Decorate the plain Python form of an intrinsic.
 
     Args:
@@ -42,4 +45,9 @@ def intrinsic(generate: Callable[..., Any]) -> Callable[[Callable[..., Any]], An
             signature and a function that generates code, as for `numba.extending.intrinsic`. It
             imports what it needs of Numba and llvmlite itself.
     """
-    return lambda plain: Intrinsic(plain, generate)
+
+    def decorate(plain: Callable[P, R]) -> Callable[P, R]:
+        made: Any = Intrinsic(plain, generate)
+        return made  # type: ignore[no-any-return]
+
+    return decorate

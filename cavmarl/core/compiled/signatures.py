@@ -110,8 +110,9 @@ def _find_dtype(text: Any) -> np.dtype[Any]:
         return np.dtype(_find(text) if ":" in text else text)
     if "items" in text:
         return np.dtype((_find_dtype(text["items"]), tuple(text["shape"])))
-    formats = [_find_dtype(part) for part in text["formats"]]
-    return np.dtype({**text, "formats": formats})
+    form: Any = {**text, "formats": [_find_dtype(part) for part in text["formats"]]}
+    found: np.dtype[Any] = np.dtype(form)
+    return found
 
 
 def _find(name: str) -> Any:

@@ -117,7 +117,8 @@ def unpack(content: bytes) -> CompiledKernel | None:
     if hashlib.sha256(body).digest() != content[:_DIGEST_BYTES]:
         return None
     about, _, code = body.partition(b"\n")
-    return CompiledKernel(*json.loads(about), code)
+    name, types, result, symbol = json.loads(about)
+    return CompiledKernel(name, types, result, symbol, code)
 
 
 @cache
@@ -129,6 +130,12 @@ def _machine() -> tuple[str, ...]:
     features = os.environ.get("NUMBA_CPU_FEATURES") or binding.get_host_cpu_features().flatten()
     settings = [f"{name}={os.environ.get(name, '')}" for name in ("NUMBA_BOUNDSCHECK", "NUMBA_OPT")]
     return (numba_version(), processor, features, *settings)
+
+
+@cache
+def machine_digest() -> str:
+    """Return a short name for what code depends on beside the sources."""
+    return hashlib.sha256("\0".join(_machine()).encode()).hexdigest()[:16]
 
 
 @cache
