@@ -109,7 +109,7 @@ def verify_entry(policy: str | Path, progress: Progress | None = None) -> Verifi
         out = Path(room) / "again"
         evaluate(
             spec,
-            {name: folder},
+            {next(iter(document["policies"])): folder},  # the tables hold this name
             episodes=job["episodes"],
             repeats=len(document["seeds"]),
             out=out,
