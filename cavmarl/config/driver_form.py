@@ -161,8 +161,8 @@ def with_form(overrides: Mapping[str, Any] | None, form: Form, driver: str) -> d
     if lines:
         raise ConfigError(
             f"The overrides and the sensors of {driver} contradict each other: {'; '.join(lines)}. "
-            "A key has one value. Leave out the overrides of these keys (overrides, --set), or the "
-            f"sensors of {driver} (sensors_of, --sensors-of)"
+            "A key has one value. Leave out the overrides of these keys (overrides, --set, "
+            "--sensors-of), or name another driver"
         )
     return given | form
 
