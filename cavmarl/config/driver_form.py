@@ -20,6 +20,7 @@ from cavmarl.config.registry import agent_entries
 from cavmarl.config.sensors import SensorsConfig
 from cavmarl.core.errors import ConfigError, PolicyError
 
+WEIGHTS_FILE = "model.safetensors"
 CONFIG_FILE = "config.json"
 # Keys of `action` that give the actions of each kind their meaning.
 SCALES = {
@@ -55,13 +56,14 @@ def read_form(folder: Path) -> Form:
     """Read the form of a trained driver from its folder.
 
     Raises:
-        PolicyError: `config.json` is missing, broken, or holds keys of another version.
+        PolicyError: a file of the driver is missing, or `config.json` is broken.
     """
     from cavmarl.config.io import validate
 
+    for name in (WEIGHTS_FILE, CONFIG_FILE):
+        if not (folder / name).is_file():
+            raise PolicyError(f"no {name} in {folder}: is this the folder of a trained driver?")
     path = folder / CONFIG_FILE
-    if not path.is_file():
-        raise PolicyError(f"no {CONFIG_FILE} in {folder}: is this the folder of a trained driver?")
     try:
         raw: Any = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:  # not all of JSON's are its own

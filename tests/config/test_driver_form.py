@@ -115,6 +115,9 @@ def test_an_unknown_driver_is_told_the_nearest() -> None:
 
 @pytest.mark.parametrize("text", [None, "", "[]", "{}", '{"sensors": 3, "action": {}}'])
 def test_a_broken_file_is_named(tmp_path: Path, text: str | None) -> None:
+    with pytest.raises(PolicyError, match=r"no model\.safetensors in"):
+        read_form(tmp_path)
+    (tmp_path / "model.safetensors").touch()
     if text is not None:
         (tmp_path / "config.json").write_text(text)
     with pytest.raises(PolicyError, match=r"config\.json"):
