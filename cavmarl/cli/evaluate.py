@@ -29,7 +29,7 @@ from cavmarl.cli.output import (
     write_json,
 )
 from cavmarl.cli.web import WebPort, say
-from cavmarl.config.world_spec import WorldSpec
+from cavmarl.config.world_spec import WorldSpec, with_sensors_of_drivers
 from cavmarl.core.errors import require
 from cavmarl.core.progress import progress_bar
 from cavmarl.viewer.web_options import DEFAULT_PORT, WebOptions
@@ -81,6 +81,8 @@ def evaluate(
     """Drive seeded episodes and show success, safety, comfort, delay, throughput and fairness."""
     _check_page(html)
     console = Console()
+    drivers = policy or ["idm"]
+    world = with_sensors_of_drivers(world, drivers)  # before a progress bar has the terminal
     folder = out or _new_folder(world.env)
     more: dict[str, Any] = {
         "episodes": episodes,
@@ -91,7 +93,7 @@ def evaluate(
     with ExitStack() as stack:
         if page:
             more["watcher"] = partial(_watched, stack, WebOptions(port=port, control=False))
-        found = evaluate_showing(console, world, policy or ["idm"], out=folder, **more)
+        found = evaluate_showing(console, world, drivers, out=folder, **more)
     if failures:
         console.print(f"failed trips: {folder / 'failures.html'}", markup=False)
     _show(console, found, folder, html, json_path)

@@ -83,6 +83,10 @@ Background = Annotated[int | None, about("Background vehicles a world; default: 
 Settings = Annotated[
     list[str] | None, about("Any key of env.yaml; may be repeated.", "--set", metavar="KEY=VALUE")
 ]
+SensorsOf = Annotated[
+    str | None,
+    about("Give the agents the sensors and actions of this trained driver.", metavar="DRIVER"),
+]
 JsonPath = Annotated[Path | None, about_file("Write the result here as JSON.", "--json")]
 RecordPath = Annotated[
     Path | None, about("Record into this new folder, for `cavmarl replay`.", "--record")
@@ -122,7 +126,7 @@ def with_world(*names: str) -> Callable[[Callable[..., None]], Callable[..., Non
     In its place stand the options that make one: all, or the environment and those of these names.
     Where the function has one of them, too, it says how it is given, and gets it.
     """
-    chosen = names or ("agents", "background", "seed", "settings")
+    chosen = names or ("agents", "background", "seed", "settings", "sensors_of")
     return partial(_with_world, ("env", *chosen))
 
 
@@ -135,6 +139,7 @@ def _with_world(names: tuple[str, ...], command: Callable[..., None]) -> Callabl
         "agents": (Agents, None),
         "background": (Background, None),
         "settings": (Settings, None),
+        "sensors_of": (SensorsOf, None),
     }
     wanted = {
         name: Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=kind)
@@ -148,8 +153,8 @@ def _with_world(names: tuple[str, ...], command: Callable[..., None]) -> Callabl
     @wraps(command)
     def program(**options: Any) -> None:
         keys = {name: options[name] for name in names if name != "settings"}
-        keys["env"] = keys["env"] or ""
-        spec = WorldSpec(overrides=parse_settings(options["settings"]), **keys)
+        env = keys.pop("env") or ""
+        spec = WorldSpec.of(env, overrides=parse_settings(options["settings"]), **keys)
         command(spec, **{name: options[name] for name in own})
 
     program.__annotations__ = {name: one.annotation for name, one in wanted.items()}

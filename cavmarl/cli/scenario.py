@@ -16,7 +16,7 @@ from rich.markup import escape
 from rich.table import Column, Table
 
 from cavmarl.cli.output import JsonPath, about, about_file, number, with_world, write_json
-from cavmarl.config.world_spec import WorldSpec
+from cavmarl.config.world_spec import WorldSpec, with_sensors_of_drivers
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.progress import counting
 
@@ -55,7 +55,7 @@ def list_scenarios(json_path: JsonPath = None) -> None:
 
 
 @app.command("run")
-@with_world("agents", "seed", "settings")
+@with_world("agents", "seed", "settings", "sensors_of")
 def run(
     world: WorldSpec,
     name: Annotated[str, typer.Argument(metavar="NAME", help="A scenario, or a .py file.")],
@@ -81,6 +81,7 @@ def run(
     from cavmarl.evaluate.scenarios.scenario_films import ScenarioCamera
     from cavmarl.evaluate.scenarios.scenario_runs import make_scenario, run_scenario
 
+    world = with_sensors_of_drivers(world, [driver])
     with ExitStack() as stack:
         vec = make_scenario(
             name, world, params=_params(param), place=place, density=density, zones=zones

@@ -22,7 +22,7 @@ from cavmarl.cli.output import (
 )
 from cavmarl.cli.web import WatchToken, WebHost, WebPort, WebToken, say
 from cavmarl.config.checks import check_count
-from cavmarl.config.world_spec import WorldSpec
+from cavmarl.config.world_spec import WorldSpec, with_sensors_of_drivers
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.progress import progress_bar
 from cavmarl.viewer.web_options import DEFAULT_PORT, WebOptions
@@ -61,6 +61,7 @@ def view(
     from cavmarl.env.parallel import parallel_env
 
     kept = recorded(record, record_also)
+    world = with_sensors_of_drivers(world, [policy])
     if web:
         from cavmarl.viewer.show_world import show_worlds
 

@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from cavmarl.cli.output import JsonPath, about, grid, number, with_world, write_json
-from cavmarl.config.world_spec import WorldSpec
+from cavmarl.config.world_spec import WorldSpec, with_sensors_of_drivers
 from cavmarl.core.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -83,6 +83,7 @@ def cross(
     from cavmarl.evaluate.zoo import cross as run
 
     console = Console()
+    world = with_sensors_of_drivers(world, policy)
     with progress_bar(console) as bar:
         found = run(world, policy, episodes=episodes, progress=_progress(bar))
     for column, title in (("success", "success, %"), ("collision", "collision, %")):

@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import sys
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypedDict, Unpack
 
+from cavmarl.config.driver_form import (
+    common_form,
+    differing_keys,
+    forms_in,
+    with_form,
+    with_sensors_of,
+)
+from cavmarl.config.registry import load_config
 from cavmarl.core.seeds import check_seed
 
 
 class WorldKeys(TypedDict, total=False):
-    """Keywords of functions that take a world; as the fields of `WorldSpec`."""
+    """Keywords of functions that take a world: the fields of `WorldSpec`, and `sensors_of`."""
 
     agents: int | None
     background: int | None
     max_cycles: int | None
     seed: int
     overrides: Mapping[str, Any] | None
+    sensors_of: str | Path | None  # a trained driver; its sensors and actions become overrides
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,10 +46,17 @@ class WorldSpec:
 
     @classmethod
     def of(cls, env: str | Path | WorldSpec, **keys: Unpack[WorldKeys]) -> WorldSpec:
-        """What a function is given that takes a world: a spec, or an environment and keywords."""
+        """What a function is given that takes a world: a spec, or an environment and keywords.
+
+        Raises:
+            ConfigError, PolicyError: `sensors_of` contradicts the overrides, or is no trained
+                driver.
+        """
         if isinstance(env, WorldSpec):
             return env
-        given: dict[str, Any] = {**keys, "overrides": dict(keys.get("overrides") or {})}
+        driver = keys.pop("sensors_of", None)
+        overrides = with_sensors_of(keys.get("overrides"), driver)
+        given: dict[str, Any] = {**keys, "overrides": dict(overrides or {})}
         return cls(env=str(env), **given)
 
     @property
@@ -51,3 +68,30 @@ class WorldSpec:
             "max_cycles": self.max_cycles,
             "overrides": self.overrides,
         }
+
+
+def with_sensors_of_drivers(spec: WorldSpec, policies: Iterable[str | Path]) -> WorldSpec:
+    """Return the world with the sensors and actions that the trained drivers among these need.
+
+    A world that has them already stays as it is; a change is announced on standard error.
+
+    Raises:
+        ConfigError: an override of the world contradicts the drivers.
+        PolicyError: a driver cannot be found or read, or two drivers need different forms.
+    """
+    forms = forms_in(policies)
+    if not forms:
+        return spec
+    form, names = common_form(forms), ", ".join(forms)
+    differing = differing_keys(form, load_config(spec.env, **spec.keywords)[0])
+    if not differing:
+        return spec
+    needed = {key: value for key, (value, _) in differing.items()}
+    fitted = replace(spec, overrides=with_form(spec.overrides, needed, names))
+    print(
+        f"cavmarl: {spec.env} gets the sensors and actions of {names} ({len(needed)} keys, as with "
+        f"--sensors-of {next(iter(forms))})",
+        file=sys.stderr,
+        flush=True,
+    )
+    return fitted

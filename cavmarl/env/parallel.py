@@ -12,6 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
+from cavmarl.config.driver_form import with_sensors_of
 from cavmarl.config.registry import load_config
 from cavmarl.core.errors import ActionError, ConfigError, EpisodeError
 from cavmarl.core.seeds import check_seed, first_seed
@@ -60,6 +61,7 @@ def parallel_env(
     background: int | None = None,
     seed: int | None = None,
     max_cycles: int | None = None,
+    sensors_of: str | Path | None = None,
     render_mode: str | None = None,
     record: Record | None = None,
     lenient: bool = False,
@@ -82,6 +84,7 @@ def parallel_env(
         background: shadows population.background.
         seed: of the first reset, if that is given none.
         max_cycles: steps until truncation; shadows horizon_s.
+        sensors_of: a trained driver, whose sensors and actions the agents get.
         render_mode: `human`, `rgb_array` or None.
         record: a new folder to record into, or `RecordOptions` (docs/recordings.md).
         lenient: for libraries that act for absent agents, or beyond the bounds: values are clipped,
@@ -91,6 +94,7 @@ def parallel_env(
 
     Raises:
         ConfigError: a key, value or combination that cannot work.
+        PolicyError: `sensors_of` is no trained driver.
         MapError: the map cannot be read or driven.
         WorkerError: worker processes cannot be started, or have no memory.
         MissingExtraError, RecordingError: no Ray, or pyarrow; `record` cannot be written.
@@ -101,14 +105,9 @@ def parallel_env(
     if lenient and isinstance(overrides, Mapping | None):
         overrides = {**LENIENT, **(overrides or {})}
     config, base_dir = load_config(
-        env,
-        zones=zones,
-        sensor_workers=sensor_workers,
-        agents=agents,
-        background=background,
-        max_cycles=max_cycles,
-        overrides=overrides,
-    )
+        env, zones=zones, sensor_workers=sensor_workers, agents=agents, background=background,
+        max_cycles=max_cycles, overrides=with_sensors_of(overrides, sensors_of),
+    )  # fmt: skip
     check_agents(config)
     check_rendering(config, render_mode, 1, workers, hosts)
     check_recording(config, record, 1, workers, hosts)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from cavmarl.balance.balance_plan import Plan
 from cavmarl.balance.plan_text import describe_plan
+from cavmarl.config.driver_form import with_sensors_of
 from cavmarl.config.registry import load_config
 from cavmarl.core.errors import ConfigError, EpisodeError
 from cavmarl.core.seeds import check_seed, first_seed
@@ -60,6 +61,7 @@ def make_vec(
     background: int | None = None,
     seed: int | None = None,
     max_cycles: int | None = None,
+    sensors_of: str | Path | None = None,
     autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
     copy: bool = True,
     render_mode: str | None = None,
@@ -82,6 +84,7 @@ def make_vec(
         background: shadows population.background.
         seed: of the first reset, if that is given none.
         max_cycles: steps until truncation; shadows horizon_s.
+        sensors_of: a trained driver, whose sensors and actions the agents get.
         autoreset_mode: when a world that is over begins anew; see `CavVectorEnv`.
         copy: False returns observations without a copy.
         render_mode: `rgb_array` or None.
@@ -90,6 +93,7 @@ def make_vec(
 
     Raises:
         ConfigError: a key, value or combination that cannot work.
+        PolicyError: `sensors_of` is no trained driver.
         MapError: the map cannot be read or driven.
         WorkerError: worker processes cannot be started, or have no memory.
         MissingExtraError, RecordingError: `hosts` or `record` without its extra; a taken path.
@@ -99,14 +103,9 @@ def make_vec(
     check_hosts(workers, hosts)
     first_seed = None if seed is None else check_seed(seed)
     config, base_dir = load_config(
-        env,
-        zones=zones,
-        sensor_workers=sensor_workers,
-        agents=agents,
-        background=background,
-        max_cycles=max_cycles,
-        overrides=overrides,
-    )
+        env, zones=zones, sensor_workers=sensor_workers, agents=agents, background=background,
+        max_cycles=max_cycles, overrides=with_sensors_of(overrides, sensors_of),
+    )  # fmt: skip
     check_agents(config)
     check_rendering(config, render_mode, num_envs, workers, hosts, ("rgb_array",))
     check_recording(config, record, num_envs, workers, hosts)

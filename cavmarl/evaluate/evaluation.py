@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.checks import check_count
-from cavmarl.config.world_spec import WorldKeys, WorldSpec
+from cavmarl.config.world_spec import WorldKeys, WorldSpec, with_sensors_of_drivers
 from cavmarl.core.errors import (
     ConfigError,
     JournalError,
@@ -100,6 +100,7 @@ def evaluate(
     """Let policies drive `repeats` runs of `episodes` seeded episodes, each counted once.
 
     All policies meet the same episodes: episode e of a run is the first one of world e of its seed.
+    If the trained drivers among them need the same sensors, the worlds get these sensors.
     Two or more runs are driven in fresh processes, one after the other.
 
     Args:
@@ -118,8 +119,10 @@ def evaluate(
         keys: of the world; the seed is that of the first run, from which the others' follow.
 
     Raises:
-        ConfigError: a number or a key that cannot work, or `out` cannot be made.
-        PolicyError: a policy cannot be loaded or does not fit, or two have one name.
+        ConfigError: a number or a key that cannot work, an override that contradicts a trained
+            driver, or `out` cannot be made.
+        PolicyError: a policy cannot be loaded or does not fit, two have one name, or two trained
+            drivers need different sensors.
         ManifestError: `out` holds results already.
         JournalError: a journal is there already.
         RecordingError: `record` cannot be written.
@@ -132,22 +135,19 @@ def evaluate(
             f"repeats = {repeats} with a watcher: runs are driven in fresh processes; watch one "
             "run, or record them"
         )
-    spec = WorldSpec.of(env, **keys)
+    named = _named(policies)
+    spec = with_sensors_of_drivers(WorldSpec.of(env, **keys), named.values())
     if failures:
         check_count("failures", failures, MAX_FAILURES)
         require("jinja2", "report")
-    recorded = None if record is None else RecordOptions.of(record)
-    if recorded is not None:
-        recorded = recorded.at(str(Path(recorded.path).absolute()))  # as a manifest tells it
     job = EpisodeJob(
         **vars(spec),
-        policies=_named(policies),
+        policies=named,
         episodes=episodes,
         runs=repeats,
-        record=recorded,
+        record=_record_options(record),
         failures=failures,
     )
-    _check_record(recorded)
     with TemporaryDirectory() as room:
         folder = Path(room) if out is None else out
         jobs, is_divided = _prepare(folder, job, repeats)
@@ -155,13 +155,19 @@ def evaluate(
         return load_report(folder)
 
 
-def _check_record(record: RecordOptions | None) -> None:
-    """Refuse early what no recording can be made in."""
-    if record is not None:
-        require("pyarrow", "recordings")
-        path = Path(record.path)
-        if path.exists() and not (path.is_dir() and not any(path.iterdir())):
-            raise RecordingError(f"{path}: there is something already; give a new folder")
+def _record_options(record: RecordOptions | str | Path | None) -> RecordOptions | None:
+    """Return the options with an absolute path, as a manifest tells it.
+
+    Refuse early what no recording can be made in.
+    """
+    if record is None:
+        return None
+    require("pyarrow", "recordings")
+    options = RecordOptions.of(record)
+    path = Path(options.path).absolute()
+    if path.exists() and not (path.is_dir() and not any(path.iterdir())):
+        raise RecordingError(f"{options.path}: there is something already; give a new folder")
+    return options.at(str(path))
 
 
 def load_report(folder: Path) -> EvaluationReport:

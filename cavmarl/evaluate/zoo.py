@@ -16,6 +16,7 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.config.driver_names import TOGETHER
 from cavmarl.config.registry import agent_entries
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import CavmarlError, ConfigError, ManifestError, PolicyError
@@ -31,7 +32,7 @@ from cavmarl.evaluate.evaluation import (
     read_evaluation,
 )
 from cavmarl.evaluate.provenance.manifest import hash_of_file
-from cavmarl.policies.policy import TOGETHER, policy_files
+from cavmarl.policies.policy import policy_files
 
 RESULT_FOLDER = "result"
 TABLES = (TRIPS_FILE, EPISODES_FILE, TRACKS_FILE)  # the same each time they are made
@@ -108,7 +109,7 @@ def verify_entry(policy: str | Path, progress: Progress | None = None) -> Verifi
         out = Path(room) / "again"
         evaluate(
             spec,
-            {name: folder},
+            {next(iter(document["policies"])): folder},  # the tables hold this name
             episodes=job["episodes"],
             repeats=len(document["seeds"]),
             out=out,

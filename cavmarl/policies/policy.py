@@ -6,13 +6,10 @@ holds the weights of a trained network. Both are files that are read, not module
 
 from __future__ import annotations
 
-import difflib
 import importlib.util
 import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from operator import attrgetter
-from os.path import isdir, isfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
-from cavmarl.config.env import EnvConfig
-from cavmarl.config.registry import agent_entries, agent_here
-from cavmarl.config.sensors import SensorsConfig
+from cavmarl.config.driver_form import differing_keys, form_of, form_of_driver
+from cavmarl.config.driver_names import SHIELDED, find_driver, name_of_driver, shared_drivers
 from cavmarl.core.errors import PolicyError, require
 from cavmarl.core.tracebacks import fault_in
 from cavmarl.engine.spaces import flat_observation, flat_observation_space, observation_parts
@@ -30,12 +26,9 @@ from cavmarl.env.parallel import CavEnv
 from cavmarl.env.vector import CavVectorEnv
 
 if TYPE_CHECKING:
-    from cavmarl.policies.networks import ActorCritic, NetworkConfig
+    from cavmarl.policies.networks import ActorCritic
 
 Environment = CavEnv | CavVectorEnv
-
-TOGETHER = "+"  # between drivers that share the agents of a world
-SHIELDED = "shielded:"  # before a driver that the built-in one relieves
 
 
 class Policy(ABC):
@@ -183,13 +176,13 @@ def load_policy(policy: str | Path, env: Environment) -> Policy:
         raise PolicyError(
             f"env is a {type(env).__name__}: pass what parallel_env() or make_vec() returned"
         )
-    if parts := _shared(policy):
+    if parts := shared_drivers(policy):
         return SharedPolicy(env, [load_policy(part, env) for part in parts])
     if isinstance(policy, str) and policy.startswith(SHIELDED):
         from cavmarl.policies.shield import ShieldedPolicy  # it is a `Policy`
 
         return ShieldedPolicy(env, load_policy(policy.removeprefix(SHIELDED), env))
-    path = _find(policy)
+    path = find_driver(policy)
     if path.is_dir():
         return _load_network_policy(path, env)
     return _load_script(path, env)
@@ -197,9 +190,9 @@ def load_policy(policy: str | Path, env: Environment) -> Policy:
 
 def policy_files(policy: str | Path) -> tuple[Path, ...]:
     """The files that make a policy what it is: its script, or its weights and their description."""
-    if parts := _shared(policy):
+    if parts := shared_drivers(policy):
         return tuple(dict.fromkeys(file for part in parts for file in policy_files(part)))
-    path = _find(policy.removeprefix(SHIELDED) if isinstance(policy, str) else policy)
+    path = find_driver(policy.removeprefix(SHIELDED) if isinstance(policy, str) else policy)
     if not path.is_dir():
         return (path,)
     require("torch", "torch")
@@ -211,43 +204,6 @@ def policy_files(policy: str | Path) -> tuple[Path, ...]:
         if not file.is_file():
             raise PolicyError(f"no {file.name} in {path}: not the folder of a trained driver")
     return files
-
-
-def _shared(policy: str | Path) -> list[str]:
-    """The drivers that share the agents; none where `policy` is one driver."""
-    if not isinstance(policy, str) or TOGETHER not in policy or Path(policy).exists():
-        return []
-    return policy.split(TOGETHER)
-
-
-def _find(policy: str | Path) -> Path:
-    """The file or folder that `policy` means."""
-    if not isinstance(policy, str | Path):
-        raise PolicyError(f"policy = {policy!r}: must be the name of a driver, or a path")
-    known = agent_entries()
-    here = agent_here(policy) if isinstance(policy, str) else None
-    if isinstance(policy, str) and policy in known:
-        if here is not None:
-            raise PolicyError(
-                f"policy '{policy}': is a driver of cavmarl, and {here} is there, too; give a path"
-            )
-        return known[policy]
-    path = Path(policy)
-    if isdir(path):  # unlike Path's, it takes names that no folder can have
-        return path
-    if isfile(path) and path.suffix == ".py":
-        return path
-    if isfile(path):
-        raise PolicyError(
-            f"{path}: no policy; give a folder with model.safetensors, or a .py with make_policy"
-        )
-    if here is not None:
-        raise PolicyError(f"policy '{policy}': {here} is code of this folder; give its path")
-    close = difflib.get_close_matches(str(policy), known, n=3)
-    meant = f"did you mean {' or '.join(close)}? " if close else ""
-    raise PolicyError(
-        f"no policy, folder or file '{policy}'; {meant}There are: {', '.join(known) or 'none'}"
-    )
 
 
 def _load_script(path: Path, env: Environment) -> Policy:
@@ -277,14 +233,16 @@ def _load_network_policy(folder: Path, env: Environment) -> NetworkPolicy:
     from cavmarl.policies.networks import load_network
 
     network, config = load_network(folder)
-    name, here = folder.name, env.config
+    name, here = name_of_driver(folder), env.config
     size = flat_observation_space(here).shape[0]
-    if unlike := _differences(config, here):
-        lines = (f"{key} is {there} there, {ours} here" for key, (there, ours) in unlike.items())
+    if unlike := differing_keys(form_of(config.sensors, config.action), here):
+        lines = (f"{key} is {there} for it, {ours} here" for key, (there, ours) in unlike.items())
         cure = {key: there for key, (there, _) in unlike.items()}
         raise PolicyError(
-            f"{name} does not fit {here.name}: {'; '.join(lines)} ({config.sensed} "
-            f"numbers observed there, {size} here); make the environment with overrides={cure}"
+            f"The policy {name} expects different {_parts(unlike)} from those that this "
+            f"environment provides ({'; '.join(lines)}). It observes {config.sensed} numbers, and "
+            f"this environment gives {size}. Add --sensors-of {name} to the command, or "
+            f"sensors_of={name!r} in Python, or pass these overrides: {cure}"
         )
     if config.sensed != size:
         raise PolicyError(
@@ -294,32 +252,16 @@ def _load_network_policy(folder: Path, env: Environment) -> NetworkPolicy:
     return NetworkPolicy(env, network)
 
 
+def _parts(keys: Iterable[str]) -> str:
+    """Return the parts of an environment that the keys belong to, in words."""
+    found = {key.partition(".")[0] for key in keys}
+    names = {"sensors": "sensors", "action": "actions"}
+    return " and ".join(name for key, name in names.items() if key in found)
+
+
 def driver_keys(policy: str | Path) -> dict[str, Any]:
-    """What a trained driver sees and does: overrides that make any environment fit for it.
+    """Return what a trained driver sees and does: overrides that make any environment fit for it.
 
     Raises PolicyError: nothing of that name, or no trained driver.
     """
-    folder = policy_files(policy)[0].parent
-    from cavmarl.policies.networks import load_network
-
-    return _keys(load_network(folder)[1])
-
-
-def _keys(config: NetworkConfig) -> dict[str, Any]:
-    """The keys of an environment that say what observations and actions mean."""
-    from cavmarl.config.io import dotted_keys  # pydantic is slow to import
-
-    scales = {
-        "continuous": ("acceleration_mps2", "steering_rad"),
-        "discrete": ("target_speeds_mps",),
-        "grid": ("acceleration_mps2", "steering_rad", "grid_throttle", "grid_steering"),
-    }[config.action.kind]
-    actions = {f"action.{key}": getattr(config.action, key) for key in ("kind", *scales)}
-    sensors = ((key, attrgetter(key)(config.sensors)) for key in dotted_keys(SensorsConfig))
-    return actions | {f"sensors.{key}": value for key, value in sensors}
-
-
-def _differences(config: NetworkConfig, here: EnvConfig) -> dict[str, tuple[Any, Any]]:
-    """Keys that make observations or actions mean something else: (in training, here)."""
-    pairs = {key: (there, attrgetter(key)(here)) for key, there in _keys(config).items()}
-    return {key: (there, ours) for key, (there, ours) in pairs.items() if there != ours}
+    return form_of_driver(policy)

@@ -26,7 +26,7 @@ def test_both_sides_learn_from_the_same_numbers(
     assert run("bench", "train", *small, "--at-least", "1e9", "--json", str(path)) == 1
     found = json.loads(path.read_text())
     ours, recipe, theirs = found["end_to_end"]["rows"]
-    assert (ours["who"], theirs["who"]) == ("cavmarl", "stable_baselines3")
+    assert (ours["name"], theirs["name"]) == ("cavmarl", "stable_baselines3")
     assert ours["worlds"] * training_speed.OUR_STEPS * 2 == theirs["decisions"]
     assert 0 < ours["decisions"] <= theirs["decisions"]
     assert found["numbers"] == 25
@@ -40,8 +40,8 @@ def test_both_sides_learn_from_the_same_numbers(
 
 
 def test_ratios_are_of_the_same_turn() -> None:
-    def row(who: str, *rates: float) -> TrainingRow:
-        return TrainingRow(who, 2, 100, rates, {})
+    def row(name: str, *rates: float) -> TrainingRow:
+        return TrainingRow(name, 2, 100, rates, {})
 
     rows = (
         row("cavmarl", 10.0, 30.0, 20.0),

@@ -212,10 +212,10 @@ def test_a_file_that_is_no_policy_is_refused(tmp_path: Path) -> None:
 def test_a_network_refuses_another_seat(checkpoint: Path, key: str, value: Any) -> None:
     vec = small_vec(**{key: value})
     name = key.replace("__", ".")
-    with pytest.raises(PolicyError, match=rf"does not fit merge: .*overrides=.*'{name}'") as caught:
+    with pytest.raises(PolicyError, match=rf"expects different .*overrides: .*'{name}'") as caught:
         load_policy(checkpoint, vec)
     at_home = attrgetter(name)(small_vec().config)
-    assert f"{name} is {at_home} there, {value} here" in str(caught.value)
+    assert f"{name} is {at_home} for it, {value} here" in str(caught.value)
     sizes = {seat.single_observation_space.shape[0] for seat in (small_vec(), vec)}
     assert all(str(size) in str(caught.value) for size in sizes)
 
@@ -226,7 +226,7 @@ def test_the_overrides_that_a_refusal_names_make_it_fit(checkpoint: Path) -> Non
         load_policy(checkpoint, make_vec("merge", overrides=changed))
     import ast
 
-    cure = ast.literal_eval(str(caught.value).partition("overrides=")[2])
+    cure = ast.literal_eval(str(caught.value).partition("overrides: ")[2])
     load_policy(checkpoint, make_vec("merge", overrides={**changed, **cure}))
     load_policy(checkpoint, make_vec("merge", overrides=changed | driver_keys(checkpoint)))
 

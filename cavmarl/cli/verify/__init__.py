@@ -29,7 +29,7 @@ from cavmarl.cli.verify.nodes import (
     verify_node_campaign,
     verify_over_nodes,
 )
-from cavmarl.config.world_spec import WorldSpec
+from cavmarl.config.world_spec import WorldSpec, with_sensors_of_drivers
 from cavmarl.core.errors import ConfigError, LostTickError
 from cavmarl.core.progress import counting
 
@@ -72,6 +72,8 @@ def verify(
             raise ConfigError("--replay: all else stands in the file; beside it goes ENV only")
         return _run_again(replay, env, json_path)
     counts = None if zones is None else _counts(zones)
+    if env is not None:
+        world = with_sensors_of_drivers(world, [policy])
     console = Console()
     checked = {"zones.check_invariants": True} if check else {}
     strict = replace(world, overrides={**world.overrides, **checked})

@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 
 from cavmarl.cli.output import JsonPath, PolicyName, about, say_difference, with_world, write_json
-from cavmarl.config.world_spec import WorldSpec
+from cavmarl.config.world_spec import WorldSpec, with_sensors_of_drivers
 from cavmarl.core.progress import counting
 
 
@@ -24,6 +24,7 @@ def verify_determinism(
     from cavmarl.verify.determinism import verify_determinism as verify
 
     console = Console()
+    world = with_sensors_of_drivers(world, [policy])
     with counting(console, f"three times {policy} in {world.env}") as progress:
         found = verify(world, policy, steps=steps, progress=progress)
     write_json(json_path, asdict(found))
