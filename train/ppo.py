@@ -29,6 +29,7 @@ from cavmarl.config.terms import TERMS
 from cavmarl.core.errors import ConfigError
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.learning import options
+from cavmarl.learning.actor_critic import ActorCritic
 from cavmarl.learning.checkpoint import Parts, bytes_of, tensor_of
 from cavmarl.learning.log import Trips, describe, progress_bar
 from cavmarl.learning.opponents import Opponents
@@ -36,7 +37,7 @@ from cavmarl.learning.phase_times import PhaseTimes
 from cavmarl.learning.run_folder import RunFolder, parse_run
 from cavmarl.learning.scales import Scales
 from cavmarl.parallel.local_worlds import kept_elsewhere
-from cavmarl.policies.networks import ActorCritic, NetworkConfig
+from cavmarl.policies.network_files import NetworkConfig
 from cavmarl.policies.policy import driver_keys, policy_files
 
 PHASES = ("simulation", "transfer", "inference", "learning")

@@ -23,14 +23,15 @@ from pettingzoo import ParallelEnv
 from cavmarl.config.env import EnvConfig
 from cavmarl.config.registry import agent_entries, agent_here
 from cavmarl.config.sensors import SensorsConfig
-from cavmarl.core.errors import PolicyError, require
+from cavmarl.core.errors import PolicyError
 from cavmarl.core.tracebacks import fault_in
 from cavmarl.engine.spaces import flat_observation, flat_observation_space, observation_parts
 from cavmarl.env.parallel import CavEnv
 from cavmarl.env.vector import CavVectorEnv
 
 if TYPE_CHECKING:
-    from cavmarl.policies.networks import ActorCritic, NetworkConfig
+    from cavmarl.policies.driver_network import DriverNetwork
+    from cavmarl.policies.network_files import NetworkConfig
 
 Environment = CavEnv | CavVectorEnv
 
@@ -93,24 +94,16 @@ class Policy(ABC):
 class NetworkPolicy(Policy):
     """A trained network, driving by its most likely actions."""
 
-    def __init__(self, env: Environment, network: ActorCritic) -> None:
+    def __init__(self, env: Environment, network: DriverNetwork) -> None:
         super().__init__(env)
         self.network = network
 
     def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
         """The network's most likely actions where `mask`, 0 elsewhere."""
-        import torch
-
-        if self.network.residual:
+        if self.network.config.residual:
             proposed = built_in_actions(self.env, mask)
             observations = np.concatenate([observations, proposed], axis=-1)
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)  # for so small a network, more cost many times what they bring
-        try:
-            with torch.inference_mode():
-                best = self.network.best(torch.from_numpy(observations[mask])).numpy()
-        finally:
-            torch.set_num_threads(threads)
+        best = self.network.best(observations[mask])
         actions = np.zeros((*mask.shape, *best.shape[1:]), dtype=best.dtype)
         actions[mask] = best
         return actions
@@ -175,7 +168,6 @@ def load_policy(policy: str | Path, env: Environment) -> Policy:
     Raises:
         PolicyError: nothing of that name, a broken file, or a network made for other observations
             or actions than this environment's.
-        MissingExtraError: a network, without torch.
     """
     if isinstance(env, ParallelEnv):
         env = env.unwrapped
@@ -202,9 +194,7 @@ def policy_files(policy: str | Path) -> tuple[Path, ...]:
     path = _find(policy.removeprefix(SHIELDED) if isinstance(policy, str) else policy)
     if not path.is_dir():
         return (path,)
-    require("torch", "torch")
-    require("safetensors", "torch")
-    from cavmarl.policies.networks import CONFIG_FILE, WEIGHTS_FILE
+    from cavmarl.policies.network_files import CONFIG_FILE, WEIGHTS_FILE  # imports pydantic
 
     files = (path / WEIGHTS_FILE, path / CONFIG_FILE)
     for file in files:
@@ -272,12 +262,10 @@ def _load_script(path: Path, env: Environment) -> Policy:
 
 
 def _load_network_policy(folder: Path, env: Environment) -> NetworkPolicy:
-    require("torch", "torch")
-    require("safetensors", "torch")
-    from cavmarl.policies.networks import load_network
+    from cavmarl.policies.driver_network import load_driver_network  # imports pydantic
 
-    network, config = load_network(folder)
-    name, here = folder.name, env.config
+    network = load_driver_network(folder)
+    config, name, here = network.config, folder.name, env.config
     size = flat_observation_space(here).shape[0]
     if unlike := _differences(config, here):
         lines = (f"{key} is {there} there, {ours} here" for key, (there, ours) in unlike.items())
@@ -300,9 +288,9 @@ def driver_keys(policy: str | Path) -> dict[str, Any]:
     Raises PolicyError: nothing of that name, or no trained driver.
     """
     folder = policy_files(policy)[0].parent
-    from cavmarl.policies.networks import load_network
+    from cavmarl.policies.network_files import read_network  # imports pydantic
 
-    return _keys(load_network(folder)[1])
+    return _keys(read_network(folder)[1])
 
 
 def _keys(config: NetworkConfig) -> dict[str, Any]:

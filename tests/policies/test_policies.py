@@ -40,7 +40,8 @@ def checkpoint(tmp_path: Path) -> Path:
 def save_driver(folder: Path, vec: CavVectorEnv, *, residual: bool = False) -> Path:
     import torch
 
-    from cavmarl.policies.networks import ActorCritic, NetworkConfig, save_network
+    from cavmarl.learning.actor_critic import ActorCritic, save_network
+    from cavmarl.policies.network_files import NetworkConfig
 
     torch.manual_seed(0)
     config = NetworkConfig(
@@ -260,7 +261,7 @@ def test_a_shield_brakes_where_the_built_in_driver_would(kind: str) -> None:
 
 def test_corrections_are_added_to_what_the_built_in_driver_would_do(tmp_path: Path) -> None:
     torch = pytest.importorskip("torch")
-    from cavmarl.policies.networks import RESIDUAL_PARTS
+    from cavmarl.policies.network_files import RESIDUAL_PARTS
 
     vec = make_vec("merge", num_envs=1, agents=3)
     folder = save_driver(tmp_path / "residual", vec, residual=True)
