@@ -15,8 +15,6 @@ from cavmarl.core.errors import ConfigError, ManifestError, PolicyError
 from cavmarl.evaluate.zoo import TABLES, cross, verify_entry, zoo_entries
 from cavmarl.policies.policy import load_policy, policy_files
 
-pytest.importorskip("torch")
-
 pytestmark = pytest.mark.integration  # a manifest asks git for the commit
 
 
