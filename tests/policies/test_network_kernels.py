@@ -43,7 +43,8 @@ def run(table: LayerTable, rows: Floats, states: Floats | None = None) -> Floats
     """Evaluate a network; the states of its GRU are overwritten."""
     outputs = np.empty((len(rows), table.width), dtype=np.float32)
     none = np.empty(0, dtype=np.float32)
-    buffers = np.full(table.num_buffered(), np.nan, dtype=np.float32)
+    buffers = table.new_buffers()
+    buffers.fill(np.nan)
     evaluate_network(
         table.layers(),
         table.weights(),
