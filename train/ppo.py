@@ -4,9 +4,8 @@
     python train/ppo.py --env town --start cities_ippo --workers 2
     python train/ppo.py --resume runs/merge_ippo_1 --total-agent-steps 8000000
 
-Read from top to bottom: settings; `Batch`, what is learnt from; `Collector`, which drives worlds;
-`Learner`, the update; `Run`, which takes turns. Agents learn from their own observations and
-rewards, and share the weights (Schulman et al. 2017; de Witt et al. 2020). See docs/learning.md.
+From top to bottom: settings; `Batch`, the decisions; `Collector`, which drives worlds; `Learner`,
+the update; `Run`, which takes turns (Schulman et al. 2017; de Witt et al. 2020; docs/learning.md).
 """
 
 from __future__ import annotations
