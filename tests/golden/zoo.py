@@ -19,20 +19,22 @@ from cavmarl.core.whole_file import draft_folder
 from cavmarl.evaluate.evaluation import load_report
 from cavmarl.evaluate.provenance.manifest import read_closed
 from cavmarl.evaluate.zoo import RESULT_FOLDER, TABLES, entry_job
+from cavmarl.policies.policy import policy_files
 
 SAME, OTHER = "same bytes as before", "recorded anew"
 
 
-def record(folder: Path) -> str:
-    """Replace the result of a driver's folder; return whether its tables have other bytes.
+def record(driver: str | Path) -> str:
+    """Replace the result of a driver, given by its name or folder; return what has become of it.
 
     The old result stays if the evaluation fails or is interrupted.
     """
+    folder = policy_files(driver)[0].parent
     result = folder / RESULT_FOLDER
     before = read_closed(result)
     with draft_folder(folder) as draft:
         made, old = draft / RESULT_FOLDER, draft / "old"
-        entry_job(before, folder).drive(folder.name, made)
+        entry_job(before, folder).drive(driver, made)
         load_report(made)
         result.rename(old)
         try:
@@ -47,13 +49,13 @@ def record(folder: Path) -> str:
 
 def main() -> int:
     """Record the results of drivers; return 1 if one of them cannot be recorded."""
-    folders = {name: path for name, path in sorted(agent_entries().items()) if path.is_dir()}
-    parser = argparse.ArgumentParser(description=f"Drivers: {' '.join(folders)}")
-    parser.add_argument("drivers", nargs="*", metavar="DRIVER", choices=[*folders, []])
+    drivers = [name for name, path in sorted(agent_entries().items()) if path.is_dir()]
+    parser = argparse.ArgumentParser(description=f"Drivers: {' '.join(drivers)}")
+    parser.add_argument("drivers", nargs="*", metavar="DRIVER")
     has_failed = False
-    for name in parser.parse_args().drivers or folders:
+    for name in parser.parse_args().drivers or drivers:
         try:
-            said = record(folders[name])
+            said = record(name)
         except CavmarlError as error:
             said, has_failed = f"FAILED: {error}", True
         print(f"{name:32} {said}", flush=True)
