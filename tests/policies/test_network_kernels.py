@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cavmarl.policies.driver_network import LayerTable
+from cavmarl.config.registry import agent_entries
+from cavmarl.policies.driver_network import DriverNetwork, LayerTable
 from cavmarl.policies.kernels.inference import (
     CLAMP,
     GRU,
@@ -23,11 +24,12 @@ from cavmarl.policies.kernels.inference import (
     choose_largest,
     evaluate_network,
 )
-from tests.naive.driver_networks import layer_norm, linear
+from cavmarl.policies.network_files import read_network
+from tests.naive.driver_networks import exact_actions, exact_outputs, layer_norm, linear
 
 Floats = NDArray[np.float32]
 
-TORCH_ERROR = 2e-6
+ERROR = 2e-6  # of an output, beside torch and beside float64
 # Of what `run_all_kinds` computes. The numbers in it are exact in float32, so every processor, and
 # Python without the compiler, gives these bytes.
 DIGEST = "1aa005700f35a94ad5d33de69c7121b7"
@@ -96,6 +98,18 @@ def test_layer_norm_equals_its_twin(width: int) -> None:
     np.testing.assert_array_equal(run(table, rows), layer_norm(rows, scale, shift))
 
 
+@pytest.mark.parametrize("name", ["merge_ippo", "cities_residual"])
+def test_outputs_are_close_to_those_of_a_plain_network(name: str) -> None:
+    weights, config = read_network(agent_entries()[name])
+    noise = 2.0 * draw(1, 2, config.observation_size)
+    rows = weights["mean"] + noise * weights["deviation"]
+    network = DriverNetwork(weights, config)
+    exact = exact_outputs(weights, config, rows)
+    np.testing.assert_allclose(network.outputs(rows), exact, rtol=0.0, atol=ERROR)
+    best = exact_actions(exact, config, rows)
+    np.testing.assert_allclose(network.best(rows), best, rtol=0.0, atol=ERROR)
+
+
 def test_rows_alone_equal_rows_in_a_batch() -> None:
     table = LayerTable(9)
     table.add(LINEAR, draw(1, 9, 12), draw(2, 12), width=12)
@@ -124,7 +138,7 @@ def test_a_gru_is_close_to_torchs() -> None:
         outputs = run(table, rows, states)
         with torch.inference_mode():
             expected = cell(torch.from_numpy(rows), expected)
-        np.testing.assert_allclose(states, expected.numpy(), rtol=0.0, atol=TORCH_ERROR)
+        np.testing.assert_allclose(states, expected.numpy(), rtol=0.0, atol=ERROR)
         np.testing.assert_array_equal(outputs, states)
 
 
@@ -136,7 +150,7 @@ def test_layer_norm_and_relu_are_close_to_torchs() -> None:
     table.add(RELU)
     known = [torch.from_numpy(array) for array in (rows, scale, shift)]
     expected = torch.nn.functional.layer_norm(known[0], (128,), *known[1:]).relu()
-    np.testing.assert_allclose(run(table, rows), expected.numpy(), rtol=0.0, atol=TORCH_ERROR)
+    np.testing.assert_allclose(run(table, rows), expected.numpy(), rtol=0.0, atol=ERROR)
 
 
 @pytest.mark.parametrize("size", [1, 2, 5])
