@@ -47,9 +47,7 @@ def linear(
             sums[j] = bias[j]
     first = 0
     while first + 8 <= width:
-        block = weights[first * size : (first + 8) * size]
-        for r in range(num_rows):
-            _add_eight(inputs[r * width + first :], block, outputs[r * size : (r + 1) * size])
+        _add_eight(inputs, first, width, weights[first * size : (first + 8) * size], outputs, size)
         first += 8
     for k in range(first, width):
         column = weights[k * size : (k + 1) * size]
@@ -61,10 +59,15 @@ def linear(
 
 
 @kernel
-def _add_eight(x: Float32s, weights: Float32s, sums: Float32s) -> None:
-    """Add the products of eight inputs with their `weights` (8 · outputs,) to `sums` (outputs,)."""
-    size = sums.shape[0]
-    x0, x1, x2, x3, x4, x5, x6, x7 = x[0], x[1], x[2], x[3], x[4], x[5], x[6], x[7]
+def _add_eight(
+    inputs: Float32s,  # (rows · width,)
+    first: int,  # of the eight inputs of each row
+    width: int,
+    weights: Float32s,  # (8 · size,): those of the eight inputs
+    outputs: Float32s,  # (rows · size,)
+    size: int,
+) -> None:
+    """Add the products of eight inputs of each row with their weights to the outputs."""
     w0 = weights[:size]
     w1 = weights[size : 2 * size]
     w2 = weights[2 * size : 3 * size]
@@ -73,9 +76,13 @@ def _add_eight(x: Float32s, weights: Float32s, sums: Float32s) -> None:
     w5 = weights[5 * size : 6 * size]
     w6 = weights[6 * size : 7 * size]
     w7 = weights[7 * size : 8 * size]
-    for j in range(size):
-        half = (((sums[j] + x0 * w0[j]) + x1 * w1[j]) + x2 * w2[j]) + x3 * w3[j]
-        sums[j] = (((half + x4 * w4[j]) + x5 * w5[j]) + x6 * w6[j]) + x7 * w7[j]
+    for r in range(outputs.shape[0] // size):
+        sums = outputs[r * size : (r + 1) * size]
+        x = inputs[r * width + first : r * width + first + 8]
+        x0, x1, x2, x3, x4, x5, x6, x7 = x[0], x[1], x[2], x[3], x[4], x[5], x[6], x[7]
+        for j in range(size):
+            half = (((sums[j] + x0 * w0[j]) + x1 * w1[j]) + x2 * w2[j]) + x3 * w3[j]
+            sums[j] = (((half + x4 * w4[j]) + x5 * w5[j]) + x6 * w6[j]) + x7 * w7[j]
 
 
 @kernel
