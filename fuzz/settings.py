@@ -28,15 +28,9 @@ from cavmarl.evaluate.provenance.manifest import (
     read_closed,
 )
 from cavmarl.evaluate.provenance.training_record import CHECKPOINT_FILE
+from cavmarl.learning.actor_critic import ActorCritic, load_network, save_network
 from cavmarl.learning.checkpoint import RunState, read_checkpoint, sealed, write_checkpoint
-from cavmarl.policies.networks import (
-    CONFIG_FILE,
-    WEIGHTS_FILE,
-    ActorCritic,
-    NetworkConfig,
-    load_network,
-    save_network,
-)
+from cavmarl.policies.network_files import CONFIG_FILE, WEIGHTS_FILE, NetworkConfig
 from fuzz.files import ROOT, Target, scratch, seed
 
 __all__ = ["CHECKPOINTS", "DRIVERS", "ENTRIES", "MANIFESTS", "OVERRIDES", "PLANS"]

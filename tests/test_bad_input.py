@@ -15,7 +15,6 @@ from cavmarl import (
     DemandError,
     EpisodeError,
     MapError,
-    MissingExtraError,
     PolicyError,
     UnknownEnvironmentError,
     load_policy,
@@ -396,7 +395,7 @@ def test_an_unknown_environment_is_refused_with_what_there_is() -> None:
 def test_names_that_no_file_can_have_are_refused(name: str) -> None:
     with pytest.raises(UnknownEnvironmentError):
         parallel_env(name)
-    with pytest.raises((PolicyError, MissingExtraError)):  # "" is the folder that one works in
+    with pytest.raises(PolicyError):  # "" is the folder that one works in
         load_policy(name, parallel_env("ring"))
     with pytest.raises((MapError, ConfigError), match=r"map\.source|can hold"):
         parallel_env("ring", overrides={"map.source": f"{name}.net.xml"})

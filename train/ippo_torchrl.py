@@ -29,11 +29,12 @@ from torchrl.objectives.value import GAE
 
 from cavmarl.adapters.torchrl_env import GROUP, CavTorchRLEnv
 from cavmarl.config.registry import load_config
+from cavmarl.learning.actor_critic import ActorCritic
 from cavmarl.learning.checkpoint import Parts
 from cavmarl.learning.log import WINDOW, curve_row
 from cavmarl.learning.options import RESUME, check_at_least, run_folder, run_program
 from cavmarl.learning.run_folder import RunFolder, parse_run
-from cavmarl.policies.networks import ActorCritic, NetworkConfig
+from cavmarl.policies.network_files import NetworkConfig
 
 LEAST_DEVIATION = 0.02  # of an observation; those that hardly change are not blown up
 OBSERVATION, MASK, ACTION, LOG_PROB, VALUE = (

@@ -4,9 +4,8 @@
     python train/ppo.py --env town --start cities_ippo --workers 2
     python train/ppo.py --resume runs/merge_ippo_1 --total-agent-steps 8000000
 
-Read from top to bottom: settings; `Batch`, what is learnt from; `Collector`, which drives worlds;
-`Learner`, the update; `Run`, which takes turns. Agents learn from their own observations and
-rewards, and share the weights (Schulman et al. 2017; de Witt et al. 2020). See docs/learning.md.
+From top to bottom: settings; `Batch`, the decisions; `Collector`, which drives worlds; `Learner`,
+the update; `Run`, which takes turns (Schulman et al. 2017; de Witt et al. 2020; docs/learning.md).
 """
 
 from __future__ import annotations
@@ -29,6 +28,7 @@ from cavmarl.config.terms import TERMS
 from cavmarl.core.errors import ConfigError
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.learning import options
+from cavmarl.learning.actor_critic import ActorCritic
 from cavmarl.learning.checkpoint import Parts, bytes_of, tensor_of
 from cavmarl.learning.log import Trips, describe, progress_bar
 from cavmarl.learning.opponents import Opponents
@@ -36,7 +36,7 @@ from cavmarl.learning.phase_times import PhaseTimes
 from cavmarl.learning.run_folder import RunFolder, parse_run
 from cavmarl.learning.scales import Scales
 from cavmarl.parallel.local_worlds import kept_elsewhere
-from cavmarl.policies.networks import ActorCritic, NetworkConfig
+from cavmarl.policies.network_files import NetworkConfig
 from cavmarl.policies.policy import driver_keys, policy_files
 
 PHASES = ("simulation", "transfer", "inference", "learning")

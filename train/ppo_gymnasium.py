@@ -27,11 +27,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cavmarl.core.errors import ConfigError
+from cavmarl.learning.actor_critic import ActorCritic
 from cavmarl.learning.checkpoint import Parts, bytes_of, tensor_of
 from cavmarl.learning.log import WINDOW, curve_row
 from cavmarl.learning.options import RESUME, check_at_least, run_folder, run_program
 from cavmarl.learning.run_folder import RunFolder, parse_run
-from cavmarl.policies.networks import ActorCritic, NetworkConfig
+from cavmarl.policies.network_files import NetworkConfig
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from torch import Tensor
 
 from cavmarl.adapters.rllib_env import CavRllibEnv
 from cavmarl.env.parallel import parallel_env
+from cavmarl.learning.actor_critic import ActorCritic, save_network
 from cavmarl.learning.log import WINDOW, curve_row
 from cavmarl.learning.options import (
     check_at_least,
@@ -37,7 +38,7 @@ from cavmarl.learning.options import (
     run_program,
 )
 from cavmarl.learning.run_folder import RunFolder
-from cavmarl.policies.networks import ActorCritic, NetworkConfig, save_network
+from cavmarl.policies.network_files import NetworkConfig
 
 DRIVER = "driver"  # the policy that all agents share
 

@@ -27,11 +27,12 @@ from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 from cavmarl.adapters.sb3_vec_env import CavSb3VecEnv
 from cavmarl.config.registry import load_config
+from cavmarl.learning.actor_critic import ActorCritic
 from cavmarl.learning.checkpoint import Parts, bytes_of, tensor_of, writing
 from cavmarl.learning.log import WINDOW, curve_row
 from cavmarl.learning.options import RESUME, check_at_least, run_folder, run_program
 from cavmarl.learning.run_folder import DRIVER_FILES, RunFolder, parse_run
-from cavmarl.policies.networks import MAX_DEVIATIONS, ActorCritic, NetworkConfig
+from cavmarl.policies.network_files import MAX_DEVIATIONS, NetworkConfig
 
 MODEL_FILE = "model.zip"
 

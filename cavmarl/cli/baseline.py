@@ -40,7 +40,6 @@ def baseline(
     """Drive a map as chance, `idm` and a trained driver do, and as `idm` does alone; one page."""
     require("matplotlib", "report")
     require("jinja2", "report")
-    require("torch", "torch")
     from cavmarl.evaluate.baseline import baseline_rows, figures, run_baseline, write_baseline
 
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S-%f")

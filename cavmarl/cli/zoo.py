@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -9,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cavmarl.cli.output import JsonPath, about, grid, number, with_world, write_json
+from cavmarl.cli.output import JsonPath, about, grid, number, print_error, with_world, write_json
 from cavmarl.config.world_spec import WorldSpec, with_sensors_of_drivers
 from cavmarl.core.progress import progress_bar
 
@@ -64,10 +65,18 @@ def verify(
     with progress_bar(console) as bar:
         found = verify_entry(name, _progress(bar))
     for file, digest in found.expected.items():
-        verdict = "differs" if file in found.differing else "the same"
-        console.print(f"{file}: {verdict} ({digest[:12]})", markup=False, highlight=False)
-    write_json(json_path, {"expected": dict(found.expected), "found": dict(found.found)})
+        verdict = f"the same ({digest[:12]})"
+        if file in found.differing:
+            verdict = f"differs (expected {digest[:12]}, found {found.found[file][:12]})"
+        console.print(f"{file}: {verdict}", markup=False, highlight=False)
+    write_json(json_path, asdict(found))
     if found.differing:
+        print_error(
+            f"{found.name}: {len(found.differing)} of {len(found.expected)} files differ; expected "
+            f"from {found.expected_on}, found on {found.found_on}. The same version of cavmarl "
+            "gives the same bytes on every processor: check the versions in the manifest of the "
+            "result, and report the difference if they are the installed ones"
+        )
         raise typer.Exit(1)
 
 

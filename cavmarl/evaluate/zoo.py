@@ -20,6 +20,7 @@ from cavmarl.config.driver_names import TOGETHER
 from cavmarl.config.registry import agent_entries
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import CavmarlError, ConfigError, ManifestError, PolicyError
+from cavmarl.core.machine import describe_hardware
 from cavmarl.engine.world_description import describe_world
 from cavmarl.engine.world_setup import load_world
 from cavmarl.evaluate.episodes import Progress
@@ -54,16 +55,46 @@ class ZooEntry:
 
 @dataclass(frozen=True)
 class Verification:
-    """An entry's result beside that of driving the same episodes again."""
+    """An entry's result beside that of driving the same episodes again.
+
+    Attributes:
+        name: of the driver.
+        expected: SHA-256 of each file of the result.
+        found: the same of the files that this run made.
+        expected_on: the processor that the result was made on.
+        found_on: the processor of this run.
+    """
 
     name: str
-    expected: Mapping[str, str]  # SHA-256 by file
+    expected: Mapping[str, str]
     found: Mapping[str, str]
+    expected_on: str
+    found_on: str
 
     @property
     def differing(self) -> list[str]:
-        """Files that are others."""
+        """Files whose bytes are not those of the result."""
         return [file for file, digest in self.expected.items() if self.found[file] != digest]
+
+
+@dataclass(frozen=True)
+class EntryJob:
+    """What a result was made of, so that it can be made again."""
+
+    world: WorldSpec
+    episodes: int
+    repeats: int
+
+    def drive(self, name: str, folder: Path, out: Path, progress: Progress | None = None) -> None:
+        """Evaluate the driver in a folder into the new folder `out`; tables hold its name."""
+        evaluate(
+            self.world,
+            {name: folder},
+            episodes=self.episodes,
+            repeats=self.repeats,
+            out=out,
+            progress=progress,
+        )
 
 
 @dataclass(frozen=True)
@@ -101,23 +132,21 @@ def verify_entry(policy: str | Path, progress: Progress | None = None) -> Verifi
         raise PolicyError(f"{policy}: is a script; the zoo has trained drivers only")
     name = folder.name
     document = read_evaluation(folder / RESULT_FOLDER)
-    job = _job_of(document, folder)
+    job = entry_job(document, folder)
     _check_weights(document, name, weights)
-    spec = WorldSpec.of(job["env"], **{key: job[key] for key in _KEYS})
-    _check_world(document, name, spec)
+    _check_world(document, name, job.world)
     with TemporaryDirectory() as room:
         out = Path(room) / "again"
-        evaluate(
-            spec,
-            {next(iter(document["policies"])): folder},  # the tables hold this name
-            episodes=job["episodes"],
-            repeats=len(document["seeds"]),
-            out=out,
-            progress=progress,
-        )
+        job.drive(next(iter(document["policies"])), folder, out, progress)
         known = document["results_sha256"]
         expected = {file: known[file] for file in TABLES if file in known}
-        return Verification(name, expected, {file: hash_of_file(out / file) for file in expected})
+        return Verification(
+            name,
+            expected,
+            {file: hash_of_file(out / file) for file in expected},
+            _processor(document.get("hardware", {})),
+            _processor(describe_hardware()),
+        )
 
 
 def cross(
@@ -180,15 +209,28 @@ def _entry(name: str, folder: Path) -> ZooEntry:
     return ZooEntry(name, folder, weights_bytes, environment, len(counted), shares)
 
 
-def _job_of(document: Mapping[str, Any], folder: Path) -> Mapping[str, Any]:
-    """What is to be done again."""
+def _processor(hardware: Mapping[str, Any]) -> str:
+    return f"{hardware.get('cpu', 'an unknown processor')} ({hardware.get('architecture')})"
+
+
+def entry_job(document: Mapping[str, Any], folder: Path) -> EntryJob:
+    """Return what the result of a driver's folder was made of.
+
+    Args:
+        document: the manifest of the result.
+        folder: of the driver.
+
+    Raises:
+        ManifestError: the manifest does not say it.
+    """
     job = document.get("job")
     if not isinstance(job, dict) or not {"env", "episodes", *_KEYS} <= job.keys():
         raise ManifestError(
             f"{folder / RESULT_FOLDER}: its manifest does not say what was driven; make the result "
             f"again: `cavmarl evaluate ENV --policy {folder} --out {folder / RESULT_FOLDER}`"
         )
-    return job
+    world = WorldSpec.of(job["env"], **{key: job[key] for key in _KEYS})
+    return EntryJob(world, job["episodes"], len(document["seeds"]))
 
 
 def _check_weights(document: Mapping[str, Any], name: str, files: Sequence[Path]) -> None:

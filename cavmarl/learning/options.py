@@ -104,10 +104,10 @@ def with_form_of(args: S, start: str) -> S:
     """
     if not start:
         return args
-    from cavmarl.policies.networks import load_network  # as above
+    from cavmarl.policies.network_files import read_network  # as above
     from cavmarl.policies.policy import policy_files
 
-    form = load_network(policy_files(start)[0].parent)[1]
+    form = read_network(policy_files(start)[0].parent)[1]
     own = {"hidden": form.hidden[0], "shared": form.shared, "residual": form.residual}
     return replace(args, **own)
 

@@ -27,6 +27,7 @@ from cavmarl.evaluate.provenance.training_record import (
     end_training,
     is_trained,
 )
+from cavmarl.learning.actor_critic import ActorCritic, save_network
 from cavmarl.learning.checkpoint import (
     Parts,
     RunState,
@@ -38,13 +39,7 @@ from cavmarl.learning.checkpoint import (
 )
 from cavmarl.learning.log import CSV_FILE, Log, cut_logs
 from cavmarl.learning.options import given_options, settings_of
-from cavmarl.policies.networks import (
-    CONFIG_FILE,
-    WEIGHTS_FILE,
-    ActorCritic,
-    NetworkConfig,
-    save_network,
-)
+from cavmarl.policies.network_files import CONFIG_FILE, WEIGHTS_FILE, NetworkConfig
 
 if sys.platform != "win32":
     import fcntl

@@ -7,9 +7,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from cavmarl.learning.actor_critic import ActorCritic
 from cavmarl.learning.checkpoint import Parts
 from cavmarl.learning.starting import begin_with
-from cavmarl.policies.networks import ActorCritic, NetworkConfig
+from cavmarl.policies.network_files import NetworkConfig
 
 LEAST_DEVIATION = 0.02  # of an observation; those that hardly change are not blown up
 

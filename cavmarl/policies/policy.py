@@ -19,14 +19,14 @@ from pettingzoo import ParallelEnv
 
 from cavmarl.config.driver_form import differing_keys, form_of, form_of_driver
 from cavmarl.config.driver_names import SHIELDED, find_driver, name_of_driver, shared_drivers
-from cavmarl.core.errors import PolicyError, require
+from cavmarl.core.errors import PolicyError
 from cavmarl.core.tracebacks import fault_in
 from cavmarl.engine.spaces import flat_observation, flat_observation_space, observation_parts
 from cavmarl.env.parallel import CavEnv
 from cavmarl.env.vector import CavVectorEnv
 
 if TYPE_CHECKING:
-    from cavmarl.policies.networks import ActorCritic
+    from cavmarl.policies.driver_network import DriverNetwork
 
 Environment = CavEnv | CavVectorEnv
 
@@ -86,24 +86,16 @@ class Policy(ABC):
 class NetworkPolicy(Policy):
     """A trained network, driving by its most likely actions."""
 
-    def __init__(self, env: Environment, network: ActorCritic) -> None:
+    def __init__(self, env: Environment, network: DriverNetwork) -> None:
         super().__init__(env)
         self.network = network
 
     def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
         """The network's most likely actions where `mask`, 0 elsewhere."""
-        import torch
-
-        if self.network.residual:
+        if self.network.config.residual:
             proposed = built_in_actions(self.env, mask)
             observations = np.concatenate([observations, proposed], axis=-1)
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)  # for so small a network, more cost many times what they bring
-        try:
-            with torch.inference_mode():
-                best = self.network.best(torch.from_numpy(observations[mask])).numpy()
-        finally:
-            torch.set_num_threads(threads)
+        best = self.network.best(observations[mask])
         actions = np.zeros((*mask.shape, *best.shape[1:]), dtype=best.dtype)
         actions[mask] = best
         return actions
@@ -168,7 +160,6 @@ def load_policy(policy: str | Path, env: Environment) -> Policy:
     Raises:
         PolicyError: nothing of that name, a broken file, or a network made for other observations
             or actions than this environment's.
-        MissingExtraError: a network, without torch.
     """
     if isinstance(env, ParallelEnv):
         env = env.unwrapped
@@ -195,9 +186,7 @@ def policy_files(policy: str | Path) -> tuple[Path, ...]:
     path = find_driver(policy.removeprefix(SHIELDED) if isinstance(policy, str) else policy)
     if not path.is_dir():
         return (path,)
-    require("torch", "torch")
-    require("safetensors", "torch")
-    from cavmarl.policies.networks import CONFIG_FILE, WEIGHTS_FILE
+    from cavmarl.policies.network_files import CONFIG_FILE, WEIGHTS_FILE  # imports pydantic
 
     files = (path / WEIGHTS_FILE, path / CONFIG_FILE)
     for file in files:
@@ -228,12 +217,10 @@ def _load_script(path: Path, env: Environment) -> Policy:
 
 
 def _load_network_policy(folder: Path, env: Environment) -> NetworkPolicy:
-    require("torch", "torch")
-    require("safetensors", "torch")
-    from cavmarl.policies.networks import load_network
+    from cavmarl.policies.driver_network import load_driver_network  # imports pydantic
 
-    network, config = load_network(folder)
-    name, here = name_of_driver(folder), env.config
+    network = load_driver_network(folder)
+    config, name, here = network.config, name_of_driver(folder), env.config
     size = flat_observation_space(here).shape[0]
     if unlike := differing_keys(form_of(config.sensors, config.action), here):
         lines = (f"{key} is {there} for it, {ours} here" for key, (there, ours) in unlike.items())

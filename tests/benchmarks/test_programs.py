@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks import balance, moving, profile, scope, selection, sumo
+from benchmarks import balance, inference, moving, profile, scope, selection, sumo
 from benchmarks.__main__ import KEPT, main, programs
 from benchmarks.harness import Report, paired_interval, run
 from cavmarl.cli.bench import app
@@ -39,6 +39,18 @@ def test_a_program_shows_and_writes(capsys: pytest.CaptureFixture[str], tmp_path
     found = json.loads(path.read_text())
     assert next(row["ns"] for row in found["rows"] if row["name"] == "sense") > 0.0
     assert found["hardware"]["usable_cores"] >= 1
+
+
+def test_driver_networks_are_measured_beside_torch() -> None:
+    pytest.importorskip("torch")
+    found = inference.measure(rows=20, inputs=9, hidden=16, repeats=3, most_ratio=1e-6)
+    assert not found.holds
+    for row in found.rows:
+        assert row["ratio"] > 0.0
+        assert row["difference"] < 2e-6
+    assert inference.measure(rows=20, inputs=9, hidden=16, repeats=1).holds
+    with pytest.raises(ConfigError, match="rows = 0"):
+        inference.measure(rows=0)
 
 
 def test_a_bound_that_does_not_hold_is_exit_code_1() -> None:

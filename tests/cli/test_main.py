@@ -350,7 +350,6 @@ def test_a_window_opens_where_sdl_is_told_how(monkeypatch: pytest.MonkeyPatch) -
 def test_a_folder_without_a_driver_says_what_is_missing(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    pytest.importorskip("torch")
     said = refusal(capsys, "evaluate", "merge", "--policy", str(tmp_path), *QUICK)
     assert f"no model.safetensors in {tmp_path}" in said
     assert "Errno" not in said

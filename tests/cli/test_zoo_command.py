@@ -10,8 +10,7 @@ import pytest
 
 from cavmarl.cli import main
 from cavmarl.config.registry import agent_entries
-
-pytest.importorskip("torch")
+from cavmarl.core.machine import describe_hardware
 
 pytestmark = pytest.mark.integration  # a manifest asks git for the commit
 
@@ -24,6 +23,30 @@ def test_the_list_has_the_figures(tmp_path: Path, capsys: pytest.CaptureFixture[
     told = json.loads(out.read_text())
     assert told["merge_ippo"]["environment"] == "merge-v5"
     assert "merge_ippo" in capsys.readouterr().out
+
+
+def test_a_difference_tells_both_hashes_and_both_processors(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    entry = Path(shutil.copytree(agent_entries()["merge_ippo"], tmp_path / "merge_ippo"))
+    path = entry / "result" / "manifest.json"
+    document = json.loads(path.read_text())
+    document["job"] |= {"episodes": 1, "seed": 3}
+    document["hardware"] |= {"cpu": "Another Processor", "architecture": "a64"}
+    path.write_text(json.dumps(document))
+    with pytest.raises(SystemExit) as ended:
+        main(["zoo", "verify", str(entry), "--json", str(tmp_path / "found.json")])
+    assert ended.value.code == 1
+    found = json.loads((tmp_path / "found.json").read_text())
+    said = capsys.readouterr()
+    for file, digest in document["results_sha256"].items():
+        if file in found["expected"]:
+            both = f"(expected {digest[:12]}, found {found['found'][file][:12]})"
+            assert f"{file}: differs {both}" in said.out
+    assert "merge_ippo: 3 of 3 files differ" in said.err
+    here = describe_hardware()
+    assert "expected from Another Processor (a64)" in said.err
+    assert f"found on {here['cpu']} ({here['architecture']})" in said.err
 
 
 def test_an_old_result_hides_no_other(

@@ -14,10 +14,12 @@ from cavmarl.config.registry import agent_entries, load_config
 from cavmarl.core.errors import ConfigError, ManifestError, PolicyError
 from cavmarl.evaluate.zoo import TABLES, cross, verify_entry, zoo_entries
 from cavmarl.policies.policy import load_policy, policy_files
-
-pytest.importorskip("torch")
+from tests.golden.zoo import OTHER, SAME, record
 
 pytestmark = pytest.mark.integration  # a manifest asks git for the commit
+
+
+FILES = ["README.md", "config.json", "manifest.json", "model.safetensors", "result"]
 
 
 @pytest.fixture
@@ -70,6 +72,29 @@ def test_a_difference_is_found(entry: Path) -> None:
     document["job"] |= {"episodes": 1, "seed": 3}
     path.write_text(json.dumps(document))
     assert set(verify_entry(entry).differing) == set(TABLES)
+
+
+def test_a_result_is_recorded_again(entry: Path) -> None:
+    path = entry / "result" / "manifest.json"
+    document = json.loads(path.read_text())
+    document["job"] |= {"episodes": 1, "seed": 3}
+    path.write_text(json.dumps(document))
+    assert record(entry) == OTHER
+    assert not verify_entry(entry).differing
+    assert record(entry) == SAME
+    assert sorted(found.name for found in entry.iterdir()) == FILES
+
+
+def test_a_result_that_cannot_be_recorded_stays(entry: Path) -> None:
+    path = entry / "result" / "manifest.json"
+    document = json.loads(path.read_text())
+    document["job"]["overrides"] = {"sensors.neighbors.range_m": 30.0}
+    path.write_text(json.dumps(document))
+    before = {found.name: found.read_bytes() for found in path.parent.iterdir()}
+    with pytest.raises(PolicyError, match=r"does not fit merge"):
+        record(entry)
+    assert {found.name: found.read_bytes() for found in path.parent.iterdir()} == before
+    assert sorted(found.name for found in entry.iterdir()) == FILES
 
 
 def test_what_is_no_entry(entry: Path, tmp_path: Path) -> None:

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from cavmarl.env.vector import CavVectorEnv, make_vec
-from cavmarl.policies.networks import ActorCritic, NetworkConfig
+from cavmarl.learning.actor_critic import ActorCritic
+from cavmarl.policies.network_files import NetworkConfig
 from cavmarl.policies.policy import load_policy
 from tests.support.training import load_program
 

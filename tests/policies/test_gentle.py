@@ -18,7 +18,6 @@ def test_one_gentle_driver_raises_the_speed_of_all_by_more_than_flows_57_percent
 
 
 def test_a_driver_that_has_learnt_it_needs_no_clock() -> None:
-    pytest.importorskip("torch")
     _, learnt = ring22.measure(["ring22_ippo"], episodes=4, seed=1000).rows
     assert learnt["gain"] > 57.0
     assert learnt["crashed"] == 0

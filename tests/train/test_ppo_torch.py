@@ -21,10 +21,10 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.env.vector import make_vec
 from cavmarl.evaluate.provenance.manifest import read_closed
 from cavmarl.evaluate.provenance.training_record import CHECKPOINT_FILE
+from cavmarl.learning.actor_critic import load_network
 from cavmarl.learning.checkpoint import read_checkpoint, write_checkpoint
 from cavmarl.learning.run_folder import parse_run
 from cavmarl.parallel.pooled_worlds import PooledWorlds
-from cavmarl.policies.networks import load_network
 from cavmarl.policies.policy import load_policy
 from tests.support.training import TRAIN, load_program
 

@@ -1,122 +1,32 @@
-"""The networks that training and evaluation share, and how they lie on disk.
+"""`ActorCritic`: the network that training programs learn, in torch, and how it is saved.
 
-Importing this module loads torch; nothing that `import cavmarl` loads imports it.
-
-A driver's folder holds `model.safetensors` (weights, no code) and `config.json` (a `NetworkConfig`:
-what the driver was made for, so that a seat that does not fit is refused and not driven badly).
+A trained driver is evaluated without torch, see `cavmarl.policies.driver_network`.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save
+from safetensors.torch import save
 from torch import Tensor, nn
 
-from cavmarl.config.action import ActionConfig
-from cavmarl.config.io import validate
-from cavmarl.config.sensors import SensorsConfig
-from cavmarl.core.errors import ConfigError, PolicyError
 from cavmarl.core.whole_file import write_whole
+from cavmarl.policies.network_files import (
+    CONFIG_FILE,
+    CONTINUOUS_ACTIONS,
+    MAX_DEVIATIONS,
+    RESIDUAL_PARTS,
+    WEIGHTS_FILE,
+    NetworkConfig,
+    read_network,
+)
 
-WEIGHTS_FILE = "model.safetensors"
-CONFIG_FILE = "config.json"
-
-CONTINUOUS_ACTIONS = 2
-# A residual driver's own part of throttle and of steering: it keeps to the built-in driver's lanes.
-RESIDUAL_PARTS = (1.0, 0.1)
-MAX_LAYERS = 8
-MAX_WIDTH = 4096
-MAX_OBSERVATION_SIZE = 65_536
-MAX_STATE_SIZE = 1_048_576
-MAX_DEVIATIONS = 5.0  # observations further from the mean are cut
 LOG_2_PI = math.log(2.0 * math.pi)
-
-
-@dataclass(frozen=True)
-class NetworkConfig:
-    """What a trained driver is and what it was made for.
-
-    Attributes:
-        environment: entry that it was trained on.
-        observation_size: numbers in one flat observation.
-        sensors: what those numbers are.
-        action: what its actions mean.
-        hidden: widths of the hidden layers, of the actor and of the critic.
-        seed: of its training.
-        agent_steps: decisions that it learned from.
-        state_size: numbers of the world's state that its critic sees beside the observation. The
-            driver itself never does.
-        shared: one body for actor and critic, of ReLU with LayerNorm; else each is a tanh network.
-        residual: what it does is added, by `RESIDUAL_PARTS`, to what the built-in driver would do,
-            which it observes last (residual learning: Silver et al. 2018, Johannink et al. 2019).
-    """
-
-    environment: str
-    observation_size: int
-    sensors: SensorsConfig
-    action: ActionConfig
-    hidden: tuple[int, ...] = (128, 128)
-    seed: int = 0
-    agent_steps: int = 0
-    state_size: int = 0
-    shared: bool = False
-    residual: bool = False
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.observation_size <= MAX_OBSERVATION_SIZE:
-            raise ConfigError(
-                f"observation_size = {self.observation_size}: must be from 1 to "
-                f"{MAX_OBSERVATION_SIZE}"
-            )
-        if self.residual and self.action.kind != "continuous":
-            raise ConfigError(
-                f"residual with action.kind = {self.action.kind}: choices cannot be added to the "
-                "built-in driver's; use action.kind = continuous"
-            )
-        if self.shared and self.state_size:
-            raise ConfigError("shared: a critic that sees the world's state has a body of its own")
-        if not 0 <= self.state_size <= MAX_STATE_SIZE:
-            raise ConfigError(f"state_size = {self.state_size}: must be from 0 to {MAX_STATE_SIZE}")
-        if not 1 <= len(self.hidden) <= MAX_LAYERS or not all(
-            1 <= width <= MAX_WIDTH for width in self.hidden
-        ):
-            raise ConfigError(
-                f"hidden = {list(self.hidden)}: must be 1 to {MAX_LAYERS} widths from 1 to "
-                f"{MAX_WIDTH}"
-            )
-
-    @property
-    def sensed(self) -> int:
-        """Numbers of an observation that its sensors give; the others are the built-in driver's."""
-        return self.observation_size - (CONTINUOUS_ACTIONS if self.residual else 0)
-
-    @property
-    def num_weights(self) -> int:
-        """How many numbers an `ActorCritic` learns, with the scaling of its observations."""
-        deviations = CONTINUOUS_ACTIONS if self.action.kind == "continuous" else 0
-        actions = self.action.choices or CONTINUOUS_ACTIONS
-        size, last = self.observation_size, self.hidden[-1]
-        if self.shared:
-            norms = 2 * sum(self.hidden)
-            weights = _weights((size, *self.hidden)) + norms
-            weights += _weights((last, actions)) + _weights((last, 1))
-        else:
-            weights = _weights((size, *self.hidden, actions))
-            weights += _weights((size + self.state_size, *self.hidden, 1))
-        return 2 * size + deviations + weights
-
-
-def _weights(sizes: tuple[int, ...]) -> int:
-    """Of linear layers."""
-    return sum((inputs + 1) * outputs for inputs, outputs in pairwise(sizes))
 
 
 class ActorCritic(nn.Module):
@@ -145,7 +55,7 @@ class ActorCritic(nn.Module):
         self.continuous = config.action.kind == "continuous"
         self.residual = config.residual
         self.state_size = config.state_size
-        actions = config.action.choices or CONTINUOUS_ACTIONS
+        actions = config.num_outputs
         self.register_buffer("mean", torch.zeros(config.observation_size))
         self.register_buffer("deviation", torch.ones(config.observation_size))
         # Small last weights: the first policy does nothing in particular (Andrychowicz et al.
@@ -283,49 +193,8 @@ def save_network(folder: Path, network: ActorCritic, config: NetworkConfig) -> N
 
 
 def load_network(folder: Path) -> tuple[ActorCritic, NetworkConfig]:
-    """Read what `save_network` wrote.
-
-    Raises:
-        PolicyError: a file is missing, broken, or does not fit the other; or weights are not
-            finite.
-    """
-    for name in (WEIGHTS_FILE, CONFIG_FILE):
-        if not (folder / name).is_file():
-            raise PolicyError(f"no {name} in {folder}: is this the folder of a trained driver?")
-    config = _read_config(folder / CONFIG_FILE)
-    path = folder / WEIGHTS_FILE
-    try:
-        weights = load_file(path)
-    except (OSError, SafetensorError) as error:
-        raise _unreadable(path, error) from error
-    held = sum(tensor.numel() for tensor in weights.values())
-    if held != config.num_weights:  # before a network is made that may be far larger than the file
-        raise PolicyError(
-            f"{path}: does not fit {CONFIG_FILE}: {held} weights, not {config.num_weights}"
-        )
+    """Read what `save_network` wrote, to train it further; raises as `read_network`."""
+    weights, config = read_network(folder)
     network = ActorCritic(config)
-    try:
-        network.load_state_dict(weights)
-    except RuntimeError as error:
-        lines = [line.strip() for line in str(error).splitlines()[1:]]
-        raise PolicyError(f"{path}: does not fit {CONFIG_FILE} ({'; '.join(lines)})") from error
-    for name, tensor in weights.items():
-        if not bool(torch.isfinite(tensor).all()):
-            raise PolicyError(f"{path}: '{name}' holds numbers that are not finite")
+    network.load_state_dict({name: torch.from_numpy(tensor) for name, tensor in weights.items()})
     return network.eval(), config
-
-
-def _read_config(path: Path) -> NetworkConfig:
-    try:
-        raw: Any = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:  # not all of JSON's are its own
-        raise _unreadable(path, error) from error
-    try:
-        return validate(NetworkConfig, raw, str(path))
-    except ConfigError as error:
-        raise PolicyError(str(error)) from error
-
-
-def _unreadable(path: Path, error: Exception) -> PolicyError:
-    reason = error.strerror if isinstance(error, OSError) else None  # its text repeats the path
-    return PolicyError(f"{path}: cannot be read ({reason or error})")

@@ -1,0 +1,1 @@
+"""Compiled loops of driver networks: the same bytes on every processor."""

@@ -1,0 +1,88 @@
+"""Trained drivers drive the same in any number of worlds, through each interface, without torch."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cavmarl.env.parallel import parallel_env
+from cavmarl.env.vector import make_vec
+from cavmarl.evaluate.evaluation import evaluate, load_tables
+from cavmarl.policies.policy import load_policy
+
+STEPS = 60
+
+
+@pytest.mark.parametrize("driver", ["merge_ippo", "merge_ippo+idm", "shielded:merge_ippo"])
+def test_an_episode_is_the_same_however_many_are_driven_together(
+    driver: str, tmp_path: Path
+) -> None:
+    first = []
+    for episodes in (1, 2, 4):
+        out = tmp_path / str(episodes)
+        evaluate("merge", driver, episodes=episodes, out=out, agents=6, seed=987, max_cycles=150)
+        trips, _ = load_tables(out)[driver]
+        first.append(trips[trips["episode"] == 0])
+    assert len(first[0]) >= 6
+    assert first[0].tobytes() == first[1].tobytes() == first[2].tobytes()
+
+
+@pytest.mark.parametrize("driver", ["merge_ippo", "merge_ippo+merge_ippo", "shielded:merge_ippo"])
+def test_both_interfaces_drive_alike(driver: str) -> None:
+    world = {"agents": 5, "background": 4}
+    env = parallel_env("merge", **world)  # type: ignore[arg-type]
+    vec = make_vec("merge", num_envs=3, **world)  # type: ignore[arg-type]
+    one, many = load_policy(driver, env), load_policy(driver, vec)
+    seen, _ = env.reset(seed=5)
+    observations, infos = vec.reset(seed=5)
+    for _ in range(STEPS):
+        by_agent = one.act(seen)
+        actions = many.act_batch(observations, infos["mask"])
+        for k, agent in enumerate(env.possible_agents):
+            if agent in by_agent:
+                np.testing.assert_array_equal(by_agent[agent], actions[0, k])
+        seen, *_ = env.step(by_agent)
+        observations, _, _, _, infos = vec.step(actions)
+    env.close()
+    vec.close()
+
+
+def test_drivers_that_share_the_agents_act_as_each_does_alone() -> None:
+    vec = make_vec("merge", num_envs=3, agents=5, background=4)
+    observations, infos = vec.reset(seed=5)
+    names = ("merge_ippo+idm", "merge_ippo", "idm")
+    shared, trained, idm = (load_policy(name, vec) for name in names)
+    is_even = np.arange(5) % 2 == 0
+    for _ in range(STEPS):
+        mask = infos["mask"]
+        found = shared.act_batch(observations, mask)
+        own, other = trained.act_batch(observations, mask), idm.act_batch(observations, mask)
+        np.testing.assert_array_equal(found[mask & is_even], own[mask & is_even])
+        np.testing.assert_array_equal(found[mask & ~is_even], other[mask & ~is_even])
+        observations, _, _, _, infos = vec.step(found)
+    vec.close()
+
+
+def test_a_trained_driver_is_evaluated_without_torch() -> None:
+    code = (
+        "import sys; sys.modules['torch'] = None\n"
+        "from cavmarl.cli import main\n"
+        "main(['evaluate', 'merge', '--policy', 'merge_ippo', '--episodes', '1'])"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    assert "merge_ippo" in ran.stdout
+
+
+def test_drivers_load_no_torch() -> None:
+    code = (
+        "import sys; from cavmarl import load_policy, make_vec; env = make_vec('merge');"
+        "load_policy('idm', env); print('safetensors' in sys.modules);"
+        "load_policy('merge_ippo', env); print('torch' in sys.modules)"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.split() == ["False", "False"]
