@@ -16,8 +16,10 @@ OLDEST_TESTS := tests/core tests/driving tests/engine tests/handoff tests/reward
     tests/env/test_parallel_env.py tests/env/test_vector_env.py tests/parallel/test_worker_pool.py tests/parallel/test_pool_resources.py \
     tests/test_bad_input.py tests/test_bad_input_files.py tests/test_public_api.py tests/adapters
 LIBRARIES_TESTS := tests/adapters tests/train/test_programs.py
-# Compiled by one process before several run tests.
-KERNELS := -c 'from cavmarl import make_vec; make_vec("grid4x4", workers=1).close()'
+# Compiled by two processes before several run tests.
+KERNELS := -m cavmarl.prebuild compile --all
+# What the tests have the package call: each has to be in the list of kernels for the wheel.
+CALLS := build/kernel_calls
 SIDE_BY_SIDE := --dist loadfile --no-loadscope-reorder
 # Three on two cores: while one waits for a process that it has started, two others work.
 THREE := -n 3 $(SIDE_BY_SIDE)
@@ -28,7 +30,7 @@ FUZZ_TARGETS ?= network programs buildings map cached zones demand sumocfg entry
 # Tests start many processes: none is to parse the sources anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help demo test quick ray check bench bounds soak model fuzz oldest libraries maps rules lock sbom audit pictures docs clean
+.PHONY: help demo test quick ray check bench bounds soak model fuzz oldest libraries maps rules lock sbom audit kernels wheel record pictures docs clean
 .DEFAULT_GOAL := help
 
 help: ## say what there is
@@ -39,8 +41,10 @@ demo: $(READY) ## adapt a driver to merge, evaluate, drive through town, leave a
 
 test: $(READY) ## the tests but the slow ones; those of kernels that have a twin also without the compiler
 	$(BIN)/python $(KERNELS)
-	$(BIN)/pytest $(THREE) -m "not slow and not alone and not ray"
-	$(BIN)/pytest -m "alone and not slow"
+	rm -rf $(CALLS) && mkdir -p $(CALLS)
+	CAVMARL_KERNEL_CALLS=$(CURDIR)/$(CALLS) $(BIN)/pytest $(THREE) -m "not slow and not alone and not ray"
+	CAVMARL_KERNEL_CALLS=$(CURDIR)/$(CALLS) $(BIN)/pytest -m "alone and not slow"
+	$(BIN)/python -m cavmarl.prebuild check $(CALLS)
 	NUMBA_DISABLE_JIT=1 $(BIN)/pytest -n 2 $(SIDE_BY_SIDE) -m "twin and not slow"
 
 quick: $(READY) ## unit tests of what has changed since main, the nearest first, for a minute
@@ -56,6 +60,12 @@ check: $(READY) ## style, types, and the direction of imports
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+kernels: $(READY) ## add what the last `make test` has called to the list of kernels for the wheel
+	$(BIN)/python -m cavmarl.prebuild record $(CALLS)
+
+wheel: $(READY) ## build the wheel with its compiled kernels into dist/
+	$(BIN)/python -m build --wheel --no-isolation --outdir dist
 
 bench: $(READY) ## run a benchmark, as NAME=step ARGS='--agents 10'; without a NAME: list them
 	$(BIN)/python -m benchmarks $(NAME) $(ARGS)

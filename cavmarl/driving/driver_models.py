@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from cavmarl.core.errors import ConfigError
+from cavmarl.core.compiled import IS_PLAIN
+from cavmarl.core.errors import ConfigError, require
 from cavmarl.core.extensions import REGISTERED_MODELS
 from cavmarl.core.records.codes import MODEL_ACC, MODEL_IDM, MODEL_KRAUSS
 from cavmarl.driving.kernels.registered_models import FIRST_REGISTERED, MAX_REGISTERED, put_model
@@ -66,7 +67,10 @@ def register_driver_model(name: str, model: Callable[..., float]) -> None:
 
     Raises:
         ConfigError: the name is taken, there are too many, or Numba cannot compile it.
+        MissingExtraError: Numba is not installed.
     """
+    if not IS_PLAIN:
+        require("numba", "compile")
     code = REGISTERED_MODELS[name] if name in REGISTERED_MODELS else None
     if code is None:
         code = FIRST_REGISTERED + len(REGISTERED_MODELS.names)

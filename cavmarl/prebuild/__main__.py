@@ -2,9 +2,8 @@
 
 compile         compile kernels for this machine, and keep them: those of a plain world, or --all
 build FOLDER    compile all kernels for the wheel's processor, link them into a library
-record FOLDER   write the list of kernels anew, from calls in files that a run of the tests has
-                left with `CAVMARL_KERNEL_CALLS=FOLDER`
-add FOLDER      add such calls to the list
+record FOLDER   add the calls that programs have left there with `CAVMARL_KERNEL_CALLS=FOLDER` to
+                the list of kernels, and remove those that cannot be made any more
 check FOLDER    exit with 1 if such a call, or a kernel that Python calls, is not in the list
 """
 
@@ -15,12 +14,11 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from cavmarl.core.cache_folder import cache_dir
-from cavmarl.core.compiled.signatures import CALLS_SETTING
+from cavmarl.core.compiled.signatures import CALLS_SETTING, example_arguments, signature_of
 from cavmarl.core.errors import KernelError
 from cavmarl.prebuild.kernel_list import called_kernels
 from cavmarl.prebuild.manifest import (
@@ -47,7 +45,7 @@ def build(folder: Path, processes: int) -> None:
     calls = read_manifest()
     if missing := called_kernels() - {call.name for call in calls}:
         raise KernelError(
-            f"the list of kernels lacks {', '.join(sorted(missing))}: record it again with "
+            f"the list of kernels lacks {', '.join(sorted(missing))}: run `make test`, then "
             "`make kernels`"
         )
     kernels = list(compile_calls(calls, processes or usable_processes()))
@@ -67,16 +65,24 @@ def compile_here(processes: int, is_all: bool) -> None:
     compile_into_cache(calls, processes or usable_processes())
 
 
-def record(folder: Path, old: Iterable[KernelCall] = ()) -> None:
-    """Write the list anew: recorded calls and old ones, of kernels that still exist."""
+def record(folder: Path) -> None:
+    """Write the list anew: recorded calls, and those of the old list that can still be made."""
     known = called_kernels()
     plain = _calls_of_plain_worlds()
-    found = {*recorded_calls(folder), *plain, *old}
+    found = {*recorded_calls(folder), *plain, *filter(_can_be_made, read_manifest())}
     calls = marked((call for call in found if call.name in known), plain)
     write_manifest(calls)
     print(f"{len(calls)} calls of {len({call.name for call in calls})} kernels")
     if missing := known - {call.name for call in calls}:
         print(f"never called: {', '.join(sorted(missing))}")
+
+
+def _can_be_made(call: KernelCall) -> bool:
+    """Return whether the types of a call still exist as the list describes them."""
+    try:
+        return signature_of(example_arguments(call.kinds)) == call.kinds
+    except (ImportError, AttributeError, TypeError):
+        return False
 
 
 _PLAIN_WORLD = """
@@ -111,7 +117,7 @@ def check(folder: Path) -> int:
     for name in sorted(unknown):
         print(f"not in the list of kernels, or with other types: {name}")
     if unknown:
-        print(f"run `python -m cavmarl.prebuild add {folder}`, and commit the list")
+        print(f"run `python -m cavmarl.prebuild record {folder}`, and commit the list")
     return int(bool(unknown))
 
 
@@ -122,7 +128,7 @@ def main() -> int:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("command", choices=("compile", "build", "record", "add", "check"))
+    parser.add_argument("command", choices=("compile", "build", "record", "check"))
     parser.add_argument("folder", type=Path, nargs="?")
     parser.add_argument("--all", action="store_true", help="each kernel of the list")
     parser.add_argument("--processes", type=int, default=0, help="0: two, or one on a single core")
@@ -134,8 +140,8 @@ def main() -> int:
             parser.error(f"{given.command} needs a FOLDER")
         elif given.command == "build":
             build(given.folder, given.processes)
-        elif given.command in ("record", "add"):
-            record(given.folder, read_manifest() if given.command == "add" else ())
+        elif given.command == "record":
+            record(given.folder)
         else:
             return check(given.folder)
     except KernelError as error:

@@ -1,0 +1,261 @@
+"""The library of compiled kernels in a wheel: used where it fits, else refused with a reason."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cavmarl.core.compiled import IS_PLAIN, code, kernel, library
+from cavmarl.core.compiled.arguments import Words, result_reader
+from cavmarl.core.compiled.library import INDEX_FILE, LIBRARY_FILE, Library, UnusableLibraryError
+from cavmarl.core.compiled.signatures import signature_of
+from cavmarl.core.compiled.sources import module_digest
+from cavmarl.core.errors import KernelError
+from cavmarl.core.math.bearings import rough_atan2
+from cavmarl.driving.driver_models import REGISTERED_MODELS, register_driver_model
+from cavmarl.prebuild.compile_calls import _compile
+from cavmarl.prebuild.kernel_list import called_kernels
+from cavmarl.prebuild.linking import link
+from cavmarl.prebuild.manifest import (
+    KernelCall,
+    marked,
+    read_manifest,
+    recorded_calls,
+    write_manifest,
+)
+
+compiled_only = pytest.mark.skipif(IS_PLAIN, reason="nothing is compiled")
+pytestmark = pytest.mark.integration  # the linker is a process
+
+NAME = "cavmarl.core.math.bearings.rough_atan2"
+TYPES = "float64;float64"
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A library of one kernel."""
+    folder = tmp_path_factory.mktemp("built")
+    link([_compile(KernelCall(NAME, json.dumps(signature_of((1.0, 2.0)))))], folder)
+    return folder
+
+
+@pytest.fixture
+def copied(built: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(built, tmp_path / "prebuilt"))
+
+
+@pytest.fixture
+def anew(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
+    """Let this process look again where kernels come from, and forget it afterwards."""
+    for cached in (code.kernel_source, code._explain):
+        cached.cache_clear()
+    yield monkeypatch
+    monkeypatch.undo()
+    for cached in (code.kernel_source, code._explain):
+        cached.cache_clear()
+
+
+def _digest() -> str:
+    return module_digest(NAME.rpartition(".")[0])
+
+
+@compiled_only
+def test_a_kernel_of_the_library_computes_what_numba_compiles(built: Path) -> None:
+    found = Library(built).find(NAME, TYPES, _digest())
+    assert found is not None
+    words = Words(3)
+    words.floats[0], words.floats[1] = 1.0, -2.5
+    enter: Any = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p)(found.address)
+    assert enter(words.address) == 0
+    assert result_reader(found.result, 2)[1](words) == rough_atan2(1.0, -2.5)
+
+
+@compiled_only
+def test_a_kernel_of_other_types_or_other_sources_is_not_in_the_library(built: Path) -> None:
+    opened = Library(built)
+    assert opened.find(NAME, "float64;int64", _digest()) is None
+    assert opened.find(NAME, TYPES, "0" * 16) is None
+    assert opened.find("cavmarl.core.math.rng.below", TYPES, _digest()) is None
+
+
+def _flip(path: Path, place: int) -> None:
+    content = bytearray(path.read_bytes())
+    content[place] ^= 1
+    path.write_bytes(content)
+
+
+@compiled_only
+@pytest.mark.parametrize("name", [LIBRARY_FILE, INDEX_FILE])
+@pytest.mark.parametrize("harm", ["flipped", "truncated", "empty"])
+def test_a_damaged_file_is_refused(copied: Path, name: str, harm: str) -> None:
+    path = copied / name
+    size = path.stat().st_size
+    if harm == "flipped":
+        _flip(path, size // 2)
+    else:
+        path.write_bytes(path.read_bytes()[: size // 2 if harm == "truncated" else 0])
+    with pytest.raises(UnusableLibraryError, match="is damaged: install cavmarl again"):
+        Library(copied)
+
+
+@compiled_only
+def test_a_missing_library_is_refused(copied: Path) -> None:
+    (copied / LIBRARY_FILE).unlink()
+    with pytest.raises(UnusableLibraryError, match="cannot be read"):
+        Library(copied)
+    (copied / INDEX_FILE).unlink()
+    with pytest.raises(UnusableLibraryError, match="this installation has none"):
+        Library(copied)
+
+
+def _change_index(folder: Path, **changes: Any) -> None:
+    index = json.loads((folder / INDEX_FILE).read_text())
+    del index["index_sha256"]
+    index |= changes
+    index["index_sha256"] = library.index_digest(index)
+    (folder / INDEX_FILE).write_text(json.dumps(index))
+
+
+@compiled_only
+def test_a_library_for_another_interpreter_or_of_another_format_is_refused(copied: Path) -> None:
+    _change_index(copied, python="cpython-399-x86_64-linux-gnu")
+    with pytest.raises(UnusableLibraryError, match="it is for cpython-399"):
+        Library(copied)
+    _change_index(copied, format=0)
+    with pytest.raises(UnusableLibraryError, match="has format 0, not 1"):
+        Library(copied)
+
+
+@compiled_only
+def test_a_processor_without_avx2_is_told(built: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = ctypes.CDLL(str(built / LIBRARY_FILE))
+    flags = Path("/proc/cpuinfo").read_text()
+    assert (library.missing_features(opened, "x86-64-v3") == []) == (" avx2 " in flags)
+    monkeypatch.setitem(library._LEAF_7_EBX, "a feature of nobody", 1 << 6)
+    monkeypatch.setattr(library, "_LEVEL_WORDS", ({}, {"AVX2": 5, "no such feature": 60}, {}, {}))
+    with pytest.raises(UnusableLibraryError, match="this processor has no no such feature"):
+        Library(built)
+
+
+@compiled_only
+def test_without_a_library_kernels_are_compiled_or_refused(
+    copied: Path, anew: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    anew.setenv("CAVMARL_CACHE_DIR", str(tmp_path / "cache"))
+    anew.setattr(library, "FOLDER", copied)
+    anew.setattr(Library.__init__, "__defaults__", (copied,))
+    function: Any = rough_atan2
+    expected = rough_atan2(1.0, 2.0)
+
+    again: Any = kernel(function.py_func)
+    assert again(1.0, 2.0) == expected
+    assert not (tmp_path / "cache").exists(), "it came from the library"
+
+    _flip(copied / LIBRARY_FILE, 1000)
+    code.kernel_source.cache_clear()
+    again = kernel(function.py_func)
+    assert again(1.0, 2.0) == expected
+    assert len(list((tmp_path / "cache").rglob("*.kernel"))) == 1
+    said = capsys.readouterr().err
+    assert said.count("a kernel is compiled on this machine, as ") == 1
+    assert "is damaged: install cavmarl again" in said
+
+    anew.setenv("CAVMARL_KERNELS", "prebuilt")
+    code.kernel_source.cache_clear()
+    with pytest.raises(KernelError, match=r"cannot be used: .* is damaged"):
+        kernel(function.py_func)(1.0, 2.0)
+
+
+@compiled_only
+def test_prebuilt_refuses_what_the_library_lacks(copied: Path, anew: pytest.MonkeyPatch) -> None:
+    anew.setattr(Library.__init__, "__defaults__", (copied,))
+    anew.setenv("CAVMARL_KERNELS", "prebuilt")
+    function: Any = rough_atan2
+    with pytest.raises(KernelError, match=r"types int64;float64; set CAVMARL_KERNELS=auto"):
+        kernel(function.py_func)(1, 2.0)
+
+
+@compiled_only
+def test_wrong_settings_and_a_missing_compiler_are_errors(
+    anew: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    function: Any = rough_atan2
+    anew.setenv("CAVMARL_KERNELS", "fastest")
+    with pytest.raises(KernelError, match="fastest: must be one of auto, prebuilt, native"):
+        kernel(function.py_func)(1.0, 2.0)
+    anew.setenv("CAVMARL_KERNELS", "native")
+    code.kernel_source.cache_clear()
+    anew.setattr(code, "numba_version", lambda: "")
+    with pytest.raises(
+        KernelError, match=r"rough_atan2 has to be compiled, as .*\[compile\]"
+    ):
+        kernel(function.py_func)(1.0, 2.0)
+
+
+@compiled_only
+def test_registered_driver_models_reach_the_library(built: Path) -> None:
+    def hold(
+        speed: float, allowed: float, gap: float, front_speed: float, min_gap: float,
+        tau: float, accel: float, decel: float,
+    ) -> float:  # fmt: skip
+        return 0.0
+
+    opened = Library(built)
+    register_driver_model("hold_of_the_library_test", hold)
+    try:
+        row = REGISTERED_MODELS["hold_of_the_library_test"] - 16
+        copy = (ctypes.c_int64 * 64).in_dll(opened._library, "cavmarl_driver_models")
+        assert copy[row] != 0
+    finally:
+        REGISTERED_MODELS.remove("hold_of_the_library_test")
+
+
+def test_each_kernel_that_python_calls_is_in_the_list() -> None:
+    assert called_kernels() == {call.name for call in read_manifest()}
+
+
+@compiled_only
+def test_each_call_of_the_list_can_be_made_again() -> None:
+    from cavmarl.core.compiled.signatures import example_arguments
+
+    for call in read_manifest():
+        assert signature_of(example_arguments(call.kinds)) == call.kinds, call.name
+
+
+def test_a_plain_world_needs_some_of_them() -> None:
+    names = {call.name.rpartition(".")[2] for call in read_manifest() if call.is_plain}
+    assert {"advance_each", "sense_each", "populate"} <= names
+    assert "mirror" not in names
+
+
+def test_the_list_is_written_as_it_is_read(tmp_path: Path) -> None:
+    calls = read_manifest()
+    write_manifest(reversed(calls), tmp_path / "list.json")
+    assert read_manifest(tmp_path / "list.json") == calls
+    few = {call for call in calls if call.is_plain}
+    assert {call for call in marked(calls, marked(few, set())) if call.is_plain} == few
+
+
+@compiled_only
+def test_calls_from_the_package_are_recorded_and_those_of_tests_are_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from cavmarl.core.math import rng
+    from cavmarl.traffic.demand.drawing import chances
+
+    monkeypatch.setenv("CAVMARL_KERNEL_CALLS", str(tmp_path))
+    plain: Any = rng.fill_uniform
+    monkeypatch.setattr("cavmarl.traffic.demand.drawing.fill_uniform", kernel(plain.py_func))
+    chances(np.uint64(1), np.zeros(2, np.int64), np.zeros(2, np.int64), 1)
+    function: Any = rough_atan2
+    kernel(function.py_func)(1.0, 2.0)
+    assert {call.name for call in recorded_calls(tmp_path)} == {
+        "cavmarl.core.math.rng.fill_uniform"
+    }
