@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import sysconfig
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import pytest
 
@@ -50,14 +53,27 @@ def elsewhere(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "bin"
 
 
-def run(command: list[str], cwd: Path) -> str:
+def room(cache: Path) -> dict[str, str]:
+    """The setting for a cache of its own."""
+    return {"CAVMARL_CACHE_DIR": str(cache)}
+
+
+def run(command: list[str], cwd: Path, settings: Mapping[str, str] = MappingProxyType({})) -> str:
     """What a command says that knows nothing of the checkout."""
     clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    done = subprocess.run(command, cwd=cwd, env=clean, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, cwd=cwd, env=clean | settings, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
+# The compiler and torch are as if they were not installed.
+BARE = """
+import sys
+for name in ("numba", "llvmlite", "torch"):
+    sys.modules[name] = None
+"""
 DRIVE = """
 import json, cavmarl
 steps = {}
@@ -77,11 +93,87 @@ print(json.dumps([cavmarl.__file__, steps]))
 
 @pytest.mark.slow
 def test_every_environment_drives_from_an_installed_wheel(elsewhere: Path, tmp_path: Path) -> None:
-    out = run([str(elsewhere / "python"), "-c", DRIVE], tmp_path)
+    out = run([str(elsewhere / "python"), "-c", BARE + DRIVE], tmp_path)
     place, departed = json.loads(out)
     assert place.startswith(str(elsewhere.parent))
     assert list(departed) == list(entries())
     assert min(departed.values()) > 1
+
+
+EVERYTHING = """
+import cavmarl
+
+def drive(**keys):
+    vec = cavmarl.make_vec("grid4x4", num_envs=2, agents=4, background=40, **keys)
+    policy = cavmarl.load_policy("idm", vec)
+    observations, infos = vec.reset(seed=1)
+    for _ in range(5):
+        actions = policy.act_batch(observations, infos["mask"])
+        observations, *_, infos = vec.step(actions)
+    vec.close()
+
+if __name__ == "__main__":
+    drive(zones=4)
+    drive(zones=4, workers=2)
+    drive(zones=4, nodes=2)
+    drive(overrides={"rig": "ten_sensors"})
+    drive(overrides={"v2x.enabled": True, "sensors.messages.objects": 4})
+    drive(overrides={"sensors.lidar.rays": 16, "sensors.roadgraph.points": 20, "sensors.stack": 2})
+    print("driven")
+"""
+PREBUILT = {"CAVMARL_KERNELS": "prebuilt"}
+
+
+@pytest.mark.slow
+def test_an_installed_wheel_compiles_nothing_for_zones_workers_nodes_and_sensors(
+    elsewhere: Path, tmp_path: Path
+) -> None:
+    script = tmp_path / "everything.py"
+    script.write_text(BARE + EVERYTHING)
+    cache = tmp_path / "cache"
+    told = run([str(elsewhere / "python"), str(script)], tmp_path, PREBUILT | room(cache))
+    assert told.split() == ["driven"]
+    assert not list(cache.rglob("*.kernel"))
+
+
+@pytest.mark.slow
+def test_a_trained_driver_of_an_installed_wheel_needs_neither_compiler_nor_torch(
+    elsewhere: Path, tmp_path: Path
+) -> None:
+    code = BARE + "from cavmarl.cli import main; sys.exit(main(sys.argv[1:]))"
+    words = ["evaluate", "merge", "--policy", "merge_ippo", "--episodes", "1", "--out", "result"]
+    run([str(elsewhere / "python"), "-c", code, *words], tmp_path, PREBUILT)
+    assert (tmp_path / "result" / "trips.csv").is_file()
+
+
+@pytest.mark.slow
+def test_an_installation_that_cannot_be_written_and_a_missing_cache_do_no_harm(
+    elsewhere: Path, tmp_path: Path
+) -> None:
+    command = [
+        str(elsewhere / "python"),
+        "-c",
+        BARE + DRIVE.replace("cavmarl.entries()", "['ring']"),
+    ]
+    run(command, tmp_path, PREBUILT | room(Path("/proc/cavmarl")))
+
+
+@pytest.mark.slow
+def test_a_damaged_library_is_compiled_anew_with_a_reason(site: Path, tmp_path: Path) -> None:
+    damaged = tmp_path / "site"
+    shutil.copytree(site, damaged)
+    library = damaged / "cavmarl/core/compiled/prebuilt/kernels.so"
+    content = bytearray(library.read_bytes())
+    content[len(content) // 2] ^= 1
+    library.write_bytes(content)
+    code = "from cavmarl.core.math.bearings import rough_atan2; print(rough_atan2(1.0, 2.0))"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=damaged, env=os.environ | room(tmp_path / "cache"), capture_output=True, text=True,
+        check=True,
+    )  # fmt: skip
+    assert 0.4 < float(done.stdout) < 0.5
+    assert f"{library} is damaged: install cavmarl again" in done.stderr
 
 
 @pytest.mark.slow

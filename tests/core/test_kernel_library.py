@@ -193,9 +193,7 @@ def test_wrong_settings_and_a_missing_compiler_are_errors(
     anew.setenv("CAVMARL_KERNELS", "native")
     code.kernel_source.cache_clear()
     anew.setattr(code, "numba_version", lambda: "")
-    with pytest.raises(
-        KernelError, match=r"rough_atan2 has to be compiled, as .*\[compile\]"
-    ):
+    with pytest.raises(KernelError, match=r"rough_atan2 has to be compiled, as .*\[compile\]"):
         kernel(function.py_func)(1.0, 2.0)
 
 
