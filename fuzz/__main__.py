@@ -13,12 +13,13 @@ from pathlib import Path
 import atheris
 
 HERE = Path(__file__).resolve().parent
-KERNELS = (HERE.parent / "cavmarl" / "kernels").glob("*.py")
+PACKAGE = HERE.parent / "cavmarl"
+KERNELS = [path for folder in PACKAGE.rglob("kernels") for path in folder.glob("*.py")]
 
 # Kernels are left out: Numba compiles the bytecode of their functions as it is.
 with atheris.instrument_imports(
     include=["cavmarl", "sumolib", "yaml"],
-    exclude=[f"cavmarl.core.compiled.{path.stem}" for path in KERNELS],
+    exclude=[".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts) for path in KERNELS],
 ):
     import cavmarl.roads.sumo_net.sumo_xml  # noqa: F401 - the reader imports it late
     from fuzz.targets import TARGETS

@@ -45,6 +45,8 @@ def prepare_kernels() -> None:
     listeners.append(_ANNOUNCER)
     if compiled_before() or not numba_version() or _marker("plain").exists():
         return
+    if not _can_keep():
+        return
     print(
         "cavmarl: compiling kernels for this machine, once for this version",
         file=sys.stderr,
@@ -75,9 +77,16 @@ def _marker(name: str) -> Path:
     return cache_dir() / "kernels" / sources_digest() / f"{machine_digest()}.{name}"
 
 
-def _leave(marker: Path) -> None:
+def _can_keep() -> bool:
+    """Return whether compiled kernels can be kept on this machine; if not, say so once."""
     try:
-        marker.parent.mkdir(parents=True, exist_ok=True)
-        marker.touch()
+        _marker("plain").parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         tell_unwritable(error)
+        return False
+    return True
+
+
+def _leave(marker: Path) -> None:
+    if _can_keep():
+        marker.touch()
