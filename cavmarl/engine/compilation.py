@@ -10,11 +10,11 @@ from pathlib import Path
 
 from cavmarl.core.cache_folder import cache_dir, tell_unwritable
 from cavmarl.core.compiled import IS_PLAIN, sources_digest
-from cavmarl.core.compiled.code import Listener, kernel_source, listeners
-from cavmarl.core.compiled.store import machine_digest, numba_version
+from cavmarl.core.compiled.kernel_files import machine_digest, numba_version
+from cavmarl.core.compiled.machine_code import CompileListener, kernel_source, listeners
 
 
-class _Announcer(Listener):
+class _Announcer(CompileListener):
     """Says so when the first kernel is compiled in this process."""
 
     def __init__(self) -> None:

@@ -20,14 +20,14 @@ from tempfile import TemporaryDirectory
 from cavmarl.core.cache_folder import cache_dir
 from cavmarl.core.compiled.signatures import CALLS_SETTING, example_arguments, signature_of
 from cavmarl.core.errors import KernelError
-from cavmarl.prebuild.kernel_list import called_kernels
-from cavmarl.prebuild.manifest import (
+from cavmarl.prebuild.call_list import (
     KernelCall,
     marked,
     read_manifest,
     recorded_calls,
     write_manifest,
 )
+from cavmarl.prebuild.kernel_list import called_kernels
 
 PLAIN_WORLDS = ("ring", "merge", "grid4x4")
 

@@ -13,9 +13,9 @@ from typing import Any, TextIO, TypeVar
 
 from cavmarl.core.compiled.arguments import type_of
 from cavmarl.core.compiled.compiler import compile_kernel
+from cavmarl.core.compiled.kernel_files import CompiledKernel, KernelFile
 from cavmarl.core.compiled.signatures import example_arguments
-from cavmarl.core.compiled.store import CompiledKernel, KernelFile
-from cavmarl.prebuild.manifest import KernelCall
+from cavmarl.prebuild.call_list import KernelCall
 
 T = TypeVar("T")
 

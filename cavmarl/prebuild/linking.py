@@ -16,6 +16,8 @@ from typing import Any
 
 from llvmlite import binding, ir
 
+from cavmarl.core.compiled.address_tables import tables
+from cavmarl.core.compiled.kernel_files import CompiledKernel, numba_version
 from cavmarl.core.compiled.library import (
     FORMAT,
     INDEX_FILE,
@@ -25,8 +27,6 @@ from cavmarl.core.compiled.library import (
     python_tag,
 )
 from cavmarl.core.compiled.sources import module_digest
-from cavmarl.core.compiled.store import CompiledKernel, numba_version
-from cavmarl.core.compiled.tables import tables
 from cavmarl.core.errors import KernelError
 
 # The target of a wheel: an Intel or AMD processor since about 2013 (Haswell, Excavator).

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cavmarl.core.compiled import IS_PLAIN, code, kernel, library
+from cavmarl.core.compiled import IS_PLAIN, kernel, library, machine_code
 from cavmarl.core.compiled.arguments import Words, result_reader
 from cavmarl.core.compiled.library import INDEX_FILE, LIBRARY_FILE, Library, UnusableLibraryError
 from cavmarl.core.compiled.signatures import signature_of
@@ -20,16 +20,16 @@ from cavmarl.core.compiled.sources import module_digest
 from cavmarl.core.errors import KernelError
 from cavmarl.core.math.bearings import rough_atan2
 from cavmarl.driving.driver_models import REGISTERED_MODELS, register_driver_model
-from cavmarl.prebuild.compile_calls import _compile
-from cavmarl.prebuild.kernel_list import called_kernels
-from cavmarl.prebuild.linking import link
-from cavmarl.prebuild.manifest import (
+from cavmarl.prebuild.call_list import (
     KernelCall,
     marked,
     read_manifest,
     recorded_calls,
     write_manifest,
 )
+from cavmarl.prebuild.compile_calls import _compile
+from cavmarl.prebuild.kernel_list import called_kernels
+from cavmarl.prebuild.linking import link
 
 compiled_only = pytest.mark.skipif(IS_PLAIN, reason="nothing is compiled")
 pytestmark = pytest.mark.integration  # the linker is a process
@@ -54,11 +54,11 @@ def copied(built: Path, tmp_path: Path) -> Path:
 @pytest.fixture
 def anew(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
     """Let this process look again where kernels come from, and forget it afterwards."""
-    for cached in (code.kernel_source, code._explain):
+    for cached in (machine_code.kernel_source, machine_code._explain):
         cached.cache_clear()
     yield monkeypatch
     monkeypatch.undo()
-    for cached in (code.kernel_source, code._explain):
+    for cached in (machine_code.kernel_source, machine_code._explain):
         cached.cache_clear()
 
 
@@ -159,7 +159,7 @@ def test_without_a_library_kernels_are_compiled_or_refused(
     assert not (tmp_path / "cache").exists(), "it came from the library"
 
     _flip(copied / LIBRARY_FILE, 1000)
-    code.kernel_source.cache_clear()
+    machine_code.kernel_source.cache_clear()
     again = kernel(function.py_func)
     assert again(1.0, 2.0) == expected
     assert len(list((tmp_path / "cache").rglob("*.kernel"))) == 1
@@ -168,7 +168,7 @@ def test_without_a_library_kernels_are_compiled_or_refused(
     assert "is damaged: install cavmarl again" in said
 
     anew.setenv("CAVMARL_KERNELS", "prebuilt")
-    code.kernel_source.cache_clear()
+    machine_code.kernel_source.cache_clear()
     with pytest.raises(KernelError, match=r"cannot be used: .* is damaged"):
         kernel(function.py_func)(1.0, 2.0)
 
@@ -191,8 +191,8 @@ def test_wrong_settings_and_a_missing_compiler_are_errors(
     with pytest.raises(KernelError, match="fastest: must be one of auto, prebuilt, native"):
         kernel(function.py_func)(1.0, 2.0)
     anew.setenv("CAVMARL_KERNELS", "native")
-    code.kernel_source.cache_clear()
-    anew.setattr(code, "numba_version", lambda: "")
+    machine_code.kernel_source.cache_clear()
+    anew.setattr(machine_code, "numba_version", lambda: "")
     with pytest.raises(KernelError, match=r"rough_atan2 has to be compiled, as .*\[compile\]"):
         kernel(function.py_func)(1.0, 2.0)
 

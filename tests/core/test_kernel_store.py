@@ -13,8 +13,8 @@ import pytest
 
 from cavmarl.core.cache_folder import cache_dir
 from cavmarl.core.compiled import IS_PLAIN, kernel, sources
-from cavmarl.core.compiled.code import Listener, listeners
-from cavmarl.core.compiled.store import CompiledKernel, KernelFile, pack, unpack
+from cavmarl.core.compiled.kernel_files import CompiledKernel, KernelFile, pack, unpack
+from cavmarl.core.compiled.machine_code import CompileListener, listeners
 from cavmarl.core.math.bearings import rough_atan2
 
 SOURCES = sources.kernel_sources()
@@ -29,7 +29,7 @@ def _digests(monkeypatch: pytest.MonkeyPatch, changed: str = "") -> dict[str, st
     return {name: sources.module_digest.__wrapped__(f"cavmarl.{name}") for name in SOURCES}
 
 
-class Compiled(Listener):
+class Compiled(CompileListener):
     """The kernels that are compiled while this is open."""
 
     def __init__(self) -> None:
@@ -151,10 +151,10 @@ def test_a_function_that_closes_over_an_object_is_not_kept() -> None:
 
 AT_ONCE = """
 import sys
-from cavmarl.core.compiled.code import Listener, listeners
+from cavmarl.core.compiled.machine_code import CompileListener, listeners
 from cavmarl.core.math.bearings import rough_atan2
 
-class Told(Listener):
+class Told(CompileListener):
     def on_compile(self, name):
         print(name.rpartition(".")[2])
 

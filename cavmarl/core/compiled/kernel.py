@@ -17,7 +17,7 @@ from cavmarl.core.compiled.arguments import (
     type_key,
     type_of,
 )
-from cavmarl.core.compiled.code import find_code
+from cavmarl.core.compiled.machine_code import find_code
 from cavmarl.core.compiled.signatures import record_call
 
 P = ParamSpec("P")

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cavmarl.core.compiled.tables import tables
+from cavmarl.core.compiled.address_tables import tables
 
 FOLDER = Path(__file__).with_name("prebuilt")
 LIBRARY_FILE = "kernels.so"

@@ -10,8 +10,8 @@ from collections.abc import Callable
 from typing import Any
 
 from cavmarl.core.compiled import IS_PLAIN
+from cavmarl.core.compiled.address_tables import define_table
 from cavmarl.core.compiled.intrinsic import intrinsic
-from cavmarl.core.compiled.tables import define_table
 
 FIRST_REGISTERED = 16  # MODEL_* code of the first registered model
 MAX_REGISTERED = 64

@@ -15,18 +15,18 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
 
+from cavmarl.core.compiled.address_tables import tables
 from cavmarl.core.compiled.arguments import ArgumentType
+from cavmarl.core.compiled.kernel_files import CompiledKernel, KernelFile, numba_version
 from cavmarl.core.compiled.library import Library, UnusableLibraryError
 from cavmarl.core.compiled.sources import module_digest
-from cavmarl.core.compiled.store import CompiledKernel, KernelFile, numba_version
-from cavmarl.core.compiled.tables import tables
 from cavmarl.core.errors import KernelError
 
 SETTING = "CAVMARL_KERNELS"
 CHOICES = ("auto", "prebuilt", "native")
 
 _ENTRY: Any = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p)  # its calls release the GIL
-_INSTALL = "install Numba with `pip install 'cavmarl[compile]'`"
+_INSTALL = "pip install '.[compile]' in a checkout of cavmarl"
 
 
 class Code(NamedTuple):
@@ -36,14 +36,14 @@ class Code(NamedTuple):
     result: str
 
 
-class Listener:
+class CompileListener:
     """Is told when this process compiles a kernel."""
 
     def on_compile(self, name: str) -> None:
         """Called before the kernel of that name is compiled."""
 
 
-listeners: list[Listener] = []
+listeners: list[CompileListener] = []
 
 
 class Source(NamedTuple):
