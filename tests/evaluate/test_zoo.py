@@ -91,7 +91,7 @@ def test_a_result_that_cannot_be_recorded_stays(entry: Path) -> None:
     document["job"]["overrides"] = {"sensors.neighbors.range_m": 30.0}
     path.write_text(json.dumps(document))
     before = {found.name: found.read_bytes() for found in path.parent.iterdir()}
-    with pytest.raises(PolicyError, match=r"does not fit merge"):
+    with pytest.raises(ConfigError, match=r"range_m is 30\.0 in the overrides"):
         record(entry)
     assert {found.name: found.read_bytes() for found in path.parent.iterdir()} == before
     assert sorted(found.name for found in entry.iterdir()) == FILES
