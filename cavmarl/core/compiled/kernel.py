@@ -43,7 +43,7 @@ class Kernel:
         update_wrapper(self, function)
         self.py_func = function
         self._is_inlined = is_inlined
-        self._calls: dict[Any, Call] = {}
+        self._calls: dict[Any, TypedKernel] = {}
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         """Call the kernel.
@@ -56,12 +56,12 @@ class Kernel:
             arguments = self._bind(arguments, named)
         return self.call_for(arguments)(arguments)
 
-    def call_for(self, arguments: tuple[Any, ...]) -> Call:
+    def call_for(self, arguments: tuple[Any, ...]) -> TypedKernel:
         """Return the kernel for the types of some arguments; it is compiled if need be."""
         key = tuple(map(type_key, arguments))
         call = self._calls.get(key)
         if call is None:
-            call = self._calls[key] = Call(self.py_func, arguments)
+            call = self._calls[key] = TypedKernel(self.py_func, arguments)
         return call
 
     @cached_property
@@ -89,7 +89,7 @@ class Kernel:
         return self._part._numba_type_
 
 
-class Call:
+class TypedKernel:
     """A kernel for arguments of certain types."""
 
     __slots__ = ("enter", "name", "num_words", "offsets", "read_result", "types", "words")
@@ -156,7 +156,7 @@ class _Specialized:
     def __init__(self, kernel: Kernel, checks: bool) -> None:
         self._kernel = kernel
         self._checks = checks
-        self._call: Call | None = None
+        self._call: TypedKernel | None = None
         self._words: list[Words] = []
 
     def __call__(self, *arguments: Any) -> Any:
