@@ -39,7 +39,7 @@ def build(folder: Path, processes: int) -> None:
     # Numba reads these when it is imported, here and in the processes that compile.
     os.environ["NUMBA_CPU_NAME"] = PROCESSOR
     os.environ["NUMBA_CPU_FEATURES"] = FEATURES
-    from cavmarl.prebuild.compile_calls import compile_calls, usable_processes
+    from cavmarl.prebuild.compile_calls import compile_into_cache, kernel_file, usable_processes
 
     started = time.monotonic()
     calls = read_manifest()
@@ -48,11 +48,14 @@ def build(folder: Path, processes: int) -> None:
             f"the list of kernels lacks {', '.join(sorted(missing))}: run `make test`, then "
             "`make kernels`"
         )
-    kernels = list(compile_calls(calls, processes or usable_processes()))
+    count = compile_into_cache(calls, processes or usable_processes())
+    kernels = [kernel for call in calls if (kernel := kernel_file(call).load())]
+    if len(kernels) < len(calls):
+        raise KernelError(f"{cache_dir()} does not keep compiled kernels: set CAVMARL_CACHE_DIR")
     link(kernels, folder)
     size = sum(path.stat().st_size for path in folder.iterdir()) / 1e6
     print(
-        f"cavmarl: {len(kernels)} kernels for {PROCESSOR} in {time.monotonic() - started:.0f} s, "
+        f"cavmarl: {len(kernels)} kernels for {PROCESSOR}, {count} of them compiled, in {time.monotonic() - started:.0f} s, "
         f"{size:.1f} MB in {folder}"
     )
 

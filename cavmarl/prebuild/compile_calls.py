@@ -6,18 +6,16 @@ import importlib
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
-from typing import Any, TextIO, TypeVar
+from typing import Any, TextIO
 
 from cavmarl.core.compiled.arguments import type_of
 from cavmarl.core.compiled.compiler import compile_kernel
 from cavmarl.core.compiled.kernel_files import CompiledKernel, KernelFile
 from cavmarl.core.compiled.signatures import example_arguments
 from cavmarl.prebuild.call_list import KernelCall
-
-T = TypeVar("T")
 
 _LINE_S = 5.0  # between two lines where the output is no terminal
 
@@ -28,33 +26,23 @@ def kernel_file(call: KernelCall) -> KernelFile:
     return KernelFile(_function_of(call), types)
 
 
-def compile_calls(
-    calls: Iterable[KernelCall], processes: int, output: TextIO = sys.stderr
-) -> Iterator[CompiledKernel]:
-    """Compile kernels in other processes, the longest first; the order of the results is open."""
-    yield from _in_processes(_compile, calls, processes, output)
-
-
 def compile_into_cache(
     calls: Iterable[KernelCall], processes: int, output: TextIO = sys.stderr
 ) -> int:
     """Compile the kernels that are not kept on this machine yet, and keep them; return how many."""
     missing = [call for call in calls if kernel_file(call).load() is None]
-    return sum(1 for _ in _in_processes(_compile_and_keep, missing, processes, output))
-
-
-def _in_processes(
-    work: Callable[[KernelCall], T], calls: Iterable[KernelCall], processes: int, output: TextIO
-) -> Iterator[T]:
-    ordered = sorted(calls, key=_weight, reverse=True)
+    if not missing:
+        return 0
+    longest_first = sorted(missing, key=_weight, reverse=True)
     with (
-        _Progress(ordered, output) as progress,
+        _Progress(longest_first, output) as progress,
         ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool,
     ):
-        running = {pool.submit(work, call): call for call in ordered}
+        running = {pool.submit(_compile_and_keep, call): call for call in longest_first}
         for done in as_completed(running):
-            yield done.result()
+            done.result()
             progress.advance(running[done])
+    return len(missing)
 
 
 def _compile(call: KernelCall) -> CompiledKernel:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import importlib
 import json
 import platform
 import shutil
@@ -60,6 +61,8 @@ def link(kernels: Sequence[CompiledKernel], folder: Path) -> None:
     Raises:
         KernelError: there is no linker, or it failed.
     """
+    for kernel in kernels:  # tables of addresses are defined by the modules that use them
+        importlib.import_module(kernel.name.rpartition(".")[0])
     folder.mkdir(parents=True, exist_ok=True)
     library = folder / LIBRARY_FILE
     with TemporaryDirectory() as room:
@@ -72,7 +75,7 @@ def link(kernels: Sequence[CompiledKernel], folder: Path) -> None:
         listed.write_text("\n".join(map(str, objects)))
         command = [
             *find_linker(), "-shared", f"-Wl,--version-script={exported}", "-Wl,--gc-sections",
-            "-Wl,-z,noexecstack", "-s", "-o", str(library), f"@{listed}", "-lm",
+            "-Wl,-z,noexecstack,-z,defs", "-s", "-o", str(library), f"@{listed}", "-lm",
         ]  # fmt: skip
         done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:

@@ -29,17 +29,29 @@ class AddressTable:
             copy[row] = address
 
     def add_copy(self, library: ctypes.CDLL) -> None:
-        """Fill the copy of a library, now and from now on."""
+        """Fill the copy of a library, if it has one, now and from now on."""
+        if not hasattr(library, self.symbol):
+            return
         copy = (ctypes.c_int64 * self.size).in_dll(library, self.symbol)
         copy[:] = self._copies[0][:]
         self._copies.append(copy)
 
 
 tables: list[AddressTable] = []
+_libraries: list[ctypes.CDLL] = []
 
 
 def define_table(symbol: str, size: int) -> AddressTable:
     """Make a table of 64-bit addresses, all zero."""
     table = AddressTable(symbol, size)
     tables.append(table)
+    for library in _libraries:
+        table.add_copy(library)
     return table
+
+
+def attach_library(library: ctypes.CDLL) -> None:
+    """Fill the tables of a library of kernels, now and whenever one of them changes."""
+    _libraries.append(library)
+    for table in tables:
+        table.add_copy(library)

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cavmarl.core.compiled.address_tables import tables
+from cavmarl.core.compiled.address_tables import attach_library
 
 FOLDER = Path(__file__).with_name("prebuilt")
 LIBRARY_FILE = "kernels.so"
@@ -72,9 +72,7 @@ class Library:
             raise UnusableLibraryError(
                 f"it is for {index['processor']}, and this processor has no {', '.join(missing)}"
             )
-        for table in tables:
-            if hasattr(self._library, table.symbol):
-                table.add_copy(self._library)
+        attach_library(self._library)
         self._modules: Mapping[str, str] = index["modules"]
         self._kernels: Mapping[str, Mapping[str, list[str]]] = index["kernels"]
 
