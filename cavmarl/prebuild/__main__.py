@@ -55,8 +55,8 @@ def build(folder: Path, processes: int) -> None:
     link(kernels, folder)
     size = sum(path.stat().st_size for path in folder.iterdir()) / 1e6
     print(
-        f"cavmarl: {len(kernels)} kernels for {PROCESSOR}, {count} of them compiled, in {time.monotonic() - started:.0f} s, "
-        f"{size:.1f} MB in {folder}"
+        f"cavmarl: {len(kernels)} kernels for {PROCESSOR}, {count} of them compiled now, in "
+        f"{time.monotonic() - started:.0f} s: {size:.1f} MB in {folder}"
     )
 
 
