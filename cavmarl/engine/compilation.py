@@ -26,7 +26,8 @@ class _Announcer(CompileListener):
         if is_long and not self.has_told:
             self.has_told = True
             print(
-                "cavmarl: compiling more kernels for this machine, once for this version",
+                "cavmarl: compiling kernels that this world needs, once for this version and "
+                "machine",
                 file=sys.stderr,
                 flush=True,
             )
@@ -48,7 +49,8 @@ def prepare_kernels() -> None:
     if not _can_keep():
         return
     print(
-        "cavmarl: compiling kernels for this machine, once for this version",
+        "cavmarl: compiling the kernels of a first step, once for this version and machine: about "
+        "25 s of processor time, shared by two processes",
         file=sys.stderr,
         flush=True,
     )
