@@ -56,7 +56,9 @@ class Library:
         index = _read_index(folder / INDEX_FILE)
         here = python_tag()
         if index["python"] != here:
-            raise UnusableLibraryError(f"it is for {index['python']}, and this is {here}")
+            raise UnusableLibraryError(
+                f"the library of compiled kernels is for {index['python']}, and this interpreter is {here}"
+            )
         path = folder / LIBRARY_FILE
         try:
             content = path.read_bytes()
@@ -70,7 +72,8 @@ class Library:
             raise UnusableLibraryError(f"{path} cannot be loaded ({error})") from error
         if missing := missing_features(self._library, index["processor"]):
             raise UnusableLibraryError(
-                f"it is for {index['processor']}, and this processor has no {', '.join(missing)}"
+                f"the library of compiled kernels is for {index['processor']}, and this processor "
+                f"lacks {', '.join(missing)}"
             )
         attach_library(self._library)
         self._modules: Mapping[str, str] = index["modules"]
@@ -106,7 +109,9 @@ def _read_index(path: Path) -> Mapping[str, Any]:
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise UnusableLibraryError("this installation has none") from error
+        raise UnusableLibraryError(
+            "this installation brings no library of compiled kernels"
+        ) from error
     try:
         index: Mapping[str, Any] = json.loads(content)
         if index["format"] != FORMAT:

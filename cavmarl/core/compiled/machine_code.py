@@ -73,8 +73,8 @@ def kernel_source() -> Source:
     except UnusableLibraryError as error:
         if choice == "prebuilt":
             raise KernelError(
-                f"{SETTING}=prebuilt: the library of compiled kernels cannot be used: {error}; "
-                f"set {SETTING}=auto to compile them"
+                f"{SETTING}=prebuilt: there are no compiled kernels to use, as {error}; set "
+                f"{SETTING}=auto to compile them"
             ) from error
         return Source(choice, None, str(error))
 
@@ -89,7 +89,7 @@ def find_code(
     """
     text = ";".join(kind.text for kind in types)
     name = f"{function.__module__}.{function.__qualname__}"
-    reason = "it is not one of the package"
+    reason = "no wheel brings kernels of other packages"
     if name.startswith("cavmarl."):
         source = kernel_source()
         reason = source.reason
@@ -97,7 +97,7 @@ def find_code(
             found = source.library.find(name, text, module_digest(function.__module__))
             if found is not None:
                 return Code(_ENTRY(found.address), found.result)
-            reason = f"the wheel does not have it for arguments of the types {text}"
+            reason = f"the wheel does not bring it for arguments of the types {text}"
         if source.choice == "prebuilt":
             raise KernelError(
                 f"{SETTING}=prebuilt: the kernel {name} would have to be compiled, as {reason}; "
