@@ -57,7 +57,7 @@ class Library:
         here = python_tag()
         if index["python"] != here:
             raise UnusableLibraryError(
-                f"the library of compiled kernels is for {index['python']}, and this interpreter is {here}"
+                f"the library of compiled kernels is for {index['python']}, and this is {here}"
             )
         path = folder / LIBRARY_FILE
         try:
