@@ -23,6 +23,7 @@ from cavmarl.core.errors import KernelError
 from cavmarl.prebuild.call_list import (
     KernelCall,
     marked,
+    merged,
     read_manifest,
     recorded_calls,
     write_manifest,
@@ -73,7 +74,7 @@ def record(folder: Path) -> None:
     known = called_kernels()
     plain = _calls_of_plain_worlds()
     found = {*recorded_calls(folder), *plain, *filter(_can_be_made, read_manifest())}
-    calls = marked((call for call in found if call.name in known), plain)
+    calls = merged(marked((call for call in found if call.name in known), plain))
     write_manifest(calls)
     print(f"{len(calls)} calls of {len({call.name for call in calls})} kernels")
     if missing := known - {call.name for call in calls}:
@@ -115,7 +116,8 @@ def _calls_of_plain_worlds() -> set[KernelCall]:
 def check(folder: Path) -> int:
     """Say which recorded calls and which kernels are not in the list."""
     calls = marked(read_manifest(), set())
-    unknown = {call.name for call in recorded_calls(folder) - calls}
+    # A call that is covered leaves the merged list as it is.
+    unknown = {call.name for call in merged(calls | recorded_calls(folder)) - calls}
     unknown |= called_kernels() - {call.name for call in calls}
     for name in sorted(unknown):
         print(f"not in the list of kernels, or with other types: {name}")

@@ -7,12 +7,14 @@ once.
 
 from __future__ import annotations
 
+import functools
 import json
 from collections.abc import Iterable, Mapping, Set
 from pathlib import Path
 from typing import Any, NamedTuple
 
 MANIFEST = Path(__file__).with_name("kernel_calls.json")
+_READONLY = " readonly"
 _BUNDLE = "#"  # before the number of a bundle
 
 
@@ -73,6 +75,33 @@ def recorded_calls(folder: Path) -> set[KernelCall]:
             name, kinds = json.loads(line)
             found.add(KernelCall(name, json.dumps(kinds)))
     return found
+
+
+def merged(calls: Iterable[KernelCall]) -> set[KernelCall]:
+    """Return one call in the place of several that differ in arrays that are read only.
+
+    Code for an array that is read only takes others, too; see `arguments.accepts`.
+    """
+    groups: dict[tuple[str, str], list[KernelCall]] = {}
+    for call in calls:
+        shape = call.signature.replace(_READONLY, "")
+        groups.setdefault((call.name, shape), []).append(call)
+    return {
+        KernelCall(
+            name,
+            json.dumps(functools.reduce(_merge, (call.kinds for call in group))),
+            any(call.is_plain for call in group),
+        )
+        for (name, _), group in groups.items()
+    }
+
+
+def _merge(one: Any, other: Any) -> Any:
+    if isinstance(one, list):
+        return [_merge(*pair) for pair in zip(one, other, strict=True)]
+    if isinstance(one, Mapping):
+        return {key: _merge(value, other[key]) for key, value in one.items()}
+    return other if isinstance(other, str) and _READONLY in other else one
 
 
 def marked(calls: Iterable[KernelCall], plain: Set[KernelCall]) -> set[KernelCall]:

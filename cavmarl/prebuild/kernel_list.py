@@ -64,9 +64,9 @@ def _imported(tree: ast.Module) -> Iterator[tuple[str, str]]:
 
 
 def _called_by_plain(tree: ast.Module, kernels: set[str]) -> Iterator[str]:
-    """Yield kernels that functions of the same file name and that are no kernels themselves."""
-    for function in _functions(tree):
-        if not _is_kernel(function):
-            for node in ast.walk(function):
+    """Yield kernels that the same file names outside of kernels."""
+    for statement in tree.body:
+        if not isinstance(statement, ast.FunctionDef) or not _is_kernel(statement):
+            for node in ast.walk(statement):
                 if isinstance(node, ast.Name) and node.id in kernels:
                     yield node.id

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from cavmarl.core.compiled import IS_PLAIN, kernel, library, machine_code
-from cavmarl.core.compiled.arguments import Words, result_reader
+from cavmarl.core.compiled.arguments import Words, accepts, result_reader
 from cavmarl.core.compiled.library import INDEX_FILE, LIBRARY_FILE, Library, UnusableLibraryError
 from cavmarl.core.compiled.signatures import signature_of
 from cavmarl.core.compiled.sources import module_digest
@@ -23,6 +23,7 @@ from cavmarl.driving.driver_models import REGISTERED_MODELS, register_driver_mod
 from cavmarl.prebuild.call_list import (
     KernelCall,
     marked,
+    merged,
     read_manifest,
     recorded_calls,
     write_manifest,
@@ -257,3 +258,45 @@ def test_calls_from_the_package_are_recorded_and_those_of_tests_are_not(
     assert {call.name for call in recorded_calls(tmp_path)} == {
         "cavmarl.core.math.rng.fill_uniform"
     }
+
+
+@pytest.mark.parametrize(
+    ("compiled", "called", "fits"),
+    [
+        ("<f8[1C readonly];int64", "<f8[1C];int64", True),
+        ("<f8[1C];int64", "<f8[1C readonly];int64", False),
+        ("<f8[2A]", "<f8[2C]", True),
+        ("<f8[2C]", "<f8[2A]", False),
+        ("<f8[2A]", "<f8[1C]", False),
+        ("<f8[2A]", "<f4[2C]", False),
+        ("<f8[1C readonly];<f8[1C]", "<f8[1C];<f8[1C]", True),
+        ("<f8[1C readonly];<f8[1C]", "<f8[1C];<f8[1C readonly]", False),
+        ("<f8[1C]", "<f8[1C unaligned]", False),
+    ],
+)
+def test_code_takes_arrays_that_it_makes_no_assumption_about(
+    compiled: str, called: str, fits: bool
+) -> None:
+    assert accepts(compiled, called) == fits
+
+
+def test_calls_that_differ_in_read_only_arrays_are_compiled_once() -> None:
+    def call(*layouts: str) -> KernelCall:
+        return KernelCall("k", json.dumps([{"array": "<f8", "layout": text} for text in layouts]))
+
+    found = merged({call("1C", "1C readonly"), call("1C readonly", "1C"), call("1C", "1A")})
+    assert found == {call("1C readonly", "1C readonly"), call("1C", "1A")}
+
+
+@compiled_only
+def test_a_read_only_array_is_taken_by_code_that_does_not_write_to_it() -> None:
+    @kernel
+    def total(values: Any) -> float:
+        found = 0.0
+        for k in range(values.shape[0]):
+            found += values[k]
+        return found
+
+    constant = np.ones(3)
+    constant.flags.writeable = False
+    assert total(constant) == total(np.ones(3)) == 3.0

@@ -9,6 +9,7 @@ words behind the arguments.
 from __future__ import annotations
 
 import ctypes
+import re
 from collections.abc import Callable
 from functools import cache
 from itertools import repeat
@@ -171,11 +172,12 @@ _NUMBERS: dict[type[Any], tuple[type[ArgumentType], str]] = {
     np.float64: (_Float, "float64"),
     np.float32: (_Float, "float32"),
     np.uint64: (_Unsigned, "uint64"),
-    **{
-        kind: (_Signed, np.dtype(kind).name)
-        for kind in (np.int8, np.int16, np.int32, np.int64, np.uint8, np.uint16, np.uint32)
-    },
+    # Shorter integers are widened, so that a kernel is not compiled for each length.
+    **dict.fromkeys(
+        (np.int8, np.int16, np.int32, np.int64, np.uint8, np.uint16, np.uint32), (_Signed, "int64")
+    ),
 }
+_LAYOUT = re.compile(r"\[(\d+)([CFA])( readonly)?( unaligned)?\]")
 
 
 def type_key(argument: Any) -> Any:
@@ -235,6 +237,29 @@ def _array_text(dtype: np.dtype[Any], ndim: int, flags: int) -> str:
     extra = "" if flags & _WRITEABLE else " readonly"
     extra += "" if flags & _ALIGNED else " unaligned"
     return f"{_dtype_text(dtype)}[{ndim}{layout}{extra}]"
+
+
+def accepts(compiled: str, called: str) -> bool:
+    """Return whether code that was compiled for some types can be called with others.
+
+    Code for arrays that are read only never writes to them, and code for any layout (`A`) follows
+    the strides, so both take other arrays, too.
+
+    Args:
+        compiled: types that the code was compiled for, as text.
+        called: types of the arguments of a call, as text.
+    """
+    if compiled == called:
+        return True
+    if _LAYOUT.sub("[]", compiled) != _LAYOUT.sub("[]", called):
+        return False
+    return all(
+        one[0] == other[0]
+        and one[1] in ("A", other[1])
+        and (one[2] != "" or other[2] == "")
+        and (one[3] != "" or other[3] == "")
+        for one, other in zip(_LAYOUT.findall(compiled), _LAYOUT.findall(called), strict=True)
+    )
 
 
 @cache

@@ -39,7 +39,7 @@ from numba.core.ir import Assign
 from numba.core.lowering import Lower
 from numba.core.registry import CPUDispatcher
 from numba.core.typed_passes import InlineOverloads, NativeLowering, NopythonRewrites
-from numba.core.types import IntegerLiteral, NamedTuple, float64, int32, intp
+from numba.core.types import Integer, IntegerLiteral, NamedTuple, float64, int32, intp
 from numba.core.untyped_passes import InlineClosureLikes, InlineInlinables
 from numba.np import arrayobj
 
@@ -376,6 +376,12 @@ class _PartDispatcher(_Dispatcher):  # type: ignore[misc]
         self.overloads[tuple(result.signature.args)] = result
 
 
+def _as_called(kind: Any) -> Any:
+    """Return the type of a number or an array as `arguments` hands it over."""
+    is_short = isinstance(kind, Integer) and kind.bitwidth < intp.bitwidth
+    return intp if is_short else kind
+
+
 _OPTIONS = {
     "nopython": True,
     "fastmath": False,
@@ -410,7 +416,7 @@ def compile_kernel(
         numba.core.errors.NumbaError: Numba cannot compile the function.
     """
     typeof: Any = numba.typeof
-    kinds = tuple(map(typeof, arguments))
+    kinds = tuple(_as_called(typeof(argument)) for argument in arguments)
     whole: Any = _Dispatcher(function, targetoptions=dict(_OPTIONS), pipeline_class=KernelCompiler)
     with _compiler_lock:
         whole.typingctx.refresh()

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cavmarl.core.compiled.address_tables import attach_library
+from cavmarl.core.compiled.arguments import accepts
 
 FOLDER = Path(__file__).with_name("prebuilt")
 LIBRARY_FILE = "kernels.so"
@@ -92,10 +93,11 @@ class Library:
         """Return a kernel's entry point for argument types; None: the library has none."""
         if not self.has(name, digest):
             return None
-        found = self._kernels[name].get(types)
-        if found is None:
+        found = self._kernels[name]
+        fitting = types if types in found else next((t for t in found if accepts(t, types)), None)
+        if fitting is None:
             return None
-        symbol, result = found
+        symbol, result = found[fitting]
         address = ctypes.cast(getattr(self._library, symbol), ctypes.c_void_p).value
         return None if address is None else Entry(address, result)
 
