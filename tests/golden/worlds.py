@@ -244,6 +244,8 @@ def main() -> int:
                 said = f"DIFFERENT: {type(error).__name__}: {error}"
             failed |= said.startswith("DIFFERENT")
             print(f"{name:32} {said}", flush=True)
+            if failed and given.write:
+                break
     return int(failed)
 
 

@@ -133,10 +133,17 @@ def results_folder() -> Path:
     places = [*ROOT.glob("cavmarl/**/*.py"), *ROOT.glob("benchmarks/ring22.py")]
     places += [path for folder in ("agents", "envs") for path in ROOT.glob(f"{folder}/**/*")]
     for path in sorted(places):
-        is_result = path.suffix == ".md" or "result" in path.parts or "__pycache__" in path.parts
-        if path.is_file() and not is_result:
+        is_recorded = path.suffix == ".md" or "result" in path.parts
+        if is_kept(path) and not is_recorded:
             digest.update(f"{path.relative_to(ROOT)}\0".encode() + path.read_bytes())
     return ROOT / "runs/record" / digest.hexdigest()[:16]
+
+
+def is_kept(path: Path) -> bool:
+    """Return whether this is a file of the repository: no bytecode, and not being made."""
+    parts = path.relative_to(ROOT).parts
+    is_draft = any(part.startswith(".") for part in parts)
+    return path.is_file() and not is_draft and "__pycache__" not in parts
 
 
 def finish(job: AnyJob, place: Path) -> float:

@@ -315,7 +315,7 @@ def _cards() -> Iterator[ScoreTable]:
         page, "scores by map", (CITIES_CARD,), partial(maps_table, CITIES_CARD, [*ours, *idms])
     )
     page, command = "agents/cities_residual/README.md", filled(RESIDUAL, SEEDS[0])
-    speeding = ("speeding, over the limit", figure("mean_speeding", " %"))
+    speeding = ("mean speed above the limit", figure("mean_speeding", " %"))
     rows = [*CITIES_ROWS, speeding, JERK]
     yield ScoreTable(page, "scores", (command,), partial(drivers_table, columns_of(command), rows))
     ours = [
