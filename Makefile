@@ -103,6 +103,9 @@ maps: $(READY) ## make the maps of all entries anew from the options beside them
 	    sed --in-place '2,/^-->$$/d' $$name && \
 	    { test $$folder != envs/cities/map || gzip --force --best --no-name $$name; }) || exit 1; done
 
+record: $(READY) ## after a change of behaviour: golden rows, zoo, scores, generated blocks; PART=scores, ROWS=all
+	$(BIN)/python -m tests.record $(PART) $(if $(filter all,$(ROWS)),--all-rows)
+
 rules: $(READY) $(TOOLS)/.ready ## ask ASAM's checker whether exported OpenDRIVE keeps its rules
 	$(BIN)/pytest tests/maps/exports/test_opendrive_rules.py
 

@@ -26,6 +26,7 @@ import sumo
 import yaml
 
 import cavmarl
+from cavmarl.core.whole_file import write_whole
 
 # Names of cavmarl's that a run needs.
 MODES = {"respawn": "respawn", "open": "open", "closed": "closed"}
@@ -235,7 +236,7 @@ def main() -> int:
                 recorded = json.loads(RECORD.read_text("utf-8")) if RECORD.exists() else {}
                 if given.write:
                     rows = json.dumps(recorded | {name: found}, indent=1, sort_keys=True)
-                    RECORD.write_text(rows + "\n", "utf-8")
+                    write_whole(RECORD, f"{rows}\n".encode())
                 elif found != (old := recorded.get(name, {})):
                     parts = [part for part in old | found if old.get(part) != found.get(part)]
                     said = f"DIFFERENT: {', '.join(parts)}"
@@ -243,6 +244,8 @@ def main() -> int:
                 said = f"DIFFERENT: {type(error).__name__}: {error}"
             failed |= said.startswith("DIFFERENT")
             print(f"{name:32} {said}", flush=True)
+            if failed and given.write:
+                break
     return int(failed)
 
 

@@ -3,15 +3,17 @@
     python -m tests.golden.zoo [DRIVER ...]
 
 evaluates each driver (all, if none is named) with the job in the manifest of its result: the same
-world, seed, episodes and runs. Use it after a change of behaviour, then rewrite the tables of the
-cards (CONTRIBUTING.md).
+world, seed, episodes and runs. It is the part `zoo` of `make record` (CONTRIBUTING.md). The first
+driver that cannot be recorded ends it.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from cavmarl.config.registry import agent_entries
 from cavmarl.core.errors import CavmarlError
@@ -21,30 +23,43 @@ from cavmarl.evaluate.provenance.manifest import read_closed
 from cavmarl.evaluate.zoo import RESULT_FOLDER, TABLES, entry_job
 from cavmarl.policies.policy import policy_files
 
-SAME, OTHER = "same bytes as before", "recorded anew"
+SAME, OTHER = "same results as before", "recorded anew"
 
 
 def record(driver: str | Path) -> str:
     """Replace the result of a driver, given by its name or folder; return what has become of it.
 
-    The old result stays if the evaluation fails or is interrupted.
+    The old result stays if the new one is the same, and if the evaluation fails or is interrupted.
     """
     folder = policy_files(driver)[0].parent
     result = folder / RESULT_FOLDER
     before = read_closed(result)
     with draft_folder(folder) as draft:
         made, old = draft / RESULT_FOLDER, draft / "old"
-        entry_job(before, folder).drive(next(iter(before["policies"])), folder, made)
+        # A name is given as such: a path in the manifest would be that of this machine.
+        entry_job(before, folder).drive(next(iter(before["policies"])), Path(driver), made)
         load_report(made)
+        found = read_closed(made)
+        if _facts(found) == _facts(before):
+            return SAME
         result.rename(old)
         try:
             made.rename(result)
         except OSError:
             old.rename(result)
             raise
-    found = read_closed(result)["results_sha256"]
-    is_same = all(found.get(name) == before["results_sha256"].get(name) for name in TABLES)
-    return SAME if is_same else OTHER
+    return OTHER
+
+
+def _facts(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a manifest says of results, without times, machine and version of the code."""
+    keys = ("schema", "metrics_version", "episodes", "seeds")
+    return {
+        **{key: document.get(key) for key in keys},
+        "world": {key: value for key, value in document["world"].items() if key != "kernels"},
+        "policies": [policy["sha256"] for policy in document["policies"].values()],
+        "tables": {name: document["results_sha256"].get(name) for name in TABLES},
+    }
 
 
 def main() -> int:
@@ -59,6 +74,8 @@ def main() -> int:
         except CavmarlError as error:
             said, has_failed = f"FAILED: {error}", True
         print(f"{name:32} {said}", flush=True)
+        if has_failed:
+            break
     return int(has_failed)
 
 

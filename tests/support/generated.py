@@ -10,21 +10,39 @@ import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from cavmarl.core.whole_file import write_whole
 
-def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table."""
-    lines = [header, ["---"] * len(header), *rows]
+
+def table(header: Sequence[str], rows: Iterable[Sequence[str]], *, is_right: bool = False) -> str:
+    """A Markdown table; `is_right` aligns all columns but the first to the right."""
+    others = "---:" if is_right else "---"
+    lines = [header, ["---", *[others] * (len(header) - 1)], *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def check_block(path: Path, name: str, expected: str) -> None:
     """Assert that the block `name` of the file says what is `expected`, or make it so."""
+    if os.environ.get("CAVMARL_REWRITE"):
+        write_block(path, name, expected)
+        return
+    assert read_block(path, name) == expected, f"{path}: run again with CAVMARL_REWRITE=1"
+
+
+def read_block(path: Path, name: str) -> str:
+    """Return the content of a block."""
+    return _block(path, name)[2].rstrip("\n")
+
+
+def write_block(path: Path, name: str, content: str) -> None:
+    """Replace the content of a block; the file is always whole."""
+    found = _block(path, name)
+    text = found.string[: found.end(1)] + content + "\n" + found.string[found.start(3) :]
+    write_whole(path, text.encode())
+
+
+def _block(path: Path, name: str) -> re.Match[str]:
     text = path.read_text(encoding="utf-8")
     pattern = re.compile(rf"(<!-- {re.escape(name)} -->\n)(.*?)(<!-- end -->)", re.DOTALL)
     found = pattern.search(text)
     assert found, f"{path} has no block <!-- {name} --> … <!-- end -->"
-    if os.environ.get("CAVMARL_REWRITE"):
-        whole = text[: found.end(1)] + expected + "\n" + text[found.start(3) :]
-        path.write_text(whole, encoding="utf-8")
-        return
-    assert found[2].rstrip("\n") == expected, f"{path}: run again with CAVMARL_REWRITE=1"
+    return found

@@ -157,7 +157,8 @@ def _engine() -> Any:
     binding.initialize_native_asmprinter()
     target = binding.Target.from_triple(binding.get_process_triple())
     machine = target.create_target_machine(opt=0, jit=True)
-    return binding.create_mcjit_compiler(binding.parse_assembly(""), machine)
+    # Code refers to its data by 32-bit offsets, so both have to lie in one piece of memory.
+    return binding.create_mcjit_compiler(binding.parse_assembly(""), machine, use_lmm=True)
 
 
 def _load_object(kernel: CompiledKernel) -> int:

@@ -1,0 +1,178 @@
+"""Jobs: what the commands beside tables of scores drive, one driver at a time.
+
+Several tables share drivers and worlds, so the unit is one driver in one world: it is driven once.
+Results stay in runs/record, under the hash of the sources that made them. An interrupted recording
+continues with the jobs that it has not finished.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shlex
+import time
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from benchmarks import ring22
+from benchmarks.harness import command as benchmark_command
+from cavmarl.cli import app
+from cavmarl.cli.output import parse_settings
+from cavmarl.config.world_spec import WorldSpec, with_sensors_of_drivers
+from cavmarl.core.whole_file import draft_folder, write_whole
+from cavmarl.evaluate import EvaluationReport, evaluate
+from cavmarl.evaluate.evaluation import load_report
+from cavmarl.evaluate.fresh import call_in_fresh_process
+
+ROOT = Path(__file__).resolve().parents[2]
+EVALUATE, RING22 = "cavmarl evaluate ", "python -m benchmarks ring22 "
+
+
+@dataclass(frozen=True)
+class Job:
+    """One driver in seeded episodes of one world."""
+
+    driver: str
+    world: WorldSpec
+    episodes: int
+    repeats: int
+
+    @property
+    def key(self) -> str:
+        """The name of its results: equal for equal jobs."""
+        text = json.dumps(asdict(self), sort_keys=True)
+        return f"{self.world.env}-{hashlib.sha256(text.encode()).hexdigest()[:16]}"
+
+    def drive(self, out: Path) -> None:
+        """Evaluate into the new folder `out`."""
+        evaluate(self.world, self.driver, episodes=self.episodes, repeats=self.repeats, out=out)
+
+    def load(self, folder: Path) -> EvaluationReport:
+        """Return the report of the results in a folder."""
+        return load_report(folder)
+
+
+@dataclass(frozen=True)
+class RingJob:
+    """The benchmark `ring22`, which measures all drivers that it is given in one run."""
+
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def key(self) -> str:
+        """The name of its results: equal for equal jobs."""
+        text = json.dumps(self.options, sort_keys=True)
+        return f"ring22-speed-{hashlib.sha256(text.encode()).hexdigest()[:16]}"
+
+    def drive(self, out: Path) -> None:
+        """Measure, and write the rows into the new folder `out`."""
+        rows = ring22.measure(**self.options).to_dict()["rows"]
+        out.mkdir()
+        write_whole(out / "rows.json", json.dumps(rows).encode())
+
+    def load(self, folder: Path) -> dict[str, dict[str, Any]]:
+        """Return the rows by driver."""
+        rows = json.loads((folder / "rows.json").read_text("utf-8"))
+        return {row["driver"]: row for row in rows}
+
+
+AnyJob = Job | RingJob
+Tell = Callable[[str], None]
+
+
+@cache
+def options_of(command: str) -> dict[str, Any]:
+    """Return the options of a command, read and checked by the command itself.
+
+    Raises typer's `UsageError`: the command has other options.
+    """
+    words = shlex.split(command)
+    if command.startswith(RING22):
+        program = typer.Typer()
+        program.command()(benchmark_command(ring22.measure))
+        return dict(typer.main.get_command(program).make_context("ring22", words[4:]).params)
+    assert command.startswith(EVALUATE), f"{command}: neither an evaluation nor ring22"
+    found: Any = typer.main.get_command(app)
+    return dict(found.commands["evaluate"].make_context("evaluate", words[2:]).params)
+
+
+def drivers_of(command: str) -> list[str]:
+    """Return the drivers that a command names, in its order."""
+    return list(options_of(command)["policy"] or ["idm"])
+
+
+@cache
+def jobs_of(command: str) -> dict[str, AnyJob]:
+    """Return the jobs of a command by driver. All drivers of an evaluation get the same world."""
+    options = options_of(command)
+    drivers = drivers_of(command)
+    if command.startswith(RING22):
+        shown = {name: value for name, value in options.items() if name != "json_path"}
+        return dict.fromkeys(["human", *drivers], RingJob(shown))
+    spec = WorldSpec.of(
+        options["env"],
+        agents=options["agents"],
+        background=options["background"],
+        seed=options["seed"],
+        overrides=parse_settings(options["settings"]),
+        sensors_of=options["sensors_of"],
+    )
+    world = with_sensors_of_drivers(spec, drivers)
+    return {name: Job(name, world, options["episodes"], options["repeats"]) for name in drivers}
+
+
+def results_folder() -> Path:
+    """Return the folder of results of today's sources: code, environments and drivers."""
+    digest = hashlib.sha256()
+    places = [*ROOT.glob("cavmarl/**/*.py"), *ROOT.glob("benchmarks/ring22.py")]
+    places += [path for folder in ("agents", "envs") for path in ROOT.glob(f"{folder}/**/*")]
+    for path in sorted(places):
+        is_recorded = path.suffix == ".md" or "result" in path.parts
+        if is_kept(path) and not is_recorded:
+            digest.update(f"{path.relative_to(ROOT)}\0".encode() + path.read_bytes())
+    return ROOT / "runs/record" / digest.hexdigest()[:16]
+
+
+def is_kept(path: Path) -> bool:
+    """Return whether this is a file of the repository: no bytecode, and not being made."""
+    parts = path.relative_to(ROOT).parts
+    is_draft = any(part.startswith(".") for part in parts)
+    return path.is_file() and not is_draft and "__pycache__" not in parts
+
+
+def finish(job: AnyJob, place: Path) -> float:
+    """Drive a job into a folder of `place`; return the seconds that it took."""
+    began_s = time.monotonic()
+    place.mkdir(parents=True, exist_ok=True)
+    with draft_folder(place) as draft:
+        job.drive(draft / "out")
+        (draft / "out").rename(place / job.key)
+    return time.monotonic() - began_s
+
+
+def finish_all(jobs: Iterable[AnyJob], processes: int, tell: Tell, place: Path) -> dict[str, Any]:
+    """Drive all jobs, each in a fresh process, and return what they have found, by key.
+
+    Jobs with results in `place` are not driven. The first error stops the recording, after the jobs
+    that are being driven.
+    """
+    chosen = {job.key: job for job in jobs}
+    missing = {key: job for key, job in chosen.items() if not (place / key).is_dir()}
+    with ThreadPoolExecutor(processes) as pool:
+        running = {
+            pool.submit(call_in_fresh_process, key, finish, job, place): key
+            for key, job in missing.items()
+        }
+        try:
+            for number, done in enumerate(as_completed(running), start=1):
+                tell(f"  {number}/{len(missing)} {running[done]}: {done.result():.0f} s")
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    return {key: job.load(place / key) for key, job in chosen.items()}
