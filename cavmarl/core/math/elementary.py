@@ -420,4 +420,6 @@ def hypot(x: float, y: float) -> float:
 
     Squares beyond the range of float64 are not avoided.
     """
+    x = float(x)
+    y = float(y)
     return math.sqrt(x * x + y * y)
