@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import PolicyError
+from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.engine.spaces import observation_parts
 from cavmarl.env.parallel import CavEnv
 from cavmarl.env.vector import CavVectorEnv
@@ -123,7 +124,7 @@ class CaccPolicy(Policy):
         gap_m = self._gap_m(newest)
         told = self._part(newest, "messages")[..., : self._objects * OBJECT_FEATURES]
         told = told.reshape(*told.shape[:-1], self._objects, OBJECT_FEATURES)
-        centre_m = np.hypot(told[..., 1], told[..., 2]) * self._scale_m
+        centre_m = hypot_all(told[..., 1], told[..., 2]) * self._scale_m
         between_m = centre_m - 0.5 * (told[..., 8] * LENGTH_SCALE + OWN_LENGTH_M)
         ahead = (told[..., 0] > 0.0) & (told[..., 1] > 0.0) & (told[..., 10] > 0.0)
         with np.errstate(invalid="ignore"):

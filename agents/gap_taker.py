@@ -119,7 +119,8 @@ class GapTaker(Policy):
             speed[..., None] * (1.0 + slower / (2.0 * np.sqrt(BRISK_MPS2 * 4.0))), 0.0
         )
         closest = (wanted_m / gap_m).max(-1, initial=0.0)
-        found: Floats = BRISK_MPS2 * (1.0 - (speed / limit) ** 4 - closest**2)
+        of_limit = (speed / limit) ** 2
+        found: Floats = BRISK_MPS2 * (1.0 - of_limit * of_limit - closest**2)
         return found
 
     def _cross(self, others: Floats, signal: Floats, speed: Floats, limit: Floats) -> Floats:

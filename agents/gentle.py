@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import PolicyError
+from cavmarl.core.math.elementary_arrays import atan2_all
 from cavmarl.engine.spaces import observation_parts
 from cavmarl.env.parallel import CavEnv
 from cavmarl.env.vector import CavVectorEnv
@@ -84,7 +85,7 @@ class GentlePolicy(Policy):
         newest = observations[..., -self._frame :].astype(np.float64)
         ahead_m, left_m = np.moveaxis(newest[..., self._aim] * self._aim_scale_m, -1, 0)
         squared = np.maximum(ahead_m**2 + left_m**2, 1.0)
-        steering = np.arctan(2.0 * WHEELBASE_M * left_m / squared) / self._steering_rad
+        steering = atan2_all(2.0 * WHEELBASE_M * left_m, squared) / self._steering_rad
         controls = np.stack([self._throttle(newest), np.clip(steering, -1.0, 1.0)], axis=-1)
         return controls.astype(np.float32)
 

@@ -15,6 +15,7 @@ from cavmarl.config.action import ActionConfig
 from cavmarl.config.env import EnvConfig
 from cavmarl.config.rig import samples_per_step
 from cavmarl.config.sensors import SensorsConfig
+from cavmarl.core.math.elementary_arrays import cos_all, sin_all
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.mounted.frames import Frames
 from cavmarl.sensors.observed import layout, sensors_of
@@ -191,8 +192,8 @@ def global_state(
     live[:, 0] = 1.0
     live[:, 1] = 2.0 * (rows["x"] - min_x) / max(max_x - min_x, 1.0) - 1.0
     live[:, 2] = 2.0 * (rows["y"] - min_y) / max(max_y - min_y, 1.0) - 1.0
-    live[:, 3] = np.cos(rows["heading"])
-    live[:, 4] = np.sin(rows["heading"])
+    live[:, 3] = cos_all(rows["heading"])
+    live[:, 4] = sin_all(rows["heading"])
     live[:, 5] = rows["speed"] / STATE_SPEED_MPS
     return np.clip(state, -1.0, 1.0).ravel()
 

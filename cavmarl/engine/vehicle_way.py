@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.core.records.codes import DRIVER_SCRIPTED
 from cavmarl.engine.world_views import WorldViews
 
@@ -51,7 +52,7 @@ def _from(line: NDArray[np.float64], start_m: float) -> NDArray[np.float64]:
     """The part of a line (n, 2) after its first metres."""
     if start_m <= 0.0:
         return line
-    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+    along = np.concatenate([[0.0], np.cumsum(hypot_all(*np.diff(line, axis=0).T))])
     start_m = min(start_m, float(along[-1]))
     begin = [np.interp(start_m, along, line[:, k]) for k in range(2)]
     return np.concatenate([[begin], line[along > start_m]])

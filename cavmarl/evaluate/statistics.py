@@ -9,6 +9,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.math.elementary import atan, cos_sin
+
 Z_95 = 1.959963984540054
 TWO_SIDED = 0.975  # of the distribution lies below the upper end of a 95 % interval
 ROUNDING = 1e-12  # values that differ by less than this share of their size are one
@@ -122,15 +124,16 @@ def student_quantile(freedom: int) -> float:
 
 def _student_within(t: float, freedom: int) -> float:
     """P(|T| < t): Abramowitz and Stegun 1964, 26.7.3 and 26.7.4."""
-    theta = math.atan(t / math.sqrt(freedom))
-    square = math.cos(theta) ** 2
+    theta = atan(t / math.sqrt(freedom))
+    cos, sin = cos_sin(theta)
+    square = cos * cos
     odd = freedom % 2 == 1
-    term = math.cos(theta) if odd else 1.0
+    term = cos if odd else 1.0
     total = term if freedom > 1 else 0.0
     for k in range(2 if odd else 1, freedom - 2, 2):
         term *= square * k / (k + 1)
         total += term
-    return 2.0 / math.pi * (theta + math.sin(theta) * total) if odd else math.sin(theta) * total
+    return 2.0 / math.pi * (theta + sin * total) if odd else sin * total
 
 
 def jain_index(values: Values) -> float:
@@ -138,7 +141,7 @@ def jain_index(values: Values) -> float:
 
     1 where all have the same, 1/n where one has all; NaN without values or where all are 0.
     """
-    squares = values.size * float(values @ values)
+    squares = values.size * float((values * values).sum())
     return float(values.sum()) ** 2 / squares if squares > 0.0 else math.nan
 
 
@@ -151,5 +154,5 @@ def gini_coefficient(values: Values) -> float:
     if total <= 0.0:
         return math.nan
     ranks = np.arange(1, values.size + 1)
-    weighted = float((2.0 * ranks - values.size - 1.0) @ np.sort(values))
+    weighted = float(((2.0 * ranks - values.size - 1.0) * np.sort(values)).sum())
     return weighted / (values.size * total)

@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.terms import TERMS
+from cavmarl.core.math.elementary import hypot
+from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 
 Rows = NDArray[np.void]
@@ -173,11 +175,11 @@ def _simplified(line: NDArray[np.float64]) -> NDArray[np.float64]:
             continue
         chord = line[last] - line[first]
         inner = line[first + 1 : last] - line[first]
-        length = float(np.hypot(*chord))
+        length = hypot(float(chord[0]), float(chord[1]))
         off = (
             np.abs(inner[:, 0] * chord[1] - inner[:, 1] * chord[0]) / length
             if length > 0.0
-            else np.hypot(*inner.T)
+            else hypot_all(*inner.T)
         )
         worst = int(off.argmax())
         if off[worst] > TOLERANCE_M:

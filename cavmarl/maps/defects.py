@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.maps.buildings import with_buildings
 from cavmarl.maps.net_document import NetDocument, points_of
 from cavmarl.maps.shared_ground import CAR_WIDTH_M, LEVEL_M
@@ -241,7 +242,7 @@ def _to_rim(place: Points, rim: Points) -> float:
     along = np.roll(rim, -1, axis=0) - rim
     square = np.maximum((along**2).sum(axis=1), 1e-12)
     share = np.clip(((place - rim) * along).sum(axis=1) / square, 0.0, 1.0)
-    return float(np.hypot(*(rim + share[:, None] * along - place).T).min())
+    return float(hypot_all(*(rim + share[:, None] * along - place).T).min())
 
 
 def _buildings_on_roads(network: RoadNetwork) -> Iterator[Defect]:

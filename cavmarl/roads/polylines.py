@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import MapError
+from cavmarl.core.math.elementary_arrays import atan2_all, hypot_all
 from cavmarl.roads.network import POINT
 
 Shape = NDArray[np.float64]
@@ -27,7 +28,7 @@ def clean_shape(points: Sequence[tuple[float, float, float]]) -> Shape:
     shape: Shape = np.array(points, dtype=np.float64).reshape(-1, 3)
     if not len(shape):
         raise MapError("a lane has no shape: build the network again with netconvert")
-    step = np.hypot(*np.diff(shape[:, :2], axis=0).T)
+    step = hypot_all(*np.diff(shape[:, :2], axis=0).T)
     fresh = np.concatenate([[True], step > SAME_POINT_M])
     return np.ascontiguousarray(shape[fresh])
 
@@ -57,7 +58,7 @@ def extend_stubs(shapes: list[Shape], before: Mapping[int, int]) -> None:
             step = shapes[source][-1] - shapes[source][-2]
             step[2] = 0.0
             shapes[row] = shapes[row][[0, 0]]
-            shapes[row][1] += step * (STUB_M / np.hypot(step[0], step[1]))
+            shapes[row][1] += step * (STUB_M / hypot_all(step[0], step[1]))
 
 
 def split_beside_ends(shapes: list[Shape], outer: Iterable[int]) -> None:
@@ -73,11 +74,11 @@ def split_beside_ends(shapes: list[Shape], outer: Iterable[int]) -> None:
         for end in (shapes[beside][0], shapes[beside][-1]):
             shape = shapes[row]
             steps = np.diff(shape, axis=0)
-            sizes = np.hypot(steps[:, 0], steps[:, 1])
+            sizes = hypot_all(steps[:, 0], steps[:, 1])
             along = ((end - shape[:-1])[:, :2] * steps[:, :2]).sum(axis=1) / sizes
             along = np.clip(along, 0.0, sizes)
             places = shape[:-1] + steps * (along / sizes)[:, None]
-            k = int(np.argmin(np.hypot(*(places - end)[:, :2].T)))
+            k = int(np.argmin(hypot_all(*(places - end)[:, :2].T)))
             before, after = sizes[:k].sum() + along[k], sizes[k:].sum() - along[k]
             if min(before, after) > UNLIKE_M and SAME_POINT_M < along[k] < sizes[k] - SAME_POINT_M:
                 shapes[row] = np.insert(shape, k + 1, places[k], axis=0)
@@ -91,7 +92,7 @@ def point_rows(shapes: Sequence[Shape]) -> tuple[NDArray[np.void], NDArray[np.in
     delta = np.diff(xyz, axis=0, append=xyz[-1:])
     last = first[1:] - 1
     delta[last] = 0.0
-    length = np.hypot(delta[:, 0], delta[:, 1])
+    length = hypot_all(delta[:, 0], delta[:, 1])
 
     points = np.zeros(len(xyz), POINT)
     points["x"], points["y"], points["z"] = xyz.T
@@ -101,7 +102,7 @@ def point_rows(shapes: Sequence[Shape]) -> tuple[NDArray[np.void], NDArray[np.in
         points["cos"] = delta[:, 0] / length
         points["sin"] = delta[:, 1] / length
         points["slope"] = delta[:, 2] / length
-    points["heading"] = np.arctan2(delta[:, 1], delta[:, 0])
+    points["heading"] = atan2_all(delta[:, 1], delta[:, 0])
     for name in ("cos", "sin", "slope", "heading"):
         points[name][last] = points[name][last - 1]
     return points, first.astype(np.int32)

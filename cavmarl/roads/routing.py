@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import RouteError
+from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.core.records import record
 from cavmarl.core.records.arrays import LaneGrid, RoadArrays
 from cavmarl.roads.kernels.plans import plan_goal
@@ -114,7 +115,7 @@ def _pieces(
     owner, first = _counted(rows["first_point"], rows["first_point"] + rows["num_points"] - 2)
     ends = [[network.points[axis][first], network.points[axis][first + 1]] for axis in ("x", "y")]
     (x0, x1), (y0, y1) = ends
-    number = (np.hypot(x1 - x0, y1 - y0) // most_m).astype(np.int64) + 1
+    number = (hypot_all(x1 - x0, y1 - y0) // most_m).astype(np.int64) + 1
     segment, k = _counted(np.zeros_like(number), number - 1)
     along = []
     for a, b in ends:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.v2x import ChannelConfig
+from cavmarl.core.math.elementary import acos, erf, exp, log10
+from cavmarl.core.math.elementary_arrays import exp_all
 from cavmarl.core.math.walls import Walls
 from cavmarl.v2x.kernels.v2x_channel import Channel
 
@@ -18,12 +19,14 @@ PREAMBLE_S = 40e-6  # of IEEE 802.11p in a channel of 10 MHz
 # The distance where fewer packets than this are received is the reach.
 LEAST_CHANCE = 1e-3
 MAX_REACH_M = 20_000
+_ROOT_2 = 1.4142135623730951
+_LN_10 = 2.302585092994046
 BUSY_LEVELS = 65  # steps in which chances of reception depend on how busy the air is
 
 
 def reference_loss_db() -> float:
     """Free-space loss at 1 m (Friis), 47.9 dB at 5.9 GHz."""
-    return 20.0 * math.log10(4.0 * math.pi * CARRIER_HZ / LIGHT_MPS)
+    return 20.0 * log10(4.0 * math.pi * CARRIER_HZ / LIGHT_MPS)
 
 
 def chance_of_reception(config: ChannelConfig, distance_m: float, extra_db: float = 0.0) -> float:
@@ -37,9 +40,10 @@ def chance_of_reception(config: ChannelConfig, distance_m: float, extra_db: floa
     `config`: of which `path_loss_exponent` is not 0. `distance_m`: between the antennas; below 1 m
     it counts as 1 m. `extra_db`: lost besides, in a building.
     """
-    lost_db = 10.0 * config.path_loss_exponent * math.log10(max(distance_m, 1.0))
+    lost_db = 10.0 * config.path_loss_exponent * log10(max(distance_m, 1.0))
     power_dbm = config.tx_power_dbm - reference_loss_db() - lost_db - extra_db
-    return NormalDist().cdf((power_dbm - config.sensitivity_dbm) / config.shadowing_db)
+    deviations = (power_dbm - config.sensitivity_dbm) / config.shadowing_db
+    return 0.5 * (1.0 + erf(deviations / _ROOT_2))
 
 
 def median_range_m(config: ChannelConfig) -> float:
@@ -47,7 +51,7 @@ def median_range_m(config: ChannelConfig) -> float:
     if config.path_loss_exponent == 0.0:
         return math.inf
     margin_db = config.tx_power_dbm - reference_loss_db() - config.sensitivity_dbm
-    return float(10.0 ** (margin_db / (10.0 * config.path_loss_exponent)))
+    return exp(margin_db / (10.0 * config.path_loss_exponent) * _LN_10)
 
 
 def airtime_s(config: ChannelConfig) -> float:
@@ -65,21 +69,22 @@ def hidden_share(distance_m: float, sensing_m: float) -> float:
     half = 0.5 * distance_m / sensing_m
     if half >= 1.0:
         return 1.0
-    return 1.0 - (math.acos(half) - half * math.sqrt(1.0 - half * half)) * 2.0 / math.pi
+    return 1.0 - (acos(half) - half * math.sqrt(1.0 - half * half)) * 2.0 / math.pi
 
 
-def chance_among_others(busy: float, hidden: float) -> float:
-    """Chance that no hidden station, for which the sender does not wait, disturbs it.
+def chances_among_others(busy: float, hidden: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the chances (n,) that no hidden station disturbs a packet.
 
-    They send at random, and a packet is lost if one of them begins within two packet times:
-    exp(-2 G), where G is their share of the air (Abramson: "The ALOHA system", 1970; Tobagi,
-    Kleinrock: "Packet switching in radio channels: part II, the hidden terminal problem", 1975).
+    The sender does not wait for hidden stations. They send at random, and a packet is lost if one
+    of them begins within two packet times: exp(-2 G), where G is their share of the air (Abramson:
+    "The ALOHA system", 1970; Tobagi, Kleinrock: "Packet switching in radio channels: part II, the
+    hidden terminal problem", 1975).
 
     Args:
         busy: share of the time in which the receiver hears a station.
-        hidden: share of the stations that the sender does not hear.
+        hidden: (n,) shares of the stations that the sender does not hear.
     """
-    return math.exp(-2.0 * busy * hidden)
+    return exp_all(-2.0 * busy * hidden)
 
 
 def _distances_m(config: ChannelConfig, sensing_m: float) -> int:
@@ -103,17 +108,17 @@ def _table(config: ChannelConfig, sensing_m: float, extra_db: float) -> NDArray[
     if config.path_loss_exponent > 0.0:
         chances *= [chance_of_reception(config, metre, extra_db) for metre in metres]
     if levels > 1 and sensing_m < math.inf:
-        hidden = [hidden_share(metre, sensing_m) for metre in metres]
+        hidden = np.array([hidden_share(metre, sensing_m) for metre in metres])
         for level in range(levels):
             busy = level / (levels - 1)
-            chances[level] *= [chance_among_others(busy, share) for share in hidden]
+            chances[level] *= chances_among_others(busy, hidden)
     return chances
 
 
 def make_channel(config: ChannelConfig, tick_s: float, walls: Walls) -> Channel:
     """What kernels take of a channel.
 
-    The chance of reception is (1 - loss) · `chance_of_reception` · `chance_among_others`.
+    The chance of reception is (1 - loss) · `chance_of_reception` · `chances_among_others`.
     """
     reach_m = config.range_m or math.inf
     sensing_m = min(median_range_m(config), reach_m)

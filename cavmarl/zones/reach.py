@@ -9,6 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.math.elementary import hypot, sine
+from cavmarl.core.math.elementary_arrays import atan2_all, hypot_all
 from cavmarl.core.records.arrays import Travel
 from cavmarl.core.records.rows import LOST_M, MERGES_M
 from cavmarl.driving.kernels.announcing import APPROACH_M
@@ -46,7 +48,7 @@ def longest_move_m(network: RoadNetwork, travel: Travel, dt: float) -> float:
     _, jump_m = _jumps(network)
     shortest_m = float(network.lanes["length_m"].min())
     jumps = 1 + min(int(MAX_SPEED_MPS * dt / max(shortest_m, 1e-9)), CROSSINGS_PER_TICK - 1)
-    way_m = float(np.hypot(MAX_SPEED_MPS, LATERAL_MPS)) * dt
+    way_m = hypot(MAX_SPEED_MPS, LATERAL_MPS) * dt
     half_m = 0.5 * float(travel.types["length"].max())
     return way_m + _kink_m(network) + jumps * jump_m + half_m
 
@@ -66,7 +68,7 @@ def off_lane_m(network: RoadNetwork, travel: Travel) -> float:
 def _kink_m(network: RoadNetwork) -> float:
     """The longest way that a place a lane's width aside jumps where a lane turns at once."""
     lanes, links = network.lanes, network.links
-    direction = network.points["cos"] + 1j * network.points["sin"]
+    direction = np.stack([network.points["cos"], network.points["sin"]], axis=1)
     first = lanes["first_point"]
     last = first + lanes["num_points"] - 2  # of its last piece
     within = np.ones(len(direction), dtype=bool)
@@ -77,8 +79,11 @@ def _kink_m(network: RoadNetwork) -> float:
     inside = np.flatnonzero(lanes["internal"])
     before.append(direction[last[inside]])
     after.append(direction[first[lanes["successor"][inside]]])
-    turn = np.abs(np.angle(np.concatenate(after) / np.concatenate(before)))
-    return float(2.0 * np.sin(0.5 * turn.max(initial=0.0)) * lanes["width_m"].max(initial=0.0))
+    cos, sin = np.concatenate(before).T
+    next_cos, next_sin = np.concatenate(after).T
+    turn = np.abs(atan2_all(cos * next_sin - sin * next_cos, cos * next_cos + sin * next_sin))
+    widest_m = float(lanes["width_m"].max(initial=0.0))
+    return 2.0 * sine(0.5 * float(turn.max(initial=0.0))) * widest_m
 
 
 def _ends(network: RoadNetwork) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -103,7 +108,7 @@ def _across_m(network: RoadNetwork) -> float:
         )
     ]
     apart = np.concatenate([through, *between])
-    return float(np.hypot(apart[:, 0], apart[:, 1]).max(initial=0.0))
+    return float(hypot_all(apart[:, 0], apart[:, 1]).max(initial=0.0))
 
 
 def _jumps(network: RoadNetwork) -> tuple[float, float]:
@@ -111,6 +116,6 @@ def _jumps(network: RoadNetwork) -> tuple[float, float]:
     links = network.links[network.links["first_internal"] < 0]
     starts, ends = _ends(network)
     jump = ends[links["from_lane"]] - starts[links["to_lane"]]
-    jump_m = np.hypot(jump[:, 0], jump[:, 1])
+    jump_m = hypot_all(jump[:, 0], jump[:, 1])
     stretch = 1.0 + jump_m / network.lanes["length_m"][links["from_lane"]]
     return float(stretch.max(initial=1.0)), float(jump_m.max(initial=0.0))

@@ -206,6 +206,13 @@ def beside_sumo(run: str, path: Path) -> dict[str, Any]:
     return {"figures": figures, "details": sha256(json.dumps(details).encode()).hexdigest()[:32]}
 
 
+def write_inputs(folder: str) -> None:
+    """Write the demand and the actuated grid that rows name."""
+    Path(folder, "demand.rou.xml").write_text(DEMAND, "utf-8")
+    command = f"{sumo.SUMO_HOME}/bin/netgenerate {ACTUATED}".replace("FOLDER", folder)
+    subprocess.run(command.split(), check=True, capture_output=True)
+
+
 def run_row(name: str, folder: str) -> dict[str, Any]:
     """The parts of one row; an AssertionError where a way ends in other hashes."""
     if name in REALISM:
@@ -226,9 +233,7 @@ def main() -> int:
     given = parser.parse_args()
     failed = False
     with tempfile.TemporaryDirectory() as folder:
-        Path(folder, "demand.rou.xml").write_text(DEMAND, "utf-8")
-        command = f"{sumo.SUMO_HOME}/bin/netgenerate {ACTUATED}".replace("FOLDER", folder)
-        subprocess.run(command.split(), check=True, capture_output=True)
+        write_inputs(folder)
         for name in given.rows or (every if given.realism else ROWS):
             said = "written" if given.write else "same"
             try:

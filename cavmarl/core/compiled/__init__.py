@@ -11,10 +11,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
+from cavmarl.core.compiled.inlined_function import InlinedFunction
 from cavmarl.core.compiled.kernel import IS_PLAIN, Kernel, specialized
 from cavmarl.core.compiled.sources import sources_digest
 
-__all__ = ["IS_PLAIN", "inlined_kernel", "kernel", "sources_digest", "specialized"]
+__all__ = [
+    "IS_PLAIN",
+    "inlined_function",
+    "inlined_kernel",
+    "kernel",
+    "sources_digest",
+    "specialized",
+]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -37,6 +45,17 @@ def inlined_kernel(function: Callable[P, R]) -> Callable[P, R]:
     seven numbers.
     """
     return _make(function, is_inlined=True)
+
+
+def inlined_function(function: Callable[P, R]) -> Callable[P, R]:
+    """Compile as `inlined_kernel` does, but only into kernels: Python runs the function itself.
+
+    For small functions of numbers that must give Python the same bits as kernels.
+    """
+    if IS_PLAIN:
+        return function
+    made: Any = InlinedFunction(function)
+    return made  # type: ignore[no-any-return]
 
 
 def _make(function: Callable[P, R], is_inlined: bool) -> Callable[P, R]:

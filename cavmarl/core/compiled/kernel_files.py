@@ -127,7 +127,9 @@ def _machine() -> tuple[str, ...]:
     from llvmlite import binding
 
     processor = os.environ.get("NUMBA_CPU_NAME") or binding.get_host_cpu_name()
-    features = os.environ.get("NUMBA_CPU_FEATURES") or binding.get_host_cpu_features().flatten()
+    features = os.environ.get("NUMBA_CPU_FEATURES")  # empty: those of the processor by its name
+    if features is None:
+        features = binding.get_host_cpu_features().flatten()
     settings = [f"{name}={os.environ.get(name, '')}" for name in ("NUMBA_BOUNDSCHECK", "NUMBA_OPT")]
     return (numba_version(), processor, features, *settings)
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.elementary import cos_sin
 
 LEVEL_HEIGHT_M = (
     4.0  # vehicles further apart in z are on different levels and do not see each other
@@ -150,8 +151,7 @@ def _fill_body(body: np.void, vehicle: np.void, row: int) -> None:
     half_length = 0.5 * vehicle["length"]
     half_width = 0.5 * vehicle["width"]
     heading = vehicle["heading"]
-    cos = math.cos(heading)
-    sin = math.sin(heading)
+    cos, sin = cos_sin(heading)
     body["id"] = vehicle["id"]
     body["row"] = row
     body["x"] = vehicle["x"]

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.math.elementary import atan2
 from cavmarl.core.records.arrays import RoadArrays
 from cavmarl.core.records.codes import MODEL_KRAUSS
 
@@ -42,7 +43,7 @@ def bend_speed(roads: RoadArrays, before: int, lane: int, distance: float) -> fl
             m += 1
         after = roads.points[m]
         bend = abs(
-            math.atan2(
+            atan2(
                 straight["cos"] * after["sin"] - straight["sin"] * after["cos"],
                 straight["cos"] * after["cos"] + straight["sin"] * after["sin"],
             )

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.math.elementary import cosine, sine
 from cavmarl.core.math.geometry import lane_pose
 from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
 from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_SCRIPTED
@@ -79,7 +80,7 @@ def _sticks_out(roads: RoadArrays, other: np.void, to_left: bool) -> bool:
     _, _, _, cos, sin, _ = lane_pose(
         roads.points, here["first_point"], here["num_points"], other["s"]
     )
-    across = math.sin(other["heading"]) * cos - math.cos(other["heading"]) * sin
+    across = sine(other["heading"]) * cos - cosine(other["heading"]) * sin
     if abs(across) < ASKEW_RAD:
         return False
     along = math.sqrt(max(1.0 - across * across, 0.0))

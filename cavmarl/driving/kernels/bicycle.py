@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.elementary import cos_sin, tangent
 from cavmarl.core.math.geometry import wrap_angle
 
 MAX_SPEED_MPS = 40.0  # beyond it the engine gives way
@@ -40,11 +41,10 @@ def bicycle_step(
         is kept in (-pi, pi]; highway-env lets it grow.
     """
     # Sine and cosine of the slip angle without inverse functions: tan(slip) is known.
-    tan_slip = 0.5 * math.tan(steering)
+    tan_slip = 0.5 * tangent(steering)
     cos_slip = 1.0 / math.sqrt(1.0 + tan_slip * tan_slip)
     sin_slip = tan_slip * cos_slip
-    cos_heading = math.cos(heading)
-    sin_heading = math.sin(heading)
+    cos_heading, sin_heading = cos_sin(heading)
     step_m = speed * dt
     yaw_rate = speed * sin_slip / (0.5 * length)
     return (

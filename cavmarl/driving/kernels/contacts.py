@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.math.elementary import cos_sin, cosine, sine
 from cavmarl.core.math.geometry import boxes_overlap
 from cavmarl.core.math.neighbors import Grid, aim, cell_at, cell_columns, cell_rows
 
@@ -20,7 +21,7 @@ def _bodies_touch(one: np.void, other: np.void) -> bool:
 
     Vehicles on and under a bridge do not touch: their `z` differ by half the sum of their heights.
     """
-    cos, sin = math.cos(one["heading"]), math.sin(one["heading"])
+    cos, sin = cos_sin(one["heading"])
     # The quick answer for those side by side on two lanes: how far the other one reaches towards
     # the one, be it turned by so much. No sine is larger than its angle.
     turn = abs(one["heading"] - other["heading"])
@@ -39,8 +40,8 @@ def _bodies_touch(one: np.void, other: np.void) -> bool:
         0.5 * one["width"],
         other["x"],
         other["y"],
-        math.cos(other["heading"]),
-        math.sin(other["heading"]),
+        cosine(other["heading"]),
+        sine(other["heading"]),
         0.5 * other["length"],
         0.5 * other["width"],
     )

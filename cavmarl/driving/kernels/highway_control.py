@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.elementary import asin, atan2
 from cavmarl.core.math.geometry import wrap_angle
 from cavmarl.core.math.scalars import clamp, not_zero
 
@@ -29,12 +30,12 @@ def steering_control(
 ) -> float:  # angle within ±`MAX_STEERING_RAD`, positive to the left
     """The steering angle in rad that brings a car to the centre of a lane."""
     divisor = not_zero(speed)
-    approach = math.asin(clamp(-KP_LATERAL * d / divisor, -1.0, 1.0))
+    approach = asin(clamp(-KP_LATERAL * d / divisor, -1.0, 1.0))
     approach = clamp(approach, -MAX_APPROACH_RAD, MAX_APPROACH_RAD)
     yaw_rate = KP_HEADING * wrap_angle(heading_error + approach)
     sin_slip = clamp(0.5 * length / divisor * yaw_rate, -1.0, 1.0)
     # tan(steering) = 2 · tan(slip), without the pole of the tangent.
-    steering = math.atan2(2.0 * sin_slip, math.sqrt(1.0 - sin_slip * sin_slip))
+    steering = atan2(2.0 * sin_slip, math.sqrt(1.0 - sin_slip * sin_slip))
     return clamp(steering, -MAX_STEERING_RAD, MAX_STEERING_RAD)
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.math.elementary import atan, atan2
 from cavmarl.core.math.geometry import lane_pose, segment_at, wrap_angle
 from cavmarl.core.math.scalars import clamp
 from cavmarl.core.records.arrays import LaneGrid, RoadArrays, Travel
@@ -124,11 +125,11 @@ def place_on_lane(roads: RoadArrays, travel: Travel, row: np.void) -> float:
             y = 0.5 * (front_y + rear_y)
             cos = along_x / chord
             sin = along_y / chord
-            heading = math.atan2(sin, cos)
+            heading = atan2(sin, cos)
     row["x"] = x - row["d"] * sin
     row["y"] = y + row["d"] * cos
     row["z"] = point["z"] + along * point["slope"]
-    row["pitch"] = math.atan(point["slope"]) if point["slope"] != 0.0 else 0.0
+    row["pitch"] = atan(point["slope"]) if point["slope"] != 0.0 else 0.0
     return float(heading)
 
 
@@ -226,14 +227,14 @@ def move_background(
     row["side_lane"] = side_lane(roads, row)
     heading = place_on_lane(roads, travel, row)
     if row["d"] != offset and speed > STANDING_MPS:
-        drift = math.atan2((row["d"] - offset) / dt, speed)
+        drift = atan2((row["d"] - offset) / dt, speed)
         most = min(MAX_DRIFT_RAD, 2.0 * MAX_SWING_M / row["length"])
         heading = wrap_angle(heading + clamp(drift, -most, most))
     row["heading"] = heading
     turned = wrap_angle(heading - before.heading)
     row["steering"] = 0.0
     if turned != 0.0 and speed > STANDING_MPS:
-        row["steering"] = clamp(math.atan(row["length"] * turned / (speed * dt)), -0.8, 0.8)
+        row["steering"] = clamp(atan(row["length"] * turned / (speed * dt)), -0.8, 0.8)
     if row["lane"] == before.lane and row["way"] == before.way:
         row["to_go"] = way_left(roads, row, step)
     else:
@@ -282,7 +283,7 @@ def move_agent(
         roads.points, lane["first_point"], lane["num_points"], row["s"]
     )
     row["z"] = z
-    row["pitch"] = math.atan(slope)
+    row["pitch"] = atan(slope)
     step = plans[row["goal"], row["lane"]]
     row["to_go"] = step["to_go"] - row["s"]
     if row["to_go"] <= ARRIVE_M:

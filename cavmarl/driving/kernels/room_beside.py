@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.math.elementary import cosine, sine
 from cavmarl.core.math.geometry import boxes_overlap, lane_pose
 from cavmarl.core.records.arrays import RoadArrays, Scratch
 from cavmarl.driving.kernels.announcing import STANDING_MPS
@@ -80,7 +81,7 @@ def _is_touched(
             continue
         if boxes_overlap(
             x, y, cos, sin, half, half_width,
-            other["x"], other["y"], np.cos(other["heading"]), np.sin(other["heading"]),
+            other["x"], other["y"], cosine(other["heading"]), sine(other["heading"]),
             0.5 * other["length"], 0.5 * other["width"],
         ):  # fmt: skip
             return True

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.elementary import atan2, cosine, sine
 from cavmarl.core.math.geometry import lane_pose
 from cavmarl.core.math.scalars import clamp
 from cavmarl.core.records.arrays import LaneGrid, RoadArrays
@@ -59,7 +58,7 @@ def steered_poses(
     s = max(here["length_m"] - begin_m, 0.0)
     x, y, z, cos, sin, _ = lane_pose(roads.points, here["first_point"], here["num_points"], s)
     row["x"], row["y"], row["z"] = x, y, z
-    row["heading"] = math.atan2(sin, cos)
+    row["heading"] = atan2(sin, cos)
     row["lane"], row["s"], row["d"] = lane, s, 0.0
     row["speed"] = _allowed_mps(roads, plan, row)
     found = 0
@@ -76,7 +75,7 @@ def steered_poses(
             break
         pose = poses[found]
         pose[0], pose[1], pose[2], pose[3] = place, row["x"], row["y"], z
-        pose[4], pose[5] = math.cos(row["heading"]), math.sin(row["heading"])
+        pose[4], pose[5] = cosine(row["heading"]), sine(row["heading"])
         found += 1
         if lane == way["to_lane"] and row["s"] >= roads.lanes[lane]["length_m"]:
             break

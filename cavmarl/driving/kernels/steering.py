@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.elementary import asin, atan2, cosine, sine, tangent
 from cavmarl.core.math.geometry import lane_pose, project, wrap_angle
 from cavmarl.core.math.scalars import clamp
 from cavmarl.core.records.arrays import RoadArrays
@@ -108,7 +109,7 @@ def steer_to_lane(
     turned = wrap_angle(direction - row["heading"])
     if row["speed"] < SLOW_MPS and d * turned > 0.0 and not here["internal"]:
         room = 0.5 * here["width_m"] + SWING_OUT_M - 0.5 * row["width"] + abs(d)
-        most = math.asin(clamp(2.0 * room / row["length"], 0.0, 1.0))
+        most = asin(clamp(2.0 * room / row["length"], 0.0, 1.0))
         if abs(turned) > most:
             d, turned = 0.0, math.copysign(abs(turned) - most, turned)
     pace = row["speed"]
@@ -143,7 +144,7 @@ def _aim_m(
         return AIM_M, 1.0
     radius_m = turned["length_m"] / turn
     missing_m = max(TURNING_RATIO * wheelbase - radius_m, 0.0)
-    earlier_m = missing_m * math.tan(0.5 * min(turn, MOST_TURN_RAD))
+    earlier_m = missing_m * tangent(0.5 * min(turn, MOST_TURN_RAD))
     most_m = min(AIM_M_PER_RAD * turn, MOST_AIM_M)
     aim_m = max(min(TURN_AIM_M + AIM_EARLIER * earlier_m, most_m), TURN_AIM_M)
     return aim_m, clamp((radius_m - CUT_RADIUS_M) / (WIDE_RADIUS_M - CUT_RADIUS_M), 0.0, 1.0)
@@ -164,22 +165,22 @@ def _aim(
     aim_m, exact = _aim_m(roads, plans, row, lane, s, wheelbase)
     aim_m = max(aim_m, AIM_S * row["speed"])
     x, y = _point_at(roads, plans, row["goal"], lane, s + aim_m)
-    aside = math.atan2(cos * (y - y0) - sin * (x - x0), cos * (x - x0) + sin * (y - y0))
+    aside = atan2(cos * (y - y0) - sin * (x - x0), cos * (x - x0) + sin * (y - y0))
     if abs(aside) < AIM_RAD:
         return math.inf
     x -= row["x"]
     y -= row["y"]
     apart = math.sqrt(x * x + y * y)
-    bearing = wrap_angle(math.atan2(y, x) - row["heading"])
+    bearing = wrap_angle(atan2(y, x) - row["heading"])
     if abs(bearing) > 0.5 * math.pi:
         return math.copysign(MAX_STEERING_RAD, bearing)
     # The arc that the middle of the rear drives, whose heading is the car's, and that of its centre
     # if this went where it heads.
     apart = max(apart, TURN_AIM_M)
-    aside_m = wheelbase * math.sin(abs(bearing))
-    following = math.atan2(2.0 * aside_m, apart + wheelbase * math.cos(bearing))
+    aside_m = wheelbase * sine(abs(bearing))
+    following = atan2(2.0 * aside_m, apart + wheelbase * cosine(bearing))
     sin_slip = min(aside_m / apart, 1.0)
-    cutting = math.atan2(2.0 * sin_slip, math.sqrt(1.0 - sin_slip * sin_slip))
+    cutting = atan2(2.0 * sin_slip, math.sqrt(1.0 - sin_slip * sin_slip))
     steering = exact * following + (1.0 - exact) * cutting
     return math.copysign(min(steering, MAX_STEERING_RAD), bearing)
 
@@ -208,4 +209,4 @@ def _direction_at(
     """Direction of the way around place `s` of a lane in rad."""
     x0, y0 = _point_at(roads, plans, goal, lane, s - CHORD_M)
     x1, y1 = _point_at(roads, plans, goal, lane, s + CHORD_M)
-    return math.atan2(y1 - y0, x1 - x0)
+    return atan2(y1 - y0, x1 - x0)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.math.elementary import cos_sin, cosine, sine
 from cavmarl.core.math.geometry import lane_pose, project, project_near
 from cavmarl.core.records.arrays import LaneGrid, RoadArrays
 from cavmarl.core.records.codes import EVENT_OFF_ROAD, EVENT_WRONG_WAY
@@ -120,8 +121,7 @@ def _search(roads: RoadArrays, grid: LaneGrid, row: np.void) -> int:
     best_rank = math.inf
     best_s = 0.0
     best_d = 0.0
-    cos_heading = math.cos(row["heading"])
-    sin_heading = math.sin(row["heading"])
+    cos_heading, sin_heading = cos_sin(row["heading"])
     for k in range(grid.cell_start[cell], grid.cell_start[cell + 1]):
         lane = grid.cell_lanes[k]
         here = roads.lanes[lane]
@@ -231,5 +231,5 @@ def _drives_along(roads: RoadArrays, row: np.void) -> bool:
 def _heads_along(roads: RoadArrays, row: np.void, lane: np.void, s: float) -> bool:
     """Whether the vehicle heads within 90° of the direction of a lane at `s`."""
     _, _, _, cos, sin, _ = lane_pose(roads.points, lane["first_point"], lane["num_points"], s)
-    along: bool = math.cos(row["heading"]) * cos + math.sin(row["heading"]) * sin >= 0.0
+    along: bool = cosine(row["heading"]) * cos + sine(row["heading"]) * sin >= 0.0
     return along

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.elementary import atan2, cos_sin
 from cavmarl.core.math.geometry import lane_pose, project
 from cavmarl.core.math.scalars import clamp
 from cavmarl.core.records.arrays import LaneGrid, RoadArrays
@@ -29,8 +28,7 @@ def _reaches_over(roads: RoadArrays, row: np.void, lane: int, inwards: int) -> b
     here = roads.lanes[lane]
     if inwards == 0 or (here["left"] if inwards > 0 else here["right"]) >= 0:
         return False
-    cos = math.cos(row["heading"])
-    sin = math.sin(row["heading"])
+    cos, sin = cos_sin(row["heading"])
     aside = 0.5 * inwards * row["width"]
     most = 0.5 * here["width_m"] + SWING_M
     for end in (-0.5, 0.5):
@@ -66,7 +64,7 @@ def stays_on_road(
     here = roads.lanes[lane]
     x, y, z, cos, sin, _ = lane_pose(roads.points, here["first_point"], here["num_points"], begin_m)
     row["x"], row["y"], row["z"] = x, y, z
-    row["heading"] = math.atan2(sin, cos)
+    row["heading"] = atan2(sin, cos)
     row["lane"] = lane
     row["s"] = begin_m
     row["d"] = 0.0

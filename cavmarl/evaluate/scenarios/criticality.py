@@ -10,6 +10,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.math.elementary import cos_sin
+from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.core.math.geometry import boxes_overlap, time_to_collision_s
 
 TRACE = np.dtype(
@@ -56,8 +58,8 @@ def post_encroachment_s(one: NDArray[np.void], other: NDArray[np.void]) -> float
     covers as the place: inf if no place was covered by both, 0 if both were there at a time. As
     bodies are known at moments only, it is too long by at most twice the time between two of them.
     """
-    reach = 0.5 * (np.hypot(one["length"], one["width"]).max(initial=0.0)
-                   + np.hypot(other["length"], other["width"]).max(initial=0.0))  # fmt: skip
+    reach = 0.5 * (hypot_all(one["length"], one["width"]).max(initial=0.0)
+                   + hypot_all(other["length"], other["width"]).max(initial=0.0))  # fmt: skip
     dx = one["x"][:, None] - other["x"][None, :]
     dy = one["y"][:, None] - other["y"][None, :]
     apart_s = np.abs(one["time_s"][:, None] - other["time_s"][None, :])
@@ -70,8 +72,7 @@ def post_encroachment_s(one: NDArray[np.void], other: NDArray[np.void]) -> float
 
 
 def _box(body: np.void) -> tuple[float, float, float, float, float, float]:
-    heading = float(body["heading"])
     return (
-        float(body["x"]), float(body["y"]), math.cos(heading), math.sin(heading),
+        float(body["x"]), float(body["y"]), *cos_sin(float(body["heading"])),
         0.5 * float(body["length"]), 0.5 * float(body["width"]),
     )  # fmt: skip

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import MapError
+from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.maps.heights.height_model import HeightModel
 from cavmarl.maps.heights.levels import Levels, crossings, levels_of
 from cavmarl.maps.heights.stations import Stations, kept_rows, laid, stations_of
@@ -215,7 +216,7 @@ def _write(document: NetDocument, stations: Stations, heights: Heights) -> None:
             z_m = np.full(len(rim), height)
             if near is not None:
                 apart = rim[:, None] - stations.plane_m[near][None]
-                z_m = heights[near][np.hypot(apart[..., 0], apart[..., 1]).argmin(axis=1)]
+                z_m = heights[near][hypot_all(apart[..., 0], apart[..., 1]).argmin(axis=1)]
             junction.set("shape", shape_text(plane, z_m))
     _write_middles(document, stations, heights)
 
@@ -240,7 +241,7 @@ def _write_middles(document: NetDocument, stations: Stations, heights: Heights) 
         places, s_m, own = laid(np.array([list(map(float, word.split(","))) for word in plane]))
         rows = stations.rows(row)
         apart = places[:, None] - stations.plane_m[rows][None]
-        z_m = heights[rows][np.hypot(apart[..., 0], apart[..., 1]).argmin(axis=1)]
+        z_m = heights[rows][hypot_all(apart[..., 0], apart[..., 1]).argmin(axis=1)]
         kept = kept_rows(s_m, z_m, own)
         words = iter(plane)
         written = [

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.maps.heights.stations import STEP_M, Rows, Stations
 from cavmarl.maps.net_document import Points
 from cavmarl.maps.osm_roads import OsmRoads
@@ -47,7 +48,7 @@ def _ends(roads: OsmRoads, name: str, geo: GeoReference, source: Path) -> Points
 
 def _between(places: Points, ends: Points) -> NDArray[np.bool_]:
     """Which places of a lane lie between those that are nearest to two points."""
-    near = [int(np.hypot(*(places - end).T).argmin()) for end in ends]
+    near = [int(hypot_all(*(places - end).T).argmin()) for end in ends]
     chosen = np.zeros(len(places), bool)
     chosen[min(near) : max(near) + 1] = True
     return chosen
@@ -84,7 +85,7 @@ def crossings(stations: Stations, levels: Levels) -> Rows:
     a, b = stations.plane_m[start], stations.plane_m[start + 1]
     level = levels[start]
     low, high = np.minimum(a, b), np.maximum(a, b)
-    order = np.argsort(low[:, 0])  # no link is longer than STEP_M
+    order = np.argsort(low[:, 0], kind="stable")  # no link is longer than STEP_M
     sorted_x = low[order, 0]
     found: set[tuple[int, int]] = set()
     for row in np.flatnonzero(level != 0).tolist():

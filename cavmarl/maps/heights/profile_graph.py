@@ -93,15 +93,15 @@ def _straight(
     result = heights.copy()
     rest = -pull(result)
     direction = scale * rest
-    power = float(rest @ direction)
+    power = float((rest * direction).sum())
     for _ in range(4 * int(free.sum()) + 10):
         if power < _TOLERANCE:
             break
         pulled = pull(direction)
-        step = power / float(direction @ pulled)
+        step = power / float((direction * pulled).sum())
         result += step * direction
         rest -= step * pulled
         fresh = scale * rest
-        power, before = float(rest @ fresh), power
+        power, before = float((rest * fresh).sum()), power
         direction = fresh + power / before * direction
     return result

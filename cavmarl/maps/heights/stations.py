@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import MapError
+from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.maps.heights.profile_graph import ProfileGraph
 from cavmarl.maps.net_document import DocumentLane, NetDocument, Points
 
@@ -64,7 +65,7 @@ def stations_of(document: NetDocument) -> Stations:
     plane = np.concatenate(parts)
     hubs, ids, links = _links(document, lanes, plane, first)
     places = np.concatenate([plane, hubs])
-    lengths = np.hypot(*(places[links[:, 0]] - places[links[:, 1]]).T)
+    lengths = hypot_all(*(places[links[:, 0]] - places[links[:, 1]]).T)
     graph = ProfileGraph(len(places), links, lengths)
     return Stations(
         lanes, plane, np.concatenate(s_parts), np.concatenate(written), first, graph, hubs, ids
@@ -73,7 +74,7 @@ def stations_of(document: NetDocument) -> Stations:
 
 def laid(shape: Points) -> tuple[Points, NDArray[np.float64], NDArray[np.bool_]]:
     """Places on a polyline, where they are on it, and which of them are its own points."""
-    lengths = np.hypot(*np.diff(shape, axis=0).T)
+    lengths = hypot_all(*np.diff(shape, axis=0).T)
     counts = np.maximum(np.ceil(lengths / STEP_M).astype(np.int64), 1)
     segment = np.repeat(np.arange(len(counts)), counts)
     starts = np.concatenate([[0], np.cumsum(counts)])
@@ -132,7 +133,7 @@ def _beside(lanes: tuple[DocumentLane, ...], plane_m: Points, first: Rows) -> li
             along = np.rint(np.linspace(0, len(there) - 1, len(here))).astype(np.int64)
             near = there[np.clip(along[:, None] + window, 0, len(there) - 1)]
             apart = plane_m[here, None] - plane_m[near]
-            nearest = np.hypot(apart[..., 0], apart[..., 1]).argmin(axis=1)
+            nearest = hypot_all(apart[..., 0], apart[..., 1]).argmin(axis=1)
             pairs.append(np.stack([here, near[np.arange(len(here)), nearest]], axis=1))
     return pairs
 

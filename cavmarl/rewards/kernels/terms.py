@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.elementary import cos_sin
 from cavmarl.core.math.geometry import time_to_collision_s
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
 from cavmarl.core.math.scalars import clamp
@@ -68,7 +69,7 @@ def _ttc_risk(rows: NDArray[np.void], i: int, grid: Grid) -> float:
     Asks only about those whose circumscribed circle could touch the own one before the horizon.
     """
     row = rows[i]
-    cos, sin = math.cos(row["heading"]), math.sin(row["heading"])
+    cos, sin = cos_sin(row["heading"])
     half_length, half_width = 0.5 * row["length"], 0.5 * row["width"]
     radius = math.sqrt(half_length * half_length + half_width * half_width)
     least = TTC_HORIZON_S

@@ -5,13 +5,13 @@ Items lie cell by cell in an index, so what is near a vehicle is always found in
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.elementary import cos_sin
 from cavmarl.core.math.neighbors import Grid, cell_columns, cell_rows
 from cavmarl.core.records import record
 
@@ -54,8 +54,7 @@ def gather_walls(
 
     Returns how many there are.
     """
-    cos = math.cos(ego["heading"])
-    sin = math.sin(ego["heading"])
+    cos, sin = cos_sin(ego["heading"])
     far = reach_m + index.largest[0]
     first_column, last_column = cell_columns(index, ego["x"], far)
     first_row, last_row = cell_rows(index, ego["y"], far)
@@ -119,8 +118,7 @@ def gather_quads(
     Returns:
         how many there are.
     """
-    cos = math.cos(ego["heading"])
-    sin = math.sin(ego["heading"])
+    cos, sin = cos_sin(ego["heading"])
     far = reach_m + index.largest[0]
     first_column, last_column = cell_columns(index, ego["x"], far)
     first_row, last_row = cell_rows(index, ego["y"], far)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.math.elementary import hypot
 from cavmarl.core.math.geometry import boxes_overlap
 
 
@@ -34,7 +35,7 @@ def swept_range(
     """
     first, last = math.inf, -math.inf
     foe_first, foe_last = math.inf, -math.inf
-    reach = math.hypot(own[0], own[1]) + math.hypot(other[0], other[1])
+    reach = hypot(own[0], own[1]) + hypot(other[0], other[1])
     for i in range(mine.shape[0]):
         s = mine[i, 0]
         for j in range(theirs.shape[0]):

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.math.elementary_arrays import atan2_all, hypot_all
 from cavmarl.roads.polylines import SAME_POINT_M, Shape
 
 KINK_RAD = np.radians(60.0)  # a path with a corner sharper than this,
@@ -88,7 +89,7 @@ def _is_broken(shapes: Sequence[Shape], way: Way) -> bool:
 def _corners(before: Shape, path: Shape, after: Shape) -> NDArray[np.float64]:
     """Changes of direction in rad along a path, from that of the lane before to that after."""
     steps = np.concatenate([before[-2:], path[1:], after[1:2] - after[0] + path[-1]])
-    heading = np.arctan2(*np.diff(steps[:, 1::-1], axis=0).T)
+    heading = atan2_all(*np.diff(steps[:, 1::-1], axis=0).T)
     corners: NDArray[np.float64] = (np.diff(heading) + np.pi) % (2.0 * np.pi) - np.pi
     return corners
 
@@ -134,16 +135,20 @@ def _curve(before: Shape, after: Shape) -> Shape:
     """A cubic curve from the end of one lane to the start of another, in their directions."""
     start, end = before[-1], after[0]
     leaves, arrives = _direction(before[-2:]), _direction(after[:2])
-    chord = float(np.hypot(*(end - start)[:2]))
-    cos_turn = float(leaves[:2] @ arrives[:2])
+    chord = float(hypot_all(*(end - start)[:2]))
+    cos_turn = float(leaves[0] * arrives[0] + leaves[1] * arrives[1])
     # The handles that make the curve an arc of a circle where both ends lie on one.
     handle = chord * 2.0 / (3.0 * (1.0 + np.sqrt(max(0.5 * (1.0 + cos_turn), 0.0))))
-    nodes = np.stack([start, start + handle * leaves, end - handle * arrives, end])
     number = int(np.clip(np.ceil(chord / CURVE_M), 8, MOST_POINTS))
     t = np.linspace(0.0, 1.0, number + 1)[:, None]
-    basis = np.hstack([(1 - t) ** 3, 3 * t * (1 - t) ** 2, 3 * t * t * (1 - t), t**3])
-    curve = basis @ nodes
-    s = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(curve[:, :2], axis=0).T))])
+    u = 1.0 - t
+    curve = (
+        u * u * u * start
+        + 3.0 * t * u * u * (start + handle * leaves)
+        + 3.0 * t * t * u * (end - handle * arrives)
+        + t * t * t * end
+    )
+    s = np.concatenate([[0.0], np.cumsum(hypot_all(*np.diff(curve[:, :2], axis=0).T))])
     curve[:, 2] = start[2] + (end[2] - start[2]) * s / max(s[-1], SAME_POINT_M)  # an even grade
     return _clean(curve)
 
@@ -151,17 +156,17 @@ def _curve(before: Shape, after: Shape) -> Shape:
 def _direction(pair: Shape) -> NDArray[np.float64]:
     step = pair[1] - pair[0]
     step[2] = 0.0
-    direction: NDArray[np.float64] = step / np.hypot(step[0], step[1])
+    direction: NDArray[np.float64] = step / hypot_all(step[0], step[1])
     return direction
 
 
 def _length(shape: Shape) -> float:
-    return float(np.hypot(*np.diff(shape[:, :2], axis=0).T).sum())
+    return float(hypot_all(*np.diff(shape[:, :2], axis=0).T).sum())
 
 
 def _cut(shape: Shape, at_m: float) -> tuple[Shape, Shape]:
     """The parts of a polyline before and behind a place in m along it."""
-    s = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(shape[:, :2], axis=0).T))])
+    s = np.concatenate([[0.0], np.cumsum(hypot_all(*np.diff(shape[:, :2], axis=0).T))])
     point = np.array([[np.interp(at_m, s, shape[:, axis]) for axis in range(3)]])
     near, far = s < at_m - SAME_POINT_M, s > at_m + SAME_POINT_M
     return np.concatenate([shape[near], point]), np.concatenate([point, shape[far]])
@@ -172,5 +177,5 @@ def _join(*parts: Shape) -> Shape:
 
 
 def _clean(shape: Shape) -> Shape:
-    step = np.hypot(*np.diff(shape[:, :2], axis=0).T)
+    step = hypot_all(*np.diff(shape[:, :2], axis=0).T)
     return np.ascontiguousarray(shape[np.concatenate([[True], step > SAME_POINT_M])])

@@ -19,6 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import MapError
+from cavmarl.core.math.elementary import cos_sin, hypot
+from cavmarl.core.math.elementary_arrays import atan2_all, cos_all, sin_all
 from cavmarl.core.records.rows import FORK_BEYOND_M
 from cavmarl.roads.network import CONFLICT
 from cavmarl.roads.sumo_net.selection import Movement
@@ -113,7 +115,7 @@ def grazing(path: LinkPath, foe: LinkPath, way: LinkPath, foe_way: LinkPath) -> 
     apart = mine.xyz[:, None, :] - theirs.xyz[None, :, :]
     square = apart[..., 0] * apart[..., 0] + apart[..., 1] * apart[..., 1]
     level = np.abs(apart[..., 2]) <= CLEARANCE_M
-    reach = 2.0 * np.hypot(HALF_LENGTH_M, HALF_WIDTH_M)
+    reach = 2.0 * hypot(HALF_LENGTH_M, HALF_WIDTH_M)
     rows, columns = np.nonzero(level & (square < reach * reach))
     if not rows.size:
         return None
@@ -128,15 +130,15 @@ def poses(path: LinkPath, way: LinkPath) -> Poses:
     """How a car stands along a path, a part of its way: as a chord, both bumpers on the way."""
     front, rear = places_on(way, path.s + HALF_LENGTH_M), places_on(way, path.s - HALF_LENGTH_M)
     chord = front - rear
-    return Poses(0.5 * (front + rear), np.arctan2(chord[:, 1], chord[:, 0]))
+    return Poses(0.5 * (front + rear), atan2_all(chord[:, 1], chord[:, 0]))
 
 
 def places_on(way: LinkPath, at: NDArray[np.float64]) -> NDArray[np.float64]:
     """(n, 3) places on a way, which goes on straight before and behind its ends."""
     ends = np.concatenate([[way.s[0] - 100.0], way.s, [way.s[-1] + 100.0]])
     first, last = way.xyz[1] - way.xyz[0], way.xyz[-1] - way.xyz[-2]
-    first = first / max(float(np.hypot(*first[:2])), 1e-6)
-    last = last / max(float(np.hypot(*last[:2])), 1e-6)
+    first = first / max(hypot(float(first[0]), float(first[1])), 1e-6)
+    last = last / max(hypot(float(last[0]), float(last[1])), 1e-6)
     xyz = np.concatenate([[way.xyz[0] - 100.0 * first], way.xyz, [way.xyz[-1] + 100.0 * last]])
     return np.stack([np.interp(at, ends, xyz[:, axis]) for axis in range(3)], axis=1)
 
@@ -149,12 +151,13 @@ def touching(
     `apart`: (n, 2) between the centres, m. `mine`: (n,) headings, rad. `theirs`: (n,) headings,
     rad.
     """
-    across = np.abs(np.sin(mine - theirs))
-    along = np.abs(np.cos(mine - theirs))
+    across = np.abs(sin_all(mine - theirs))
+    along = np.abs(cos_all(mine - theirs))
     separated = np.zeros(len(apart), dtype=np.bool_)
     for heading in (mine, theirs):
-        forward = np.abs(apart[:, 0] * np.cos(heading) + apart[:, 1] * np.sin(heading))
-        sideways = np.abs(apart[:, 1] * np.cos(heading) - apart[:, 0] * np.sin(heading))
+        cos, sin = cos_all(heading), sin_all(heading)
+        forward = np.abs(apart[:, 0] * cos + apart[:, 1] * sin)
+        sideways = np.abs(apart[:, 1] * cos - apart[:, 0] * sin)
         separated |= forward > HALF_LENGTH_M * (1.0 + along) + HALF_WIDTH_M * across
         separated |= sideways > HALF_WIDTH_M * (1.0 + along) + HALF_LENGTH_M * across
     return ~separated
@@ -256,11 +259,12 @@ def _poses(path: LinkPath | None, way: LinkPath | None) -> Poses:
 
 def _first_free(end: NDArray[np.float64], others: Sequence[Poses]) -> float:
     x, y, z, heading = end
+    cos, sin = cos_sin(heading)
     for step in range(int(MOST_M / STEP_M) + 1):
         back = step * STEP_M
         centre = LINE_MARGIN_M + back + 0.5 * BODY_M
         body = Poses(
-            np.array([[x - centre * np.cos(heading), y - centre * np.sin(heading), z]]),
+            np.array([[x - centre * cos, y - centre * sin, z]]),
             np.array([heading]),
         )
         if not any(_meets(body, other) for other in others):

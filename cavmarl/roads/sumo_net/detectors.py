@@ -77,7 +77,7 @@ class _Approaches:
         self.lanes: list[int] = [
             int(lane)
             for lane in dict.fromkeys(
-                links["from_lane"][np.argsort(links["signal_index"])].tolist()
+                links["from_lane"][np.argsort(links["signal_index"], kind="stable")].tolist()
             )
             if program.params.get(roads.lane_ids[lane]) != NO_DETECTOR
         ]

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import MapError
+from cavmarl.core.math.elementary_arrays import atan2_all
 from cavmarl.core.math.geometry import project
 from cavmarl.core.records.rows import FORK_BEYOND_M, STEERED, SWEPT_BEYOND_M
 from cavmarl.roads.network import EDGE, JUNCTION, LANE, LINK, GeoReference, RoadNetwork
@@ -350,7 +351,7 @@ def _map_neighbors(lanes: NDArray[np.void], points: NDArray[np.void]) -> None:
 def _lane_ends(lanes: NDArray[np.void], points: NDArray[np.void]) -> NDArray[np.float64]:
     """(L, 4) x, y, z of each lane's last point and its direction there."""
     last = points[lanes["first_point"] + lanes["num_points"] - 1]
-    heading = np.arctan2(last["sin"], last["cos"])
+    heading = atan2_all(last["sin"], last["cos"])
     return np.stack([last["x"], last["y"], last["z"], heading], axis=1)
 
 

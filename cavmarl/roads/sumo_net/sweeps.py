@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.core.records.rows import SIZE_BODIES_M, SIZE_LENGTHS_M, WAIT_SLACK_M
 from cavmarl.roads.kernels.swept_range import swept_range
 from cavmarl.roads.network import SWEEP
@@ -224,7 +225,7 @@ def _find_behind(
         theirs = poses[turn][foe]
         theirs = theirs[theirs[:, 0] + foe_half >= 0.0]
         aside = theirs[:, 1:3] - places_on(way, theirs[:, 0])[:, :2]
-        bends = np.hypot(aside[:, 0], aside[:, 1]) > LEAST_ASIDE_M
+        bends = hypot_all(aside[:, 0], aside[:, 1]) > LEAST_ASIDE_M
         has_left = theirs[:, 0] >= foe_half
         other = (foe_half, foe_wide, length, 0.0, 0.0)
         for own, (half, wide) in enumerate(BODIES):
@@ -286,6 +287,6 @@ def poses_on_rails(
     at = np.arange(-(BEFORE_M + half_m), length_m + beyond_m + half_m + STEP_M, STEP_M)
     front, rear = places_on(way, at + half_m), places_on(way, at - half_m)
     chord = front - rear
-    size = np.maximum(np.hypot(chord[:, 0], chord[:, 1]), 1e-6)
+    size = np.maximum(hypot_all(chord[:, 0], chord[:, 1]), 1e-6)
     middle = 0.5 * (front + rear)
     return np.column_stack([at, middle, chord[:, 0] / size, chord[:, 1] / size])

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.elementary import hypot, tangent
 from cavmarl.core.math.spans import row_span
 from cavmarl.sensors.kernels.faces import (
     CameraPose,
@@ -63,7 +64,7 @@ def make_camera(
         fov_rad: horizontal opening, less than pi.
         range_m: deeper places are not seen.
     """
-    focal = 0.5 * width / math.tan(0.5 * fov_rad)
+    focal = 0.5 * width / tangent(0.5 * fov_rad)
     return CameraPose(mount, focal, range_m, np.zeros((5, 4)), np.zeros((4, 3)))
 
 
@@ -173,7 +174,7 @@ def _add_wall(camera: CameraPose, picture: PixelRows, num: int, wall: np.void, n
     set_corner(camera, 2, bx, by, height)
     set_corner(camera, 3, ax, ay, height)
     picture.semantic[number] = BUILDING
-    length = math.hypot(bx - ax, by - ay)
+    length = hypot(bx - ax, by - ay)
     if length > 0.0:
         x, y = (by - ay) / length, (ax - bx) / length
         # The side that is seen.

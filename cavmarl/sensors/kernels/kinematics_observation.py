@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.elementary import atan2, cos_sin, cosine, sine
 from cavmarl.core.math.geometry import lane_pose, project, wrap_angle
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
 from cavmarl.core.math.rng import STREAM_SENSOR, below
@@ -59,8 +60,7 @@ def vehicle_features(
     direction to the vehicle's goal is shown; else it is 0. `out`: (NUM_VEHICLE_FEATURES,),
     overwritten.
     """
-    cos = math.cos(row["heading"])
-    sin = math.sin(row["heading"])
+    cos, sin = cos_sin(row["heading"])
     out[FEATURE_PRESENCE] = 1.0
     out[FEATURE_X] = row["x"]
     out[FEATURE_Y] = -row["y"]
@@ -85,7 +85,7 @@ def vehicle_features(
     )
     out[FEATURE_LONG_OFF] = row["s"]
     out[FEATURE_LAT_OFF] = -row["d"]
-    out[FEATURE_ANG_OFF] = -wrap_angle(row["heading"] - math.atan2(lane_sin, lane_cos))
+    out[FEATURE_ANG_OFF] = -wrap_angle(row["heading"] - atan2(lane_sin, lane_cos))
 
 
 @kernel
@@ -93,8 +93,8 @@ def make_relative(values: NDArray[np.float64], ego: np.void) -> None:
     """Take the place and the velocity of `ego` from those in `values`, in the world's axes."""
     values[FEATURE_X] -= ego["x"]
     values[FEATURE_Y] -= -ego["y"]
-    values[FEATURE_VX] -= ego["speed"] * math.cos(ego["heading"])
-    values[FEATURE_VY] -= -ego["speed"] * math.sin(ego["heading"])
+    values[FEATURE_VX] -= ego["speed"] * cosine(ego["heading"])
+    values[FEATURE_VY] -= -ego["speed"] * sine(ego["heading"])
 
 
 @kernel

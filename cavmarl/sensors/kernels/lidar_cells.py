@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.elementary import atan2, cosine, sine
+from cavmarl.core.math.elementary_arrays import cos_all, sin_all
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
 from cavmarl.sensors.kernels.sensor_arrays import LidarCells
 
@@ -25,14 +27,14 @@ TWO_PI = 2.0 * math.pi
 def cell_directions(cells: int) -> NDArray[np.float64]:
     """Cosine and sine (cells, 2) of the middle of each cell, from east to south."""
     angles = np.arange(cells) * (2.0 * np.pi / max(cells, 1))
-    return np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return np.stack([cos_all(angles), sin_all(angles)], axis=1)
 
 
 @kernel
 def _cell_of(x: float, y: float, cells: int) -> tuple[int, float]:
     """The cell of a direction, and the angle that highway-env finds it by."""
     step = TWO_PI / cells
-    angle = math.atan2(y, x) + 0.5 * step
+    angle = atan2(y, x) + 0.5 * step
     return math.floor(angle / step) % cells, angle
 
 
@@ -137,8 +139,8 @@ def observe_lidar_cells(
     `out`: an observation; 2 · cells numbers from `sensor.at` on are written.
     """
     ego = rows[i]
-    ego_cos = math.cos(ego["heading"])
-    ego_sin = -math.sin(ego["heading"])
+    ego_cos = cosine(ego["heading"])
+    ego_sin = -sine(ego["heading"])
     for k in range(sensor.cells):
         echo = sensor.echoes[k]
         echo["distance"] = sensor.range_m

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
 from cavmarl.core.math.bearings import ANGLE_ERROR_RAD, rough_atan2
+from cavmarl.core.math.elementary import cos_sin
+from cavmarl.core.math.elementary_arrays import cos_all, sin_all
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
 from cavmarl.core.records import record
 
@@ -38,7 +40,7 @@ _PARALLEL = 1e-200
 def ray_directions(num_rays: int) -> NDArray[np.float64]:
     """Directions (num_rays, 2), cosine and sine: equally spaced, counter-clockwise from ahead."""
     angles = 2.0 * np.pi * np.arange(num_rays) / num_rays
-    return np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return np.stack([cos_all(angles), sin_all(angles)], axis=1)
 
 
 @kernel
@@ -172,8 +174,7 @@ def lidar(
     far it sees, in the plane. `out`: ECHO (num_rays,), overwritten.
     """
     ego = rows[row]
-    ego_cos = math.cos(ego["heading"])
-    ego_sin = math.sin(ego["heading"])
+    ego_cos, ego_sin = cos_sin(ego["heading"])
     for r in range(out.size):
         echo = out[r]
         echo["distance"] = range_m

@@ -8,12 +8,11 @@ once, by `roads.roadgraph`.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.elementary import cos_sin
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M
 from cavmarl.core.math.scalars import clamp
 from cavmarl.core.records import record
@@ -153,8 +152,7 @@ def observe_roadgraph(row: np.void, sensor: RoadgraphSensor, out: NDArray[np.flo
 
     `sensor`: settings, points and scratch. `out`: an observation, zeros from `sensor.at` on.
     """
-    cos = math.cos(row["heading"])
-    sin = math.sin(row["heading"])
+    cos, sin = cos_sin(row["heading"])
     found = nearest_points(row["x"], row["y"], row["z"], sensor)
     for k in range(found):
         point = sensor.road_map.points[sensor.sorted_point[k]]

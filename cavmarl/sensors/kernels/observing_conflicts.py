@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.elementary import atan2, cosine, sine
 from cavmarl.core.math.geometry import lane_pose
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
 from cavmarl.core.math.walls import is_cut
@@ -73,8 +74,8 @@ def _foresee(
     """
     looks[0, 0] = row["x"]
     looks[0, 1] = row["y"]
-    looks[0, 2] = math.cos(row["heading"])
-    looks[0, 3] = math.sin(row["heading"])
+    looks[0, 2] = cosine(row["heading"])
+    looks[0, 3] = sine(row["heading"])
     stride = LOOK_S * speed
     lane, way = row["lane"], row["way"]
     here = roads.lanes[lane]
@@ -133,7 +134,7 @@ def _indicated(roads: RoadArrays, link: int) -> float:
     _, _, _, cos, sin, _ = lane_pose(roads.points, first, num, before["length_m"])
     first, num = after["first_point"], after["num_points"]
     _, _, _, cos_after, sin_after, _ = lane_pose(roads.points, first, num, 0.0)
-    turns = math.atan2(sin_after * cos - cos_after * sin, cos_after * cos + sin_after * sin)
+    turns = atan2(sin_after * cos - cos_after * sin, cos_after * cos + sin_after * sin)
     if abs(turns) < INDICATED_RAD:
         return 0.0
     return 1.0 if turns > 0.0 else -1.0
@@ -247,8 +248,8 @@ def _take_reports(
         gone_m = (tick - report["tick"]) * tick_s * report["speed"]
         body["id"] = report["subject"]
         body["row"] = k
-        body["cos"] = math.cos(report["heading"])
-        body["sin"] = math.sin(report["heading"])
+        body["cos"] = cosine(report["heading"])
+        body["sin"] = sine(report["heading"])
         body["x"] = report["x"] + gone_m * body["cos"]
         body["y"] = report["y"] + gone_m * body["sin"]
         body["z"] = report["z"]

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.elementary import cos_sin
 from cavmarl.core.math.scalars import clamp
 from cavmarl.core.records.arrays import RoadArrays, Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT, SIGNAL_GREEN_MAJOR, SIGNAL_GREEN_MINOR
@@ -59,8 +58,7 @@ def _observe_object(
 ) -> None:
     _observe_place(report, row, cos, sin, scale_m, out)
     turned = report["heading"] - row["heading"]
-    turned_cos = math.cos(turned)
-    turned_sin = math.sin(turned)
+    turned_cos, turned_sin = cos_sin(turned)
     out[3] = _unit((report["speed"] * turned_cos - row["speed"]) / SPEED_SCALE)
     out[4] = _unit(report["speed"] * turned_sin / SPEED_SCALE)
     out[5] = _unit(turned_cos)
@@ -167,8 +165,7 @@ def observe_messages(
             agent = row["agent"]
             seen = observations[w, agent]
             out = seen[newest_frame(seen, stack) + at :]
-            cos = math.cos(row["heading"])
-            sin = math.sin(row["heading"])
+            cos, sin = cos_sin(row["heading"])
             for k in range(objects):
                 report = mail.objects[w, agent, k]
                 if report["sender"] < 0:

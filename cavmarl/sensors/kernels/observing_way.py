@@ -6,12 +6,11 @@ from any lane of a road.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.elementary import atan2, cos_sin
 from cavmarl.core.math.geometry import lane_pose, wrap_angle
 from cavmarl.core.records.arrays import RoadArrays, Travel
 from cavmarl.core.records.codes import (
@@ -85,8 +84,7 @@ def observe_way(
     Beyond the end of the way its last place is told, without a curve. `time` is that of the tick,
     in s since the world's reset. `observation`: (D,), 0 before.
     """
-    cos_heading = math.cos(row["heading"])
-    sin_heading = math.sin(row["heading"])
+    cos_heading, sin_heading = cos_sin(row["heading"])
     distances = sensor.distances_m
     lines_at = sensor.at + PLACE_FEATURES * distances.size
     size = LINE_FEATURES + 1 if sensor.timing else LINE_FEATURES
@@ -97,7 +95,7 @@ def observe_way(
         roads.points, here["first_point"], here["num_points"], row["s"]
     )
     before_m = 0.0
-    direction = math.atan2(sin, cos)
+    direction = atan2(sin, cos)
     told = 0
     lines = 0
     for _ in range(MOST_LANES):
@@ -110,7 +108,7 @@ def observe_way(
                 roads.points, here["first_point"], here["num_points"], distance - start
             )
             left = (y - row["y"]) * cos_heading - (x - row["x"]) * sin_heading
-            turned = math.atan2(sin, cos)
+            turned = atan2(sin, cos)
             out = observation[at : at + PLACE_FEATURES]
             out[0] = unit(left / distances[told])
             if distance > before_m:

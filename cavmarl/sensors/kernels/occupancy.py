@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.elementary import cosine, sine
 from cavmarl.core.math.geometry import project
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
 from cavmarl.core.math.scalars import clamp
@@ -35,8 +36,8 @@ def _cell(sensor: OccupancyGrid, ego: np.void, x: float, y: float) -> int:
     right = x - ego["x"]
     down = ego["y"] - y
     if sensor.aligned:
-        cos = math.cos(ego["heading"])
-        sin = -math.sin(ego["heading"])
+        cos = cosine(ego["heading"])
+        sin = -sine(ego["heading"])
         right, down = cos * right + sin * down, cos * down - sin * right
     column = math.floor((right - sensor.min_x) / sensor.step_x)
     row = math.floor((down - sensor.min_y) / sensor.step_y)

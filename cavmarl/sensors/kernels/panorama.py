@@ -11,13 +11,13 @@ The records do not say in which row a body lies or which zone owns it.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.elementary import cosine, sine
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
 from cavmarl.core.records import record
 from cavmarl.roads.kernels.backdrop_pieces import Backdrop, gather_quads, gather_walls
@@ -158,10 +158,10 @@ def _gather_prisms(
     """
     ego = rows[row]
     axes = (
-        math.cos(ego["heading"]),
-        math.sin(ego["heading"]),
-        math.cos(ego["pitch"]),
-        math.sin(ego["pitch"]),
+        cosine(ego["heading"]),
+        sine(ego["heading"]),
+        cosine(ego["pitch"]),
+        sine(ego["pitch"]),
     )
     far = reach_m + grid.largest[0]
     first_column, last_column = cell_columns(grid, ego["x"], far)

@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
 from cavmarl.core.math.bearings import ANGLE_ERROR_RAD, rough_atan2
+from cavmarl.core.math.elementary import hypot
+from cavmarl.core.math.elementary_arrays import cos_all, sin_all
 from cavmarl.core.math.geometry import PI, TWO_PI
 from cavmarl.core.records import record
 
@@ -72,9 +74,9 @@ def make_fan(
     elevation = np.asarray(elevations_rad)[np.newaxis, :]
     own = np.stack(
         [
-            np.cos(azimuth) * np.cos(elevation),
-            np.sin(azimuth) * np.cos(elevation),
-            np.sin(elevation) * np.ones_like(azimuth),
+            cos_all(azimuth) * cos_all(elevation),
+            sin_all(azimuth) * cos_all(elevation),
+            sin_all(elevation) * np.ones_like(azimuth),
         ],
         axis=2,
     )
@@ -260,13 +262,13 @@ def _columns_of_wall(
     """The columns that can meet a wall whose ends are seen at a and b."""
     if fan.tilted:
         half_height = 0.5 * wall["height"]
-        half_length = 0.5 * math.hypot(bx - ax, by - ay)
+        half_length = 0.5 * hypot(bx - ax, by - ay)
         return _columns_of_ball(
             fan,
             0.5 * (wall["ax"] + wall["bx"]),
             0.5 * (wall["ay"] + wall["by"]),
             half_height,
-            math.hypot(half_length, half_height),
+            hypot(half_length, half_height),
         )
     yaw_cos = fan.mount[0, 0]
     yaw_sin = fan.mount[1, 0]

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.elementary import cos_sin, cosine, log
 from cavmarl.core.math.geometry import TWO_PI
 from cavmarl.core.math.rng import mix, quick_uniform
 from cavmarl.core.records import record
@@ -56,8 +57,8 @@ def gauss(key: np.uint64, vehicle: int, tick: int, draw: int) -> float:
 
     `draw`: which one of this tick, below 2**30.
     """
-    radius = math.sqrt(-2.0 * math.log(1.0 - quick_uniform(key, vehicle, tick, 2 * draw)))
-    return radius * math.cos(TWO_PI * quick_uniform(key, vehicle, tick, 2 * draw + 1))
+    radius = math.sqrt(-2.0 * log(1.0 - quick_uniform(key, vehicle, tick, 2 * draw)))
+    return radius * cosine(TWO_PI * quick_uniform(key, vehicle, tick, 2 * draw + 1))
 
 
 @kernel
@@ -115,9 +116,9 @@ def rotation(yaw: float, pitch: float, roll: float, out: NDArray[np.float64]) ->
     `pitch`: rad, positive upwards. `roll`: rad, positive with the left side up. `out`: (3, 3),
     overwritten; its columns are the turned frame's axes.
     """
-    cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
-    cos_pitch, sin_pitch = math.cos(pitch), math.sin(pitch)
-    cos_roll, sin_roll = math.cos(roll), math.sin(roll)
+    cos_yaw, sin_yaw = cos_sin(yaw)
+    cos_pitch, sin_pitch = cos_sin(pitch)
+    cos_roll, sin_roll = cos_sin(roll)
     out[0, 0] = cos_yaw * cos_pitch
     out[1, 0] = sin_yaw * cos_pitch
     out[2, 0] = sin_pitch

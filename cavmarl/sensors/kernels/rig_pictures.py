@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.elementary import hypot
 from cavmarl.core.math.neighbors import Grid, fill_grid
 from cavmarl.core.math.spans import row_span
 from cavmarl.core.records.arrays import Worlds
@@ -127,7 +128,7 @@ def _fill_line(
 ) -> None:
     dx = strip[b, 0] - strip[a, 0]
     dy = strip[b, 1] - strip[a, 1]
-    length = math.hypot(dx, dy)
+    length = hypot(dx, dy)
     if length == 0.0:
         return
     x = -dy / length * half_m
@@ -181,7 +182,7 @@ def camera_reach_m(camera: CameraPose, width: int, height: int) -> float:
     across = 0.5 * width / camera.focal
     up = 0.5 * height / camera.focal
     farthest_m = camera.range_m * math.sqrt(1.0 + across * across + up * up)
-    return farthest_m + math.hypot(camera.mount[0, 3], camera.mount[1, 3])
+    return farthest_m + hypot(camera.mount[0, 3], camera.mount[1, 3])
 
 
 @kernel

@@ -7,12 +7,11 @@ sensor, along the ray: positive where the distance grows. The ground and clutter
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.elementary import hypot
 from cavmarl.core.math.neighbors import Grid, fill_grid
 from cavmarl.core.records import record
 from cavmarl.core.records.arrays import Worlds
@@ -116,7 +115,7 @@ BLOCK = 16
 @kernel
 def reach_of(fan: Fan) -> float:
     """How far from the vehicle's place something can be that a ray meets, m."""
-    return fan.range_m + math.hypot(fan.mount[0, 3], fan.mount[1, 3])
+    return fan.range_m + hypot(fan.mount[0, 3], fan.mount[1, 3])
 
 
 @kernel

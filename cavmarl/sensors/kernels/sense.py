@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.elementary import atan2, cos_sin
 from cavmarl.core.math.geometry import lane_pose, wrap_angle
 from cavmarl.core.math.neighbors import Grid, fill_grid, nearest_bodies
 from cavmarl.core.math.scalars import clamp
@@ -74,7 +75,7 @@ def observe_ego(
     _, _, _, cos, sin, _ = lane_pose(
         roads.points, lane["first_point"], lane["num_points"], row["s"]
     )
-    error = wrap_angle(row["heading"] - math.atan2(sin, cos))
+    error = wrap_angle(row["heading"] - atan2(sin, cos))
     out[0] = unit(row["speed"] / SPEED_SCALE)
     out[1] = unit(row["accel"] / ACCEL_SCALE)
     out[2] = unit(row["steering"] / STEERING_SCALE)
@@ -111,8 +112,7 @@ def observe_route(
     out: NDArray[np.float32],
 ) -> None:
     """Points of the way ahead in the ego frame; beyond the way's end its last point."""
-    cos_heading = math.cos(row["heading"])
-    sin_heading = math.sin(row["heading"])
+    cos_heading, sin_heading = cos_sin(row["heading"])
     scale = sensors.route_points * sensors.route_spacing_m
     lane = row["lane"]
     s = row["s"]
@@ -156,8 +156,7 @@ def observe_neighbors(
         sensors.near_body,
         sensors.near_squared,
     )
-    cos_heading = math.cos(row["heading"])
-    sin_heading = math.sin(row["heading"])
+    cos_heading, sin_heading = cos_sin(row["heading"])
     k = 0
     for candidate in range(found):
         if k == sensors.neighbors:

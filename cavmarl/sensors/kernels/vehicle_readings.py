@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
+from cavmarl.core.math.elementary import atan2, cos_sin, tangent
 from cavmarl.core.math.geometry import lane_pose, project_near, wrap_angle
 from cavmarl.core.records.arrays import RoadArrays, Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT, EVENT_COLLIDED
@@ -49,10 +50,10 @@ def feel(
     if pose["id"] == row["id"]:
         yaw_accel = (row["yaw_rate"] - pose["yaw_rate"]) / tick_s
         pitch_rate = wrap_angle(row["pitch"] - pose["pitch"]) / tick_s
-    tan_slip = 0.5 * math.tan(steering)
+    tan_slip = 0.5 * tangent(steering)
     cos_slip = 1.0 / math.sqrt(1.0 + tan_slip * tan_slip)
     sin_slip = tan_slip * cos_slip
-    cos_pitch, sin_pitch = math.cos(pitch), math.sin(pitch)
+    cos_pitch, sin_pitch = cos_sin(pitch)
     x, y = mount.place[0], mount.place[1]
     inwards = speed * yaw_rate
     force_x = accel * cos_slip - inwards * sin_slip - yaw_accel * y - yaw_rate * yaw_rate * x
@@ -231,14 +232,14 @@ def measure_lane_boundary(
             _, offset, cos, sin = project_near(
                 roads.points, lane["first_point"], lane["num_points"], x, y, row["s"], _WINDOW_M
             )
-            looks = math.atan2(axes[1, 1, 0], axes[1, 0, 0])
+            looks = atan2(axes[1, 1, 0], axes[1, 0, 0])
             x0, y0 = _way_ahead(roads, plans, row, 0.0)
             x1, y1 = _way_ahead(roads, plans, row, 0.5 * lookahead_m)
             x2, y2 = _way_ahead(roads, plans, row, lookahead_m)
             scratch[0] = 0.5 * lane["width_m"] - offset
             scratch[1] = 0.5 * lane["width_m"] + offset
             scratch[2] = lane["width_m"]
-            scratch[3] = wrap_angle(looks - math.atan2(sin, cos))
+            scratch[3] = wrap_angle(looks - atan2(sin, cos))
             scratch[4] = bend(x0, y0, x1, y1, x2, y2)
             add_errors(noise, row, worlds.ticks[w], 0, scratch)
             for channel in range(scratch.size):

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError
+from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.core.math.neighbors import Grid, cell_at, make_grid
 from cavmarl.core.records.codes import CLASS_PEDESTRIAN
 from cavmarl.roads.kernels.backdrop_pieces import Backdrop
@@ -69,7 +70,7 @@ def _index(corners: NDArray[np.float64]) -> tuple[Grid, NDArray[np.intp]]:
     order = np.argsort(cells, kind="stable")
     grid.start[:] = np.searchsorted(cells[order], np.arange(len(grid.start)))
     apart = corners - middles[:, np.newaxis]
-    grid.largest[0] = np.hypot(apart[..., 0], apart[..., 1]).max()
+    grid.largest[0] = hypot_all(apart[..., 0], apart[..., 1]).max()
     return grid, order
 
 
@@ -89,7 +90,7 @@ def lane_strips(network: RoadNetwork) -> tuple[NDArray[np.float64], NDArray[np.f
     before = np.where(first[:, np.newaxis], after, np.roll(after, 1, axis=0))
     # The last point repeats the direction of the segment before it.
     along = before + after
-    size = np.hypot(along[:, 0], along[:, 1])
+    size = hypot_all(along[:, 0], along[:, 1])
     # Of a lane that turns back on the spot, which has no middle direction, the one after counts.
     along = np.where(
         size[:, np.newaxis] > 1e-6, along / np.maximum(size, 1e-6)[:, np.newaxis], after

@@ -15,6 +15,7 @@ from cavmarl.config.rig import (
     RgbCameraConfig,
     SemanticCameraConfig,
 )
+from cavmarl.core.math.elementary import hypot
 from cavmarl.sensors.kernels.camera_picture import colours, make_camera, make_picture
 from cavmarl.sensors.kernels.faces import CameraPose
 from cavmarl.sensors.kernels.panorama import NUM_SEMANTICS
@@ -124,8 +125,8 @@ class BevGrid(ImagingSensor[BevGridConfig]):
     @staticmethod
     def reach_m(config: BevGridConfig, largest_radius_m: float) -> float:
         """To its farthest corner, and the nearest side of a body."""
-        farthest_m = math.hypot(max(config.ahead_m, config.behind_m), config.aside_m)
-        return farthest_m + math.hypot(config.x_m, config.y_m) + largest_radius_m
+        farthest_m = hypot(max(config.ahead_m, config.behind_m), config.aside_m)
+        return farthest_m + hypot(config.x_m, config.y_m) + largest_radius_m
 
     def arguments(self, scene: SensedScene, due: Due, frames: SensorFrames) -> tuple[Any, ...]:
         return (*self.view(scene, due), self._grid, self._reach_m, self._panorama, frames.data)

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from cavmarl.config.rig import GnssConfig
 from cavmarl.core.errors import MapError, require
+from cavmarl.core.math.elementary import cos_sin
+from cavmarl.core.math.elementary_arrays import atan2_all, cos_all, hypot_all, sin_all
 from cavmarl.roads.network import GeoReference, RoadNetwork
 
 Points = NDArray[np.float64]
@@ -99,11 +101,10 @@ class TangentPlane:
         )
 
     def to_earth(self, points: Points) -> Points:
-        return _from_centred(points @ self._axes + self._origin_m)
+        return _from_centred(_turned(points, self._axes) + self._origin_m)
 
     def to_map(self, places: Points) -> Points:
-        found: Points = (_to_centred(places) - self._origin_m) @ self._axes.T
-        return found
+        return _turned(_to_centred(places) - self._origin_m, self._axes.T)
 
 
 def _in_the_plane(projection: str) -> str:
@@ -112,8 +113,15 @@ def _in_the_plane(projection: str) -> str:
     return " ".join(word for word in words if not word.startswith(_OF_HEIGHTS))
 
 
+def _turned(points: Points, axes: Points) -> Points:
+    """Return points (n, 3) times axes (3, 3); sums of a BLAS differ between processors."""
+    found: Points = points[:, :1] * axes[0] + points[:, 1:2] * axes[1] + points[:, 2:] * axes[2]
+    return found
+
+
 def _sin_cos(angle_deg: float) -> tuple[float, float]:
-    return math.sin(math.radians(angle_deg)), math.cos(math.radians(angle_deg))
+    cos, sin = cos_sin(math.radians(angle_deg))
+    return sin, cos
 
 
 def _to_centred(places: Points) -> Points:
@@ -121,23 +129,23 @@ def _to_centred(places: Points) -> Points:
     latitude, longitude = np.radians(places[:, 0]), np.radians(places[:, 1])
     height_m = places[:, 2]
     normal_m = _normal_m(latitude)
-    across_m = (normal_m + height_m) * np.cos(latitude)
-    polar_m = (normal_m * (1.0 - _SQUARED_ECCENTRICITY) + height_m) * np.sin(latitude)
-    return np.stack([across_m * np.cos(longitude), across_m * np.sin(longitude), polar_m], axis=1)
+    across_m = (normal_m + height_m) * cos_all(latitude)
+    polar_m = (normal_m * (1.0 - _SQUARED_ECCENTRICITY) + height_m) * sin_all(latitude)
+    return np.stack([across_m * cos_all(longitude), across_m * sin_all(longitude), polar_m], axis=1)
 
 
 def _from_centred(points: Points) -> Points:
     """The inverse of `_to_centred`, for places away from the poles."""
     x, y, polar_m = points.T
-    across_m = np.hypot(x, y)
-    latitude = np.arctan2(polar_m, across_m * (1.0 - _SQUARED_ECCENTRICITY))
+    across_m = hypot_all(x, y)
+    latitude = atan2_all(polar_m, across_m * (1.0 - _SQUARED_ECCENTRICITY))
     for _ in range(_ROUNDS):
-        raised_m = polar_m + _SQUARED_ECCENTRICITY * _normal_m(latitude) * np.sin(latitude)
-        latitude = np.arctan2(raised_m, across_m)
-    height_m = across_m / np.cos(latitude) - _normal_m(latitude)
-    return np.stack([np.degrees(latitude), np.degrees(np.arctan2(y, x)), height_m], axis=1)
+        raised_m = polar_m + _SQUARED_ECCENTRICITY * _normal_m(latitude) * sin_all(latitude)
+        latitude = atan2_all(raised_m, across_m)
+    height_m = across_m / cos_all(latitude) - _normal_m(latitude)
+    return np.stack([np.degrees(latitude), np.degrees(atan2_all(y, x)), height_m], axis=1)
 
 
 def _normal_m(latitude: Points) -> Points:
-    found: Points = _AXIS_M / np.sqrt(1.0 - _SQUARED_ECCENTRICITY * np.sin(latitude) ** 2)
+    found: Points = _AXIS_M / np.sqrt(1.0 - _SQUARED_ECCENTRICITY * np.square(sin_all(latitude)))
     return found

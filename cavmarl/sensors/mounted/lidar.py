@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from cavmarl.config.rig import LidarRigConfig, RadarConfig
+from cavmarl.core.math.elementary import hypot
 from cavmarl.sensors.kernels.ray_fan import HIT, Fan, make_fan
 from cavmarl.sensors.kernels.rig_frames import Due
 from cavmarl.sensors.kernels.rig_rays import TARGET, measure_lidar, measure_radar
@@ -43,7 +44,7 @@ class _Rays(ImagingSensor[C]):
     @staticmethod
     def reach_m(config: C, largest_radius_m: float) -> float:
         """Its range, from where it is mounted to the nearest side of a body."""
-        return config.range_m + math.hypot(config.x_m, config.y_m) + largest_radius_m
+        return config.range_m + hypot(config.x_m, config.y_m) + largest_radius_m
 
 
 class Lidar(_Rays[LidarRigConfig]):

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.sensors import SensorsConfig
 from cavmarl.core.extensions import REGISTERED_SENSORS
+from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.core.math.walls import Walls, make_walls
 from cavmarl.core.records.arrays import Sensors
 from cavmarl.rewards.kernels.terms import TTC_REACH_M
@@ -120,7 +121,7 @@ def largest_radius_m(types: NDArray[np.void]) -> float:
     Args:
         types: VTYPE (num_types,), `Travel.types`: those of agents and of all others.
     """
-    return 0.5 * float(np.hypot(types["length"], types["width"]).max())
+    return 0.5 * float(hypot_all(types["length"], types["width"]).max())
 
 
 def sensing_reach_m(config: SensorsConfig, largest_radius_m: float) -> float:

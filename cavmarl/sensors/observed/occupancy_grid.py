@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from cavmarl.config.sensors import OccupancyGridConfig, SensorsConfig
+from cavmarl.core.math.elementary import hypot
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.kernels.sensor_arrays import OccupancyGrid
 from cavmarl.sensors.observed.feature import Feature
@@ -60,7 +59,7 @@ def reach_m(config: SensorsConfig) -> float:
     grid = config.occupancy_grid
     if not grid.features:
         return 0.0
-    return math.hypot(*(max(abs(low), abs(high)) for low, high in grid.grid_size_m))
+    return hypot(*(max(abs(low), abs(high)) for low, high in grid.grid_size_m))
 
 
 def settings(

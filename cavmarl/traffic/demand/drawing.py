@@ -7,6 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.math.elementary import log1p
+from cavmarl.core.math.elementary_arrays import cos_all, log1p_all
 from cavmarl.core.math.rng import STREAM_DEMAND, fill_uniform
 from cavmarl.traffic.demand.demand_records import FLOW_PROBABILITY, FLOW_REGULAR
 
@@ -77,12 +79,12 @@ def _random(flow: np.void, key: int, row: int, end_ms: int) -> NDArray[np.int64]
     rate, wanted = float(flow["rate"]), int(flow["number"])
     begin = int(flow["begin_ms"])
     at = float((-(-begin // 1000) - 1) * 1000 if trials else begin)
-    decay = (-math.inf if rate == 1.0 else math.log1p(-rate)) if trials else -rate
+    decay = (-math.inf if rate == 1.0 else log1p(-rate)) if trials else -rate
     times: list[NDArray[np.float64]] = [np.empty(0)]
     drawn = 0
     while at < end_ms and drawn < wanted:
         numbers = np.arange(drawn, drawn + _CHUNK)
-        gaps = np.log1p(-chances(key, np.full(_CHUNK, row), numbers, DRAW_TIME)) / decay
+        gaps = log1p_all(-chances(key, np.full(_CHUNK, row), numbers, DRAW_TIME)) / decay
         gaps = np.floor(gaps) + 1.0 if trials else gaps
         times.append(at + np.cumsum(gaps * 1000.0))
         at = float(times[-1][-1])
@@ -107,7 +109,7 @@ def speed_factors(
         stream = DRAW_SPEED_FACTOR + 2 * attempt
         radius = chances(key, orders["element"], orders["number"], stream)
         angle = chances(key, orders["element"], orders["number"], stream + 1)
-        normal = np.sqrt(-2.0 * np.log1p(-radius)) * np.cos(2.0 * np.pi * angle)
+        normal = np.sqrt(-2.0 * log1p_all(-radius)) * cos_all(2.0 * np.pi * angle)
         value = kind["speed_factor"] + kind["speed_dev"] * normal
         last = attempt == SPEED_FACTOR_TRIES - 1
         fits = np.isnan(drawn) & (last | ((value >= low) & (value <= high)))

@@ -8,12 +8,11 @@ long as there is room) and `admit` (each shard: into its rows or among its ghost
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.math.elementary import cosine, sine
 from cavmarl.core.math.geometry import boxes_overlap, lane_pose
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M
 from cavmarl.core.records.arrays import Demand, Gate, RoadArrays, Scratch, Travel, Worlds
@@ -133,14 +132,14 @@ def _touches(own: np.void, other: np.void) -> bool:
     return boxes_overlap(
         own["x"],
         own["y"],
-        math.cos(own["heading"]),
-        math.sin(own["heading"]),
+        cosine(own["heading"]),
+        sine(own["heading"]),
         half_length,
         half_width,
         other["x"],
         other["y"],
-        math.cos(other["heading"]),
-        math.sin(other["heading"]),
+        cosine(other["heading"]),
+        sine(other["heading"]),
         0.5 * other["length"],
         0.5 * other["width"],
     )

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.math.elementary import atan, cosine, sine
 from cavmarl.core.math.geometry import lane_pose, wrap_angle
 from cavmarl.core.records.arrays import Gate, RoadArrays, Travel, Zoned
 from cavmarl.core.records.codes import COUNT_DEPARTED, DRIVER_SUMO, EVENT_ARRIVED
@@ -190,8 +191,8 @@ def _stand_in(roads: RoadArrays, travel: Travel, paths: Paths, seen: np.void, ro
     half = 0.5 * row["length"]
     heading = wrap_angle(0.5 * math.pi - math.radians(seen["angle"]))
     row["heading"] = heading
-    row["x"] = seen["x"] - half * math.cos(heading)
-    row["y"] = seen["y"] - half * math.sin(heading)
+    row["x"] = seen["x"] - half * cosine(heading)
+    row["y"] = seen["y"] - half * sine(heading)
     row["speed"] = seen["speed"]
     _place_centre(roads, seen, row)
     lane = roads.lanes[row["lane"]]
@@ -199,7 +200,7 @@ def _stand_in(roads: RoadArrays, travel: Travel, paths: Paths, seen: np.void, ro
         roads.points, lane["first_point"], lane["num_points"], row["s"]
     )
     row["z"] = seen["z"] - half * slope
-    row["pitch"] = math.atan(slope)
+    row["pitch"] = atan(slope)
     row["side_lane"] = side_lane(roads, row)
     row["target_lane"] = row["lane"]
     signals = seen["signals"]

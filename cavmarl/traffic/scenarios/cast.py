@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError
+from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.core.math.geometry import lane_pose
 from cavmarl.core.records.arrays import Gate, RoadArrays, Scripts, Travel, Worlds
 from cavmarl.core.records.codes import COUNT_DEPARTED, DRIVER_SCRIPTED
@@ -150,12 +151,12 @@ class Cast:
     def _is_clear(self, roads: RoadArrays, rows: NDArray[np.void]) -> NDArray[np.bool_]:
         """(n,) which vehicles stand neither in the scene nor where an agent begins."""
         clear: NDArray[np.bool_] = (
-            np.hypot(rows["x"] - self.scene.x, rows["y"] - self.scene.y) > self.scene.clear_m
+            hypot_all(rows["x"] - self.scene.x, rows["y"] - self.scene.y) > self.scene.clear_m
         )
         for seat in self.seats[1:]:
             lane = roads.lanes[seat.lane]
             x, y, *_ = lane_pose(roads.points, lane["first_point"], lane["num_points"], seat.s)
-            clear &= np.hypot(rows["x"] - x, rows["y"] - y) > SEAT_CLEAR_M
+            clear &= hypot_all(rows["x"] - x, rows["y"] - y) > SEAT_CLEAR_M
         return clear
 
     def _departure(self, roads: RoadArrays, agent: int, seat: Seat) -> np.void:

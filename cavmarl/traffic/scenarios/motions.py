@@ -11,6 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.math.elementary import atan, atan2, cosine, sine
+from cavmarl.core.math.elementary_arrays import cos_all, hypot_all, sin_all
 from cavmarl.driving.kernels.announcing import announced_m
 from cavmarl.driving.kernels.approach import MAX_LINKS_AHEAD
 from cavmarl.roads.network import RoadNetwork
@@ -88,7 +90,7 @@ class Move:
             yield Pose(x, y, heading, 0.0, self.beside)
         if len(line) == 1:
             return
-        steps = np.hypot(*np.diff(line[:, :2], axis=0).T)
+        steps = hypot_all(*np.diff(line[:, :2], axis=0).T)
         along = np.concatenate([[0.0], np.cumsum(steps)])
         headings = np.unwrap(line[:, 2])
         for u, speed in _course(float(along[-1]), 0.0, self.speed_mps, 0.0, dt):
@@ -126,10 +128,10 @@ class Ride:
         return Pose(
             0.5 * (front[0] + rear[0]),
             0.5 * (front[1] + rear[1]),
-            math.atan2(front[1] - rear[1], front[0] - rear[0]),
+            atan2(front[1] - rear[1], front[0] - rear[0]),
             speed,
             lane,
-            math.atan(slope),
+            atan(slope),
             (lane, s, 0.0),
             self._entered(network, lane),
             tuple(self._claims(network, u, speed, length)),
@@ -210,13 +212,13 @@ def arc(
     side = math.copysign(1.0, turn_rad) * (-1.0 if backwards else 1.0)
     headings = heading + np.linspace(0.0, turn_rad, max(2, int(abs(turn_rad) / 0.05) + 1))
     middle_x, middle_y = (
-        x - side * radius_m * math.sin(heading),
-        y + side * radius_m * math.cos(heading),
+        x - side * radius_m * sine(heading),
+        y + side * radius_m * cosine(heading),
     )
     return np.stack(
         [
-            middle_x + side * radius_m * np.sin(headings),
-            middle_y - side * radius_m * np.cos(headings),
+            middle_x + side * radius_m * sin_all(headings),
+            middle_y - side * radius_m * cos_all(headings),
             headings,
         ],
         axis=1,

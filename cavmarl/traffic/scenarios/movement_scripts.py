@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.math.elementary import cos_sin, cosine, hypot, sine
 from cavmarl.core.records import record
 from cavmarl.core.records.arrays import Scripts
 from cavmarl.core.records.codes import CLASS_PEDESTRIAN, MODEL_IDM
@@ -74,7 +75,7 @@ class Shadows:
             start, end = covered_stretch(self._network.points, row, points)
             if start <= end:
                 _, _, _, cos, sin, _ = self._network.pose_on(lane, 0.5 * (start + end))
-                along = math.cos(pose.heading) * cos + math.sin(pose.heading) * sin
+                along = cosine(pose.heading) * cos + sine(pose.heading) * sin
                 found[lane] = Shadow(start, end, max(pose.speed * along, 0.0))
         return found
 
@@ -87,7 +88,7 @@ class Shadows:
             s, d, _, _ = self._network.beside(lane, pose.x, pose.y)
             length = float(self._network.lanes["length_m"][lane])
             on = min(max(s, 0.0), length)
-            off = math.hypot(abs(s - on), d)
+            off = hypot(abs(s - on), d)
             if off < best_off:
                 best, best_off = (lane, on, d), off
         return best
@@ -98,7 +99,7 @@ class Shadows:
     def distance_m(self, lane: int, s: float, pose: Pose) -> float:
         """From a place on a lane to an actor, in the plane."""
         x, y, *_ = self._network.pose_on(lane, s)
-        return math.hypot(x - pose.x, y - pose.y)
+        return hypot(x - pose.x, y - pose.y)
 
     def _is_level(self, lane: int, other: int) -> bool:
         """Whether two lanes that are near each other can be on the same road."""
@@ -147,7 +148,7 @@ def _outline(pose: Pose, length: float, width: float) -> NDArray[np.float64]:
     along = np.linspace(-0.5, 0.5, max(2, round(length / SAMPLE_M) + 1)) * length
     across = np.linspace(-0.5, 0.5, max(2, round(width / SAMPLE_M) + 1)) * width
     u, v = (grid.ravel() for grid in np.meshgrid(along, across))
-    cos, sin = math.cos(pose.heading), math.sin(pose.heading)
+    cos, sin = cos_sin(pose.heading)
     return np.stack([pose.x + u * cos - v * sin, pose.y + u * sin + v * cos], axis=1)
 
 

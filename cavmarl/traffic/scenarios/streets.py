@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.math.elementary import atan2, cosine, hypot, sine
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.routing import lane_grid
 
@@ -47,7 +48,7 @@ class Streets:
     def point(self, lane: int, s: float, d: float = 0.0) -> NDArray[np.float64]:
         """(3,) x, y and heading of a place on a lane, `d` m to the left of its middle."""
         x, y, _, cos, sin, _ = self.network.pose_on(lane, s)
-        return np.array([x - d * sin, y + d * cos, math.atan2(sin, cos)])
+        return np.array([x - d * sin, y + d * cos, atan2(sin, cos)])
 
     @property
     def _sides(self) -> tuple[str, str]:
@@ -105,7 +106,7 @@ class Streets:
             return None
         middle = self.point(lane, s)
         place, d, cos, sin = self.network.beside(other, middle[0], middle[1])
-        along = cos * math.cos(heading) + sin * math.sin(heading)
+        along = cos * cosine(heading) + sin * sine(heading)
         if along > -0.99 or abs(d) > BESIDE_M:
             return None
         return Opposite(other, place, abs(d))
@@ -148,7 +149,7 @@ class Streets:
         while own >= 0 and self.network.lanes["internal"][own]:
             s, d, _, _ = self.network.beside(own, x, y)
             beyond = max(-s, s - self.length_m(own), 0.0)
-            nearest = min(nearest, math.hypot(d, beyond))
+            nearest = min(nearest, hypot(d, beyond))
             own = int(self.network.lanes["successor"][own])
         return nearest
 

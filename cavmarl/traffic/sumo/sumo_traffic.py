@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import CapacityError, SumoError
+from cavmarl.core.math.elementary_arrays import cos_all, sin_all
 from cavmarl.core.records.arrays import Gate, RoadArrays, Travel, Worlds, Zoned
 from cavmarl.core.records.codes import COUNT_REROUTED, LANE_GIVEN, POS_GIVEN, SPEED_MAX
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
@@ -285,8 +286,8 @@ class SumoTraffic:
         moved = np.zeros(num, dtype=MOVED)
         half = 0.5 * ours["length"]
         moved["id"] = ours["id"]
-        moved["x"] = ours["x"] + half * np.cos(ours["heading"])
-        moved["y"] = ours["y"] + half * np.sin(ours["heading"])
+        moved["x"] = ours["x"] + half * cos_all(ours["heading"])
+        moved["y"] = ours["y"] + half * sin_all(ours["heading"])
         moved["angle"] = np.degrees(0.5 * math.pi - ours["heading"]) % 360.0
         moved["edge"] = self._edge_of_lane[ours["lane"]]
         moved["kind"] = ours["vtype"]

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.math.elementary import cosine, sine
 from cavmarl.core.records.arrays import Zoned
 from cavmarl.zones.kernels.zone_lookup import ZoneArrays, squared_distance, zone_of
 
@@ -94,8 +95,8 @@ def _tell_of(
         _note(out[found], row["id"], zone, i, here, True, squared)
         found += 1
     way = row["speed"] * borders.ahead_s
-    then_x = x + math.cos(row["heading"]) * way
-    then_y = y + math.sin(row["heading"]) * way
+    then_x = x + cosine(row["heading"]) * way
+    then_y = y + sine(row["heading"]) * way
     if squared_distance(rects, zone, then_x, then_y) > limit:
         there = zone_of(zones, then_x, then_y)
         if there != here:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError
+from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.zones.kernels.zone_lookup import LOOK, WATCH, Halo
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
@@ -51,7 +52,7 @@ def lane_watchers(
     min_x, min_y, max_x, max_y = partition.arrays.rects.T[:, :, None]
     dx = np.maximum(np.maximum(min_x - lanes["max_x"], lanes["min_x"] - max_x), 0.0)
     dy = np.maximum(np.maximum(min_y - lanes["max_y"], lanes["min_y"] - max_y), 0.0)
-    watching = (asked | (np.hypot(dx, dy) <= within_m + _ROUNDING_M)).T
+    watching = (asked | (hypot_all(dx, dy) <= within_m + _ROUNDING_M)).T
     start = np.concatenate([[0], np.cumsum(watching.sum(axis=1))])
     lane, zone = np.nonzero(watching)
     watchers = np.zeros(zone.size, dtype=WATCH)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.zones.partition.zone_partition import ZonePartition
 from cavmarl.zones.partition.zone_survey import junction_boxes, lane_segments
@@ -112,7 +113,7 @@ def _lane_km(partition: ZonePartition, network: RoadNetwork) -> Floats:
     shares = np.sort(np.concatenate([ends, *cuts], axis=1), axis=1)
     pieces = np.diff(shares, axis=1)
     middles = shares[:, :-1] + pieces / 2.0
-    lengths = pieces * np.hypot(*along.T)[:, None]
+    lengths = pieces * hypot_all(*along.T)[:, None]
     kept = lengths > 0.0
     which = np.nonzero(kept)[0]
     owners = partition.zones_of(starts[which] + middles[kept][:, None] * along[which])

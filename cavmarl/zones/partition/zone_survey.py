@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.roads.network import RoadNetwork
 
 Floats = NDArray[np.float64]
@@ -25,7 +26,7 @@ def lane_segments(network: RoadNetwork) -> Floats:
 def lane_samples(network: RoadNetwork) -> Floats:
     """Places all along the lanes, (n, 3): x and y in m, and how many metres each stands for."""
     segments = lane_segments(network)
-    lengths = np.hypot(*(segments[:, 2:] - segments[:, :2]).T)
+    lengths = hypot_all(*(segments[:, 2:] - segments[:, :2]).T)
     pieces = np.maximum(np.ceil(lengths / _SAMPLE_M), 1.0).astype(np.int64)
     which = np.repeat(np.arange(len(segments)), pieces)
     rank = np.arange(len(which)) - np.repeat(np.cumsum(pieces) - pieces, pieces)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.math.elementary import acos, sine
 from cavmarl.traffic.scenarios.motions import ACCEL_MPS2, Act, Await, Move, Wait, arc
 from cavmarl.traffic.scenarios.movement_scripts import Actor, Cue
 from cavmarl.traffic.scenarios.scene import Scene, Seat, setting
@@ -64,7 +65,7 @@ def stage(streets: Streets, place: int, parameters: Parameters) -> Scene:
         Move(away, place, speed),
         Wait(0.5),
     ]
-    across_s = begin_s - RADIUS_M * math.sin(_first_turn(other))
+    across_s = begin_s - RADIUS_M * sine(_first_turn(other))
     x, y, _ = streets.point(place, across_s).tolist()
     edge = streets.edge(place)
     seat = Seat(place, max(across_s - radius_m - 20.0, 5.0), parameters.speed_mps, edge)
@@ -78,7 +79,7 @@ def _first_turn(other: Opposite) -> float:
     Three arcs of one radius r through α, π - 2 α and α carry a car 2 r (1 - 2 cos α) aside, which
     has to be the distance of the lanes.
     """
-    return math.acos(0.25 * (2.0 - other.apart_m / RADIUS_M))
+    return acos(0.25 * (2.0 - other.apart_m / RADIUS_M))
 
 
 def _parts(streets: Streets, other: Opposite) -> list[NDArray[np.float64]]:

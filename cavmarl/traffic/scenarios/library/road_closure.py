@@ -5,9 +5,9 @@ The agent stops before them until the road is opened again, or reaches its goal 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
+from cavmarl.core.math.elementary import hypot
 from cavmarl.traffic.scenarios.motions import Act, Await, Move, Ride, Wait
 from cavmarl.traffic.scenarios.movement_scripts import Actor, Cue
 from cavmarl.traffic.scenarios.scene import FREE_M, Scene, approach, setting
@@ -75,5 +75,5 @@ def stage(streets: Streets, place: int, parameters: Parameters) -> Scene:
         replace(seat, goal_edge=streets.edge(goal)),
         vans,
         [Cue(x, y, NEAR_M)],
-        clear_m=math.hypot(start[0] - x, start[1] - y) + MARGIN_M,
+        clear_m=hypot(start[0] - x, start[1] - y) + MARGIN_M,
     )

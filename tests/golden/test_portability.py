@@ -1,0 +1,36 @@
+"""Worlds and drivers compute the same bytes on every processor that this machine can imitate."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.golden import portability
+from tests.golden.portability import Processor, compare
+
+
+def test_numpy_and_the_c_library_do_not_matter(capsys: pytest.CaptureFixture[str]) -> None:
+    assert compare(is_quick=True) == 0, capsys.readouterr().out
+    assert capsys.readouterr().out.count("same") >= 2
+
+
+@pytest.mark.slow
+def test_the_processor_does_not_matter(capsys: pytest.CaptureFixture[str]) -> None:
+    assert compare(is_quick=False) == 0, capsys.readouterr().out
+    with capsys.disabled():  # what was skipped belongs to the result
+        print(capsys.readouterr().out)
+
+
+def test_a_difference_is_reported(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    processors = {name: Processor({"CASE": name}, is_quick=True) for name in ("other", "failing")}
+    found = {"": [{"states": "1"}], "other": [{"states": "2"}], "failing": [{"error": "no memory"}]}
+    monkeypatch.setattr(portability, "PROCESSORS", processors)
+    monkeypatch.setattr(portability, "QUICK_TASKS", ("two",))
+    monkeypatch.setattr(
+        portability, "hashes", lambda processor, *_: iter(found[processor.settings.get("CASE", "")])
+    )
+    assert compare(is_quick=True) == 1
+    other, failing = capsys.readouterr().out.splitlines()
+    assert other.endswith("DIFFERENT: states")
+    assert failing.endswith("DIFFERENT: no memory")
