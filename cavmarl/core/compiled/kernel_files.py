@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cavmarl.core.cache_folder import cache_dir, tell_unwritable
+from cavmarl.core.compiled.arguments import accepts
 from cavmarl.core.compiled.sources import module_digest
 from cavmarl.core.whole_file import write_whole
 
@@ -56,22 +57,31 @@ class KernelFile:
         self.name = f"{module}.{name}"
         self.types = types
         self._frozen = _frozen_values(function)
-        parts = (module, name, repr(function.__code__.co_firstlineno), types, *_machine())
-        digest = hashlib.sha256("\0".join((*parts, self._frozen or "")).encode()).hexdigest()[:32]
-        self.symbol = f"cavmarl_{digest}"
+        line = str(function.__code__.co_firstlineno)
+        kernel = _digest_of(module, name, line, self._frozen or "", *_machine())
+        digest = _digest_of(types)
+        self.symbol = f"cavmarl_{kernel}_{digest}"
         folder = cache_dir() / "kernels" / module_digest(module)
         readable = name.rpartition(".")[2].strip("<>")
-        self._path = folder / f"{readable}.{digest}{SUFFIX}"
+        self._path = folder / f"{readable}.{kernel}.{digest}{SUFFIX}"
+        self._pattern = f"{readable}.{kernel}.*{SUFFIX}"
 
     def load(self) -> CompiledKernel | None:
-        """Return the kernel; None if there is no file, or a damaged one."""
+        """Return the kernel for these types, or for others that take such arguments, too.
+
+        None: there is no such file, or only damaged ones.
+        """
         if self._frozen is None:
             return None
-        try:
-            content = self._path.read_bytes()
-        except OSError:
-            return None
-        return unpack(content)
+        others = sorted(self._path.parent.glob(self._pattern))
+        for path in (self._path, *others):
+            try:
+                found = unpack(path.read_bytes())
+            except OSError:
+                continue
+            if found is not None and accepts(found.types, self.types):
+                return found
+        return None
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -102,6 +112,10 @@ class KernelFile:
             write_whole(self._path, pack(kernel))
         except OSError as error:
             tell_unwritable(error)
+
+
+def _digest_of(*parts: str) -> str:
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
 
 
 def pack(kernel: CompiledKernel) -> bytes:
@@ -137,7 +151,7 @@ def _machine() -> tuple[str, ...]:
 @cache
 def machine_digest() -> str:
     """Return a short name for what code depends on beside the sources."""
-    return hashlib.sha256("\0".join(_machine()).encode()).hexdigest()[:16]
+    return _digest_of(*_machine())
 
 
 @cache

@@ -148,6 +148,9 @@ def _explain(reason: str) -> None:
         )
 
 
+_LOADED: dict[str, int] = {}  # addresses of entry points, by symbol
+
+
 @cache
 def _engine() -> Any:
     """Return LLVM's loader of object files."""
@@ -162,7 +165,9 @@ def _engine() -> Any:
 
 
 def _load_object(kernel: CompiledKernel) -> int:
-    """Load an ELF object into this process and return the address of its entry point."""
+    """Load an ELF object into this process, once, and return the address of its entry point."""
+    if kernel.symbol in _LOADED:
+        return _LOADED[kernel.symbol]
     from llvmlite import binding
 
     for table in tables:
@@ -171,4 +176,5 @@ def _load_object(kernel: CompiledKernel) -> int:
     engine.add_object_file(binding.ObjectFileRef.from_data(kernel.code))
     engine.finalize_object()
     address: int = engine.get_function_address(kernel.symbol)
+    _LOADED[kernel.symbol] = address
     return address
