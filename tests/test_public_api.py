@@ -134,7 +134,7 @@ def test_every_entry_has_its_ids() -> None:
 
 
 def test_the_ids_make_environments() -> None:
-    ego = gymnasium.make("cavmarl/ring-v4")
+    ego = gymnasium.make("cavmarl/ring-v5")
     observation, _ = ego.reset(seed=0)
     assert ego.observation_space.contains(observation)
     assert ego.step(ego.action_space.sample())[0].shape == observation.shape
@@ -147,6 +147,6 @@ def test_the_ids_make_environments() -> None:
 
 @pytest.mark.skipif(not hasattr(pettingzoo, "register"), reason="needs PettingZoo 1.27")
 def test_pettingzoo_makes_them_by_id() -> None:
-    env = pettingzoo.make("parallel", "cavmarl/ring-v4")
+    env = pettingzoo.make("parallel", "cavmarl/ring-v5")
     observations, _ = env.reset(seed=0)
     assert list(observations) == env.unwrapped.possible_agents

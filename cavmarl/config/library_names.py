@@ -1,7 +1,7 @@
 """The names under which other libraries find the environments.
 
 PettingZoo: the module functions `parallel_env`, `env` and `raw_env`, and, from 1.27 on, ids such
-as `cavmarl/merge-v5` in both its registries. Gymnasium: `cavmarl/merge-v5`, one vehicle of the
+as `cavmarl/merge-v6` in both its registries. Gymnasium: `cavmarl/merge-v6`, one vehicle of the
 world as a single-agent environment, and `cavmarl/mergeAgents-v5` for `gymnasium.make_vec`, all
 agents as rows; `cavmarl/mergeDiscrete-v2` and `cavmarl/mergeDiscreteAgents-v2` are the same with
 meta-actions. highway-env's tasks have its names: `cavmarl-highway/merge-v0` for `merge-v0`.

@@ -47,7 +47,7 @@ class ZooEntry:
     name: str
     folder: Path
     weights_bytes: int
-    environment: str  # with its version, as `merge-v5`; empty: no result
+    environment: str  # with its version, as `merge-v6`; empty: no result
     trips: int  # of the result
     shares: Mapping[str, float]  # of trips, by a name of `SHARES`
     refused: str = ""  # what is wrong with the entry, and its cure; the rest is empty then

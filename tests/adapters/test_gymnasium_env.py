@@ -18,7 +18,7 @@ MODES = ("closed", "open", "respawn")
 
 def make(mode: str = "closed", kind: str = "flat", **arguments: Any) -> gymnasium.Env[Any, Any]:
     overrides = {"population.mode": mode, "observation.kind": kind}
-    return gymnasium.make("cavmarl/merge-v5", max_cycles=40, overrides=overrides, **arguments)
+    return gymnasium.make("cavmarl/merge-v6", max_cycles=40, overrides=overrides, **arguments)
 
 
 @pytest.mark.parametrize("kind", ["flat", "dict"])
@@ -34,7 +34,7 @@ def test_the_other_agents_become_background() -> None:
     entry, _ = load_config("merge")
     everybody = entry.population.agents + entry.population.background
     assert (population.agents, population.background) == (1, everybody - 1)
-    overridden = gymnasium.make("cavmarl/ring-v4", overrides={"population.background": 3})
+    overridden = gymnasium.make("cavmarl/ring-v5", overrides={"population.background": 3})
     assert overridden.unwrapped._env.config.population.background == 3
 
 
@@ -70,7 +70,7 @@ def test_an_episode_is_one_trip_or_is_cut_at_the_horizon(mode: str) -> None:
 )
 def test_one_vehicle_is_one_vehicle(arguments: dict[str, Any], key: str) -> None:
     with pytest.raises(ConfigError, match=f"^{key}: this view decides it"):
-        gymnasium.make("cavmarl/ring-v4", **arguments)
+        gymnasium.make("cavmarl/ring-v5", **arguments)
 
 
 def test_the_spec_tells_the_horizon_and_makes_the_same_again() -> None:
@@ -78,7 +78,7 @@ def test_the_spec_tells_the_horizon_and_makes_the_same_again() -> None:
     assert world.spec is not None
     assert world.spec.max_episode_steps == 40
     assert gymnasium.make(world.spec).unwrapped._env.max_cycles == 40
-    cut = gymnasium.make("cavmarl/ring-v4", max_episode_steps=2)
+    cut = gymnasium.make("cavmarl/ring-v5", max_episode_steps=2)
     cut.reset(seed=0)
     cut.step(cut.action_space.sample())
     assert cut.step(cut.action_space.sample())[3], "Gymnasium's own limit works, too"
@@ -91,7 +91,7 @@ def test_the_infos_say_what_highway_envs_say() -> None:
     ends = {"crashed": 0, "is_success": 0}
     for seed in range(4):
         driven = seed % 2 == 0
-        world = gymnasium.make("cavmarl/merge-v5", background=0 if driven else 24)
+        world = gymnasium.make("cavmarl/merge-v6", background=0 if driven else 24)
         _, info = world.reset(seed=seed)
         env, done = world.unwrapped._env, False
         while not done:
@@ -119,6 +119,6 @@ def test_config_holds_nested_keys_of_the_entry() -> None:
     assert made.sensors.lanes == entry.sensors.lanes, "what it does not name stays"
     assert made.terms.weights == {**entry.terms.weights, "collision": -9.0}
     with pytest.raises(ConfigError, match="lanes_count"):
-        gymnasium.make("cavmarl/merge-v5", config={"lanes_count": 4})
+        gymnasium.make("cavmarl/merge-v6", config={"lanes_count": 4})
     with pytest.raises(ConfigError, match="must be a mapping of keys"):
-        gymnasium.make("cavmarl/merge-v5", config=[1])
+        gymnasium.make("cavmarl/merge-v6", config=[1])

@@ -21,7 +21,7 @@ def test_the_list_has_the_figures(tmp_path: Path, capsys: pytest.CaptureFixture[
         main(["zoo", "list", "--json", str(out)])
     assert ended.value.code == 0
     told = json.loads(out.read_text())
-    assert told["merge_ippo"]["environment"] == "merge-v5"
+    assert told["merge_ippo"]["environment"] == "merge-v6"
     assert "merge_ippo" in capsys.readouterr().out
 
 
@@ -60,7 +60,7 @@ def test_an_old_result_hides_no_other(
         main(["zoo", "list", "--json", "zoo.json"])
     assert ended.value.code == 1
     told = json.loads(Path("zoo.json").read_text())
-    assert told["merge_ippo"]["environment"] == "merge-v5"
+    assert told["merge_ippo"]["environment"] == "merge-v6"
     assert list(told["old"]) == ["refused"]
     said = capsys.readouterr()
     assert "merge_ippo" in said.out

@@ -38,7 +38,7 @@ def test_the_discrete_ids_have_meta_actions_whatever_else_is_set() -> None:
     """Programs such as CleanRL's take an id and nothing else."""
     five = gymnasium.spaces.Discrete(5)
     assert gymnasium.make("cavmarl/ringDiscrete-v4").action_space == five
-    assert gymnasium.make("cavmarl/ring-v4").action_space != five
+    assert gymnasium.make("cavmarl/ring-v5").action_space != five
     more = {"overrides": {"sensors.lidar.rays": 8}}
     assert gymnasium.make("cavmarl/ringDiscrete-v4", **more).action_space == five
     rows = gymnasium.make_vec("cavmarl/ringDiscreteAgents-v4", num_envs=2, **more)
@@ -126,7 +126,7 @@ def test_odd_folders_beside_fail_no_import(tmp_path: Path, monkeypatch: pytest.M
         [sys.executable, "-W", "error", "-c", told], capture_output=True, text=True, check=True
     )
     ids = set(done.stdout.splitlines())
-    assert {"cavmarl/fine-v999999999", "cavmarl/ring-v4"} <= ids
+    assert {"cavmarl/fine-v999999999", "cavmarl/ring-v5"} <= ids
     assert not any(" " in name or "-dash" in name for name in ids)
     with pytest.raises(cavmarl.ConfigError, match="latin"):
         cavmarl.parallel_env("latin")

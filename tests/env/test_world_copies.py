@@ -126,7 +126,7 @@ def test_agents_in_turn(how: str) -> None:
 
 
 def test_one_vehicle() -> None:
-    one = gymnasium.make("cavmarl/merge-v5")
+    one = gymnasium.make("cavmarl/merge-v6")
     one.reset(seed=4)
     one.step(np.zeros(2, np.float32))
     other = copy.deepcopy(one)

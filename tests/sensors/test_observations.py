@@ -104,7 +104,7 @@ def test_pettingzoo_accepts_all_sensors_together(kind: str, mode: str) -> None:
 def test_gymnasium_accepts_all_sensors_together(kind: str) -> None:
     overrides = {**EVERYTHING, "observation.kind": kind}
     check_env(
-        gymnasium.make("cavmarl/merge-v5", overrides=overrides).unwrapped, skip_render_check=True
+        gymnasium.make("cavmarl/merge-v6", overrides=overrides).unwrapped, skip_render_check=True
     )
 
 
