@@ -138,7 +138,7 @@ def test_the_ids_make_environments() -> None:
     observation, _ = ego.reset(seed=0)
     assert ego.observation_space.contains(observation)
     assert ego.step(ego.action_space.sample())[0].shape == observation.shape
-    rows = gymnasium.make_vec("cavmarl/ringAgents-v4")
+    rows = gymnasium.make_vec("cavmarl/ringAgents-v5")
     observations, _ = rows.reset(seed=0)
     assert observations.shape == rows.observation_space.shape
     ego.close()

@@ -2,7 +2,7 @@
 
 PettingZoo: the module functions `parallel_env`, `env` and `raw_env`, and, from 1.27 on, ids such
 as `cavmarl/merge-v6` in both its registries. Gymnasium: `cavmarl/merge-v6`, one vehicle of the
-world as a single-agent environment, and `cavmarl/mergeAgents-v5` for `gymnasium.make_vec`, all
+world as a single-agent environment, and `cavmarl/mergeAgents-v6` for `gymnasium.make_vec`, all
 agents as rows; `cavmarl/mergeDiscrete-v2` and `cavmarl/mergeDiscreteAgents-v2` are the same with
 meta-actions. highway-env's tasks have its names: `cavmarl-highway/merge-v0` for `merge-v0`.
 """

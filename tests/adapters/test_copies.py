@@ -23,7 +23,7 @@ ROWS = 4
 
 
 def rows(**arguments: Any) -> Any:
-    name = "cavmarl/mergeAgents-v5"
+    name = "cavmarl/mergeAgents-v6"
     made = gymnasium.make_vec(name, num_envs=ROWS, num_worlds=2, **SMALL, **arguments)
     made.reset(seed=1)
     return made

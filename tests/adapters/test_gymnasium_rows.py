@@ -29,7 +29,7 @@ def overrides(mode: str, kind: str = "flat") -> dict[str, Any]:
 
 def make(mode: str = "respawn", kind: str = "flat", **arguments: Any) -> Any:
     settings = {"num_worlds": WORLDS, "background": 4, "max_cycles": 12} | arguments
-    name = "cavmarl/mergeAgents-v5"
+    name = "cavmarl/mergeAgents-v6"
     return gymnasium.make_vec(name, num_envs=ROWS, overrides=overrides(mode, kind), **settings)
 
 
@@ -188,7 +188,7 @@ def test_the_same_seed_gives_the_same_rows() -> None:
 )
 def test_rows_that_cannot_be_are_refused(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        gymnasium.make_vec("cavmarl/mergeAgents-v5", num_envs=ROWS, **arguments)
+        gymnasium.make_vec("cavmarl/mergeAgents-v6", num_envs=ROWS, **arguments)
 
 
 def test_rows_without_autoreset_begin_anew_when_they_are_told_to() -> None:
@@ -262,11 +262,11 @@ def test_torchrls_wrapper_takes_the_rows(autoreset: str) -> None:
 
 def test_the_spec_tells_the_horizon_and_makes_the_same_again() -> None:
     rows = make()
-    assert rows.spec.id == "cavmarl/mergeAgents-v5"
+    assert rows.spec.id == "cavmarl/mergeAgents-v6"
     assert rows.spec.max_episode_steps == 12
     again = gymnasium.make_vec(rows.spec)
     assert (again.num_envs, again.vec.max_cycles) == (ROWS, 12)
-    shorter = gymnasium.make_vec("cavmarl/ringAgents-v4", num_envs=2, max_episode_steps=7)
+    shorter = gymnasium.make_vec("cavmarl/ringAgents-v5", num_envs=2, max_episode_steps=7)
     assert shorter.vec.max_cycles == 7
 
 

@@ -186,7 +186,7 @@ def test_sb3_records_a_video_of_the_worlds(tmp_path: Any, recorded: Any) -> None
 def test_rows_have_the_spec_of_their_entry(rows: Any) -> None:
     from cavmarl.adapters.sb3_vec_env import CavSb3VecEnv
 
-    assert rows.spec.id == "cavmarl/mergeAgents-v5"
+    assert rows.spec.id == "cavmarl/mergeAgents-v6"
     assert rows.get_attr("spec", 0) == [rows.spec]
     assert rows.spec.max_episode_steps == 20
     folder = Path(__file__).parents[2] / "envs" / "ring"

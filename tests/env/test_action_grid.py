@@ -113,5 +113,5 @@ def test_a_network_drives_on_its_own_grid_only(tmp_path: Path) -> None:
     assert vec.action_space.contains(actions)
     with pytest.raises(PolicyError, match=r"action\.grid_steering"):
         load_policy(tmp_path, worlds(**{"action.grid_steering": [0.0, 0.1]}))
-    with pytest.raises(PolicyError, match=r"action\.kind is grid there, discrete here"):
+    with pytest.raises(PolicyError, match=r"action\.kind is grid for it, discrete here"):
         load_policy(tmp_path, worlds(**{"action.kind": "discrete"}))

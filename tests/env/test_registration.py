@@ -37,10 +37,10 @@ def test_every_entry_has_its_ids(name: str) -> None:
 def test_the_discrete_ids_have_meta_actions_whatever_else_is_set() -> None:
     """Programs such as CleanRL's take an id and nothing else."""
     five = gymnasium.spaces.Discrete(5)
-    assert gymnasium.make("cavmarl/ringDiscrete-v4").action_space == five
+    assert gymnasium.make("cavmarl/ringDiscrete-v5").action_space == five
     assert gymnasium.make("cavmarl/ring-v5").action_space != five
     more = {"overrides": {"sensors.lidar.rays": 8}}
-    assert gymnasium.make("cavmarl/ringDiscrete-v4", **more).action_space == five
+    assert gymnasium.make("cavmarl/ringDiscrete-v5", **more).action_space == five
     rows = gymnasium.make_vec("cavmarl/ringDiscreteAgents-v4", num_envs=2, **more)
     assert rows.single_action_space == five
 

@@ -376,9 +376,12 @@ class _PartDispatcher(_Dispatcher):  # type: ignore[misc]
         self.overloads[tuple(result.signature.args)] = result
 
 
+_Integer: Any = Integer
+
+
 def _as_called(kind: Any) -> Any:
     """Return the type of a number or an array as `arguments` hands it over."""
-    is_short = isinstance(kind, Integer) and kind.bitwidth < intp.bitwidth
+    is_short = isinstance(kind, _Integer) and kind.bitwidth < 64
     return intp if is_short else kind
 
 
