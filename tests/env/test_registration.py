@@ -41,7 +41,7 @@ def test_the_discrete_ids_have_meta_actions_whatever_else_is_set() -> None:
     assert gymnasium.make("cavmarl/ring-v5").action_space != five
     more = {"overrides": {"sensors.lidar.rays": 8}}
     assert gymnasium.make("cavmarl/ringDiscrete-v5", **more).action_space == five
-    rows = gymnasium.make_vec("cavmarl/ringDiscreteAgents-v4", num_envs=2, **more)
+    rows = gymnasium.make_vec("cavmarl/ringDiscreteAgents-v5", num_envs=2, **more)
     assert rows.single_action_space == five
 
 
