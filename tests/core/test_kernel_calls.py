@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cavmarl.core.compiled import IS_PLAIN, kernel, specialized
+from cavmarl.core.compiled import IS_PLAIN, kernel, specialized, unchecked
 from cavmarl.core.compiled.arguments import type_key, type_of
 from cavmarl.core.compiled.kernel import CHECKS_INDICES
 
@@ -117,9 +117,10 @@ def test_what_a_kernel_cannot_take_is_a_type_error() -> None:
         same_number([1])
 
 
-def test_a_call_refers_to_no_array_afterwards() -> None:
+@pytest.mark.parametrize("call", [total_of, unchecked(total_of)])
+def test_a_call_refers_to_no_array_afterwards(call: Any) -> None:
     values = np.ones(3)
-    assert total_of(values) == 3.0
+    assert call(values) == 3.0
     gone = weakref.ref(values)
     del values
     gc.collect()

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
 from cavmarl.core.compiled.inlined_function import InlinedFunction
-from cavmarl.core.compiled.kernel import IS_PLAIN, Kernel, specialized
+from cavmarl.core.compiled.kernel import IS_PLAIN, Kernel, specialized, unchecked
 from cavmarl.core.compiled.sources import sources_digest
 
 __all__ = [
@@ -22,6 +22,7 @@ __all__ = [
     "kernel",
     "sources_digest",
     "specialized",
+    "unchecked",
 ]
 
 P = ParamSpec("P")

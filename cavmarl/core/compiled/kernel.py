@@ -150,6 +150,31 @@ def specialized(kernel: Callable[P, R], checks: bool = True) -> Callable[P, R]:
     return call  # type: ignore[no-any-return]
 
 
+def unchecked(kernel: Callable[P, R]) -> Callable[P, R]:
+    """Return a kernel for callers whose arguments always have the types of the first call.
+
+    Nothing is compared, and nothing refers to the arguments afterwards: for small kernels that all
+    callers of a process share.
+    """
+    if not isinstance(kernel, Kernel):
+        return kernel
+    call: Any = _Unchecked(kernel)
+    return call  # type: ignore[no-any-return]
+
+
+class _Unchecked:
+    __slots__ = ("_call", "_kernel")
+
+    def __init__(self, kernel: Kernel) -> None:
+        self._kernel = kernel
+        self._call: TypedKernel | None = None
+
+    def __call__(self, *arguments: Any) -> Any:
+        if self._call is None:
+            self._call = self._kernel.call_for(arguments)
+        return self._call(arguments)
+
+
 class _Specialized:
     __slots__ = ("_call", "_checks", "_kernel", "_words")
 

@@ -10,7 +10,7 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.compiled import inlined_kernel, kernel, specialized
+from cavmarl.core.compiled import inlined_kernel, kernel, unchecked
 
 LARGE = 1 << 12  # bytes; of fewer the CRC is as fast
 _PRIME = np.uint64(0x9E3779B97F4A7C15)
@@ -40,7 +40,7 @@ def _step(state: np.uint64, word: np.uint64) -> np.uint64:
     return state ^ (state >> _SHIFT)
 
 
-_mixed = specialized(mixed, checks=False)
+_mixed = unchecked(mixed)
 
 
 def checksum(data: bytes | bytearray | memoryview) -> int:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.compiled import specialized
+from cavmarl.core.compiled import specialized, unchecked
 from cavmarl.core.errors import MessageError
 from cavmarl.parallel.nodes.link import Bytes
 from cavmarl.parallel.step_arrays import StepArrays
@@ -24,7 +24,7 @@ Agents = NDArray[np.int64]
 ZoneRects = list[list[float]]
 """Zones as `node_cuts.told_zones` gives them."""
 
-_pack = specialized(pack_actions, checks=False)
+_pack = unchecked(pack_actions)
 
 
 class Actions(NamedTuple):

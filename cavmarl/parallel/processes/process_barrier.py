@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.compiled import IS_PLAIN, kernel, specialized
+from cavmarl.core.compiled import IS_PLAIN, kernel, unchecked
 from cavmarl.core.compiled.intrinsic import intrinsic
 
 Words = NDArray[np.int64]
@@ -194,11 +194,11 @@ _has, _set, _look, _pass, present_core = (
     (_plain_has, _plain_set, _plain_look, _plain_pass, _plain_core)
     if IS_PLAIN
     else (
-        specialized(_compiled_has, checks=False),
-        specialized(_compiled_set, checks=False),
-        specialized(_compiled_look, checks=False),
-        specialized(_compiled_pass, checks=False),
-        specialized(_compiled_core, checks=False),
+        unchecked(_compiled_has),
+        unchecked(_compiled_set),
+        unchecked(_compiled_look),
+        unchecked(_compiled_pass),
+        unchecked(_compiled_core),
     )
 )
 
