@@ -143,7 +143,7 @@ def _compiled_has(theirs: Words, number: int) -> bool:
 def _compiled_set(mine: Words, at: int, value: int, theirs: Words) -> int:
     """Write a word, then read whether the other side sleeps."""
     _store(mine, at, value)
-    return _load(theirs, ASLEEP)  # type: ignore[no-any-return]
+    return _load(theirs, ASLEEP)
 
 
 @kernel
@@ -166,7 +166,7 @@ def _compiled_pass() -> None:
 
 @kernel
 def _compiled_core() -> int:
-    return _core()  # type: ignore[no-any-return]
+    return _core()
 
 
 def _plain_core() -> int:
