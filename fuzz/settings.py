@@ -17,6 +17,7 @@ from cavmarl.balance.plan_text import describe_plan
 from cavmarl.balance.problem import Problem, equal_costs
 from cavmarl.cli.output import parse_settings
 from cavmarl.config.action import ActionConfig
+from cavmarl.config.driver_form import CONFIG_FILE, WEIGHTS_FILE
 from cavmarl.config.env import EnvConfig
 from cavmarl.config.io import read_yaml, validate
 from cavmarl.config.registry import load_config
@@ -30,7 +31,7 @@ from cavmarl.evaluate.provenance.manifest import (
 from cavmarl.evaluate.provenance.training_record import CHECKPOINT_FILE
 from cavmarl.learning.actor_critic import ActorCritic, load_network, save_network
 from cavmarl.learning.checkpoint import RunState, read_checkpoint, sealed, write_checkpoint
-from cavmarl.policies.network_files import CONFIG_FILE, WEIGHTS_FILE, NetworkConfig
+from cavmarl.policies.network_files import NetworkConfig
 from fuzz.files import ROOT, Target, scratch, seed
 
 __all__ = ["CHECKPOINTS", "DRIVERS", "ENTRIES", "MANIFESTS", "OVERRIDES", "PLANS"]

@@ -15,13 +15,12 @@ import torch
 from safetensors.torch import save
 from torch import Tensor, nn
 
+from cavmarl.config.driver_form import CONFIG_FILE, WEIGHTS_FILE
 from cavmarl.core.whole_file import write_whole
 from cavmarl.policies.network_files import (
-    CONFIG_FILE,
     CONTINUOUS_ACTIONS,
     MAX_DEVIATIONS,
     RESIDUAL_PARTS,
-    WEIGHTS_FILE,
     NetworkConfig,
     read_network,
 )

@@ -15,6 +15,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, ClassVar, Protocol, Self, TypeVar
 
 from cavmarl.balance.balance_plan import Plan
+from cavmarl.config.driver_form import CONFIG_FILE, WEIGHTS_FILE
 from cavmarl.config.io import validate
 from cavmarl.core.errors import ConfigError, TrainingError
 from cavmarl.core.whole_file import remove_dead_drafts
@@ -39,7 +40,7 @@ from cavmarl.learning.checkpoint import (
 )
 from cavmarl.learning.log import CSV_FILE, Log, cut_logs
 from cavmarl.learning.options import given_options, settings_of
-from cavmarl.policies.network_files import CONFIG_FILE, WEIGHTS_FILE, NetworkConfig
+from cavmarl.policies.network_files import NetworkConfig
 
 if sys.platform != "win32":
     import fcntl

@@ -17,7 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
-from cavmarl.config.driver_form import differing_keys, form_of, form_of_driver
+from cavmarl.config.driver_form import (
+    CONFIG_FILE,
+    WEIGHTS_FILE,
+    differing_keys,
+    form_of,
+    form_of_driver,
+)
 from cavmarl.config.driver_names import SHIELDED, find_driver, name_of_driver, shared_drivers
 from cavmarl.core.errors import PolicyError
 from cavmarl.core.tracebacks import fault_in
@@ -186,8 +192,6 @@ def policy_files(policy: str | Path) -> tuple[Path, ...]:
     path = find_driver(policy.removeprefix(SHIELDED) if isinstance(policy, str) else policy)
     if not path.is_dir():
         return (path,)
-    from cavmarl.policies.network_files import CONFIG_FILE, WEIGHTS_FILE  # imports pydantic
-
     files = (path / WEIGHTS_FILE, path / CONFIG_FILE)
     for file in files:
         if not file.is_file():

@@ -14,10 +14,11 @@ import pytest
 from numpy.typing import NDArray
 from safetensors.numpy import load_file, save_file
 
+from cavmarl.config.driver_form import CONFIG_FILE, WEIGHTS_FILE
 from cavmarl.config.registry import agent_entries
 from cavmarl.core.errors import PolicyError
 from cavmarl.policies.driver_network import DriverNetwork, load_driver_network
-from cavmarl.policies.network_files import CONFIG_FILE, WEIGHTS_FILE, read_network
+from cavmarl.policies.network_files import read_network
 from cavmarl.policies.policy import load_policy
 from tests.support.saved_drivers import save_driver, small_vec
 

@@ -136,7 +136,7 @@ def _core() -> int:
 
 @kernel
 def _compiled_has(theirs: Words, number: int) -> bool:
-    return _load(theirs, NUMBER) >= number  # type: ignore[no-any-return]
+    return _load(theirs, NUMBER) >= number
 
 
 @kernel
