@@ -41,7 +41,9 @@ class KernelHook(BuildHookInterface[Any]):
             return
         self._folder = tempfile.mkdtemp(prefix="cavmarl-kernels-")
         command = [sys.executable, "-m", "cavmarl.prebuild", "build", self._folder]
-        environment = {**os.environ, "PYTHONPATH": self.root}
+        # An isolated build finds its own requirements by the path that is set already.
+        paths = [self.root, *filter(None, [os.environ.get("PYTHONPATH")])]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
         subprocess.run(command, cwd=self.root, env=environment, check=True)
         for path in Path(self._folder).iterdir():
             build_data["force_include"][str(path)] = f"{PLACE}/{path.name}"
