@@ -20,9 +20,10 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[1]
 # torch's wheels differ by processor.
-LOCKED = "sumo,maps,followers,nodes,recordings,render,report,service"
+LOCKED = "compile,sumo,maps,followers,nodes,recordings,render,report,service"
 EXTRAS = (
     "",
+    "compile",
     "sumo",
     "maps",
     "followers",
