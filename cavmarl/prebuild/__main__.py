@@ -50,9 +50,11 @@ def build(folder: Path, processes: int) -> None:
             "`make kernels`"
         )
     count = compile_into_cache(calls, processes or usable_processes())
-    kernels = [kernel for call in calls if (kernel := kernel_file(call).load())]
-    if len(kernels) < len(calls):
+    found = [kernel_file(call).load() for call in calls]
+    if None in found:
         raise KernelError(f"{cache_dir()} does not keep compiled kernels: set CAVMARL_CACHE_DIR")
+    # Code for arrays of any layout serves calls with contiguous arrays, too.
+    kernels = list({kernel.symbol: kernel for kernel in found if kernel is not None}.values())
     link(kernels, folder)
     size = sum(path.stat().st_size for path in folder.iterdir()) / 1e6
     print(
