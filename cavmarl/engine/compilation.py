@@ -50,7 +50,7 @@ def prepare_kernels() -> None:
         return
     print(
         "cavmarl: compiling the kernels of a first step, once for this version and machine: about "
-        "25 s of processor time, shared by two processes",
+        "40 s of processor time, shared by two processes",
         file=sys.stderr,
         flush=True,
     )
