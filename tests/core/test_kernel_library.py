@@ -159,7 +159,10 @@ def test_without_a_library_kernels_are_compiled_or_refused(
     assert again(1.0, 2.0) == expected
     assert not (tmp_path / "cache").exists(), "it came from the library"
 
-    _flip(copied / LIBRARY_FILE, 1000)
+    damaged = Path(shutil.copytree(copied, tmp_path / "damaged"))  # the other one is in use
+    _flip(damaged / LIBRARY_FILE, 1000)
+    anew.setattr(Library.__init__, "__defaults__", (damaged,))
+    anew.setattr(library, "FOLDER", damaged)
     machine_code.kernel_source.cache_clear()
     again = kernel(function.py_func)
     assert again(1.0, 2.0) == expected
