@@ -173,9 +173,6 @@ class Tick:
                 self.division.everybody_next() as everybody,
             ):
                 traffic.rerouting.act(gate, everybody)
-        if traffic.found_ways is not None and traffic.found_ways.turned_away:
-            with self.division.everybody_next() as everybody:
-                traffic.found_ways.turn_away(gate, everybody)
 
     def _note_left(self) -> None:
         if self.coordination is not None:

@@ -31,7 +31,6 @@ from cavmarl.core.records.arrays import (
 )
 from cavmarl.core.records.codes import DRIVER_BACKGROUND, DRIVER_SUMO
 from cavmarl.driving.kernels.approach import APPROACH
-from cavmarl.driving.kernels.held_vehicles import HeldVehicles, no_held
 from cavmarl.driving.kernels.lane_index import ENTRY
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.roads.network import RoadNetwork
@@ -136,12 +135,6 @@ class Shard:
             common=None if first is None else first.worlds,
             zeros=zeros,
             num_cues=len(travel.scripts.cues),
-        )
-        # Of all zones of this process; it is written anew for each tick that holds some.
-        self.held: HeldVehicles = (
-            no_held(len(zoned.num_owned), num_worlds, capacity * config.zones.holds)
-            if first is None
-            else first.held
         )
         self.sides = (self.worlds.rows, zoned.rows[1, zone])
         self.side = self.next_side = 0  # in which of them the committed rows are

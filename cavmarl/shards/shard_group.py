@@ -135,7 +135,6 @@ class ShardGroup:
             self._members,
             first.side,
             first.next_side,
-            first.held,
             self._roads,
             first.plans,
             self._travel,

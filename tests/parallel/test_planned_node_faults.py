@@ -173,11 +173,6 @@ def deaths_at(point: str, tick: int, nodes: list[int], seeds: int, messages: dic
             "one world at a time, not in 2",
         ),
         ({"messages": {"Letter": {}}}, {}, "are none of Step"),
-        (
-            {},
-            {"overrides": {"zones.policy": "hold", "zones.grace_ticks": 2}},
-            "zones.policy = 'hold'.*use force or extend",
-        ),
         ("nowhere.json", {}, "nowhere.json: No such file.*name a file of JSON"),
     ],
 )

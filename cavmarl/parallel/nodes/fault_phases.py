@@ -147,9 +147,4 @@ def node_faults(settings: ZonesConfig, zones: int, num_worlds: int) -> Faults | 
     for key, (is_there, why) in refused.items():
         if is_there:
             raise ConfigError(f"zones.faults, {key}: not over nodes: {why}")
-    if settings.holds:
-        raise ConfigError(
-            f"zones.faults with zones.policy = {settings.policy!r}: not over nodes, where no "
-            "vehicle is held before a border; use force or extend, or leave out nodes"
-        )
     return faults

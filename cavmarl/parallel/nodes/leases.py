@@ -28,5 +28,5 @@ def leases_of(ticks: int, lease: int) -> int:
 def late_ticks(config: EnvConfig) -> int:
     """For how many ticks more than one a vehicle that has crossed may stay with its zone."""
     if config.zones.faults:
-        return limits_of(config.zones).longest_deferral
+        return limits_of(config.zones).deferral
     return lease_ticks(config) - 1

@@ -28,7 +28,6 @@ from cavmarl.core.records.arrays import (
     Zoned,
 )
 from cavmarl.core.records.codes import DRIVER_AGENT
-from cavmarl.driving.kernels.held_vehicles import HeldVehicles
 from cavmarl.roads.kernels.signal_phases import detect
 from cavmarl.sensors.kernels.output_reset import credit
 from cavmarl.sensors.kernels.sense import sense
@@ -117,7 +116,6 @@ def advance_each(
     members: Members,
     side: int,
     next_side: int,
-    held: HeldVehicles,
     roads: RoadArrays,
     plans: NDArray[np.void],
     travel: Travel,
@@ -139,8 +137,6 @@ def advance_each(
             lane_grid,
             _worlds(members, zone, side, next_side),
             members.halo.inner[zone],
-            held.rows[zone],
-            held.counts[zone],
             scratch,
             commands,
             discrete,
