@@ -117,6 +117,8 @@ REFUSED = {
     ("a network simulator", "worlds on Ray"): OF_THE_CALLER,
     ("a journal", "worlds on Ray"): NOT_ON_HOSTS,
     ("planned faults", "worlds on Ray"): NOT_ON_HOSTS,
+    ("planned faults", "nodes"): NOT_OVER_NODES,
+    ("planned faults", "nodes on Ray"): NOT_OVER_NODES,
     ("sensor workers", "worlds on Ray"): "leave out the hosts",
     ("balance by LoadScore", "worlds on Ray"): "or leave out the hosts",
     ("sensor workers", "nodes on Ray"): NOT_OVER_NODES,
