@@ -12,9 +12,6 @@ from cavmarl.cli import main as cavmarl
 KEPT = {
     "step": "Agent-steps a second next to highway-env's.",
     "traffic": "Our traffic next to SUMO's own run of the same demand.",
-    "workers": "Worlds over several workers.",
-    "sensors": "One vehicle's sensors over several sensor workers.",
-    "clock": "The clock of a master and that of a follower in another process.",
     "train": "PPO from end to end next to stable-baselines3's.",
 }
 

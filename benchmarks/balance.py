@@ -13,10 +13,11 @@ from typing import Annotated, Any
 import typer
 
 from benchmarks.balance_replay import BalanceReplay, replay_traces
-from benchmarks.harness import Report, Say, about, check_range, run, silent
 from benchmarks.load_traces import LoadTrace, generated_trace, recorded_trace
+from benchmarks.program import run
 from cavmarl.balance.problem import BalanceRule
-from cavmarl.cli.output import Seed, Settings, parse_settings
+from cavmarl.bench.harness import BenchmarkReport, Say, check_range, silent
+from cavmarl.cli.output import Seed, Settings, about, parse_settings
 from cavmarl.config.zones import ZONE_LAYOUTS
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import find_map
@@ -47,7 +48,7 @@ def measure(
     seed: Seed = 0,
     settings: Settings = None,
     say: Say = silent,
-) -> Report:
+) -> BenchmarkReport:
     """Static, balanced and the extensions on the same traces: makespans beside the static one's."""
     rule = BalanceRule(tolerance=tolerance, max_moves=max_moves, move_s=1e-3 * move_ms)
     check_range(workers=(workers, 1, float("inf")))
@@ -68,7 +69,7 @@ def measure(
     return _report(replay_traces(found, rule), "recorded" if recorded else "generated")
 
 
-def _report(found: BalanceReplay, kind: str) -> Report:
+def _report(found: BalanceReplay, kind: str) -> BenchmarkReport:
     shown = [
         {
             **asdict(row),
@@ -80,7 +81,7 @@ def _report(found: BalanceReplay, kind: str) -> Report:
     placed = [row for row in found.rows if row.name not in ("static", "perfect")]
     verdicts = dict.fromkeys(row.verdict for row in placed)
     (fitted,) = (row.weights for row in placed if row.name == "calibrated")
-    return Report(
+    return BenchmarkReport(
         f"{found.map_name}: {found.zones} zones on {found.workers} workers, {found.traces} {kind} "
         f"traces of {found.rounds} rounds",
         {

@@ -14,18 +14,18 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.harness import (
-    Report,
+from benchmarks.program import run
+from cavmarl.bench.harness import (
+    BenchmarkReport,
     Say,
-    about,
     check_positive,
     check_range,
     one_core,
     paired_ratio,
-    run,
     silent,
     take_turns,
 )
+from cavmarl.cli.output import about
 from cavmarl.config.action import ActionConfig
 from cavmarl.config.sensors import SensorsConfig
 from cavmarl.core.errors import require
@@ -44,7 +44,7 @@ def measure(
     repeats: Annotated[int, about("Turns.")] = 40,
     most_ratio: Annotated[float | None, about("Exit with 1 if the ratio is above this.")] = None,
     say: Say = silent,
-) -> Report:
+) -> BenchmarkReport:
     """Time of a driver's forward pass: the kernel that evaluates drivers, and torch."""
     check_range(rows=(rows, 1, 1_000_000), inputs=(inputs, 1, MAX_OBSERVATION_SIZE))
     check_range(hidden=(hidden, 1, MAX_WIDTH), repeats=(repeats, 1, 100_000))
@@ -67,7 +67,7 @@ def measure(
                 found.append({"form": name} | _compare(config, rows, repeats, say))
         finally:
             torch.set_num_threads(threads)
-    return Report(
+    return BenchmarkReport(
         title=f"{rows} rows, widths {inputs}, {hidden}, {hidden}, 2, one core: ns per row",
         columns={"layers": "form", "kernel": "kernel_ns:,.0f", "torch": "torch_ns:,.0f"}
         | {"ratio": "ratio:.2f", "largest difference": "difference:.1e"},

@@ -14,16 +14,16 @@ from functools import partial
 from statistics import median
 from typing import Annotated, Any
 
-from benchmarks.harness import (
-    Report,
+from benchmarks.program import run
+from cavmarl.bench.harness import (
+    BenchmarkReport,
     Say,
-    about,
     check_positive,
     check_range,
     one_core,
-    run,
     silent,
 )
+from cavmarl.cli.output import about
 from cavmarl.core.errors import MissingExtraError, require
 from cavmarl.env.parallel import parallel_env
 from cavmarl.env.vector import make_vec
@@ -42,7 +42,7 @@ def measure(
         float | None, about("Exit with 1 if TorchRL's view adds more ms a step.")
     ] = None,
     say: Say = silent,
-) -> Report:
+) -> BenchmarkReport:
     """What the libraries' views add to a step of the same world, in the processor's time."""
     check_positive("--at-most", at_most)
     check_range(agents=(agents, 1, 10_000), steps=(steps, 1, 10_000))
@@ -59,7 +59,7 @@ def measure(
                 row["missing"] = str(error)
             rows.append(row)
     added = next(row["added_ms"] for row in rows if row["view"] == "torchrl")
-    return Report(
+    return BenchmarkReport(
         f"a step of one world with {agents:,} agents, in ms of one core: medians of {steps} steps",
         {"view": "view", "a step": "step_ms:.2f", "of it the view's": "added_ms:.2f"},
         rows,

@@ -15,8 +15,9 @@ from typing import Annotated, Any
 import numpy as np
 
 import cavmarl
-from benchmarks.harness import Env, Report, Say, about, check_range, numbers_of, run, silent
-from cavmarl.cli.output import Settings, parse_settings
+from benchmarks.program import run
+from cavmarl.bench.harness import BenchmarkReport, Say, check_range, numbers_of, silent
+from cavmarl.cli.output import OptionalEnvironment, Settings, about, parse_settings
 from cavmarl.core.errors import ConfigError
 from cavmarl.cosim.followers.follower_client import FollowerView, sight_of
 from cavmarl.cosim.followers.follower_snapshots import SnapshotTime, take_snapshot, welcome_to
@@ -36,7 +37,7 @@ CLOUD_SPACING_M, CLOUD_NOISE_M = 0.4, 0.03  # of the map's own surface
 
 
 def measure(
-    env: Env = "grid4x4",
+    env: OptionalEnvironment = "grid4x4",
     cloud: Annotated[Path | None, about("A point-cloud map; none: the map's own surface.")] = None,
     buildings: Annotated[str, about("As map.buildings.")] = "map/buildings.poly.xml",
     noise: Annotated[float, about("Of GNSS, standard deviation, m.")] = 1.0,
@@ -48,7 +49,7 @@ def measure(
     seeds: Annotated[str, about("A drive for each, with commas between.")] = "1,2,3",
     settings: Settings = None,
     say: Say = silent,
-) -> Report:
+) -> BenchmarkReport:
     """How far the place is off, by GNSS, IMU and odometry, and with scan matching."""
     check_range(time_s=(time_s, 1.0, 3600.0), skip_s=(skip_s, 0.0, time_s - STEP_S))
     check_range(noise=(noise, 0.0, 100.0), bias=(bias, 0.0, 100.0))
@@ -75,7 +76,7 @@ def measure(
         "GNSS: how far its fixes are off in the mean; used, refused: scans; ms: a step, processor"
     ]
     title = f"place off, m: GNSS {noise:g} m of noise, {bias:g} m of bias"
-    return Report(title + ("" if markings else ", no lane markings"), columns, rows, notes)
+    return BenchmarkReport(title + ("" if markings else ", no lane markings"), columns, rows, notes)
 
 
 def rig_with(noise_m: float, bias_m: float, markings: bool) -> dict[str, dict[str, Any]]:

@@ -12,18 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.filling import write_filling_demand
-from benchmarks.harness import (
-    Env,
-    Report,
+from benchmarks.program import run
+from cavmarl.bench.harness import (
+    BenchmarkReport,
     Say,
-    about,
     check_positive,
     paired_ratio,
-    run,
     silent,
     take_turns,
 )
-from cavmarl.cli.output import Seed, Settings, parse_settings
+from cavmarl.cli.output import OptionalEnvironment, Seed, Settings, about, parse_settings
 from cavmarl.core.errors import ConfigError, EvaluationError
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv, make_vec
@@ -34,7 +32,7 @@ SETTLE_ROUNDS = 6  # before anything is timed
 
 
 def measure(
-    env: Env = "grid4x4",
+    env: OptionalEnvironment = "grid4x4",
     worlds: Annotated[int, about("Number of parallel worlds.")] = 16,
     workers: Annotated[int, about("Workers that the worlds are shared out over.")] = 2,
     lead: Annotated[int, about("Steps before half of the worlds begin anew.")] = 600,
@@ -48,7 +46,7 @@ def measure(
         float | None, about("Exit with 1 if moving is not so many times faster.")
     ] = None,
     say: Say = silent,
-) -> Report:
+) -> BenchmarkReport:
     """Worlds of unequal cost over workers: shared out by number, and moving by what they cost.
 
     Worlds fill, half of them begin anew, and they are stepped, placed once and moving, by turns.
@@ -108,12 +106,12 @@ def _report(
     workers: int,
     vehicles: tuple[int, ...],
     at_least: float | None,
-) -> Report:
+) -> BenchmarkReport:
     fixed, moving = rows
     half = len(vehicles) // 2
     ratio = paired_ratio(fixed["step_ms"], moving["step_ms"])
     processor_ratio = fixed["busiest_ms"] / moving["busiest_ms"]
-    return Report(
+    return BenchmarkReport(
         f"{env}: {len(vehicles)} worlds over {workers} workers; {half} of "
         f"{statistics.fmean(vehicles[:half]):.0f} vehicles, {len(vehicles) - half} of "
         f"{statistics.fmean(vehicles[half:]):.0f}",

@@ -15,7 +15,9 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from benchmarks.harness import Env, Report, Say, about, check_positive, run, silent
+from benchmarks.program import run
+from cavmarl.bench.harness import BenchmarkReport, Say, check_positive, silent
+from cavmarl.cli.output import OptionalEnvironment, about
 from cavmarl.config.registry import load_config
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.processes import start_python
@@ -35,14 +37,14 @@ SERVES = "import sys; from benchmarks.node_latencies import serve; serve(*sys.ar
 
 
 def measure(
-    env: Env = "merge",
+    env: OptionalEnvironment = "merge",
     nodes: Annotated[int, about("Nodes; as many zones.")] = 2,
     turns: Annotated[int, about(f"Turns of {TURN_STEPS} steps without traffic.")] = 20,
     kills: Annotated[int, about("Times that a node is killed.")] = 100,
     background: Annotated[int, about("Vehicles beside the agent while nodes are killed.")] = 20,
     seed: Annotated[int, about("Of the moments at which nodes are killed.")] = 0,
     say: Say = silent,
-) -> Report:
+) -> BenchmarkReport:
     """Time ticks of a world with one vehicle; then kill nodes, and wait for the zones to go on."""
     check_positive("--turns", turns)
     check_positive("--kills", kills)
@@ -51,7 +53,7 @@ def measure(
     say("empty ticks")
     rows = _empty_ticks(env, nodes, turns)
     rows.append(_kills(env, nodes, kills, background, random.Random(seed), say))
-    return Report(
+    return BenchmarkReport(
         f"{nodes} nodes of this machine, {os.cpu_count()} cores",
         {
             "what": "what",

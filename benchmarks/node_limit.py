@@ -12,8 +12,10 @@ from pathlib import Path
 from statistics import median
 from typing import Annotated, Any
 
-from benchmarks.harness import Report, Say, about, check_positive, run, silent
+from benchmarks.program import run
 from benchmarks.world_processes import PER_JUNCTION, WorldProcess, make_city
+from cavmarl.bench.harness import BenchmarkReport, Say, check_positive, silent
+from cavmarl.cli.output import about
 from cavmarl.core.errors import ConfigError
 
 
@@ -22,7 +24,7 @@ def measure(
     steps: Annotated[int, about("Steps of each turn.")] = 40,
     repeats: Annotated[int, about("Turns of each side, one after the other.")] = 7,
     say: Say = silent,
-) -> Report:
+) -> BenchmarkReport:
     """Time a city, half of it alone, and two halves at once, by turns."""
     check_positive("--steps", steps)
     check_positive("--repeats", repeats)
@@ -48,7 +50,7 @@ def measure(
                     found[name].append(_turn(some, steps))
     base_s = median(wall_s for wall_s, _ in next(iter(found.values())))
     rows = [_row(name, turns, base_s) for name, turns in found.items()]
-    return Report(
+    return BenchmarkReport(
         "what two nodes can gain at most",
         {"world": "world", "ms": "wall_ms:.3g", "cpu ms": "cpu_ms:.3g", "faster": "faster:.2f"},
         rows,

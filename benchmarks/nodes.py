@@ -12,9 +12,11 @@ from pathlib import Path
 from statistics import median
 from typing import Annotated, Any, NamedTuple
 
-from benchmarks.harness import Report, Say, about, numbers_of, paired_interval, run, silent
 from benchmarks.node_costs import NodeCosts, NodeSample, caches_here, fitted
+from benchmarks.program import run
 from benchmarks.world_processes import PER_JUNCTION, Turn, WorldProcess, make_city
+from cavmarl.bench.harness import BenchmarkReport, Say, numbers_of, paired_interval, silent
+from cavmarl.cli.output import about
 from cavmarl.core.errors import ConfigError
 
 PREDICTED = (10_000, 100_000, 1_000_000, 10_000_000)
@@ -39,7 +41,7 @@ def measure(
         ),
     ] = False,
     say: Say = silent,
-) -> Report:
+) -> BenchmarkReport:
     """Measure worlds by turns, fit a model to the runs with 0 to 2 nodes, and compare the rest.
 
     Each world is in processes of its own, and has its heap in huge pages. They take turns in one
@@ -61,7 +63,7 @@ def measure(
     known = [s for s in samples.values() if s.nodes <= 2 and s.latency_s == 0.0]
     costs, cores = fitted(known, caches_here()), os.cpu_count() or 1
     rows = [_row(side, samples, turns, costs, cores) for side in samples]
-    return Report(
+    return BenchmarkReport(
         f"a city over nodes, {cores} cores",
         {
             "vehicles": "vehicles:,",

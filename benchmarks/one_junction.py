@@ -12,7 +12,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
-from benchmarks.harness import Report, Say, about, check_range, numbers_of, run, silent
+from benchmarks.program import run
+from cavmarl.bench.harness import BenchmarkReport, Say, check_range, numbers_of, silent
+from cavmarl.cli.output import about
 from cavmarl.core.errors import ConfigError, require
 from cavmarl.evaluate.traffic.traffic_comparison import compare_traffic
 
@@ -34,7 +36,7 @@ def measure(
     seeds: Annotated[str, about("Seeds of trips and of both, as 1,2,3.")] = "1,2,3",
     seconds: Annotated[int, about("Simulated seconds of each run.")] = 900,
     say: Say = silent,
-) -> Report:
+) -> BenchmarkReport:
     """Arrivals, delay and speed at one junction over several seeds: sums of ours over SUMO's."""
     check_range(seconds=(seconds, 1, 100_000))
     chosen = numbers_of("--seeds", seeds)
@@ -49,7 +51,7 @@ def measure(
                 say(f"{kind}, {flow}")
                 rows.append({"kind": kind} | _row(net, flow, chosen, seconds))
     columns = {head: head for head in rows[0]}
-    return Report(f"ours (SUMO's), {seconds} s, seeds {seeds}", columns, rows)
+    return BenchmarkReport(f"ours (SUMO's), {seconds} s, seeds {seeds}", columns, rows)
 
 
 def _draw(kind: str, folder: Path) -> Path:

@@ -9,9 +9,10 @@ from typing import Annotated
 
 import typer
 
-from benchmarks.harness import Report, Say, about, check_range, run, silent
-from cavmarl.bench.stopwatch import Stopwatch
-from cavmarl.cli.output import Agents, Background, Seed, Settings, parse_settings
+from benchmarks.program import run
+from benchmarks.stopwatch import Stopwatch
+from cavmarl.bench.harness import BenchmarkReport, Say, check_range, silent
+from cavmarl.cli.output import Agents, Background, Seed, Settings, about, parse_settings
 from cavmarl.env.vector import CavVectorEnv, make_vec
 
 VIEW = "view"  # actions checked and decoded, results copied: what is no phase
@@ -27,7 +28,7 @@ def measure(
     seed: Seed = 0,
     settings: Settings = None,
     say: Say = silent,
-) -> Report:
+) -> BenchmarkReport:
     """The processor's nanoseconds a vehicle and step, phase by phase.
 
     A world with stopwatches and one without go the same ways, by turns. What the stopwatch takes
@@ -52,7 +53,7 @@ def measure(
     timed_ns, plain_ns = best.ns * share, min(without for _, without, _ in turns) * share
     vehicles, acting = best.vehicle_steps / steps, best.agent_steps / steps
     ticks = timed.config.clock.ticks_per_step
-    return Report(
+    return BenchmarkReport(
         f"{vehicles:,.0f} vehicles, {acting:,.0f} of them agents; {ticks} ticks a step",
         {"phase": "name", "ns a vehicle and step": "ns:,.0f", "share": "share:.1%"},
         [

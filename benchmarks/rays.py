@@ -14,7 +14,9 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from benchmarks.harness import Report, Say, about, check_range, one_core, run, silent, take_turns
+from benchmarks.program import run
+from cavmarl.bench.harness import BenchmarkReport, Say, check_range, one_core, silent, take_turns
+from cavmarl.cli.output import about
 from cavmarl.config.registry import load_config
 from cavmarl.engine.rig_component import MountedSensors
 from cavmarl.engine.simulation import Simulation
@@ -37,7 +39,7 @@ LIDAR = {"type": "lidar", "rays": 64, "z_m": 0.8, "range_m": 100.0}
 
 def measure(
     repeats: Annotated[int, about("Turns of each sensor.")] = 5, say: Say = silent
-) -> Report:
+) -> BenchmarkReport:
     """Each sensor of the rig `ten_sensors`, and all together, at 400 cars/km² on one core.
 
     The rows are means over 100 vehicles of one world; what a tick of ten sensors takes is measured
@@ -58,7 +60,7 @@ def measure(
     lidar_ns = next(row["number_ns"] for row in rows if row["name"] == PLANE_LIDAR)
     cameras_ms = 1e-3 * (us["depth_camera"] + us["semantic_camera"])
     density = float(many.running()[0]) / _area_km2(many)
-    return Report(
+    return BenchmarkReport(
         f"{density:.0f} cars/km², {repeats} turns, one core",
         {
             "sensor": "name",

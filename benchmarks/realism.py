@@ -11,7 +11,9 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any
 
-from benchmarks.harness import Report, Say, about, check_range, numbers_of, run, silent
+from benchmarks.program import run
+from cavmarl.bench.harness import BenchmarkReport, Say, check_range, numbers_of, silent
+from cavmarl.cli.output import about
 from cavmarl.core.errors import require
 from cavmarl.evaluate.traffic.traffic_comparison import compare_traffic
 from cavmarl.evaluate.traffic.traffic_metrics import TrafficFigures
@@ -40,7 +42,7 @@ def measure(
     seeds: Annotated[str, about("Seeds of both, as 1,2,3.")] = "1,2,3",
     seconds: Annotated[int, about("Simulated seconds of each run.")] = 900,
     say: Say = silent,
-) -> Report:
+) -> BenchmarkReport:
     """Ours beside SUMO's over several seeds; of each figure the least and the greatest."""
     check_range(seconds=(seconds, 1, 100_000))
     chosen = numbers_of("--seeds", seeds)
@@ -61,7 +63,7 @@ def measure(
         shown = {head: _both(ours, sumo, *figure) for head, figure in COLUMNS.items()}
         rows.append({"demand": name, **shown})
     columns = {"demand": "demand", **{head: head for head in COLUMNS}}
-    return Report(f"ours (SUMO's), {seconds} s, seeds {seeds}", columns, rows, notes)
+    return BenchmarkReport(f"ours (SUMO's), {seconds} s, seeds {seeds}", columns, rows, notes)
 
 
 def _both(

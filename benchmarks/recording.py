@@ -9,24 +9,22 @@ from tempfile import TemporaryDirectory
 from time import perf_counter, thread_time
 from typing import Annotated
 
-from benchmarks.harness import (
-    Env,
-    Report,
+from benchmarks.program import run
+from cavmarl.bench.harness import (
+    BenchmarkReport,
     Say,
-    about,
     check_positive,
     paired_ratio,
-    run,
     silent,
     take_turns,
 )
-from cavmarl.cli.output import Seed
+from cavmarl.cli.output import OptionalEnvironment, Seed, about
 from cavmarl.core.errors import ConfigError
 from cavmarl.env.vector import CavVectorEnv, make_vec
 
 
 def measure(
-    env: Env = "town",
+    env: OptionalEnvironment = "town",
     vehicles: Annotated[int, about("Vehicles of the world, one in ten of them an agent.")] = 1000,
     steps: Annotated[int, about("Steps of a turn; several parts are written in it.")] = 400,
     turns: Annotated[int, about("Turns of each side.")] = 7,
@@ -35,7 +33,7 @@ def measure(
         float | None, about("Exit with 1 if a recorded step takes more times as long.")
     ] = None,
     say: Say = silent,
-) -> Report:
+) -> BenchmarkReport:
     """Milliseconds a step with and without a recording; both drive the same episodes.
 
     Of the wall, and of the processor for the thread that steps: it is not disturbed by others.
@@ -76,7 +74,7 @@ def measure(
         for name, taken in found.items()
     ]
     own_ratio = paired_ratio(own["recorded"], own["not recorded"])
-    return Report(
+    return BenchmarkReport(
         f"A step of {env}, {vehicles} vehicles",
         {"": "side", "ms a step": "ms:.3f", "least": "least:.3f", "processor": "own:.3f"},
         rows,

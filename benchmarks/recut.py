@@ -10,8 +10,9 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.harness import Env, Report, Say, about, check_range, run, silent
-from cavmarl.cli.output import Settings, parse_settings
+from benchmarks.program import run
+from cavmarl.bench.harness import BenchmarkReport, Say, check_range, silent
+from cavmarl.cli.output import OptionalEnvironment, Settings, about, parse_settings
 from cavmarl.core.errors import EvaluationError
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.evaluate.statistics import mean_interval
@@ -20,14 +21,14 @@ Floats = NDArray[np.float64]
 
 
 def measure(
-    env: Env = "rush",
+    env: OptionalEnvironment = "rush",
     zones: Annotated[int, about("Zones of each world.")] = 4,
     every: Annotated[int, about("Steps between checks of the zones.")] = 20,
     steps: Annotated[int, about("Steps of each seed.")] = 300,
     seeds: Annotated[int, about("Number of seeds; an interval needs two.")] = 5,
     settings: Settings = None,
     say: Say = silent,
-) -> Report:
+) -> BenchmarkReport:
     """A world whose zones stay beside one whose zones become others: evenness, and its price."""
     most = float("inf")
     check_range(
@@ -55,7 +56,7 @@ def measure(
     interval = mean_interval(ratios)
     between = "" if interval is None else f" ({interval.low:.2f} to {interval.high:.2f})"
     mean = statistics.fmean(vehicles)
-    return Report(
+    return BenchmarkReport(
         f"{pair['static'].config.name}: {zones} zones, {mean:.0f} vehicles",
         {
             "zones": "name",

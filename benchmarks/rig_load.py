@@ -1,4 +1,4 @@
-"""Make a rig so heavy that its sensors take a given time a tick, for `cavmarl bench sensors --rig`.
+"""Make a rig for the benchmark `sensors`, so heavy that it takes a given time a tick.
 
 Resolutions and rates are raised until all sensors together, each due in every tick, take so long;
 each takes about as much as the others, as far as it can have any resolution.
@@ -15,10 +15,11 @@ from typing import Annotated, Any
 
 import yaml
 
-from benchmarks.harness import Env, Report, Say, about, run, silent
-from cavmarl.bench.sensor_bench import first_job, job_config, run_job
-from cavmarl.bench.sensor_run import Rig, SensorJob, load_rig
-from cavmarl.cli.output import Seed, Settings, parse_settings
+from benchmarks.program import run
+from benchmarks.sensor_bench import first_job, job_config, run_job
+from benchmarks.sensor_run import Rig, SensorJob, load_rig
+from cavmarl.bench.harness import BenchmarkReport, Say, silent
+from cavmarl.cli.output import OptionalEnvironment, Seed, Settings, about, parse_settings
 from cavmarl.config.env import EnvConfig
 from cavmarl.config.registry import find_settings
 from cavmarl.config.rig import MAX_SAMPLE_NUMBERS, MountedConfig
@@ -37,7 +38,7 @@ _SCALED = {*_LIMITS, "cell_m"}
 
 
 def measure(
-    env: Env = "town",
+    env: OptionalEnvironment = "town",
     load: Annotated[float, about("Milliseconds of sensing a tick.", metavar="MS")] = 20.0,
     out: Annotated[Path, about("Write the rig here.")] = Path("rig.yaml"),
     rig: Annotated[str, about("Sensors: a name in configs/rigs/, or a .yaml.")] = "ten_sensors",
@@ -46,7 +47,7 @@ def measure(
     seed: Seed = 0,
     settings: Settings = None,
     say: Say = silent,
-) -> Report:
+) -> BenchmarkReport:
     """Find resolutions at which a rig takes so long a tick, and write it as a file."""
     if not 0.0 < load <= 1e4:
         raise ConfigError(f"load {load:g} ms: must be above 0 and at most 10000")
@@ -61,11 +62,11 @@ def measure(
     config = job_config(found)
     dt_s = config.clock.sim_dt_s
     rows = [{"name": name, "shape": sensor.shape} for name, sensor in config.rig.items()]
-    return Report(
+    return BenchmarkReport(
         f"{out}: {load:g} ms a tick",
         {"sensor": "name", "sample": "shape"},
         rows,
-        notes=[f"cavmarl bench sensors {env} --rig {out} --set clock.ctrl_dt_s={dt_s:g}"],
+        notes=[f"python -m benchmarks sensors {env} --rig {out} --set clock.ctrl_dt_s={dt_s:g}"],
         facts={"load_ms": load, "rig": _plain(found.spec.overrides["rig"])},
     )
 

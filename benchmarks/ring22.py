@@ -14,8 +14,9 @@ import typer
 from numpy.typing import NDArray
 
 import cavmarl
-from benchmarks.harness import Report, Say, about, check_range, run, silent
-from cavmarl.cli.output import Seed
+from benchmarks.program import run
+from cavmarl.bench.harness import BenchmarkReport, Say, check_range, silent
+from cavmarl.cli.output import Seed, about
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import load_world
 from cavmarl.evaluate.driven_worlds import DrivenWorld
@@ -34,7 +35,7 @@ def measure(
     after_s: Annotated[int, about("Seconds of each that do not count.")] = 75,
     seed: Seed = 0,
     say: Say = silent,
-) -> Report:
+) -> BenchmarkReport:
     """Mean speed of all cars of `ring22`, by the driver of one of them.
 
     Episodes differ by where the agent starts. Those in which it crashes have no mean speed.
@@ -45,7 +46,7 @@ def measure(
     for name in policy or ["gentle"]:
         say(name)
         rows.append(_row(name, driver_mps(name, episodes, after_s, seed), rows[0]["mean"]))
-    return Report(
+    return BenchmarkReport(
         "mean speed of all cars of ring22",
         {
             "driver": "driver",

@@ -13,10 +13,11 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from benchmarks.harness import Report, Say, about, check_range, run, silent
+from benchmarks.clock_drift import measure_drift
+from benchmarks.program import run
 from cavmarl.balance.load_score import THRESHOLDS, WEIGHTS, Candidate, Utilisation, select
-from cavmarl.bench.clock_drift import measure_drift
-from cavmarl.cli.output import Seed
+from cavmarl.bench.harness import BenchmarkReport, Say, check_range, silent
+from cavmarl.cli.output import Seed, about
 from cavmarl.env.vector import make_vec
 from cavmarl.v2x.kernels.v2x_records import KIND_CAM, KIND_CPM, KIND_DENM, KIND_SPAT
 
@@ -114,7 +115,7 @@ def measure(
     steps: Annotated[int, about("Steps of each run.")] = 100,
     seed: Seed = 0,
     say: Say = silent,
-) -> Report:
+) -> BenchmarkReport:
     """Check what is in scope, row by row."""
     check_range(steps=(steps, 20, 100_000))
     say("zones")
@@ -133,7 +134,7 @@ def measure(
         say(name)
         found = check()
         rows.append({"what": name, "A": paper, "here": found.shown, "holds": found.holds})
-    return Report(
+    return BenchmarkReport(
         "in scope: A beside a short run here",
         {"what": "what", "A": "A", "here": "here", "holds": "holds"},
         rows,

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from benchmarks.harness import Report, Say, about, check_range, run, silent
+from benchmarks.program import run
 from cavmarl.balance.load_score import (
     THRESHOLDS,
     WEIGHTS,
@@ -17,7 +17,8 @@ from cavmarl.balance.load_score import (
     Utilisation,
     select,
 )
-from cavmarl.cli.output import Seed
+from cavmarl.bench.harness import BenchmarkReport, Say, check_range, silent
+from cavmarl.cli.output import Seed, about
 from cavmarl.evaluate.statistics import share_interval
 
 # Beside the paper's: all alike, each resource alone, and each pair.
@@ -38,7 +39,7 @@ def measure(
     choices: Annotated[int, about("Choices with each weights.")] = 1000,
     seed: Seed = 0,
     say: Say = silent,
-) -> Report:
+) -> BenchmarkReport:
     """Choose among random admissible workers with several weights, and take the time."""
     check_range(choices=(choices, 1, 1_000_000))
     fleets = list(_fleets(FEW, choices, seed))
@@ -70,7 +71,7 @@ def measure(
         spent.append(1e-3 * (time.perf_counter_ns() - began))
     latency = {f"p{quantile}": float(np.percentile(spent, quantile)) for quantile in (50, 95, 99)}
     timed = ", ".join(f"{name} {value:.0f} µs" for name, value in latency.items())
-    return Report(
+    return BenchmarkReport(
         f"weights beside 0.6, 0.2, 0.2: {choices} choices of {FEW} workers",
         {
             "weights": "weights",

@@ -18,8 +18,9 @@ import httpx
 import numpy as np
 import psutil
 
-from benchmarks.harness import Report, Say, about, check_range, run, silent
-from cavmarl.cli.output import Seed
+from benchmarks.program import run
+from cavmarl.bench.harness import BenchmarkReport, Say, check_range, silent
+from cavmarl.cli.output import Seed, about
 from cavmarl.client import Client
 from cavmarl.core.errors import ServiceError
 from cavmarl.service.access import Access
@@ -41,7 +42,7 @@ def measure(
     hours: Annotated[float, about("Simulated hours of churn, with a tenth of the nodes.")] = 24.0,
     seed: Seed = 0,
     say: Say = silent,
-) -> Report:
+) -> BenchmarkReport:
     """Time selections and beats, and replay a day in which nodes and sessions come and go."""
     check_range(
         nodes=(nodes, 1, 10_000), requests=(requests, 1, 1_000_000),
@@ -61,7 +62,7 @@ def measure(
     ]
     rows.append({"what": f"{beats_hz:.0f} beats a second, share of one core", "value": share})
     rows += [{"what": f"churn: {name}", "value": value} for name, value in churn.items()]
-    return Report(
+    return BenchmarkReport(
         "the coordination service",
         {"": "what", "found": "value:.3f"},
         rows,

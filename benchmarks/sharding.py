@@ -18,9 +18,10 @@ from typing import Annotated, Any
 
 import typer
 
-from benchmarks.harness import Report, Say, about, check_range, numbers_of, one_core, run, silent
+from benchmarks.program import run
 from benchmarks.sharding_turns import Pair, Turn, TwinWorlds
-from cavmarl.cli.output import Agents, Background, Seed, Settings, parse_settings
+from cavmarl.bench.harness import BenchmarkReport, Say, check_range, numbers_of, one_core, silent
+from cavmarl.cli.output import Agents, Background, Seed, Settings, about, parse_settings
 from cavmarl.config.zones import MAX_ZONES, ZONE_LAYOUTS
 from cavmarl.core.errors import ConfigError, EvaluationError
 from cavmarl.engine.simulation import Simulation
@@ -47,7 +48,7 @@ def measure(
     seed: Seed = 0,
     settings: Settings = None,
     say: Say = silent,
-) -> Report:  # fmt: skip
+) -> BenchmarkReport:  # fmt: skip
     """The same world in several numbers of zones, by phases; an error if they differ."""
     counts = numbers_of("--zones", zones)
     check_numbers(counts, after, repeats)
@@ -80,7 +81,7 @@ def measure_sharding(
     repeats: int = 5,
     make_checked: Callable[[int], Simulation] | None = None,
     say: Say = silent,
-) -> Report:
+) -> BenchmarkReport:
     """Measure by turns on one core."""
     check_numbers(zones, after_s, repeats)
     with one_core():
@@ -111,7 +112,9 @@ def measure_sharding(
     return _report(first, rows, after_s, repeats)
 
 
-def _report(first: Simulation, rows: list[dict[str, Any]], after_s: int, repeats: int) -> Report:
+def _report(
+    first: Simulation, rows: list[dict[str, Any]], after_s: int, repeats: int
+) -> BenchmarkReport:
     agents, dt_s = first.config.population.agents, first.config.clock.sim_dt_s
     notes = [
         f"{row['zones']} zones, ns a vehicle and tick: "
@@ -119,7 +122,7 @@ def _report(first: Simulation, rows: list[dict[str, Any]], after_s: int, repeats
         + f"; sum {row['timed_ns']:,.1f}, without stopwatches {row['plain_ns']:,.1f}"
         for row in rows
     ]
-    return Report(
+    return BenchmarkReport(
         f"{first.network.name}, {rows[0]['vehicles']:,.0f} vehicles, {agents} of them agents, halo "
         f"{rows[0]['halo_m']:.0f} m\none core, {repeats} turns after {after_s} s, ticks of "
         f"{dt_s:g} s; states of all worlds are equal",

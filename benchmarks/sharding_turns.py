@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from cavmarl.bench.stopwatch import Stopwatch
+from benchmarks.stopwatch import Stopwatch
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.evaluate.driven_worlds import DrivenWorld

@@ -7,16 +7,25 @@ from dataclasses import replace
 from statistics import median
 from typing import Annotated, Any
 
-from benchmarks.harness import Env, Report, Say, about, numbers_of, paired_ratio, run, silent
-from cavmarl.bench.worker_speed import Measured
-from cavmarl.cli.output import Agents, Background, Seed, Settings, parse_settings
+from benchmarks.program import run
+from benchmarks.worker_speed import Measured
+from cavmarl.bench.harness import BenchmarkReport, Say, numbers_of, paired_ratio, silent
+from cavmarl.cli.output import (
+    Agents,
+    Background,
+    OptionalEnvironment,
+    Seed,
+    Settings,
+    about,
+    parse_settings,
+)
 from cavmarl.config.registry import load_config
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError, EvaluationError
 
 
 def measure(
-    env: Env = "rush",
+    env: OptionalEnvironment = "rush",
     vehicles: Annotated[
         str, about("Vehicles of the world; default: the environment's.", metavar="N,…")
     ] = "",
@@ -31,7 +40,7 @@ def measure(
     seed: Seed = 0,
     settings: Settings = None,
     say: Say = silent,
-) -> Report:
+) -> BenchmarkReport:
     """One world undivided, in zones on one worker, and in zones over several, by turns."""
     if workers < 2 or steps < 1 or repeats < 1:
         raise ConfigError(
@@ -51,7 +60,7 @@ def measure(
         wanted = replace(spec, background=others)
         rows.append(_measured(wanted, zones or workers, workers, steps, repeats))
     line = split_line([(row["vehicles"], row["ratio"]) for row in rows])
-    return Report(
+    return BenchmarkReport(
         f"{env}: one world undivided, and in {zones or workers} zones over one and {workers} "
         "workers",
         {

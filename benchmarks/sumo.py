@@ -18,9 +18,10 @@ from typing import Annotated, Any
 
 import typer
 
-from benchmarks.harness import Report, Say, about, check_range, run, silent, take_turns
+from benchmarks.program import run
+from cavmarl.bench.harness import BenchmarkReport, Say, check_range, silent, take_turns
 from cavmarl.bench.traffic_speed import TURN_S, Turn, load_sumo, turn_of_sumo
-from cavmarl.cli.output import Seed
+from cavmarl.cli.output import Seed, about
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import find_map
 from cavmarl.env.vector import CavVectorEnv, make_vec
@@ -48,7 +49,7 @@ def measure(
     after: Annotated[int, about("Simulated seconds before the first turn.")] = 120,
     repeats: Annotated[int, about("Turns of 10 simulated seconds of each side.")] = 5,
     say: Say = silent,
-) -> Report:
+) -> BenchmarkReport:
     """What coupling a world to SUMO adds to the time that libsumo takes alone."""
     check_range(after=(after, 1, 3600), repeats=(repeats, 1, 100))
     path = find_map(map_name)
@@ -82,7 +83,7 @@ def measure(
     if not alone["vehicles"] > 0.0:
         raise ConfigError("no vehicle drives: another --after, or more demand")
     added, added_wall = (coupled[key] / alone[key] - 1.0 for key in ("median_ms", "median_wall_ms"))
-    return Report(
+    return BenchmarkReport(
         f"{path.name.removesuffix('.gz').removesuffix('.net.xml')}, {source.value}, step {dt:g} s, "
         f"{agents} agents, {repeats} turns of each, after {after} s",
         {

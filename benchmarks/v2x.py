@@ -12,8 +12,9 @@ from statistics import fmean, median
 from time import perf_counter
 from typing import Annotated, Any
 
-from benchmarks.harness import Env, Report, Say, about, check_positive, one_core, run, silent
-from cavmarl.cli.output import Seed
+from benchmarks.program import run
+from cavmarl.bench.harness import BenchmarkReport, Say, check_positive, one_core, silent
+from cavmarl.cli.output import OptionalEnvironment, Seed, about
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import load_world
@@ -36,7 +37,7 @@ SHAPE = {"population.mode": "respawn", "clock.ctrl_dt_s": 0.05, "sensors.lidar.r
 
 
 def measure(
-    env: Env = "town",
+    env: OptionalEnvironment = "town",
     vehicles: Annotated[int, about("Vehicles that send, as far as there is room.")] = 1000,
     receivers: Annotated[
         int | None, about("Agents among them, which receive; default: all.")
@@ -48,7 +49,7 @@ def measure(
         float | None, about("Exit with 1 if any channel takes more ms a tick.")
     ] = None,
     say: Say = silent,
-) -> Report:
+) -> BenchmarkReport:
     """Milliseconds a tick for messages among vehicles, by channel, beside the tick itself."""
     check_positive("--at-most", at_most)
     receivers = vehicles if receivers is None else receivers
@@ -84,7 +85,7 @@ def measure(
     for name, (bus, _) in buses.items():
         rows.append(_row(name, bus.statistics(), bus_ms[name], warmup))
     mean, rate_hz = fmean(running[warmup:]), config.v2x.cam.rate_hz
-    return Report(
+    return BenchmarkReport(
         f"{env}: {mean:,.0f} vehicles at {rate_hz:g} Hz, up to {receivers:,} of them receive; "
         "one core",
         {

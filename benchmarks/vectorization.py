@@ -23,7 +23,9 @@ from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv
 from pettingzoo import ParallelEnv
 
-from benchmarks.harness import Report, Say, about, paired_ratio, run, silent, take_turns
+from benchmarks.program import run
+from cavmarl.bench.harness import BenchmarkReport, Say, paired_ratio, silent, take_turns
+from cavmarl.cli.output import about
 from cavmarl.core.errors import ConfigError, MissingExtraError, require
 from cavmarl.engine.spaces import flat_observation_space
 from cavmarl.engine.world_setup import load_world
@@ -51,7 +53,7 @@ def measure(
     workers: Annotated[int, about("Worker processes of each library, one world each.")] = 2,
     repeats: Annotated[int, about("Turns of each library.")] = 7,
     say: Say = silent,
-) -> Report:
+) -> BenchmarkReport:
     """Step worlds in which nothing happens through each library's workers, by turns."""
     if workers < 1 or agents < 1 or agents % workers:
         raise ConfigError(f"{agents} agents over {workers} workers: must be the same for each")
@@ -87,7 +89,7 @@ def measure(
             row["ratio"] = paired_ratio(row["step_us"], turns["cavmarl"])
             row["order_ratio"] = paired_ratio(row["step_us"], turns[ORDER])
         rows.append(row)
-    return Report(
+    return BenchmarkReport(
         f"a step of {agents} agents over {workers} workers, {size} numbers each",
         {
             "library": "name",

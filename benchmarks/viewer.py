@@ -22,8 +22,9 @@ import numpy as np
 from websockets.asyncio.client import connect
 from websockets.sync.client import connect as connect_now
 
-from benchmarks.harness import Env, Report, Say, about, paired_ratio, run, silent, take_turns
-from cavmarl.cli.output import Seed
+from benchmarks.program import run
+from cavmarl.bench.harness import BenchmarkReport, Say, paired_ratio, silent, take_turns
+from cavmarl.cli.output import OptionalEnvironment, Seed, about
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_frame import SEEN, WorldFrame
 from cavmarl.env.parallel import CavEnv, parallel_env
@@ -43,7 +44,7 @@ WATCHED_STEPS, WATCHED_TURNS = 200, 5
 
 
 def measure(
-    env: Env = "grid4x4",
+    env: OptionalEnvironment = "grid4x4",
     vehicles: Annotated[int, about("Vehicles of a frame.")] = 10_000,
     clients: Annotated[int, about("Clients that watch at once.")] = 100,
     rate_hz: Annotated[float, about("Frames a second that they are sent.")] = 10.0,
@@ -51,7 +52,7 @@ def measure(
     seconds: Annotated[float, about("That clients and the page are watched for.")] = 10.0,
     seed: Seed = 0,
     say: Say = silent,
-) -> Report:
+) -> BenchmarkReport:
     """Bytes, milliseconds and shares of one core that the viewer costs."""
     if moving < 10:
         raise ConfigError(f"moving = {moving}: must be at least 10")
@@ -84,7 +85,7 @@ def measure(
         "first, ms": "first:.0f",
         "times as long": "ratio:.3f",
     }
-    return Report(f"{vehicles} vehicles on {env}", columns, rows)
+    return BenchmarkReport(f"{vehicles} vehicles on {env}", columns, rows)
 
 
 def made_up_frames(env: CavEnv, count: int, seed: int, number: int = 20) -> list[WorldFrame]:

@@ -4,7 +4,7 @@ Every trip counts, those that the end of the run cuts, too. A vehicle stands wit
 has stood for `STANDS_S`, its signal is not red, no other vehicle is near ahead of it or behind the
 junction, and none is, or has its rear, on a way that crosses its own, or comes to a line where it
 has to give way, as near as drivers announce themselves. What touches on ground that the map gives
-two roads is counted apart (`maps.shared_ground`).
+two roads is counted apart (`shared_ground`).
 """
 
 from __future__ import annotations
@@ -22,17 +22,19 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from benchmarks.harness import Report, Say, about, check_range, numbers_of, run, silent
-from cavmarl.cli.output import Seed
+from benchmarks.program import run
+from benchmarks.shared_ground import shared_ground
+from benchmarks.world_draw import draw_world
+from benchmarks.world_files import cut_maps, make_net
+from cavmarl.bench.harness import BenchmarkReport, Say, check_range, numbers_of, silent
+from cavmarl.cli.output import Seed, about
 from cavmarl.core.errors import CavmarlError, ConfigError
 from cavmarl.core.records.codes import SIGNAL_NONE
 from cavmarl.driving.kernels.announcing import announced_m
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.evaluate.recorder import Recorder
-from cavmarl.evaluate.traffic.world_draw import draw_world
-from cavmarl.evaluate.traffic.world_files import cut_maps, make_net
-from cavmarl.maps.shared_ground import LEVEL_M, shared_ground
+from cavmarl.maps.defects import LEVEL_M
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.render.ground import signal_codes
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
@@ -93,7 +95,7 @@ def measure(
     seconds: Annotated[int, about("Simulated seconds of each run.")] = 300,
     seed: Seed = 0,
     say: Say = silent,
-) -> Report:
+) -> BenchmarkReport:
     """Trips of the built-in driver that end off the road, in a collision, or stand for ever."""
     check_range(worlds=(worlds, 0, 10_000), seconds=(seconds, 1, 100_000))
     check_range(first_seed=(first_seed, 0, 10**9))
@@ -126,7 +128,7 @@ def measure(
     columns |= {"stand": "stands"}
     shown = [row for row in rows if not worlds or row["faults"] or row["map"] in named.values()]
     more = [f"and {len(notes) - SHOWN} more"] if len(notes) > SHOWN else []
-    return Report(
+    return BenchmarkReport(
         f"the built-in driver in agents' seats, {seconds} s: trips, shares of them in %, vehicles "
         f"that stand {STANDS_S:.0f} s without a cause",
         columns,

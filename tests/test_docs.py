@@ -138,7 +138,7 @@ def test_files_of_code_that_a_page_names_exist(page: Path) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_benchmarks_that_a_page_names_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
-    for name in re.findall(r"python -m benchmarks\.(\w+)", text):
+    for name in re.findall(r"python -m benchmarks[. ]([a-z]\w*)", text):
         assert (ROOT / f"benchmarks/{name}.py").is_file(), name
     for name in re.findall(r"`cavmarl bench (\w+)", text):
         assert (ROOT / f"cavmarl/cli/bench/{name}.py").is_file(), name

@@ -1,7 +1,8 @@
-"""What all measurements share: sides that take turns, medians, checks of numbers, tables, JSON.
+"""What all benchmarks share: reports, sides that take turns, medians, checks of numbers.
 
+A benchmark returns a `BenchmarkReport`, which prints its tables and becomes the JSON of `--json`.
 All sides of a comparison are measured once a turn, one after the other, so that what else the
-machine does falls on all of them. `benchmarks/`, beside the package, stands on this, too.
+machine does falls on all of them. `benchmarks/`, beside the package, is built on this, too.
 """
 
 from __future__ import annotations
@@ -11,9 +12,9 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, field
 from statistics import fmean, median, variance
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -21,6 +22,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from cavmarl.core.errors import ConfigError
+from cavmarl.core.machine import describe_hardware
 from cavmarl.core.progress import progress_bar
 
 Say = Callable[[str], None]
@@ -47,14 +49,60 @@ def spread(values: Iterable[float]) -> Spread:
     return Spread(min(found), median(found), max(found))
 
 
-class Result:
-    """A dataclass whose derived figures stand in its JSON beside its fields."""
+@dataclass(frozen=True)
+class BenchmarkReport:
+    """The result of a benchmark.
 
-    DERIVED: ClassVar[tuple[str, ...]] = ()  # properties that are written, too
+    Attributes:
+        title: of the table.
+        columns: head of a column → `key` or `key:format` of the rows, left to right. The first
+            column is text.
+        rows: one a side, with all that was measured of it.
+        notes: lines below the tables; they may have rich's markup.
+        facts: figures that belong to no row.
+        holds: whether a bound that was asked for was kept; if not, the exit code is 1.
+        caption: a line below the table.
+        tables: further tables; their figures are in `facts`.
+    """
+
+    title: str
+    columns: Mapping[str, str]
+    rows: Sequence[Mapping[str, Any]]
+    notes: Sequence[str] = ()
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    holds: bool = True
+    caption: str | None = None
+    tables: Sequence[Table] = ()
+
+    def row(self, name: str) -> Mapping[str, Any]:
+        """Return the row whose first column shows `name`."""
+        key = next(iter(self.columns.values()))
+        return next(row for row in self.rows if row[key] == name)
 
     def to_dict(self) -> dict[str, Any]:
-        derived = {name: getattr(self, name) for name in self.DERIVED}
-        return {**asdict(self), **derived}  # type: ignore[call-overload]
+        """Return plain values, for JSON."""
+        return {"hardware": describe_hardware(), **self.facts, "rows": [dict(r) for r in self.rows]}
+
+    def show(self, console: Console) -> None:
+        """Print the tables, the notes and the hardware."""
+        lines = ([_cell(row, shown) for shown in self.columns.values()] for row in self.rows)
+        console.print(make_table(self.title, list(self.columns), lines, self.caption))
+        for table in self.tables:
+            console.print(table)
+        for note in self.notes:
+            console.print(note, highlight=False)
+        console.print(hardware_line(describe_hardware()), highlight=False)
+
+
+def _cell(row: Mapping[str, Any], shown: str) -> str:
+    key, _, form = shown.partition(":")
+    value = row.get(key)
+    return "-" if value is None else str(value) if not form else format(value, form)
+
+
+def is_kept(at_least: float | None, ratio: float | None) -> bool:
+    """Return whether a ratio keeps the bound of `--at-least`; without a bound or ratio: yes."""
+    return at_least is None or ratio is None or ratio >= at_least
 
 
 def take_turns(

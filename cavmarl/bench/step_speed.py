@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from cavmarl.bench.harness import Result, Say, check_range, one_core, silent, spread, take_turns
+from cavmarl.bench.harness import Say, check_range, one_core, silent, spread, take_turns
 from cavmarl.bench.highway_worlds import (
     IDLE,
     KINEMATICS,
@@ -73,7 +73,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class StepSpeed(Result):
+class StepSpeed:
     """Result of the comparison."""
 
     road_m: float  # length of the road that `agents` vehicles were set out on, on both sides

@@ -14,7 +14,6 @@ from functools import partial
 from pathlib import Path
 
 from cavmarl.bench.harness import (
-    Result,
     Say,
     Spread,
     check_range,
@@ -34,7 +33,7 @@ TURN_S = 10
 
 
 @dataclass(frozen=True)
-class TrafficSpeed(Result):
+class TrafficSpeed:
     """Result of the comparison; rates are vehicle-steps a second of the processor's time."""
 
     map_name: str  # the map's name

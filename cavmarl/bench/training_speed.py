@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import yaml
 
-from cavmarl.bench.harness import Result, Say, check_range, paired_ratio, silent
+from cavmarl.bench.harness import Say, check_range, paired_ratio, silent
 from cavmarl.bench.highway_worlds import (
     THEIR_KINEMATICS,
     highway_env,
@@ -80,7 +80,7 @@ class TrainingRow:
 
 
 @dataclass(frozen=True)
-class TrainingSpeed(Result):
+class TrainingSpeed:
     """What was measured: two kinds of benchmark, whose numbers are never mixed."""
 
     agents: int  # of a world
@@ -110,13 +110,15 @@ class TrainingSpeed(Result):
         rates = {row.name: row.rates for row in self.end_to_end}
         return paired_ratio(rates[one], rates[other])
 
-    def to_dict(self) -> dict[str, Any]:
-        plain = super().to_dict()
+    def facts(self) -> dict[str, Any]:
+        """Return plain values, for a report: all but the rows of `end_to_end`."""
         return {
-            **plain,
+            "agents": self.agents,
+            "workers": self.workers,
+            "numbers": self.numbers,
+            "recipe_numbers": self.recipe_numbers,
             "end_to_end": {
                 "kind": "end_to_end",
-                "rows": plain["end_to_end"],
                 "ratio": self.ratio,
                 "recipe_rate": self.recipe_rate,
             },

@@ -8,7 +8,7 @@ from functools import partial, wraps
 from inspect import Parameter, Signature, signature
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
 
 import typer
 from rich import box
@@ -24,6 +24,8 @@ from cavmarl.core.seeds import check_seed
 if TYPE_CHECKING:
     from cavmarl.recordings.extra_tables import RecordOptions
     from cavmarl.verify.differences import Difference
+
+Made = TypeVar("Made")
 
 
 def _writable(option: typer.CallbackParam, path: Path | None) -> Path | None:
@@ -114,13 +116,7 @@ def recorded(path: Path | None, also: str) -> RecordOptions | None:
     return RecordOptions(path, include)
 
 
-def end_below(at_least: float | None, ratio: float | None) -> None:
-    """End the command with exit code 1 if a ratio is below what `--at-least` asks for."""
-    if at_least is not None and ratio is not None and ratio < at_least:
-        raise typer.Exit(1)
-
-
-def with_world(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+def with_world(*names: str) -> Callable[[Callable[..., Made]], Callable[..., Made]]:
     """Makes a command of a function that takes a `world: WorldSpec`.
 
     In its place stand the options that make one: all, or the environment and those of these names.
@@ -130,7 +126,7 @@ def with_world(*names: str) -> Callable[[Callable[..., None]], Callable[..., Non
     return partial(_with_world, ("env", *chosen))
 
 
-def _with_world(names: tuple[str, ...], command: Callable[..., None]) -> Callable[..., None]:
+def _with_world(names: tuple[str, ...], command: Callable[..., Made]) -> Callable[..., Made]:
     own = dict(signature(command).parameters)
     hints = get_type_hints(command, include_extras=True)
     shared = {
@@ -151,11 +147,11 @@ def _with_world(names: tuple[str, ...], command: Callable[..., None]) -> Callabl
         wanted[name] = one.replace(annotation=hints[name], kind=Parameter.KEYWORD_ONLY)
 
     @wraps(command)
-    def program(**options: Any) -> None:
+    def program(**options: Any) -> Made:
         keys = {name: options[name] for name in names if name != "settings"}
         env = keys.pop("env") or ""
         spec = WorldSpec.of(env, overrides=parse_settings(options["settings"]), **keys)
-        command(spec, **{name: options[name] for name in own})
+        return command(spec, **{name: options[name] for name in own})
 
     program.__annotations__ = {name: one.annotation for name, one in wanted.items()}
     vars(program)["__signature__"] = Signature(list(wanted.values()))

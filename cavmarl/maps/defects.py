@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.maps.buildings import with_buildings
 from cavmarl.maps.net_document import NetDocument, points_of
-from cavmarl.maps.shared_ground import CAR_WIDTH_M, LEVEL_M
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 
 _CAR = 1 << VEHICLE_CLASSES.index("passenger")
+CAR_WIDTH_M = 1.8
+LEVEL_M = 3.0  # lanes that differ more in height are a bridge and the road below it
 STEP_M = 0.1  # of height, between lanes of which one leads into the other
 SEARCHES = ("crossings", "signals", "lanes", "steps", "parts", "stop lines", "buildings")
 _DEEP_M = 1.0  # that a stop line may lie inside its junction

@@ -1,7 +1,7 @@
 """Figures of the two papers, drawn from what is measured here; see docs/papers.md.
 
 `python -m docs.pictures.paper_figures docs/images` draws `drift.svg` anew, in a minute. The plot of
-the sensor workers is that of `cavmarl bench sensors --plot`.
+the sensor workers is that of `python -m benchmarks sensors --plot`.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from cavmarl.bench.clock_drift import ClockDrift, measure_drift
+from benchmarks.clock_drift import ClockDrift, measure_drift
 from cavmarl.core.errors import require
 
 STEPS, ROGUE = 5000, 0.92

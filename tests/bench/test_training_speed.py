@@ -25,7 +25,7 @@ def test_both_sides_learn_from_the_same_numbers(
     small = ("--agents", "2", "--worlds", "2", "--repeats", "1")
     assert run("bench", "train", *small, "--at-least", "1e9", "--json", str(path)) == 1
     found = json.loads(path.read_text())
-    ours, recipe, theirs = found["end_to_end"]["rows"]
+    ours, recipe, theirs = found["rows"]
     assert (ours["name"], theirs["name"]) == ("cavmarl", "stable_baselines3")
     assert ours["worlds"] * training_speed.OUR_STEPS * 2 == theirs["decisions"]
     assert 0 < ours["decisions"] <= theirs["decisions"]

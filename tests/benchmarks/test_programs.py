@@ -12,7 +12,8 @@ import pytest
 
 from benchmarks import balance, inference, moving, profile, scope, selection, sumo
 from benchmarks.__main__ import KEPT, main, programs
-from benchmarks.harness import Report, paired_interval, run
+from benchmarks.program import run
+from cavmarl.bench.harness import BenchmarkReport, paired_interval
 from cavmarl.cli.bench import app
 from cavmarl.core.errors import ConfigError
 from tests.support.sumo_worlds import tiny_file
@@ -21,8 +22,7 @@ from tests.support.sumo_worlds import tiny_file
 def test_all_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     main([])
     shown = capsys.readouterr().out
-    kept = {getattr(command.callback, "__name__", "") for command in app.registered_commands}
-    assert kept == set(KEPT)
+    assert {command.name for command in app.registered_commands} == set(KEPT)
     assert {"sharding", "balance", "moving", "recut", "rays", "v2x", "sumo"} <= set(programs())
     assert all(name in shown for name in KEPT | programs())
     with pytest.raises(SystemExit, match="no benchmark 'nothing'"):
@@ -54,8 +54,8 @@ def test_driver_networks_are_measured_beside_torch() -> None:
 
 
 def test_a_bound_that_does_not_hold_is_exit_code_1() -> None:
-    def measure(say: Any) -> Report:
-        return Report("a", {"name": "name"}, [{"name": "b"}], holds=False)
+    def measure(say: Any) -> BenchmarkReport:
+        return BenchmarkReport("a", {"name": "name"}, [{"name": "b"}], holds=False)
 
     with pytest.raises(SystemExit) as ended:
         run(measure, [])

@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks import rig_load
 from benchmarks.rig_load import scaled
-from cavmarl.bench.sensor_run import SensorJob, load_rig
+from benchmarks.sensor_run import SensorJob, load_rig
 from cavmarl.config.registry import find_settings, load_config
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError

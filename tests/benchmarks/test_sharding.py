@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.harness import run
+from benchmarks.program import run
 from benchmarks.sharding import measure, measure_sharding
 from benchmarks.sharding_turns import PHASES
 from cavmarl.core.errors import ConfigError, EvaluationError

@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from benchmarks import yardstick
-from benchmarks.harness import Report
+from cavmarl.bench.harness import BenchmarkReport
 from cavmarl.core.errors import ConfigError
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.engine.world_setup import load_world
@@ -42,7 +42,7 @@ def test_the_table_has_room_for_all_columns_on_a_narrow_terminal(
     name = "/maps/of/a/far/folder/bologna_buslanes.net.xml"
     found = yardstick.measure([name], agents="100", models="Krauss")
     console = Console(width=80, record=True)
-    Report(found.title, found.columns, found.rows).show(console)
+    BenchmarkReport(found.title, found.columns, found.rows).show(console)
     lines = console.export_text().splitlines()
     assert max(map(len, lines)) <= 80
     (own,) = (line.split() for line in lines if line.split()[:1] == ["bologna_buslanes"])

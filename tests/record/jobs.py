@@ -21,9 +21,9 @@ from typing import Any
 import typer
 
 from benchmarks import ring22
-from benchmarks.harness import command as benchmark_command
 from cavmarl.cli import app
 from cavmarl.cli.output import parse_settings
+from cavmarl.cli.report_command import report_command
 from cavmarl.config.world_spec import WorldSpec, with_sensors_of_drivers
 from cavmarl.core.whole_file import draft_folder, write_whole
 from cavmarl.evaluate import EvaluationReport, evaluate
@@ -95,7 +95,7 @@ def options_of(command: str) -> dict[str, Any]:
     words = shlex.split(command)
     if command.startswith(RING22):
         program = typer.Typer()
-        program.command()(benchmark_command(ring22.measure))
+        program.command()(report_command(ring22.measure))
         return dict(typer.main.get_command(program).make_context("ring22", words[4:]).params)
     assert command.startswith(EVALUATE), f"{command}: neither an evaluation nor ring22"
     found: Any = typer.main.get_command(app)

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from dataclasses import asdict
+from typing import Annotated
 
-from rich.console import Console
-from rich.table import Table
-
-from cavmarl.bench.harness import make_table, measuring
-from cavmarl.cli.output import JsonPath, about, check_bound, end_below, write_json
-
-if TYPE_CHECKING:
-    from cavmarl.bench.step_speed import StepSpeed
+from cavmarl.bench.harness import BenchmarkReport, Say, is_kept, silent
+from cavmarl.cli.output import about, check_bound
 
 _SENSORS = {"lidar": "64 rays", "kinematics": "no rays"}
 _SIDES = {
@@ -31,40 +26,36 @@ def step(
     at_least: Annotated[
         float | None, about("Exit with 1 if the ratio with a lidar is below.", callback=check_bound)
     ] = None,
-    json_path: JsonPath = None,
-) -> None:
+    say: Say = silent,
+) -> BenchmarkReport:
     """Agent-steps a second next to highway-env's: same road, vehicles and rates; one core."""
     from cavmarl.bench.step_speed import measure_step_speed
 
-    console = Console()
-    with measuring(console) as say:
-        found = measure_step_speed(agents, worlds, repeats, say)
-    console.print(_table(found))
-    console.print(
-        f"batched over highway-env: [bold]{found.ratio:,.0f}[/] with a lidar, "
-        f"[bold]{found.ratio_kinematics:,.0f}[/] without "
-        f"({found.ratio_kinematics_raw:,.0f} over its raw observation)\n"
-        f"an agent among ten times as many costs [bold]{found.cost_of_more:.2f}[/] times as much; "
-        f"dicts add [bold]{found.dict_us:.2f} µs[/] an agent and step"
-    )
-    write_json(json_path, found.to_dict())
-    end_below(at_least, found.ratio)
-
-
-def _table(found: StepSpeed) -> Table:
-    rows = [
-        (
-            _SENSORS[row.sensors],
-            _SIDES[row.side],
-            str(row.worlds),
-            *(f"{value:,.0f}" for value in (row.agents, row.low, row.median, row.high)),
-        )
-        for row in sorted(found.rows, key=lambda row: list(_SENSORS).index(row.sensors))
-    ]
-    title = (
+    found = measure_step_speed(agents, worlds, repeats, say)
+    return BenchmarkReport(
         f"agent-steps/s of one core: {found.rows[0].agents} controlled vehicles on "
         f"{found.road_m / 1000.0:.1f} km of four lanes,\n"
-        f"two ticks a step; ours with 16 neighbours too; {found.repeats} turns"
+        f"two ticks a step; ours with 16 neighbours too; {found.repeats} turns",
+        {
+            "observation": "observation",
+            "side": "shown_side",
+            "worlds": "worlds",
+            "agents": "agents:,.0f",
+            "min": "low:,.0f",
+            "median": "median:,.0f",
+            "max": "high:,.0f",
+        },
+        [
+            {**asdict(row), "observation": _SENSORS[row.sensors], "shown_side": _SIDES[row.side]}
+            for row in sorted(found.rows, key=lambda row: list(_SENSORS).index(row.sensors))
+        ],
+        notes=[
+            f"batched over highway-env: [bold]{found.ratio:,.0f}[/] with a lidar, "
+            f"[bold]{found.ratio_kinematics:,.0f}[/] without "
+            f"({found.ratio_kinematics_raw:,.0f} over its raw observation)",
+            f"an agent among ten times as many costs [bold]{found.cost_of_more:.2f}[/] times as "
+            f"much; dicts add [bold]{found.dict_us:.2f} µs[/] an agent and step",
+        ],
+        facts=asdict(found),
+        holds=is_kept(at_least, found.ratio),
     )
-    heads = ("observation", "side", "worlds", "agents", "min", "median", "max")
-    return make_table(title, heads, rows)

@@ -2,29 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
+from rich.markup import escape
 
-from cavmarl.bench.harness import make_table, measuring
-from cavmarl.cli.bench.traffic_worlds import compare_worlds
-from cavmarl.cli.output import (
-    JsonPath,
-    Seed,
-    about,
-    about_file,
-    make_folder,
-    number,
-    write_json,
-)
+from cavmarl.bench.harness import BenchmarkReport, Say, silent
+from cavmarl.cli.output import Seed, about, about_file, number
 from cavmarl.core.errors import ConfigError, require
-
-if TYPE_CHECKING:
-    from cavmarl.bench.traffic_speed import TrafficSpeed
-    from cavmarl.evaluate.traffic.traffic_comparison import TrafficComparison
 
 _ROWS = {
     "departed": "departed",
@@ -42,12 +29,12 @@ _ROWS = {
 
 def traffic(
     map_name: Annotated[
-        str, typer.Argument(metavar="[MAP]", help="A map file, or an environment's name or folder.")
-    ] = "",
+        str, typer.Argument(metavar="MAP", help="A map file, or an environment's name or folder.")
+    ],
     demand: Annotated[
-        list[Path] | None,
+        list[Path],
         about("A .rou.xml, .add.xml or .sumocfg; may be repeated.", "--demand", "-d"),
-    ] = None,
+    ],
     seconds: Annotated[int, about("Simulated seconds, from the demand's beginning.")] = 900,
     dt: Annotated[float, about("Step length of both, in seconds.")] = 0.1,
     seed: Seed = 0,
@@ -60,59 +47,43 @@ def traffic(
     ] = False,
     after: Annotated[int, about("With --speed: simulated seconds before the first turn.")] = 120,
     repeats: Annotated[int, about("With --speed: turns of 10 simulated seconds of each side.")] = 5,
-    worlds: Annotated[
-        int | None, about("Draw so many worlds by chance and compare all; no MAP.")
-    ] = None,
-    first_seed: Annotated[int, about("With --worlds: the first one's seed.")] = 0,
-    out: Annotated[
-        Path, about("With --worlds: folder of the results; rows that are there stay.")
-    ] = Path("traffic_worlds"),
-    without: Annotated[
-        list[str] | None, about("With --worlds: a feature to leave out; may be repeated.")
-    ] = None,
-    maps: Annotated[
-        Path | None, about("With --worlds: folder of maps to cut; default: SUMO's own.")
-    ] = None,
-    json_path: JsonPath = None,
-) -> None:
+    say: Say = silent,
+) -> BenchmarkReport:
     """Our traffic beside SUMO's own run: same map, demand, seed and step length."""
-    if worlds is not None:
-        if map_name or demand or plot is not None or speed:
-            raise ConfigError("--worlds: draws maps and demands itself; leave out MAP, -d, --plot")
-        make_folder(out)
-        chosen = tuple(without or ())
-        compare_worlds(worlds, first_seed, out, seconds, dt, json_path, chosen, maps)
-        return
-    if not map_name or not demand:
-        raise ConfigError("give a MAP and its --demand FILE, or --worlds N to draw both by chance")
     if speed and plot is not None:
         raise ConfigError("--plot: draws flow and density, which --speed does not measure; use one")
     if speed:
-        _measure_speed(map_name, demand, dt, seed, after, repeats, json_path)
-    else:
-        _compare(map_name, demand, seconds, dt, seed, teleports, plot, json_path)
+        return _speed(map_name, demand, dt, seed, after, repeats, say)
+    return _comparison(map_name, demand, seconds, dt, seed, teleports, plot, say)
 
 
-def _measure_speed(
-    map_name: str,
-    demand: list[Path],
-    dt: float,
-    seed: int,
-    after: int,
-    repeats: int,
-    json_path: Path | None,
-) -> None:
+def _speed(
+    map_name: str, demand: list[Path], dt: float, seed: int, after: int, repeats: int, say: Say
+) -> BenchmarkReport:
     from cavmarl.bench.traffic_speed import measure_traffic_speed
 
-    console = Console()
-    with measuring(console) as say:
-        turns = {"after_s": after, "repeats": repeats}
-        found = measure_traffic_speed(map_name, demand, dt_s=dt, seed=seed, progress=say, **turns)
-    console.print(_speeds(found))
-    write_json(json_path, found.to_dict())
+    turns = {"after_s": after, "repeats": repeats}
+    found = measure_traffic_speed(map_name, demand, dt_s=dt, seed=seed, progress=say, **turns)
+    title = f"{found.map_name}, step {found.dt_s:g} s, one core, {found.repeats} turns of each"
+    return BenchmarkReport(
+        f"{title}, after {found.after_s} s",
+        {
+            "vehicle-steps/s": "side",
+            "vehicles": "vehicles:,.0f",
+            "min": "low:,.0f",
+            "median": "median:,.0f",
+            "max": "high:,.0f",
+        },
+        [
+            {"side": "cavmarl", "vehicles": found.our_vehicles, **asdict(found.ours)},
+            {"side": "libsumo", "vehicles": found.sumo_vehicles, **asdict(found.sumo)},
+        ],
+        facts=asdict(found),
+        caption=f"ratio of the medians: {found.ratio:.1f}",
+    )
 
 
-def _compare(
+def _comparison(
     map_name: str,
     demand: list[Path],
     seconds: int,
@@ -120,56 +91,34 @@ def _compare(
     seed: int,
     teleports: bool,
     plot: Path | None,
-    json_path: Path | None,
-) -> None:
+    say: Say,
+) -> BenchmarkReport:
     from cavmarl.evaluate.traffic.traffic_comparison import compare_traffic
     from cavmarl.evaluate.traffic.traffic_plot import plot_fundamental_diagram
 
     if plot is not None:
         require("matplotlib", "report")
-    console = Console()
-    with measuring(console) as say:
-        found = compare_traffic(
-            map_name,
-            demand,
-            seconds=seconds,
-            dt_s=dt,
-            seed=seed,
-            teleports=teleports,
-            progress=say,
-        )
-        if plot is not None:
-            plot_fundamental_diagram(found, plot)
-    console.print(_figures(found))
-    if found.tolerated:
-        console.print("tolerated in our reading of the demand:", *found.tolerated, sep="\n")
-    write_json(json_path, found.to_dict())
-
-
-def _figures(found: TrafficComparison) -> Table:
+    found = compare_traffic(
+        map_name, demand, seconds=seconds, dt_s=dt, seed=seed, teleports=teleports, progress=say
+    )
+    if plot is not None:
+        plot_fundamental_diagram(found, plot)
     rows = []
     for label, name in _ROWS.items():
-        sides = (getattr(run.figures, name) for run in (found.ours, found.sumo))
-        rows.append((label, *map(_cell, sides), number(found.ratio(name))))
-    title = f"{found.map_name}, {found.seconds} s, step {found.dt_s:g} s, seed {found.seed}"
-    return make_table(title, ("", "cavmarl", "SUMO", "ratio"), rows)
-
-
-def _speeds(found: TrafficSpeed) -> Table:
-    rows = [
-        (name, *(f"{value:,.0f}" for value in (vehicles, rates.low, rates.median, rates.high)))
-        for name, vehicles, rates in (
-            ("cavmarl", found.our_vehicles, found.ours),
-            ("libsumo", found.sumo_vehicles, found.sumo),
-        )
-    ]
-    title = f"{found.map_name}, step {found.dt_s:g} s, one core, {found.repeats} turns of each"
-    heads = ("vehicle-steps/s", "vehicles", "min", "median", "max")
-    ratio = f"ratio of the medians: {found.ratio:.1f}"
-    return make_table(f"{title}, after {found.after_s} s", heads, rows, ratio)
+        ours, sumo = (_cell(getattr(run.figures, name)) for run in (found.ours, found.sumo))
+        ratio = number(found.ratio(name))
+        rows.append({"figure": label, "cavmarl": ours, "SUMO": sumo, "ratio": ratio})
+    notes = [escape(line) for line in found.tolerated]
+    return BenchmarkReport(
+        f"{found.map_name}, {found.seconds} s, step {found.dt_s:g} s, seed {found.seed}",
+        {"": "figure", "cavmarl": "cavmarl", "SUMO": "SUMO", "ratio": "ratio"},
+        rows,
+        notes=["tolerated in our reading of the demand:", *notes] if notes else [],
+        facts=found.to_dict(),
+    )
 
 
 def _cell(value: float | str | None) -> str:
     if isinstance(value, str):
-        return value or "-"
+        return escape(value) or "-"
     return f"{value:,}" if isinstance(value, int) else number(value)

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from statistics import median
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
-from rich.console import Console
-from rich.table import Table
-
-from cavmarl.bench.harness import hardware_line, make_table, measuring
-from cavmarl.cli.output import AtLeast, JsonPath, about, end_below, write_json
+from cavmarl.bench.harness import BenchmarkReport, Say, is_kept, silent
+from cavmarl.cli.output import AtLeast, about
 
 if TYPE_CHECKING:
-    from cavmarl.bench.training_speed import TrainingSpeed
+    from cavmarl.bench.training_speed import TrainingRow
 
 _SIDES = {
     "cavmarl": "cavmarl",
     "cavmarl_recipe": "cavmarl, our recipe",
     "stable_baselines3": "SB3 on highway-env",
 }
-_PHASES = ("simulation", "transfer", "inference", "learning")
+_PHASES = {
+    "simu-\nlation": "simulation",
+    "trans-\nfer": "transfer",
+    "infer-\nence": "inference",
+    "learn-\ning": "learning",
+}
 
 
 def train(
@@ -30,8 +33,8 @@ def train(
     workers: Annotated[int, about("Worker processes of each side.")] = 2,
     repeats: Annotated[int, about("Number of measured updates of each side.")] = 3,
     at_least: AtLeast = None,
-    json_path: JsonPath = None,
-) -> None:
+    say: Say = silent,
+) -> BenchmarkReport:
     """PPO from end to end next to stable-baselines3's on highway-env, and where the time goes.
 
     Same road, vehicles, observation, network, batch and epochs. How fast our worlds are alone, with
@@ -39,35 +42,34 @@ def train(
     """
     from cavmarl.bench.training_speed import measure_training
 
-    console = Console()
-    with measuring(console) as say:
-        found = measure_training(agents, worlds, workers, repeats, say)
-    write_json(json_path, found.to_dict())
-    console.print(_table(found))
-    console.print(
+    found = measure_training(agents, worlds, workers, repeats, say)
+    notes = [
         f"end to end, ours over theirs: [bold]{found.ratio:,.1f}[/]; our own recipe "
-        f"({found.recipe_numbers} numbers): [bold]{found.recipe_rate:,.0f}[/] agent-steps/s\n"
+        f"({found.recipe_numbers} numbers): [bold]{found.recipe_rate:,.0f}[/] agent-steps/s",
         f"worlds and sensors alone, without learning: {median(found.stepping):,.0f} agent-steps/s",
-        highlight=False,
-    )
-    if found.is_crowded:
-        console.print("note: more workers than cores", style="yellow")
-    end_below(at_least, found.ratio)
-
-
-def _table(found: TrainingSpeed) -> Table:
-    sides = found.end_to_end
-    rows = [
-        ("worlds", *(str(side.worlds) for side in sides)),
-        ("decisions an update", *(f"{side.decisions:,}" for side in sides)),
     ]
-    for name, of in (("min", min), ("median", median), ("max", max)):
-        rows.append((f"agent-steps/s: {name}", *(f"{of(side.rates):,.0f}" for side in sides)))
-    for phase in _PHASES:
-        cells = (f"{side.shares[phase]:.0%}" if phase in side.shares else "-" for side in sides)
-        rows.append((f"{phase}, of the time", *cells))
-    title = (
+    if found.is_crowded:
+        notes.append("[yellow]note: more workers than cores[/]")
+    return BenchmarkReport(
         f"PPO, {found.agents} agents a world, {found.numbers} numbers each, {found.workers} "
-        f"workers\n{hardware_line(found.hardware)}"
+        "workers:\nagent-steps/s, and the share of the time in each phase",
+        {
+            "end to end": "side",
+            "worlds": "worlds",
+            "decisions\nan update": "decisions:,",
+            "min": "low:,.0f",
+            "median": "median:,.0f",
+            "max": "high:,.0f",
+            **{head: f"{phase}:.0%" for head, phase in _PHASES.items()},
+        },
+        [_row(side) for side in found.end_to_end],
+        notes=notes,
+        facts=found.facts(),
+        holds=is_kept(at_least, found.ratio),
     )
-    return make_table(title, ("end to end", *(_SIDES[side.name] for side in sides)), rows)
+
+
+def _row(side: TrainingRow) -> dict[str, Any]:
+    rates = side.rates
+    shown = {"low": min(rates), "median": median(rates), "high": max(rates), **side.shares}
+    return {**asdict(side), "side": _SIDES[side.name], **shown}

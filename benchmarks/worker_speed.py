@@ -12,17 +12,17 @@ import multiprocessing
 import signal
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import pairwise
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, ClassVar, Unpack
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.bench.harness import Result, Say, paired_ratio, silent
+from cavmarl.bench.harness import Say, paired_ratio, silent
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError, WorkerError
 from cavmarl.core.machine import describe_hardware
@@ -47,10 +47,8 @@ class Row:
 
 
 @dataclass(frozen=True)
-class WorkerSpeed(Result):
+class WorkerSpeed:
     """What was measured."""
-
-    DERIVED: ClassVar = ("ratio", "processor_ratio", "cost_of_one", "is_crowded")
 
     env: str  # of which environment
     worlds: int  # that were stepped together
@@ -168,10 +166,8 @@ class Measured:
 
 
 @dataclass(frozen=True)
-class CoreCeiling(Result):
+class CoreCeiling:
     """Programs of their own that step worlds, one at a time and all at once."""
-
-    DERIVED: ClassVar = ("ratio",)
 
     programs: int  # how many
     alone_ms: tuple[float, ...]  # of each turn, ms a step of all worlds, one program after another
@@ -181,6 +177,10 @@ class CoreCeiling(Result):
     def ratio(self) -> float:
         """How many times faster all at once are; median of the turns."""
         return paired_ratio(self.alone_ms, self.together_ms)
+
+    def facts(self) -> dict[str, Any]:
+        """Return plain values, for a report."""
+        return {**asdict(self), "ratio": self.ratio}
 
 
 def measure_ceiling(

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cavmarl.bench.clock_drift import ClockDrift, measure_drift, rows_of, write_rows
+from benchmarks.clock_drift import ClockDrift, measure_drift, rows_of, write_rows
+from benchmarks.clock_reader import is_due
 from cavmarl.core.errors import ConfigError
-from cavmarl.cosim.followers.clock_reader import is_due
 from cavmarl.cosim.time_master import OwnTicks
 
 
@@ -46,7 +46,6 @@ def test_what_is_measured_holds_only_if_own_ticks_are_noticed_or_change_nothing(
     even = rows_of([0, 1, 2], [5, 6, 7], 0.1)
     found = ClockDrift("ring", 0.1, 0.5, "obey", None, even, 4, 4, 4, 0)
     assert found.holds
-    assert found.to_dict()["holds"]
     for ticks, holds in ((1, True), (2, False), (1000, False), (None, False)):
         assert replace(found, noticed_ticks=ticks).holds == holds
     ahead = rows_of([0, 1, 2], [5, 6, 8], 0.1)

@@ -9,11 +9,9 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from cavmarl.cli import main
-from cavmarl.cli.bench.traffic_worlds import _worst
-from cavmarl.core.errors import ConfigError, MissingExtraError
-from cavmarl.evaluate.traffic import world_runs
-from cavmarl.evaluate.traffic.world_rows import (
+from benchmarks import traffic_worlds, world_runs
+from benchmarks.program import run
+from benchmarks.world_rows import (
     Row,
     comparable,
     deviation,
@@ -25,7 +23,7 @@ from cavmarl.evaluate.traffic.world_rows import (
     sumo_beside_itself,
     worst,
 )
-from cavmarl.evaluate.traffic.world_runs import (
+from benchmarks.world_runs import (
     KEPT,
     ROWS_FILE,
     WorldSeries,
@@ -33,6 +31,7 @@ from cavmarl.evaluate.traffic.world_runs import (
     run_worlds,
     world_folder,
 )
+from cavmarl.core.errors import ConfigError, MissingExtraError
 
 pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
 pytest.importorskip("matplotlib", reason="needs the extra 'report'")
@@ -138,7 +137,11 @@ def test_the_table_of_the_worst_keeps_its_words_whole_on_a_narrow_terminal(
     features = ["grid", "right_before_left", "turn_lanes", "random_priority", "near_capacity"]
     row = a_row(7, mean_speed_mps=9.0, contacts=3) | {"features": features}
     console = Console(width=80, record=True)
-    console.print(_worst([row, {"seed": 8, "features": [], "error": "no net\nmore"}], tmp_path))
+    console.print(
+        traffic_worlds.worst_table(
+            [row, {"seed": 8, "features": [], "error": "no net\nmore"}], tmp_path
+        )
+    )
     text = console.export_text()
     lines = [line.split() for line in text.splitlines() if line.split()[:1] == ["world_000007"]]
     assert lines[0][1:4] == ["grid,", "right_before_left,", "turn_lanes,"]
@@ -152,12 +155,12 @@ def stubbed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Worlds are not run: a folder and a row each; the seeds that were asked for."""
     ran: list[int] = []
 
-    def run(job: WorldSeries, seed: int) -> Row:
+    def run_world(job: WorldSeries, seed: int) -> Row:
         ran.append(seed)
         world_folder(job.out, seed).mkdir()
         return a_row(seed, mean_speed_mps=10.0 + 0.1 * seed)
 
-    monkeypatch.setattr(world_runs, "_run_world", run)
+    monkeypatch.setattr(world_runs, "_run_world", run_world)
     return ran
 
 
@@ -192,13 +195,10 @@ def test_a_broken_row_is_named(tmp_path: Path) -> None:
     ("words", "says"),
     [
         (("--worlds", "0"), "worlds = 0"),
-        (("--worlds", "1", "--first-seed", "-1"), "first_seed = -1"),
-        (("--worlds", "1", "--without", "hills"), "--without hills"),
-        (("--worlds", "1", "--dt", "0.5"), "sim_dt_s = 0.5"),
-        (("--worlds", "1", "--speed"), "--worlds"),
-        (("some.net.xml", "--worlds", "1"), "--worlds"),
-        (("--worlds", "1", "--out", "/proc/nowhere"), "/proc/nowhere: cannot be written"),
-        (("some.net.xml",), "give a MAP and its --demand FILE"),
+        (("--first-seed", "-1"), "first_seed = -1"),
+        (("--without", "hills"), "--without hills"),
+        (("--dt", "0.5"), "sim_dt_s = 0.5"),
+        (("--out", "/proc/nowhere"), "/proc/nowhere: cannot be written"),
     ],
 )
 def test_bad_input_is_one_line(
@@ -206,7 +206,7 @@ def test_bad_input_is_one_line(
 ) -> None:
     out = () if "--out" in words else ("--out", str(tmp_path))
     with pytest.raises(SystemExit) as ended:
-        main(("bench", "traffic", *words, *out))
+        run(traffic_worlds.measure, [*words, *out])
     assert ended.value.code == 2
     assert says in " ".join(capsys.readouterr().err.split())
 
@@ -225,11 +225,11 @@ def test_two_worlds_are_run_and_shown(tmp_path: Path, capsys: pytest.CaptureFixt
     document = tmp_path / "all.json"
     words = ("--worlds", "2", "--first-seed", "11", "--seconds", "30", "--dt", "0.2")
     with pytest.raises(SystemExit) as ended:
-        main(("bench", "traffic", *words, "--out", str(tmp_path), "--json", str(document)))
+        run(traffic_worlds.measure, [*words, "--out", str(tmp_path), "--json", str(document)])
     assert not ended.value.code
     shown = capsys.readouterr().out
     assert "2 worlds, 0 failed" in shown
-    rows = json.loads(document.read_text())["rows"]
+    rows = json.loads(document.read_text())["worlds"]
     assert [row["seed"] for row in rows] == [11, 12]
     assert all(len(row["sumo_spread"]["arrived"]) == 3 for row in rows)
     for row in rows:

@@ -1,6 +1,6 @@
 """A program that follows a world's clock, records it, and on request ticks by itself.
 
-    python -m cavmarl.cosim.followers.clock_reader ADDRESS SHARE
+    python -m benchmarks.clock_reader ADDRESS SHARE
 
 At the end it prints one line of JSON: the world's tick when it joined, then after each step, as the
 follower has it then, what the clock of its own process says meanwhile (seconds since it joined),

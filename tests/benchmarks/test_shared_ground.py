@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from cavmarl.maps.map_features import MAP_FEATURES, map_features
-from cavmarl.maps.shared_ground import shared_ground, stub_lanes
+from benchmarks.map_features import MAP_FEATURES, map_features
+from benchmarks.shared_ground import shared_ground, stub_lanes
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network
 from tests.support.netgenerate import netconvert, netgenerate

@@ -12,9 +12,9 @@ from xml.etree.ElementTree import Element, ElementTree, SubElement, indent
 import defusedxml.ElementTree
 import numpy as np
 
+from benchmarks.world_draw import DemandDraw, WorldDraw
 from cavmarl.core.errors import ConfigError, MapError, require
 from cavmarl.core.processes import dying_with_parent
-from cavmarl.evaluate.traffic.world_draw import DemandDraw, WorldDraw
 from cavmarl.maps.map_kinds import MAP_ENDINGS
 from cavmarl.maps.netconvert import build_network, map_file
 from cavmarl.roads.cache import load_network

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cavmarl.bench.stopwatch import Stopwatch
+from benchmarks.stopwatch import Stopwatch
 from cavmarl.config.env import EnvConfig
 from cavmarl.config.io import read_yaml
 from cavmarl.config.world_spec import WorldSpec

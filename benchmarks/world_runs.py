@@ -10,15 +10,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from benchmarks.map_features import map_features
+from benchmarks.world_draw import WorldDraw, check_features, draw_world
+from benchmarks.world_files import NET_FILE, ROUTES_FILE, cut_maps, make_files
+from benchmarks.world_rows import Row, failed_row, row_of, worst
 from cavmarl.config.env import ClockConfig
 from cavmarl.core.errors import CavmarlError, ConfigError, require
 from cavmarl.engine.simulation import Simulation
 from cavmarl.evaluate.traffic.traffic_comparison import compare_traffic
 from cavmarl.evaluate.traffic.traffic_plot import plot_fundamental_diagram
-from cavmarl.evaluate.traffic.world_draw import WorldDraw, check_features, draw_world
-from cavmarl.evaluate.traffic.world_files import NET_FILE, ROUTES_FILE, cut_maps, make_files
-from cavmarl.evaluate.traffic.world_rows import Row, failed_row, row_of, worst
-from cavmarl.maps.map_features import map_features
 from cavmarl.render.topdown import WorldView
 from cavmarl.roads.cache import load_network
 
@@ -150,7 +150,8 @@ def _write_commands(job: WorldSeries, draw: WorldDraw, folder: Path) -> None:
     net, routes = folder / NET_FILE, folder / ROUTES_FILE
     words = ["cavmarl", "bench", "traffic", str(net), "--demand", str(routes)]
     words += [f"--seconds={job.seconds}", f"--dt={job.dt_s:g}", f"--seed={draw.seed}"]
-    again = ["cavmarl", "bench", "traffic", "--worlds=1", f"--first-seed={draw.seed}"]
+    again = ["python", "-m", "benchmarks", "traffic_worlds", "--worlds=1"]
+    again += [f"--first-seed={draw.seed}"]
     again += [f"--seconds={job.seconds}", f"--dt={job.dt_s:g}", "--out=AGAIN"]
     again += [f"--without={name}" for name in job.without]
     again += [] if job.maps is None else [f"--maps={job.maps}"]

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
-from cavmarl.bench.sensor_bench import SensorBench, measure_sensor_workers
-from cavmarl.bench.sensor_run import PARTS, describe_rig, load_rig
-from cavmarl.cli import app
+from benchmarks import sensors
+from benchmarks.program import run
+from benchmarks.sensor_bench import SensorBench, measure_sensor_workers
+from benchmarks.sensor_run import PARTS, describe_rig, load_rig
 from cavmarl.config.registry import find_settings, load_config
 from cavmarl.core.errors import ConfigError
 from cavmarl.parallel.processes.process_barrier import usable_cores
@@ -47,7 +47,7 @@ def test_the_ceiling_of_the_machine_is_measured_beside(found: SensorBench) -> No
         return
     assert found.ceiling is not None
     assert found.ceiling.programs == 2
-    assert 0.0 < found.ceiling.ratio == found.to_dict()["ceiling"]["ratio"]
+    assert 0.0 < found.ceiling.ratio == found.facts()["ceiling"]["ratio"]
 
 
 def test_the_parts_of_a_step_are_within_it(found: SensorBench) -> None:
@@ -76,7 +76,7 @@ def test_the_time_of_sumo_is_named_apart(found: SensorBench, tmp_path: Path) -> 
         parts = coupled.parts_ms(1)
         assert parts["SUMO"] > 0.0
         assert sum(parts.values()) <= coupled.rows[0].step_ms * (1.0 + 1e-9)
-        assert "SUMO" in coupled.to_dict()["parts_ms"][1]
+        assert "SUMO" in coupled.facts()["parts_ms"][1]
 
 
 def test_resources_are_those_of_all_processes(found: SensorBench) -> None:
@@ -96,12 +96,12 @@ def test_both_placements_are_told(found: SensorBench) -> None:
 
 
 def test_the_result_is_json_with_every_sensor(found: SensorBench) -> None:
-    told = json.loads(json.dumps(found.to_dict()))
+    told = json.loads(json.dumps(found.facts()))
     sensors = told["turns"][0]["run"]["sensors"]
     assert [sensor["name"] for sensor in sensors] == list(RIG)
     assert sensors[1]["resolution"] == [18, 32, 3]
     assert sensors[1]["placement"]["z_m"] == 1.5
-    assert told["rows"][0]["ci95_between_runs"] is None
+    assert found.rows[0].ci95_between_runs is None
 
 
 def test_the_rig_of_ten_lists_what_it_is() -> None:
@@ -114,21 +114,37 @@ def test_the_rig_of_ten_lists_what_it_is() -> None:
     )
 
 
-def test_the_command_writes_every_step_and_a_figure(tmp_path: Path) -> None:
+def test_the_program_writes_every_step_and_a_figure(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     rig = tmp_path / "small.yaml"
     rig.write_text("wheels: {type: odometry, rate_hz: 20}\n")
-    words = ["bench", "sensors", "grid4x4", "--rig", str(rig), "--workers", "1,2"]
+    words = ["grid4x4", "--rig", str(rig), "--workers", "1,2"]
     words += ["--warmup", "1", "--steps", "3", "--repeats", "1"]
     words += ["--csv", str(tmp_path / "steps.csv"), "--plot", str(tmp_path / "figure.png")]
-    result = CliRunner().invoke(app, [*words, "--json", str(tmp_path / "found.json")])
-    assert result.exit_code == 0, result.output
-    assert "step by step: the same" in result.output
+    with pytest.raises(SystemExit) as ended:
+        run(sensors.measure, [*words, "--json", str(tmp_path / "found.json")])
+    assert not ended.value.code
+    assert "step by step: the same" in capsys.readouterr().out
     with (tmp_path / "steps.csv").open() as file:
         lines = list(csv.DictReader(file))
     assert sorted({line["workers"] for line in lines}) == ["1", "2"]
     assert len(lines) == 6
     assert (tmp_path / "figure.png").stat().st_size > 10_000
-    assert json.loads((tmp_path / "found.json").read_text())["is_same"]
+    written = json.loads((tmp_path / "found.json").read_text())
+    assert written["is_same"]
+    assert [row["workers"] for row in written["rows"]] == [1, 2]
+
+
+@pytest.mark.parametrize("option", ["--csv", "--plot", "--json"])
+def test_files_are_tried_before_any_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str
+) -> None:
+    missing = tmp_path / "missing" / "x.png"
+    with pytest.raises(SystemExit) as ended:
+        run(sensors.measure, ["nowhere", option, str(missing)])
+    assert ended.value.code == 2
+    assert f"{option} {missing}: cannot be written" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 
-from cavmarl.bench.harness import Result
 from cavmarl.core.errors import ConfigError, require
 from cavmarl.evaluate.statistics import Interval, mean_interval
 from cavmarl.evaluate.traffic.traffic_plot import save_figure
@@ -46,7 +45,7 @@ class Measured:
 
 
 @dataclass(frozen=True)
-class ScalingRow(Result):
+class ScalingRow:
     """What was measured with n sensor workers, and what follows from it."""
 
     workers: int

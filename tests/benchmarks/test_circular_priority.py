@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from cavmarl.maps.circular_priority import circular_priority
-from cavmarl.maps.map_features import map_features
+from benchmarks.circular_priority import circular_priority
+from benchmarks.map_features import map_features
 from cavmarl.roads.sumo_net.reader import read_network
 from tests.support.netgenerate import netconvert, netgenerate
 

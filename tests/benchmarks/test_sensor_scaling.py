@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cavmarl.bench.sensor_scaling import (
+from benchmarks.sensor_scaling import (
     MIN_RUNS,
     Measured,
     ScalingRow,

@@ -1,4 +1,4 @@
-"""`cavmarl verify --kill` and `cavmarl bench workers`: what they print, write and refuse."""
+"""`cavmarl verify --kill`: what it prints, writes and refuses."""
 
 from __future__ import annotations
 
@@ -71,8 +71,6 @@ def test_the_workers_of_one_world_are_killed(capsys: pytest.CaptureFixture[str])
         (("verify", "ring", "--kill", "1", "--zones", "1,2"), ("--zones 1,2", "one number")),
         (("verify", "ring", "--kill", "1", "--layout", "grid"), ("--layout", "--set")),
         (("verify", "ring", "--kill", "1", "--workers", "3", "--worlds", "2"), ("workers = 3",)),
-        (("bench", "workers", "ring", "--workers", "1"), ("1 workers", "at least 2")),
-        (("bench", "workers", "ring", "--at-least", "-1"), ("--at-least -1", "above 0")),
     ],
 )
 def test_what_cannot_be_is_refused(
@@ -80,17 +78,3 @@ def test_what_cannot_be_is_refused(
 ) -> None:
     said = refusal(capsys, *words)
     assert all(word in said for word in told), said
-
-
-def test_bench_workers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "speed.json"
-    small = ("--steps", "2", "--repeats", "2", "--json", str(path))
-    assert run("bench", "workers", *SMALL, *small, "--at-least", "100") == 1
-    found = json.loads(path.read_text())
-    assert [row["workers"] for row in found["rows"]] == [0, 1, 2]
-    assert all(len(row["step_ms"]) == 2 for row in found["rows"])
-    assert found["ratio"] > 0.0
-    assert found["barrier_us"][0] <= found["barrier_us"][1] <= found["barrier_us"][3]
-    assert found["hardware"]["usable_cores"] >= 1
-    assert found["ceiling"]["ratio"] > 0.0
-    assert "an empty command to all 2" in capsys.readouterr().out

@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.maps.defects import CAR_WIDTH_M, LEVEL_M
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import lane_grid
 
-CAR_LENGTH_M, CAR_WIDTH_M = 5.0, 1.8
-LEVEL_M = 3.0  # lanes that differ more in height are a bridge and the road below it
+CAR_LENGTH_M = 5.0
 STEP_M = 1.0
 
 

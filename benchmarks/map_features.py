@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from cavmarl.maps.circular_priority import circular_priority
-from cavmarl.maps.shared_ground import shared_ground, stub_lanes
+from benchmarks.circular_priority import circular_priority
+from benchmarks.shared_ground import shared_ground, stub_lanes
 from cavmarl.roads.network import RoadNetwork
 
 MAP_FEATURES = frozenset(("circular_priority", "shared_ground", "stub_lanes"))

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import fmean, median
-from typing import Any, ClassVar, Unpack
+from typing import Any, Unpack
 
-from cavmarl.bench.harness import Result, Say, silent
-from cavmarl.bench.sensor_run import PARTS, Rig, SensorJob, SensorRun, Window, run_sensors
-from cavmarl.bench.sensor_scaling import ScalingRow, Series, scaling_table, summarize
-from cavmarl.bench.worker_speed import CoreCeiling, measure_ceiling
+from benchmarks.sensor_run import PARTS, Rig, SensorJob, SensorRun, Window, run_sensors
+from benchmarks.sensor_scaling import ScalingRow, Series, scaling_table, summarize
+from benchmarks.worker_speed import CoreCeiling, measure_ceiling
+from cavmarl.bench.harness import Say, silent
 from cavmarl.config.env import EnvConfig
 from cavmarl.config.registry import load_config
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
@@ -44,10 +44,8 @@ class Turn:
 
 
 @dataclass(frozen=True)
-class SensorBench(Result):
+class SensorBench:
     """Result of `measure_sensor_workers`."""
-
-    DERIVED: ClassVar = ("sensing_ms", "costs_ms", "is_same")
 
     env: str  # of which environment
     agents: int  # vehicles with sensors
@@ -118,15 +116,18 @@ class SensorBench(Result):
         """Resources of the last run with so many workers."""
         return list(self.of(workers)[-1].windows)
 
-    def to_dict(self) -> dict[str, Any]:
+    def facts(self) -> dict[str, Any]:
+        """Return plain values, for a report: all but `rows`."""
         numbers = self.numbers
         shares = {
             number: {name: asdict(found) for name, found in self.shares(number).items()}
             for number in numbers
         }
-        return super().to_dict() | {
-            "rows": [row.to_dict() for row in self.rows],
-            "ceiling": None if self.ceiling is None else self.ceiling.to_dict(),
+        return asdict(self) | {
+            "sensing_ms": self.sensing_ms,
+            "costs_ms": self.costs_ms,
+            "is_same": self.is_same,
+            "ceiling": None if self.ceiling is None else self.ceiling.facts(),
             "sd": "sd_within_run is the sample standard deviation (n - 1) of steps within a run",
             "parts_ms": {number: self.parts_ms(number) for number in numbers},
             "shares": shares,

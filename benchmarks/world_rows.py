@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.map_features import MAP_FEATURES
+from benchmarks.world_draw import WorldDraw
 from cavmarl.evaluate.traffic.traffic_comparison import TrafficComparison
-from cavmarl.evaluate.traffic.world_draw import WorldDraw
-from cavmarl.maps.map_features import MAP_FEATURES
 
 Row = dict[str, Any]  # a line of worlds.jsonl
 

@@ -1,40 +1,30 @@
-"""`cavmarl bench sensors`: ten sensors of one vehicle over several sensor workers."""
+"""One vehicle's sensors over several numbers of sensor workers."""
 
 from __future__ import annotations
 
 import csv
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
-import typer
-from rich.console import Console
 from rich.table import Table
 
-from cavmarl.bench.harness import make_table, measuring, numbers_of
-from cavmarl.cli.output import (
-    JsonPath,
-    OptionalEnvironment,
-    about,
-    about_file,
-    check_bound,
-    end_below,
-    with_world,
-    write_json,
-)
+from benchmarks.program import run
+from benchmarks.sensor_bench import SensorBench, measure_sensor_workers
+from benchmarks.sensor_run import Window, load_rig
+from benchmarks.sensor_scaling import MIN_RUNS, ScalingRow, plot_sensor_workers
+from cavmarl.bench.harness import BenchmarkReport, Say, is_kept, make_table, numbers_of, silent
+from cavmarl.cli.output import OptionalEnvironment, about, about_file, check_bound, with_world
 from cavmarl.config.registry import find_settings
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
-
-if TYPE_CHECKING:
-    from cavmarl.bench.sensor_bench import SensorBench
-    from cavmarl.bench.sensor_run import Window
-    from cavmarl.bench.sensor_scaling import ScalingRow
-    from cavmarl.parallel.sensor_workers.sensor_shares import Shares
+from cavmarl.parallel.processes.process_barrier import usable_cores
+from cavmarl.parallel.sensor_workers.sensor_shares import Shares
 
 
 @with_world()
-def sensors(
+def measure(
     world: WorldSpec,
     env: OptionalEnvironment = "town",
     workers: Annotated[
@@ -56,35 +46,44 @@ def sensors(
             "Exit with 1 if the second number is not so many times faster.", callback=check_bound
         ),
     ] = None,
-    json_path: JsonPath = None,
-) -> None:
+    say: Say = silent,
+) -> BenchmarkReport:
     """One vehicle and its sensors, with each number of sensor workers, in processes anew.
 
     Exit code 1: states or frames differed between runs, or --at-least did not hold.
     """
-    from cavmarl.bench.sensor_bench import measure_sensor_workers
-    from cavmarl.bench.sensor_run import load_rig
-    from cavmarl.bench.sensor_scaling import plot_sensor_workers
-
-    numbers = numbers_of("--workers", workers)
-    counts: dict[str, Any] = {"warmup": warmup, "steps": steps, "repeats": repeats}
-    console = Console()
-    with measuring(console) as say:
-        mounted = load_rig(find_settings("rig", rig))
-        found = measure_sensor_workers(world, mounted, workers=numbers, say=say, **counts)
+    mounted = load_rig(find_settings("rig", rig))
+    found = measure_sensor_workers(
+        world,
+        mounted,
+        workers=numbers_of("--workers", workers),
+        warmup=warmup,
+        steps=steps,
+        repeats=repeats,
+        say=say,
+    )
     rows = found.rows
-    for table in (_sensors(found), _scaling(found, rows), _parts(found), _resources(found)):
-        console.print(table)
-    _say(console, found, rows)
-    write_json(json_path, found.to_dict())
     if csv_path is not None:
         _write_csv(csv_path, found)
     if plot is not None:
         title = f"{Path(env).stem}: {len(found.costs_ms)} sensors, {found.sensing_ms:.1f} ms a tick"
         plot_sensor_workers(rows, title, plot)
-    if not found.is_same:
-        raise typer.Exit(1)
-    end_below(at_least, rows[1].speedup if len(rows) > 1 else None)
+    speedup = rows[1].speedup if len(rows) > 1 else None
+    return BenchmarkReport(
+        f"{Path(found.env).stem}, {found.agents} vehicles with sensors, {found.warmup} + "
+        f"{found.steps} steps, placed by {found.placement}",
+        {"sensor\nworkers": "name", **_FIGURES},
+        [{"name": _name(row), **asdict(row)} for row in rows],
+        notes=_notes(found, rows),
+        facts=found.facts(),
+        holds=found.is_same and is_kept(at_least, speedup),
+        caption="best: of those measured; SD: of the steps of a run",
+        tables=(_sensors(found), _parts(found), _resources(found)),
+    )
+
+
+def _name(row: ScalingRow) -> str:
+    return f"{row.workers} (best)" if row.is_best else str(row.workers)
 
 
 def _sensors(found: SensorBench) -> Table:
@@ -133,25 +132,16 @@ def _homes(plan: Shares) -> dict[int, str]:
 
 
 _FIGURES = {
-    "FPS": "fps",
-    "tick +\nsensors\nms": "step_ms", "SD\nms": "sd_within_run", "wait\nms": "wait_ms",
-    "speedup": "speedup", "effi-\nciency\n%": "efficiency_pct", "CV\n%": "cv_pct",
-    "wait\n%": "wait_share_pct", "rest\nms": "rest_ms",
-}  # fmt: skip
-
-
-def _scaling(found: SensorBench, rows: list[ScalingRow]) -> Table:
-    cells = []
-    for row in rows:
-        values = (f"{getattr(row, name):.2f}" for name in _FIGURES.values())
-        cells.append((f"{row.workers}{' (best)' if row.is_best else ''}", *values))
-    return make_table(
-        f"{Path(found.env).stem}, {found.agents} vehicles with sensors, {found.warmup} + "
-        f"{found.steps} steps, placed by {found.placement}",
-        ("sensor\nworkers", *_FIGURES),
-        cells,
-        "best: of those measured; SD: of the steps of a run",
-    )
+    "FPS": "fps:.2f",
+    "tick +\nsensors\nms": "step_ms:.2f",
+    "SD\nms": "sd_within_run:.2f",
+    "wait\nms": "wait_ms:.2f",
+    "speedup": "speedup:.2f",
+    "effi-\nciency\n%": "efficiency_pct:.2f",
+    "CV\n%": "cv_pct:.2f",
+    "wait\n%": "wait_share_pct:.2f",
+    "rest\nms": "rest_ms:.2f",
+}
 
 
 def _parts(found: SensorBench) -> Table:
@@ -186,10 +176,7 @@ def _resources(found: SensorBench) -> Table:
     return make_table("resources", ("a step", *map(str, found.numbers)), rows)
 
 
-def _say(console: Console, found: SensorBench, rows: list[ScalingRow]) -> None:
-    from cavmarl.bench.sensor_scaling import MIN_RUNS
-    from cavmarl.parallel.processes.process_barrier import usable_cores
-
+def _notes(found: SensorBench, rows: list[ScalingRow]) -> list[str]:
     best = next(row for row in rows if row.is_best)
     intervals = [
         f"{row.workers}: {row.ci95_between_runs.low:.2f} to {row.ci95_between_runs.high:.2f} ms"
@@ -211,11 +198,13 @@ def _say(console: Console, found: SensorBench, rows: list[ScalingRow]) -> None:
             "not give"
         )
     cores = len(usable_cores())
-    lines.append(f"cores: {cores}; runs in this order: {[turn.workers for turn in found.turns]}")
+    order = ", ".join(str(turn.workers) for turn in found.turns)
+    lines.append(f"cores: {cores}; runs in this order: {order}")
     crowded = [number for number in found.numbers if number > cores]
     if crowded:
-        lines.append(f"[yellow]note: {crowded} are more sensor workers than cores[/]")
-    console.print("\n".join(lines), highlight=False)
+        told = ", ".join(map(str, crowded))
+        lines.append(f"[yellow]note: {told} are more sensor workers than cores[/]")
+    return lines
 
 
 def _write_csv(path: Path, found: SensorBench) -> None:
@@ -232,3 +221,7 @@ def _write_csv(path: Path, found: SensorBench) -> None:
                     writer.writerow([turn.place, turn.repeat, turn.workers, step, *values])
     except OSError as error:
         raise ConfigError(f"--csv {path}: cannot be written ({error.strerror})") from error
+
+
+if __name__ == "__main__":
+    run(measure)

@@ -8,8 +8,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from cavmarl.core.errors import ConfigError
-from cavmarl.evaluate.traffic.world_draw import (
+from benchmarks.world_draw import (
     FEATURES,
     JUNCTIONS,
     KINDS,
@@ -20,7 +19,8 @@ from cavmarl.evaluate.traffic.world_draw import (
     WorldDraw,
     draw_world,
 )
-from cavmarl.evaluate.traffic.world_files import cut_maps, make_files
+from benchmarks.world_files import cut_maps, make_files
+from cavmarl.core.errors import ConfigError
 from cavmarl.roads.cache import load_network
 
 pytest.importorskip("sumo", reason="needs the extra 'sumo'")

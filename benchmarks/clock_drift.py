@@ -14,9 +14,9 @@ from dataclasses import asdict, dataclass
 from fractions import Fraction
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, ClassVar, Unpack
+from typing import Any, Unpack
 
-from cavmarl.bench.harness import Result, check_range
+from cavmarl.bench.harness import check_range
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import EvaluationError
 from cavmarl.core.processes import start_python
@@ -24,7 +24,7 @@ from cavmarl.cosim.followers.followed_world import FollowedWorld
 from cavmarl.cosim.time_master import OwnTicks, Pacer, RealTime, Unpaced
 from cavmarl.env.parallel import parallel_env
 
-PROGRAM = "cavmarl.cosim.followers.clock_reader"
+PROGRAM = "benchmarks.clock_reader"
 ENDS_S = 30.0  # for the follower to end by itself
 JOINS_S = 60.0  # for it to start
 TIMEOUT_S = 60.0
@@ -47,10 +47,8 @@ class DriftRow:
 
 
 @dataclass(frozen=True)
-class ClockDrift(Result):
+class ClockDrift:
     """What was measured."""
-
-    DERIVED: ClassVar = ("holds",)
 
     environment: str  # on which
     dt_s: float  # seconds a tick, which is a step here

@@ -1,0 +1,72 @@
+"""The clock of a master and that of a follower in another process, after the same steps."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Literal
+
+from benchmarks.clock_drift import ClockDrift, measure_drift, write_rows
+from benchmarks.program import run
+from cavmarl.bench.harness import BenchmarkReport, Say, silent
+from cavmarl.cli.output import OptionalEnvironment, about, about_file, with_world
+from cavmarl.config.world_spec import WorldSpec
+
+
+@with_world("seed", "settings")
+def measure(
+    world: WorldSpec,
+    env: OptionalEnvironment = "ring",
+    steps: Annotated[int, about("Steps of the master; a step is one tick here.")] = 5000,
+    rogue: Annotated[
+        float, about("Share of steps in which the follower also ticks by itself.")
+    ] = 0.0,
+    own_ticks: Annotated[
+        Literal["obey", "refuse", "ignore"],
+        about("What the master does with such a tick; obey: the world really ticks."),
+    ] = "obey",
+    pace: Annotated[
+        float | None,
+        about("Simulated seconds a second; then a clock of the follower's own is read, too."),
+    ] = None,
+    csv_path: Annotated[Path | None, about_file("Write the table here.", "--csv")] = None,
+    say: Say = silent,
+) -> BenchmarkReport:
+    """Read a master's clock and that of a follower in another process: Table II."""
+    say(f"{steps} steps")
+    found = measure_drift(world, steps=steps, rogue=rogue, answer=own_ticks, pace=pace)
+    if csv_path is not None:
+        write_rows(csv_path, found.rows)
+    return BenchmarkReport(
+        f"{found.environment}, {1000.0 * found.dt_s:g} ms a step",
+        {
+            "step": "step",
+            "master, s": "master_s:.1f",
+            "follower, s": "follower_s:.1f",
+            "normalised, s": "normalised_s:.1f",
+            "Δ, s": "delta_s:.1f",
+            "ratio": "ratio:.2f",
+            "own clock, Δ, s": "own_delta_s:+.4f",
+        },
+        [asdict(row) for row in found.rows],
+        notes=[_verdict(found)],
+        facts={**asdict(found), "holds": found.holds},
+        holds=found.holds,
+    )
+
+
+def _verdict(found: ClockDrift) -> str:
+    if not found.own_ticks:
+        equal = "equal" if found.holds else "[bold]not equal[/]"
+        return f"the follower did not tick by itself; the clocks are {equal}"
+    told = f"the follower ticked by itself {found.own_ticks} times ({found.answer})"
+    if found.noticed_ticks is None:
+        return f"{told}; the master counted {found.counted}, and the world went on only with it"
+    return (
+        f"{told}; the master noticed {found.drift_events} times that the world had gone on without "
+        f"it, first {found.noticed_ticks} of its ticks after the first time"
+    )
+
+
+if __name__ == "__main__":
+    run(measure)

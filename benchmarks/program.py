@@ -1,0 +1,28 @@
+"""How a benchmark is run as a program.
+
+A benchmark is a function that takes options and a `say`, and returns a `BenchmarkReport` of
+`cavmarl.bench.harness`, which has turns, medians and checks of numbers, too.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+
+import typer
+
+from cavmarl.bench.harness import BenchmarkReport
+from cavmarl.cli.output import print_error
+from cavmarl.cli.report_command import report_command
+from cavmarl.core.errors import CavmarlError
+
+
+def run(measure: Callable[..., BenchmarkReport], words: Sequence[str] | None = None) -> None:
+    """Run a benchmark as a program; an error that is raised on purpose is one line and code 2."""
+    app = typer.Typer(pretty_exceptions_enable=False)
+    app.command()(report_command(measure))
+    try:
+        app(args=None if words is None else list(words))
+    except CavmarlError as error:
+        print_error(str(error))
+        sys.exit(2)
