@@ -36,9 +36,9 @@ from cavmarl.driving.kernels.lane_index import ENTRY
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN, lane_grid
+from cavmarl.sensors.kernels.frame_stacks import fill_stacks
 from cavmarl.sensors.kernels.observe_optional import observe_optional
 from cavmarl.sensors.kernels.observing_messages import observe_messages
-from cavmarl.sensors.kernels.output_reset import fill_stacks
 from cavmarl.sensors.observed import layout, optional_arrays, sensor_arrays
 from cavmarl.shards.kernels.world_phases import suggest
 from cavmarl.shards.registered_outputs import RegisteredOutputs

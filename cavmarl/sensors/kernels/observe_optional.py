@@ -9,6 +9,7 @@ from cavmarl.core.compiled import kernel
 from cavmarl.core.math.neighbors import Grid, fill_grid
 from cavmarl.core.records.arrays import LaneGrid, RoadArrays, Travel, Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
+from cavmarl.sensors.kernels.frame_stacks import has_entered, newest_frame
 from cavmarl.sensors.kernels.kinematics_observation import observe_kinematics
 from cavmarl.sensors.kernels.lidar_cells import observe_lidar_cells
 from cavmarl.sensors.kernels.nearest_road_points import observe_roadgraph
@@ -16,7 +17,6 @@ from cavmarl.sensors.kernels.observing_conflicts import forget_others, observe_c
 from cavmarl.sensors.kernels.observing_history import observe_history
 from cavmarl.sensors.kernels.observing_way import observe_way
 from cavmarl.sensors.kernels.occupancy import observe_occupancy
-from cavmarl.sensors.kernels.output_reset import has_entered, newest_frame
 from cavmarl.sensors.kernels.sensor_arrays import OptionalSensors
 
 
