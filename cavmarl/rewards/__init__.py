@@ -2,10 +2,10 @@
 
 | step | where it is computed | where it is called, at the end of each step |
 |---|---|---|
-| the terms of one agent | `rewards/kernels/terms.py` | `sensors/kernels/sense.py`, shard by shard |
+| terms of one agent | `rewards/kernels/terms.py` | `sensors/kernels/sense.py`, a shard |
 | terms registered by users | `rewards/registered_terms.py` | `shards/registered_outputs.py` |
-| weighted sum and team share | `rewards/kernels/reward.py` | `engine/kernels/outputs.py`, once a world |
-| credit to the episode return | `rewards/kernels/reward.py` | `shards/kernels/group_phases.py` |
+| weighted sum, team share | `rewards/kernels/reward.py` | `engine/kernels/outputs.py`, a world |
+| credit to the return | `rewards/kernels/reward.py` | `shards/kernels/group_phases.py` |
 
 The terms are computed inside of `sense` because that kernel has filled the grid of the vehicles
 around the agent, which the time to collision needs. `engine/tick.py` has the order of these calls.

@@ -114,7 +114,7 @@ class Shard:
         self.sensors = sensor_arrays(config.sensors, network)
         most_told = config.v2x.inbox.objects
         num_worlds, capacity = zoned.rows.shape[2:]
-        self._further = optional_arrays(config.sensors, network, plans, most_told, capacity)
+        self._optional = optional_arrays(config.sensors, network, plans, most_told, capacity)
         self._registered = RegisteredOutputs(config, network)
         self._floating = len(network.maps) > 1
         self._extent_m = network.room_m
@@ -152,7 +152,7 @@ class Shard:
         self.target_speeds = np.array(config.action.target_speeds_mps)
         self.discrete = config.action.kind == "discrete"
         self._call_leave = specialized(leave)
-        self._call_observe_further = specialized(observe_optional)
+        self._call_observe_optional = specialized(observe_optional)
         self._call_observe_messages = specialized(observe_messages)
         self._call_fill_stacks = specialized(fill_stacks)
 
@@ -196,10 +196,10 @@ class Shard:
         And the registered terms.
         """
         observations, stack = self.outputs.observations, self.config.sensors.stack
-        if self._further is not None:
+        if self._optional is not None:
             clock = self.config.clock
-            self._call_observe_further(
-                self.roads, self.travel, self.lane_grid, self.worlds, self.grid, self._further,
+            self._call_observe_optional(
+                self.roads, self.travel, self.lane_grid, self.worlds, self.grid, self._optional,
                 self._untold if self.mail is None else self.mail.objects,
                 clock.sim_dt_s, clock.ticks_per_step, stack, chosen, observations,
             )  # fmt: skip

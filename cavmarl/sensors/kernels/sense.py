@@ -1,7 +1,7 @@
 """The end of a step: what the agents of one shard observe, and their terms.
 
 One function a sensor: it writes its features, scaled numbers in [-1, 1], from position `at` on. The
-scales stand here; the names and meanings of the features in `sensors/observed/ego_features.py`.
+scales stand here; the names and meanings of the features in `sensors/observed/`.
 """
 
 from __future__ import annotations
