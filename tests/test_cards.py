@@ -34,7 +34,7 @@ OFF = SensorsConfig(
 )
 
 # The sensors that entries leave off, with the settings that those who made them have as defaults.
-FURTHER = (
+OPTIONAL = (
     replace(OFF, kinematics=KinematicsConfig(vehicles_count=5)),
     replace(
         OFF,
@@ -46,10 +46,10 @@ FURTHER = (
 )
 
 
-def further_table() -> str:
-    """The tables of `FURTHER` as one; each sensor's indices begin at 0."""
-    head, *rows = observation_table(FURTHER[0]).split("\n", 1)
-    for config in FURTHER[1:]:
+def optional_table() -> str:
+    """The tables of `OPTIONAL` as one; each sensor's indices begin at 0."""
+    head, *rows = observation_table(OPTIONAL[0]).split("\n", 1)
+    for config in OPTIONAL[1:]:
         rows.append(observation_table(config).split("\n", 2)[2])
     return "\n".join([head, *rows])
 
@@ -58,7 +58,7 @@ def further_table() -> str:
     "page", ["docs/environments.md", *(f"envs/{name}/README.md" for name in sorted(entries()))]
 )
 def test_a_page_has_the_sensors_that_can_be_switched_on(page: str) -> None:
-    check_block(ROOT / page, "further sensors", further_table())
+    check_block(ROOT / page, "optional sensors", optional_table())
 
 
 @pytest.mark.parametrize("name", sorted(entries()))

@@ -9,9 +9,9 @@ those can be used here.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
-from typing import Annotated, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from cavmarl.config.checks import Section, Whole, Within, check, check_finite
 from cavmarl.core.extensions import REGISTERED_SENSORS
@@ -41,7 +41,34 @@ MAX_GRID_NUMBERS = 65_536
 
 
 @dataclass(frozen=True)
-class EgoConfig:
+class SensorSection(Section, key=""):
+    """The keys of one sensor.
+
+    A class of a sensor names `switches`, the fields that switch it on: it is off if each of them is
+    0, empty or false. `sight` are those switches that let it look at other vehicles or at signals.
+    """
+
+    switches: ClassVar[tuple[str, ...]] = ()
+    sight: ClassVar[tuple[str, ...]] = ()
+
+    def __init_subclass__(
+        cls, key: str, switches: tuple[str, ...] = (), sight: tuple[str, ...] = ()
+    ) -> None:
+        super().__init_subclass__(key=key)
+        cls.switches, cls.sight = switches, sight
+
+    @property
+    def is_on(self) -> bool:
+        """Whether any of the switches is set."""
+        return any(getattr(self, name) for name in self.switches)
+
+    def without_sight(self) -> Self:
+        """Return the same sensor with its sight switched off."""
+        return replace(self, **{name: type(getattr(self, name))() for name in self.sight})
+
+
+@dataclass(frozen=True)
+class EgoConfig(SensorSection, key="sensors.ego", switches=("enabled",)):
     """The vehicle itself, its lane and what the plan asks of it.
 
     Attributes:
@@ -54,7 +81,7 @@ class EgoConfig:
 
 
 @dataclass(frozen=True)
-class RouteAheadConfig(Section, key="sensors.route"):
+class RouteAheadConfig(SensorSection, key="sensors.route", switches=("points",)):
     """Points of the route ahead, in the ego frame.
 
     Attributes:
@@ -67,7 +94,9 @@ class RouteAheadConfig(Section, key="sensors.route"):
 
 
 @dataclass(frozen=True)
-class NeighborsConfig(Section, key="sensors.neighbors"):
+class NeighborsConfig(
+    SensorSection, key="sensors.neighbors", switches=("count",), sight=("count",)
+):
     """The nearest vehicles, in the ego frame.
 
     Attributes:
@@ -82,7 +111,9 @@ class NeighborsConfig(Section, key="sensors.neighbors"):
 
 
 @dataclass(frozen=True)
-class SignalAheadConfig(Section, key="sensors.signal"):
+class SignalAheadConfig(
+    SensorSection, key="sensors.signal", switches=("enabled",), sight=("enabled",)
+):
     """The next signal or duty to give way on the route.
 
     Attributes:
@@ -97,7 +128,7 @@ class SignalAheadConfig(Section, key="sensors.signal"):
 
 
 @dataclass(frozen=True)
-class LanesConfig(Section, key="sensors.lanes"):
+class LanesConfig(SensorSection, key="sensors.lanes", switches=("range_m",), sight=("range_m",)):
     """Vehicles by their place along the lanes around, and the one that crosses the own way first.
 
     Attributes:
@@ -108,7 +139,7 @@ class LanesConfig(Section, key="sensors.lanes"):
 
 
 @dataclass(frozen=True)
-class LidarConfig(Section, key="sensors.lidar"):
+class LidarConfig(SensorSection, key="sensors.lidar", switches=("rays",), sight=("rays",)):
     """Distances around the vehicle.
 
     Attributes:
@@ -123,7 +154,9 @@ class LidarConfig(Section, key="sensors.lidar"):
 
 
 @dataclass(frozen=True)
-class KinematicsConfig(Section, key="sensors.kinematics"):
+class KinematicsConfig(
+    SensorSection, key="sensors.kinematics", switches=("vehicles_count",), sight=("vehicles_count",)
+):
     """highway-env's `Kinematics`: a table of vehicles by features, the own one first.
 
     Attributes:
@@ -161,7 +194,9 @@ class KinematicsConfig(Section, key="sensors.kinematics"):
 
 
 @dataclass(frozen=True)
-class OccupancyGridConfig(Section, key="sensors.occupancy_grid"):
+class OccupancyGridConfig(
+    SensorSection, key="sensors.occupancy_grid", switches=("features",), sight=("features",)
+):
     """highway-env's `OccupancyGrid`: layers of cells around the vehicle.
 
     Attributes:
@@ -222,7 +257,9 @@ class OccupancyGridConfig(Section, key="sensors.occupancy_grid"):
 
 
 @dataclass(frozen=True)
-class LidarObservationConfig(Section, key="sensors.lidar_observation"):
+class LidarObservationConfig(
+    SensorSection, key="sensors.lidar_observation", switches=("cells",), sight=("cells",)
+):
     """highway-env's `LidarObservation`: distance and speed in sectors around the vehicle.
 
     Attributes:
@@ -237,7 +274,7 @@ class LidarObservationConfig(Section, key="sensors.lidar_observation"):
 
 
 @dataclass(frozen=True)
-class RoadgraphConfig(Section, key="sensors.roadgraph"):
+class RoadgraphConfig(SensorSection, key="sensors.roadgraph", switches=("points",)):
     """The nearest points of the road network, as Waymax's `roadgraph_points`.
 
     Attributes:
@@ -252,7 +289,9 @@ class RoadgraphConfig(Section, key="sensors.roadgraph"):
 
 
 @dataclass(frozen=True)
-class MessagesConfig(Section, key="sensors.messages"):
+class MessagesConfig(
+    SensorSection, key="sensors.messages", switches=("objects", "events", "signal")
+):
     """What the vehicle has been told over the air, see `v2x`.
 
     Attributes:
@@ -269,7 +308,9 @@ class MessagesConfig(Section, key="sensors.messages"):
 
 
 @dataclass(frozen=True)
-class WayConfig(Section, key="sensors.way"):
+class WayConfig(
+    SensorSection, key="sensors.way", switches=("distances_m", "lines"), sight=("lines",)
+):
     """The way ahead by its shape, its lanes and the stop lines on it.
 
     Attributes:
@@ -297,7 +338,9 @@ class WayConfig(Section, key="sensors.way"):
 
 
 @dataclass(frozen=True)
-class ConflictsConfig(Section, key="sensors.conflicts"):
+class ConflictsConfig(
+    SensorSection, key="sensors.conflicts", switches=("count",), sight=("count",)
+):
     """The vehicles that come nearest to the own way, the soonest and nearest ones first.
 
     Nothing of their plans is told but what `indicators` show: each is taken to go on as it goes,
@@ -322,7 +365,7 @@ class ConflictsConfig(Section, key="sensors.conflicts"):
 
 
 @dataclass(frozen=True)
-class HistoryConfig(Section, key="sensors.history"):
+class HistoryConfig(SensorSection, key="sensors.history", switches=("steps",)):
     """What the vehicle was told to do, and its speeds.
 
     Attributes:
@@ -361,48 +404,25 @@ class SensorsConfig(Section, key="sensors"):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        counts = (
-            self.ego.enabled,
-            self.route.points,
-            self.neighbors.count,
-            self.signal.enabled,
-            self.lanes.range_m,
-            self.lidar.rays,
-            self.kinematics.vehicles_count,
-            len(self.occupancy_grid.features),
-            self.lidar_observation.cells,
-            self.roadgraph.points,
-            self.messages.objects,
-            self.messages.events,
-            self.messages.signal,
-            len(self.way.distances_m),
-            self.way.lines,
-            self.conflicts.count,
-            self.history.steps,
-            len(self.registered),
-        )
         for name in self.registered:
             there = name in REGISTERED_SENSORS
             check(there, "sensors.registered", name, REGISTERED_SENSORS.advice())
         once = len(set(self.registered)) == len(self.registered)
         self.need("registered", once, "must name each sensor once")
-        check(any(counts), "sensors", "all off", "an agent must observe something; switch one on")
+        is_any_on = bool(self.registered) or any(one.is_on for one in self._sections().values())
+        check(is_any_on, "sensors", "all off", "an agent must observe something; switch one on")
+
+    def _sections(self) -> dict[str, SensorSection]:
+        """Return the keys of each sensor of the package, by its name."""
+        named = ((entry.name, getattr(self, entry.name)) for entry in fields(self))
+        return {name: value for name, value in named if isinstance(value, SensorSection)}
 
     def without_sight(self) -> SensorsConfig:
-        """The same without those that look at others or at signals."""
-        return replace(
-            self,
-            neighbors=replace(self.neighbors, count=0),
-            signal=replace(self.signal, enabled=False),
-            lanes=replace(self.lanes, range_m=0.0),
-            lidar=replace(self.lidar, rays=0),
-            kinematics=replace(self.kinematics, vehicles_count=0),
-            occupancy_grid=replace(self.occupancy_grid, features=()),
-            lidar_observation=replace(self.lidar_observation, cells=0),
-            way=replace(self.way, lines=0),
-            conflicts=replace(self.conflicts, count=0),
-            registered=(),
-        )
+        """Return the same sensors, but for those that look at others or at signals."""
+        blind: dict[str, Any] = {
+            name: section.without_sight() for name, section in self._sections().items()
+        }
+        return replace(self, registered=(), **blind)
 
 
 def _is_range(bounds: tuple[float, ...]) -> bool:

@@ -10,9 +10,9 @@ from cavmarl.core.compiled import specialized
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.memory import Zeros
 from cavmarl.core.records.arrays import Outputs, Worlds
+from cavmarl.engine.kernels.outputs import clear_outputs, settle_outputs
 from cavmarl.roads.kernels.signal_phases import switch_signals
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.sensors.kernels.output_reset import clear_outputs, settle_outputs
 from cavmarl.sensors.observed import frame_size
 
 

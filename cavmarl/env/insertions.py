@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,8 +16,6 @@ from cavmarl.core.records.codes import (
     INSERT_OPEN,
     INSERT_VEHICLE,
 )
-from cavmarl.env.declared_events import DeclaredEvents
-from cavmarl.parallel.step_arrays import SteppedWorlds
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.shards.shard import Commands
 
@@ -191,76 +188,3 @@ class Insertions:
         self._waiting[chosen] = 0
         for world in np.flatnonzero(chosen).tolist():
             self._told[world] = ()
-
-
-class InsertedWorlds:
-    """Base of an environment: vehicles can be put into its running worlds."""
-
-    config: EnvConfig
-    network: RoadNetwork
-    worlds: SteppedWorlds
-    _events: DeclaredEvents
-
-    @cached_property
-    def _insertions(self) -> Insertions:
-        return Insertions(self.config, self.network, len(self.worlds.arrays.mask))
-
-    def insert_vehicle(self, lane: str, position_m: float, world: int = 0) -> None:
-        """Let a car enter a world in the next step, or as soon as there is a safe gap.
-
-        It counts in `population.insertions`, drives to a goal of the generator's and is one of its
-        vehicles from then on.
-
-        Args:
-            lane: id of a lane of a road.
-            position_m: on it, of the front bumper.
-            world: its number.
-
-        Raises:
-            ActionError: no such lane or place, or cars may not drive there.
-            CapacityError: as many have been put there in this episode as may be.
-            ConfigError: `population.insertions` is 0.
-        """
-        self._insertions.vehicle(world, lane, position_m)
-
-    def close_road(self, edge: str, world: int = 0) -> None:
-        """Close a road from the next step on, until it is opened or the episode is over.
-
-        On each of its lanes a car stands at its beginning, as soon as there is a safe gap; each
-        counts in `population.insertions`. Others wait behind them, or go round where they can.
-
-        Args:
-            edge: id of a road.
-            world: its number.
-
-        Raises:
-            ActionError: as of `insert_vehicle`, or it is closed already.
-            CapacityError, ConfigError: as of `insert_vehicle`.
-        """
-        self._insertions.barrier(world, edge)
-
-    def open_road(self, edge: str, world: int = 0) -> None:
-        """Open a road that was closed: from the next step on the cars there drive on.
-
-        They go to a goal of the generator's, as others that were put there; they still count in
-        `population.insertions`.
-
-        Args:
-            edge: id of a road.
-            world: its number.
-
-        Raises:
-            ActionError: no such road, or it is not closed.
-            ConfigError: `population.insertions` is 0.
-        """
-        self._insertions.no_barrier(world, edge)
-
-    def closed_roads(self, world: int = 0) -> tuple[str, ...]:
-        """Ids of the roads that `close_road` has closed, also from the next step on."""
-        return self._insertions.closed(world)
-
-    def _take_step(self, commands: Commands) -> None:
-        """Step the worlds with all that waits for a step; after a failure that still waits."""
-        self.worlds.step(self._insertions.add_to(self._events.add_to(commands)))
-        self._events.taken()
-        self._insertions.taken()

@@ -15,31 +15,24 @@ from pettingzoo import ParallelEnv
 from cavmarl.config.driver_form import with_sensors_of
 from cavmarl.config.registry import load_config
 from cavmarl.core.errors import ActionError, ConfigError, EpisodeError
-from cavmarl.core.seeds import check_seed, first_seed
-from cavmarl.engine.simulation import Simulation
+from cavmarl.core.seeds import check_seed
 from cavmarl.engine.spaces import (
     STATE_FEATURES,
     action_space,
-    named_observation,
-    observation_parts,
     observation_space,
-    sensed_observation,
     state_space,
 )
 from cavmarl.engine.world_setup import check_agents, make_world
-from cavmarl.env.actions import LENIENT, ActionDecoder
-from cavmarl.env.declared_events import DeclaredEvents
-from cavmarl.env.drawn_worlds import RENDER_MODES, DrawnWorlds, check_rendering
+from cavmarl.env.actions import LENIENT
+from cavmarl.env.agent_dicts import AgentDicts, Listed, Observation
+from cavmarl.env.drawn_worlds import RENDER_MODES, check_rendering
 from cavmarl.env.recorded_worlds import Record, check_recording
-from cavmarl.env.world_copies import CopiedWithWorlds
+from cavmarl.env.step_session import StepSession
+from cavmarl.env.worlds_environment import WorldsEnvironment
 from cavmarl.parallel.backends import check_hosts, make_worlds, places_of
 from cavmarl.parallel.step_arrays import SteppedWorlds
 from cavmarl.sensors.mounted.frames import SensorFrames
 
-# What an agent's info holds, behind the terms.
-_OF_VEHICLE = ("active", "vehicle_done", "vehicle_id")
-
-Observation = NDArray[np.float32] | dict[str, NDArray[Any]]
 Stepped = tuple[
     dict[str, Observation],
     dict[str, float],
@@ -125,7 +118,7 @@ def _flags(agents: list[str], flags: NDArray[np.bool_]) -> dict[str, bool]:
     return dict(zip(agents, flags.tolist(), strict=True))
 
 
-class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is not typed
+class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[misc] # PettingZoo is not typed
     """One world.
 
     Observations, actions and rewards are described in docs/environments.md. The infos of each agent
@@ -150,39 +143,21 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
     def __init__(
         self, worlds: SteppedWorlds, *, seed: int | None = None, render_mode: str | None = None
     ) -> None:
-        self.worlds = worlds
-        self.config = config = worlds.world.config
-        self.network = worlds.world.network
-        self.render_mode = render_mode
+        super().__init__(StepSession(worlds, seed=seed), render_mode)
+        config = self.config
+        self.metadata = {**type(self).metadata, **self.metadata}
         self.ghosts_of: int | None = None
-        self.metadata = {
-            **self.metadata,
-            "name": f"cavmarl/{config.name}-v{config.version}",
-            "render_fps": max(1, round(1.0 / config.clock.ctrl_dt_s)),
-        }
-        self.possible_agents = [f"car_{k}" for k in range(config.population.num_ids)]
-        self._rows: NDArray[np.intp]
-        self._listed: NDArray[np.intp] | slice  # the same
-        self._list(np.zeros(0, dtype=np.intp))
-        self._max_cycles = config.max_steps
         one_observation, one_action = observation_space(config), action_space(config.action)
         self.observation_spaces = dict.fromkeys(self.possible_agents, one_observation)
         self.action_spaces = dict.fromkeys(self.possible_agents, one_action)
-        self._seats = config.population.mode == "respawn"
-        self._stack = config.sensors.stack
-        self._term_names = config.terms.names
-        self._info_absent = dict.fromkeys((*self._term_names, *_OF_VEHICLE), 0.0)
-        self._info_active = self._info_absent | {"active": 1.0}
-        self._parts = (
-            observation_parts(config.sensors)
-            if config.observation.kind == "dict" and config.observation.mode != "sensors"
-            else None
-        )
         self.state_space = state_space(worlds.arrays.states.shape[1] // STATE_FEATURES)
-        self._decoder = ActionDecoder(config.action, 1, self.possible_agents)
-        self._events = DeclaredEvents(config, 1)
-        self._first_seed = seed
-        self._view = None
+        self._dicts = AgentDicts(config)
+        self._seats = config.population.mode == "respawn"
+        self._max_cycles = config.max_steps
+        self._steps = 0
+        self._rows: NDArray[np.intp]
+        self._listed: Listed  # the same
+        self._list(np.zeros(0, dtype=np.intp))
 
     @property
     def max_cycles(self) -> int:
@@ -203,20 +178,6 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
             )
         self._max_cycles = int(steps)
 
-    @property
-    def step_s(self) -> float:
-        """Seconds a step."""
-        return self.config.clock.ctrl_dt_s
-
-    @property
-    def simulation(self) -> Simulation:
-        """The world behind this view, for tools that draw or measure it.
-
-        Raises:
-            ConfigError: it lives in worker processes.
-        """
-        return self.worlds.simulation
-
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         """The same object at each call and for each agent."""
         return self.observation_spaces[agent]
@@ -234,17 +195,9 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
             seed: root of all random numbers; None goes on with the next episode of the last seed.
             options: not used; accepted because the API has it.
         """
-        if seed is not None or not self._ready:
-            seed = first_seed(seed, self._first_seed)
-        arrays = self.worlds.arrays
-        arrays.chosen[:] = True
-        self.worlds.reset(seed, 0)
-        self._decoder.forget(arrays.chosen)
-        self._insertions.forget(arrays.chosen)
+        self._session.reset(seed, np.ones(1, dtype=np.bool_))
         self._steps = 0
-        self._ready = True
-        self._record_frames()
-        self._list(np.flatnonzero(arrays.mask[0] | self._seats))
+        self._list(np.flatnonzero(self.worlds.arrays.mask[0] | self._seats))
         if not self.agents:
             self._wait_for_agents()
         return self._observations(), self._infos()
@@ -259,7 +212,7 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
             EpisodeError: before the first reset; actions after everybody has left.
             ActionError: a refused action; nothing has changed and the step can be repeated.
         """
-        if not self._ready:
+        if not self._session.is_ready:
             raise EpisodeError("step() before reset(): call env.reset(seed=…) first")
         if not self.agents:
             if actions and self.config.action.late_actions == "error":
@@ -267,10 +220,9 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
             return {}, {}, {}, {}, {}
         active = self.worlds.arrays.mask[0, self._listed]
         needed = self.agents if active.all() else list(compress(self.agents, active.tolist()))
-        commands = self._decoder.from_dict(actions, self.agents, needed)
-        self._take_step(commands)
+        commands = self._session.decoder.from_dict(actions, self.agents, needed)
+        self._session.step(commands)
         self._steps += 1
-        self._record_frames()
         return self._report()
 
     def _report(self) -> Stepped:
@@ -315,55 +267,17 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
         """Let an empty world go on until an agent enters; ends without one at the horizon."""
         arrays = self.worlds.arrays
         while not arrays.episode_over[0] and self._steps < self._max_cycles:
-            self._take_step(self._decoder.idle())
+            self._session.step(self._session.decoder.idle())
             self._steps += 1
-            self._record_frames()
             if arrays.mask.any():
                 self._list(np.flatnonzero(arrays.mask[0]))
                 break
 
     def _observations(self) -> dict[str, Observation]:
-        form = self.config.observation
-        if form.mode == "sensors" and form.kind == "dict":
-            sensed = {
-                name: data[0, self._listed].copy()
-                for name, data in sensed_observation(self.worlds.arrays.frames).items()
-            }
-            return {
-                agent: {name: data[k] for name, data in sensed.items()}
-                for k, agent in enumerate(self.agents)
-            }
-        found = self.worlds.arrays.observations[0].copy()[self._listed]
-        if self._parts is None:
-            return dict(zip(self.agents, found, strict=True))
-        named = named_observation(
-            self._parts, found.reshape(len(found), self._stack, found.shape[1] // self._stack)
-        )
-        return {
-            agent: {name: part[k] for name, part in named.items()}
-            for k, agent in enumerate(self.agents)
-        }
+        return self._dicts.observations(self.worlds.arrays, self.agents, self._listed)
 
     def _infos(self) -> dict[str, dict[str, float]]:
-        arrays, listed = self.worlds.arrays, self._listed
-        done, ids = arrays.vehicle_done[0, listed], arrays.vehicle_ids[0, listed]
-        active = (ids >= 0) & ~done
-        terms = arrays.terms[0, listed].T
-        # Most are 0 for everybody: no accident, no red light.
-        columns = [
-            (self._term_names[k], terms[k]) for k in np.flatnonzero(terms.any(axis=1)).tolist()
-        ]
-        columns.append(("vehicle_id", ids))
-        usual = self._info_active
-        if not active.all():
-            usual = self._info_absent
-            columns.append(("active", active.astype(np.float64)))
-            columns.append(("vehicle_done", done.astype(np.float64)))
-        infos = [usual.copy() for _ in self.agents]
-        for name, column in columns:
-            for info, number in zip(infos, column.tolist(), strict=True):
-                info[name] = number
-        return dict(zip(self.agents, infos, strict=True))
+        return self._dicts.infos(self.worlds.arrays, self.agents, self._listed)
 
     def declare_event(self, agent: str, cause: str) -> None:
         """Let an agent's vehicle tell others of an event in the next step (docs/v2x.md).
@@ -378,7 +292,7 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
         """
         if agent not in self.agents:
             raise ActionError(f"declare_event('{agent}', …): it is not in the episode")
-        self._events.declare(0, self.possible_agents.index(agent), cause)
+        self._session.events.declare(0, self.possible_agents.index(agent), cause)
 
     def frames(self, agent: str) -> dict[str, SensorFrames]:
         """What the sensors of an agent's `rig` have got in the last step, by name.
@@ -402,7 +316,7 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
         Raises:
             ActionError: wrong shape, dtype or value.
         """
-        self._decoder.check(agent, action)
+        self._session.decoder.check(agent, action)
 
     def state(self) -> NDArray[np.float32]:
         """The global state, within `state_space`: see `engine.spaces.global_state`."""
@@ -417,15 +331,15 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
     def traffic_stats(self) -> dict[str, float]:
         """Traffic since reset: departed, waiting, running, arrived, contacts, mean speed and more.
 
-        All fields of `runtime.traffic_stats.TrafficStats`, and how many actions were clipped, held
+        All fields of `engine.traffic_stats.TrafficStats`, and how many actions were clipped, held
         and ignored.
         """
-        return {**self.worlds.traffic_stats(0), **self._decoder.tolerated()}
+        return {**self.worlds.traffic_stats(0), **self._session.decoder.tolerated()}
 
     def suggest_actions(self) -> dict[str, Any]:
         """What the built-in driver (IDM, MOBIL, lane controller) would do in each agent's place."""
         self.worlds.suggest()
-        batch = self._decoder.encode(self.worlds.arrays.suggested)[0]
+        batch = self._session.decoder.encode(self.worlds.arrays.suggested)[0]
         return dict(zip(self.agents, batch[self._rows], strict=True))
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -438,12 +352,11 @@ class CavEnv(CopiedWithWorlds, DrawnWorlds, ParallelEnv[str, Any, Any]):  # type
             ConfigError: no zone of that number.
             EpisodeError: before the first reset.
         """
-        return self._frame(ghosts_of=self.ghosts_of)
+        return self._picture(0, self.ghosts_of)
 
     def close(self) -> None:
         """Close window and recording and end the worker processes, if there are any.
 
         Without workers the environment can be used on.
         """
-        self._close_view()
-        self.worlds.close()
+        self._session.close()

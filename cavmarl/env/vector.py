@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -17,8 +16,7 @@ from cavmarl.balance.plan_text import describe_plan
 from cavmarl.config.driver_form import with_sensors_of
 from cavmarl.config.registry import load_config
 from cavmarl.core.errors import ConfigError, EpisodeError
-from cavmarl.core.seeds import check_seed, first_seed
-from cavmarl.engine.simulation import Simulation
+from cavmarl.core.seeds import check_seed
 from cavmarl.engine.spaces import (
     action_space,
     flat_observation_space,
@@ -26,17 +24,15 @@ from cavmarl.engine.spaces import (
     sensed_observation,
 )
 from cavmarl.engine.world_setup import check_agents, make_world
-from cavmarl.env.actions import ActionDecoder
 from cavmarl.env.autoreset import known_mode, present_mode, refuse_over, with_rows
-from cavmarl.env.declared_events import DeclaredEvents
-from cavmarl.env.drawn_worlds import DrawnWorlds, check_rendering
+from cavmarl.env.drawn_worlds import check_rendering
 from cavmarl.env.recorded_worlds import Record, check_recording
-from cavmarl.env.saved_state import SavedState
-from cavmarl.env.world_copies import CopiedWithWorlds
+from cavmarl.env.saved_state import load_session, save_session
+from cavmarl.env.step_session import StepSession
+from cavmarl.env.worlds_environment import WorldsEnvironment
 from cavmarl.parallel.backends import check_hosts, make_worlds, places_of
 from cavmarl.parallel.step_arrays import SteppedWorlds
 from cavmarl.sensors.mounted.frames import SensorFrames
-from cavmarl.shards.shard import Commands
 
 MAX_WORLDS = 65_536
 
@@ -125,7 +121,7 @@ def _checked(num_envs: int) -> int:
     return int(num_envs)
 
 
-class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
+class CavVectorEnv(WorldsEnvironment):
     """W worlds with A agent seats each; ground truth is flat, whatever `observation.kind` says.
 
     With `observation.mode: sensors` and `observation.kind: dict`, observations are dicts: an array
@@ -153,10 +149,6 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
             large ones are copied for longer than they are made.
         disabled: worlds that are over wait for a reset; they are those of the next step.
         render_mode: `rgb_array` or None.
-
-    Attributes:
-        simulated_s: time that all steps have taken up to now, without that for checking actions and
-            copying what comes out.
     """
 
     def __init__(
@@ -168,13 +160,13 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
         disabled: bool = False,
         render_mode: str | None = None,
     ) -> None:
-        self.worlds = worlds
-        self.config = config = worlds.world.config
-        self.network = worlds.world.network
+        super().__init__(
+            StepSession(worlds, in_place=True, seed=None if seed is None else check_seed(seed)),
+            render_mode,
+        )
+        config, form = self.config, self.config.observation
         self.num_envs = num_envs = len(worlds.arrays.mask)
-        self.possible_agents = [f"car_{k}" for k in range(config.population.num_ids)]
         self.num_agents = len(self.possible_agents)
-        form = config.observation
         self._senses = form.mode == "sensors" and form.kind == "dict"
         self.single_observation_space: Any = (
             frames_space(config) if self._senses else flat_observation_space(config)
@@ -186,27 +178,14 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
         self.action_space = batch_space(
             batch_space(self.single_action_space, self.num_agents), num_envs
         )
-        self.metadata = {
-            "name": f"cavmarl/{config.name}-v{config.version}",
+        self.metadata |= {
             "autoreset_mode": present_mode(worlds.in_next_step, disabled),
             "render_modes": ["rgb_array"],
-            "render_fps": max(1, round(1.0 / config.clock.ctrl_dt_s)),
         }
-        self.render_mode = render_mode
-        self._view = None
         self._disabled = disabled
         self._over = np.zeros(num_envs, dtype=np.bool_)  # and not begun anew yet
-        arrays = worlds.arrays
-        commands = Commands(arrays.controls, arrays.meta_actions)
-        self._decoder = ActionDecoder(config.action, num_envs, self.possible_agents, commands)
-        self._read_only = arrays.observations.view()
-        self._read_only.flags.writeable = False
         self._mask = np.zeros((num_envs, self.num_agents), dtype=np.bool_)
-        self._events = DeclaredEvents(config, num_envs)
-        self._first_seed = None if seed is None else check_seed(seed)
         self._copy = copy
-        self._ready = False
-        self.simulated_s = 0.0
 
     @property
     def max_cycles(self) -> int:
@@ -214,23 +193,14 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
         return self.config.max_steps
 
     @property
-    def step_s(self) -> float:
-        """Seconds a step."""
-        return self.config.clock.ctrl_dt_s
-
-    @property
     def state_size(self) -> int:
         """Numbers in the global state of a world."""
         return int(self.worlds.arrays.states.shape[1])
 
     @property
-    def simulation(self) -> Simulation:
-        """The worlds behind this view, for tools that draw or measure them.
-
-        Raises:
-            ConfigError: they live in worker processes.
-        """
-        return self.worlds.simulation
+    def simulated_s(self) -> float:
+        """Time that all steps have taken up to now, without that for actions and for copying."""
+        return self._session.simulated_s
 
     @property
     def plans(self) -> tuple[Plan, ...]:
@@ -266,16 +236,9 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
         options = options or {}
         chosen = self._chosen(options.get("reset_mask"), seed)
         first_world = int(options.get("first_world", 0))
-        if seed is not None or not self._ready:
-            seed = first_seed(seed, self._first_seed)
-        self.worlds.arrays.chosen[:] = chosen
-        self.worlds.reset(seed, first_world)
-        self._decoder.forget(chosen)
-        self._insertions.forget(chosen)
+        self._session.reset(seed, chosen, first_world)
         self._mask = self.worlds.arrays.mask.copy()
         self._over = self._over & ~chosen
-        self._ready = True
-        self._record_frames(chosen)
         return self._observations(), {"mask": self._mask.copy()}
 
     def _chosen(self, reset_mask: Any, seed: int | None) -> NDArray[np.bool_]:
@@ -292,7 +255,7 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
             raise ConfigError(
                 "reset_mask with a seed: a seed is that of all worlds; leave one of the two out"
             )
-        if not self._ready:
+        if not self._session.is_ready:
             raise EpisodeError("reset_mask before the first reset: call vec.reset(seed=…)")
         return chosen
 
@@ -318,23 +281,19 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
                 is over.
             ActionError: wrong shape, dtype or value; nothing has changed.
         """
-        if not self._ready:
+        if not self._session.is_ready:
             raise EpisodeError("step() before reset(): call vec.reset(seed=…) first")
         if self._disabled:
             refuse_over(self._over)
-        commands = self._decoder.from_array(actions, self._mask)
-        began = time.perf_counter()
-        self._take_step(commands)
-        self.simulated_s += time.perf_counter() - began
-        self._record_frames()
+        session = self._session
+        session.step(session.decoder.from_array(actions, self._mask))
         arrays = self.worlds.arrays
         over = self._over = arrays.episode_over.copy()
         terminations = arrays.terminations.copy()
         observations = final_observations = self._observations()
         if np.count_nonzero(over) or np.count_nonzero(terminations):
             final_observations = self._final_observations(over | terminations.any(axis=1))
-            self._decoder.forget(over)
-            self._insertions.forget(over)
+            session.forget(over)
         self._mask = arrays.mask.copy()
         infos: dict[str, NDArray[Any]] = {
             "acted": arrays.acted.copy(),
@@ -351,7 +310,7 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
     def _observations(self) -> Observations:
         arrays = self.worlds.arrays
         if not self._senses:
-            return arrays.observations.copy() if self._copy else self._read_only
+            return self._given(arrays.observations)
         left = arrays.terminations & ~arrays.episode_over[:, None]
         if self.worlds.in_next_step or not left.any():
             sensed = sensed_observation(arrays.frames)
@@ -381,7 +340,7 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
             ActionError: no such agent.
             ConfigError: no such cause, or no messages are sent in this environment.
         """
-        self._events.declare(world, agent, cause)
+        self._session.events.declare(world, agent, cause)
 
     def _final_observations(self, ended: NDArray[np.bool_]) -> Observations:
         """The observations, and of the worlds (W,) where something ended those before that."""
@@ -415,7 +374,7 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
     def suggest_actions(self) -> NDArray[Any]:
         """What the built-in driver (IDM, MOBIL, lane controller) would do in each agent's place."""
         self.worlds.suggest()
-        return self._decoder.encode(self.worlds.arrays.suggested)
+        return self._session.decoder.encode(self.worlds.arrays.suggested)
 
     def state(self) -> NDArray[np.float32]:
         """The global states (W, S), each as `CavEnv.state`; what a central critic may see.
@@ -431,7 +390,25 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
 
     def traffic_stats(self, world: int = 0) -> dict[str, float]:
         """Traffic of one world since its reset, as `CavEnv.traffic_stats`."""
-        return {**self.worlds.traffic_stats(world), **self._decoder.tolerated(world)}
+        return {**self.worlds.traffic_stats(world), **self._session.decoder.tolerated(world)}
+
+    def save_state(self) -> bytes:
+        """All that later steps depend on: of the worlds, of actions held, of what is shown.
+
+        Raises:
+            EpisodeError: before the first reset.
+            ConfigError: worlds have processes or files of their own: SUMO's, a journal's.
+        """
+        return save_session(self._session, self._mask)
+
+    def load_state(self, saved: bytes) -> None:
+        """Go on from what `save_state` gave; zones and workers may be others than they were.
+
+        Raises:
+            ConfigError: it is damaged, of other worlds, of another number of them, or of another
+                version.
+        """
+        load_session(self._session, self._mask, saved)
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """A frame (height, width, 3) of each world; None and a warning without a render_mode.
@@ -440,10 +417,9 @@ class CavVectorEnv(CopiedWithWorlds, SavedState, DrawnWorlds):
             EpisodeError: before the first reset.
         """
         drawn = range(self.num_envs if self.render_mode else 1)  # one is enough to warn
-        frames = [self._frame(world) for world in drawn]
+        frames = [self._picture(world) for world in drawn]
         return tuple(frame for frame in frames if frame is not None) or None
 
     def close(self) -> None:
         """End recording and worker processes, if there are any; arrays that were returned stay."""
-        self._close_view()
-        self.worlds.close()
+        self._session.close()

@@ -12,7 +12,7 @@ from cavmarl.core.records.arrays import Outputs, Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.driving.agent_view import BatchView, RegisteredFunction, batch_view
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.sensors.kernels.output_reset import newest_frame
+from cavmarl.sensors.kernels.frame_stacks import newest_frame
 from cavmarl.sensors.observed import layout
 
 

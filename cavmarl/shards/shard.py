@@ -35,9 +35,9 @@ from cavmarl.driving.kernels.lane_index import ENTRY
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN, lane_grid
+from cavmarl.sensors.kernels.frame_stacks import fill_stacks
 from cavmarl.sensors.kernels.observe_optional import observe_optional
 from cavmarl.sensors.kernels.observing_messages import observe_messages
-from cavmarl.sensors.kernels.output_reset import fill_stacks
 from cavmarl.sensors.observed import layout, optional_arrays, sensor_arrays
 from cavmarl.shards.kernels.world_phases import suggest
 from cavmarl.shards.registered_outputs import RegisteredOutputs
@@ -113,7 +113,7 @@ class Shard:
         self.sensors = sensor_arrays(config.sensors, network)
         most_told = config.v2x.inbox.objects
         num_worlds, capacity = zoned.rows.shape[2:]
-        self._further = optional_arrays(config.sensors, network, plans, most_told, capacity)
+        self._optional = optional_arrays(config.sensors, network, plans, most_told, capacity)
         self._registered = RegisteredOutputs(config, network)
         self._floating = len(network.maps) > 1
         self._extent_m = network.room_m
@@ -145,7 +145,7 @@ class Shard:
         self.target_speeds = np.array(config.action.target_speeds_mps)
         self.discrete = config.action.kind == "discrete"
         self._call_leave = specialized(leave)
-        self._call_observe_further = specialized(observe_optional)
+        self._call_observe_optional = specialized(observe_optional)
         self._call_observe_messages = specialized(observe_messages)
         self._call_fill_stacks = specialized(fill_stacks)
 
@@ -189,10 +189,10 @@ class Shard:
         And the registered terms.
         """
         observations, stack = self.outputs.observations, self.config.sensors.stack
-        if self._further is not None:
+        if self._optional is not None:
             clock = self.config.clock
-            self._call_observe_further(
-                self.roads, self.travel, self.lane_grid, self.worlds, self.grid, self._further,
+            self._call_observe_optional(
+                self.roads, self.travel, self.lane_grid, self.worlds, self.grid, self._optional,
                 self._untold if self.mail is None else self.mail.objects,
                 clock.sim_dt_s, clock.ticks_per_step, stack, chosen, observations,
             )  # fmt: skip

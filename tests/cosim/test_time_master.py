@@ -12,6 +12,7 @@ from cavmarl.core.errors import (
 )
 from cavmarl.cosim.time_master import OwnTicks, Pacer, RealTime, Stepwise, TimeMaster
 from cavmarl.engine.step_trace import SENSORS, TICK, StepTrace
+from cavmarl.shards.shard import Commands
 
 FOREVER = {"population.mode": "respawn", "clock.ctrl_dt_s": 0.05, "horizon_s": 600}
 
@@ -128,9 +129,7 @@ def test_whoever_goes_round_the_master_is_noticed_and_refused() -> None:
     master.step(env.suggest_actions())
     simulation = env.simulation
     shape = simulation.outputs.present.shape
-    simulation.step(
-        type(env._decoder.idle())(np.zeros((*shape, 2)), np.ones(shape, dtype=np.int64))
-    )
+    simulation.step(Commands(np.zeros((*shape, 2)), np.ones(shape, dtype=np.int64)))
     with pytest.raises(ClockError, match="tick 2, but its time master left it at 1"):
         master.step(env.suggest_actions())
     assert master.world_ticks.tolist() == [2]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from cavmarl.sensors.kernels.sensor_arrays import RoadPoints
+from cavmarl.sensors.kernels.nearest_road_points import RoadPoints
 
 
 def nearest_points(

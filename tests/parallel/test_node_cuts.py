@@ -138,7 +138,7 @@ def test_pictures_have_the_zones_of_now(make: Make) -> None:
     before, now = vec.worlds.world.partition, over_nodes(vec).partition
     assert over_nodes(vec).recuts
     vec.render()
-    assert vec._shown().partition.content_hash == now.content_hash != before.content_hash
+    assert vec._session.present().partition.content_hash == now.content_hash != before.content_hash
 
 
 def test_zones_are_told_to_the_last_bit(make: Make) -> None:

@@ -12,7 +12,7 @@ import cavmarl
 from cavmarl.core.math.neighbors import fill_grid
 from cavmarl.engine.spaces import observation_parts
 from cavmarl.sensors.kernels.observing_conflicts import forget_others, observe_conflicts
-from cavmarl.sensors.observed.way_features import conflicts_settings
+from cavmarl.sensors.observed import conflicts_sensor
 from tests.naive import observing_way as naive
 from tests.sensors.test_hidden_neighbors import blocked
 
@@ -119,8 +119,10 @@ def test_what_a_hidden_vehicle_does_changes_nothing_until_it_says_so() -> None:
         pass
     shard = vec.worlds.simulation.shards[0]
     rows = vec.worlds.simulation.vehicles(0).copy()
-    walls = shard._further.conflicts.walls
-    sensor = conflicts_settings(vec.config.sensors, 0, walls, vec.config.v2x.inbox.objects, 64)
+    walls = shard._optional.conflicts.walls
+    sensor = conflicts_sensor.settings(
+        vec.config.sensors, 0, walls, vec.config.v2x.inbox.objects, 64
+    )
     inboxes = vec.simulation.messages.mail.objects[0]
     phase, tick = np.zeros(0, np.int32), ticks(vec)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.sensors import VEHICLE_FEATURES, KinematicsConfig, SensorsConfig
 from cavmarl.sensors.kernels.kinematics_observation import observe_kinematics
-from cavmarl.sensors.observed import highway_kinematics as kinematics
+from cavmarl.sensors.observed import kinematics_sensor as kinematics
 from cavmarl.sensors.observed.highway import default_ranges, range_table
 from tests.support import highway
 from tests.support.traffic import network

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.sensors import LidarObservationConfig, SensorsConfig
 from cavmarl.sensors.kernels.lidar_cells import observe_lidar_cells
-from cavmarl.sensors.observed import lidar_observation
+from cavmarl.sensors.observed import lidar_observation_sensor as lidar_observation
 from tests.support import highway
 from tests.support.builders import vehicles
 

@@ -16,10 +16,10 @@ from cavmarl.sensors.kernels.nearest_road_points import (
     TYPE_LANE,
     TYPE_LINE,
     TYPE_STOP,
+    RoadgraphSensor,
     nearest_points,
     observe_roadgraph,
 )
-from cavmarl.sensors.kernels.sensor_arrays import RoadgraphSensor
 from cavmarl.sensors.observed import roadgraph
 from cavmarl.sensors.observed.roadgraph import road_points
 from tests.naive import roadgraph as naive

@@ -22,8 +22,7 @@ from cavmarl.driving.kernels.gaps import link_signal
 from cavmarl.roads.network import SIGNAL_STATES
 from cavmarl.sensors.kernels.observing_conflicts import observe_conflicts
 from cavmarl.sensors.kernels.observing_way import observe_way
-from cavmarl.sensors.observed import frame_size, layout
-from cavmarl.sensors.observed.way_features import conflicts_settings, way_settings
+from cavmarl.sensors.observed import conflicts_sensor, frame_size, layout, way_sensor
 from cavmarl.shards.shard import CONTROLLER
 from cavmarl.v2x.kernels.v2x_records import REPORT
 from tests.naive import observing_way as naive
@@ -51,7 +50,7 @@ def observed_way(name: str, row: np.void, phase: NDArray[np.int32]) -> list[floa
     place = layout(CONFIG)["way"]
     out = np.zeros(frame_size(CONFIG), np.float32)
     controllers = np.zeros(roads.num_controllers, CONTROLLER)
-    sensor = way_settings(CONFIG, place.start)
+    sensor = way_sensor.settings(CONFIG, place.start)
     observe_way(roads.arrays, travel(name), controllers, row, phase, 0.0, 0.1, sensor, out)
     assert not out[: place.start].any()
     assert not out[place.stop :].any()
@@ -70,7 +69,9 @@ def observed_conflicts(
     fill_grid(rows, len(rows), grid)
     place = layout(config)["conflicts"]
     out = np.zeros(frame_size(config), np.float32)
-    sensor = conflicts_settings(config, place.start, make_walls(np.zeros((0, 4))), 0, len(rows))
+    sensor = conflicts_sensor.settings(
+        config, place.start, make_walls(np.zeros((0, 4))), 0, len(rows)
+    )
     told = np.zeros(0, REPORT)
     observe_conflicts(roads.arrays, travel(name), rows, i, grid, phase, told, 0, 0.1, sensor, out)
     assert not out[: place.start].any()

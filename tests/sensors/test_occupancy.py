@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cavmarl.config.sensors import OccupancyGridConfig, SensorsConfig
 from cavmarl.roads import routing
 from cavmarl.sensors.kernels.occupancy import observe_occupancy
-from cavmarl.sensors.observed import occupancy_grid
+from cavmarl.sensors.observed import occupancy_grid_sensor
 from tests.support import highway
 from tests.support.traffic import network, on_lane
 
@@ -33,13 +33,13 @@ CONFIGS: dict[str, dict[str, Any]] = {
 def layers(env: Any, rows: NDArray[np.void], i: int, **config: Any) -> NDArray[np.float32]:
     """Our grid (F, W, H) of row i."""
     settings = SensorsConfig(occupancy_grid=OccupancyGridConfig(**config))
-    sensor = occupancy_grid.settings(settings, 0, network("ring"), highway.destinations(env))
+    sensor = occupancy_grid_sensor.settings(settings, 0, network("ring"), highway.destinations(env))
     road = highway.roads(env)
     sensor = sensor._replace(lane_seen=np.zeros(len(road.lanes) + 1, np.int64))
-    out = np.zeros(np.prod(occupancy_grid.shape(settings), dtype=int), np.float32)
+    out = np.zeros(np.prod(occupancy_grid_sensor.shape(settings), dtype=int), np.float32)
     grid, lane_grid = highway.grid_of(rows), highway.everywhere(road)
     observe_occupancy(road, lane_grid, rows, i, grid, sensor, out)
-    return out.reshape(occupancy_grid.shape(settings))
+    return out.reshape(occupancy_grid_sensor.shape(settings))
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -96,7 +96,7 @@ def test_near_lanes_draw_what_all_lanes_draw(name: str) -> None:
         rows = on_lane(roads, int(lane), 0.3 * float(roads.lanes["length_m"][lane]))
         drawn = []
         for lane_grid in (routing.lane_grid(roads), highway.everywhere(roads.arrays)):
-            sensor = occupancy_grid.settings(settings, 0, roads, np.zeros((1, 1, 2)))
+            sensor = occupancy_grid_sensor.settings(settings, 0, roads, np.zeros((1, 1, 2)))
             out = np.zeros(121, np.float32)
             observe_occupancy(roads.arrays, lane_grid, rows, 0, highway.grid_of(rows), sensor, out)
             drawn.append(out)

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cavmarl.sensors.kernels.output_reset import newest_frame, repeat_frame, shift_frames
+from cavmarl.sensors.kernels.frame_stacks import newest_frame, repeat_frame, shift_frames
 
 
 @pytest.mark.parametrize("stack", [1, 2, 4])

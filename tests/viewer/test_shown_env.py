@@ -68,7 +68,7 @@ def test_a_page_chooses_among_the_worlds_that_a_program_steps(vec: CavVectorEnv)
         assert tick_of(client) % ticks == 0
         assert shown._publishers[0].published == 0
     vec.step(vec.suggest_actions())
-    assert not vec._watchers
+    assert not vec._session.is_watched
 
 
 def test_what_is_shown_changes_nothing_of_what_is_stepped() -> None:
@@ -135,7 +135,7 @@ def test_an_evaluation_is_watched_and_stays_the_same(tmp_path: Path) -> None:
 
     def watcher(vec: CavVectorEnv) -> Any:
         shown = ShownEnv(vec, WebOptions(port=0, control=False), looks_itself=False)
-        assert not vec._watchers
+        assert not vec._session.is_watched
 
         def look() -> None:
             shown.look()

@@ -13,6 +13,7 @@ headings and lateral offsets negated.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,6 @@ from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell
 from cavmarl.core.math.rng import STREAM_SENSOR, below
 from cavmarl.core.math.scalars import clamp
 from cavmarl.core.records.arrays import RoadArrays
-from cavmarl.sensors.kernels.sensor_arrays import KinematicsSensor
 
 # In the order of config_sensors.VEHICLE_FEATURES, then `on_road`, which is of a place and not of a
 # vehicle.
@@ -43,6 +43,24 @@ FEATURE_LAT_OFF = 11
 FEATURE_ANG_OFF = 12
 NUM_VEHICLE_FEATURES = 13
 FEATURE_ON_ROAD = 13
+
+
+class KinematicsSensor(NamedTuple):
+    """highway-env's `Kinematics`."""
+
+    at: int
+    vehicles: int  # rows, the own one included; 0: off
+    features: NDArray[np.int64]  # (F,) FEATURE_* codes, the columns
+    ranges: NDArray[np.float64]  # (NUM_VEHICLE_FEATURES, 2) what becomes [-1, 1]; nan: left as is
+    absolute: bool
+    shuffled: bool
+    clip: bool
+    see_behind: bool
+    observe_intentions: bool
+    destinations: NDArray[np.float64]  # (M, G, 2) where each goal of each map is, m
+    near_body: NDArray[np.int64]  # (vehicles,) scratch
+    near_key: NDArray[np.float64]
+    values: NDArray[np.float64]  # (NUM_VEHICLE_FEATURES,) scratch
 
 
 @kernel

@@ -11,6 +11,7 @@ without a vehicle have the range as distance and as speed.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,6 @@ from cavmarl.core.compiled import kernel
 from cavmarl.core.math.elementary import atan2, cosine, sine
 from cavmarl.core.math.elementary_arrays import cos_all, sin_all
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
-from cavmarl.sensors.kernels.sensor_arrays import LidarCells
 
 TWO_PI = 2.0 * math.pi
 
@@ -28,6 +28,17 @@ def cell_directions(cells: int) -> NDArray[np.float64]:
     """Cosine and sine (cells, 2) of the middle of each cell, from east to south."""
     angles = np.arange(cells) * (2.0 * np.pi / max(cells, 1))
     return np.stack([cos_all(angles), sin_all(angles)], axis=1)
+
+
+class LidarCells(NamedTuple):
+    """highway-env's `LidarObservation`."""
+
+    at: int
+    cells: int  # 0: off
+    range_m: float
+    scale: float  # what distances and speeds are divided by
+    directions: NDArray[np.float64]  # (cells, 2) cosine and sine of the middle of each cell
+    echoes: NDArray[np.void]  # ECHO (cells,) scratch
 
 
 @kernel

@@ -8,6 +8,8 @@ once, by `roads.roadgraph`.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,7 +18,6 @@ from cavmarl.core.math.elementary import cos_sin
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M
 from cavmarl.core.math.scalars import clamp
 from cavmarl.core.records import record
-from cavmarl.sensors.kernels.sensor_arrays import RoadgraphSensor, RoadPoints
 
 # ROAD_POINT["type"], in the order of the features that say which one it is
 TYPE_LANE = 0  # middle of a lane outside junctions
@@ -40,6 +41,32 @@ ROAD_POINT = record(
 
 # Points are put into rings of equal area before they are sorted: few need to be compared.
 NUM_RINGS = 256
+
+
+class RoadPoints(NamedTuple):
+    """Points of a road map in square cells."""
+
+    min_x: float  # m, corner of cell (0, 0)
+    min_y: float
+    cell_m: float
+    num_x: int
+    num_y: int
+    start: NDArray[np.int32]  # (num_x * num_y + 1,) points of cell c: [start[c], start[c + 1])
+    points: NDArray[np.void]  # ROAD_POINT (N,)
+
+
+class RoadgraphSensor(NamedTuple):
+    """The nearest points of the road network."""
+
+    at: int
+    num_points: int  # 0: off
+    range_m: float
+    road_map: RoadPoints
+    near_point: NDArray[np.int64]  # (N,) scratch
+    near_squared: NDArray[np.float64]
+    sorted_point: NDArray[np.int64]  # (N,) scratch; the answer
+    sorted_squared: NDArray[np.float64]
+    ring_start: NDArray[np.int64]  # (NUM_RINGS + 1,) scratch
 
 
 @kernel

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,15 +11,33 @@ from cavmarl.core.compiled import kernel
 from cavmarl.core.math.neighbors import Grid, fill_grid
 from cavmarl.core.records.arrays import LaneGrid, RoadArrays, Travel, Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
-from cavmarl.sensors.kernels.kinematics_observation import observe_kinematics
-from cavmarl.sensors.kernels.lidar_cells import observe_lidar_cells
-from cavmarl.sensors.kernels.nearest_road_points import observe_roadgraph
-from cavmarl.sensors.kernels.observing_conflicts import forget_others, observe_conflicts
-from cavmarl.sensors.kernels.observing_history import observe_history
-from cavmarl.sensors.kernels.observing_way import observe_way
-from cavmarl.sensors.kernels.occupancy import observe_occupancy
-from cavmarl.sensors.kernels.output_reset import has_entered, newest_frame
-from cavmarl.sensors.kernels.sensor_arrays import OptionalSensors
+from cavmarl.sensors.kernels.frame_stacks import has_entered, newest_frame
+from cavmarl.sensors.kernels.kinematics_observation import KinematicsSensor, observe_kinematics
+from cavmarl.sensors.kernels.lidar_cells import LidarCells, observe_lidar_cells
+from cavmarl.sensors.kernels.nearest_road_points import RoadgraphSensor, observe_roadgraph
+from cavmarl.sensors.kernels.observing_conflicts import (
+    ConflictsSensor,
+    forget_others,
+    observe_conflicts,
+)
+from cavmarl.sensors.kernels.observing_history import HistorySensor, observe_history
+from cavmarl.sensors.kernels.observing_way import WaySensor, observe_way
+from cavmarl.sensors.kernels.occupancy import OccupancyGrid, observe_occupancy
+
+
+class OptionalSensors(NamedTuple):
+    """The settings of each optional sensor, by its name in `sensors.observed.SENSORS`.
+
+    They are apart from `arrays.Sensors`, so that `sense` need not unpack what is off.
+    """
+
+    kinematics: KinematicsSensor
+    occupancy_grid: OccupancyGrid
+    lidar_observation: LidarCells
+    roadgraph: RoadgraphSensor
+    way: WaySensor
+    conflicts: ConflictsSensor
+    history: HistorySensor
 
 
 @kernel
@@ -27,7 +47,7 @@ def observe_optional(
     lane_grid: LaneGrid,
     worlds: Worlds,
     grid: Grid,
-    further: OptionalSensors,
+    optional: OptionalSensors,
     objects: NDArray[np.void],
     tick_s: float,
     ticks_per_step: int,
@@ -37,11 +57,17 @@ def observe_optional(
 ) -> None:
     """Write these sensors' parts of every agent's newest frame in the chosen worlds.
 
-    `further`: settings and scratch; sensors that are off write nothing. `objects`: REPORT (W, A or
+    `optional`: settings and scratch; sensors that are off write nothing. `objects`: REPORT (W, A or
     more, N), the inboxes of vehicles; N is 0 where there are no messages. `observations`:
     (W, A, D), the parts 0 before.
     """
-    kinematics, occupancy, lidar_cells, roadgraph, path, conflicts, history = further
+    kinematics = optional.kinematics
+    occupancy_grid = optional.occupancy_grid
+    lidar_observation = optional.lidar_observation
+    roadgraph = optional.roadgraph
+    way = optional.way
+    conflicts = optional.conflicts
+    history = optional.history
     for w in range(chosen.size):
         if not chosen[w]:
             continue
@@ -59,17 +85,17 @@ def observe_optional(
             out = seen[newest_frame(seen, stack) :]
             if kinematics.vehicles > 0:
                 observe_kinematics(roads, rows, i, grid, kinematics, out)
-            if occupancy.features.size > 0:
-                observe_occupancy(roads, lane_grid, rows, i, grid, occupancy, out)
-            if lidar_cells.cells > 0:
-                observe_lidar_cells(rows, i, grid, lidar_cells, out)
+            if occupancy_grid.features.size > 0:
+                observe_occupancy(roads, lane_grid, rows, i, grid, occupancy_grid, out)
+            if lidar_observation.cells > 0:
+                observe_lidar_cells(rows, i, grid, lidar_observation, out)
             if roadgraph.num_points > 0:
                 observe_roadgraph(row, roadgraph, out)
             phase = worlds.signal_phase[w]
-            if path.distances_m.size > 0 or path.lines > 0:
+            if way.distances_m.size > 0 or way.lines > 0:
                 time = worlds.ticks[w] * tick_s
                 controllers = worlds.controllers[w]
-                observe_way(roads, travel, controllers, row, phase, time, tick_s, path, out)
+                observe_way(roads, travel, controllers, row, phase, time, tick_s, way, out)
             if conflicts.most > 0:
                 told, tick = objects[w, row["agent"]], worlds.ticks[w]
                 observe_conflicts(

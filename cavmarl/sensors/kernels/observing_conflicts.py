@@ -15,6 +15,7 @@ have gone on as it says, and nothing else of them. Which lane they are on it doe
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,8 @@ from cavmarl.core.compiled import kernel
 from cavmarl.core.math.elementary import atan2, cosine, sine
 from cavmarl.core.math.geometry import lane_pose
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
-from cavmarl.core.math.walls import is_cut
+from cavmarl.core.math.walls import Walls, is_cut
+from cavmarl.core.records import record
 from cavmarl.core.records.arrays import RoadArrays, Travel
 from cavmarl.core.records.codes import (
     DRIVER_SCRIPTED,
@@ -35,7 +37,6 @@ from cavmarl.core.records.rows import is_off_lanes
 from cavmarl.driving.kernels.gaps import link_signal
 from cavmarl.driving.kernels.ways import goes_on
 from cavmarl.sensors.kernels.observing_way import MOST_LANES
-from cavmarl.sensors.kernels.sensor_arrays import ConflictsSensor
 
 CONFLICT_FEATURES = 9
 HEARD_FEATURES = 2  # more with `heard`
@@ -50,6 +51,34 @@ GAP_HALF_M = 2.0  # a gap of this length is a nearness of 0.5
 WHEN_HALF_S = 2.0  # a time of this length is a soonness of 0.5
 PLACE_HALF_M = 10.0  # a distance of this length is 0.5
 SPEED_HALF_MPS = 10.0  # a relative speed of this is 0.5
+
+
+RANKED = record(
+    ("counts", np.float64),  # m, what it is ranked by
+    ("near", np.float64),  # m, the gap of its approach
+    ("when", np.float64),  # s until then
+    ("id", np.int64),
+    ("body", np.int64),  # position in `Grid.bodies`; -1 - k: `ConflictsSensor.told[k]`
+)
+
+
+class ConflictsSensor(NamedTuple):
+    """Vehicles that come near the own way."""
+
+    at: int
+    most: int  # vehicles that are told; 0: off
+    range_m: float
+    walls: Walls  # that hide others
+    heard: bool  # whether messages tell of those that are not seen
+    told: NDArray[np.void]  # BODY (inbox,) scratch: those that messages tell of, where they are now
+    indicators: bool  # whether others show their way over the next junction
+    looks: NDArray[np.float64]  # (NUM_LOOKS, 4) scratch: where the own vehicle will be,
+    heard_looks: NDArray[np.float64]  # (NUM_LOOKS, 4) one that a message tells of,
+    others: NDArray[np.float64]  # (capacity, NUM_LOOKS, 4) and those in `Grid.bodies`
+    indicated: NDArray[np.float64]  # (capacity,) the turn that each indicates: 1 left, -1 right
+    foreseen: NDArray[np.int64]  # (capacity,) at which filling of the grid these were written
+    filling: NDArray[np.int64]  # (1,) which one it is now
+    ranked: NDArray[np.void]  # RANKED (count,) scratch
 
 
 @kernel

@@ -5,6 +5,8 @@ The numbers of the steps before stand in the frame before, which `shift_frames` 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,6 +14,13 @@ from cavmarl.core.compiled import kernel
 from cavmarl.sensors.kernels.sense import ACCEL_SCALE, SPEED_SCALE, STEERING_SCALE, unit
 
 HISTORY_FEATURES = 3  # of a step
+
+
+class HistorySensor(NamedTuple):
+    """What the vehicle did before."""
+
+    at: int
+    size: int  # numbers; 0: off
 
 
 @kernel

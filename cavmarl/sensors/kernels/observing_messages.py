@@ -10,7 +10,7 @@ from cavmarl.core.math.elementary import cos_sin
 from cavmarl.core.math.scalars import clamp
 from cavmarl.core.records.arrays import RoadArrays, Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT, SIGNAL_GREEN_MAJOR, SIGNAL_GREEN_MINOR
-from cavmarl.sensors.kernels.output_reset import newest_frame
+from cavmarl.sensors.kernels.frame_stacks import newest_frame
 from cavmarl.v2x.kernels.v2x_records import (
     CAUSE_COLLISION,
     CAUSE_HARD_BRAKING,

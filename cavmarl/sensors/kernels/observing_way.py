@@ -6,6 +6,8 @@ from any lane of a road.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,7 +28,6 @@ from cavmarl.driving.kernels.gaps import link_signal, must_stop
 from cavmarl.driving.kernels.signal_timing import time_to_change
 from cavmarl.driving.kernels.ways import goes_on
 from cavmarl.sensors.kernels.sense import SPEED_SCALE, gives_way_on, soonness, unit
-from cavmarl.sensors.kernels.sensor_arrays import WaySensor
 
 PLACE_FEATURES = 4  # of a place of the way
 LINE_FEATURES = 5  # of a stop line, one more with the time of its signal
@@ -34,6 +35,16 @@ CURVATURE_SCALE = 0.2  # 1/m
 WIDTH_SCALE = 8.0  # m
 LINE_HALF_M = 20.0  # a line at this distance is half as near as can be
 MOST_LANES = 48  # that a way is followed over
+
+
+class WaySensor(NamedTuple):
+    """The way ahead."""
+
+    at: int
+    distances_m: NDArray[np.float64]  # (P,) of the places that are told, rising
+    lines: int  # stop lines that are told
+    range_m: float  # up to where
+    timing: bool
 
 
 @kernel

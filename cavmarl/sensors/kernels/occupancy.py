@@ -8,6 +8,7 @@ that hold a waypoint of a lane's middle.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +25,31 @@ from cavmarl.sensors.kernels.kinematics_observation import (
     make_relative,
     vehicle_features,
 )
-from cavmarl.sensors.kernels.sensor_arrays import OccupancyGrid
 
 # How far along a lane highway-env sets waypoints, from the place beside the vehicle.
 LANE_REACH_M = 100.0
+
+
+class OccupancyGrid(NamedTuple):
+    """highway-env's `OccupancyGrid`."""
+
+    at: int
+    features: NDArray[np.int64]  # (F,) FEATURE_* codes, the layers; none: off
+    ranges: NDArray[np.float64]  # (NUM_VEHICLE_FEATURES, 2) what becomes [-1, 1]; nan: left as is
+    min_x: float
+    min_y: float
+    step_x: float
+    step_y: float
+    num_x: int
+    num_y: int
+    radius_m: float  # of a circle around the vehicle that holds the grid
+    aligned: bool
+    clip: bool
+    as_image: bool
+    destinations: NDArray[np.float64]  # (M, G, 2) where each goal of each map is, m
+    cell_body: NDArray[np.int64]  # (num_x * num_y,) scratch
+    lane_seen: NDArray[np.int64]  # (L + 1,) scratch: when each lane was drawn last, and the time
+    values: NDArray[np.float64]  # (NUM_VEHICLE_FEATURES,) scratch
 
 
 @kernel

@@ -1,7 +1,7 @@
 """The end of a step: what the agents of one shard observe, and their terms.
 
 One function a sensor: it writes its features, scaled numbers in [-1, 1], from position `at` on. The
-scales stand here; the names and meanings of the features in `sensors/observed/ego_features.py`.
+scales stand here; the names and meanings of the features in `sensors/observed/`.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from cavmarl.core.records.codes import (
 from cavmarl.driving.kernels.gaps import link_signal
 from cavmarl.driving.kernels.signal_timing import time_to_change
 from cavmarl.rewards.kernels.terms import write_terms
+from cavmarl.sensors.kernels.frame_stacks import has_entered, newest_frame, shift_frames
 from cavmarl.sensors.kernels.lidar_fan import lidar
 from cavmarl.sensors.kernels.observing_lanes import observe_lanes
-from cavmarl.sensors.kernels.output_reset import has_entered, newest_frame, shift_frames
 
 EGO_FEATURES = 13
 NEIGHBOR_FEATURES = 7
@@ -275,8 +275,8 @@ def sense(
     """Write what every owned agent of the chosen worlds gets, at its own index.
 
     A vehicle that entered during the step has not acted: it is observed, its terms are 0, and it
-    does not end. `observe_optional` and `fill_stacks` complete the observations,
-    `kernels.outputs` does what concerns the agents of all shards.
+    does not end. `observe_optional` and `fill_stacks` complete the observations. The terms are
+    summed in `rewards.kernels.reward`, when all shards have written theirs.
 
     `worlds`: committed rows at the end of the step, ghosts among them. `outputs`: cleared where
     chosen; written at the indices of owned agents.

@@ -1,11 +1,12 @@
-"""The sensors that agents observe: what each adds to an observation, and how far it looks.
+"""The sensors that agents observe: one file each, and `SENSORS`, the only list of them.
 
-A new one of the package has its features here, a kernel that writes its numbers, which
-`kernels/sense` or, if most environments leave it off, `kernels/observe_optional` calls, and its
-place in `SENSORS`. Those from outside are registered, see `sensors.registry`.
+A file holds what the sensor adds to an observation, how far it looks and, if it is optional, what
+its kernel takes. CONTRIBUTING.md says how to add one; `sensors.registry` takes those from outside.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,64 +14,51 @@ from numpy.typing import NDArray
 from cavmarl.config.sensors import SensorsConfig
 from cavmarl.core.extensions import REGISTERED_SENSORS
 from cavmarl.core.math.elementary_arrays import hypot_all
-from cavmarl.core.math.walls import Walls, make_walls
 from cavmarl.core.records.arrays import Sensors
 from cavmarl.rewards.kernels.terms import TTC_REACH_M
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.kernels.lidar_fan import ECHO, ray_directions
-from cavmarl.sensors.kernels.sensor_arrays import OptionalSensors
-from cavmarl.sensors.observed import ego_features as seen
-from cavmarl.sensors.observed import highway_kinematics as kinematics
-from cavmarl.sensors.observed import lidar_observation, occupancy_grid, roadgraph, way_features
+from cavmarl.sensors.kernels.observe_optional import OptionalSensors
+from cavmarl.sensors.observed import (
+    conflicts_sensor,
+    ego_sensor,
+    history_sensor,
+    kinematics_sensor,
+    lanes_sensor,
+    lidar_observation_sensor,
+    lidar_sensor,
+    messages_sensor,
+    neighbors_sensor,
+    occupancy_grid_sensor,
+    roadgraph,
+    route_sensor,
+    signal_sensor,
+    way_sensor,
+)
 from cavmarl.sensors.observed.feature import Sensor
 from cavmarl.sensors.observed.highway import goal_places
+from cavmarl.sensors.observed.sensor_setup import SensorSetup, walls_of
 
-# Those of the package, in the order of their features in a frame.
+# The sensors of the package, in the order of their features in a frame.
 SENSORS: tuple[Sensor, ...] = (
-    Sensor("ego", seen.ego),
-    Sensor("route", seen.route),
-    Sensor("neighbors", seen.neighbors, lambda c: c.neighbors.range_m * (c.neighbors.count > 0)),
-    Sensor("signal", seen.signal),
-    # Its range is that of gaps along lanes and of centres in the plane.
-    Sensor("lanes", seen.lanes, lambda c: c.lanes.range_m),
-    Sensor("lidar", seen.lidar, lambda c: c.lidar.range_m * (c.lidar.rays > 0), sees_bodies=True),
-    Sensor("kinematics", kinematics.features, kinematics.reach_m, kinematics.shape),
-    Sensor(
-        "occupancy_grid",
-        occupancy_grid.features,
-        occupancy_grid.reach_m,
-        occupancy_grid.shape,
-        occupancy_grid.dtype,
-    ),
-    Sensor(
-        "lidar_observation",
-        lidar_observation.features,
-        lidar_observation.reach_m,
-        lidar_observation.shape,
-    ),
-    Sensor("roadgraph", roadgraph.features, shape=roadgraph.shape),
-    Sensor("messages", seen.messages),  # they come from the bus, which knows no zones
-    Sensor("way", way_features.way),
-    Sensor(
-        "conflicts",
-        way_features.conflicts,
-        lambda c: c.conflicts.range_m * (c.conflicts.count > 0),
-        way_features.conflicts_shape,
-    ),
-    # The last of the package: see `carried_from`.
-    Sensor("history", way_features.history, shape=way_features.history_shape),
+    ego_sensor.SENSOR,
+    route_sensor.SENSOR,
+    neighbors_sensor.SENSOR,
+    signal_sensor.SENSOR,
+    lanes_sensor.SENSOR,
+    lidar_sensor.SENSOR,
+    kinematics_sensor.SENSOR,
+    occupancy_grid_sensor.SENSOR,
+    lidar_observation_sensor.SENSOR,
+    roadgraph.SENSOR,
+    messages_sensor.SENSOR,
+    way_sensor.SENSOR,
+    conflicts_sensor.SENSOR,
+    history_sensor.SENSOR,  # the last one: see `carried_from`
 )
 
 # The nearest vehicles of which walls may hide some.
 MAX_NEIGHBORS_TRIED = 256
-
-# Those that `observe_optional` writes.
-FURTHER = frozenset(
-    (
-        "kinematics", "occupancy_grid", "lidar_observation", "roadgraph",
-        "way", "conflicts", "history",
-    )
-)  # fmt: skip
 
 
 def sensors_of(config: SensorsConfig) -> tuple[Sensor, ...]:
@@ -145,15 +133,9 @@ def _starts(config: SensorsConfig) -> dict[str, int]:
     }
 
 
-def _walls(network: RoadNetwork, through_walls: bool) -> Walls:
-    """The walls that hide others; none where these are seen through walls."""
-    walls = network.walls[:0] if through_walls else network.walls
-    return make_walls(np.stack([walls[name] for name in ("ax", "ay", "bx", "by")], axis=1))
-
-
 def sensor_arrays(config: SensorsConfig, network: RoadNetwork) -> Sensors:
     """The settings and the scratch memory that `sense` takes."""
-    walls = _walls(network, config.neighbors.through_walls)
+    walls = walls_of(network, config.neighbors.through_walls)
     near = MAX_NEIGHBORS_TRIED if len(walls.segments) else config.neighbors.count
     places = layout(config)
     starts = _starts(config)
@@ -195,26 +177,21 @@ def optional_arrays(
     most_told: int,
     capacity: int,
 ) -> OptionalSensors | None:
-    """What `observe_optional` takes; None if all of its sensors are off.
+    """Return what `observe_optional` takes; None if all optional sensors are off.
 
     `most_told`: vehicles that an inbox keeps. `capacity`: rows of a world.
     """
-    if FURTHER.isdisjoint(layout(config)):
+    optional = [sensor for sensor in SENSORS if sensor.settings is not None]
+    places = layout(config)
+    if not any(sensor.name in places for sensor in optional):
         return None
     starts = _starts(config)
     goals = goal_places(network, plans)
-    return OptionalSensors(
-        kinematics=kinematics.settings(config, starts["kinematics"], network, goals),
-        occupancy=occupancy_grid.settings(config, starts["occupancy_grid"], network, goals),
-        lidar_cells=lidar_observation.settings(config, starts["lidar_observation"]),
-        roadgraph=roadgraph.settings(config, starts["roadgraph"], network),
-        way=way_features.way_settings(config, starts["way"]),
-        conflicts=way_features.conflicts_settings(
-            config,
-            starts["conflicts"],
-            _walls(network, config.conflicts.through_walls),
-            most_told,
-            capacity,
-        ),
-        history=way_features.history_settings(config, starts["history"]),
-    )
+    settings: dict[str, Any] = {
+        sensor.name: sensor.settings(
+            SensorSetup(config, starts[sensor.name], network, goals, most_told, capacity)
+        )
+        for sensor in optional
+        if sensor.settings is not None
+    }
+    return OptionalSensors(**settings)

@@ -1,8 +1,8 @@
-"""What a sensor says of itself."""
+"""`Sensor` and `Feature`: how a sensor that agents observe describes itself."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +10,10 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from cavmarl.config.sensors import SensorsConfig
+from cavmarl.sensors.observed.sensor_setup import SensorSetup
+
+Row = tuple[str, str, str]
+"""Name, meaning and scale of a feature."""
 
 
 @dataclass(frozen=True)
@@ -21,6 +25,20 @@ class Feature:
     scale: str = ""  # the number that 1.0 stands for, with its unit; empty for flags
     low: float = -1.0  # smallest value
     high: float = 1.0  # largest value
+
+
+def features_of(rows: Iterable[Row]) -> list[Feature]:
+    return [Feature(*row) for row in rows]
+
+
+def numbered(count: int, subject: str, rows: Iterable[Row]) -> list[Feature]:
+    """Return the rows of each of several things, one thing after the other."""
+    listed = list(rows)
+    return [
+        Feature(f"{name}_{k}", f"{subject.format(k)}: {meaning}", scale)
+        for k in range(count)
+        for name, meaning, scale in listed
+    ]
 
 
 def _nowhere(config: SensorsConfig) -> float:
@@ -46,6 +64,8 @@ class Sensor:
     # of its part of a Dict observation; -1 stands for all features
     shape: Callable[[SensorsConfig], tuple[int, ...]] = _flat
     dtype: Callable[[SensorsConfig], DTypeLike] = _float32  # of that part
+    # of an optional sensor, which `observe_optional` writes: what its kernel takes
+    settings: Callable[[SensorSetup], tuple[Any, ...]] | None = None
     # whether it looks that far for any part of a body, and not for its centre
     sees_bodies: bool = False
     # of a sensor from outside of the package: its numbers, of a view of one agent, or of several

@@ -21,9 +21,10 @@ from cavmarl.sensors.kernels.nearest_road_points import (
     TYPE_LANE,
     TYPE_LINE,
     TYPE_STOP,
+    RoadgraphSensor,
+    RoadPoints,
 )
-from cavmarl.sensors.kernels.sensor_arrays import RoadgraphSensor, RoadPoints
-from cavmarl.sensors.observed.feature import Feature
+from cavmarl.sensors.observed.feature import Feature, Sensor
 
 CELL_M = 16.0
 
@@ -157,3 +158,11 @@ def _no_points() -> RoadPoints:
     for array in (points, start):
         array.setflags(write=False)
     return RoadPoints(0.0, 0.0, 1.0, 1, 1, start, points)
+
+
+SENSOR = Sensor(
+    "roadgraph",
+    features,
+    shape=shape,
+    settings=lambda made: settings(made.config, made.at, made.network),
+)

@@ -28,8 +28,8 @@ from cavmarl.core.records.arrays import (
     Zoned,
 )
 from cavmarl.core.records.codes import DRIVER_AGENT
+from cavmarl.rewards.kernels.reward import credit
 from cavmarl.roads.kernels.signal_phases import detect
-from cavmarl.sensors.kernels.output_reset import credit
 from cavmarl.sensors.kernels.sense import sense
 from cavmarl.shards.kernels.world_phases import advance, begin_step, resolve
 from cavmarl.traffic.kernels.admission import admit, propose, rank_lanes

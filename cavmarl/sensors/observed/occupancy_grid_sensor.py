@@ -8,8 +8,8 @@ from numpy.typing import DTypeLike, NDArray
 from cavmarl.config.sensors import OccupancyGridConfig, SensorsConfig
 from cavmarl.core.math.elementary import hypot
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.sensors.kernels.sensor_arrays import OccupancyGrid
-from cavmarl.sensors.observed.feature import Feature
+from cavmarl.sensors.kernels.occupancy import OccupancyGrid
+from cavmarl.sensors.observed.feature import Feature, Sensor
 from cavmarl.sensors.observed.highway import codes, range_table, vehicle_feature
 
 _DEFAULT_RANGES = {"vx": (-80.0, 80.0), "vy": (-80.0, 80.0)}
@@ -88,3 +88,13 @@ def settings(
         lane_seen=np.zeros(len(network.lanes) + 1, dtype=np.int64),
         values=np.zeros(len(table)),
     )
+
+
+SENSOR = Sensor(
+    "occupancy_grid",
+    features,
+    reach_m,
+    shape,
+    dtype,
+    settings=lambda made: settings(made.config, made.at, made.network, made.goals),
+)

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from cavmarl.config.sensors import SensorsConfig
-from cavmarl.sensors.kernels.lidar_cells import cell_directions
+from cavmarl.sensors.kernels.lidar_cells import LidarCells, cell_directions
 from cavmarl.sensors.kernels.lidar_fan import ECHO
-from cavmarl.sensors.kernels.sensor_arrays import LidarCells
-from cavmarl.sensors.observed.feature import Feature
+from cavmarl.sensors.observed.feature import Feature, Sensor
 from cavmarl.sensors.observed.highway import MAX_RELATIVE_MPS
 
 # Within a body distances are negative, by no more than its length.
@@ -69,3 +68,12 @@ def settings(config: SensorsConfig, at: int) -> LidarCells:
 def _scale(config: SensorsConfig) -> float:
     lidar = config.lidar_observation
     return lidar.maximum_range_m if lidar.normalize else 1.0
+
+
+SENSOR = Sensor(
+    "lidar_observation",
+    features,
+    reach_m,
+    shape,
+    settings=lambda made: settings(made.config, made.at),
+)

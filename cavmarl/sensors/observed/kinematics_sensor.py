@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from cavmarl.config.sensors import SensorsConfig
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.sensors.kernels.kinematics_observation import PERCEPTION_M
-from cavmarl.sensors.kernels.sensor_arrays import KinematicsSensor
-from cavmarl.sensors.observed.feature import Feature
+from cavmarl.sensors.kernels.kinematics_observation import PERCEPTION_M, KinematicsSensor
+from cavmarl.sensors.observed.feature import Feature, Sensor
 from cavmarl.sensors.observed.highway import codes, default_ranges, range_table, vehicle_feature
 
 # The range of y is the map's; whatever it is, it becomes [-1, 1].
@@ -72,3 +71,12 @@ def settings(
         near_key=np.zeros(max(kinematics.vehicles_count, 1)),
         values=np.zeros(len(table)),
     )
+
+
+SENSOR = Sensor(
+    "kinematics",
+    features,
+    reach_m,
+    shape,
+    settings=lambda made: settings(made.config, made.at, made.network, made.goals),
+)

@@ -1,0 +1,222 @@
+"""`StepSession`: the worlds that an environment steps, and all that goes into and out of a step."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config.env import EnvConfig
+from cavmarl.core.errors import ConfigError, EpisodeError
+from cavmarl.core.seeds import first_seed
+from cavmarl.engine.simulation import Simulation
+from cavmarl.engine.vehicle_way import way_ahead
+from cavmarl.engine.world_frame import WorldFrame, frame_of
+from cavmarl.env.actions import ActionDecoder
+from cavmarl.env.declared_events import DeclaredEvents
+from cavmarl.env.drawn_worlds import WorldCopy, vehicles_that_ended
+from cavmarl.env.insertions import Insertions
+from cavmarl.env.recorded_worlds import Record, WorldRecorder
+from cavmarl.parallel.local_worlds import LocalWorlds, kept_elsewhere
+from cavmarl.parallel.step_arrays import SteppedWorlds
+from cavmarl.recordings.extra_tables import RecordOptions
+from cavmarl.render.topdown import WorldView
+from cavmarl.shards.shard import Commands
+
+
+class StepSession:
+    """The running worlds of one environment.
+
+    A step takes decoded actions, declared events and insertions. After each reset and step, the
+    session records the worlds and calls those who watch them. A copy or a pickle of it has worlds
+    of its own, which go on bit for bit; it neither records nor is watched.
+
+    Args:
+        worlds: that are stepped.
+        in_place: whether actions are decoded into the arrays of the worlds.
+        seed: of the first reset, if that is given none.
+
+    Attributes:
+        worlds: that are stepped.
+        agents: ids of the agents of a world.
+        decoder: decodes actions into commands.
+        events: what agents have declared for the next step.
+        insertions: what was put into the worlds for the next step.
+        is_ready: whether `reset` has been called.
+        simulated_s: time that all steps of the worlds have taken up to now.
+    """
+
+    def __init__(
+        self, worlds: SteppedWorlds, *, in_place: bool = False, seed: int | None = None
+    ) -> None:
+        config, arrays = worlds.world.config, worlds.arrays
+        num_worlds = len(arrays.mask)
+        self.worlds = worlds
+        self.agents = tuple(f"car_{k}" for k in range(config.population.num_ids))
+        commands = Commands(arrays.controls, arrays.meta_actions) if in_place else None
+        self.decoder = ActionDecoder(config.action, num_worlds, self.agents, commands)
+        self.events = DeclaredEvents(config, num_worlds)
+        self.insertions = Insertions(config, worlds.world.network, num_worlds)
+        self.is_ready = False
+        self.simulated_s = 0.0
+        self._in_place = in_place
+        self._first_seed = seed
+        self._copy = WorldCopy()
+        self._recorder: WorldRecorder | None = None
+        self._watchers: tuple[Callable[[], None], ...] = ()
+        self._view: WorldView | None = None
+
+    @property
+    def config(self) -> EnvConfig:
+        """What the worlds are made of."""
+        return self.worlds.world.config
+
+    @property
+    def is_watched(self) -> bool:
+        """Whether a function is called after each reset and step."""
+        return bool(self._watchers)
+
+    def reset(self, seed: int | None, chosen: NDArray[np.bool_], first_world: int = 0) -> None:
+        """Begin an episode in the chosen worlds (W,).
+
+        Without a seed, the first reset takes that of the session, a later one goes on with the last
+        one. `first_world`: number of the first world, on which its random numbers depend.
+        """
+        if seed is not None or not self.is_ready:
+            seed = first_seed(seed, self._first_seed)
+        self.worlds.arrays.chosen[:] = chosen
+        self.worlds.reset(seed, first_world)
+        self.forget(chosen)
+        self.is_ready = True
+        self._look(chosen)
+
+    def step(self, commands: Commands) -> None:
+        """Step the worlds with all that waits for a step; after a failure that still waits."""
+        began = time.perf_counter()
+        self.worlds.step(self.insertions.add_to(self.events.add_to(commands)))
+        self.events.taken()
+        self.insertions.taken()
+        self.simulated_s += time.perf_counter() - began
+        self._look()
+
+    def forget(self, chosen: NDArray[np.bool_]) -> None:
+        """Forget what actions and insertions belong to the last episode of the chosen worlds."""
+        self.decoder.forget(chosen)
+        self.insertions.forget(chosen)
+
+    def refuse_unready(self, call: str) -> None:
+        """Raise an EpisodeError that names a call before the first reset."""
+        if not self.is_ready:
+            raise EpisodeError(f"{call} before reset(): call reset(seed=…) first")
+
+    def frames(self, chosen: Sequence[int], ghosts: bool) -> list[WorldFrame]:
+        """Return frames of some worlds as they are now; see `WorldsEnvironment.world_frames`."""
+        count = len(self.worlds.arrays.mask)
+        if wrong := [world for world in chosen if not 0 <= world < count]:
+            raise ConfigError(f"world {wrong[0]}: there are the worlds 0 to {count - 1}")
+        self.refuse_unready("world_frames()")
+        return self._frames(chosen, ghosts)
+
+    def way_ahead(self, vehicle: int, world: int) -> NDArray[np.float64]:
+        """Return the way of a vehicle; see `WorldsEnvironment.way_ahead`."""
+        self.refuse_unready("way_ahead()")
+        return way_ahead(self._copy.standing(self.worlds), vehicle, world)
+
+    def present(self) -> Simulation:
+        """Return the worlds as they are now, or a copy where other processes run them."""
+        return self._copy.present(self.worlds)
+
+    def picture(
+        self, world: int, ghosts_of: int | None, mode: str, name: str, fps: int
+    ) -> NDArray[np.uint8] | None:
+        """Draw a world as it is now; pygame is loaded at the first picture.
+
+        Args:
+            world: its number.
+            ghosts_of: a zone, to show what it sees of the others; None: the owners of vehicles.
+            mode: `human` for a window, or `rgb_array`; only the first call reads it, and those
+                that follow here.
+            name: of the window.
+            fps: frames a second, for the window.
+        """
+        self.refuse_unready("render()")
+        simulation = self.present()
+        if self._view is None:
+            self._view = WorldView(simulation, mode, name, fps)
+        return self._view.show(ghosts_of, world)
+
+    def watch(self, look: Callable[[], None]) -> Callable[[], None]:
+        """Have a function called after each reset and step; returns what ends that."""
+        self._watchers = (*self._watchers, look)
+
+        def end() -> None:
+            self._watchers = tuple(one for one in self._watchers if one is not look)
+
+        return end
+
+    def record(self, record: Record | None) -> None:
+        """Record all worlds from now on; see `WorldsEnvironment.record`."""
+        if record is None:
+            return
+        if self._recorder is not None:
+            path = str(RecordOptions.of(record).path)
+            raise EpisodeError(f"record({path!r}): {self._recorder.path} is recorded already")
+        standing = self._copy.standing(self.worlds)
+        self._recorder = WorldRecorder(record, self.worlds, standing)
+
+    def close(self) -> None:
+        """End the recording, the window and the worlds."""
+        if self._recorder is not None:
+            recorder, self._recorder = self._recorder, None
+            recorder.close()
+        if self._view is not None:
+            self._view.close()
+            self._view = None
+        self._copy.close()
+        self.worlds.close()
+
+    def _frames(
+        self,
+        chosen: Sequence[int],
+        ghosts: bool,
+        room: Callable[[int], NDArray[np.void]] | None = None,
+    ) -> list[WorldFrame]:
+        key = kept_elsewhere(self.config)
+        if key and not isinstance(self.worlds, LocalWorlds):
+            raise ConfigError(
+                f"{key}: frames of such worlds can only be had in the caller's process; use "
+                "workers=0"
+            )
+        simulation, told, arrays = self.present(), self.insertions.told, self.worlds.arrays
+        return [
+            frame_of(
+                simulation, world, ghosts, vehicles_that_ended(arrays, world), told(world), room
+            )
+            for world in chosen
+        ]
+
+    def _look(self, chosen: NDArray[np.bool_] | None = None) -> None:
+        """Record the chosen worlds (W,), or all, as they are now, and call those who watch."""
+        if self._recorder is not None:
+            every = range(len(self.worlds.arrays.mask))
+            some = every if chosen is None else np.flatnonzero(chosen).tolist()
+            self._recorder.add(self._frames(some, ghosts=True, room=self._recorder.room))
+        for look in self._watchers:
+            look()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # What refers to arrays of the worlds is made anew.
+        memory = self.decoder.memory, self.events.memory, self.insertions.memory
+        kept = self.is_ready, self.simulated_s, self._first_seed
+        return _made_again, (self.worlds, self._in_place), (kept, memory)
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        (self.is_ready, self.simulated_s, self._first_seed), memory = state
+        self.decoder.memory, self.events.memory, self.insertions.memory = memory
+
+
+def _made_again(worlds: SteppedWorlds, in_place: bool) -> StepSession:
+    return StepSession(worlds, in_place=in_place)

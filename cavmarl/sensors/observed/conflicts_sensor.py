@@ -1,0 +1,122 @@
+"""The `conflicts` sensor: the vehicles that come nearest to the own way.
+
+The scales are those of the kernel `observing_conflicts`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cavmarl.config.sensors import SensorsConfig
+from cavmarl.core.math.neighbors import BODY
+from cavmarl.core.math.walls import Walls
+from cavmarl.sensors.kernels.observing_conflicts import (
+    AGE_SCALE_S,
+    CONFLICT_FEATURES,
+    GAP_HALF_M,
+    HEARD_FEATURES,
+    INDICATED_FEATURES,
+    NUM_LOOKS,
+    PLACE_HALF_M,
+    RANKED,
+    SPEED_HALF_MPS,
+    WHEN_HALF_S,
+    ConflictsSensor,
+)
+from cavmarl.sensors.observed.feature import Feature, Sensor
+from cavmarl.sensors.observed.sensor_setup import walls_of
+
+_PLACE = f"x / ({PLACE_HALF_M:g} m + abs(x))"
+_RELATIVE = f"v / ({SPEED_HALF_MPS:g} m/s + abs(v))"
+
+
+def features(config: SensorsConfig) -> list[Feature]:
+    """Nine numbers a vehicle, or up to twelve; first what comes nearest and soonest; or 0."""
+    rows: tuple[tuple[str, str, str, float], ...] = (
+        (
+            "near",
+            f"how near it comes: {GAP_HALF_M:g} m / ({GAP_HALF_M:g} m + gap); 0: there is none",
+            "",
+            0.0,
+        ),
+        (
+            "soon",
+            f"how soon: {WHEN_HALF_S:g} s / ({WHEN_HALF_S:g} s + time); 0: there is none",
+            "",
+            0.0,
+        ),
+        ("x", "forward place, ego frame", _PLACE, -1.0),
+        ("y", "place to the left, ego frame", _PLACE, -1.0),
+        ("vx", "forward velocity minus the own one, ego frame", _RELATIVE, -1.0),
+        ("vy", "velocity to the left, ego frame", _RELATIVE, -1.0),
+        ("cos", "cosine of its heading minus the own one", "", -1.0),
+        ("sin", "sine of its heading minus the own one", "", -1.0),
+        (
+            "first",
+            "1 if it goes first at the next junction, or is on it; -1 if it gives way; else 0",
+            "",
+            -1.0,
+        ),
+    )
+    if config.conflicts.heard:
+        age = "how old the message is that tells of it, if it is not seen"
+        rows += (
+            ("seen", "1 if it is seen; 0: a message tells of it, or there is none", "", 0.0),
+            ("age", age, f"{AGE_SCALE_S:g} s", 0.0),
+        )
+    if config.conflicts.indicators:
+        rows += (("turn", "1 if it indicates that it turns left, -1: right; else 0", "", -1.0),)
+    return [
+        Feature(f"{name}_{k}", f"vehicle {k}: {meaning}", scale, low)
+        for k in range(config.conflicts.count)
+        for name, meaning, scale, low in rows
+    ]
+
+
+def shape(config: SensorsConfig) -> tuple[int, ...]:
+    more = HEARD_FEATURES if config.conflicts.heard else 0
+    more += INDICATED_FEATURES if config.conflicts.indicators else 0
+    return config.conflicts.count, CONFLICT_FEATURES + more
+
+
+def reach_m(config: SensorsConfig) -> float:
+    return config.conflicts.range_m * (config.conflicts.count > 0)
+
+
+def settings(
+    config: SensorsConfig, at: int, walls: Walls, most_told: int, capacity: int
+) -> ConflictsSensor:
+    """What the kernel takes; `most_told`: vehicles that an inbox keeps; `capacity`: of the grid."""
+    given = config.conflicts
+    capacity = capacity if given.count else 0
+    return ConflictsSensor(
+        at,
+        given.count,
+        given.range_m,
+        walls,
+        given.heard,
+        told=np.zeros(most_told, BODY),
+        indicators=given.indicators,
+        looks=np.zeros((NUM_LOOKS, 4)),
+        heard_looks=np.zeros((NUM_LOOKS, 4)),
+        others=np.zeros((capacity, NUM_LOOKS, 4)),
+        indicated=np.zeros(capacity),
+        foreseen=np.zeros(capacity, np.int64),
+        filling=np.ones(1, np.int64),
+        ranked=np.zeros(given.count, RANKED),
+    )
+
+
+SENSOR = Sensor(
+    "conflicts",
+    features,
+    reach_m,
+    shape,
+    settings=lambda made: settings(
+        made.config,
+        made.at,
+        walls_of(made.network, made.config.conflicts.through_walls),
+        made.most_told,
+        made.capacity,
+    ),
+)

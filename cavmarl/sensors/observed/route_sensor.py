@@ -1,0 +1,24 @@
+"""The `route` sensor: points of the way ahead."""
+
+from __future__ import annotations
+
+from cavmarl.config.sensors import SensorsConfig
+from cavmarl.sensors.observed.feature import Feature, Sensor
+
+
+def features(config: SensorsConfig) -> list[Feature]:
+    """X (forward) and y (left) of points of the way ahead in the ego frame."""
+    route = config.route
+    scale = f"{route.points * route.spacing_m:g} m"
+    return [
+        Feature(
+            f"{axis}_{k}",
+            f"{side} of the point {(k + 1) * route.spacing_m:g} m along the way, ego frame",
+            scale,
+        )
+        for k in range(route.points)
+        for axis, side in (("x", "forward place"), ("y", "place to the left"))
+    ]
+
+
+SENSOR = Sensor("route", features)

@@ -1,0 +1,30 @@
+"""`SensorSetup`: what the settings of an optional sensor are made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config.sensors import SensorsConfig
+from cavmarl.core.math.walls import Walls, make_walls
+from cavmarl.roads.network import RoadNetwork
+
+
+@dataclass(frozen=True)
+class SensorSetup:
+    """The world of a sensor, and the place of its numbers."""
+
+    config: SensorsConfig
+    at: int  # where its numbers begin in a frame
+    network: RoadNetwork
+    goals: NDArray[np.float64]  # see `highway.goal_places`
+    most_told: int  # vehicles that an inbox keeps
+    capacity: int  # rows of a world
+
+
+def walls_of(network: RoadNetwork, through_walls: bool) -> Walls:
+    """Return the walls that hide vehicles; none if the sensor sees through walls."""
+    walls = network.walls[:0] if through_walls else network.walls
+    return make_walls(np.stack([walls[name] for name in ("ax", "ay", "bx", "by")], axis=1))

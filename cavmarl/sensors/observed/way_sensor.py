@@ -1,0 +1,62 @@
+"""The `way` sensor: the way ahead by its shape, its lanes and the stop lines on it.
+
+The scales are those of the kernel `observing_way`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cavmarl.config.sensors import SensorsConfig
+from cavmarl.sensors.kernels.observing_way import (
+    CURVATURE_SCALE,
+    LINE_HALF_M,
+    WIDTH_SCALE,
+    WaySensor,
+)
+from cavmarl.sensors.kernels.sense import SPEED_SCALE
+from cavmarl.sensors.observed.feature import Feature, Sensor
+
+_SPEED = f"{SPEED_SCALE:g} m/s"
+
+
+def features(config: SensorsConfig) -> list[Feature]:
+    """Four numbers a place, nearest first; then five a line, or six with `timing`."""
+    found = []
+    for k, distance in enumerate(config.way.distances_m):
+        where = f"{distance:g} m along the way"
+        found += [
+            Feature(f"left_{k}", f"place to the left of what is {where}", f"{distance:g} m"),
+            Feature(
+                f"curvature_{k}",
+                f"curvature from the place before to {where}, left positive",
+                f"{CURVATURE_SCALE:g} 1/m",
+            ),
+            Feature(f"width_{k}", f"width of the lane {where}", f"{WIDTH_SCALE:g} m", 0.0),
+            Feature(f"limit_{k}", f"speed limit {where}", _SPEED, 0.0),
+        ]
+    near = f"{LINE_HALF_M:g} m / ({LINE_HALF_M:g} m + way)"
+    for k in range(config.way.lines):
+        rows = [
+            ("line", f"how near stop line {k} is along the way: {near}; 0: there is none"),
+            ("line_red", f"1 if the signal of line {k} is red, or asks to stop first"),
+            ("line_yellow", f"1 if the signal of line {k} is yellow"),
+            ("line_green", f"1 if the signal of line {k} is green"),
+            ("line_yields", f"1 if others have the right of way behind line {k}"),
+        ]
+        if config.way.timing:
+            rows.append(
+                ("line_change", f"how soon the signal of line {k} changes: 5 s / (5 s + time)")
+            )
+        found += [Feature(f"{name}_{k}", meaning, "", 0.0) for name, meaning in rows]
+    return found
+
+
+def settings(config: SensorsConfig, at: int) -> WaySensor:
+    """What the kernel takes."""
+    given = config.way
+    distances = np.array(given.distances_m, dtype=np.float64)
+    return WaySensor(at, distances, given.lines, given.range_m, given.timing)
+
+
+SENSOR = Sensor("way", features, settings=lambda made: settings(made.config, made.at))
