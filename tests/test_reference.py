@@ -21,10 +21,10 @@ with warnings.catch_warnings():
     from highway_env.vehicle.kinematics import Vehicle
 
 from cavmarl.core.math.geometry import wrap_angle
-from cavmarl.driving.kernels import bicycle as kinematics
-from cavmarl.driving.kernels import car_following as idm
-from cavmarl.driving.kernels import highway_control as control
-from cavmarl.driving.kernels import lane_change
+from cavmarl.driving.kernels.lanes import lane_change
+from cavmarl.driving.kernels.models import idm
+from cavmarl.driving.kernels.motion import bicycle as kinematics
+from cavmarl.driving.kernels.motion import highway_control as control
 from tests.naive.kinematics import clip_control
 
 IDM_DEFAULTS = (idm.ACCEL_MAX, idm.DECEL_COMFORT, idm.JAM_DISTANCE_M, idm.TIME_HEADWAY_S)

@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.records.codes import MODEL_IDM
-from cavmarl.driving.kernels.car_following import (
+from cavmarl.driving.kernels.models.idm import (
     ACCEL_LIMIT,
     ACCEL_MAX,
     DECEL_COMFORT,
     JAM_DISTANCE_M,
     TIME_HEADWAY_S,
 )
-from cavmarl.driving.kernels.motion import MAX_SPEED_MPS
+from cavmarl.driving.kernels.motion.motion import MAX_SPEED_MPS
 from cavmarl.roads.network import VEHICLE_CLASSES
 
 # A vehicle of SUMO's class "ignoring" heeds no permission.

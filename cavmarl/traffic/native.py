@@ -21,7 +21,7 @@ from cavmarl.core.records.arrays import Demand, Gate, Travel, Worlds
 from cavmarl.core.records.codes import MODEL_KRAUSS
 from cavmarl.driving.driver_models import model_code
 from cavmarl.driving.kernels.drivers import look_ahead_m, see_line_m
-from cavmarl.driving.kernels.lane_index import VIEW_M
+from cavmarl.driving.kernels.lanes.lane_index import VIEW_M
 from cavmarl.driving.vehicle_types import agent_types, generated_types
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN, make_plans

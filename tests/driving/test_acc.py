@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from cavmarl.core.records.codes import MODEL_ACC
-from cavmarl.driving.kernels.acc import acc_acceleration
-from cavmarl.driving.kernels.following import behind, no_constraint, response
+from cavmarl.driving.kernels.models.acc import acc_acceleration
+from cavmarl.driving.kernels.models.following import behind, no_constraint, response
 from cavmarl.driving.vehicle_types import CLASS_DEFAULTS, VTYPE
 
 DT, STEPS, FOLLOWERS = 0.1, 1000, 5

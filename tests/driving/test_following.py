@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cavmarl.core.records.codes import MODEL_IDM, MODEL_KRAUSS
-from cavmarl.driving.kernels.following import (
+from cavmarl.driving.kernels.models.following import (
     LINE_MARGIN_M,
     accel_behind,
     before_line,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_BACKGROUND, MODEL_KRAUSS
-from cavmarl.driving.kernels.lane_choice import (
+from cavmarl.driving.kernels.lanes.lane_choice import (
     MAX_BRAKING_NEEDED,
     MERGE_ROOM_M,
     SWAP_ROOM_M,
@@ -16,7 +16,7 @@ from cavmarl.driving.kernels.lane_choice import (
     room_for_more,
     wish_on_lane,
 )
-from cavmarl.driving.kernels.lane_index import index_lanes
+from cavmarl.driving.kernels.lanes.lane_index import index_lanes
 from cavmarl.driving.vehicle_types import generated_types
 from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.roads.network import LANE

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from cavmarl.core.records.codes import EVENT_ARRIVED, HOLD_NONE, HOLD_SIGNAL, MODEL_KRAUSS
-from cavmarl.driving.kernels.gaps import is_minor
-from cavmarl.driving.kernels.junctions import may_enter
-from cavmarl.driving.kernels.motion import move_background
+from cavmarl.driving.kernels.junctions.gaps import is_minor
+from cavmarl.driving.kernels.junctions.junctions import may_enter
+from cavmarl.driving.kernels.motion.motion import move_background
 from cavmarl.engine.simulation import Simulation
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network

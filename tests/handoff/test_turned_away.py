@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cavmarl.core.records.arrays import Gate, RoadArrays, Travel, Worlds
-from cavmarl.driving.kernels.ways import goes_on
+from cavmarl.driving.kernels.lanes.route_following import next_step_of_plan
 from cavmarl.engine.simulation import Simulation
 from cavmarl.handoff.fault_injection.fault_plan import Faults
 from cavmarl.ownership.transport import Rates
@@ -32,7 +32,7 @@ def edges_of(roads: RoadArrays, travel: Travel, row: Any) -> list[int]:
     while lane >= 0:
         if not roads.lanes[lane]["internal"]:
             found.append(int(roads.lanes[lane]["edge"]))
-        lane, way, _ = goes_on(roads, travel, lane, way)
+        lane, way, _ = next_step_of_plan(roads, travel, lane, way)
     return found
 
 

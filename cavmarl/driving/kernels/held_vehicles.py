@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.records import record
 from cavmarl.core.records.arrays import RoadArrays, Travel
-from cavmarl.driving.kernels.following import before_line, response
+from cavmarl.driving.kernels.models.following import before_line, response
 
 HELD = record(
     ("vehicle", np.int64),

@@ -9,8 +9,8 @@ from cavmarl.core.compiled import kernel
 from cavmarl.core.math.neighbors import Grid, fill_grid
 from cavmarl.core.records.arrays import LaneGrid, RoadArrays, Travel, Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
+from cavmarl.sensors.kernels.highway_lidar import observe_lidar_cells
 from cavmarl.sensors.kernels.kinematics_observation import observe_kinematics
-from cavmarl.sensors.kernels.lidar_cells import observe_lidar_cells
 from cavmarl.sensors.kernels.nearest_road_points import observe_roadgraph
 from cavmarl.sensors.kernels.observing_conflicts import forget_others, observe_conflicts
 from cavmarl.sensors.kernels.observing_history import observe_history

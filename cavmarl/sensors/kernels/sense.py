@@ -31,10 +31,10 @@ from cavmarl.core.records.codes import (
     SIGNAL_YELLOW_MAJOR,
     SIGNAL_YELLOW_MINOR,
 )
-from cavmarl.driving.kernels.gaps import link_signal
-from cavmarl.driving.kernels.signal_timing import time_to_change
+from cavmarl.driving.kernels.junctions.gaps import link_signal
+from cavmarl.driving.kernels.junctions.signal_timing import time_to_change
 from cavmarl.rewards.kernels.terms import write_terms
-from cavmarl.sensors.kernels.lidar_fan import lidar
+from cavmarl.sensors.kernels.lidar_2d import lidar
 from cavmarl.sensors.kernels.observing_lanes import observe_lanes
 from cavmarl.sensors.kernels.output_reset import has_entered, newest_frame, shift_frames
 

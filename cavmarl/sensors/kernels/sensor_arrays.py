@@ -55,7 +55,7 @@ class OccupancyGrid(NamedTuple):
 
 
 class LidarCells(NamedTuple):
-    """highway-env's `LidarObservation`: see `kernels.lidar_cells`."""
+    """highway-env's `LidarObservation`: see `kernels.highway_lidar`."""
 
     at: int
     cells: int  # 0: off

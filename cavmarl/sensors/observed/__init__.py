@@ -17,7 +17,7 @@ from cavmarl.core.math.walls import Walls, make_walls
 from cavmarl.core.records.arrays import Sensors
 from cavmarl.rewards.kernels.terms import TTC_REACH_M
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.sensors.kernels.lidar_fan import ECHO, ray_directions
+from cavmarl.sensors.kernels.lidar_2d import ECHO, ray_directions
 from cavmarl.sensors.kernels.sensor_arrays import OptionalSensors
 from cavmarl.sensors.observed import ego_features as seen
 from cavmarl.sensors.observed import highway_kinematics as kinematics

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import kernel
 from cavmarl.core.records.arrays import RoadArrays, Travel
 from cavmarl.core.records.codes import DRIVER_BACKGROUND, DRIVER_SCRIPTED, EVENT_ARRIVED
-from cavmarl.driving.kernels.ways import goes_on
+from cavmarl.driving.kernels.lanes.route_following import next_step_of_plan
 from cavmarl.roads.kernels.plans import change_cost
 from cavmarl.roads.kernels.route_steps import follow_plan, plan_route
 
@@ -144,7 +144,7 @@ def last_edge(roads: RoadArrays, travel: Travel, lane: int, way: int) -> int:
     for _ in range(travel.steps.shape[0]):
         if not roads.lanes[lane]["internal"]:
             edge = roads.lanes[lane]["edge"]
-        lane, way, _link = goes_on(roads, travel, lane, way)
+        lane, way, _link = next_step_of_plan(roads, travel, lane, way)
         if lane < 0:
             return edge
     return -1

@@ -14,7 +14,7 @@ from cavmarl.core.records.arrays import RoadArrays, Travel, Zoned
 from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_BACKGROUND
 from cavmarl.core.records.rows import is_lost
 from cavmarl.driving.kernels.held_vehicles import stopping_m
-from cavmarl.driving.kernels.ways import goes_on
+from cavmarl.driving.kernels.lanes.route_following import next_step_of_plan
 from cavmarl.zones.kernels.zone_lookup import ZoneArrays, squared_distance, zone_of
 
 AHEAD = record(
@@ -144,7 +144,7 @@ def _crossing(
                 return inside, -1
         begin += here["length_m"]
         s = 0.0
-        lane, way, _ = goes_on(roads, travel, lane, way)
+        lane, way, _ = next_step_of_plan(roads, travel, lane, way)
         if lane < 0:
             break
     return inside, -1
