@@ -25,6 +25,7 @@ from cavmarl.driving.kernels.junctions.deadlocks import (
     resolves_deadlocks,
     yields_in_deadlock,
 )
+from cavmarl.driving.vehicle_types import set_model
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network
 from tests.support.builders import vehicles
@@ -140,7 +141,7 @@ def test_circles_are_for_sumo_s_drivers_on_equal_roads(
     network = read_network(crossing(kind))
     tables = travel("grid4x4")
     types = np.array(tables.types)
-    types["model"] = model
+    set_model(types, model)
     (row,) = vehicles([(0.0, 0.0, 0.0)], driver=driver)
     lanes = [network.lane_ids[lane] for lane in network.links["to_lane"]]
     links = [

@@ -27,7 +27,7 @@ from cavmarl.driving.kernels.junctions.swept_areas import (
 )
 from cavmarl.driving.kernels.lanes.lane_index import index_lanes
 from cavmarl.driving.kernels.models.following import behind, no_constraint
-from cavmarl.driving.vehicle_types import generated_types
+from cavmarl.driving.vehicle_types import generated_types, set_model
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN
 from cavmarl.roads.sumo_net.reader import read_network
@@ -202,7 +202,8 @@ def test_one_that_stops_for_a_bus_still_comes_ready_to_stop_to_its_place_inside(
     nowhere = np.zeros(len(network.lanes), PLAN)
     nowhere["next"], nowhere["link"] = -1, -1
     types = np.array(generated_types())
-    types["model"], types["decel"] = MODEL_KRAUSS, 4.5
+    set_model(types, MODEL_KRAUSS)
+    types["decel"] = 4.5
     travel, lane = travel_by(nowhere, types), int(links["from_lane"][link])
     front_m = 9.0
     s = float(network.lanes["length_m"][lane]) - front_m - 0.5 * CAR_M

@@ -25,7 +25,6 @@ from cavmarl.core.records.codes import (
     HOLD_NONE,
     HOLD_SIGNAL,
     HOLD_YIELD,
-    MODEL_KRAUSS,
 )
 from cavmarl.core.records.rows import is_lost
 from cavmarl.driving.kernels.junctions.deadlocks import resolves_deadlocks
@@ -106,7 +105,7 @@ RETURN_MPS = 5.0  # at which a lost vehicle looks for its lane
 @inlined_kernel
 def look_ahead_m(kind: np.void, speed: float) -> float:
     """How far ahead of its centre a driver looks, in m: IDM reacts earlier and more softly."""
-    if kind["model"] == MODEL_KRAUSS:
+    if kind["as_sumo"]:
         way = 45.0 + speed * (1.0 + kind["tau"]) + 0.5 * speed * speed / kind["decel"]
     else:
         way = 30.0 + 2.0 * speed + 0.2 * speed * speed
@@ -119,7 +118,7 @@ def see_line_m(kind: np.void, speed: float) -> float:
 
     IDM asks as soon as it sees the line; Krauss's driver when it may soon have to brake.
     """
-    if kind["model"] == MODEL_KRAUSS:
+    if kind["as_sumo"]:
         braking = 0.6 * speed * speed / kind["decel"]
         return float(SEE_LINE_M + speed * (1.0 + kind["tau"]) + braking)
     return VIEW_M
@@ -180,7 +179,7 @@ def _at_line(
         closer = CLOSER_M if resolves_deadlocks(roads, travel, row, link) else 0.0
         return before_line(kind, speed, min(to_line + closer, stop), dt), hold, to_line
     constraint = merging
-    minor = kind["model"] == MODEL_KRAUSS and is_minor(roads, link, phase)
+    minor = kind["as_sumo"] and is_minor(roads, link, phase)
     if roads.links[link]["wait_m"] < math.inf:
         inside = before_waiting(roads, kind, row, link, -front, waits, minor, dt)
         constraint = max(constraint, inside)
@@ -219,7 +218,7 @@ def _road_ahead(
     lane = row["lane"]
     here = roads.lanes[lane]
     distance = here["length_m"] - row["s"]
-    queues = speed == 0.0 and kind["model"] == MODEL_KRAUSS and not here["internal"]
+    queues = speed == 0.0 and kind["as_sumo"] and not here["internal"]
     if queues and k + 1 < scratch.lane_end[lane] and distance >= half + NEXT_LINE_M:
         leader = scratch.entries[k + 1]
         gap = leader["s"] - row["s"] - half - leader["half"]
@@ -309,7 +308,7 @@ def _road_ahead(
             break
         distance += ahead["length_m"]
     if hold == HOLD_YIELD and speed < KEPT_MPS and -kept < KEPT_MPS:
-        if kind["model"] == MODEL_KRAUSS and not here["internal"]:
+        if kind["as_sumo"] and not here["internal"]:
             hold = HOLD_EXIT_BLOCKED  # whatever it gives way to: it will not come
     return constraint, allowed, hold, link_ahead
 

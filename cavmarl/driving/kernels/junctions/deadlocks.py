@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.math.rng import STREAM_DRIVER, quick_uniform
 from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
-from cavmarl.core.records.codes import DRIVER_BACKGROUND, HOLD_YIELD, MODEL_KRAUSS
+from cavmarl.core.records.codes import DRIVER_BACKGROUND, HOLD_YIELD
 from cavmarl.driving.kernels.junctions.stop_line_registration import STANDING_MPS, can_be_ignored
 
 DEADLOCK_LINKS = 8  # the longest chain of yielding links that is searched
@@ -34,11 +34,11 @@ def on_equal_road(roads: RoadArrays, link: int) -> bool:
 
 @inlined_kernel
 def drives_as_sumo(travel: Travel, row: np.void) -> bool:
-    """Whether a vehicle has a driver that SUMO has, too: Krauss's, in the background."""
+    """Return whether a vehicle is driven as SUMO drives it: in the background, by such a model."""
     if row["driver"] != DRIVER_BACKGROUND:
         return False
-    krauss: bool = travel.types[row["vtype"]]["model"] == MODEL_KRAUSS
-    return krauss
+    as_sumo: bool = travel.types[row["vtype"]]["as_sumo"]
+    return as_sumo
 
 
 @inlined_kernel

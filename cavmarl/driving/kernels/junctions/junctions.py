@@ -21,7 +21,6 @@ from cavmarl.core.records.codes import (
     HOLD_NONE,
     HOLD_SIGNAL,
     HOLD_YIELD,
-    MODEL_KRAUSS,
     SIGNAL_GREEN_MAJOR,
     SIGNAL_OFF,
     SIGNAL_RED,
@@ -194,7 +193,7 @@ def may_enter(
     if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW:
         return HOLD_SIGNAL
     kind = travel.types[row["vtype"]]
-    stops = kind["decel"] if kind["model"] == MODEL_KRAUSS else COMFORT_STOP
+    stops = kind["decel"] if kind["as_sumo"] else COMFORT_STOP
     if (signal == SIGNAL_YELLOW_MINOR or signal == SIGNAL_YELLOW_MAJOR) and needed < stops:
         # A vehicle that gave way at the line all through green goes now, as the others stop.
         if row["hold"] != HOLD_YIELD or front > LAST_CHANCE_M:
@@ -386,7 +385,7 @@ def constraint_inside(
     target = roads.links[link]
     if target["wait_m"] < math.inf and front <= target["wait_m"] + WAIT_SLACK_M:
         waits = waits_inside(roads, travel, rows, i, link, -place, way, phase, scratch)
-        minor = kind["model"] == MODEL_KRAUSS and is_minor(roads, link, phase)
+        minor = kind["as_sumo"] and is_minor(roads, link, phase)
         constraint = before_waiting(roads, kind, row, link, front, waits, minor, dt)
     hold = waits
     first = target["first_conflict"]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays, Scratch
-from cavmarl.core.records.codes import DRIVER_AGENT, HOLD_NONE, MODEL_KRAUSS
+from cavmarl.core.records.codes import DRIVER_AGENT, HOLD_NONE
 from cavmarl.core.records.rows import SIZE_BODIES_M, SIZE_LENGTHS_M, STEERED, SWEPT_BEYOND_M
 from cavmarl.driving.kernels.junctions.stop_line_registration import (
     APPROACH_STANDING_M,
@@ -323,7 +323,7 @@ def before_foe_sweep_beyond_junction(
 def before_line_gently(kind: np.void, row: np.void, gap: float, dt: float) -> float:
     """The constraint of a line before which no vehicle brakes harder than those behind can."""
     constraint = before_line(kind, row["speed"], gap, dt)
-    if kind["model"] == MODEL_KRAUSS:
+    if kind["as_sumo"]:
         return float(min(constraint, kind["decel"] * dt - row["speed"]))
     return float(min(constraint, kind["accel"] + kind["decel"]))
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
-from cavmarl.core.records.codes import DRIVER_AGENT, MODEL_KRAUSS
+from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.driving.kernels.lanes.lane_change import (
     LANE_CHANGE_DELAY_S,
     MAX_BRAKING_IMPOSED,
@@ -229,7 +229,7 @@ def _change_is_safe(
             return False
         after = accel_behind(kind, speed, desired, net, leader["speed"], leader["decel"])
         # Krauss's answers for a reaction time, and asks for less than it takes at a crawl.
-        faster = speed - leader["speed"] if kind["model"] == MODEL_KRAUSS else 0.0
+        faster = speed - leader["speed"] if kind["as_sumo"] else 0.0
         if faster > 0.0 and faster * faster > 2.0 * MAX_BRAKING_ACCEPTED * net:
             return False
     after = max(after, -speed / BRAKE_TIME_S)

@@ -9,7 +9,6 @@ import numpy as np
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.math.elementary import atan2
 from cavmarl.core.records.arrays import RoadArrays
-from cavmarl.core.records.codes import MODEL_KRAUSS
 
 LIMIT_DECEL = 2.0  # m/s², how a driver slows for a bend, or a lower limit ahead
 LIMIT_LEAD_S = 1.0  # to be down this time before it, as the model lags behind what is allowed
@@ -61,7 +60,7 @@ def speed_before_limit(
     """Return the speed in m/s from which a driver can slow down to a limit `distance` m ahead."""
     decel = LIMIT_DECEL
     lead_s = LIMIT_LEAD_S
-    if kind["model"] == MODEL_KRAUSS:
+    if kind["as_sumo"]:
         decel = kind["decel"]
         lead_s = dt
     return math.sqrt(limit * limit + 2.0 * decel * max(distance - lead_s * speed, 0.0))
