@@ -1,6 +1,6 @@
 """What cavmarl pulls in: exact files with hashes, and licences.
 
-python -m docs.supply_chain lock       # writes constraints-hashes.txt, by pip's own resolver
+python -m docs.supply_chain lock       # writes constraints/hashes.txt, by pip's own resolver
 python -m docs.supply_chain licences   # prints the table of docs/licences.md
 """
 
@@ -42,7 +42,7 @@ EXTRAS = (
 HEAD = """\
 # Every file that `pip install '.[{extras}]'` takes on 64-bit Linux with Python
 # 3.11, with its hash; made by `make lock`. To install nothing else:
-#     pip install --require-hashes --requirement constraints-hashes.txt
+#     pip install --require-hashes --requirement constraints/hashes.txt
 #     pip install --no-deps --no-build-isolation .
 """
 
@@ -50,7 +50,7 @@ HEAD = """\
 def write_lock(path: Path) -> None:
     """Resolve and download as pip does, and write each file's hash."""
     words = [sys.executable, "-m", "pip", "install", "--dry-run", "--ignore-installed", "--quiet"]
-    words += ["--report", "-", f".[{LOCKED}]", "--constraint", "constraints.txt"]
+    words += ["--report", "-", f".[{LOCKED}]", "--constraint", "constraints/exact.txt"]
     done = subprocess.run(words, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True)
     lines = []
     for found in json.loads(done.stdout)["install"]:
@@ -108,7 +108,7 @@ def _licence(name: str) -> str:
 
 if __name__ == "__main__":
     if sys.argv[1:] == ["lock"]:
-        write_lock(ROOT / "constraints-hashes.txt")
+        write_lock(ROOT / "constraints/hashes.txt")
     elif sys.argv[1:] == ["licences"]:
         for row in licences():
             print("| {} |".format(" | ".join(row)))
