@@ -166,6 +166,6 @@ $(LIBRARIES)/.ready: pyproject.toml constraints/libraries.txt
 	"$(PYTHON)" -m venv --clear $(LIBRARIES)
 	$(LIBRARIES)/bin/python -m pip install $$(grep '^torch==' constraints/libraries.txt) \
 	    --constraint constraints/libraries.txt
-	$(LIBRARIES)/bin/python -m pip install --editable '.[sumo,sb3,torchrl,benchmarl,rllib]' pytest \
+	$(LIBRARIES)/bin/python -m pip install --editable '.[sumo,train,torchrl,benchmarl,rllib]' pytest \
 	    hypothesis --constraint constraints/libraries.txt
 	@touch $@

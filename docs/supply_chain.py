@@ -10,6 +10,7 @@ import json
 import re
 import subprocess
 import sys
+import tomllib
 from collections import defaultdict
 from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, distribution
@@ -20,22 +21,20 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[1]
 # torch's wheels differ by processor.
-LOCKED = "compile,sumo,maps,followers,nodes,recordings,render,report,service"
+LOCKED = "compile,sumo,maps,nodes,report,render,record,followers,service"
 EXTRAS = (
     "",
     "compile",
     "sumo",
     "maps",
-    "followers",
     "nodes",
-    "recordings",
-    "mcap",
-    "render",
     "report",
-    "service",
+    "render",
+    "record",
+    "followers",
     "viewer",
-    "torch",
-    "sb3",
+    "service",
+    "train",
     "torchrl",
     "ray",
 )
@@ -79,7 +78,7 @@ def _closure(name: str, extra: str, seen: set[tuple[str, str]] | None = None) ->
     """All packages that one needs, with one of its extras."""
     seen = set() if seen is None else seen
     found: set[str] = set()
-    for line in distribution(name).requires or ():
+    for line in _requirements(name, extra):
         need = Requirement(line)
         if need.marker is not None and not need.marker.evaluate({"extra": extra}):
             continue
@@ -93,6 +92,15 @@ def _closure(name: str, extra: str, seen: set[tuple[str, str]] | None = None) ->
             except PackageNotFoundError:
                 continue
     return found - {"cavmarl"}
+
+
+def _requirements(name: str, extra: str) -> list[str]:
+    """What a package asks for; cavmarl's own list is that of this checkout."""
+    if name != "cavmarl":
+        return distribution(name).requires or []
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    needs: list[str] = [*project["dependencies"]]
+    return needs + (project["optional-dependencies"][extra] if extra else [])
 
 
 def _licence(name: str) -> str:

@@ -12,7 +12,7 @@ with warnings.catch_warnings():
     # Importing pygame warns of a deprecated package that it uses itself.
     warnings.simplefilter("ignore", DeprecationWarning)
     warnings.simplefilter("ignore", UserWarning)
-    pytest.importorskip("highway_env", reason="needs the extra 'highway'")
+    pytest.importorskip("highway_env", reason="needs the extra 'bench'")
 
     from highway_env.road.lane import CircularLane, StraightLane
     from highway_env.road.road import Road, RoadNetwork
