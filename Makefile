@@ -1,4 +1,4 @@
-# Every target sets up what it needs: a virtual environment in .venv with the versions of constraints.txt.
+# Every target sets up what it needs: a virtual environment in .venv with the versions of constraints/exact.txt.
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
@@ -84,7 +84,7 @@ model: ## verify the model of the hand-off protocol, and that each of its mutati
 	sh docs/model/check_model.sh
 
 fuzz: $(READY) ## each file parser, FUZZ_SECONDS long; what crashes one stays in fuzz/crashes
-	$(BIN)/python -m pip install --quiet --editable '.[fuzz]' --constraint constraints.txt
+	$(BIN)/python -m pip install --quiet --editable '.[fuzz]' --constraint constraints/exact.txt
 	for target in $(FUZZ_TARGETS); do $(BIN)/python -m fuzz $$target $(FUZZ_SECONDS) || exit 1; done
 
 oldest: $(OLDEST)/.ready ## the heart of the tests with the oldest versions that are allowed
@@ -109,7 +109,7 @@ record: $(READY) ## after a change of behaviour: golden rows, zoo, scores, gener
 rules: $(READY) $(TOOLS)/.ready ## ask ASAM's checker whether exported OpenDRIVE keeps its rules
 	$(BIN)/pytest tests/maps/exports/test_opendrive_rules.py
 
-lock: $(READY) ## write constraints-hashes.txt: each file of an installation with its hash
+lock: $(READY) ## write constraints/hashes.txt: each file of an installation with its hash
 	$(BIN)/python -m docs.supply_chain lock
 
 sbom: $(READY) $(TOOLS)/.ready ## list all parts of an installation, in CycloneDX's form
@@ -136,14 +136,14 @@ clean: ## remove .venv, builds and caches; runs/ stays
 
 # torch comes first and alone, so that a CPU build that pip is told of (PIP_EXTRA_INDEX_URL,
 # PIP_FIND_LINKS) is taken instead of several GB of CUDA libraries.
-$(READY): pyproject.toml constraints.txt
+$(READY): pyproject.toml constraints/exact.txt
 	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	    echo "cavmarl needs Python 3.11 or newer: make PYTHON=/path/to/python3.11" >&2; exit 1; }
 	@"$(PYTHON)" -c 'import ensurepip, venv' 2>/dev/null || $(VENV_PACKAGE) || { \
 	    echo "Python's venv is missing; on Debian: sudo apt-get install python3-venv" >&2; exit 1; }
 	test -x $(BIN)/pip || "$(PYTHON)" -m venv --clear .venv
-	$(BIN)/python -m pip install $$(grep '^torch==' constraints.txt) --constraint constraints.txt
-	$(BIN)/python -m pip install --editable '.[dev]' --constraint constraints.txt
+	$(BIN)/python -m pip install $$(grep '^torch==' constraints/exact.txt) --constraint constraints/exact.txt
+	$(BIN)/python -m pip install --editable '.[dev]' --constraint constraints/exact.txt
 	@touch $@
 
 $(TOOLS)/.ready:
@@ -156,16 +156,16 @@ $(SITE)/.ready: docs/requirements.txt
 	$(SITE)/bin/python -m pip install --quiet --requirement docs/requirements.txt
 	@touch $@
 
-$(OLDEST)/.ready: pyproject.toml constraints-oldest.txt
+$(OLDEST)/.ready: pyproject.toml constraints/oldest.txt
 	"$(PYTHON)" -m venv --clear $(OLDEST)
 	$(OLDEST)/bin/python -m pip install --editable '.[sumo]' pytest hypothesis \
-	    --constraint constraints-oldest.txt
+	    --constraint constraints/oldest.txt
 	@touch $@
 
-$(LIBRARIES)/.ready: pyproject.toml constraints-libraries.txt
+$(LIBRARIES)/.ready: pyproject.toml constraints/libraries.txt
 	"$(PYTHON)" -m venv --clear $(LIBRARIES)
-	$(LIBRARIES)/bin/python -m pip install $$(grep '^torch==' constraints-libraries.txt) \
-	    --constraint constraints-libraries.txt
-	$(LIBRARIES)/bin/python -m pip install --editable '.[sumo,sb3,torchrl,benchmarl,rllib]' pytest \
-	    hypothesis --constraint constraints-libraries.txt
+	$(LIBRARIES)/bin/python -m pip install $$(grep '^torch==' constraints/libraries.txt) \
+	    --constraint constraints/libraries.txt
+	$(LIBRARIES)/bin/python -m pip install --editable '.[sumo,train,torchrl,benchmarl,rllib]' pytest \
+	    hypothesis --constraint constraints/libraries.txt
 	@touch $@

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import PolicyError
-from cavmarl.driving.kernels.steering import steer_to_lane
+from cavmarl.driving.kernels.motion.steering import steer_to_lane
 from cavmarl.env.parallel import CavEnv
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.policies.policy import Policy

@@ -49,7 +49,7 @@ def measure(
     check_range(rows=(rows, 1, 1_000_000), inputs=(inputs, 1, MAX_OBSERVATION_SIZE))
     check_range(hidden=(hidden, 1, MAX_WIDTH), repeats=(repeats, 1, 100_000))
     check_positive("--most-ratio", most_ratio)
-    torch = require("torch", "torch")
+    torch = require("torch", "train")
     threads = torch.get_num_threads()
     found: list[dict[str, Any]] = []
     with one_core():

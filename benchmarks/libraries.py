@@ -91,7 +91,7 @@ def _milliseconds(step: Step) -> float:
 def _one_thread() -> Iterator[None]:
     """Keep torch, if it is there, to one thread: it is to have no more than the others."""
     try:
-        torch = require("torch", "torch")
+        torch = require("torch", "train")
     except MissingExtraError:
         yield
         return

@@ -128,7 +128,7 @@ def _gymnasium(agents: int, size: int, workers: int) -> Iterator[Step]:
 def _supersuit(agents: int, size: int, workers: int) -> Iterator[Step]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what the library says of itself
-        supersuit = require("supersuit", "supersuit")
+        supersuit = require("supersuit", "bench")
         rows = supersuit.pettingzoo_env_to_vec_env_v1(_TrivialAgents(agents, size))
         vec = supersuit.concat_vec_envs_v1(rows, workers, workers, base_class="gymnasium")
         try:

@@ -30,7 +30,7 @@ from cavmarl.bench.harness import BenchmarkReport, Say, check_range, numbers_of,
 from cavmarl.cli.output import Seed, about
 from cavmarl.core.errors import CavmarlError, ConfigError
 from cavmarl.core.records.codes import SIGNAL_NONE
-from cavmarl.driving.kernels.announcing import announced_m
+from cavmarl.driving.kernels.junctions.stop_line_registration import registration_distance_m
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.evaluate.recorder import Recorder
@@ -313,7 +313,7 @@ class _Standing:
         crosses |= np.isin(others["lane"], into) & (others["s"] < 0.5 * others["length"])
         first = network.links["from_lane"][conflicts["foe"][conflicts["must_yield"]]]
         to_line = lanes["length_m"][others["lane"]] - others["s"]
-        announced = np.array([announced_m(speed) for speed in others["speed"].tolist()])
+        announced = np.array([registration_distance_m(speed) for speed in others["speed"].tolist()])
         comes = np.isin(others["lane"], first) & (to_line < announced)
         return bool((crosses | comes).any())
 

@@ -1,6 +1,6 @@
 """What cavmarl pulls in: exact files with hashes, and licences.
 
-python -m docs.supply_chain lock       # writes constraints-hashes.txt, by pip's own resolver
+python -m docs.supply_chain lock       # writes constraints/hashes.txt, by pip's own resolver
 python -m docs.supply_chain licences   # prints the table of docs/licences.md
 """
 
@@ -10,6 +10,7 @@ import json
 import re
 import subprocess
 import sys
+import tomllib
 from collections import defaultdict
 from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, distribution
@@ -20,29 +21,27 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[1]
 # torch's wheels differ by processor.
-LOCKED = "compile,sumo,maps,followers,nodes,recordings,render,report,service"
+LOCKED = "compile,sumo,maps,nodes,report,render,record,followers,service"
 EXTRAS = (
     "",
     "compile",
     "sumo",
     "maps",
-    "followers",
     "nodes",
-    "recordings",
-    "mcap",
-    "render",
     "report",
-    "service",
+    "render",
+    "record",
+    "followers",
     "viewer",
-    "torch",
-    "sb3",
+    "service",
+    "train",
     "torchrl",
     "ray",
 )
 HEAD = """\
 # Every file that `pip install '.[{extras}]'` takes on 64-bit Linux with Python
 # 3.11, with its hash; made by `make lock`. To install nothing else:
-#     pip install --require-hashes --requirement constraints-hashes.txt
+#     pip install --require-hashes --requirement constraints/hashes.txt
 #     pip install --no-deps --no-build-isolation .
 """
 
@@ -50,7 +49,7 @@ HEAD = """\
 def write_lock(path: Path) -> None:
     """Resolve and download as pip does, and write each file's hash."""
     words = [sys.executable, "-m", "pip", "install", "--dry-run", "--ignore-installed", "--quiet"]
-    words += ["--report", "-", f".[{LOCKED}]", "--constraint", "constraints.txt"]
+    words += ["--report", "-", f".[{LOCKED}]", "--constraint", "constraints/exact.txt"]
     done = subprocess.run(words, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True)
     lines = []
     for found in json.loads(done.stdout)["install"]:
@@ -79,7 +78,7 @@ def _closure(name: str, extra: str, seen: set[tuple[str, str]] | None = None) ->
     """All packages that one needs, with one of its extras."""
     seen = set() if seen is None else seen
     found: set[str] = set()
-    for line in distribution(name).requires or ():
+    for line in _requirements(name, extra):
         need = Requirement(line)
         if need.marker is not None and not need.marker.evaluate({"extra": extra}):
             continue
@@ -95,6 +94,15 @@ def _closure(name: str, extra: str, seen: set[tuple[str, str]] | None = None) ->
     return found - {"cavmarl"}
 
 
+def _requirements(name: str, extra: str) -> list[str]:
+    """What a package asks for; cavmarl's own list is that of this checkout."""
+    if name != "cavmarl":
+        return distribution(name).requires or []
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    needs: list[str] = [*project["dependencies"]]
+    return needs + (project["optional-dependencies"][extra] if extra else [])
+
+
 def _licence(name: str) -> str:
     told = distribution(name).metadata
     if expression := told.get("License-Expression"):
@@ -108,7 +116,7 @@ def _licence(name: str) -> str:
 
 if __name__ == "__main__":
     if sys.argv[1:] == ["lock"]:
-        write_lock(ROOT / "constraints-hashes.txt")
+        write_lock(ROOT / "constraints/hashes.txt")
     elif sys.argv[1:] == ["licences"]:
         for row in licences():
             print("| {} |".format(" | ".join(row)))

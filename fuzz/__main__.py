@@ -14,7 +14,7 @@ import atheris
 
 HERE = Path(__file__).resolve().parent
 PACKAGE = HERE.parent / "cavmarl"
-KERNELS = [path for folder in PACKAGE.rglob("kernels") for path in folder.glob("*.py")]
+KERNELS = [path for folder in PACKAGE.rglob("kernels") for path in folder.rglob("*.py")]
 
 # Kernels are left out: Numba compiles the bytecode of their functions as it is.
 with atheris.instrument_imports(

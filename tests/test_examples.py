@@ -41,7 +41,7 @@ def test_a_notebook_is_what_its_script_makes(script: Path) -> None:
 @each
 def test_a_notebook_runs(script: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if script.stem == "train_and_evaluate":
-        pytest.importorskip("torch", reason="needs the extra: torch")
+        pytest.importorskip("torch", reason="needs the extra: train")
     if script.stem == "own_map_and_reward":
         pytest.importorskip("sumo", reason="needs the extra: sumo")
     monkeypatch.setenv("CAVMARL_SHORT", "1")

@@ -25,12 +25,12 @@ def test_the_page_tells_the_licence_of_each_package() -> None:
 def test_each_locked_file_has_the_version_of_the_constraints() -> None:
     exact = dict(
         line.lower().replace("_", "-").split("==")
-        for line in (ROOT / "constraints.txt").read_text().splitlines()
+        for line in (ROOT / "constraints/exact.txt").read_text().splitlines()
         if not line.startswith("#")
     )
     locked = [
         re.fullmatch(r"([a-z0-9-]+)==(\S+) --hash=sha256:[0-9a-f]{64}", line)
-        for line in (ROOT / "constraints-hashes.txt").read_text().splitlines()
+        for line in (ROOT / "constraints/hashes.txt").read_text().splitlines()
         if not line.startswith("#")
     ]
     assert all(locked)

@@ -12,7 +12,7 @@ with warnings.catch_warnings():
     # Importing pygame warns of a deprecated package that it uses itself.
     warnings.simplefilter("ignore", DeprecationWarning)
     warnings.simplefilter("ignore", UserWarning)
-    pytest.importorskip("highway_env", reason="needs the extra 'highway'")
+    pytest.importorskip("highway_env", reason="needs the extra 'bench'")
 
     from highway_env.road.lane import CircularLane, StraightLane
     from highway_env.road.road import Road, RoadNetwork
@@ -21,10 +21,10 @@ with warnings.catch_warnings():
     from highway_env.vehicle.kinematics import Vehicle
 
 from cavmarl.core.math.geometry import wrap_angle
-from cavmarl.driving.kernels import bicycle as kinematics
-from cavmarl.driving.kernels import car_following as idm
-from cavmarl.driving.kernels import highway_control as control
-from cavmarl.driving.kernels import lane_change
+from cavmarl.driving.kernels.lanes import lane_change
+from cavmarl.driving.kernels.models import idm
+from cavmarl.driving.kernels.motion import bicycle as kinematics
+from cavmarl.driving.kernels.motion import highway_control as control
 from tests.naive.kinematics import clip_control
 
 IDM_DEFAULTS = (idm.ACCEL_MAX, idm.DECEL_COMFORT, idm.JAM_DISTANCE_M, idm.TIME_HEADWAY_S)

@@ -23,7 +23,7 @@ from cavmarl.env.world_copies import OwnWorlds
 try:
     from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 except ModuleNotFoundError as error:
-    raise missing(error.name, "sb3") from error
+    raise missing(error.name, "train") from error
 
 DECIDED = ("autoreset_mode", "copy")  # stable-baselines3 resets in the same step and keeps views
 ARRIVAL = TERMS.index("arrival")

@@ -68,7 +68,7 @@ class _World(gymnasium.Env[Any, Any]):
     """One world of highway-env, with one array for all agents."""
 
     def __init__(self, agents: int, observation: dict[str, Any], horizon_s: float) -> None:
-        require("highway_env", "highway")  # in a process of its own: it registers the world
+        require("highway_env", "bench")  # in a process of its own: it registers the world
         self._env = highway_env(agents, observation)
         self._env.configure({"duration": horizon_s})
         size = self._stack(self._env.reset(seed=0)[0]).shape

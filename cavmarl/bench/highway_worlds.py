@@ -54,7 +54,7 @@ def overrides(sensors: dict[str, Any], agents: int) -> dict[str, Any]:
 
 def highway_env(agents: int, observation: dict[str, Any]) -> Any:
     """highway-env's own highway with that many controlled vehicles, stepped once."""
-    gymnasium = require("gymnasium", "highway")
+    gymnasium = require("gymnasium", "bench")
     config = {
         "controlled_vehicles": agents,
         "vehicles_count": 0,

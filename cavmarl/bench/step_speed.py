@@ -91,7 +91,7 @@ def measure_step_speed(
 ) -> StepSpeed:
     """Measure by turns on one core, kernels warm."""
     check_range(agents=(agents, 1, MAX_AGENTS), worlds=(worlds, 1, 1024), repeats=(repeats, 1, 100))
-    require("highway_env", "highway")
+    require("highway_env", "bench")
     with one_core(), tempfile.TemporaryDirectory() as folder:
         progress("making highway-env's worlds")
         theirs = {(sensors, side): highway_env(agents, seen) for sensors, side, seen in THEIRS}

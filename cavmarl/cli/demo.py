@@ -37,7 +37,7 @@ def demo(
 
     if not 0.0 < minutes <= 600.0 or not 0.0 < seconds <= 3600.0:
         raise ConfigError("--minutes must be above 0, at most 600; --seconds above 0, at most 3600")
-    require("torch", "torch")
+    require("torch", "train")
     require("sumo", "sumo")  # it has the map of town
     require("imageio_ffmpeg", "render")
     require("matplotlib", "report")

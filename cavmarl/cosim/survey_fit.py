@@ -46,7 +46,7 @@ def fit_survey(cloud: Cloud, network: RoadNetwork) -> tuple[SurveyFit, Compariso
 
     Raises MapError: nothing of the cloud lies on the map.
     """
-    gicp: Any = require("small_gicp", "clouds")
+    gicp: Any = require("small_gicp", "maps")
     plane = cloud.points[:, :2]
     box = (*(plane.min(axis=0) - _MARGIN_M), *(plane.max(axis=0) + _MARGIN_M))
     whole, spacing_m = map_surface(network, box, _SAMPLED_M)

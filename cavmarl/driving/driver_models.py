@@ -1,6 +1,7 @@
 """The car-following models by name: of the package, of SUMO, and registered from outside.
 
-A model of the package is a code, a branch in `kernels/following.py` and a line in `MODELS`.
+A model of the package is a code, a branch in `kernels/models/following.py` and a line in `MODELS`;
+with a line in `AS_SUMO` of `vehicle_types`, its drivers also look ahead and yield as SUMO's do.
 """
 
 from __future__ import annotations
@@ -11,7 +12,11 @@ from cavmarl.core.compiled import IS_PLAIN
 from cavmarl.core.errors import ConfigError, require
 from cavmarl.core.extensions import REGISTERED_MODELS
 from cavmarl.core.records.codes import MODEL_ACC, MODEL_IDM, MODEL_KRAUSS
-from cavmarl.driving.kernels.registered_models import FIRST_REGISTERED, MAX_REGISTERED, put_model
+from cavmarl.driving.kernels.models.registered_models import (
+    FIRST_REGISTERED,
+    MAX_REGISTERED,
+    put_model,
+)
 
 # Code by name, the name being that of SUMO's carFollowModel.
 MODELS = {"IDM": MODEL_IDM, "Krauss": MODEL_KRAUSS, "ACC": MODEL_ACC}

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.action import ActionConfig
 from cavmarl.core.records.rows import SIZE_BODIES_M, STEERED
-from cavmarl.driving.kernels.steered_drive import steered_poses
+from cavmarl.driving.kernels.motion.steered_drive import steered_poses
 from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.roads.cache import derived_network
 from cavmarl.roads.network import SWEEP, RoadNetwork

@@ -12,15 +12,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.records.codes import MODEL_IDM
-from cavmarl.driving.kernels.car_following import (
+from cavmarl.core.records.codes import MODEL_IDM, MODEL_KRAUSS
+from cavmarl.driving.kernels.models.idm import (
     ACCEL_LIMIT,
     ACCEL_MAX,
     DECEL_COMFORT,
     JAM_DISTANCE_M,
     TIME_HEADWAY_S,
 )
-from cavmarl.driving.kernels.motion import MAX_SPEED_MPS
+from cavmarl.driving.kernels.motion.motion import MAX_SPEED_MPS
 from cavmarl.roads.network import VEHICLE_CLASSES
 
 # A vehicle of SUMO's class "ignoring" heeds no permission.
@@ -30,7 +30,8 @@ VTYPE = np.dtype(
     [
         ("vclass", np.int32),  # index in VEHICLE_CLASSES
         ("permissions", np.uint32),  # bits of LANE["permissions"] of which one must be set
-        ("model", np.int32),  # MODEL_*
+        ("model", np.int32),  # MODEL_*; written by `set_model`
+        ("as_sumo", np.bool_),  # whether its driver looks ahead and yields as SUMO's drivers do
         ("length", np.float64),  # m
         ("width", np.float64),  # m
         ("height", np.float64),  # m
@@ -164,8 +165,18 @@ AGENT_TYPES = {
     "truck": AgentType("truck", 8.0, 2.5, 3.6, 1.5, 4.0, 6.0, 3.0, 25.0, 4.8, 0.7),
     "bus": AgentType("bus", 12.0, 2.55, 3.2, 1.2, 3.5, 5.5, 3.0, 27.8, 6.0, 0.75),
 }
+# Car-following models of drivers that are SUMO's in everything else, too: how far they look ahead,
+# and how they yield, queue and resolve deadlocks.
+AS_SUMO = frozenset({MODEL_KRAUSS})
+
 CAR_WHEELBASE_M = 5.0  # highway-env's car has its axles at its bumpers
 NO_LIMIT = 1e9  # of what a policy asks of a car, beyond `action`
+
+
+def set_model(types: NDArray[np.void] | np.void, model: int) -> None:
+    """Let the drivers of VTYPE rows, or of one row, follow by a model, MODEL_*."""
+    types["model"] = model
+    types["as_sumo"] = model in AS_SUMO
 
 
 def agent_types(names: Iterable[str], model: int = MODEL_IDM) -> NDArray[np.void]:
@@ -196,7 +207,7 @@ def generated_types(model: int = MODEL_IDM) -> NDArray[np.void]:
     car = types[0]
     car["vclass"] = VEHICLE_CLASSES.index("passenger")
     car["permissions"] = 1 << VEHICLE_CLASSES.index("passenger")
-    car["model"] = model
+    set_model(types, model)
     car["length"], car["width"], car["height"] = 5.0, 2.0, 1.6
     car["accel"] = ACCEL_MAX
     car["decel"] = DECEL_COMFORT

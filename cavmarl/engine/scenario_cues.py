@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import specialized
-from cavmarl.driving.kernels.scripted_rows import note_cues
+from cavmarl.driving.kernels.motion.scripted_rows import note_cues
 from cavmarl.handoff.division import Division
 from cavmarl.shards.shard import Commands, Shard
 

@@ -162,7 +162,7 @@ def _record_options(record: RecordOptions | str | Path | None) -> RecordOptions 
     """
     if record is None:
         return None
-    require("pyarrow", "recordings")
+    require("pyarrow", "record")
     options = RecordOptions.of(record)
     path = Path(options.path).absolute()
     if path.exists() and not (path.is_dir() and not any(path.iterdir())):

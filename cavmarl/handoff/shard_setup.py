@@ -11,7 +11,7 @@ from cavmarl.config.zones import ZonesConfig
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.memory import Zeros
 from cavmarl.core.records.arrays import Outputs
-from cavmarl.driving.kernels.motion import MAX_SPEED_MPS
+from cavmarl.driving.kernels.motion.motion import MAX_SPEED_MPS
 from cavmarl.handoff.division import Division
 from cavmarl.ownership.decisions import Neighbours
 from cavmarl.ownership.distances import Distances, check_coverage, needed_overlap_m

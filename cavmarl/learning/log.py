@@ -94,7 +94,7 @@ class Log:
         with writing(self._path):
             self._file = self._path.open("a", encoding="utf-8", newline="")
             if tensorboard:
-                board = require("torch.utils.tensorboard", "torch")
+                board = require("torch.utils.tensorboard", "train")
                 self._board = board.SummaryWriter(str(folder))
 
     def write(self, row: dict[str, float]) -> None:

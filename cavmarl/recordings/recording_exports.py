@@ -105,8 +105,8 @@ def write_mcap(
     Raises:
         MissingExtraError: mcap is not installed.
     """
-    writer_module = require("mcap.writer", "mcap")
-    require("mcap.well_known", "mcap")
+    writer_module = require("mcap.writer", "record")
+    require("mcap.well_known", "record")
     events: dict[int, list[FrameEvent]] = {}
     for found in recording.events(world):
         if found.episode == episode:

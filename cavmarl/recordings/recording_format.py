@@ -147,12 +147,12 @@ def dtype_of(columns: Columns) -> np.dtype[Any]:
 
 def arrow() -> Any:
     """pyarrow; raises MissingExtraError: it is not installed."""
-    return require("pyarrow", "recordings")
+    return require("pyarrow", "record")
 
 
 def write_table(table: Any) -> bytes:
     """A table as a Parquet file."""
-    pa, parquet = arrow(), require("pyarrow.parquet", "recordings")
+    pa, parquet = arrow(), require("pyarrow.parquet", "record")
     sink = pa.BufferOutputStream()
     split = [name for name in _SPLIT if name in table.column_names]
     coded = [name for name in ("kind", "detail") if name in table.column_names]
@@ -167,7 +167,7 @@ def read_table(path: Path) -> Any:
     Raises:
         RecordingError: it is missing or damaged.
     """
-    parquet = require("pyarrow.parquet", "recordings")
+    parquet = require("pyarrow.parquet", "record")
     try:
         return parquet.read_table(path, page_checksum_verification=True, partitioning=None)
     except FileNotFoundError:

@@ -30,8 +30,8 @@ from cavmarl.core.records.arrays import (
     Zoned,
 )
 from cavmarl.core.records.codes import DRIVER_BACKGROUND, DRIVER_SUMO
-from cavmarl.driving.kernels.approach import APPROACH
-from cavmarl.driving.kernels.lane_index import ENTRY
+from cavmarl.driving.kernels.junctions.approach import APPROACH
+from cavmarl.driving.kernels.lanes.lane_index import ENTRY
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN, lane_grid

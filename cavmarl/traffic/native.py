@@ -18,10 +18,9 @@ from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import CapacityError
 from cavmarl.core.memory import Zeros
 from cavmarl.core.records.arrays import Demand, Gate, Travel, Worlds
-from cavmarl.core.records.codes import MODEL_KRAUSS
 from cavmarl.driving.driver_models import model_code
 from cavmarl.driving.kernels.drivers import look_ahead_m, see_line_m
-from cavmarl.driving.kernels.lane_index import VIEW_M
+from cavmarl.driving.kernels.lanes.lane_index import VIEW_M
 from cavmarl.driving.vehicle_types import agent_types, generated_types
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN, make_plans
@@ -238,7 +237,7 @@ class NativeTraffic:
         fast_mps = FAST_FACTOR * float(self.network.lanes["speed_mps"].max())
         return max(
             VIEW_M
-            if kind["model"] != MODEL_KRAUSS
+            if not kind["as_sumo"]
             else min(look_m(kind, min(fast_mps, float(kind["max_speed"]))), VIEW_M)
             for kind in self.file.types
         )

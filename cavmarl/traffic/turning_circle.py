@@ -14,7 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.records.arrays import RoadArrays
-from cavmarl.driving.kernels.trial_drive import BEYOND_M, FASTER_MPS, TRIAL_MPS, stays_on_road
+from cavmarl.driving.kernels.motion.trial_drive import (
+    BEYOND_M,
+    FASTER_MPS,
+    TRIAL_MPS,
+    stays_on_road,
+)
 from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.roads.kernels.plans import TURNAROUND
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork

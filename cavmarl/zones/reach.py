@@ -13,9 +13,9 @@ from cavmarl.core.math.elementary import hypot, sine
 from cavmarl.core.math.elementary_arrays import atan2_all, hypot_all
 from cavmarl.core.records.arrays import Travel
 from cavmarl.core.records.rows import LOST_M, MERGES_M
-from cavmarl.driving.kernels.announcing import APPROACH_M
-from cavmarl.driving.kernels.junctions import EXIT_LOOK_M
-from cavmarl.driving.kernels.motion import CROSSINGS_PER_TICK, LATERAL_MPS, MAX_SPEED_MPS
+from cavmarl.driving.kernels.junctions.junctions import EXIT_LOOK_M
+from cavmarl.driving.kernels.junctions.stop_line_registration import APPROACH_M
+from cavmarl.driving.kernels.motion.motion import CROSSINGS_PER_TICK, LATERAL_MPS, MAX_SPEED_MPS
 from cavmarl.roads.network import RoadNetwork
 
 ASIDE_M = 10.0  # between the centres of neighbour lanes, and of vehicles beside them

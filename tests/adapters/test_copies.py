@@ -30,7 +30,7 @@ def rows(**arguments: Any) -> Any:
 
 
 def sb3(**arguments: Any) -> Any:
-    pytest.importorskip("stable_baselines3", reason="needs the extra: sb3")
+    pytest.importorskip("stable_baselines3", reason="needs the extra: train")
     from cavmarl.adapters.sb3_vec_env import CavSb3VecEnv
 
     made = CavSb3VecEnv("merge", num_worlds=2, agents=2, **SMALL, **arguments)
@@ -98,8 +98,8 @@ def test_views_of_worker_processes_are_refused(view: str) -> None:
 
 def test_supersuits_copies_are_worlds_of_their_own() -> None:
     """PettingZoo's documented way to stable-baselines3."""
-    supersuit = pytest.importorskip("supersuit", reason="needs the extra: supersuit")
-    stable_baselines3 = pytest.importorskip("stable_baselines3", reason="needs the extra: sb3")
+    supersuit = pytest.importorskip("supersuit", reason="needs the extra: bench")
+    stable_baselines3 = pytest.importorskip("stable_baselines3", reason="needs the extra: train")
     world = cavmarl.parallel_env("merge", agents=2, **SMALL)
     joined = supersuit.concat_vec_envs_v1(
         supersuit.pettingzoo_env_to_vec_env_v1(world),

@@ -13,7 +13,7 @@ from cavmarl.core.errors import MissingExtraError
 @pytest.mark.parametrize(
     ("view", "library", "extra"),
     [
-        ("sb3_vec_env", "stable_baselines3", "sb3"),
+        ("sb3_vec_env", "stable_baselines3", "train"),
         ("torchrl_env", "torch", "torchrl"),
         ("torchrl_env", "torchrl", "torchrl"),
         ("benchmarl_task", "benchmarl", "benchmarl"),
@@ -24,7 +24,7 @@ from cavmarl.core.errors import MissingExtraError
 def test_a_missing_library_is_named_with_its_extra(
     monkeypatch: pytest.MonkeyPatch, view: str, library: str, extra: str
 ) -> None:
-    pytest.importorskip("torch", reason="needs the extra: torch")
+    pytest.importorskip("torch", reason="needs the extra: train")
 
     class Hidden:
         def find_spec(self, name: str, path: object = None, target: object = None) -> None:

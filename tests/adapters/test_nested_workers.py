@@ -73,7 +73,7 @@ def test_in_the_workers_of_gymnasiums_async_vector(workers: int, autoreset: Auto
 
 @pytest.mark.parametrize("workers", WORKERS)
 def test_in_the_workers_of_stable_baselines3(workers: int) -> None:
-    sb3 = pytest.importorskip("stable_baselines3", reason="needs the extra: sb3")
+    sb3 = pytest.importorskip("stable_baselines3", reason="needs the extra: train")
     envs = sb3.common.vec_env
     make = partial(OneRow, workers)
     here, there = envs.DummyVecEnv([make, make]), envs.SubprocVecEnv([make, make])

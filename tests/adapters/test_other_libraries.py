@@ -32,7 +32,7 @@ def test_each_library_has_an_example(library: str) -> None:
 def test_its_example_runs(library: str, tmp_path: Path) -> None:
     pytest.importorskip(library, reason="no extra of cavmarl: install it to try it")
     if library == "supersuit":
-        pytest.importorskip("stable_baselines3", reason="needs the extra: sb3")
+        pytest.importorskip("stable_baselines3", reason="needs the extra: train")
     program = tmp_path / "program.py"
     program.write_text(example(library), encoding="utf-8")
     command = [sys.executable, str(program)]

@@ -65,5 +65,5 @@ def test_numbers_that_cannot_be_are_refused(wrong: dict[str, int], said: str) ->
 
 def test_what_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "highway_env", None)
-    with pytest.raises(MissingExtraError, match=r"pip install .\.\[highway\]"):
+    with pytest.raises(MissingExtraError, match=r"pip install .\.\[bench\]"):
         measure_training()

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.filterwarnings("ignore")  # what the libraries warn of 
 
 
 def test_each_library_steps_the_same_agents() -> None:
-    pytest.importorskip("supersuit", reason="needs the extra: supersuit")
+    pytest.importorskip("supersuit", reason="needs the extra: bench")
     found = measure(agents=4, workers=2, repeats=1)
     rows = {row["library"]: row for row in found.rows}
     assert list(rows) == list(LIBRARIES)
@@ -26,7 +26,7 @@ def test_each_library_steps_the_same_agents() -> None:
 def test_a_library_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "supersuit", None)
     found = measure(agents=2, workers=2, repeats=1)
-    assert "'.[supersuit]'" in found.facts["missing"]["supersuit"]
+    assert "'.[bench]'" in found.facts["missing"]["supersuit"]
     assert "ratio" not in found.rows[-1]
 
 

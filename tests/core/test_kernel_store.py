@@ -47,7 +47,7 @@ class Compiled(CompileListener):
 
 
 def test_every_folder_of_kernels_is_read() -> None:
-    folders = {path.parent for path in PACKAGE.rglob("kernels/*.py")}
+    folders = {path.parent for path in PACKAGE.rglob("kernels/**/*.py")}
     assert len(folders) > 8
     for folder in folders:
         assert ".".join(folder.relative_to(PACKAGE).parts) in SOURCES
@@ -61,9 +61,9 @@ def test_a_change_moves_the_kernels_that_call_what_has_changed_and_no_others(
     after = _digests(monkeypatch, "core.math.geometry")
     moved = {name for name in SOURCES if before[name] != after[name]}
     # `group_phases` calls `world_phases`, which calls `contacts`.
-    called = {"driving.kernels.contacts", "shards.kernels.world_phases"}
+    called = {"driving.kernels.motion.contacts", "shards.kernels.world_phases"}
     assert {"core.math.geometry", "shards.kernels.group_phases", *called} <= moved
-    assert moved.isdisjoint({"core.math.rng", "driving.kernels.krauss", "core.math.buckets"})
+    assert moved.isdisjoint({"core.math.rng", "driving.kernels.models.krauss", "core.math.buckets"})
 
 
 @pytest.mark.parametrize("changed", sources._SHARED)

@@ -63,7 +63,7 @@ def unsafe_calls(tree: ast.AST) -> Iterator[str]:
 def found_calls() -> set[str]:
     """Return `file: call` of each unsafe call in code whose results enter a world."""
     paths = [path for folder in FOLDERS for path in (PACKAGE / folder).rglob("*.py")]
-    paths += [path for pattern in (*FILES, "**/kernels/*.py") for path in PACKAGE.glob(pattern)]
+    paths += [path for pattern in (*FILES, "**/kernels/**/*.py") for path in PACKAGE.glob(pattern)]
     assert len(paths) > 300
     return {
         f"{name}: {call}"

@@ -17,7 +17,7 @@ from cavmarl.cosim.stack.stack_types import StackMount, StackSensor
 from cavmarl.maps.fidelity.cloud_files import read_cloud
 from cavmarl.sensors.kernels.vehicle_readings import GRAVITY_MPS2
 
-pytest.importorskip("small_gicp", reason="needs the extra 'clouds'")
+pytest.importorskip("small_gicp", reason="needs the extra 'maps'")
 
 
 def test_heights_and_pitches_of_a_hill_are_found() -> None:

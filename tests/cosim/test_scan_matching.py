@@ -20,7 +20,7 @@ from cavmarl.cosim.stack.stack import Stack, StackConfig, sensor_of, vehicle_of
 from cavmarl.engine.world_setup import load_roads
 from cavmarl.maps.fidelity.cloud_files import Cloud, write_cloud
 
-pytest.importorskip("small_gicp", reason="needs the extra 'clouds'")
+pytest.importorskip("small_gicp", reason="needs the extra 'maps'")
 
 
 @pytest.fixture(scope="module")

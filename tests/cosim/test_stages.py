@@ -38,7 +38,7 @@ from cavmarl.cosim.stack.stack_types import (
     StackSensor,
     Trajectory,
 )
-from cavmarl.driving.kernels.bicycle import bicycle_step
+from cavmarl.driving.kernels.motion.bicycle import bicycle_step
 from cavmarl.engine.world_setup import load_roads
 
 TICK_S = 0.05

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from cavmarl.core.records.codes import MODEL_ACC
-from cavmarl.driving.kernels.acc import acc_acceleration
-from cavmarl.driving.kernels.following import behind, no_constraint, response
-from cavmarl.driving.vehicle_types import CLASS_DEFAULTS, VTYPE
+from cavmarl.driving.kernels.models.acc import acc_acceleration
+from cavmarl.driving.kernels.models.following import behind, no_constraint, response
+from cavmarl.driving.vehicle_types import CLASS_DEFAULTS, VTYPE, set_model
 
 DT, STEPS, FOLLOWERS = 0.1, 1000, 5
 START_MPS, START_GAP_M, LIMIT_MPS = 20.0, 22.5, 30.0
@@ -75,7 +75,8 @@ def car() -> np.void:
     for field, value in CLASS_DEFAULTS["passenger"]._asdict().items():
         if field in (VTYPE.names or ()):
             kind[field] = value
-    kind["model"], kind["tau"], kind["sigma"] = MODEL_ACC, 1.0, 0.0
+    set_model(kind, MODEL_ACC)
+    kind["tau"], kind["sigma"] = 1.0, 0.0
     return kind
 
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from cavmarl.core.records.arrays import Scratch
 from cavmarl.core.records.codes import HOLD_EXIT_BLOCKED
 from cavmarl.core.records.rows import SIZE_LENGTHS_M
-from cavmarl.driving.kernels.approach import register_links
+from cavmarl.driving.kernels.junctions.approach import register_links
 from cavmarl.engine.simulation import Simulation
 from cavmarl.roads.routing import PLAN
 from tests.naive import approach as naive

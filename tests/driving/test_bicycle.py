@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cavmarl.driving.kernels import bicycle as kinematics
+from cavmarl.driving.kernels.motion import bicycle as kinematics
 from tests.naive import kinematics as naive
 from tests.naive.geometry import wrap_angle
 from tests.support.builders import angles

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cavmarl.core.math.neighbors import make_grid
-from cavmarl.driving.kernels.contacts import find_contacts
+from cavmarl.driving.kernels.motion.contacts import find_contacts
 from tests.naive import contacts as naive
 from tests.support.builders import crowds, vehicles
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cavmarl.core.records.codes import MODEL_IDM, MODEL_KRAUSS
-from cavmarl.driving.kernels.following import (
+from cavmarl.driving.kernels.models.following import (
     LINE_MARGIN_M,
     accel_behind,
     before_line,
@@ -16,7 +16,7 @@ from cavmarl.driving.kernels.following import (
     speed_behind,
     wish,
 )
-from cavmarl.driving.vehicle_types import CLASS_DEFAULTS, VTYPE, generated_types
+from cavmarl.driving.vehicle_types import CLASS_DEFAULTS, VTYPE, generated_types, set_model
 from tests.naive import following as naive
 
 DT = 0.1
@@ -33,7 +33,8 @@ def krauss(sigma: float = 0.5) -> np.void:
     for field, value in CLASS_DEFAULTS["passenger"]._asdict().items():
         if field in (VTYPE.names or ()):
             car[field] = value
-    car["model"], car["tau"], car["sigma"] = MODEL_KRAUSS, 1.0, sigma
+    set_model(car, MODEL_KRAUSS)
+    car["tau"], car["sigma"] = 1.0, sigma
     return car
 
 

@@ -22,8 +22,8 @@ from cavmarl.core.records.codes import (
     SIGNAL_NONE,
     SIGNAL_OFF_BLINKING,
 )
-from cavmarl.driving.kernels.approach import APPROACH
-from cavmarl.driving.kernels.gaps import STUCK_S, foe_blocks, ignores
+from cavmarl.driving.kernels.junctions.approach import APPROACH
+from cavmarl.driving.kernels.junctions.gaps import STUCK_S, foe_blocks, ignores
 from cavmarl.driving.vehicle_types import generated_types
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network

@@ -6,10 +6,10 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from cavmarl.driving.kernels import highway_control as control
-from cavmarl.driving.kernels.bicycle import bicycle_step
+from cavmarl.driving.kernels.motion import highway_control as control
+from cavmarl.driving.kernels.motion.bicycle import bicycle_step
 from tests.naive import control as naive
-from tests.naive.car_following import not_zero
+from tests.naive.idm import not_zero
 from tests.support.builders import angles
 
 

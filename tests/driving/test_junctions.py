@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from cavmarl.core.math.geometry import boxes_overlap, lane_pose
 from cavmarl.core.records.codes import DRIVER_AGENT
-from cavmarl.driving.kernels.announcing import STANDING_MPS
-from cavmarl.driving.kernels.junctions import _exit_blocked
-from cavmarl.driving.kernels.lane_index import index_lanes
+from cavmarl.driving.kernels.junctions.junctions import _exit_blocked
+from cavmarl.driving.kernels.junctions.stop_line_registration import STANDING_MPS
+from cavmarl.driving.kernels.lanes.lane_index import index_lanes
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network
 from tests.support.junction_scenes import Scene, build_crossing

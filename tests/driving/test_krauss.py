@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cavmarl.config.registry import load_config, resolve_map
-from cavmarl.driving.kernels.krauss import dawdle, safe_speed
+from cavmarl.driving.kernels.models.krauss import dawdle, safe_speed
 from tests.naive import krauss as naive
 
 GAPS = st.floats(-10.0, 300.0) | st.sampled_from([0.0, 1.0])

@@ -3,7 +3,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cavmarl.driving.kernels.lane_change import mobil_accepts
+from cavmarl.driving.kernels.lanes.lane_change import mobil_accepts
 from tests.naive import lane_change as naive
 
 ACCEL = st.floats(-6.0, 3.0) | st.sampled_from([-2.0, 0.0, 0.2, 2.0])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_BACKGROUND, MODEL_KRAUSS
-from cavmarl.driving.kernels.lane_choice import (
+from cavmarl.driving.kernels.lanes.lane_choice import (
     MAX_BRAKING_NEEDED,
     MERGE_ROOM_M,
     SWAP_ROOM_M,
@@ -16,8 +16,8 @@ from cavmarl.driving.kernels.lane_choice import (
     room_for_more,
     wish_on_lane,
 )
-from cavmarl.driving.kernels.lane_index import index_lanes
-from cavmarl.driving.vehicle_types import generated_types
+from cavmarl.driving.kernels.lanes.lane_index import index_lanes
+from cavmarl.driving.vehicle_types import generated_types, set_model
 from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.roads.network import LANE
 from cavmarl.roads.routing import PLAN
@@ -134,7 +134,8 @@ def test_a_change_of_lanes_asks_those_of_every_lane_that_leads_there(
 def test_no_change_of_lanes_ends_where_a_crawl_cannot_stop(gap_m: float, safe: bool) -> None:
     """Krauss's driver asks for its speed in a reaction time, whatever the gap: -3.5 m/s² here."""
     roads, types = network("merge"), generated_types().copy()
-    types["model"], types["tau"] = MODEL_KRAUSS, 1.0
+    set_model(types, MODEL_KRAUSS)
+    types["tau"] = 1.0
     tables = travel("merge")._replace(types=types)
     lane = int(np.flatnonzero(~roads.lanes["internal"] & (roads.lanes["left"] >= 0))[0])
     left = int(roads.lanes["left"][lane])

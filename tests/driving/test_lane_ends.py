@@ -13,17 +13,17 @@ from cavmarl.core.records.codes import (
     HOLD_SIGNAL,
     SIGNAL_RED,
 )
-from cavmarl.driving.kernels.beside import behind_askew
 from cavmarl.driving.kernels.drivers import decide
-from cavmarl.driving.kernels.following import no_constraint
-from cavmarl.driving.kernels.gaps import link_signal
-from cavmarl.driving.kernels.lane_ends import (
+from cavmarl.driving.kernels.junctions.gaps import link_signal
+from cavmarl.driving.kernels.lanes.adjacent_leaders import behind_askew
+from cavmarl.driving.kernels.lanes.lane_ends import (
     LONGEST_HALF_M,
     _behind_turning,
     behind_over_line,
     misses_change,
 )
-from cavmarl.driving.kernels.lane_index import index_lanes
+from cavmarl.driving.kernels.lanes.lane_index import index_lanes
+from cavmarl.driving.kernels.models.following import no_constraint
 from cavmarl.driving.vehicle_types import generated_types
 from cavmarl.roads.routing import PLAN
 from tests.support.dead_ends import before_dead_end, put

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.math.geometry import lane_pose
 from cavmarl.core.records.arrays import Scratch
-from cavmarl.driving.kernels.lane_index import (
+from cavmarl.driving.kernels.lanes.lane_index import (
     VIEW_M,
     ahead_on,
     behind_by,

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cavmarl.driving.kernels.following import no_constraint
-from cavmarl.driving.kernels.junctions import behind_merging
+from cavmarl.driving.kernels.junctions.junctions import behind_merging
+from cavmarl.driving.kernels.models.following import no_constraint
 from cavmarl.driving.vehicle_types import generated_types
 from tests.support.junction_scenes import Scene, build_crossing
 from tests.support.traffic import network, on_lane, scratch

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from cavmarl.core.records.codes import EVENT_ARRIVED, HOLD_NONE, HOLD_SIGNAL, MODEL_KRAUSS
-from cavmarl.driving.kernels.gaps import is_minor
-from cavmarl.driving.kernels.junctions import may_enter
-from cavmarl.driving.kernels.motion import move_background
+from cavmarl.driving.kernels.junctions.gaps import is_minor
+from cavmarl.driving.kernels.junctions.junctions import may_enter
+from cavmarl.driving.kernels.motion.motion import move_background
+from cavmarl.driving.vehicle_types import set_model
 from cavmarl.engine.simulation import Simulation
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network
@@ -42,7 +43,8 @@ def test_krauss_stops_for_yellow_where_its_brakes_are_enough() -> None:
     length_m = float(roads.lanes["length_m"][lane])
     room, decel = scratch(roads, 1), 4.5
     types = np.array(travel("grid4x4").types)
-    types["model"], types["decel"] = MODEL_KRAUSS, decel
+    set_model(types, MODEL_KRAUSS)
+    types["decel"] = decel
     tables = travel("grid4x4")._replace(types=types)
     back_m = float(roads.lanes["stop_back_m"][lane])
     for needs, holds in ((0.9 * decel, HOLD_SIGNAL), (1.1 * decel, HOLD_NONE)):

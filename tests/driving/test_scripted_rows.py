@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from cavmarl.core.math.geometry import lane_pose, project
 from cavmarl.core.records.arrays import Travel
 from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_BACKGROUND, DRIVER_SCRIPTED
-from cavmarl.driving.kernels.approach import register_links
-from cavmarl.driving.kernels.lane_index import index_lanes
-from cavmarl.driving.kernels.scripted_rows import follow_script, note_cues, stand_at
+from cavmarl.driving.kernels.junctions.approach import register_links
+from cavmarl.driving.kernels.lanes.lane_index import index_lanes
+from cavmarl.driving.kernels.motion.scripted_rows import follow_script, note_cues, stand_at
 from cavmarl.driving.vehicles import VEHICLE, blank_vehicle
 from cavmarl.roads.routing import PLAN, make_plans
 from cavmarl.shards.shard import _make_scratch

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cavmarl.driving.kernels.gaps import link_signal
-from cavmarl.driving.kernels.signal_timing import time_to_change
+from cavmarl.driving.kernels.junctions.gaps import link_signal
+from cavmarl.driving.kernels.junctions.signal_timing import time_to_change
 from cavmarl.roads.kernels.signal_phases import switch_signals
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network

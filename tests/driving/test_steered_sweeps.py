@@ -9,11 +9,11 @@ import pytest
 
 from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_BACKGROUND, HOLD_NONE, HOLD_SIGNAL
 from cavmarl.core.records.rows import STEERED
-from cavmarl.driving.kernels.approach import APPROACH
-from cavmarl.driving.kernels.beside import behind_askew
-from cavmarl.driving.kernels.following import no_constraint
-from cavmarl.driving.kernels.lane_index import index_lanes
-from cavmarl.driving.kernels.swept_areas import MOST_BACK_M, room_m, swept_stop
+from cavmarl.driving.kernels.junctions.approach import APPROACH
+from cavmarl.driving.kernels.junctions.swept_areas import MOST_BACK_M, room_m, stop_before_foe_sweep
+from cavmarl.driving.kernels.lanes.adjacent_leaders import behind_askew
+from cavmarl.driving.kernels.lanes.lane_index import index_lanes
+from cavmarl.driving.kernels.models.following import no_constraint
 from cavmarl.driving.steered_sweeps import load_steered, with_steered_sweeps
 from cavmarl.driving.vehicle_types import generated_types
 from cavmarl.engine.world_setup import load_world
@@ -109,7 +109,7 @@ def test_a_driver_in_an_agents_seat_waits_before_an_area_that_another_is_in(
     entry["dist"], entry["speed"] = 2.5 - (float(sweep["foe_enter_m"]) + 0.5), 3.0
     room.link_end[foe] = 1
     place = float(sweep["enter_m"]) - 2.0
-    stop = swept_stop(network.arrays, rows, 0, link, place, -np.inf, room)
+    stop = stop_before_foe_sweep(network.arrays, rows, 0, link, place, -np.inf, room)
     assert stop == (sweep["enter_m"] if waits else np.inf)
 
 
@@ -125,11 +125,11 @@ def test_a_steered_car_waits_before_its_line_where_others_will_sweep(
     row["driver"] = driver
     room = scratch(network, 1)
     held, goes = room_m(HOLD_SIGNAL, HOLD_NONE), room_m(HOLD_NONE, HOLD_NONE)
-    stop = swept_stop(network.arrays, row, 0, link, -12.0, held, room)
+    stop = stop_before_foe_sweep(network.arrays, row, 0, link, -12.0, held, room)
     rows = rows_of(network, link)
     before = rows["enter_m"][(rows["own"] == STEERED) & (rows["enter_m"] > -MOST_BACK_M)]
     assert stop == (before.min() if back else np.inf)
-    assert swept_stop(network.arrays, row, 0, link, -12.0, goes, room) == np.inf
+    assert stop_before_foe_sweep(network.arrays, row, 0, link, -12.0, goes, room) == np.inf
 
 
 @pytest.mark.parametrize(
@@ -172,7 +172,7 @@ def stop_for_a_fast_one(
     entry["link"], entry["row"], entry["id"], entry["half"] = sweep["foe"], 1, -1, 2.5
     entry["dist"], entry["speed"] = front_m + 2.5, speed
     room.link_end[sweep["foe"]] = 1
-    return swept_stop(network.arrays, rows, 0, link, place, -np.inf, room)
+    return stop_before_foe_sweep(network.arrays, rows, 0, link, place, -np.inf, room)
 
 
 @pytest.mark.parametrize(("beyond_m", "goes_on"), [(0.5, True), (-0.5, False)])

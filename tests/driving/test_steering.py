@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cavmarl.driving.kernels.bicycle import bicycle_step
-from cavmarl.driving.kernels.highway_control import steering_control
-from cavmarl.driving.kernels.steering import nearest_speed, steer_to_lane, take_meta_action
-from cavmarl.driving.kernels.tracking import locate
+from cavmarl.driving.kernels.motion.bicycle import bicycle_step
+from cavmarl.driving.kernels.motion.highway_control import steering_control
+from cavmarl.driving.kernels.motion.steering import nearest_speed, steer_to_lane, take_meta_action
+from cavmarl.driving.kernels.motion.tracking import locate
 from cavmarl.roads.routing import lane_grid
 from tests.support.traffic import network, on_lane, plans
 

@@ -10,7 +10,7 @@ import pytest
 import cavmarl
 from cavmarl.config.terms import TERMS
 from cavmarl.core.records.codes import DRIVER_AGENT
-from cavmarl.driving.kernels.junctions import note_stop
+from cavmarl.driving.kernels.junctions.junctions import note_stop
 from cavmarl.roads.routing import PLAN
 from cavmarl.roads.sumo_net.reader import read_network
 from tests.support.netgenerate import netgenerate

@@ -16,18 +16,18 @@ from cavmarl.core.records.codes import (
     MODEL_KRAUSS,
 )
 from cavmarl.core.records.rows import STEERED
-from cavmarl.driving.kernels.approach import APPROACH
 from cavmarl.driving.kernels.drivers import _at_line, decide
-from cavmarl.driving.kernels.following import behind, no_constraint
-from cavmarl.driving.kernels.lane_index import index_lanes
-from cavmarl.driving.kernels.swept_areas import (
+from cavmarl.driving.kernels.junctions.approach import APPROACH
+from cavmarl.driving.kernels.junctions.swept_areas import (
     behind_fork,
+    foe_would_sweep_over,
     room_m,
-    swept_stop,
+    stop_before_foe_sweep,
     wait_place,
-    would_be_swept,
 )
-from cavmarl.driving.vehicle_types import generated_types
+from cavmarl.driving.kernels.lanes.lane_index import index_lanes
+from cavmarl.driving.kernels.models.following import behind, no_constraint
+from cavmarl.driving.vehicle_types import generated_types, set_model
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN
 from cavmarl.roads.sumo_net.reader import read_network
@@ -127,12 +127,14 @@ class Meeting:
         """Where the front of one has to stop."""
         room, roads = self._announced(asks, places), self.network.arrays
         link = (self.link, int(self.sweep["foe"]))[asks]
-        return float(swept_stop(roads, self.rows, asks, link, places[asks], room_m, room))
+        return float(
+            stop_before_foe_sweep(roads, self.rows, asks, link, places[asks], room_m, room)
+        )
 
     def car_is_swept(self, places: tuple[float, float]) -> bool:
         """Whether the car may not enter at its place."""
         room, roads, link = self._announced(1, places), self.network.arrays, self.sweep["foe"]
-        return bool(would_be_swept(roads, self.rows[1], link, places[1], room))
+        return bool(foe_would_sweep_over(roads, self.rows[1], link, places[1], room))
 
 
 def test_a_bus_waits_before_the_junction_for_a_car_that_stands_at_the_line(
@@ -200,7 +202,8 @@ def test_one_that_stops_for_a_bus_still_comes_ready_to_stop_to_its_place_inside(
     nowhere = np.zeros(len(network.lanes), PLAN)
     nowhere["next"], nowhere["link"] = -1, -1
     types = np.array(generated_types())
-    types["model"], types["decel"] = MODEL_KRAUSS, 4.5
+    set_model(types, MODEL_KRAUSS)
+    types["decel"] = 4.5
     travel, lane = travel_by(nowhere, types), int(links["from_lane"][link])
     front_m = 9.0
     s = float(network.lanes["length_m"][lane]) - front_m - 0.5 * CAR_M

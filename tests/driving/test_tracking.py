@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.records.arrays import LaneGrid
 from cavmarl.core.records.codes import EVENT_OFF_ROAD, EVENT_WRONG_WAY
-from cavmarl.driving.kernels.tracking import locate, side_lane
+from cavmarl.driving.kernels.motion.tracking import locate, side_lane
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import lane_grid, make_plans
 from tests.support.traffic import NAMES, network, on_lane, plans

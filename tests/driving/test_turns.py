@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from cavmarl.core.records.codes import EVENT_OFF_ROAD, EVENT_WRONG_WAY
-from cavmarl.driving.kernels.bends import bend_speed
-from cavmarl.driving.kernels.tracking import locate
+from cavmarl.driving.kernels.motion.speed_limits_ahead import bend_speed
+from cavmarl.driving.kernels.motion.tracking import locate
 from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import lane_grid, make_plans

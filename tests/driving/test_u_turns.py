@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 from cavmarl.core.records.codes import DRIVER_BACKGROUND, HOLD_YIELD
 from cavmarl.core.records.rows import SWEPT_BEYOND_M
-from cavmarl.driving.kernels.approach import register_links
 from cavmarl.driving.kernels.drivers import decide
-from cavmarl.driving.kernels.following import no_constraint
-from cavmarl.driving.kernels.lane_choice import _change_is_safe
-from cavmarl.driving.kernels.lane_ends import behind_beside
-from cavmarl.driving.kernels.lane_index import index_lanes
-from cavmarl.driving.kernels.swept_areas import swept_stop
+from cavmarl.driving.kernels.junctions.approach import register_links
+from cavmarl.driving.kernels.junctions.swept_areas import stop_before_foe_sweep
+from cavmarl.driving.kernels.lanes.lane_choice import _change_is_safe
+from cavmarl.driving.kernels.lanes.lane_ends import behind_beside
+from cavmarl.driving.kernels.lanes.lane_index import index_lanes
+from cavmarl.driving.kernels.models.following import no_constraint
 from cavmarl.driving.vehicle_types import generated_types
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN
@@ -137,7 +137,7 @@ def test_a_bus_leaves_room_for_a_u_turn_ahead_of_it_and_not_behind_it(
     room = scratch(network, 2)
     register_links(network.arrays, travel, rows, 2, np.zeros(2, PLAN), np.zeros(2, np.int64), room)
     room.approach["dist"][room.approach["row"] == 1] = 0.5 * BUS_M - foe_m
-    stop = swept_stop(network.arrays, rows, 0, turn, own_m, np.inf, room)
+    stop = stop_before_foe_sweep(network.arrays, rows, 0, turn, own_m, np.inf, room)
     assert stop == (sweep["enter_m"] if waits else np.inf)
 
 
@@ -266,7 +266,7 @@ def test_a_bus_that_turns_round_at_a_dead_end_minds_those_that_have_entered_besi
     other["row"], other["id"], other["half"] = 1, 1, half_m
     for s, waits in ((half_m + 0.5, True), (half_m + 20.0, False)):
         other["dist"] = -length_m - s
-        stop_m = swept_stop(network.arrays, rows, 0, turn, -5.0, -np.inf, room)
+        stop_m = stop_before_foe_sweep(network.arrays, rows, 0, turn, -5.0, -np.inf, room)
         assert (stop_m < np.inf) == waits
 
 

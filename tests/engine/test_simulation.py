@@ -10,7 +10,7 @@ import pytest
 
 from cavmarl.core.errors import CapacityError
 from cavmarl.core.records.codes import DRIVER_BACKGROUND, SIGNAL_RED, SIGNAL_RED_YELLOW
-from cavmarl.driving.kernels.gaps import link_signal
+from cavmarl.driving.kernels.junctions.gaps import link_signal
 from cavmarl.engine.simulation import Simulation
 from tests.support.driving import drive, make_simulation, make_traffic, start
 

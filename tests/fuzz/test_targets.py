@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-pytest.importorskip("torch", reason="drivers need the extra 'torch'")
+pytest.importorskip("torch", reason="drivers need the extra 'train'")
 pytest.importorskip("sumo", reason="maps need the extra 'sumo'")
 
 from fuzz.mutations import mutated

@@ -8,7 +8,7 @@ import pytest
 
 from cavmarl.config.registry import load_config
 from cavmarl.core.errors import ConfigError
-from cavmarl.driving.kernels.motion import MAX_SPEED_MPS
+from cavmarl.driving.kernels.motion.motion import MAX_SPEED_MPS
 from cavmarl.handoff.shard_setup import halo_m
 from tests.support.driving import drive, make_simulation, start
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from cavmarl.core.records.arrays import Travel
 from cavmarl.core.records.codes import HOLD_EXIT_BLOCKED, HOLD_NONE, HOLD_SIGNAL
-from cavmarl.driving.kernels.lane_index import beside_s
+from cavmarl.driving.kernels.lanes.lane_index import beside_s
 from cavmarl.roads.network import RoadNetwork
 
 Entry = tuple[int, int, float]  # link, vehicle's id, m of its centre to the stop line

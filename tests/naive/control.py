@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from tests.naive.car_following import not_zero
 from tests.naive.geometry import wrap_angle
+from tests.naive.idm import not_zero
 
 
 def steering_control(speed: float, d: float, heading_error: float, length: float) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tests.naive import car_following, krauss
+from tests.naive import idm, krauss
 
 CAR_M = 5.0  # IDM measures between the centres of two such cars
 MARGIN_M = 1.0  # kept before lines
@@ -16,10 +16,10 @@ def idm_response(
     """IDM behind the worst of several leaders, given as (gap between bumpers, speed)."""
     jam = float(kind["min_gap"]) + CAR_M
     own = (float(kind["accel"]), float(kind["decel"]), jam, float(kind["tau"]))
-    wanted = [car_following.idm_acceleration(speed, allowed, None, 0.0, *own)]
+    wanted = [idm.idm_acceleration(speed, allowed, None, 0.0, *own)]
     for gap, front_speed in leaders:
         distance = max(gap, 0.1) + CAR_M
-        wanted.append(car_following.idm_acceleration(speed, allowed, distance, front_speed, *own))
+        wanted.append(idm.idm_acceleration(speed, allowed, distance, front_speed, *own))
     return min(max(min(wanted), -6.0), 6.0)
 
 

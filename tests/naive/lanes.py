@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.driving.kernels.announcing import announced_m
+from cavmarl.driving.kernels.junctions.stop_line_registration import registration_distance_m
 from cavmarl.roads.network import RoadNetwork
 
 Entry = tuple[float, int, int]  # s, id, row
@@ -74,7 +74,7 @@ def behind(
             coming = [
                 (distance + length - at, int(rows[j]["id"]), j)
                 for at, _, j in on_lane(roads, rows, before)
-                if j != i and distance + length - at < announced_m(rows[j]["speed"])
+                if j != i and distance + length - at < registration_distance_m(rows[j]["speed"])
             ]
             if coming and coming[-1][0] <= VIEW_M:
                 found.append(coming[-1])

@@ -17,10 +17,10 @@ from cavmarl.core.records.rows import (
     STEERED,
     SWEPT_BEYOND_M,
 )
-from cavmarl.driving.kernels.announcing import APPROACH_M
-from cavmarl.driving.kernels.junctions import EXIT_LOOK_M
-from cavmarl.driving.kernels.lane_choice import LOOK_BACK_M
-from cavmarl.driving.kernels.lane_index import GOES_ON_M
+from cavmarl.driving.kernels.junctions.junctions import EXIT_LOOK_M
+from cavmarl.driving.kernels.junctions.stop_line_registration import APPROACH_M
+from cavmarl.driving.kernels.lanes.lane_choice import LOOK_BACK_M
+from cavmarl.driving.kernels.lanes.lane_index import GOES_ON_M
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.zones.kernels.visibility_tests import ASIDE_M, ROUNDING_M
 from tests.naive.lanes import beside_s

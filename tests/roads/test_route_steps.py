@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from cavmarl.driving.kernels.ways import next_step, own_step, way_left
+from cavmarl.driving.kernels.lanes.route_following import distance_left, next_step, own_step
 from cavmarl.roads.kernels.route_steps import plan_route, trace_edges
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.routing import PLAN, make_plans, way
@@ -178,7 +178,7 @@ def test_what_is_left_of_a_way_is_the_sum_of_what_lies_ahead(
                 if m + k == len(lanes) - 1 or not changes_lane(roads, lanes[m + k : m + k + 2])
             ]
             expected = roads.lanes["length_m"][ahead].sum() - s
-            assert way_left(
+            assert distance_left(
                 roads.arrays, row[0], travel.steps[own_step(roads.arrays, row[0])]
             ) == pytest.approx(expected)
 

@@ -20,8 +20,8 @@ from cavmarl.sensors.kernels.camera_picture import (
     write_colours,
     write_halves,
 )
-from cavmarl.sensors.kernels.faces import CameraPose, PixelRows
 from cavmarl.sensors.kernels.panorama import BUILDING, CAR, GROUND, NOTHING, PEDESTRIAN, ROAD
+from cavmarl.sensors.kernels.polygon_fill import CameraPose, PixelRows
 from cavmarl.sensors.kernels.rig_pictures import camera_reach_m
 from tests.naive import imaging as naive
 from tests.support.builders import crowds, vehicles

@@ -12,8 +12,8 @@ from cavmarl.config.sensors import LanesConfig, SensorsConfig
 from cavmarl.core.math.neighbors import fill_grid, make_grid
 from cavmarl.core.records.arrays import Travel
 from cavmarl.core.records.codes import SIGNAL_RED, SIGNAL_RED_YELLOW
-from cavmarl.driving.kernels.gaps import link_signal
-from cavmarl.driving.kernels.tracking import side_lane
+from cavmarl.driving.kernels.junctions.gaps import link_signal
+from cavmarl.driving.kernels.motion.tracking import side_lane
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import make_plans
 from cavmarl.roads.sumo_net.reader import read_network

@@ -18,7 +18,7 @@ from cavmarl.config.sensors import ConflictsConfig, HistoryConfig, SensorsConfig
 from cavmarl.core.compiled import IS_PLAIN
 from cavmarl.core.math.neighbors import fill_grid, make_grid
 from cavmarl.core.math.walls import make_walls
-from cavmarl.driving.kernels.gaps import link_signal
+from cavmarl.driving.kernels.junctions.gaps import link_signal
 from cavmarl.roads.network import SIGNAL_STATES
 from cavmarl.sensors.kernels.observing_conflicts import observe_conflicts
 from cavmarl.sensors.kernels.observing_way import observe_way

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cavmarl.roads.kernels.backdrop_pieces import WALL
-from cavmarl.sensors.kernels.ray_fan import HIT, cast, make_fan
+from cavmarl.sensors.kernels.ray_caster import HIT, cast, make_fan
 from cavmarl.sensors.kernels.rig_rays import TARGET, detect
 from tests.naive import imaging as naive
 from tests.support.builders import crowds, vehicles

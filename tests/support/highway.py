@@ -26,7 +26,7 @@ OVERWRITTEN = ("DISTANCE_WANTED", "COMFORT_ACC_MAX", "COMFORT_ACC_MIN")
 
 def make(name: str, seed: int, **config: Any) -> Any:
     """One of highway-env's environments, a second into an episode."""
-    pytest.importorskip("highway_env", reason="needs cavmarl[highway]")
+    pytest.importorskip("highway_env", reason="needs cavmarl[bench]")
     import gymnasium
     import highway_env
     from highway_env.vehicle.behavior import IDMVehicle

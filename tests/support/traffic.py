@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from cavmarl.config.registry import load_config, resolve_map
 from cavmarl.core.records.arrays import Scratch, Travel
 from cavmarl.core.records.rows import SIZE_LENGTHS_M
-from cavmarl.driving.kernels.lane_index import VIEW_M
-from cavmarl.driving.kernels.motion import place_on_lane
+from cavmarl.driving.kernels.lanes.lane_index import VIEW_M
+from cavmarl.driving.kernels.motion.motion import place_on_lane
 from cavmarl.driving.vehicle_types import generated_types
 from cavmarl.driving.vehicles import VEHICLE, blank_vehicle
 from cavmarl.roads.cache import load_network

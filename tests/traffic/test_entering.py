@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from cavmarl.core.math.rng import world_key
 from cavmarl.core.records import codes
 from cavmarl.core.records.arrays import Scratch, Travel
-from cavmarl.driving.kernels.following import speed_behind
-from cavmarl.driving.kernels.lane_index import VIEW_M, index_lanes
+from cavmarl.driving.kernels.lanes.lane_index import VIEW_M, index_lanes
+from cavmarl.driving.kernels.models.following import speed_behind
 from cavmarl.driving.vehicle_types import generated_types
 from cavmarl.roads.routing import PLAN as _PLAN
 from cavmarl.roads.routing import make_plans

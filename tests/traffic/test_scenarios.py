@@ -12,7 +12,7 @@ import pytest
 
 from cavmarl.core.errors import CavmarlError, ConfigError, PolicyError
 from cavmarl.core.records.codes import DRIVER_SCRIPTED
-from cavmarl.driving.kernels.gaps import link_signal
+from cavmarl.driving.kernels.junctions.gaps import link_signal
 from cavmarl.env.parallel import parallel_env
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.evaluate.scenarios.scenario_runs import ScenarioRun, make_scenario, run_scenario

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_SUMO
-from cavmarl.driving.kernels.ways import next_step
+from cavmarl.driving.kernels.lanes.route_following import next_step
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.step_trace import MIRROR, SENSORS, SUMO, TICK, StepTrace
 from cavmarl.roads.network import SIGNAL_STATES

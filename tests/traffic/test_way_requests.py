@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_BACKGROUND, EVENT_ARRIVED
-from cavmarl.driving.kernels.ways import next_step
+from cavmarl.driving.kernels.lanes.route_following import next_step
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.roads.kernels.plans import plan_goal
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork

@@ -15,7 +15,7 @@ import pytest
 
 from tests.support.training import TRAIN, load_program
 
-pytest.importorskip("torch", reason="needs the extra: torch")
+pytest.importorskip("torch", reason="needs the extra: train")
 
 WAIT_MS = 20_000  # until what is waited for is taken not to come
 

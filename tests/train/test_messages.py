@@ -9,7 +9,7 @@ import pytest
 
 from tests.support.training import TRAIN, load_program
 
-pytest.importorskip("torch", reason="needs the extra: torch")
+pytest.importorskip("torch", reason="needs the extra: train")
 
 
 def test_the_arms_are_compared_by_seed(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ from cavmarl.evaluate.provenance.manifest import read_closed
 from cavmarl.evaluate.provenance.training_record import is_trained
 from tests.support.training import TRAIN, load_program
 
-pytest.importorskip("torch", reason="needs the extra: torch")
+pytest.importorskip("torch", reason="needs the extra: train")
 
 AGENTS = load_config("merge")[0].population.agents
 SMALL = """\
@@ -53,8 +53,8 @@ def small(updates: int) -> list[object]:
 @pytest.mark.parametrize(
     ("program", "module", "extra"),
     [
-        ("ppo_gymnasium.py", "gymnasium", "torch"),
-        ("ppo_sb3.py", "stable_baselines3", "sb3"),
+        ("ppo_gymnasium.py", "gymnasium", "train"),
+        ("ppo_sb3.py", "stable_baselines3", "train"),
         ("ippo_torchrl.py", "torchrl", "torchrl"),
         ("ppo_rllib.py", "ray.rllib", "rllib (make libraries)"),
     ],

@@ -18,7 +18,7 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("torch", reason="needs the extra: torch")
+pytest.importorskip("torch", reason="needs the extra: train")
 
 from cavmarl.core.errors import ConfigError, TrainingError
 from cavmarl.evaluate.provenance.training_record import CHECKPOINT_FILE, is_trained

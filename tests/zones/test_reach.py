@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from cavmarl.core.records.rows import LOST_M
-from cavmarl.driving.kernels.lane_index import VIEW_M
-from cavmarl.driving.kernels.motion import LATERAL_MPS, MAX_SPEED_MPS
+from cavmarl.driving.kernels.lanes.lane_index import VIEW_M
+from cavmarl.driving.kernels.motion.motion import LATERAL_MPS, MAX_SPEED_MPS
 from cavmarl.engine.world_setup import find_map
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from cavmarl.core.records.rows import MERGES_M
-from cavmarl.driving.kernels.announcing import APPROACH_M
+from cavmarl.driving.kernels.junctions.stop_line_registration import APPROACH_M
 from cavmarl.driving.steered_sweeps import load_steered
 from cavmarl.engine.world_setup import find_map
 from cavmarl.roads.cache import load_network

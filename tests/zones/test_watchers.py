@@ -15,7 +15,7 @@ from cavmarl.core.records.codes import (
     HOLD_YIELD,
 )
 from cavmarl.core.records.rows import MERGES_M
-from cavmarl.driving.kernels.announcing import announced_m
+from cavmarl.driving.kernels.junctions.stop_line_registration import registration_distance_m
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.zones.kernels.borders import Borders
 from cavmarl.zones.kernels.ghost_exchange import exchange, gather
@@ -90,7 +90,7 @@ def expected_of(
     for row in naive.within(partition.reaching[zone], SEEN_M, others):
         look, s = looks[zone, row["lane"]], row["s"]
         asked = s <= look["head"] or s >= look["tail"] or int(row["id"]) in near
-        reach_m = announced_m(row["speed"])
+        reach_m = registration_distance_m(row["speed"])
         coming = look["line"] - s < reach_m
         idle = row["hold"] in (HOLD_SIGNAL, HOLD_EXIT_BLOCKED)
         idle |= row["hold"] == HOLD_NONE and row["wait_s"] > 3.0

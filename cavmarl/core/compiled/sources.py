@@ -28,7 +28,7 @@ def kernel_sources() -> dict[str, bytes]:
         _PACKAGE / "core" / "math",
         _PACKAGE / "core" / "records",
     )
-    paths = [path for folder in folders for path in folder.glob("*.py")]
+    paths = [path for folder in folders for path in folder.rglob("*.py")]
     paths += [_PACKAGE.joinpath(*name.split(".")).with_suffix(".py") for name in _PARTS]
     return {_name_of(path): path.read_bytes() for path in paths}
 

@@ -201,7 +201,7 @@ class _Walls:
                 f"{path}: has no walls to match scans with ({len(self._points)} upright points): "
                 "survey a map with buildings (map.buildings), or use localisation=gnss_imu"
             )
-        gicp: Any = require("small_gicp", "clouds")
+        gicp: Any = require("small_gicp", "maps")
         self._ground = ground if len(ground) else self._points
         flat = np.column_stack([self._ground[:, :2], np.zeros(len(self._ground))])
         self._tree = gicp.KdTree(flat)
@@ -292,7 +292,7 @@ def _fit(target: Target, points: Points, start: Points) -> _Fit:
 
 def _laid(target: Target, points: Points, begin: Points) -> Points:
     """The motion (4, 4) that lays points of the vehicle's frame onto walls, from a guess on."""
-    gicp: Any = require("small_gicp", "clouds")
+    gicp: Any = require("small_gicp", "maps")
     shift = np.eye(4)
     shift[:3, 3] = -target.middle_m
     source = gicp.PointCloud(points)

@@ -162,7 +162,7 @@ def _gnss_imu(vehicle: Vehicle) -> Localisation:
 
 
 def _scan_matching(vehicle: Vehicle) -> Localisation:
-    from cavmarl.cosim.stack.scan_matching import ScanMatching  # needs the extra `clouds`
+    from cavmarl.cosim.stack.scan_matching import ScanMatching  # needs the extra `maps`
 
     geodesy = _geodesy(vehicle)
     return ScanMatching(vehicle.sensors, geodesy, vehicle.hd_map, vehicle.tick_s, vehicle.cloud)

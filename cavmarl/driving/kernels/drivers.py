@@ -25,22 +25,11 @@ from cavmarl.core.records.codes import (
     HOLD_NONE,
     HOLD_SIGNAL,
     HOLD_YIELD,
-    MODEL_KRAUSS,
 )
 from cavmarl.core.records.rows import is_lost
-from cavmarl.driving.kernels.bends import bend_speed, slowing_to
-from cavmarl.driving.kernels.beside import behind_askew, behind_entry, beside, swings_back_m
-from cavmarl.driving.kernels.circles import breaks_circles
-from cavmarl.driving.kernels.courtesy import COURTESY_DECEL, let_merge
-from cavmarl.driving.kernels.following import (
-    LINE_MARGIN_M,
-    before_line,
-    no_constraint,
-    response,
-    wish,
-)
-from cavmarl.driving.kernels.gaps import is_minor
-from cavmarl.driving.kernels.junctions import (
+from cavmarl.driving.kernels.junctions.deadlocks import resolves_deadlocks
+from cavmarl.driving.kernels.junctions.gaps import is_minor
+from cavmarl.driving.kernels.junctions.junctions import (
     SEE_FOES_M,
     STOP_LINE_M,
     before_waiting,
@@ -50,7 +39,22 @@ from cavmarl.driving.kernels.junctions import (
     may_enter,
     waits_inside,
 )
-from cavmarl.driving.kernels.lane_choice import (
+from cavmarl.driving.kernels.junctions.swept_areas import (
+    before_foe_sweep,
+    before_foe_sweep_beyond_junction,
+    before_line_gently,
+    behind_fork,
+    room_m,
+    stop_before_foe_sweep,
+)
+from cavmarl.driving.kernels.lanes.adjacent_leaders import (
+    behind_adjacent_leader,
+    behind_askew,
+    behind_entry,
+    swings_back_m,
+)
+from cavmarl.driving.kernels.lanes.cooperative_braking import COOPERATIVE_DECEL, brake_for_merging
+from cavmarl.driving.kernels.lanes.lane_choice import (
     CREEP_MPS,
     MERGE_ROOM_M,
     SIDEWAYS_S,
@@ -60,28 +64,28 @@ from cavmarl.driving.kernels.lane_choice import (
     thinks_of_lanes,
     wish_on_lane,
 )
-from cavmarl.driving.kernels.lane_ends import (
+from cavmarl.driving.kernels.lanes.lane_ends import (
     behind_beside,
     behind_over_line,
     lane_end,
     misses_change,
     over_end,
 )
-from cavmarl.driving.kernels.lane_index import VIEW_M, last_on
-from cavmarl.driving.kernels.room_beside import STAYS_ASIDE, stays_aside
-from cavmarl.driving.kernels.stopping import way_to_stop
-from cavmarl.driving.kernels.swept_areas import (
-    before_line_gently,
-    before_swept,
-    before_swept_behind,
-    behind_fork,
-    room_m,
-    swept_stop,
+from cavmarl.driving.kernels.lanes.lane_index import VIEW_M, last_on
+from cavmarl.driving.kernels.lanes.route_following import next_step, next_step_from
+from cavmarl.driving.kernels.lanes.side_clearance import STAYS_ASIDE, stays_aside
+from cavmarl.driving.kernels.models.following import (
+    LINE_MARGIN_M,
+    before_line,
+    no_constraint,
+    response,
+    wish,
 )
-from cavmarl.driving.kernels.ways import leave, next_step
+from cavmarl.driving.kernels.motion.ordered_stops import distance_to_stop
+from cavmarl.driving.kernels.motion.speed_limits_ahead import bend_speed, speed_before_limit
 
 SEE_LINE_M = 12.0  # at rest: swept areas begin up to 10.5 m before a line
-CLOSER_M = 0.9  # than `LINE_MARGIN_M` one that breaks circles stands before its line
+CLOSER_M = 0.9  # than `LINE_MARGIN_M` a driver that resolves deadlocks stands before its line
 NEAR_M = 8.0  # to a leader so near the corner between matters,
 ASKEW_RAD = 0.7  # if it turns by so much: the gap is half a width less
 NEXT_LINE_M = 5.0  # and braking way: so near a line is minded by a vehicle with a leader
@@ -101,7 +105,7 @@ RETURN_MPS = 5.0  # at which a lost vehicle looks for its lane
 @inlined_kernel
 def look_ahead_m(kind: np.void, speed: float) -> float:
     """How far ahead of its centre a driver looks, in m: IDM reacts earlier and more softly."""
-    if kind["model"] == MODEL_KRAUSS:
+    if kind["as_sumo"]:
         way = 45.0 + speed * (1.0 + kind["tau"]) + 0.5 * speed * speed / kind["decel"]
     else:
         way = 30.0 + 2.0 * speed + 0.2 * speed * speed
@@ -114,7 +118,7 @@ def see_line_m(kind: np.void, speed: float) -> float:
 
     IDM asks as soon as it sees the line; Krauss's driver when it may soon have to brake.
     """
-    if kind["model"] == MODEL_KRAUSS:
+    if kind["as_sumo"]:
         braking = 0.6 * speed * speed / kind["decel"]
         return float(SEE_LINE_M + speed * (1.0 + kind["tau"]) + braking)
     return VIEW_M
@@ -157,7 +161,7 @@ def _at_line(
         constraint, hold, waits = constraint_inside(
             roads, travel, rows, i, link, -distance, way, phase, dt, scratch
         )
-        swept = before_swept(roads, rows, i, kind, link, front, waits, dt, scratch)
+        swept = before_foe_sweep(roads, rows, i, kind, link, front, waits, dt, scratch)
         return max(constraint, swept), hold, math.inf
     merging = no_constraint(kind)
     if row["driver"] == DRIVER_AGENT or speed > FAST_MPS:
@@ -169,13 +173,13 @@ def _at_line(
     stop = math.inf
     if roads.links[link]["num_sweeps"] > 0:
         room = room_m(hold, waits)
-        stop = front + swept_stop(roads, rows, i, link, -front, room, scratch)
+        stop = front + stop_before_foe_sweep(roads, rows, i, link, -front, room, scratch)
     if hold != HOLD_NONE:
         to_line = min(to_line, max(stop, 0.0))
-        closer = CLOSER_M if breaks_circles(roads, travel, row, link) else 0.0
+        closer = CLOSER_M if resolves_deadlocks(roads, travel, row, link) else 0.0
         return before_line(kind, speed, min(to_line + closer, stop), dt), hold, to_line
     constraint = merging
-    minor = kind["model"] == MODEL_KRAUSS and is_minor(roads, link, phase)
+    minor = kind["as_sumo"] and is_minor(roads, link, phase)
     if roads.links[link]["wait_m"] < math.inf:
         inside = before_waiting(roads, kind, row, link, -front, waits, minor, dt)
         constraint = max(constraint, inside)
@@ -214,7 +218,7 @@ def _road_ahead(
     lane = row["lane"]
     here = roads.lanes[lane]
     distance = here["length_m"] - row["s"]
-    queues = speed == 0.0 and kind["model"] == MODEL_KRAUSS and not here["internal"]
+    queues = speed == 0.0 and kind["as_sumo"] and not here["internal"]
     if queues and k + 1 < scratch.lane_end[lane] and distance >= half + NEXT_LINE_M:
         leader = scratch.entries[k + 1]
         gap = leader["s"] - row["s"] - half - leader["half"]
@@ -236,10 +240,12 @@ def _road_ahead(
         constraint, hold, waits = constraint_inside(
             roads, travel, rows, i, here["link"], place, row["way"], phase, dt, scratch
         )
-        swept = before_swept(roads, rows, i, kind, here["link"], -place - half, waits, dt, scratch)
+        swept = before_foe_sweep(
+            roads, rows, i, kind, here["link"], -place - half, waits, dt, scratch
+        )
         constraint = max(constraint, fork, swept)
     else:
-        constraint = before_swept_behind(roads, rows, i, kind, dt, scratch)
+        constraint = before_foe_sweep_beyond_junction(roads, rows, i, kind, dt, scratch)
     look = min(look_ahead_m(kind, speed), travel.view_m)
     see = min(see_line_m(kind, speed) + half, travel.see_m)
     # Behind a leader on its own lane a driver minds the next line only where it could not stop
@@ -256,7 +262,7 @@ def _road_ahead(
         before = lane
         before_way = way
         if before == row["lane"] and before_way == row["way"]:
-            lane, way, link = leave(roads, step, before, way)
+            lane, way, link = next_step_from(roads, step, before, way)
         else:
             lane, way, link = next_step(roads, travel, before, way)
         if lane < 0 or (steered and misses_change(roads, travel, before, before_way)):
@@ -282,7 +288,7 @@ def _road_ahead(
         if steered:
             allowed = min(allowed, bend_speed(roads, before, lane, distance))
         if limit < allowed:
-            allowed = min(allowed, slowing_to(kind, limit, distance, speed, dt))
+            allowed = min(allowed, speed_before_limit(kind, limit, distance, speed, dt))
         j = last_on(scratch, lane, row["id"], distance, travel.view_m)
         if j >= 0:
             leader = scratch.entries[j]
@@ -302,7 +308,7 @@ def _road_ahead(
             break
         distance += ahead["length_m"]
     if hold == HOLD_YIELD and speed < KEPT_MPS and -kept < KEPT_MPS:
-        if kind["model"] == MODEL_KRAUSS and not here["internal"]:
+        if kind["as_sumo"] and not here["internal"]:
             hold = HOLD_EXIT_BLOCKED  # whatever it gives way to: it will not come
     return constraint, allowed, hold, link_ahead
 
@@ -375,7 +381,7 @@ def decide(
         constraint, allowed, hold, link_ahead = _road_ahead(
             roads, travel, rows, k, step[i], phase, room_m, dt, scratch
         )
-        to_stop = way_to_stop(roads, travel, row)
+        to_stop = distance_to_stop(roads, travel, row)
         if to_stop < math.inf:
             constraint = max(constraint, before_line(kind, speed, to_stop + LINE_MARGIN_M, dt))
         askew = no_constraint(kind)
@@ -404,7 +410,7 @@ def decide(
                 roads, travel, rows, k, step[i], phase, room_m, dt, scratch
             )
             target = lane["left"] if change > 0 else lane["right"]
-            aside = beside(roads, travel, kind, row, target, scratch)
+            aside = behind_adjacent_leader(roads, travel, kind, row, target, scratch)
             constraint = max(constraint, askew, aside)
             if lane["length_m"] - row["s"] < 0.5 * row["length"] + SIDEWAYS_S * CREEP_MPS:
                 # Faster, it would be too late for the change, and brake.
@@ -420,9 +426,12 @@ def decide(
             if target >= 0 and room < FALL_IN_M:
                 # Fall in behind its future leader on the other lane.
                 fall_in = wish(
-                    kind, speed, allowed, beside(roads, travel, kind, row, target, scratch)
+                    kind,
+                    speed,
+                    allowed,
+                    behind_adjacent_leader(roads, travel, kind, row, target, scratch),
                 )
-                accel = min(accel, max(fall_in, -COURTESY_DECEL))
+                accel = min(accel, max(fall_in, -COOPERATIVE_DECEL))
         if driver == DRIVER_BACKGROUND and stays_aside(roads, rows, row, scratch):
             change = STAYS_ASIDE
         scratch.accel[i] = accel
@@ -440,4 +449,4 @@ def decide(
     for k in range(total):
         entry = scratch.entries[k]
         if entry["blinker"] != 0 and not entry["side"]:
-            let_merge(roads, travel, rows, rows[entry["row"]], scratch)
+            brake_for_merging(roads, travel, rows, rows[entry["row"]], scratch)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.math.neighbors import make_grid
-from cavmarl.driving.kernels.contacts import find_contacts
+from cavmarl.driving.kernels.motion.contacts import find_contacts
 from cavmarl.evaluate.traffic.junction_locks import JunctionLocks
 from cavmarl.roads.network import RoadNetwork
 

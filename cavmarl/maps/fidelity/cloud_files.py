@@ -56,7 +56,7 @@ def read_cloud(path: Path) -> Cloud:
     Raises:
         MapError: the file is missing, cut short, of another kind, or holds no place.
         CapacityError: it has more points than `MOST_POINTS`.
-        MissingExtraError: pcd, las and laz need the extra `clouds`.
+        MissingExtraError: pcd, las and laz need the extra `maps`.
     """
     try:
         with path.open("rb") as stream:
@@ -220,7 +220,7 @@ def _cut_short(path: Path, number: int, found: int) -> MapError:
 
 
 def _read_pcd(path: Path, head: bytes) -> Points:
-    pypcd4: Any = require("pypcd4", "clouds")
+    pypcd4: Any = require("pypcd4", "maps")
     said = re.search(rb"^POINTS\s+(\d+)", head, re.MULTILINE)
     number = int(said[1][:_MOST_DIGITS]) if said else -1
     _check_number(path, number)
@@ -238,7 +238,7 @@ def _read_pcd(path: Path, head: bytes) -> Points:
 
 
 def _read_las(path: Path) -> Points:
-    laspy: Any = require("laspy", "clouds")
+    laspy: Any = require("laspy", "maps")
     try:
         with laspy.open(path) as reader:
             number = int(reader.header.point_count)

@@ -20,7 +20,7 @@ def thin_out(cloud: Cloud, voxel_m: float, threads: int = 2) -> Cloud:
         return cloud
     if not 0.0 < voxel_m < np.inf:
         raise ConfigError(f"voxels of {voxel_m:g} m: give a side above 0, or 0 for no filter")
-    gicp: Any = require("small_gicp", "clouds")
+    gicp: Any = require("small_gicp", "maps")
     # The library numbers voxels from (0, 0, 0) on and leaves out what is too far from there.
     middle = 0.5 * (cloud.points.min(axis=0) + cloud.points.max(axis=0))
     if np.ptp(cloud.points, axis=0).max() / voxel_m >= 2.0 * (1 << _VOXEL_BITS):
@@ -51,7 +51,7 @@ def drop_outliers(cloud: Cloud, sigmas: float, threads: int = 2) -> Cloud:
 
 def neighbour_distances(points: Any, number: int, threads: int = 2) -> Any:
     """(n, number) distances in m of each point to those of its own cloud that are next to it."""
-    gicp: Any = require("small_gicp", "clouds")
+    gicp: Any = require("small_gicp", "maps")
     centred = points - points.mean(axis=0)
     _, squares = gicp.KdTree(centred, threads).batch_knn_search(centred, number + 1, threads)
     return np.sqrt(np.asarray(squares)[:, 1:])

@@ -62,7 +62,7 @@ def moved(points: Points, transform: Points) -> Points:
 
 def nearest_distances(points: Points, others: Points, threads: int = 2) -> Points:
     """(n,) distances in m of points (n, 3) to the nearest of others (m, 3) each."""
-    gicp: Any = require("small_gicp", "clouds")
+    gicp: Any = require("small_gicp", "maps")
     middle = others.mean(axis=0)
     tree = gicp.KdTree(others - middle, threads)
     found: Points = np.sqrt(
@@ -75,7 +75,7 @@ class Target:
     """A cloud that others are laid onto, with its tree; about its own middle, for the digits."""
 
     def __init__(self, points: Points, threads: int = 2) -> None:
-        gicp: Any = require("small_gicp", "clouds")
+        gicp: Any = require("small_gicp", "maps")
         if len(points) < FEWEST_POINTS:
             raise MapError(
                 f"a cloud of {len(points)} points: {FEWEST_POINTS} are needed at least: take "
@@ -114,7 +114,7 @@ def align(source: Points, target: Target, *, keep: float = 0.8) -> Alignment:
         ConfigError: `keep` is no share.
         MapError: too few points.
     """
-    gicp: Any = require("small_gicp", "clouds")
+    gicp: Any = require("small_gicp", "maps")
     if not 0.1 <= keep <= 1.0:
         raise ConfigError(f"keep {keep:g}: must be a share from 0.1 to 1 of the points")
     own = Target(source, target.threads)

@@ -80,7 +80,7 @@ def fit_roads(network: RoadNetwork, points: Points, box_m: Box, threads: int = 2
     stations = _stations(network, box_m)
     if not len(stations.border):
         return RoadFit(0, np.zeros(0), np.zeros(0), None)
-    gicp: Any = require("small_gicp", "clouds")
+    gicp: Any = require("small_gicp", "maps")
     middle = stations.border.mean(axis=0)
     flat = stations.border - middle
     flat[:, 2] = 0.0

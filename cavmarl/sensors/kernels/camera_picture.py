@@ -14,15 +14,6 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import kernel
 from cavmarl.core.math.elementary import hypot, tangent
 from cavmarl.core.math.spans import row_span
-from cavmarl.sensors.kernels.faces import (
-    CameraPose,
-    Faces,
-    PixelRows,
-    add_face,
-    draw_faces,
-    ground_at,
-    set_corner,
-)
 from cavmarl.sensors.kernels.panorama import (
     BICYCLE,
     BUILDING,
@@ -38,6 +29,15 @@ from cavmarl.sensors.kernels.panorama import (
     TRUCK,
     Counts,
     Panorama,
+)
+from cavmarl.sensors.kernels.polygon_fill import (
+    CameraPose,
+    Faces,
+    PixelRows,
+    add_face,
+    draw_faces,
+    ground_at,
+    set_corner,
 )
 
 # Faces that every picture has; those of bodies and buildings follow.

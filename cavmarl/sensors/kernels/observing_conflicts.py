@@ -34,8 +34,8 @@ from cavmarl.core.records.codes import (
     SIGNAL_RED_YELLOW,
 )
 from cavmarl.core.records.rows import is_off_lanes
-from cavmarl.driving.kernels.gaps import link_signal
-from cavmarl.driving.kernels.ways import goes_on
+from cavmarl.driving.kernels.junctions.gaps import link_signal
+from cavmarl.driving.kernels.lanes.route_following import next_step_of_plan
 from cavmarl.sensors.kernels.observing_way import MOST_LANES
 
 CONFLICT_FEATURES = 9
@@ -115,7 +115,7 @@ def _foresee(
     told = 1
     for _ in range(MOST_LANES):
         end = start + here["length_m"]
-        following, way_there, link = goes_on(roads, travel, lane, way)
+        following, way_there, link = next_step_of_plan(roads, travel, lane, way)
         if link >= 0:
             following = following if left > 0 else -1
             left -= 1

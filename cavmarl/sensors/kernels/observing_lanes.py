@@ -18,9 +18,9 @@ from cavmarl.core.math.scalars import clamp
 from cavmarl.core.records.arrays import RoadArrays, Sensors, Travel
 from cavmarl.core.records.codes import SIGNAL_RED, SIGNAL_RED_YELLOW
 from cavmarl.core.records.rows import is_off_lanes
-from cavmarl.driving.kernels.gaps import link_signal
-from cavmarl.driving.kernels.lane_index import beside_s
-from cavmarl.driving.kernels.ways import next_step
+from cavmarl.driving.kernels.junctions.gaps import link_signal
+from cavmarl.driving.kernels.lanes.lane_index import beside_s
+from cavmarl.driving.kernels.lanes.route_following import next_step
 
 OWN = 0  # slots of two features each: a gap and a speed
 LEFT = 1  # ahead; behind in the slot after it

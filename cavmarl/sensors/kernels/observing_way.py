@@ -24,9 +24,9 @@ from cavmarl.core.records.codes import (
     SIGNAL_YELLOW_MAJOR,
     SIGNAL_YELLOW_MINOR,
 )
-from cavmarl.driving.kernels.gaps import link_signal, must_stop
-from cavmarl.driving.kernels.signal_timing import time_to_change
-from cavmarl.driving.kernels.ways import goes_on
+from cavmarl.driving.kernels.junctions.gaps import link_signal, must_stop
+from cavmarl.driving.kernels.junctions.signal_timing import time_to_change
+from cavmarl.driving.kernels.lanes.route_following import next_step_of_plan
 from cavmarl.sensors.kernels.sense import SPEED_SCALE, gives_way_on, soonness, unit
 
 PLACE_FEATURES = 4  # of a place of the way
@@ -111,7 +111,7 @@ def observe_way(
     lines = 0
     for _ in range(MOST_LANES):
         end = start + here["length_m"]
-        following, way_there, link = goes_on(roads, travel, lane, way)
+        following, way_there, link = next_step_of_plan(roads, travel, lane, way)
         while told < distances.size and (distances[told] <= end or following < 0):
             at = sensor.at + PLACE_FEATURES * told
             distance = min(distances[told], end)

@@ -29,7 +29,6 @@ from cavmarl.sensors.kernels.camera_picture import (
     write_colours,
     write_halves,
 )
-from cavmarl.sensors.kernels.faces import CameraPose, PixelRows
 from cavmarl.sensors.kernels.panorama import (
     BUILDING,
     GROUND,
@@ -39,6 +38,7 @@ from cavmarl.sensors.kernels.panorama import (
     Panorama,
     gather,
 )
+from cavmarl.sensors.kernels.polygon_fill import CameraPose, PixelRows
 from cavmarl.sensors.kernels.rig_frames import Due, Noise, error_of, sensor_key
 
 

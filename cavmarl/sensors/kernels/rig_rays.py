@@ -18,7 +18,7 @@ from cavmarl.core.records.arrays import Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.roads.kernels.backdrop_pieces import Backdrop
 from cavmarl.sensors.kernels.panorama import Panorama, gather
-from cavmarl.sensors.kernels.ray_fan import WALL_HIT, Fan, cast
+from cavmarl.sensors.kernels.ray_caster import WALL_HIT, Fan, cast
 from cavmarl.sensors.kernels.rig_frames import Due, Noise, error_of, sensor_key
 
 TARGET = record(

@@ -31,11 +31,11 @@ from cavmarl.core.records.codes import (
     SIGNAL_YELLOW_MAJOR,
     SIGNAL_YELLOW_MINOR,
 )
-from cavmarl.driving.kernels.gaps import link_signal
-from cavmarl.driving.kernels.signal_timing import time_to_change
+from cavmarl.driving.kernels.junctions.gaps import link_signal
+from cavmarl.driving.kernels.junctions.signal_timing import time_to_change
 from cavmarl.rewards.kernels.terms import write_terms
 from cavmarl.sensors.kernels.frame_stacks import has_entered, newest_frame, shift_frames
-from cavmarl.sensors.kernels.lidar_fan import lidar
+from cavmarl.sensors.kernels.lidar_2d import lidar
 from cavmarl.sensors.kernels.observing_lanes import observe_lanes
 
 EGO_FEATURES = 13

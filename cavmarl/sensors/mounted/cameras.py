@@ -17,8 +17,8 @@ from cavmarl.config.rig import (
 )
 from cavmarl.core.math.elementary import hypot
 from cavmarl.sensors.kernels.camera_picture import colours, make_camera, make_picture
-from cavmarl.sensors.kernels.faces import CameraPose
 from cavmarl.sensors.kernels.panorama import NUM_SEMANTICS
+from cavmarl.sensors.kernels.polygon_fill import CameraPose
 from cavmarl.sensors.kernels.rig_frames import Due
 from cavmarl.sensors.kernels.rig_pictures import (
     camera_reach_m,

@@ -9,7 +9,7 @@ import numpy as np
 
 from cavmarl.config.rig import LidarRigConfig, RadarConfig
 from cavmarl.core.math.elementary import hypot
-from cavmarl.sensors.kernels.ray_fan import HIT, Fan, make_fan
+from cavmarl.sensors.kernels.ray_caster import HIT, Fan, make_fan
 from cavmarl.sensors.kernels.rig_frames import Due
 from cavmarl.sensors.kernels.rig_rays import TARGET, measure_lidar, measure_radar
 from cavmarl.sensors.mounted.frames import SensorFrames

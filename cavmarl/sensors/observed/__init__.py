@@ -17,7 +17,7 @@ from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.core.records.arrays import Sensors
 from cavmarl.rewards.kernels.terms import TTC_REACH_M
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.sensors.kernels.lidar_fan import ECHO, ray_directions
+from cavmarl.sensors.kernels.lidar_2d import ECHO, ray_directions
 from cavmarl.sensors.kernels.observe_optional import OptionalSensors
 from cavmarl.sensors.observed import (
     conflicts_sensor,

@@ -15,7 +15,7 @@ from cavmarl.sensors.observed.feature import Feature
 MAX_SPEED_MPS = 40.0  # Vehicle.MAX_SPEED
 LANE_WIDTH_M = 4.0  # AbstractLane.DEFAULT_WIDTH
 
-# No velocities differ by more: driving/kernels/motion.py keeps speeds from 0 to 60 m/s.
+# No velocities differ by more: driving/kernels/motion/motion.py keeps speeds from 0 to 60 m/s.
 MAX_RELATIVE_MPS = 120.0
 
 _MEANINGS = {

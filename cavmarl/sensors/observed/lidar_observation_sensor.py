@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from cavmarl.config.sensors import SensorsConfig
-from cavmarl.sensors.kernels.lidar_cells import LidarCells, cell_directions
-from cavmarl.sensors.kernels.lidar_fan import ECHO
+from cavmarl.sensors.kernels.highway_lidar import LidarCells, cell_directions
+from cavmarl.sensors.kernels.lidar_2d import ECHO
 from cavmarl.sensors.observed.feature import Feature, Sensor
 from cavmarl.sensors.observed.highway import MAX_RELATIVE_MPS
 

@@ -29,18 +29,18 @@ from cavmarl.core.records.codes import (
     EVENTS_THAT_END,
 )
 from cavmarl.core.records.rows import is_lost
-from cavmarl.driving.kernels.approach import register_links
-from cavmarl.driving.kernels.contacts import find_contacts
 from cavmarl.driving.kernels.drivers import decide
-from cavmarl.driving.kernels.gaps import STOOD_S
-from cavmarl.driving.kernels.highway_control import speed_control
-from cavmarl.driving.kernels.junctions import note_stop
-from cavmarl.driving.kernels.lane_choice import needed_change
-from cavmarl.driving.kernels.lane_index import index_lanes
-from cavmarl.driving.kernels.motion import move_agent, move_background
-from cavmarl.driving.kernels.scripted_rows import follow_script
-from cavmarl.driving.kernels.steering import nearest_speed, steer_to_lane, take_meta_action
-from cavmarl.driving.kernels.ways import own_step
+from cavmarl.driving.kernels.junctions.approach import register_links
+from cavmarl.driving.kernels.junctions.gaps import STOOD_S
+from cavmarl.driving.kernels.junctions.junctions import note_stop
+from cavmarl.driving.kernels.lanes.lane_choice import needed_change
+from cavmarl.driving.kernels.lanes.lane_index import index_lanes
+from cavmarl.driving.kernels.lanes.route_following import own_step
+from cavmarl.driving.kernels.motion.contacts import find_contacts
+from cavmarl.driving.kernels.motion.highway_control import speed_control
+from cavmarl.driving.kernels.motion.motion import move_agent, move_background
+from cavmarl.driving.kernels.motion.scripted_rows import follow_script
+from cavmarl.driving.kernels.motion.steering import nearest_speed, steer_to_lane, take_meta_action
 from cavmarl.zones.kernels.zone_lookup import is_inside, note_outer
 
 

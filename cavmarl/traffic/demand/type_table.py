@@ -16,6 +16,7 @@ from cavmarl.driving.vehicle_types import (
     NEAREST_CLASS,
     NO_ROAD_CLASSES,
     VTYPE,
+    set_model,
 )
 from cavmarl.roads.network import VEHICLE_CLASSES
 from cavmarl.traffic.demand.demand_records import MAX_WEIGHT, Options, listed, weighted
@@ -82,7 +83,8 @@ def vtype_record(element: Element, report: DemandReport) -> NDArray[np.void] | N
     record = np.zeros((), dtype=VTYPE)
     record["vclass"] = VEHICLE_CLASSES.index(NEAREST_CLASS[name])
     record["permissions"] = ALL_PERMISSIONS if name == "ignoring" else 1 << int(record["vclass"])
-    record["model"] = model = _model(element, report)
+    model = _model(element, report)
+    set_model(record, model)
     for key in ("length", "width", "height", "accel", "decel"):
         record[key] = _number(element, key, getattr(default, key))
     record["min_gap"] = _number(element, "minGap", default.min_gap)

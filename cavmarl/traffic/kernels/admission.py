@@ -18,10 +18,10 @@ from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M
 from cavmarl.core.records.arrays import Demand, Gate, RoadArrays, Scratch, Travel, Worlds
 from cavmarl.core.records.codes import COUNT_DEPARTED, LANE_FIRST, LANE_GIVEN, LANE_RANDOM, POS_LAST
 from cavmarl.core.records.rows import SWEPT_BEYOND_M
-from cavmarl.driving.kernels.approach import register_links
-from cavmarl.driving.kernels.lane_index import index_lanes
-from cavmarl.driving.kernels.swept_areas import would_be_swept
-from cavmarl.driving.kernels.ways import fed_lane, next_step
+from cavmarl.driving.kernels.junctions.approach import register_links
+from cavmarl.driving.kernels.junctions.swept_areas import foe_would_sweep_over
+from cavmarl.driving.kernels.lanes.lane_index import index_lanes
+from cavmarl.driving.kernels.lanes.route_following import fed_lane, next_step
 from cavmarl.traffic.kernels.demand_generator import enter
 from cavmarl.traffic.kernels.entering import (
     crowd,
@@ -210,13 +210,13 @@ def _is_swept(roads: RoadArrays, travel: Travel, row: np.void, scratch: Scratch)
     half = 0.5 * row["length"]
     to_line = here["length_m"] - row["s"]
     ahead = _link_ahead(roads, travel, row) if to_line <= travel.see_m else -1
-    if ahead >= 0 and would_be_swept(roads, row, ahead, half - to_line, scratch):
+    if ahead >= 0 and foe_would_sweep_over(roads, row, ahead, half - to_line, scratch):
         return True
     for n in range(_num_behind(roads, row)):
         link = _link_behind(roads, row, n)
         if link >= 0:
             place = roads.links[link]["length_m"] + row["s"] + half
-            if would_be_swept(roads, row, link, place, scratch):
+            if foe_would_sweep_over(roads, row, link, place, scratch):
                 return True
     return False
 

@@ -40,8 +40,8 @@ from cavmarl.core.records.codes import (
     SUM_DISTANCE_M,
     SUM_TIME_S,
 )
-from cavmarl.driving.kernels.motion import place_on_lane
-from cavmarl.driving.kernels.ways import own_step, time_of_way, way_left
+from cavmarl.driving.kernels.lanes.route_following import distance_left, own_step, route_time_s
+from cavmarl.driving.kernels.motion.motion import place_on_lane
 from cavmarl.roads.kernels.map_draw import map_of
 from cavmarl.traffic.kernels.barriers import withdraw
 from cavmarl.traffic.kernels.entering import speed_at
@@ -205,10 +205,10 @@ def enter(
     row["departed"] = worlds.ticks[w]
     row["tick"] = worlds.ticks[w]
     row["heading"] = place_on_lane(roads, travel, row)
-    row["to_go"] = way_left(roads, row, travel.steps[own_step(roads, row)])
+    row["to_go"] = distance_left(roads, row, travel.steps[own_step(roads, row)])
     row["step_to_go"] = row["to_go"]
     if row["agent"] >= 0 and travel.trip_horizon > 0.0:
-        most_s = time_of_way(roads, travel, row, worlds.ticks[w] * travel.tick_s)
+        most_s = route_time_s(roads, travel, row, worlds.ticks[w] * travel.tick_s)
         row["due"] = worlds.ticks[w] + math.ceil(most_s / travel.tick_s)
 
 

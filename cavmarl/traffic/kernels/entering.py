@@ -30,11 +30,11 @@ from cavmarl.core.records.codes import (
     SPEED_RANDOM,
 )
 from cavmarl.core.records.rows import ENTER_REACH_M
-from cavmarl.driving.kernels.beside import askew_beside
-from cavmarl.driving.kernels.following import LINE_MARGIN_M, accel_behind, speed_behind
-from cavmarl.driving.kernels.lane_index import ahead_on, behind_by, first_from, last_on
-from cavmarl.driving.kernels.swept_areas import LONG_FORK_M
-from cavmarl.driving.kernels.ways import next_step
+from cavmarl.driving.kernels.junctions.swept_areas import LONG_FORK_M
+from cavmarl.driving.kernels.lanes.adjacent_leaders import askew_beside
+from cavmarl.driving.kernels.lanes.lane_index import ahead_on, behind_by, first_from, last_on
+from cavmarl.driving.kernels.lanes.route_following import next_step
+from cavmarl.driving.kernels.models.following import LINE_MARGIN_M, accel_behind, speed_behind
 
 ENTER_GAP_M = 1.0  # m between bumpers, the least with which a vehicle enters
 LEADER_M = 150.0  # how far ahead a leader is looked for

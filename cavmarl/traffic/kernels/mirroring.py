@@ -17,9 +17,9 @@ from cavmarl.core.math.elementary import atan, cosine, sine
 from cavmarl.core.math.geometry import lane_pose, wrap_angle
 from cavmarl.core.records.arrays import Gate, RoadArrays, Travel, Zoned
 from cavmarl.core.records.codes import COUNT_DEPARTED, DRIVER_SUMO, EVENT_ARRIVED
-from cavmarl.driving.kernels.motion import account, before_tick, lane_before
-from cavmarl.driving.kernels.tracking import side_lane
-from cavmarl.driving.kernels.ways import own_step, way_left
+from cavmarl.driving.kernels.lanes.route_following import distance_left, own_step
+from cavmarl.driving.kernels.motion.motion import account, before_tick, lane_before
+from cavmarl.driving.kernels.motion.tracking import side_lane
 
 BODY_LANES = 8  # that lie between a front and its body's centre
 BLINKS_RIGHT = 1  # bits of SUMO's vehicle signals
@@ -210,7 +210,7 @@ def _stand_in(roads: RoadArrays, travel: Travel, paths: Paths, seen: np.void, ro
     elif signals & BLINKS_RIGHT:
         row["blinker"] = -1
     row["way"] = _way_at(roads, paths, seen["route"], seen["at"], row["lane"])
-    row["to_go"] = way_left(roads, row, travel.steps[own_step(roads, row)])
+    row["to_go"] = distance_left(roads, row, travel.steps[own_step(roads, row)])
 
 
 @inlined_kernel

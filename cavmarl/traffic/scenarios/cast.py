@@ -16,7 +16,7 @@ from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.core.math.geometry import lane_pose
 from cavmarl.core.records.arrays import Gate, RoadArrays, Scripts, Travel, Worlds
 from cavmarl.core.records.codes import COUNT_DEPARTED, DRIVER_SCRIPTED
-from cavmarl.driving.kernels.scripted_rows import stand_at
+from cavmarl.driving.kernels.motion.scripted_rows import stand_at
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.traffic.departure_queue import DEPARTURE
 from cavmarl.traffic.kernels.demand_generator import enter

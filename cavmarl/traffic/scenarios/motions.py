@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from cavmarl.core.math.elementary import atan, atan2, cosine, sine
 from cavmarl.core.math.elementary_arrays import cos_all, hypot_all, sin_all
-from cavmarl.driving.kernels.announcing import announced_m
-from cavmarl.driving.kernels.approach import MAX_LINKS_AHEAD
+from cavmarl.driving.kernels.junctions.approach import MAX_LINKS_AHEAD
+from cavmarl.driving.kernels.junctions.stop_line_registration import registration_distance_m
 from cavmarl.roads.network import RoadNetwork
 
 ACCEL_MPS2 = 2.5  # how actors speed up and slow down
@@ -162,7 +162,7 @@ class Ride:
         self, network: RoadNetwork, u: float, speed: float, length: float
     ) -> Iterator[tuple[float, int]]:
         """The links that it is on, or will be on soon, as `kernels.approach` lists them."""
-        reach = announced_m(speed)
+        reach = registration_distance_m(speed)
         line_m, ahead = 0.0, 0
         for before, after in pairwise(self.lanes):
             line_m += float(network.lanes["length_m"][before])

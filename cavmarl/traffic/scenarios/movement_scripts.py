@@ -23,7 +23,7 @@ from cavmarl.core.math.elementary import cos_sin, cosine, hypot, sine
 from cavmarl.core.records import record
 from cavmarl.core.records.arrays import Scripts
 from cavmarl.core.records.codes import CLASS_PEDESTRIAN, MODEL_IDM
-from cavmarl.driving.vehicle_types import CLASS_DEFAULTS, generated_types
+from cavmarl.driving.vehicle_types import CLASS_DEFAULTS, generated_types, set_model
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.routing import lane_grid
 from cavmarl.traffic.kernels.covered_stretch import covered_stretch
@@ -240,7 +240,7 @@ def actor_types() -> NDArray[np.void]:
     for row, body in zip(types, BODIES.values(), strict=True):
         for name, value in body._asdict().items():
             row[name] = value
-    types["model"] = MODEL_IDM
+    set_model(types, MODEL_IDM)
     return types
 
 

@@ -15,7 +15,13 @@ from numpy.typing import NDArray
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ConfigError, DemandError
 from cavmarl.core.records.codes import MODEL_KRAUSS
-from cavmarl.driving.vehicle_types import NEAREST_CLASS, NO_ROAD_CLASSES, VTYPE, generated_types
+from cavmarl.driving.vehicle_types import (
+    NEAREST_CLASS,
+    NO_ROAD_CLASSES,
+    VTYPE,
+    generated_types,
+    set_model,
+)
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.sumo_net.xml_source import read_bytes
 from cavmarl.traffic.sumo.sumo_input import SumoInput, command_words, read_input
@@ -150,7 +156,7 @@ def _types(described: list[dict[str, Any]]) -> NDArray[np.void]:
             row[name] = kind[name]
         row["vclass"] = VEHICLE_CLASSES.index(NEAREST_CLASS[kind["vclass"]])
         row["permissions"] = 1 << int(row["vclass"])
-        row["model"] = MODEL_KRAUSS
+        set_model(row, MODEL_KRAUSS)
         row["desired_max_speed"] = row["max_speed"]
         row["max_speed_factor"] = np.inf
         row["reroute"] = row["reroute_period_ms"] = -1

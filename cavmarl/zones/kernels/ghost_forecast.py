@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel
-from cavmarl.driving.kernels.motion import MAX_SPEED_MPS, STANDING_MPS
+from cavmarl.driving.kernels.motion.motion import MAX_SPEED_MPS, STANDING_MPS
 
 # Which words of a VEHICLE record fields are; the lane is in the low half of its word.
 PLACES = {

@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays
 from cavmarl.core.records.rows import ENTER_REACH_M, MERGES_M, STEERED, SWEPT_BEYOND_M
-from cavmarl.driving.kernels.announcing import APPROACH_M
-from cavmarl.driving.kernels.circles import on_equal_road
-from cavmarl.driving.kernels.gaps import STATE_MAJOR
-from cavmarl.driving.kernels.junctions import EXIT_LOOK_M
-from cavmarl.driving.kernels.lane_choice import LOOK_BACK_M
-from cavmarl.driving.kernels.lane_index import goes_on_m
-from cavmarl.driving.kernels.swept_areas import size_of
-from cavmarl.zones.kernels.lane_ways import begin_ways, spread_ways
+from cavmarl.driving.kernels.junctions.deadlocks import on_equal_road
+from cavmarl.driving.kernels.junctions.gaps import STATE_MAJOR
+from cavmarl.driving.kernels.junctions.junctions import EXIT_LOOK_M
+from cavmarl.driving.kernels.junctions.stop_line_registration import APPROACH_M
+from cavmarl.driving.kernels.junctions.swept_areas import size_of
+from cavmarl.driving.kernels.lanes.lane_choice import LOOK_BACK_M
+from cavmarl.driving.kernels.lanes.lane_index import goes_on_m
+from cavmarl.zones.kernels.lane_paths import begin_paths, extend_paths
 from cavmarl.zones.kernels.visibility_scratch import VisibilityScratch
 from cavmarl.zones.kernels.zone_lookup import squared_distance
 
@@ -175,15 +175,15 @@ def _look_along(
     for lane in range(roads.lanes.shape[0]):
         if scratch.first[lane] <= scratch.last[lane]:
             left = roads.lanes[lane]["length_m"] - scratch.last[lane]
-            begin_ways(roads, lane, True, left, scratch.ahead)
-            begin_ways(roads, lane, False, scratch.first[lane], scratch.behind)
+            begin_paths(roads, lane, True, left, scratch.ahead)
+            begin_paths(roads, lane, False, scratch.first[lane], scratch.behind)
             first, last = scratch.first[lane] - view_m, scratch.last[lane] + view_m
             _see(roads, lane, first, last, half_m, looks)
-    spread_ways(roads, True, view_m, scratch.ahead, scratch)
+    extend_paths(roads, True, view_m, scratch.ahead, scratch)
     for lane in range(roads.lanes.shape[0]):
         if scratch.ahead[lane] <= view_m:
             _see(roads, lane, 0.0, view_m - scratch.ahead[lane], half_m, looks)
-    spread_ways(roads, False, BACK_M, scratch.behind, scratch)
+    extend_paths(roads, False, BACK_M, scratch.behind, scratch)
     for lane in range(roads.lanes.shape[0]):
         if scratch.behind[lane] <= BACK_M:
             back = scratch.behind[lane] + roads.lanes[lane]["length_m"] - ROUNDING_M
@@ -285,9 +285,9 @@ def _look_at_junctions(
                 scratch.to_line[other] = 0.0
                 if scratch.swept[link]:
                     scratch.to_room[other] = 0.0
-    spread_ways(roads, False, APPROACH_M, scratch.to_line, scratch)
-    spread_ways(roads, False, APPROACH_M, scratch.to_room, scratch)
-    spread_ways(roads, True, EXIT_LOOK_M, scratch.beyond, scratch)
+    extend_paths(roads, False, APPROACH_M, scratch.to_line, scratch)
+    extend_paths(roads, False, APPROACH_M, scratch.to_room, scratch)
+    extend_paths(roads, True, EXIT_LOOK_M, scratch.beyond, scratch)
     for lane in range(roads.lanes.shape[0]):
         if scratch.beyond[lane] <= EXIT_LOOK_M:
             _see(roads, lane, 0.0, EXIT_LOOK_M - scratch.beyond[lane], half_m, looks)

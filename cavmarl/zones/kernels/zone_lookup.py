@@ -19,7 +19,10 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.records.codes import DRIVER_BACKGROUND
 from cavmarl.core.records.rows import MERGES_M
-from cavmarl.driving.kernels.announcing import announced_m, is_let_stand
+from cavmarl.driving.kernels.junctions.stop_line_registration import (
+    can_be_ignored,
+    registration_distance_m,
+)
 
 
 class ZoneArrays(NamedTuple):
@@ -149,9 +152,9 @@ def is_asked_about(halo: Halo, watch: np.void, row: np.void) -> bool:
     """Whether some driver of a zone that watches a vehicle's lane may ask about it."""
     # Answers are unpredictable: branches would cost more than all that they leave out.
     s = row["s"]
-    reach_m = announced_m(row["speed"])
+    reach_m = registration_distance_m(row["speed"])
     to_line = watch["line"] - s
-    stands = is_let_stand(row)
+    stands = can_be_ignored(row)
     is_let = (row["driver"] == DRIVER_BACKGROUND) & stands & (to_line > halo.line_m)
     comes = (to_line < reach_m) & (not is_let)
     merges = (watch["merge"] - s < MERGES_M) & (not stands)

@@ -34,7 +34,7 @@ def ascii_ply(path: Path) -> None:
 
 
 def las(path: Path) -> None:
-    laspy: Any = pytest.importorskip("laspy", reason="needs the extra 'clouds'")
+    laspy: Any = pytest.importorskip("laspy", reason="needs the extra 'maps'")
     header = laspy.LasHeader(point_format=3, version="1.2")
     header.scales = np.full(3, 0.001)
     header.offsets = np.array([1.0, 2.0, 3.0])
@@ -44,7 +44,7 @@ def las(path: Path) -> None:
 
 
 def pcd(path: Path, encoding: str = "binary_compressed") -> None:
-    pypcd4: Any = pytest.importorskip("pypcd4", reason="needs the extra 'clouds'")
+    pypcd4: Any = pytest.importorskip("pypcd4", reason="needs the extra 'maps'")
     cloud = pypcd4.PointCloud.from_xyz_points(POINTS.astype(np.float32))
     cloud.save(path, encoding=pypcd4.Encoding(encoding))
 

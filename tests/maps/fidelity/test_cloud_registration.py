@@ -12,7 +12,7 @@ from cavmarl.maps.fidelity.cloud_registration import Target, align, moved, neare
 from cavmarl.maps.fidelity.comparison import compare, histogram, start_transform
 from tests.maps.fidelity.scenes import motion, street
 
-pytest.importorskip("small_gicp", reason="needs the extra 'clouds'")
+pytest.importorskip("small_gicp", reason="needs the extra 'maps'")
 
 KNOWN = motion(0.5, -0.5, 0.25, 2.0)  # 0.75 m and 2°
 

@@ -21,7 +21,7 @@ from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
 from tests.maps.fidelity.scenes import motion
 
-pytest.importorskip("small_gicp", reason="needs the extra 'clouds'")
+pytest.importorskip("small_gicp", reason="needs the extra 'maps'")
 
 MAP = "grid4x4"
 KERB_M = 0.15

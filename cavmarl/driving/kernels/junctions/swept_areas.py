@@ -1,0 +1,357 @@
+"""Swept areas: where a long or a steered vehicle in a bend, or one beside it, has to wait.
+
+No right of way says which goes first there. A vehicle in the area does; of two before it the
+one that is further along, unless something else holds it. What it waits for is no reason for others
+to let it pass: a driver that gives way to it goes on.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.records.arrays import RoadArrays, Scratch
+from cavmarl.core.records.codes import DRIVER_AGENT, HOLD_NONE
+from cavmarl.core.records.rows import SIZE_BODIES_M, SIZE_LENGTHS_M, STEERED, SWEPT_BEYOND_M
+from cavmarl.driving.kernels.junctions.stop_line_registration import (
+    APPROACH_STANDING_M,
+    STANDING_MPS,
+    can_be_ignored,
+)
+from cavmarl.driving.kernels.models.following import before_line, behind, no_constraint
+
+VAN_M, BUS_M = SIZE_LENGTHS_M
+CAR_BODY_M, VAN_BODY_M, BUS_BODY_M = SIZE_BODIES_M
+EASY_STOP = 2.0  # m/s², of one that needs more to stop before the area it is said that it comes;
+HARD_STOP = 3.5  # one that needs more goes first
+AT_AREA_M = 0.01  # one that stands right before an area is not in it, however places are rounded
+MIN_STOP_M = 0.01  # a distance below counts as this
+SOON_M = 3.5  # one that is so near to the area may be in it at once
+LONG_FORK_M = 6.0  # how much further long vehicles need to be clear of one another at a fork
+WAIT_EARLIER_M = 3.0  # how much before the map's position a long vehicle waits inside, at most
+MOST_BACK_M = 5.0  # before its line, where a steered car waits so that others can pass
+GIVE_UP_S = 60.0  # one that has stood so long goes on, whatever is in the area
+
+
+@inlined_kernel
+def size_of(half: float) -> int:
+    """The size class of a vehicle, of half its length in m."""
+    return int(2.0 * half > VAN_M) + int(2.0 * half > BUS_M)
+
+
+@inlined_kernel
+def _body_m(half: float, size: int) -> float:
+    """How long a vehicle counts as: areas end where a body of its class ends at the line."""
+    least = VAN_BODY_M if size == 1 else (BUS_BODY_M if size == 2 else CAR_BODY_M)
+    return float(max(2.0 * half, least))
+
+
+@inlined_kernel
+def _nothing_sweeps(roads: RoadArrays, size: int, link: int, scratch: Scratch) -> bool:
+    """Whether a vehicle on `link` is a car, and none at the junction so large as to sweep over it.
+
+    The answer for most, without a look at the areas.
+    """
+    row = roads.links[link]
+    nothing: bool = size == 0 and row["swept_by"] > scratch.largest[row["junction"]]
+    return nothing
+
+
+@kernel
+def stop_before_foe_sweep(
+    roads: RoadArrays,
+    rows: NDArray[np.void],  # VEHICLE (C,)
+    i: int,  # the row that asks
+    link: int,  # that it is on, or takes next
+    place: float,  # of its front, m beyond its stop line
+    # it has to stop anyway, and leaves room for those that are so near to their lines, m; or -inf
+    room_m: float,
+    scratch: Scratch,
+) -> float:
+    """Return how far beyond its stop line row i may go without being swept by a foe, in m.
+
+    The distance is that of its front; inf where no foe sweeps.
+    """
+    row = rows[i]
+    size = size_of(0.5 * row["length"])
+    rear = place - _body_m(0.5 * row["length"], size)
+    own = STEERED if size == 0 and row["driver"] == DRIVER_AGENT else size
+    stop = math.inf
+    if _nothing_sweeps(roads, own, link, scratch):
+        return stop
+    has_left = place > roads.links[link]["length_m"] + 0.5 * row["length"]
+    first = roads.links[link]["first_sweep"]
+    for k in range(first, first + roads.links[link]["num_sweeps"]):
+        sweep = roads.sweeps[k]
+        if sweep["own"] > own:
+            break  # they are sorted by it
+        if sweep["own"] != own or rear > sweep["leave_m"]:
+            continue
+        if has_left and place > sweep["enter_m"] + AT_AREA_M:
+            continue  # it clears the area, as it has left the junction
+        if own == STEERED and room_m > 0.0 and -MOST_BACK_M < sweep["enter_m"] <= 0.0:
+            stop = min(stop, max(sweep["enter_m"], place))  # it waits where no other will sweep
+        same_lane = roads.links[sweep["foe"]]["from_lane"] == roads.links[link]["from_lane"]
+        for n in range(scratch.link_start[sweep["foe"]], scratch.link_end[sweep["foe"]]):
+            foe = scratch.approach[n]
+            other = size_of(foe["half"])
+            if other == 0 and own == STEERED and rows[foe["row"]]["driver"] == DRIVER_AGENT:
+                other = STEERED
+            if foe["row"] == i or other != sweep["other"]:
+                continue
+            if same_lane and foe["half"] - foe["dist"] < place:
+                continue  # it comes behind the row
+            if own == STEERED and _stands_in_the_way(roads, row, link, place, sweep, foe):
+                continue  # that one brakes hard for it anyway: it does not stop there
+            if _is_in_the_way(rows, row, foe, sweep, place, room_m):
+                # One that is in the area, too, stops where it is. Behind one that stands, or may
+                # have to for it, it waits before the junction: else neither could go on.
+                stop = min(stop, max(sweep["enter_m"], place))
+                if place <= 0.0 and (
+                    foe["speed"] <= STANDING_MPS or _must_yield(roads, sweep["foe"], link)
+                ):
+                    stop = min(stop, 0.0)
+    return stop
+
+
+@kernel
+def foe_would_sweep_over(
+    roads: RoadArrays,
+    row: np.void,  # VEHICLE that enters
+    link: int,  # that it takes next
+    place: float,  # of its front, m beyond its stop line
+    scratch: Scratch,
+) -> bool:
+    """Return whether a foe would sweep over a vehicle that enters the road here.
+
+    That foe is in the area, or can stop before it only by hard braking. Areas of steered cars do
+    not count: where roads share ground, none could enter any more.
+    """
+    own = size_of(0.5 * row["length"])
+    if _nothing_sweeps(roads, own, link, scratch):
+        return False
+    rear = place - _body_m(0.5 * row["length"], own)
+    first = roads.links[link]["first_sweep"]
+    for k in range(first, first + roads.links[link]["num_sweeps"]):
+        sweep = roads.sweeps[k]
+        if sweep["own"] > own:
+            break  # they are sorted by it
+        if sweep["own"] != own or rear > sweep["leave_m"]:
+            continue
+        to_area = sweep["enter_m"] - place
+        if to_area >= 0.0 and not _needs(row["speed"], to_area, EASY_STOP):
+            continue
+        for n in range(scratch.link_start[sweep["foe"]], scratch.link_end[sweep["foe"]]):
+            foe = scratch.approach[n]
+            if size_of(foe["half"]) != sweep["other"]:
+                continue
+            foe_place = foe["half"] - foe["dist"]
+            to_area = sweep["foe_enter_m"] - foe_place
+            if foe_place - _body_m(foe["half"], sweep["other"]) <= sweep["foe_leave_m"] and (
+                to_area < 0.0 or _needs(foe["speed"], to_area, EASY_STOP)
+            ):
+                return True
+    return False
+
+
+@kernel
+def _must_yield(roads: RoadArrays, link: int, other: int) -> bool:
+    """Whether vehicles on a link give way to those on another one."""
+    first = roads.links[link]["first_conflict"]
+    for c in range(first, first + roads.links[link]["num_conflicts"]):
+        if roads.conflicts[c]["foe"] == other:
+            return bool(roads.conflicts[c]["must_yield"])
+    return False
+
+
+@kernel
+def _stands_in_the_way(
+    roads: RoadArrays, row: np.void, link: int, place: float, sweep: np.void, foe: np.void
+) -> bool:
+    """Whether a row that stops for a foe's sweep stands where that one drives, and comes fast.
+
+    Its front is at `place`. The foe is still before its line. One that gives way has been let in,
+    and would stop behind the foe's front; one that has the right of way is there already.
+    """
+    front = foe["dist"] - foe["half"]
+    if front <= 0.0 or not _needs(foe["speed"], front, HARD_STOP):
+        return False
+    first = roads.links[link]["first_conflict"]
+    for c in range(first, first + roads.links[link]["num_conflicts"]):
+        conflict = roads.conflicts[c]
+        if conflict["foe"] == sweep["foe"]:
+            if conflict["must_yield"] and place > 0.0:
+                place = max(place, sweep["enter_m"])
+            elif not _must_yield(roads, sweep["foe"], link):
+                return False
+            inside: bool = conflict["enter_m"] < place < conflict["leave_m"] + row["length"]
+            return inside
+    return False
+
+
+@inlined_kernel
+def room_m(at_line: int, inside: int) -> float:
+    """Return how near to their lines foes are for which a waiting vehicle leaves room, in m.
+
+    See `stop_before_foe_sweep`.
+    """
+    if at_line != HOLD_NONE:
+        return APPROACH_STANDING_M
+    return math.inf if inside != HOLD_NONE else -math.inf
+
+
+@kernel
+def wait_place(roads: RoadArrays, link: int, half: float) -> float:
+    """Where inside a junction a vehicle on `link` waits, in m beyond its stop line.
+
+    That is the map's waiting position. Long vehicles wait up to `WAIT_EARLIER_M` before it where
+    others would sweep over it: cars go back only where one comes, see `stop_before_foe_sweep`.
+    """
+    size = size_of(half)
+    wait_m = place = roads.links[link]["wait_m"]
+    if size == 0:
+        return float(wait_m)
+    first = roads.links[link]["first_sweep"]
+    for k in range(first, first + roads.links[link]["num_sweeps"]):
+        sweep = roads.sweeps[k]
+        if sweep["own"] == size and sweep["enter_m"] > max(wait_m - WAIT_EARLIER_M, 0.0):
+            place = min(place, sweep["enter_m"])
+    return float(place)
+
+
+@inlined_kernel
+def _is_in_the_way(
+    rows: NDArray[np.void], row: np.void, foe: np.void, sweep: np.void, place: float, room_m: float
+) -> bool:
+    """Whether a row whose front is at `place` has to wait for one APPROACH."""
+    foe_place = foe["half"] - foe["dist"]
+    foe_rear = foe_place - _body_m(foe["half"], sweep["other"])
+    if foe_rear > sweep["foe_leave_m"] or row["wait_s"] > GIVE_UP_S:
+        return False
+    inside = place > sweep["enter_m"] + AT_AREA_M
+    foe_inside = foe_place > sweep["foe_enter_m"] + AT_AREA_M
+    if foe_inside and not inside:
+        return True
+    if inside and not foe_inside:
+        return False
+    to_area = sweep["foe_enter_m"] - foe_place
+    comes = room_m > 0.0 and _needs(foe["speed"], to_area, EASY_STOP)
+    if not inside and (comes or foe_place > -room_m):
+        return True  # it loses nothing if it leaves room
+    if rows[foe["row"]]["hold"] != HOLD_NONE:
+        return False
+    if inside:
+        return _is_ahead(foe, foe_place, row, place)
+    # One that does not know of this area does not wait before it.
+    unaware = sweep["own"] == STEERED and sweep["other"] != STEERED
+    own_to_area = sweep["enter_m"] - place
+    # Of two that are late to stop the one that has to brake less waits, until the other has passed.
+    foe_needs = _decel_to_stop(foe["speed"], to_area)
+    own_needs = _decel_to_stop(row["speed"], own_to_area)
+    if max(foe_needs, own_needs) > HARD_STOP and foe_needs != own_needs:
+        return bool(foe_needs > own_needs)
+    soon = to_area < SOON_M or _needs(foe["speed"], to_area, EASY_STOP)
+    if unaware:
+        return soon and (foe["speed"] > STANDING_MPS or _is_ahead(foe, foe_place, row, place))
+    # One that is ahead and stands is kept there by a leader, be it one that waits for this row.
+    return soon and not can_be_ignored(rows[foe["row"]]) and _is_ahead(foe, foe_place, row, place)
+
+
+@inlined_kernel
+def _decel_to_stop(speed: float, distance: float) -> float:
+    """The braking in m/s² with which a vehicle stops within a distance."""
+    return float(speed * speed / (2.0 * max(distance, MIN_STOP_M)))
+
+
+@inlined_kernel
+def _needs(speed: float, distance: float, decel: float) -> bool:
+    """Whether stopping within a distance takes harder braking."""
+    needs: bool = speed * speed > 2.0 * decel * distance
+    return needs
+
+
+@inlined_kernel
+def _is_ahead(foe: np.void, foe_place: float, row: np.void, place: float) -> bool:
+    ahead: bool = foe_place > place or (foe_place == place and foe["id"] < row["id"])
+    return ahead
+
+
+@inlined_kernel
+def before_foe_sweep(
+    roads: RoadArrays,
+    rows: NDArray[np.void],
+    i: int,
+    kind: np.void,
+    link: int,
+    front: float,
+    hold: int,
+    dt: float,
+    scratch: Scratch,
+) -> float:
+    """Return the constraint of areas that foes sweep, on row i with its front before a stop line.
+
+    `front`: m from its front to the stop line of the link. `hold`: why it waits inside anyway,
+    HOLD_*.
+    """
+    if roads.links[link]["num_sweeps"] == 0:
+        return no_constraint(kind)
+    stop = stop_before_foe_sweep(roads, rows, i, link, -front, room_m(HOLD_NONE, hold), scratch)
+    return (
+        no_constraint(kind)
+        if stop == math.inf
+        else before_line_gently(kind, rows[i], stop + front, dt)
+    )
+
+
+@kernel
+def before_foe_sweep_beyond_junction(
+    roads: RoadArrays, rows: NDArray[np.void], i: int, kind: np.void, dt: float, scratch: Scratch
+) -> float:
+    """Return the constraint of areas that foes sweep beyond the junction that row i has left."""
+    row = rows[i]
+    link, half = row["link"], 0.5 * row["length"]
+    if row["s"] - half >= SWEPT_BEYOND_M or link < 0 or roads.links[link]["to_lane"] != row["lane"]:
+        return no_constraint(kind)
+    place = roads.links[link]["length_m"] + row["s"] + half
+    return before_foe_sweep(roads, rows, i, kind, link, -place, HOLD_NONE, dt, scratch)
+
+
+@inlined_kernel
+def before_line_gently(kind: np.void, row: np.void, gap: float, dt: float) -> float:
+    """The constraint of a line before which no vehicle brakes harder than those behind can."""
+    constraint = before_line(kind, row["speed"], gap, dt)
+    if kind["as_sumo"]:
+        return float(min(constraint, kind["decel"] * dt - row["speed"]))
+    return float(min(constraint, kind["accel"] + kind["decel"]))
+
+
+@kernel
+def behind_fork(
+    roads: RoadArrays,
+    kind: np.void,
+    row: np.void,
+    lane: int,
+    chosen: int,
+    distance: float,
+    scratch: Scratch,
+) -> float:
+    """The constraint of vehicles that have just turned off from the same lane into another link."""
+    constraint = no_constraint(kind)
+    first = roads.lanes[lane]["first_link"]
+    for link in range(first, first + roads.lanes[lane]["num_links"]):
+        if link == chosen:
+            continue
+        for k in range(scratch.link_start[link], scratch.link_end[link]):
+            other = scratch.approach[k]
+            place = -other["dist"]
+            longest = max(row["length"], 2.0 * other["half"])
+            fork_m = roads.links[link]["fork_m"] + (LONG_FORK_M if longest > VAN_M else 0.0)
+            if place > max(-distance, 0.0) and place - other["half"] < fork_m:
+                gap = distance + place - 0.5 * row["length"] - other["half"]
+                constraint = max(
+                    constraint, behind(kind, row["speed"], gap, other["speed"], kind["decel"])
+                )
+    return constraint

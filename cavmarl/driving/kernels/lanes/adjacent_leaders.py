@@ -1,0 +1,147 @@
+"""Leaders on adjacent lanes that a vehicle covers, or that stick out into its own lane."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.math.elementary import cosine, sine
+from cavmarl.core.math.geometry import lane_pose
+from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
+from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_SCRIPTED
+from cavmarl.driving.kernels.junctions.swept_areas import BUS_M
+from cavmarl.driving.kernels.lanes.lane_index import ahead_on, beside_s, last_on
+from cavmarl.driving.kernels.models.following import behind, no_constraint
+from cavmarl.roads.kernels.plans import TURNAROUND
+
+STICKS_OUT_M = 0.1  # over the side of its lane, so far that others have to mind it
+ASKEW_RAD = 0.15  # a vehicle that stands less askew does not stick out
+SWINGS_BACK_M = 3.0  # both bumpers on its way, a bus of 12 m that turns round stands further back
+
+
+@inlined_kernel
+def behind_entry(kind: np.void, speed: float, gap: float, leader: np.void) -> float:
+    """The constraint of a leader by its ENTRY in the index of lanes; `gap`: between bumpers, m."""
+    return behind(kind, speed, gap, leader["speed"], leader["decel"])
+
+
+@inlined_kernel
+def swings_back_m(
+    roads: RoadArrays, travel: Travel, rows: NDArray[np.void], leader: np.void
+) -> float:
+    """How far a leader's rear may come back, in m: that of a bus does while it turns round."""
+    if leader["half"] <= 0.5 * BUS_M:
+        return 0.0
+    other = rows[leader["row"]]
+    if other["driver"] == DRIVER_SCRIPTED:
+        return 0.0
+    here = roads.lanes[other["lane"]]
+    link = here["link"] if here["internal"] else travel.steps[other["way"] + other["lane"]]["link"]
+    turns: bool = link >= 0 and roads.links[link]["direction"] == TURNAROUND
+    return SWINGS_BACK_M if turns else 0.0
+
+
+@kernel
+def behind_adjacent_leader(
+    roads: RoadArrays, travel: Travel, kind: np.void, row: np.void, lane: int, scratch: Scratch
+) -> float:
+    """Return the constraint of the leader on an adjacent lane that the body covers or will."""
+    target = roads.lanes[lane]
+    s = beside_s(roads, row["lane"], lane, row["s"])
+    half = 0.5 * row["length"]
+    j = ahead_on(scratch, lane, s, row["id"], travel.view_m)
+    if j >= 0:
+        leader = scratch.entries[j]
+        return behind_entry(kind, row["speed"], leader["s"] - s - half - leader["half"], leader)
+    # Beyond the end of that lane, whichever way others have gone there.
+    constraint = no_constraint(kind)
+    for link in range(target["first_link"], target["first_link"] + target["num_links"]):
+        distance = target["length_m"] - s
+        beyond = roads.links[link]["next_lane"]
+        j = last_on(scratch, beyond, row["id"], distance, travel.view_m)
+        while j < 0 and roads.lanes[beyond]["internal"]:
+            distance += roads.lanes[beyond]["length_m"]
+            beyond = roads.lanes[beyond]["successor"]
+            j = last_on(scratch, beyond, row["id"], distance, travel.view_m)
+        if j >= 0:
+            leader = scratch.entries[j]
+            gap = distance + leader["s"] - half - leader["half"]
+            constraint = max(constraint, behind_entry(kind, row["speed"], gap, leader))
+    return constraint
+
+
+@kernel
+def _sticks_out(roads: RoadArrays, other: np.void, to_left: bool) -> bool:
+    """Whether a corner of a vehicle reaches over a side of its lane, as it crawls askew."""
+    here = roads.lanes[other["lane"]]
+    _, _, _, cos, sin, _ = lane_pose(
+        roads.points, here["first_point"], here["num_points"], other["s"]
+    )
+    across = sine(other["heading"]) * cos - cosine(other["heading"]) * sin
+    if abs(across) < ASKEW_RAD:
+        return False
+    along = math.sqrt(max(1.0 - across * across, 0.0))
+    reach = 0.5 * (other["length"] * abs(across) + other["width"] * along)
+    aside = other["d"] if to_left else -other["d"]
+    out: bool = aside + reach > 0.5 * here["width_m"] + STICKS_OUT_M
+    return out
+
+
+@kernel
+def askew_beside(
+    roads: RoadArrays,
+    travel: Travel,
+    rows: NDArray[np.void],  # VEHICLE (C,)
+    lane: int,
+    s: float,
+    own_id: int,
+    to_left: bool,  # whether it is asked of the left neighbour
+    scratch: Scratch,
+) -> tuple[int, float]:
+    """The steered vehicle that sticks out from a neighbour lane into a lane, next ahead of `s`.
+
+    Its entry, and how far ahead its centre is in m; (-1, inf) where there is none.
+    """
+    here = roads.lanes[lane]
+    neighbor = here["left"] if to_left else here["right"]
+    if neighbor < 0:
+        return -1, math.inf
+    place = beside_s(roads, lane, neighbor, s)
+    k = ahead_on(scratch, neighbor, place, own_id, travel.view_m)
+    while 0 <= k < scratch.lane_end[neighbor]:
+        entry = scratch.entries[k]
+        if entry["s"] - place > travel.view_m:
+            break
+        other = rows[entry["row"]]
+        passed_over = entry["side"] or entry["id"] == own_id or other["driver"] != DRIVER_AGENT
+        if not passed_over and _sticks_out(roads, other, not to_left):
+            return k, entry["s"] - place
+        k += 1
+    return -1, math.inf
+
+
+@kernel
+def behind_askew(
+    roads: RoadArrays,
+    travel: Travel,
+    rows: NDArray[np.void],  # VEHICLE (C,)
+    kind: np.void,
+    row: np.void,  # of an agent
+    lane: int,  # its own, or one ahead,
+    s: float,  # and where it is on it: before its start if negative
+    scratch: Scratch,
+) -> float:
+    """The constraint of steered vehicles ahead on neighbour lanes that stick out into a lane."""
+    constraint = no_constraint(kind)
+    begin = max(s, 0.0)
+    for to_left in (True, False):
+        k, apart = askew_beside(roads, travel, rows, lane, begin, row["id"], to_left, scratch)
+        apart += begin - s
+        if k >= 0 and apart <= travel.view_m:
+            leader = scratch.entries[k]
+            gap = apart - 0.5 * row["length"] - leader["half"]
+            constraint = max(constraint, behind_entry(kind, row["speed"], gap, leader))
+    return constraint

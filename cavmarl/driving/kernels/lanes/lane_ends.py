@@ -1,0 +1,179 @@
+"""What the end of a lane asks of a driver: room to change lanes, and rears that are over it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.records.arrays import RoadArrays, Scratch, Travel
+from cavmarl.core.records.codes import DRIVER_AGENT, HOLD_NONE
+from cavmarl.driving.kernels.junctions.swept_areas import VAN_M, before_foe_sweep, behind_fork
+from cavmarl.driving.kernels.lanes.adjacent_leaders import behind_adjacent_leader, behind_entry
+from cavmarl.driving.kernels.lanes.lane_choice import LEAST_SWAP_M, MERGE_ROOM_SHARE, SWAP_ROOM_M
+from cavmarl.driving.kernels.lanes.lane_index import beside_s, last_on
+from cavmarl.driving.kernels.lanes.route_following import next_step
+from cavmarl.driving.kernels.lanes.side_clearance import LONGEST_HALF_M
+from cavmarl.driving.kernels.models.following import (
+    LINE_MARGIN_M,
+    before_line,
+    behind,
+    no_constraint,
+)
+
+
+@kernel
+def lane_end(
+    roads: RoadArrays,
+    travel: Travel,
+    row: np.void,
+    kind: np.void,
+    lane: int,
+    way: int,
+    distance: float,
+    merge_room_m: float,
+    dt: float,
+) -> float:
+    """The constraint of the end of a lane from which the way goes on only after a lane change."""
+    step = travel.steps[way + lane]
+    if step["to_go"] < math.inf and step["change"] == 0:
+        return no_constraint(kind)
+    # Stop with room enough to swing out, but on this lane and not before it.
+    length = roads.lanes[lane]["length_m"]
+    half = 0.5 * row["length"]
+    room = min(merge_room_m, MERGE_ROOM_SHARE * length)
+    if step["change"] > 0 and merge_room_m > 0.0:
+        swap = SWAP_ROOM_M
+        if row["driver"] != DRIVER_AGENT:  # it steers without room: on short lanes its rear counts
+            swap = min(swap, length - room - 2.0 * (row["length"] + LINE_MARGIN_M))
+            swap = max(swap, LEAST_SWAP_M)
+        room += row["length"] + swap
+    place = max(length - half - room, min(2.0 * LINE_MARGIN_M, 0.5 * length))
+    return before_line(kind, row["speed"], distance - length + place, dt)
+
+
+@kernel
+def _behind_turning(
+    roads: RoadArrays, kind: np.void, row: np.void, lane: int, distance: float, scratch: Scratch
+) -> float:
+    """The constraint of long vehicles that turn off from beside a lane that leads nowhere.
+
+    `distance`: of the row's centre to the end of that lane, in m. Their rears swing out over
+    it, and without a link it has no swept areas.
+    """
+    constraint = no_constraint(kind)
+    for neighbor in (roads.lanes[lane]["left"], roads.lanes[lane]["right"]):
+        if neighbor < 0:
+            continue
+        first = roads.lanes[neighbor]["first_link"]
+        for link in range(first, first + roads.lanes[neighbor]["num_links"]):
+            for k in range(scratch.link_start[link], scratch.link_end[link]):
+                other = scratch.approach[k]
+                rear = -other["dist"] - other["half"]
+                gap = distance - 0.5 * row["length"] + rear
+                if 2.0 * other["half"] <= VAN_M or gap < 0.0 or rear > 0.0:
+                    continue
+                if other["half"] > other["dist"]:
+                    found = behind(kind, row["speed"], gap, other["speed"], kind["decel"])
+                    constraint = max(constraint, found)
+    return constraint
+
+
+@kernel
+def misses_change(roads: RoadArrays, travel: Travel, lane: int, way: int) -> bool:
+    """Whether a lane that the way leaves sideways leads on to a turn that a car cannot take."""
+    if roads.lanes[lane]["internal"]:
+        return False
+    step = travel.steps[way + lane]
+    if step["link"] < 0 or step["change"] == 0:
+        return False
+    beyond = travel.steps[way + step["shift"] + roads.links[step["link"]]["to_lane"]]
+    misses: bool = beyond["turnarounds"] > step["turnarounds"]
+    return misses
+
+
+@kernel
+def behind_over_line(
+    roads: RoadArrays,
+    travel: Travel,
+    row: np.void,
+    kind: np.void,
+    lane: int,
+    way: int,
+    distance: float,
+    scratch: Scratch,
+) -> float:
+    """The constraint of a vehicle whose rear is still before the line, behind a short first lane.
+
+    `lane`: that lane, which begins at the line, `distance` m ahead.
+    """
+    line = distance
+    while distance - line < LONGEST_HALF_M:
+        distance += roads.lanes[lane]["length_m"]
+        lane, way, _ = next_step(roads, travel, lane, way)
+        if lane < 0:
+            break
+        j = last_on(scratch, lane, row["id"], distance, travel.view_m)
+        if j >= 0:
+            leader = scratch.entries[j]
+            rear = distance + leader["s"] - leader["half"]
+            if rear < line:
+                return behind_entry(kind, row["speed"], rear - 0.5 * row["length"], leader)
+            break
+    return no_constraint(kind)
+
+
+@inlined_kernel
+def over_end(
+    roads: RoadArrays,
+    rows: NDArray[np.void],
+    i: int,
+    kind: np.void,
+    lane: int,
+    distance: float,
+    is_near: bool,
+    dt: float,
+    scratch: Scratch,
+) -> float:
+    """Constraint of row i by bodies over the end of a lane, `distance` m ahead, that it stops at.
+
+    Wherever it goes from there, a vehicle that has left the lane by any link may still have its
+    rear over the end, and others, which a background driver minds where that `is_near`, turn over
+    it.
+    """
+    row = rows[i]
+    constraint = behind_fork(roads, kind, row, lane, -1, distance, scratch)
+    if not is_near or row["driver"] == DRIVER_AGENT:
+        return constraint
+    if roads.lanes[lane]["num_links"] == 0:
+        return max(constraint, _behind_turning(roads, kind, row, lane, distance, scratch))
+    first, front = roads.lanes[lane]["first_link"], distance - 0.5 * row["length"]
+    swept = before_foe_sweep(roads, rows, i, kind, first, front, HOLD_NONE, dt, scratch)
+    return max(constraint, swept)
+
+
+@kernel
+def behind_beside(
+    roads: RoadArrays,
+    travel: Travel,
+    rows: NDArray[np.void],
+    i: int,
+    kind: np.void,
+    see_m: float,
+    dt: float,
+    scratch: Scratch,
+) -> float:
+    """The constraint of the lane beside that row i's body still covers, up to the end of it.
+
+    `see_m`: how near the end has to be, for those that turn over it to be asked about.
+    """
+    row = rows[i]
+    lane = row["side_lane"]
+    constraint = behind_adjacent_leader(roads, travel, kind, row, lane, scratch)
+    distance = roads.lanes[lane]["length_m"] - beside_s(roads, row["lane"], lane, row["s"])
+    if distance > 0.5 * row["length"]:
+        over = over_end(roads, rows, i, kind, lane, distance, distance < see_m, dt, scratch)
+        constraint = max(constraint, over)
+    return constraint

@@ -1,0 +1,108 @@
+"""Route following: which lane and link a vehicle takes at the end of a lane.
+
+All plans lie in one table, `Travel.steps`. A vehicle's `way` says where in it: the step of a lane
+outside junctions is `steps[way + lane]`. The plan of a goal covers every lane, so its way never
+changes. An explicit route has steps for its own edges only, one edge after the other; each step
+says by how much the way shifts on the next edge. Inside junctions lanes have one successor.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.records.arrays import RoadArrays, Travel
+from cavmarl.roads.kernels.signal_phases import program_at
+
+MOST_CHANGES = 8  # of lanes at the end of one lane
+
+
+@inlined_kernel
+def own_step(roads: RoadArrays, row: np.void) -> int:
+    """Where in `Travel.steps` a vehicle is: at its lane's step, in a junction at the next one's."""
+    lane = row["lane"]
+    if roads.lanes[lane]["internal"]:
+        lane = roads.links[roads.lanes[lane]["link"]]["to_lane"]
+    return int(row["way"] + lane)
+
+
+@inlined_kernel
+def next_step_from(roads: RoadArrays, step: np.void, lane: int, way: int) -> tuple[int, int, int]:
+    """`next_step` from the lane that a vehicle is on, whose own step is known."""
+    if roads.lanes[lane]["internal"]:
+        return roads.lanes[lane]["successor"], way, -1
+    return step["next"], way + step["shift"], step["link"]
+
+
+@inlined_kernel
+def next_step(roads: RoadArrays, travel: Travel, lane: int, way: int) -> tuple[int, int, int]:
+    """What follows the end of a lane: (lane, way there, link that is entered).
+
+    The lane is -1 where the way ends or goes on from another lane; the link is -1 inside junctions.
+    """
+    if roads.lanes[lane]["internal"]:
+        return roads.lanes[lane]["successor"], way, -1
+    step = travel.steps[way + lane]
+    return step["next"], way + step["shift"], step["link"]
+
+
+@inlined_kernel
+def fed_lane(roads: RoadArrays, lane: int) -> int:
+    """A lane, or where no link leads into it the one beside it into which one does."""
+    row = roads.lanes[lane]
+    if row["num_into"] == 0:
+        for side in (row["left"], row["right"]):
+            if side >= 0 and roads.lanes[side]["num_into"] > 0:
+                return int(side)
+    return lane
+
+
+@inlined_kernel
+def distance_left(roads: RoadArrays, row: np.void, step: np.void) -> float:
+    """Return the distance in m from a vehicle's centre to the end of its way; inf without one.
+
+    `step` is its own one.
+    """
+    here = roads.lanes[row["lane"]]
+    left = -row["s"]
+    if here["internal"]:
+        left += roads.links[here["link"]]["length_m"] - here["link_offset_m"]
+    return float(step["to_go"] + left)
+
+
+@kernel
+def next_step_of_plan(
+    roads: RoadArrays, travel: Travel, lane: int, way: int
+) -> tuple[int, int, int]:
+    """`next_step`, from the lane that the plan asks for where it does not go on from this one."""
+    for _ in range(MOST_CHANGES):
+        following, way_there, link = next_step(roads, travel, lane, way)
+        if following >= 0 or roads.lanes[lane]["internal"]:
+            return following, way_there, link
+        change = travel.steps[way + lane]["change"]
+        if change == 0:
+            break
+        lane = roads.lanes[lane]["left"] if change > 0 else roads.lanes[lane]["right"]
+        if lane < 0:
+            break
+    return -1, way, -1
+
+
+@kernel
+def route_time_s(roads: RoadArrays, travel: Travel, row: np.void, begin_s: float) -> float:
+    """Return the time in s of a route at its limits, times `Travel.trip_horizon`, and signals.
+
+    Each signal counts with a whole cycle of the program that is on at `begin_s`.
+    """
+    lane, way = row["lane"], row["way"]
+    free_s = -row["s"] / roads.lanes[lane]["speed_mps"]
+    signals_s = 0.0
+    for _ in range(roads.lanes.shape[0]):
+        free_s += roads.lanes[lane]["length_m"] / roads.lanes[lane]["speed_mps"]
+        lane, way, link = next_step_of_plan(roads, travel, lane, way)
+        if lane < 0:
+            break
+        if link >= 0 and roads.links[link]["signal"] >= 0:
+            program = program_at(roads, roads.links[link]["signal"], begin_s, travel.tick_s)
+            signals_s += roads.programs[program]["cycle_s"]
+    return float(travel.trip_horizon * free_s + signals_s)

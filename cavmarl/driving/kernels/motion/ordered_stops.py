@@ -1,0 +1,81 @@
+"""Ordered stops: bus stops, deliveries, and other stops that a demand file asks for."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cavmarl.core.compiled import inlined_kernel
+from cavmarl.core.records.arrays import RoadArrays, Travel
+from cavmarl.core.records.codes import UNTIL_DEPARTURE
+
+STANDING_MPS = 0.1
+STOPPED_M = 3.0  # a front this far before the place has reached it
+PASSED_M = 1.0  # a front this far beyond it will not stop there any more
+STAY = 2  # result of `change_for_stop`
+LANE_EARLY_M = 100.0  # this far before it the driver wants its lane
+
+
+@inlined_kernel
+def distance_to_stop(roads: RoadArrays, travel: Travel, row: np.void) -> float:
+    """Return the distance in m from a vehicle's front to its next stop on this edge, or inf."""
+    if row["stop"] < 0 or row["stop"] == row["stops_end"]:
+        return np.inf
+    stop = travel.stops[row["stop"]]
+    lane = roads.lanes[row["lane"]]
+    place = roads.lanes[stop["lane"]]
+    if place["edge"] != lane["edge"]:
+        return np.inf
+    left = float(
+        stop["end"] * lane["length_m"] / place["length_m"] - row["s"] - 0.5 * row["length"]
+    )
+    return left if left > -PASSED_M else np.inf
+
+
+@inlined_kernel
+def change_for_stop(roads: RoadArrays, travel: Travel, row: np.void) -> int:
+    """Return the side to which a vehicle has to change for its next stop: 1 left, -1 right, 0 none.
+
+    The result is `STAY` if it is on that lane already.
+    """
+    if distance_to_stop(roads, travel, row) > LANE_EARLY_M:
+        return 0
+    stop = travel.stops[row["stop"]]
+    if stop["lane"] == row["lane"]:
+        return STAY
+    inwards = 1 if stop["lane"] > row["lane"] else -1
+    # Lanes count from the kerb: where one drives on the left, the next one lies to the right.
+    here = roads.lanes[row["lane"]]
+    mirrored = here["right"] == row["lane"] + 1 or here["left"] == row["lane"] - 1
+    return -inwards if mirrored else inwards
+
+
+@inlined_kernel
+def advance_stop(
+    roads: RoadArrays,
+    travel: Travel,  # with the stops
+    row: np.void,  # VEHICLE after the tick, written
+    lane_before: int,  # LANE that it was on before
+    dt: float,  # seconds a tick
+) -> None:
+    """Count the time that a vehicle has spent at its stop, and end the stop when it is over.
+
+    A stop that the vehicle has passed is skipped.
+    """
+    if row["stop"] < 0 or row["stop"] == row["stops_end"]:
+        return
+    stop = travel.stops[row["stop"]]
+    edge = roads.lanes[stop["lane"]]["edge"]
+    left = distance_to_stop(roads, travel, row)
+    if left <= STOPPED_M and row["speed"] < STANDING_MPS:
+        row["stopped_s"] += dt
+        row["wait_s"] = 0.0
+        now = travel.begin_s + row["tick"] * dt
+        until = stop["until"]
+        if until >= 0.0 and stop["until_from"] == UNTIL_DEPARTURE:
+            until += travel.begin_s + row["departed"] * dt
+        if row["stopped_s"] >= stop["duration"] and now >= until:
+            row["stop"] += 1
+            row["stopped_s"] = 0.0
+    elif roads.lanes[lane_before]["edge"] == edge and left == np.inf:
+        row["stop"] += 1
+        row["stopped_s"] = 0.0

@@ -1,0 +1,101 @@
+"""Rows that follow a script: pedestrians, and the vehicles of scenarios.
+
+A script is made before the first step: one FRAME a tick, each of which says which one follows. At
+some it waits until its cue has come. So where a row is depends on its frame and the cues alone,
+and every owner of the row moves it the same way.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.records.arrays import RoadArrays, Travel
+from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_BACKGROUND
+from cavmarl.driving.kernels.lanes.route_following import distance_left, own_step
+from cavmarl.driving.kernels.motion.motion import account, before_tick
+
+
+@inlined_kernel
+def stand_at(frame: np.void, row: np.void) -> None:
+    """Put a row where a FRAME says."""
+    row["x"] = frame["x"]
+    row["y"] = frame["y"]
+    row["z"] = frame["z"]
+    row["heading"] = frame["heading"]
+    row["pitch"] = frame["pitch"]
+    row["speed"] = frame["speed"]
+    row["lane"] = frame["lane"]
+    row["target_lane"] = frame["lane"]
+    row["link"] = frame["link"]
+    row["s"] = frame["s"]
+    row["d"] = frame["d"]
+
+
+@inlined_kernel
+def _let_go(roads: RoadArrays, travel: Travel, row: np.void, goal: int) -> None:
+    """Make a row that of a background vehicle on its way to a goal."""
+    row["driver"] = DRIVER_BACKGROUND
+    row["goal"] = goal
+    row["way"] = goal * roads.lanes.shape[0]
+    row["to_go"] = distance_left(roads, row, travel.steps[own_step(roads, row)])
+
+
+@inlined_kernel
+def follow_script(
+    roads: RoadArrays,
+    travel: Travel,  # with the scripts
+    cues: NDArray[np.int64],  # (T,) the tick in which each came, -1: not yet
+    row: np.void,  # VEHICLE, the committed record, which becomes the next one
+    dt: float,  # seconds of the tick
+) -> None:
+    """Advance a row that follows a script by one tick."""
+    before = before_tick(row)
+    frame = travel.scripts.frames[row["goal"]]
+    if frame["cue"] < 0 or cues[frame["cue"]] >= 0:
+        row["goal"] = frame["following"]
+        frame = travel.scripts.frames[row["goal"]]
+    stand_at(frame, row)
+    account(row, before, roads, row["speed_factor"], dt)
+    if frame["released_to"] >= 0:
+        _let_go(roads, travel, row, frame["released_to"])
+
+
+@kernel
+def note_cues(
+    cues: NDArray[np.void],  # CUE (T,)
+    rows: NDArray[np.void],  # VEHICLE (k, W, C), the committed ones of all zones
+    num_owned: NDArray[np.int64],  # (k, W)
+    ticks: NDArray[np.int64],  # (W,) since reset
+    came: NDArray[np.int64],  # (W, T) the tick in which each came, -1: not yet; written
+) -> None:
+    """Note which cues come in this tick: at their time, or as soon as an agent is near a place.
+
+    An any-of over all agents of a world: neither the order of rows nor their owners matter.
+    """
+    for w in range(ticks.size):
+        for c in range(cues.size):
+            cue = cues[c]
+            if came[w, c] >= 0:
+                continue
+            if cue["tick"] >= 0:
+                if ticks[w] >= cue["tick"]:
+                    came[w, c] = ticks[w]
+                continue
+            for zone in range(rows.shape[0]):
+                if _any_near(cue, rows[zone, w], num_owned[zone, w]):
+                    came[w, c] = ticks[w]
+                    break
+
+
+@kernel
+def _any_near(cue: np.void, rows: NDArray[np.void], num: int) -> bool:
+    for i in range(num):
+        row = rows[i]
+        if row["driver"] == DRIVER_AGENT:
+            dx = row["x"] - cue["x"]
+            dy = row["y"] - cue["y"]
+            if dx * dx + dy * dy <= cue["radius_m"] * cue["radius_m"]:
+                return True
+    return False

@@ -1,0 +1,66 @@
+"""Speed limits ahead: how fast a driver may be before a lower limit or a sharp bend."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from cavmarl.core.compiled import inlined_kernel, kernel
+from cavmarl.core.math.elementary import atan2
+from cavmarl.core.records.arrays import RoadArrays
+
+LIMIT_DECEL = 2.0  # m/s², how a driver slows for a bend, or a lower limit ahead
+LIMIT_LEAD_S = 1.0  # to be down this time before it, as the model lags behind what is allowed
+LATERAL_ACCEL = 2.5  # m/s², with which a steered car takes a bend: where a lane turns
+MIN_BEND_RAD = 0.2  # by more than this
+BEND_M = 6.0  # within this length
+
+
+@kernel
+def bend_speed(roads: RoadArrays, before: int, lane: int, distance: float) -> float:
+    """Return the speed in m/s, now, at which a steered car can take all bends of a lane in comfort.
+
+    `distance` is the way to the start of the lane in m, negative on it; there it comes from the
+    lane `before`, which is the same where it is on it.
+    """
+    row = roads.lanes[lane]
+    first = row["first_point"]
+    last = first + row["num_points"] - 1
+    slowest = math.inf
+    for k in range(first if before != lane else first + 1, last):
+        to_bend = distance + roads.points[k]["s"]
+        if to_bend < -BEND_M:
+            continue
+        straight = roads.points[k - 1]
+        if k == first:
+            straight = roads.points[
+                roads.lanes[before]["first_point"] + roads.lanes[before]["num_points"] - 1
+            ]
+        m = k
+        while m < last - 1 and roads.points[m + 1]["s"] - roads.points[k]["s"] < BEND_M:
+            m += 1
+        after = roads.points[m]
+        bend = abs(
+            atan2(
+                straight["cos"] * after["sin"] - straight["sin"] * after["cos"],
+                straight["cos"] * after["cos"] + straight["sin"] * after["sin"],
+            )
+        )
+        if bend > MIN_BEND_RAD:
+            squared = LATERAL_ACCEL * BEND_M / bend + 2.0 * LIMIT_DECEL * max(to_bend, 0.0)
+            slowest = min(slowest, math.sqrt(squared))
+    return slowest
+
+
+@inlined_kernel
+def speed_before_limit(
+    kind: np.void, limit: float, distance: float, speed: float, dt: float
+) -> float:
+    """Return the speed in m/s from which a driver can slow down to a limit `distance` m ahead."""
+    decel = LIMIT_DECEL
+    lead_s = LIMIT_LEAD_S
+    if kind["as_sumo"]:
+        decel = kind["decel"]
+        lead_s = dt
+    return math.sqrt(limit * limit + 2.0 * decel * max(distance - lead_s * speed, 0.0))

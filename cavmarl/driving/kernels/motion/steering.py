@@ -1,0 +1,212 @@
+"""How an action becomes throttle and steering: meta-actions, and the controllers behind them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.compiled import kernel
+from cavmarl.core.math.elementary import asin, atan2, cosine, sine, tangent
+from cavmarl.core.math.geometry import lane_pose, project, wrap_angle
+from cavmarl.core.math.scalars import clamp
+from cavmarl.core.records.arrays import RoadArrays
+from cavmarl.core.records.codes import (
+    ACTION_FASTER,
+    ACTION_LANE_LEFT,
+    ACTION_LANE_RIGHT,
+    ACTION_SLOWER,
+)
+from cavmarl.driving.kernels.motion.highway_control import (
+    MAX_STEERING_RAD,
+    PURSUIT_S,
+    steering_control,
+)
+
+AIM_M = 4.0  # in a bend a driver aims at a place of the way so far ahead, or further:
+AIM_S = 0.6  # where it is after this time,
+AIM_RAD = 0.1  # if that lies so far aside of where the lane leads here
+MAX_AIM_LANES = 8  # that lie between, at most
+# Over junctions it aims nearer, and further again by this times the way by which an arc of the
+# turning circle begins before one of the path, but not further than this times the angle in rad.
+TURN_AIM_M = 3.0
+AIM_EARLIER = 1.5
+AIM_M_PER_RAD = 2.6
+MOST_AIM_M = 7.0
+MOST_TURN_RAD = 2.8  # a sharper turn counts as this
+CUT_RADIUS_M = 6.0  # a turn of this radius is cut,
+WIDE_RADIUS_M = 9.0  # one of that is followed
+NEAR_TURN_M = 10.0  # before it, a junction counts as one
+TURN_MPS = 3.5  # in and behind junctions a slower car steers as one that turns at this speed
+TURNING_RATIO = 1.118  # radius of the turning circle over the wheelbase, wheels turned by 45°
+SLOW_MPS = 3.0  # a slower car on its way to a lane may stop askew:
+SWING_OUT_M = 0.1  # its front does not reach further over the far side of that lane
+CHORD_M = 1.5  # real lanes have corners: their direction is that of a chord, this far to both sides
+
+
+@kernel
+def nearest_speed(target_speeds: NDArray[np.float64], speed: float) -> int:
+    """Index of the target speed nearest to `speed`; of two, the lower one."""
+    best = 0
+    for k in range(1, target_speeds.shape[0]):
+        if abs(target_speeds[k] - speed) < abs(target_speeds[best] - speed):
+            best = k
+    return best
+
+
+@kernel
+def take_meta_action(
+    roads: RoadArrays, row: np.void, action: int, target_speeds: NDArray[np.float64]
+) -> None:
+    """Set target lane and target speed of a vehicle as highway-env's `MDPVehicle` does.
+
+    FASTER and SLOWER step from the present target speed; a lane change asks for the neighbour of
+    the present lane and is ignored where there is none.
+    """
+    k = nearest_speed(target_speeds, row["target_speed"])
+    if action == ACTION_FASTER:
+        k = min(k + 1, target_speeds.shape[0] - 1)
+    elif action == ACTION_SLOWER:
+        k = max(k - 1, 0)
+    elif action == ACTION_LANE_LEFT and roads.lanes[row["lane"]]["left"] >= 0:
+        row["target_lane"] = roads.lanes[row["lane"]]["left"]
+    elif action == ACTION_LANE_RIGHT and roads.lanes[row["lane"]]["right"] >= 0:
+        row["target_lane"] = roads.lanes[row["lane"]]["right"]
+    row["target_speed"] = target_speeds[k]
+
+
+@kernel
+def steer_to_lane(
+    roads: RoadArrays, plans: NDArray[np.void], row: np.void, target_lane: int, wheelbase: float
+) -> float:
+    """The steering angle in rad that brings a vehicle to the middle of a lane.
+
+    `wheelbase` is its own one, in m.
+
+    A target that is neither the vehicle's lane nor a neighbour of it counts as the lane it is on.
+    Beyond the lane's end the lane that the plan names goes on.
+    """
+    lane = row["lane"]
+    here = roads.lanes[lane]
+    if target_lane >= 0 and (target_lane == here["left"] or target_lane == here["right"]):
+        lane = target_lane
+        here = roads.lanes[lane]
+    s, d, _, _ = project(roads.points, here["first_point"], here["num_points"], row["x"], row["y"])
+    ahead = s + row["speed"] * PURSUIT_S
+    following = plans[row["goal"], lane]["next"]
+    if s > here["length_m"] and following >= 0:
+        ahead -= here["length_m"]
+        lane = following
+        here = roads.lanes[lane]
+        s, d, _, _ = project(
+            roads.points, here["first_point"], here["num_points"], row["x"], row["y"]
+        )
+    aimed = _aim(roads, plans, row, lane, s, wheelbase)
+    if aimed < math.inf:
+        return aimed
+    direction = _direction_at(roads, plans, row["goal"], lane, ahead)
+    turned = wrap_angle(direction - row["heading"])
+    if row["speed"] < SLOW_MPS and d * turned > 0.0 and not here["internal"]:
+        room = 0.5 * here["width_m"] + SWING_OUT_M - 0.5 * row["width"] + abs(d)
+        most = asin(clamp(2.0 * room / row["length"], 0.0, 1.0))
+        if abs(turned) > most:
+            d, turned = 0.0, math.copysign(abs(turned) - most, turned)
+    pace = row["speed"]
+    if 0.0 <= pace < TURN_MPS and (here["internal"] or s < NEAR_TURN_M):
+        pace = TURN_MPS
+    return steering_control(pace, d, turned, wheelbase)
+
+
+@kernel
+def _aim_m(
+    roads: RoadArrays, plans: NDArray[np.void], row: np.void, lane: int, s: float, wheelbase: float
+) -> tuple[float, float]:
+    """How far ahead a driver aims in a bend, in m, and how exactly it follows it, from 0 to 1.
+
+    The tighter a turn is, the further ahead, and the more it cuts the corner: that of the kerb, so
+    that its front does not swing over the middle of the road.
+    """
+    here = roads.lanes[lane]
+    link = here["link"]
+    if not here["internal"]:
+        if s < here["length_m"] - NEAR_TURN_M:
+            return AIM_M, 1.0
+        link = plans[row["goal"], lane]["link"]
+    if link < 0 or roads.links[link]["length_m"] == 0.0:
+        return AIM_M, 1.0
+    turned = roads.links[link]
+    before = roads.lanes[turned["from_lane"]]
+    last = roads.points[before["first_point"] + before["num_points"] - 1]
+    first = roads.points[roads.lanes[turned["to_lane"]]["first_point"]]
+    turn = abs(wrap_angle(first["heading"] - last["heading"]))
+    if turn < AIM_RAD:
+        return AIM_M, 1.0
+    radius_m = turned["length_m"] / turn
+    missing_m = max(TURNING_RATIO * wheelbase - radius_m, 0.0)
+    earlier_m = missing_m * tangent(0.5 * min(turn, MOST_TURN_RAD))
+    most_m = min(AIM_M_PER_RAD * turn, MOST_AIM_M)
+    aim_m = max(min(TURN_AIM_M + AIM_EARLIER * earlier_m, most_m), TURN_AIM_M)
+    return aim_m, clamp((radius_m - CUT_RADIUS_M) / (WIDE_RADIUS_M - CUT_RADIUS_M), 0.0, 1.0)
+
+
+@kernel
+def _aim(
+    roads: RoadArrays, plans: NDArray[np.void], row: np.void, lane: int, s: float, wheelbase: float
+) -> float:
+    """The steering angle in rad that brings a vehicle round a bend; inf where there is none.
+
+    Pure pursuit: the arc through a place of the way ahead. So the car turns in before a bend that
+    is tighter than its turning circle. Coulter: "Implementation of the pure pursuit path tracking
+    algorithm", CMU-RI-TR-92-01.
+    """
+    here = roads.lanes[lane]
+    x0, y0, _, cos, sin, _ = lane_pose(roads.points, here["first_point"], here["num_points"], s)
+    aim_m, exact = _aim_m(roads, plans, row, lane, s, wheelbase)
+    aim_m = max(aim_m, AIM_S * row["speed"])
+    x, y = _point_at(roads, plans, row["goal"], lane, s + aim_m)
+    aside = atan2(cos * (y - y0) - sin * (x - x0), cos * (x - x0) + sin * (y - y0))
+    if abs(aside) < AIM_RAD:
+        return math.inf
+    x -= row["x"]
+    y -= row["y"]
+    apart = math.sqrt(x * x + y * y)
+    bearing = wrap_angle(atan2(y, x) - row["heading"])
+    if abs(bearing) > 0.5 * math.pi:
+        return math.copysign(MAX_STEERING_RAD, bearing)
+    # The arc that the middle of the rear drives, whose heading is the car's, and that of its centre
+    # if this went where it heads.
+    apart = max(apart, TURN_AIM_M)
+    aside_m = wheelbase * sine(abs(bearing))
+    following = atan2(2.0 * aside_m, apart + wheelbase * cosine(bearing))
+    sin_slip = min(aside_m / apart, 1.0)
+    cutting = atan2(2.0 * sin_slip, math.sqrt(1.0 - sin_slip * sin_slip))
+    steering = exact * following + (1.0 - exact) * cutting
+    return math.copysign(min(steering, MAX_STEERING_RAD), bearing)
+
+
+@kernel
+def _point_at(
+    roads: RoadArrays, plans: NDArray[np.void], goal: int, lane: int, s: float
+) -> tuple[float, float]:
+    """The place at `s` of a lane, beyond its end on those that the plan names."""
+    here = roads.lanes[lane]
+    for _ in range(MAX_AIM_LANES):
+        following = plans[goal, lane]["next"]
+        if s <= here["length_m"] or following < 0:
+            break
+        s -= here["length_m"]
+        lane = following
+        here = roads.lanes[lane]
+    x, y, _, _, _, _ = lane_pose(roads.points, here["first_point"], here["num_points"], s)
+    return x, y
+
+
+@kernel
+def _direction_at(
+    roads: RoadArrays, plans: NDArray[np.void], goal: int, lane: int, s: float
+) -> float:
+    """Direction of the way around place `s` of a lane in rad."""
+    x0, y0 = _point_at(roads, plans, goal, lane, s - CHORD_M)
+    x1, y1 = _point_at(roads, plans, goal, lane, s + CHORD_M)
+    return atan2(y1 - y0, x1 - x0)

@@ -1,0 +1,56 @@
+"""The extras of `pyproject.toml`: errors name those that there are, and `all` has the tasks."""
+
+from __future__ import annotations
+
+import ast
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+ROOT = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
+# Their packages fit no other versions of libraries, or not every machine.
+APART = {"benchmarl", "rllib", "lanelet2"}
+TOOLS = {"all", "bench", "dev", "fuzz"}
+
+
+def named_extras() -> Iterator[tuple[str, str]]:
+    """Yield (extra, file) of each call of `require` or `missing`."""
+    for folder in ("cavmarl", "benchmarks", "docs", "train"):
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            for node in ast.walk(ast.parse(path.read_bytes())):
+                if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Name):
+                    continue
+                if node.func.id in ("require", "missing") and len(node.args) == 2:
+                    extra = node.args[1]
+                    if isinstance(extra, ast.Constant):
+                        yield extra.value, path.relative_to(ROOT).as_posix()
+
+
+def reached(extra: str) -> set[str]:
+    """Return an extra and those of cavmarl that it asks for."""
+    found = {extra}
+    for line in EXTRAS[extra]:
+        need = Requirement(line)
+        if need.name == "cavmarl":
+            found = found.union(*map(reached, need.extras))
+    return found
+
+
+def test_errors_name_extras_that_there_are() -> None:
+    named = list(named_extras())
+    assert len(named) > 50
+    assert not [(extra, file) for extra, file in named if extra not in EXTRAS]
+
+
+def test_all_has_each_task_whose_packages_fit_together() -> None:
+    assert reached("all") == set(EXTRAS) - APART - TOOLS | {"all"}
+
+
+@pytest.mark.parametrize("extra", ["all", "bench"])
+def test_a_developer_has_all_and_what_is_compared_with(extra: str) -> None:
+    assert extra in reached("dev")
