@@ -12,8 +12,8 @@ from cavmarl.core.math.neighbors import Grid, fill_grid
 from cavmarl.core.records.arrays import LaneGrid, RoadArrays, Travel, Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.sensors.kernels.frame_stacks import has_entered, newest_frame
-from cavmarl.sensors.kernels.kinematics_observation import KinematicsSensor, observe_kinematics
 from cavmarl.sensors.kernels.highway_lidar import LidarCells, observe_lidar_cells
+from cavmarl.sensors.kernels.kinematics_observation import KinematicsSensor, observe_kinematics
 from cavmarl.sensors.kernels.nearest_road_points import RoadgraphSensor, observe_roadgraph
 from cavmarl.sensors.kernels.observing_conflicts import (
     ConflictsSensor,
