@@ -21,9 +21,9 @@ from cavmarl.engine.shared_outputs import SharedOutputs
 from cavmarl.engine.tick_setup import make_frames, make_tick
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.observed import carried_from
-from cavmarl.shards.executor import SerialExecutor
 from cavmarl.shards.shard import Commands, common_of
 from cavmarl.shards.shard_backend import VehicleControl
+from cavmarl.shards.shard_group import ShardGroup
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
 
@@ -52,7 +52,7 @@ class KinematicShard:
         self._shared = shared
         self._refuse_what_is_shared(config, network)
         self._shard = tick.shards[zone]
-        tick.executor = self._executor = SerialExecutor([self._shard])
+        tick.executor = self._executor = ShardGroup([self._shard])
         self.zone = zone
         self.reach_m = tick.division.halo.halo_m
         self._per_step = config.clock.ticks_per_step
@@ -126,8 +126,8 @@ class KinematicShard:
         """Move the owned vehicles to the next tick."""
         worlds = self._shard.worlds
         if worlds.ticks[0] % self._per_step == 0:
-            self._executor.each("begin_step", self._commands)
-        self._executor.each("advance", self._commands)
+            self._executor.begin_step(self._commands)
+        self._executor.advance(self._commands)
         self._tick.leave()
         self._tick.gate.num_queue[:] = 0  # those that would follow are others' to spawn
         self._is_moved = True
@@ -149,8 +149,8 @@ class KinematicShard:
 
     def commit(self) -> int:
         """End the tick; its number."""
-        self._executor.each("resolve")
-        self._executor.each("commit")
+        self._executor.resolve()
+        self._executor.commit()
         self._is_moved = False
         worlds = self._shard.worlds
         worlds.ticks[0] += 1

@@ -92,6 +92,23 @@ def bind(kernel: Callable[P, R], *arguments: P.args, **named: P.kwargs) -> Bound
     return BoundCall(kernel, bound.args)
 
 
+def keep_last(make: Callable[P, R]) -> Callable[P, R]:
+    """Return a function that calls `make` only if an argument is not the one of the last call."""
+    last: list[Any] = [None, None]
+
+    def find(*arguments: P.args, **named: P.kwargs) -> R:
+        known = last[0]
+        if known is None or not all(map(_is_same, arguments, known)) or named:
+            last[:] = arguments, make(*arguments, **named)
+        return cast(R, last[1])
+
+    return find
+
+
+def _is_same(one: Any, other: Any) -> bool:
+    return one is other or (type(one) in (int, float) and one == other)
+
+
 class CallSequence:
     """Bound calls in their order; some only if the result of an earlier call is true."""
 

@@ -94,7 +94,9 @@ class Kernel:
 class TypedKernel:
     """A kernel for arguments of certain types."""
 
-    __slots__ = ("address", "enter", "name", "num_words", "offsets", "read_result", "types", "words")
+    __slots__ = (
+        "address", "enter", "name", "num_words", "offsets", "read_result", "types", "words",
+    )  # fmt: skip
 
     def __init__(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
         self.name = function.__name__

@@ -6,8 +6,6 @@ depends on the order of rows.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -35,7 +33,6 @@ from cavmarl.driving.kernels.approach import register_links
 from cavmarl.driving.kernels.contacts import find_contacts
 from cavmarl.driving.kernels.drivers import decide
 from cavmarl.driving.kernels.gaps import STOOD_S
-from cavmarl.driving.kernels.held_vehicles import most_accel
 from cavmarl.driving.kernels.highway_control import speed_control
 from cavmarl.driving.kernels.junctions import note_stop
 from cavmarl.driving.kernels.lane_choice import needed_change
@@ -123,7 +120,6 @@ def _drive_agent(
     discrete: bool,
     accel_limit: float,
     steering_limit: float,
-    most: float,  # m/s², if it is held
     dt: float,
 ) -> None:
     """Move an agent's vehicle by its command or by the controllers, unless its trip is over."""
@@ -142,7 +138,6 @@ def _drive_agent(
     throttle, steering = _delay(
         worlds.pending, w, row["agent"], worlds.ticks[w], throttle, steering
     )
-    throttle = min(throttle, most)
     move_agent(roads, plans, lane_grid, row, kind, throttle, steering, worlds.signal_phase[w], dt)
     if row["due"] >= 0 and row["tick"] >= row["due"]:
         row["events"] |= EVENT_OUT_OF_TIME
@@ -182,7 +177,6 @@ def _drive_in_background(
     row: np.void,
     step: np.void,
     i: int,  # the row that was decided for
-    most: float,  # m/s², if it is held
     dt: float,
     scratch: Scratch,
 ) -> int:
@@ -192,7 +186,7 @@ def _drive_in_background(
     row["blinker"] = scratch.blinker[i]
     if scratch.link_ahead[i] >= 0 and row["wait_s"] >= STOOD_S:
         row["stopped_at"] = scratch.link_ahead[i]
-    accel, change = min(scratch.accel[i], most), scratch.lane_change[i]
+    accel, change = scratch.accel[i], scratch.lane_change[i]
     move_background(roads, travel, row, step, accel, change, dt)
     return row["events"] & EVENT_ARRIVED  # type: ignore[no-any-return]
 
@@ -205,8 +199,6 @@ def advance(
     lane_grid: LaneGrid,  # which lanes lie near a place
     worlds: Worlds,  # next_rows is written
     inner: NDArray[np.float64],  # the part of the zone that no other one sees; see `Halo`
-    held: NDArray[np.void],  # HELD (W, H), what has to stop before a border of the zone
-    num_held: NDArray[np.int64],  # (W,) how many there are
     scratch: Scratch,
     # (W, A, 2) throttle in m/s² and steering in rad of continuous actions
     commands: NDArray[np.float64],
@@ -232,15 +224,12 @@ def advance(
             if k + SOON < owned:
                 _fetch_lanes(roads, rows, k, scratch)
             i = scratch.order[k]
-            most = math.inf
-            if num_held[w] > 0:
-                most = most_accel(roads, travel, rows[i], held[w], num_held[w], dt)
             if not in_place:
                 worlds.next_rows[w, k] = rows[i]
             row = worlds.next_rows[w, k]
             touching += row["hit"] >= 0
             if row["driver"] == DRIVER_BACKGROUND:
-                through += _drive_in_background(roads, travel, row, step[i], i, most, dt, scratch)
+                through += _drive_in_background(roads, travel, row, step[i], i, dt, scratch)
             elif row["driver"] == DRIVER_SCRIPTED:
                 row["events"] = 0
                 follow_script(roads, travel, worlds.cues[w], row, dt)
@@ -257,7 +246,6 @@ def advance(
                     discrete,
                     accel_limit,
                     steering_limit,
-                    most,
                     dt,
                 )
             if not is_inside(inner, row["x"], row["y"]):
