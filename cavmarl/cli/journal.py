@@ -60,8 +60,6 @@ def _owners(table: OwnerTable) -> Table:
 def _counts(summary: JournalSummary) -> Table:
     span = f", {summary.first_tick} to {summary.last_tick}" if summary.ticks else ""
     moved = f"{summary.switches}, {summary.forced} of them forced; {summary.deferrals} deferred"
-    if summary.held:
-        moved += f", {summary.held} held before a border"
     rows = {
         "run": summary.run,
         "lines": f"{summary.lines}",

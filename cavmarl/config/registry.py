@@ -144,7 +144,7 @@ def load_config(
         if isinstance(keys, dict) and isinstance(keys.get("rig"), str):
             keys["rig"] = load_rig(keys["rig"], base_dir)
         _refuse_code(keys, where)
-        config = validate(EnvConfig, with_current_names(keys), where)
+        config = validate(EnvConfig, with_current_names(keys, where), where)
     else:
         base_dir, where = found.parent, str(found)
         config = EnvConfig(
@@ -173,7 +173,8 @@ def load_config(
             shadow(raw, key, load_rig(str(value), base_dir) if is_named else value)
         if max_cycles is not None:
             raw["horizon_s"] = _horizon_s(max_cycles, raw)
-        config = validate(EnvConfig, with_current_names(raw), f"{where}, overridden")
+        where = f"{where}, overridden"
+        config = validate(EnvConfig, with_current_names(raw, where), where)
     return config, base_dir
 
 

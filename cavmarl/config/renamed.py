@@ -1,6 +1,6 @@
-"""Names of keys, modes and terms that have changed: the old ones still work, and warn.
+"""Names of keys, modes and terms that have changed, and keys that are no longer there.
 
-They go with the version after this one.
+Old names still work, and warn; they go with the version after this one. Removed keys are refused.
 """
 
 from __future__ import annotations
@@ -8,6 +8,8 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from typing import Any
+
+from cavmarl.core.errors import ConfigError
 
 # Dotted key before → now.
 KEYS = {
@@ -23,18 +25,34 @@ KEYS = {
 }
 OLD_TERMS = tuple(key.rpartition(".")[2] for key in KEYS if key.startswith("terms.weights."))
 MODES = {"seats": "respawn", "entering": "open"}
+# Dotted key → what to do instead.
+REMOVED = {
+    "zones.policy": "a vehicle is handed over after zones.max_deferred_ticks, as with 'force'",
+    "zones.grace_ticks": "add these ticks to zones.max_deferred_ticks",
+}
 
 
-def with_current_names(raw: object) -> object:
+def with_current_names(raw: object, where: str) -> object:
     """The same keys and values as of an env.yaml, by the names that they have now.
 
     An old name warns (`FutureWarning`) and takes the place of the new one.
+
+    Args:
+        raw: mappings, sequences, strings, numbers, bools, None.
+        where: begins every message: the file that `raw` comes from.
+
+    Raises:
+        ConfigError: a key that has been removed; the message says what to do instead.
     """
     if not isinstance(raw, Mapping):
         return raw
     found = {
         key: dict(value) if isinstance(value, Mapping) else value for key, value in raw.items()
     }
+    for old, instead in REMOVED.items():
+        *folders, name = old.split(".")
+        if name in (_inner(found, folders) or {}):
+            raise ConfigError(f"{where}: {old} has been removed: {instead}")
     for old, new in KEYS.items():
         *folders, name = old.split(".")
         place = _inner(found, folders)

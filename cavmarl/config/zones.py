@@ -24,12 +24,7 @@ class ZonesConfig(Section, key="zones"):
         weight: what `bisection` shares out evenly: length of lanes, or area.
         hysteresis_m: how far behind a border a vehicle changes its zone.
         max_deferred_ticks: ticks for which a vehicle that has crossed stays with its old zone, if
-            the new one does not acknowledge it.
-        policy: what follows: `force`: the change is forced at once; `extend`: after `grace_ticks`
-            more. With `hold` a vehicle is stopped before the border if the zone behind it has not
-            acknowledged it for more than `grace_ticks`; with `reroute` it takes a way around that
-            zone, if there is one. A world in which that happens is not the undivided one any more.
-        grace_ticks: that `extend` grants behind a border, `hold` and `reroute` before it.
+            the new one does not acknowledge it; then the change is forced.
         backoff_ticks: for which a zone that has refused a vehicle is not asked again.
         halo_m: how far zones see over their borders; default: as far as exactness needs, and less
             is refused.
@@ -53,8 +48,6 @@ class ZonesConfig(Section, key="zones"):
     weight: Literal["lane_length", "uniform"] = "lane_length"
     hysteresis_m: Annotated[float, Within(0.0, 100.0)] = 2.0
     max_deferred_ticks: Annotated[int, Whole(0, 1000)] = 2
-    policy: Literal["force", "extend", "hold", "reroute"] = "force"
-    grace_ticks: Annotated[int, Whole(0, 1000)] = 0
     backoff_ticks: Annotated[int, Whole(0, 1000)] = 4
     halo_m: Annotated[float | None, Within(0.0, 1e6)] = None
     approach_ticks: Annotated[int, Whole(1, 1000)] = 2
@@ -73,21 +66,8 @@ class ZonesConfig(Section, key="zones"):
             f"must be {', '.join(ZONE_LAYOUTS)}, or a zone file ({', '.join(ZONE_FILE_SUFFIXES)})",
         )
         self.need(
-            "grace_ticks",
-            (self.policy == "force") == (self.grace_ticks == 0),
-            "must be 1 or more with extend, hold and reroute of zones.policy, and 0 with force",
-        )
-        self.need(
             "repartition_steps",
             not (self.repartition_steps and (self.faults or self.reproducers)),
             "vehicles that change their zone must not be late: leave out zones.faults and "
             "zones.reproducers, or let zones stay",
         )
-
-    @property
-    def holds(self) -> bool:
-        """Whether vehicles are kept from borders whose other side does not answer.
-
-        A divided world in which that happens is not the undivided one.
-        """
-        return self.policy in ("hold", "reroute")

@@ -149,7 +149,6 @@ class Simulation(WorldViews):
             self._shared_arrays,
             longest_move_m(self.network, tick.traffic.travel, self.config.clock.sim_dt_s),
             runs=runs,
-            found_ways=tick.traffic.found_ways,
         )
         tick.coordination = refereeing.coordination
         self._recovery = refereeing.recovery

@@ -52,7 +52,6 @@ def make_tick(
             zeros=zeros,
             scene=plan_scene(config.scenario, network),
             sumo=demand if isinstance(demand, SumoDemand) else None,
-            turns_away=config.zones.policy == "reroute",
         )
     shards, division = divide(
         config, network, partition, traffic, shared.outputs, num_worlds, zeros, late_ticks

@@ -37,7 +37,6 @@ def describe_world(
         "kernels": sources_digest(),
         "zones": partition.count,
         "zones_content_sha256": partition.content_hash,
-        "equals_undivided": not (partition.count > 1 and config.zones.holds),
         "channel": asdict(config.v2x.channel)
         if config.v2x.enabled
         else "none: there are no messages between vehicles",

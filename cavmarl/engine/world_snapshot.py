@@ -46,7 +46,7 @@ def save(parts: Parts) -> list[Array]:
     return [
         *_fixed(parts),
         gate.queue[:, :waiting],
-        *_of_found_ways(parts),
+        *_of_rerouting(parts),
         parts.division.contacts(),
         *(
             parts.division.owned(w, zone)
@@ -72,7 +72,7 @@ def load(
     queue = next(rest)
     gate.queue[:, : queue.shape[1]] = queue
     gate.num_passing[:] = 0
-    for array in _of_found_ways(parts):
+    for array in _of_rerouting(parts):
         _put(array, next(rest))
     contacts = next(rest)
     vehicles = [[next(rest) for _ in range(parts.division.count)] for _ in everywhere]
@@ -86,21 +86,21 @@ def load(
 
 def share_of(parts: Parts, w: int) -> list[Array]:
     """What `save` would give if there were no world but one; some are views, to be copied."""
-    gate, found_ways = parts.gate, parts.traffic.found_ways
+    gate, rerouting = parts.gate, parts.traffic.rerouting
     waiting = gate.queue[w : w + 1, : gate.num_queue.item(w)]
     owned = [parts.division.owned(w, zone) for zone in range(parts.division.count)]
     if parts.sumo is not None:
         waiting, owned = waiting.copy(), [rows.copy() for rows in owned]
         for rows in (waiting, *owned):
             parts.sumo.shift(rows, -w)
-    if found_ways is not None:
+    if rerouting is not None:
         owned = [rows.copy() for rows in owned]
         for rows in owned:
-            rows["way"] = found_ways.ways_of_first_world(rows["way"], w)
+            rows["way"] = rerouting.ways_of_first_world(rows["way"], w)
     return [
         *(array[w : w + 1] for array in _fixed(parts)),
         waiting,
-        *(() if found_ways is None else found_ways.arrays_of(w)),
+        *(() if rerouting is None else rerouting.arrays_of(w)),
         parts.division.contacts()[w : w + 1],
         *owned,
     ]
@@ -108,7 +108,7 @@ def share_of(parts: Parts, w: int) -> list[Array]:
 
 def join(parts: Parts, shares: Sequence[Sequence[Array]]) -> list[Array]:
     """What `save` would give of worlds of which each share has been one."""
-    zones, found_ways = parts.division.count, parts.traffic.found_ways
+    zones, rerouting = parts.division.count, parts.traffic.rerouting
     if parts.sumo is not None:
         shares = [_shifted(parts, parts.sumo, share, w) for w, share in enumerate(shares)]
     fields = zip(*(share[:-zones] for share in shares), strict=True)
@@ -116,8 +116,8 @@ def join(parts: Parts, shares: Sequence[Sequence[Array]]) -> list[Array]:
     for w, share in enumerate(shares):
         for owned in share[-zones:]:
             rows = owned.copy()
-            if found_ways is not None:
-                rows["way"] = found_ways.ways_of_world(rows["way"], w)
+            if rerouting is not None:
+                rows["way"] = rerouting.ways_of_world(rows["way"], w)
             joined.append(rows)
     return joined
 
@@ -160,14 +160,14 @@ def committed(parts: Parts) -> Iterator[Array]:
     """What a tick changes beside the shards' own and what they have in common."""
     yield from arrays_of(parts.gate, Gate, Use.COMMITTED)
     yield from arrays_of(parts.outputs, Outputs, Use.COMMITTED)
-    yield from _of_found_ways(parts)
+    yield from _of_rerouting(parts)
     for part in parts.attached:
         yield from part.arrays()
 
 
-def _of_found_ways(parts: Parts) -> Iterator[Array]:
-    if parts.traffic.found_ways is not None:
-        yield from parts.traffic.found_ways.arrays()
+def _of_rerouting(parts: Parts) -> Iterator[Array]:
+    if parts.traffic.rerouting is not None:
+        yield from parts.traffic.rerouting.arrays()
 
 
 def _put(target: Array, saved: Array) -> None:
@@ -178,12 +178,12 @@ def _put(target: Array, saved: Array) -> None:
 
 def digest_world(parts: Parts, world: int) -> str:
     """Hex digest of one world, whatever the order of rows; see `Simulation.state_hash`."""
-    worlds, gate, found_ways = parts.worlds, parts.gate, parts.traffic.found_ways
+    worlds, gate, rerouting = parts.worlds, parts.gate, parts.traffic.rerouting
     sumo = parts.sumo
     rows = parts.division.vehicles(world)
     rows = rows[np.argsort(rows["id"])]
-    if found_ways is not None:
-        rows["way"] = found_ways.ways_of_first_world(rows["way"], world)
+    if rerouting is not None:
+        rows["way"] = rerouting.ways_of_first_world(rows["way"], world)
     if sumo is not None:
         sumo.shift(rows, -world)
     digest = hashlib.blake2b(digest_size=16)
@@ -200,8 +200,8 @@ def digest_world(parts: Parts, world: int) -> str:
     common = arrays_of(worlds, Common, Use.DIGESTED)
     for array in (*common, *arrays_of(gate, Gate, Use.DIGESTED)):
         digest.update(array[world].tobytes())
-    if found_ways is not None:
-        for array in found_ways.state(world, parts.division.vehicles(world)):
+    if rerouting is not None:
+        for array in rerouting.state(world, parts.division.vehicles(world)):
             digest.update(array.tobytes())
     for part in parts.attached:
         for array in part.arrays():

@@ -8,7 +8,6 @@ import numpy as np
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.config.zones import ZonesConfig
-from cavmarl.core.errors import ConfigError
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.memory import Zeros
 from cavmarl.core.records.arrays import Outputs
@@ -16,7 +15,7 @@ from cavmarl.driving.kernels.motion import MAX_SPEED_MPS
 from cavmarl.handoff.division import Division
 from cavmarl.ownership.decisions import Neighbours
 from cavmarl.ownership.distances import Distances, check_coverage, needed_overlap_m
-from cavmarl.ownership.limits import DeadlinePolicy, Limits
+from cavmarl.ownership.limits import Limits
 from cavmarl.rewards.registered_terms import terms_reach_m
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.observed import carried_from, largest_radius_m, sensing_reach_m
@@ -46,12 +45,9 @@ def divide(
     """One shard a zone, and the division that knows them all.
 
     Raises:
-        ConfigError: `zones.halo_m` is less than exactness needs, or SUMO moves vehicles that a
-            policy would have to hold.
+        ConfigError: `zones.halo_m` is less than exactness needs.
     """
     settings, dt = config.zones, config.clock.sim_dt_s
-    if settings.holds and traffic.sumo is not None:
-        raise _not_held(settings)
     radius_m = largest_radius_m(traffic.travel.types)
     sensing_m = max(
         terms_reach_m(config.terms),
@@ -105,13 +101,6 @@ def divide(
     return shards, division
 
 
-def _not_held(zones: ZonesConfig) -> ConfigError:
-    return ConfigError(
-        f"zones.policy = {zones.policy!r}: vehicles that SUMO moves cannot be held before a "
-        "border; use force or extend, or a demand that is driven here"
-    )
-
-
 def halo_m(
     config: EnvConfig,  # `zones.halo_m` is taken if it is given
     reach_m: float,  # the farthest that any driver looks
@@ -159,8 +148,6 @@ def limits_of(settings: ZonesConfig, schema: int = 1) -> Limits:
     """Deadlines of the protocol; `schema` is the version of vehicles' states."""
     return Limits(
         deferral=settings.max_deferred_ticks,
-        policy=DeadlinePolicy(settings.policy),
-        grace=settings.grace_ticks,
         backoff=settings.backoff_ticks,
         schema=schema,
     )
@@ -172,7 +159,7 @@ def _limits_at_borders(settings: ZonesConfig, late_ticks: int) -> Limits:
     may_be_late = settings.faults or settings.reproducers
     if may_be_late:
         return limits
-    return replace(limits, deferral=late_ticks, policy=DeadlinePolicy.FORCE, grace=0)
+    return replace(limits, deferral=late_ticks)
 
 
 def _approach_m(config: EnvConfig, fastest_mps: float) -> float:

@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 
 from cavmarl.core.errors import ProtocolError
 from cavmarl.ownership.limits import Limits
-from cavmarl.ownership.messages import Birth, BorderWait, Deferral, Switch
+from cavmarl.ownership.messages import Birth, Deferral, Switch
 from cavmarl.ownership.readiness import Readiness
 from cavmarl.ownership.safeguards import Safeguards
 from cavmarl.ownership.table import Table
@@ -95,7 +95,7 @@ class Decisions:
             if self.neighbours and self.neighbours.is_teleport(vehicle, source, target):
                 teleports.append(vehicle)
             waited = table.deferred.get(vehicle, 0)
-            may_wait = waited < self._limits.longest_deferral or not self._safeguards.deadline
+            may_wait = waited < self._limits.deferral or not self._safeguards.deadline
             if self._ready(table, vehicle, target, epoch):
                 switches.append(Switch(vehicle, source, target, epoch + 1, False))
             elif may_wait:
@@ -104,20 +104,6 @@ class Decisions:
                 switches.append(Switch(vehicle, source, target, epoch + 1, True))
         gone = {switch.vehicle for switch in switches}
         return tuple(switches), tuple(deferred), tuple(v for v in teleports if v in gone)
-
-    def waits(self, table: Table, approaching: Iterable[tuple[int, int]]) -> tuple[BorderWait, ...]:
-        """Which of (vehicle, zone that it would enter) wait for an acknowledgement, and how long.
-
-        Raises:
-            ProtocolError: a vehicle or a zone does not exist.
-        """
-        waiting = []
-        for vehicle, zone in sorted(approaching):
-            _check_exist(table, vehicle, zone)
-            if not self._ready(table, vehicle, zone, table.owners[vehicle][1]):
-                ticks = table.waiting.get(vehicle, 0) + 1
-                waiting.append(BorderWait(vehicle, ticks, ticks > self._limits.grace))
-        return tuple(waiting)
 
     def check_births(self, table: Table, births: Iterable[Birth]) -> None:
         """See that new vehicles are new."""

@@ -20,7 +20,6 @@ from cavmarl.ownership.messages import (
     Ack,
     Begin,
     Birth,
-    BorderWait,
     Commit,
     Done,
     Fence,
@@ -168,8 +167,6 @@ class Directory:
         births: Iterable[Birth] = (),
         inputs: bytes = b"",  # digest of the actions
         payloads: Mapping[int, bytes] | None = None,  # zone → what rides with its STEP
-        # (vehicle, zone that it would enter) for vehicles before a border that the policy can hold
-        approaching: Iterable[tuple[int, int]] = (),
     ) -> Output:
         """Decide the way to the next tick: BEGIN, then a STEP for every zone."""
         table = self.table
@@ -178,8 +175,7 @@ class Directory:
         new = tuple(sorted(births))
         self.check_births(new)
         switches, deferred, teleports = self._decisions.switches(table, movers)
-        waiting = self._decisions.waits(table, approaching)
-        decided = (switches, deferred, new, inputs, teleports, waiting)
+        decided = (switches, deferred, new, inputs, teleports)
         begun = self._logged(Begin(table.episode, table.tick + 1, *decided))
         records = begun.records if self._safeguards.log_before_send else ()
         return Output(records, self.resend(payloads=payloads or {}).messages)
@@ -218,12 +214,6 @@ class Directory:
             return ()
         return tuple(zone for zone in self.table.hosts if zone not in self.dones)
 
-    def overdue(self) -> tuple[BorderWait, ...]:
-        """Vehicles that the policy HOLD or REROUTE asks the runtime to act upon in this tick."""
-        if self.table.plan is None:
-            return ()
-        return tuple(entry for entry in self.table.plan.record.waiting if entry.held)
-
     def commit(
         self,
         rows: Mapping[int, int],  # zone → digest of the rows that the store holds for the tick
@@ -259,7 +249,7 @@ class Directory:
             whether there can be such a tick; else nothing has begun.
         """
         table = self.table
-        self.is_quiet = table.plan is None and not (table.deferred or table.waiting)
+        self.is_quiet = table.plan is None and not table.deferred
         return self.is_quiet
 
     def commit_quiet(self) -> None:

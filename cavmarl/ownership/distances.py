@@ -56,7 +56,7 @@ def needed_overlap_m(
     A zone that keeps a vehicle for D more ticks must see all that the vehicle can see, `reach_m`
     around it, however far it has come in that time.
     """
-    return reach_m + hysteresis_m + (limits.longest_deferral + 1) * v_max_mps * dt_s
+    return reach_m + hysteresis_m + (limits.deferral + 1) * v_max_mps * dt_s
 
 
 def check_coverage(
@@ -68,7 +68,7 @@ def check_coverage(
         raise ConfigError(
             f"an overlap of {distances.overlap_m:g} m is too narrow: {needed:g} m = reach "
             f"{reach_m:g} m + hysteresis {distances.hysteresis_m:g} m + "
-            f"({limits.longest_deferral} + 1) ticks · {v_max_mps:g} m/s · {dt_s:g} s are needed"
+            f"({limits.deferral} + 1) ticks · {v_max_mps:g} m/s · {dt_s:g} s are needed"
         )
     if distances.approach_m < v_max_mps * dt_s:
         raise ConfigError(

@@ -1,6 +1,6 @@
 """Log records as JSON lines, and back.
 
-A line is an object with the keys `schema` ("cavmarl.ownership/4"), `sequence` (0, 1, 2, …),
+A line is an object with the keys `schema` ("cavmarl.ownership/5"), `sequence` (0, 1, 2, …),
 `kind` (RESET, BEGIN, COMMIT, FENCE, HOST), `episode`, `tick`, the fields of that kind, and
 `checksum`: BLAKE2b of 8 bytes, in hex, over the checksum of the line before, if there is one, and
 the line as it would be without that key. So a line of another log, or of an earlier one, is none of
@@ -21,7 +21,7 @@ from cavmarl.core.errors import JournalError
 from cavmarl.ownership.messages import Begin, Commit, Fence, Host, Record, Reset
 from cavmarl.ownership.table import Table
 
-SCHEMA = "cavmarl.ownership/4"
+SCHEMA = "cavmarl.ownership/5"
 KINDS: dict[str, type[Record]] = {
     "RESET": Reset,
     "BEGIN": Begin,

@@ -228,17 +228,6 @@ class Deferral(NamedTuple):
     ticks: int
 
 
-class BorderWait(NamedTuple):
-    """A vehicle before a border that its target has not acknowledged, `ticks` ticks in a row.
-
-    `held`: its source keeps it from the border.
-    """
-
-    vehicle: int
-    ticks: int
-    held: bool
-
-
 class Birth(NamedTuple):
     """A vehicle that a zone begins to own."""
 
@@ -275,8 +264,7 @@ class Reset(Record):
 class Begin(Record):
     """What has been decided for the way to `tick`. `inputs` is the digest of the actions.
 
-    `teleports` are the vehicles among `switches` whose new zone is no neighbour of the old one;
-    `waiting` are vehicles before a border, with the policies that hold them there.
+    `teleports` are the vehicles among `switches` whose new zone is no neighbour of the old one.
     """
 
     switches: tuple[Switch, ...] = ()
@@ -284,7 +272,6 @@ class Begin(Record):
     births: tuple[Birth, ...] = ()
     inputs: bytes = b""
     teleports: tuple[int, ...] = ()
-    waiting: tuple[BorderWait, ...] = ()
 
 
 @dataclass(slots=True, unsafe_hash=True)

@@ -41,7 +41,6 @@ class Table:
         episode: counts the resets; -1 before the first.
         owners: vehicle → (zone, epoch) as of the committed tick.
         deferred: vehicle → ticks that it has been with a zone which does not contain it.
-        waiting: vehicle → ticks that it has been before a border without an acknowledgement.
         hosts: zone → (worker, incarnation); incarnation 0 means never hosted.
         counts: zone → how many vehicles it owned at the committed tick.
     """
@@ -50,7 +49,6 @@ class Table:
         self.run, self.tick, self.episode = b"", 0, -1
         self.owners: dict[int, tuple[int, int]] = {}
         self.deferred: dict[int, int] = {}
-        self.waiting: dict[int, int] = {}
         self.hosts = dict.fromkeys(sorted(zones), (-1, 0))
         self.states = dict.fromkeys(self.hosts, State.UNHOSTED)  # zone → UNHOSTED, HOSTED or FENCED
         self.seen = SeenIds()  # ids that have been in the episode
@@ -157,7 +155,7 @@ class Table:
         if len(record.run) != RUN_BYTES:
             raise JournalError(f"a run has {RUN_BYTES} bytes, not {len(record.run)}")
         self.run, self.tick, self.episode = record.run, record.tick, record.episode
-        self.owners, self.deferred, self.waiting, self.plan = {}, {}, {}, None
+        self.owners, self.deferred, self.plan = {}, {}, None
         self.counts = dict.fromkeys(self.hosts, 0)
         self._tallies = dict.fromkeys(self.hosts, OwnedTally())
         self._moves.clear()
@@ -197,8 +195,6 @@ class Table:
                 self.owners[vehicle] = (switch.target, switch.epoch)
         deferred = plan.record.deferred
         self.deferred = {vehicle: ticks for vehicle, ticks in deferred if vehicle in self.owners}
-        waiting = plan.record.waiting
-        self.waiting = {vehicle: ticks for vehicle, ticks, _ in waiting if vehicle in self.owners}
         self._tallies = {entry.zone: entry.owned for entry in record.zones}
         self.counts = {entry.zone: entry.owned.vehicles for entry in record.zones}
         self.tick, self.plan = record.tick, None

@@ -86,9 +86,6 @@ def _record(record: Record) -> str:
                 for s in record.switches
             ]
             parts += [f"v{d.vehicle} deferred {d.ticks}" for d in record.deferred]
-            parts += [
-                f"v{e.vehicle} {'held' if e.held else 'waits'} {e.ticks}" for e in record.waiting
-            ]
         case Commit():
             parts = [f"v{entry.vehicle} removed" for entry in record.removed]
             parts += [" ".join(f"{entry.zone}:{entry.owned.vehicles}" for entry in record.zones)]

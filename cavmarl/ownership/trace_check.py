@@ -92,7 +92,6 @@ class TraceChecker:
         self._run, self._episode, self._tick = b"", -1, 0
         self._tallies: defaultdict[int, OwnedTally] = defaultdict(OwnedTally)
         self._deferred: dict[int, int] = {}
-        self._waiting: dict[int, int] = {}
         self._born = SeenIds()
         self._incarnations: dict[int, int] = {}
         self._fenced: set[int] = set()
@@ -127,7 +126,6 @@ class TraceChecker:
         _require(record.tick >= self._tick, f"the tick goes back from {self._tick}")
         self._run, self._episode, self._tick = record.run, record.episode, record.tick
         self.owners, self.changes, self._deferred, self._born = {}, [], {}, SeenIds()
-        self._waiting = {}
         self._tallies.clear()
         self._begun, self._dones = None, {}
         self._fences, self._ready = {}, set()
@@ -169,9 +167,6 @@ class TraceChecker:
             follows = ticks == self._deferred.get(vehicle, 0) + 1
             _require(follows and vehicle in self.owners, f"v{vehicle} cannot wait for tick {ticks}")
             _require(ticks <= self._longest, f"v{vehicle} waits longer than {self._longest} ticks")
-        for vehicle, ticks, _ in record.waiting:
-            follows = ticks == self._waiting.get(vehicle, 0) + 1
-            _require(follows and vehicle in self.owners, f"v{vehicle} cannot wait for tick {ticks}")
         for vehicle, _, _ in record.births:
             _require(vehicle not in self._born, f"v{vehicle} is born twice")
             self._born.add(vehicle)
@@ -268,7 +263,6 @@ class TraceChecker:
             _require(exact, f"zone {ledger.zone} does not own what it should")
         self._tick, self._begun, self._dones = record.tick, None, {}
         self._deferred = {v: ticks for v, ticks in begun.deferred if v in self.owners}
-        self._waiting = {v: ticks for v, ticks, _ in begun.waiting if v in self.owners}
         self._forget()
 
     @staticmethod

@@ -27,7 +27,6 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN, make_plans
 from cavmarl.traffic.demand import STOP, DemandFile
 from cavmarl.traffic.departure_queue import with_room
-from cavmarl.traffic.found_ways import FoundWays
 from cavmarl.traffic.kernels.admission import accept, assign_lanes
 from cavmarl.traffic.kernels.demand_generator import call_orders, insert, populate, settle
 from cavmarl.traffic.map_trips import MapTrips, for_each_map, together
@@ -42,7 +41,6 @@ from cavmarl.traffic.turning_circle import TurningBody, with_tight_turns
 from cavmarl.traffic.way_search import WaySlots, seekers, way_slots
 
 FAST_FACTOR = 1.5  # a speed over the limit that hardly any driver of the demand wants
-TURNED_STEPS = 256  # a third of the steps that the way of a vehicle may have that turns away
 JAM_GAP_M = 2.5  # between the bumpers of vehicles that stand in a queue
 
 
@@ -134,7 +132,6 @@ class NativeTraffic:
     zeros: Zeros = np.zeros
     scene: Scene | None = None  # what is played to the agents of each world
     sumo: SumoDemand | None = None  # in the place of a file: what SUMO runs beside these worlds
-    turns_away: bool = False  # any vehicle may look for a way that keeps away from some edges
 
     def __post_init__(self) -> None:
         # Trips that do not exist are refused when the world is made, not at its first reset.
@@ -150,9 +147,8 @@ class NativeTraffic:
             "_travel_of_others",
             "_slots",
             "rerouting",
-            "found_ways",
             "calls",
-        ):  # each world has its part of them
+        ):  # of each world
             vars(other).pop(name, None)
         other._check_room()
         return other
@@ -317,19 +313,14 @@ class NativeTraffic:
     @cached_property
     def _slots(self) -> WaySlots | None:
         """Room for the ways that vehicles find while the world runs, where some may."""
-        schedule, number, longest = self.schedule, 0, 0
-        first_step = self.plans.size
-        if schedule is not None:
-            longest = schedule.longest
-            first_step += len(schedule.steps)
-            if self._reroutes:
-                number = seekers(schedule, self.capacity, self.horizon_s)
-        if self.turns_away:
-            number, longest = self.capacity, max(longest, TURNED_STEPS)
+        schedule = self.schedule
+        if schedule is None or not self._reroutes:
+            return None
+        number = seekers(schedule, self.capacity, self.horizon_s)
         if number == 0:
             return None
-        lanes = self.network.lanes
-        return way_slots(lanes, longest, first_step, self.num_worlds, number)
+        first_step = self.plans.size + len(schedule.steps)
+        return way_slots(self.network.lanes, schedule.longest, first_step, self.num_worlds, number)
 
     @property
     def _reroutes(self) -> bool:
@@ -344,18 +335,11 @@ class NativeTraffic:
 
     @cached_property
     def rerouting(self) -> Rerouting | None:
-        """Those ways; None where vehicles do not reroute."""
-        if self.schedule is None or self._slots is None or not self._reroutes:
+        """What keeps ways that are found; None where vehicles do not reroute."""
+        if self.schedule is None or self._slots is None:
             return None
         first_type = len(generated_types())
         return Rerouting(self.schedule, self.travel, self._slots, first_type, self.dt)
-
-    @cached_property
-    def found_ways(self) -> FoundWays | None:
-        """What keeps ways that are found, of vehicles that reroute or have to turn away."""
-        if self.rerouting is not None or self._slots is None:
-            return self.rerouting
-        return FoundWays(self.network.arrays, self.travel, self._slots, self.schedule)
 
     @cached_property
     def capacity(self) -> int:
@@ -404,8 +388,8 @@ class NativeTraffic:
             gate = with_room(gate, len(orders))
             gate.orders[w, : len(orders)] = orders
             gate.num_orders[w] = len(orders)
-            if self.found_ways is not None:
-                self.found_ways.begin(int(w), int(worlds.keys[w]), self.horizon_s)
+            if self.rerouting is not None:
+                self.rerouting.begin(int(w), int(worlds.keys[w]), self.horizon_s)
         return gate
 
     def populate(self, gate: Gate, worlds: Worlds, chosen: NDArray[np.bool_]) -> None:

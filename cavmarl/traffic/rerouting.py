@@ -14,14 +14,15 @@ from numpy.typing import NDArray
 
 from cavmarl.core.math.rng import STREAM_REROUTER, uniform
 from cavmarl.core.records import record
-from cavmarl.core.records.arrays import Gate, Travel, Worlds
+from cavmarl.core.records.arrays import Gate, RoadArrays, Travel, Worlds
 from cavmarl.core.records.codes import COUNT_REROUTED
+from cavmarl.roads.routing import PLAN
 from cavmarl.traffic.demand import Choices
 from cavmarl.traffic.demand.rerouters import KEEP_DESTINATION
-from cavmarl.traffic.found_ways import FoundWays, plain
 from cavmarl.traffic.kernels.way_requests import (
     find_asking,
     limit_speeds,
+    mark_slots,
     sample_speeds,
 )
 from cavmarl.traffic.schedule import Schedule
@@ -40,7 +41,7 @@ LOOK = record(
 )
 
 
-class Rerouting(FoundWays):
+class Rerouting:
     """Vehicles that reroute, what is known of the traffic, and the ways that were found; W worlds.
 
     `travel`: types and ways, with room behind them. `slots`: that room. `first_type`: VTYPE row of
@@ -50,7 +51,9 @@ class Rerouting(FoundWays):
     def __init__(
         self, schedule: Schedule, travel: Travel, slots: WaySlots, first_type: int, dt: float
     ) -> None:
-        super().__init__(schedule.demand.network.arrays, travel, slots, schedule)
+        self._roads: RoadArrays = schedule.demand.network.arrays
+        self._travel = travel
+        self._slots = slots
         self._schedule = schedule
         self._first_type = first_type
         self._dt = dt
@@ -87,8 +90,10 @@ class Rerouting(FoundWays):
         looks["next"] = np.where(orders["reroute"], 0, NEVER)
         looks["goal"] = self._schedule.last_edges(orders["route"])
         looks["seen"] = -1
-        super().begin(world, key, horizon_s)
-        looks["may_leave"] = self._may_leave[world]
+        routes = self._schedule.demand.routes[orders["route"]]
+        looks["may_leave"] = routes["exact"] | (routes["num_edges"] <= 2)
+        first = self._slots.first_of(world)
+        self._travel.steps[first : first + self._slots.of_world] = np.zeros((), dtype=PLAN)
         if self._measures:
             limit_speeds(self._roads, self._past[world], self._speed_sums[world])
 
@@ -99,6 +104,14 @@ class Rerouting(FoundWays):
                 self._sample(worlds, w, int(tick))
                 gate.counts[w, COUNT_REROUTED] += self._let_ask(worlds, w, int(tick))
 
+    def ways_of_first_world(self, ways: NDArray[np.int64], world: int) -> NDArray[np.int64]:
+        """VEHICLE["way"] (n,) of a world as it would be in the first one."""
+        return self._slots.ways_of_first_world(ways, world)
+
+    def ways_of_world(self, ways: NDArray[np.int64], world: int) -> NDArray[np.int64]:
+        """VEHICLE["way"] (n,) in a world, of ways as they are in the first one."""
+        return self._slots.ways_of_first_world(ways, -world)
+
     def state(self, world: int, rows: NDArray[np.void]) -> Iterator[NDArray[np.generic]]:
         """What of a world's state is kept here, as arrays without padding.
 
@@ -106,19 +119,25 @@ class Rerouting(FoundWays):
         """
         yield self._speed_sums[world]
         yield self._past[world]
-        yield from plain(self._looks[world, : self._num_looks[world]])
-        yield from super().state(world, rows)
+        yield from _plain(self._looks[world, : self._num_looks[world]])
+        slots = self._slots
+        used = np.zeros(slots.number, dtype=np.bool_)
+        first = slots.first_of(world)
+        mark_slots(self._roads, rows, len(rows), first, slots.steps, used)
+        steps = self._travel.steps[first : first + slots.of_world]
+        yield from _plain(steps.reshape(slots.number, slots.steps)[used])
 
     def arrays(self) -> Iterator[NDArray[np.generic]]:
         """What a tick changes here, of all worlds; to be copied and put back."""
         yield from (self._past, self._speed_sums, self._looks)
-        yield from super().arrays()
+        yield self._travel.steps[self._slots.first :]
 
     def arrays_of(self, world: int) -> Iterator[NDArray[np.generic]]:
         """`arrays` as they would be if there were no world but one."""
         for array in (self._past, self._speed_sums, self._looks):
             yield array[world : world + 1]
-        yield from super().arrays_of(world)
+        first = self._slots.first_of(world)
+        yield self._travel.steps[first : first + self._slots.of_world]
 
     def _sample(self, worlds: Worlds, w: int, tick: int) -> None:
         interval_ms = self._schedule.demand.device.adaptation_interval_ms
@@ -240,3 +259,9 @@ class Rerouting(FoundWays):
     def _pick(self, choices: Choices, number: int, rule: np.void, row: np.void) -> int:
         drawn = np.array([self._drawn(rule, row, 1)])
         return int(choices.pick(np.array([number], dtype=np.int32), drawn)[0])
+
+
+def _plain(records: NDArray[np.void]) -> Iterator[NDArray[np.generic]]:
+    """The fields of records, one after the other, without padding."""
+    for name in records.dtype.names or ():
+        yield np.ascontiguousarray(records[name])

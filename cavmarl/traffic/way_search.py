@@ -98,7 +98,7 @@ def way_slots(
         raise CapacityError(
             f"ways of {number} vehicles that look for their own, {steps} steps each, in "
             f"{num_worlds} worlds are over {MAX_STEPS} steps: fewer worlds, or fewer vehicles "
-            "with a rerouting device or with zones.policy = reroute"
+            "with a rerouting device"
         )
     return WaySlots(first_step + num_lanes, number, steps, num_worlds, num_lanes)
 

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.checks import check_count
-from cavmarl.config.registry import load_config
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.config.zones import MAX_ZONES, ZONE_FILE_SUFFIXES
 from cavmarl.core.errors import ConfigError, ProtocolError
@@ -97,14 +96,13 @@ def verify_zones(
 
     Raises:
         ConfigError: a number or a key that cannot work; more zones than the map can hold, or a zone
-            file of another number; worlds that `refuse_unequal` refuses.
+            file of another number.
         JournalError: a journal that cannot be begun.
         PolicyError: the policy cannot be loaded or does not fit.
     """
     check_count("steps", steps, MAX_STEPS)
     spec = WorldSpec.of(env, **keys)
     divided = _divided(spec, layout, faults, check)
-    refuse_unequal(replace(spec, overrides=divided))
     plain = {key: value for key, value in divided.items() if not key.startswith("zones.")}
 
     def run(count: int, settings: Mapping[str, Any]) -> DrivenRun:
@@ -132,21 +130,6 @@ def verify_zones(
     hashes = tuple(whole.vec.state_hash(w) for w in range(worlds))
     results = tuple(other.result() for other in compared)
     return Equivalence(spec.env, worlds, steps, ticks, hashes, results)
-
-
-def refuse_unequal(spec: WorldSpec) -> None:
-    """Refuse worlds that are declared not to be the undivided one.
-
-    Raises:
-        ConfigError: their policy at borders changes what vehicles do.
-    """
-    zones = load_config(spec.env, **spec.keywords)[0].zones
-    if zones.holds:
-        raise ConfigError(
-            f"zones.policy = {zones.policy!r}: such a world is declared not to equal the undivided "
-            "one, since it keeps vehicles from borders whose other side does not answer; nothing "
-            "is compared: verify it with zones.policy = force or extend"
-        )
 
 
 def _divided(

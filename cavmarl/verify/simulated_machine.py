@@ -15,7 +15,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Mapping
 from itertools import count
-from typing import Any, NoReturn, cast
+from typing import Any, cast
 
 from cavmarl.core.errors import MessageError
 from cavmarl.engine.world_setup import World
@@ -384,7 +384,3 @@ class _System:
         late = late_ticks(world.config)
         world = unwatched(world)
         return LocalWorlds(world, num_worlds, in_next_step=in_next_step, late_ticks=late)
-
-    def end(self) -> NoReturn:
-        self._machine.end(self._process)
-        raise ProcessEndedError

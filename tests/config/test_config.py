@@ -301,9 +301,6 @@ def test_zones_are_laid_out_by_name_or_by_a_file(tmp_path: Path, layout: str) ->
         ("max_deferred_ticks", -1),
         ("max_deferred_ticks", 2.5),
         ("approach_ticks", 0),
-        ("grace_ticks", -1),
-        ("grace_ticks", 1),
-        ("policy", "wait"),
         ("backoff_ticks", 1001),
         ("halo_m", -1.0),
         ("halo_m", float("inf")),
@@ -314,16 +311,6 @@ def test_zones_are_laid_out_by_name_or_by_a_file(tmp_path: Path, layout: str) ->
 def test_settings_of_zones_are_checked(key: str, value: object) -> None:
     with pytest.raises(ConfigError, match=rf"zones\.{key} = "):
         load_config("ring", overrides={f"zones.{key}": value})
-
-
-def test_a_policy_has_the_grace_that_it_needs() -> None:
-    grace = "must be 1 or more with extend, hold and reroute of zones.policy, and 0 with force"
-    with pytest.raises(ConfigError, match=rf"zones\.grace_ticks = 0: {grace}"):
-        load_config("ring", overrides={"zones.policy": "extend"})
-    for policy, holds in (("extend", False), ("hold", True), ("reroute", True)):
-        patient = {"zones.policy": policy, "zones.grace_ticks": 3}
-        zones = load_config("ring", overrides=patient)[0].zones
-        assert (zones.grace_ticks, zones.holds) == (3, holds)
 
 
 def test_signal_programs_are_files_beside_the_map_and_choices(tmp_path: Path) -> None:

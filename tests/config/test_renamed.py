@@ -1,8 +1,9 @@
-"""Old names of keys, modes and terms still work, warn, and mean the same."""
+"""Old names of keys, modes and terms still work, warn, and mean the same; removed keys do not."""
 
 from __future__ import annotations
 
 import dataclasses
+import re
 import warnings
 from pathlib import Path
 
@@ -11,7 +12,8 @@ import pytest
 from cavmarl.config.env import EnvConfig
 from cavmarl.config.io import dotted_keys
 from cavmarl.config.registry import load_config
-from cavmarl.config.renamed import KEYS, MODES
+from cavmarl.config.renamed import KEYS, MODES, REMOVED
+from cavmarl.core.errors import ConfigError
 
 VALUES = {"workers.watch": True, "zones.check": True}
 
@@ -56,3 +58,11 @@ def test_a_file_with_old_names_is_read(tmp_path: Path) -> None:
     assert found.terms.weights["jerk"] == -0.5
     assert "comfort" not in found.terms.weights
     assert dataclasses.asdict(found)["zones"]["check_invariants"] is True
+
+
+@pytest.mark.parametrize(("key", "instead"), REMOVED.items())
+def test_a_removed_key_is_refused_with_what_to_do_instead(key: str, instead: str) -> None:
+    assert key not in dotted_keys(EnvConfig)
+    message = re.escape(f"{key} has been removed: {instead}")
+    with pytest.raises(ConfigError, match=message):
+        load_config("ring", overrides={key: "hold"})

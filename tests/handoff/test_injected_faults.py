@@ -81,7 +81,6 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "short episodes": ("grid4x4", {**BUSY, "horizon_s": 1.2}),
     "team's rewards": ("grid4x4", {**BUSY, "terms.team_share": 0.4}),
     "no deferral": ("grid4x4", {**BUSY, "zones.max_deferred_ticks": 0}),
-    "a grace": ("grid4x4", {**BUSY, "zones.policy": "extend", "zones.grace_ticks": 3}),
 }  # fmt: skip
 
 

@@ -271,7 +271,7 @@ def test_a_summary_counts_what_was_committed(written: Path) -> None:
     assert summary.to_dict() == {
         "run": bytes(range(16)).hex(), "lines": len(eventful().log), "episodes": 1,
         "ticks": 6, "first_tick": 1, "last_tick": 6, "births": 2, "removals": 1, "switches": 2,
-        "forced": 1, "deferrals": 2, "held": 0, "hosts": 3, "fences": 1, "unfinished": -1,
+        "forced": 1, "deferrals": 2, "hosts": 3, "fences": 1, "unfinished": -1,
         "torn": "",
     }  # fmt: skip
     assert table.owners == {7: (1, 1)}

@@ -42,28 +42,27 @@ def test_a_world_is_not_made_that_could_not_be_exact() -> None:
     assert make_simulation("grid4x4", **settings).zone_loads().halo_m == 5000.0
 
 
-def extended(grace: int) -> dict[str, Any]:
-    """The policy that grants so many ticks."""
-    return {"zones.policy": "extend" if grace else "force", "zones.grace_ticks": grace}
+def deferred(ticks: int) -> dict[str, Any]:
+    return {"zones.max_deferred_ticks": ticks}
 
 
 def test_who_may_stay_longer_is_seen_from_farther_away() -> None:
     config = load_config("grid4x4", overrides=LOSSY)[0]
-    patient = load_config("grid4x4", overrides=LOSSY | extended(5))[0]
+    patient = load_config("grid4x4", overrides=LOSSY | deferred(7))[0]
     more_m = halo_m(patient, 100.0, 4) - halo_m(config, 100.0, 4)
     assert more_m == pytest.approx(5 * MAX_SPEED_MPS * 0.1)
 
 
-def test_after_the_grace_the_change_is_forced() -> None:
+def test_after_the_deadline_the_change_is_forced() -> None:
     lost = '{"messages": {"Prepare": {"drop": 1.0}}}'
     waited: set[int] = set()
-    for grace in (0, 3):
+    for ticks in (2, 5):
         simulation = make_simulation(
             "grid4x4",
             mode="respawn",
             agents=4,
             background=60,
-            overrides=SETTINGS | extended(grace) | {"zones.faults": lost},
+            overrides=SETTINGS | deferred(ticks) | {"zones.faults": lost},
         )
         start(simulation, seed=1)
         for _ in range(40):

@@ -70,11 +70,10 @@ class Bench:
         self,
         movers: Iterable[tuple[int, int]] = (),
         births: Iterable[tuple[int, int]] = (),
-        approaching: Iterable[tuple[int, int]] = (),
     ) -> tuple[Step, ...]:
-        """BEGIN with vehicles in zones, new ones in zones, and some before a zone; the STEPs."""
+        """BEGIN with vehicles in zones, and new ones in zones; the STEPs."""
         new = [Birth(vehicle, zone, self.state(vehicle)) for vehicle, zone in births]
-        output = self.note(self.directory.begin(movers, new, approaching=approaching))
+        output = self.note(self.directory.begin(movers, new))
         return tuple(message for message in output.messages if isinstance(message, Step))
 
     def give(self, message: Message, removed: Sequence[int] = ()) -> tuple[Message, ...]:
@@ -140,4 +139,4 @@ class Bench:
         return self.directory.table.owners[vehicle][0]
 
     def judge(self) -> None:
-        check_trace(self.trace.entries, self.limits.longest_deferral, self.limits.lifetime)
+        check_trace(self.trace.entries, self.limits.deferral, self.limits.lifetime)

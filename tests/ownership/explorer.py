@@ -326,7 +326,7 @@ class Explorer:
             owned = {v: epoch for v, (owner, epoch) in table.owners.items() if owner == zone}
             if tally(RUN, owned) != expected:
                 raise ProtocolError(f"I6: the ledger of zone {zone} is not that of its vehicles")
-        if any(ticks > self.small.limits.longest_deferral for ticks in table.deferred.values()):
+        if any(ticks > self.small.limits.deferral for ticks in table.deferred.values()):
             raise ProtocolError(f"I5: somebody waits too long: {table.deferred}")
 
     # Numbers for parties and messages

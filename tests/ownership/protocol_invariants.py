@@ -56,7 +56,7 @@ class Monitor:
         self._check_retained(directory, endpoints)
         self._check_ledger(directory)
         for vehicle, ticks in directory.table.deferred.items():
-            if ticks > self._limits.longest_deferral:
+            if ticks > self._limits.deferral:
                 raise ProtocolError(f"I5: vehicle {vehicle} waits for {ticks} ticks")
 
     def committed(self, world: int, store: Store) -> None:

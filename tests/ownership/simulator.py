@@ -103,7 +103,7 @@ class Simulator:
         self.judge()
 
     def judge(self) -> None:
-        check_trace(self.trace.entries, self.limits.longest_deferral, self.limits.lifetime)
+        check_trace(self.trace.entries, self.limits.deferral, self.limits.lifetime)
 
     def step(self) -> None:
         """One tick."""

@@ -12,7 +12,7 @@ from cavmarl.core.errors import (
 )
 from cavmarl.ownership.decisions import Neighbours
 from cavmarl.ownership.distances import Distances, check_coverage, needed_overlap_m
-from cavmarl.ownership.limits import DeadlinePolicy, Limits
+from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import (
     Begin,
     Switch,
@@ -52,43 +52,6 @@ def test_r28_who_comes_back_before_the_switch_has_not_waited() -> None:
     assert not bench.directory.table.deferred
     bench.tick(movers=[(7, 1)])
     assert bench.directory.table.deferred == {7: 1}
-
-
-@pytest.mark.parametrize("policy", [p for p in DeadlinePolicy if p is not DeadlinePolicy.FORCE])
-def test_r29_a_policy_grants_ticks_behind_the_border_or_holds_before_it(
-    policy: DeadlinePolicy,
-) -> None:
-    bench = Bench(limits=Limits(deferral=1, policy=policy, grace=2))
-    holds = policy is not DeadlinePolicy.EXTEND
-    bench.tick(births=[(7, 0)])
-    overdue = []
-    for _ in range(4 * holds):
-        steps = bench.begin(approaching=[(7, 1)])
-        overdue.append(tuple(wait.vehicle for wait in bench.directory.overdue()))
-        bench.pass_on(steps)
-        bench.commit()
-    assert overdue == [(), (), (7,), (7,)] * holds
-    assert not bench.directory.overdue()
-    for _ in range(bench.limits.longest_deferral):
-        assert bench.owner(7) == 0
-        bench.tick(movers=[(7, 1)])
-    assert bench.directory.table.deferred[7] == (1 if holds else 3)
-    assert not bench.directory.table.waiting, "only ticks in a row count"
-    bench.tick(movers=[(7, 1)])
-    assert bench.owner(7) == 1
-
-
-def test_r29_what_is_acknowledged_does_not_wait() -> None:
-    bench = Bench(limits=Limits(policy=DeadlinePolicy.HOLD, grace=1))
-    bench.tick(births=[(7, 0)])
-    for _ in range(2):
-        bench.pass_on(bench.begin(approaching=[(7, 1)]))
-        bench.commit()
-    assert bench.directory.table.waiting == {7: 2}
-    bench.pass_on(bench.offer(0, (7, 1)))
-    bench.begin(approaching=[(7, 1)])
-    assert not bench.directory.table.planned.record.waiting
-    assert not bench.directory.overdue()
 
 
 def test_r30_an_overlap_that_does_not_cover_is_refused_with_the_numbers() -> None:

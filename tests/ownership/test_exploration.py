@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import pytest
 
-from cavmarl.ownership.limits import DeadlinePolicy, Limits
+from cavmarl.ownership.limits import Limits
 from tests.ownership.explorer import Explorer, Small
-
-PATIENT = Limits(deferral=1, policy=DeadlinePolicy.EXTEND, grace=1)
 
 QUICK = {
     "1 vehicle, 3 zones, 3 ticks": Small(zones=3, ticks=3),
@@ -28,7 +26,6 @@ QUICK = {
     ),
     "1 vehicle, 2 zones, two hosts die": Small(crashes=2),
     "1 vehicle, 2 zones, no waiting": Small(ticks=3, limits=Limits(deferral=0)),
-    "1 vehicle, 2 zones, a policy": Small(ticks=4, turns_away=False, limits=PATIENT),
     "2 vehicles, 2 zones, 3 ticks": Small(vehicles=2, ticks=3),
     "2 vehicles, 2 zones, the coordinator dies": Small(
         vehicles=2, ticks=3, coordinator_crashes=1, turns_away=False

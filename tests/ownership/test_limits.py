@@ -9,7 +9,7 @@ import pytest
 from cavmarl.core.errors import ConfigError, ProtocolError
 from cavmarl.ownership.distances import Distances
 from cavmarl.ownership.ledger import OwnedTally, SeenIds, tally
-from cavmarl.ownership.limits import DeadlinePolicy, Limits
+from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.transport import Rates
 
 RUN = bytes(range(16))
@@ -20,8 +20,6 @@ RUN = bytes(range(16))
     [
         ({"deferral": -1}, "deferral is -1"),
         ({"attempts": 0}, "attempts is 0"),
-        ({"grace": 2}, "'force' takes no grace"),
-        ({"policy": DeadlinePolicy.HOLD}, "need at least 1"),
     ],
 )
 def test_deadlines_that_cannot_work_are_refused(change: dict[str, Any], why: str) -> None:

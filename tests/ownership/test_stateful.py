@@ -109,7 +109,7 @@ class Ownership(RuleBasedStateMachine):
             return
         table = self.bench.directory.table
         assert table.owners.keys() == self.where.keys()
-        longest = self.bench.limits.longest_deferral
+        longest = self.bench.limits.deferral
         assert all(ticks <= longest for ticks in table.deferred.values())
         waiting = set(table.deferred)
         for zone, endpoint in self.bench.endpoints.items():

@@ -169,7 +169,7 @@ def entries() -> tuple[TraceEntry, ...]:
 
 
 def judge(entries: list[TraceEntry]) -> None:
-    check_trace(entries, Limits().longest_deferral, Limits().lifetime)
+    check_trace(entries, Limits().deferral, Limits().lifetime)
 
 
 def places(

@@ -62,7 +62,7 @@ def test_the_rows_of_a_campaign_are_the_switches_of_its_log() -> None:
     log = followed(simulator.trace)
     assert len(log.rows) == simulator.switches == log.counts["switched"] + log.counts["forced"]
     assert log.counts["deferred"] == simulator.deferred
-    assert all(row.waited <= Limits().longest_deferral for row in log.rows)
+    assert all(row.waited <= Limits().deferral for row in log.rows)
     assert all(row.forced or row.offers for row in log.rows)
 
 

@@ -89,8 +89,6 @@ FEATURES: dict[str, Callable[[Path], Keywords]] = {
     "invariant checks": _with(zones__check_invariants=True),
     "repartitions": _with(zones__repartition_steps=3),
     "planned faults": _faults,
-    "holding before borders": _with(zones__policy="hold", zones__grace_ticks=3),
-    "turning away from borders": _with(zones__policy="reroute", zones__grace_ticks=3),
 }
 PLACES: dict[str, Keywords] = {
     "zones": {"zones": 3},
@@ -103,7 +101,7 @@ PLACES: dict[str, Keywords] = {
 # What an undivided world, beside which others are run, does not know.
 ONLY_DIVIDED = (
     "zones.faults", "zones.journal", "zones.check_invariants", "zones.repartition_steps",
-    "workers.balance_steps", "workers.monitor_cpu", "zones.policy", "zones.grace_ticks",
+    "workers.balance_steps", "workers.monitor_cpu",
 )  # fmt: skip
 OF_ONE_WORLD = "of one world over"
 OF_THE_CALLER = "a network simulator is in the caller's process"
@@ -119,6 +117,8 @@ REFUSED = {
     ("a network simulator", "worlds on Ray"): OF_THE_CALLER,
     ("a journal", "worlds on Ray"): NOT_ON_HOSTS,
     ("planned faults", "worlds on Ray"): NOT_ON_HOSTS,
+    ("planned faults", "nodes"): NOT_OVER_NODES,
+    ("planned faults", "nodes on Ray"): NOT_OVER_NODES,
     ("sensor workers", "worlds on Ray"): "leave out the hosts",
     ("balance by LoadScore", "worlds on Ray"): "or leave out the hosts",
     ("sensor workers", "nodes on Ray"): NOT_OVER_NODES,

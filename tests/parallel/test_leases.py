@@ -34,18 +34,10 @@ def test_leases_are_for_all_ticks_of_a_step(ticks: int) -> None:
     assert late_ticks(config) == each - 1
 
 
-def test_with_a_plan_of_faults_a_lease_is_a_tick() -> None:
-    config = stepped(MOST, **{"zones.faults": "{}", "zones.policy": "extend"})
-    assert lease_ticks(config) == 1
-    assert late_ticks(config) == config.zones.max_deferred_ticks + config.zones.grace_ticks == 5
-
-
-def stepped(ticks: int, **overrides: Any) -> EnvConfig:
+def stepped(ticks: int) -> EnvConfig:
     """Settings with so many ticks a step."""
-    overrides |= {"clock.ctrl_dt_s": 0.05 * ticks, "clock.sim_dt_s": 0.05, "zones.grace_ticks": 3}
+    overrides = {"clock.ctrl_dt_s": 0.05 * ticks, "clock.sim_dt_s": 0.05}
     overrides["horizon_s"] = 5.0 * ticks
-    if "zones.policy" not in overrides:
-        del overrides["zones.grace_ticks"]
     return load_config("grid4x4", zones=2, overrides=overrides)[0]
 
 

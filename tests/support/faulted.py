@@ -106,7 +106,7 @@ def replay(
     vec = make_vec(run.env, num_envs=run.worlds, zones=zones, overrides=wanted)
     for coordinator in vec.simulation.coordinators:
         deadlines = vec.simulation.config.zones
-        longest = deadlines.max_deferred_ticks + deadlines.grace_ticks
+        longest = deadlines.max_deferred_ticks
         coordinator.watch(Checked(longest, is_direct=faults is None))
         for watcher in watchers:
             coordinator.watch(watcher)

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from cavmarl.config.zones import ZonesConfig
 from cavmarl.core.errors import ConfigError
-from cavmarl.handoff.border_holds import BorderHolds
 from cavmarl.handoff.coordinator.coordinator import Coordinator
 from cavmarl.handoff.coordinator.coordinators import Coordinators, RowStates
 from cavmarl.handoff.coordinator.handoff_log import HandoffLog
@@ -28,13 +27,12 @@ from cavmarl.handoff.fault_injection.message_coordinator import MessageCoordinat
 from cavmarl.handoff.fault_injection.recovery import Recovery
 from cavmarl.handoff.shard_setup import limits_of, neighbours_of
 from cavmarl.ownership.directory import Directory
-from cavmarl.ownership.limits import DeadlinePolicy, Limits
+from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import RUN_BYTES
 from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.ownership.transport import Network
 from cavmarl.shards.shard import Shard
-from cavmarl.traffic.found_ways import FoundWays
 
 
 class CoordinatorSetup(NamedTuple):
@@ -97,7 +95,6 @@ def make_coordinators(
     safeguards: Safeguards = ALL_ON,  # remedies of the protocol; tests take one away
     # one a world; None: they are chosen, and their journals must not be there
     runs: Sequence[WorldRun] | None = None,
-    found_ways: FoundWays | None = None,  # where vehicles that turn away from a border find one
 ) -> CoordinatorSetup:
     """The coordinators of a divided world.
 
@@ -109,9 +106,7 @@ def make_coordinators(
     limits = limits_of(settings, division.codec.schema)
     faults, deaths = check_faults(settings, division.count, division.num_worlds)
     crashes = Crashes(faults) if faults is not None and deaths else None
-    ways = found_ways if limits.policy is DeadlinePolicy.REROUTE else None
-    holds = BorderHolds(shards, division, limits.grace, ways) if limits.holds else None
-    states = [RowStates(division, w, holds) for w in range(division.num_worlds)]
+    states = [RowStates(division, w) for w in range(division.num_worlds)]
     transfers = tuple(TransferLog(limits.lifetime, known.borders) for known in states)
     coordinators = [
         _referee(

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import ProtocolError
 from cavmarl.core.records.arrays import Gate
-from cavmarl.handoff.border_holds import Ahead, BorderHolds
 from cavmarl.handoff.coordinator.coordinator import ArrivingVehicle, Coordinator, Near
 from cavmarl.handoff.coordinator.invariant_monitor import InvariantMonitor
 from cavmarl.handoff.coordinator.row_digests import RowDigests
@@ -21,7 +20,7 @@ from cavmarl.handoff.fault_injection.committed_store import CommittedStore, Note
 from cavmarl.handoff.fault_injection.message_coordinator import MessageCoordinator
 from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.ledger import state_digest
-from cavmarl.ownership.messages import BorderWait, Record
+from cavmarl.ownership.messages import Record
 from cavmarl.shards.shard import Commands
 from cavmarl.zones.kernels.zone_lookup import zones_of
 
@@ -62,13 +61,10 @@ class NearBorders:
 class RowStates:
     """States of one world's vehicles at the committed tick, read from the rows of their owners."""
 
-    def __init__(self, division: Division, world: int, holds: BorderHolds | None = None) -> None:
+    def __init__(self, division: Division, world: int) -> None:
         self.borders = NearBorders(division, world)  # vehicles near a border when the tick began
-        # of them those before it that can be held there; none without a policy that holds
-        self.ahead: Sequence[Ahead] = ()
         self._division = division
         self._world = world
-        self._holds = holds
         self._known: dict[int, bytes] = {}
 
     def forget(self) -> None:
@@ -77,17 +73,8 @@ class RowStates:
     def look(self, everybody: bool) -> list[Near]:
         """Vehicles near a border; see `Division.near`."""
         found = self._division.near(self._world, everybody)
-        if self._holds is not None:
-            self.ahead = self._holds.ahead(self._world)
-            told = {(entry.vehicle, entry.target) for entry in found}
-            found += [e.near() for e in self.ahead if (e.vehicle, e.target) not in told]
         self.borders.near = found
         return found
-
-    def hold(self, held: Sequence[BorderWait]) -> None:
-        """Keep these vehicles from the border in the tick on its way, and no others."""
-        if self._holds is not None:
-            self._holds.hold(self._world, self.ahead, held)
 
     def change(self, entries: Sequence[ArrivingVehicle]) -> None:
         """Let rows change hands, of vehicles that `look` has found."""

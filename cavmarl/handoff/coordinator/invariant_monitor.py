@@ -65,7 +65,7 @@ class OwnersOnRecord:
         near: Sequence[Container[int]] | None = None,  # zone → its neighbours; None: all
     ) -> None:
         self.entered = self.left = 0  # vehicles that zones have begun to own, since the reset
-        self._checker = TraceChecker(limits.longest_deferral, limits.lifetime, is_direct, near)
+        self._checker = TraceChecker(limits.deferral, limits.lifetime, is_direct, near)
         self._sums = np.zeros(zones, dtype=np.uint64)
         self._current = self._sums  # with what records that are still to come add to them
         self.ask: Callable[[], None] = _nothing

@@ -28,8 +28,6 @@ class JournalSummary:
     forced: int = 0  # of these with the state attached, since the target was not ready in time
     # ticks that vehicles stayed with a zone that did not contain them, all together
     deferrals: int = 0
-    # ticks that vehicles were kept from a border whose other side did not answer, all together
-    held: int = 0
     hosts: int = 0  # processes that were given a zone
     fences: int = 0  # processes that were given up
     unfinished: int = -1  # the tick that was begun and not committed, or -1
@@ -48,7 +46,6 @@ class JournalSummary:
         self.switches += len(begin.switches)
         self.forced += sum(switch.forced for switch in begin.switches)
         self.deferrals += len(begin.deferred)
-        self.held += sum(entry.held for entry in begin.waiting)
         self.unfinished = -1
 
 

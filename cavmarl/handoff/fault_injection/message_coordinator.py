@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Protocol, TypeAlias
 
 from cavmarl.core.errors import ProtocolError
-from cavmarl.handoff.border_holds import Ahead
 from cavmarl.handoff.coordinator.coordinator import ArrivingVehicle, Coordinator, Near
 from cavmarl.handoff.coordinator.journal import AnyJournal, MemoryJournal
 from cavmarl.ownership.decisions import Neighbours
@@ -17,7 +16,6 @@ from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import (
     COORDINATOR,
     Begin,
-    BorderWait,
     Message,
     Output,
     Prepare,
@@ -49,8 +47,6 @@ class Post(Protocol):
 class States(Protocol):
     """Rows of vehicles at the committed tick."""
 
-    ahead: Sequence[Ahead]  # vehicles before a border, of those that `look` has found
-
     def forget(self) -> None: ...
 
     def look(self, everybody: bool) -> Sequence[Near]:
@@ -66,10 +62,6 @@ class States(Protocol):
     def digest_of(self, vehicle: int) -> bytes: ...
 
     def change(self, entries: Sequence[ArrivingVehicle]) -> None: ...
-
-    def hold(self, held: Sequence[BorderWait]) -> None:
-        """Keep these vehicles from the border in the tick on its way, and no others."""
-        ...
 
 
 class MessageCoordinator(Coordinator):
@@ -155,25 +147,12 @@ class MessageCoordinator(Coordinator):
             owners = directory.table.owners
             movers = [(v.vehicle, v.target) for v in near if v.crossed and v.vehicle in owners]
             self._leases = {}
-            before = self._approaching()
-            self._do(directory.begin(movers, births, inputs, approaching=before))
+            self._do(directory.begin(movers, births, inputs))
         self._until("STEP", self._unleased, lambda: directory.resend(self._unleased()))
         entries = self._entries()
         for switch, _ in entries:
             states.state(switch.vehicle)  # a STEP may be repeated after rows moved
         states.change(entries)
-        if self._limits.holds:
-            states.hold(directory.overdue())
-
-    def _approaching(self) -> list[tuple[int, int]]:
-        """(vehicle, next zone) before a border: those that can stop there, or are held already."""
-        table, grace = self.directory.table, self._limits.grace
-        return [
-            (entry.vehicle, entry.target)
-            for entry in self._states.ahead
-            if entry.vehicle in table.owners
-            and (entry.can_stop or table.waiting.get(entry.vehicle, 0) > grace)
-        ]
 
     def end(self, rows: Callable[[int], int], stored: Callable[[int], int] | None = None) -> None:
         """Every zone is through: DONE and COMMIT.

@@ -7,17 +7,13 @@ be offered before that, since it is on no record yet, a lease of no ticks comes 
 from __future__ import annotations
 
 from cavmarl.config.env import EnvConfig
-from cavmarl.handoff.shard_setup import limits_of
 
 MOST = 4  # ticks: the longer, the further zones have to see over their borders
 
 
 def lease_ticks(config: EnvConfig) -> int:
-    """The ticks of a lease; the last one of a step may have fewer.
-
-    One with a plan of faults, which counts deadlines by ticks.
-    """
-    return 1 if config.zones.faults else min(config.clock.ticks_per_step, MOST)
+    """The ticks of a lease; the last one of a step may have fewer."""
+    return min(config.clock.ticks_per_step, MOST)
 
 
 def leases_of(ticks: int, lease: int) -> int:
@@ -27,6 +23,4 @@ def leases_of(ticks: int, lease: int) -> int:
 
 def late_ticks(config: EnvConfig) -> int:
     """For how many ticks more than one a vehicle that has crossed may stay with its zone."""
-    if config.zones.faults:
-        return limits_of(config.zones).longest_deferral
     return lease_ticks(config) - 1

@@ -80,7 +80,6 @@ class FrameKind(IntEnum):
     ACTIONS = 23  # C → N: those
     EXCHANGE = 24  # N → C: messages that are sent, for a network simulator
     RECEPTIONS = 25  # C → N: which of them are received where
-    PHASE = 26  # C → N, N → C: messages of the protocol that a plan of faults may harm
 
 
 class NodeFrame(NamedTuple):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 
 from cavmarl.core.errors import MessageError, ProtocolError
@@ -46,9 +46,8 @@ class _World:
         limits: Limits,
         journal: AnyJournal | None,
         is_checked: bool,
-        states: CrossingDigests,
     ) -> None:
-        self.states = states
+        self.states = CrossingDigests()
         self.directory = Directory(run, range(zones), self.states, limits)
         self.journal = journal
         self.log = TransferLog(limits.lifetime)
@@ -102,12 +101,8 @@ class NodeCoordinator:
 
     Attributes:
         switched: vehicles that have changed their owner.
-        injected: (kind, fault) → how often a plan of faults has had it happen to a message.
         is_late: a vehicle has crossed a border that was on no record: a lease of no ticks is due.
     """
-
-    states: type[CrossingDigests] = CrossingDigests
-    may_be_quiet = True  # where there is nothing to say of a tick nothing is sent
 
     def __init__(
         self,
@@ -119,13 +114,12 @@ class NodeCoordinator:
         is_checked: bool = False,  # whether it is checked what zones own
     ) -> None:
         self._worlds = [
-            _World(run, len(node_of), limits, journal, is_checked, self.states())
+            _World(run, len(node_of), limits, journal, is_checked)
             for run, journal in zip(runs, journals, strict=True)
         ]
         self._node_of = node_of
-        self._links, self._limits = links, limits
+        self._links = links
         self.switched, self.is_late = 0, False
-        self.injected: Counter[tuple[str, str]] = Counter()
 
     def host(self, neighbours: Neighbours) -> list[list[Hosting]]:
         """Begin; what the hosts of all zones have to know, by worlds."""
@@ -194,7 +188,7 @@ class NodeCoordinator:
         output = world.directory.on_message(message)
         world.write(output)
         if output.messages:
-            self._send([(w, answer) for answer in output.messages])
+            self.lease(self._by_node([(w, answer) for answer in output.messages]), 1)
 
     def commit(self, reports: Mapping[int, tuple[list[tuple[int, Message]], list[Report]]]) -> None:
         """All nodes are through with the tick, as they report."""
@@ -253,7 +247,7 @@ class NodeCoordinator:
         for w, world in enumerate(self._worlds):
             births, world.births = world.births, []
             world.answered.clear()
-            if self.may_be_quiet and world.says_nothing(births) and world.directory.begin_quiet():
+            if world.says_nothing(births) and world.directory.begin_quiet():
                 continue
             output = world.directory.begin(world.movers, births)
             world.has_told = True
@@ -275,9 +269,6 @@ class NodeCoordinator:
             for vehicle, zone in sorted(world.answered)
             if vehicle in owners and owners[vehicle][0] != zone
         ]
-
-    def _send(self, messages: Sequence[tuple[int, Message]]) -> None:
-        self.lease(self._by_node(messages), 1)
 
     def lease(self, messages: Mapping[int, bytes], ticks: int) -> None:
         """Send each node what `begin` has decided; 0 ticks, or as many as a lease has."""

@@ -19,18 +19,19 @@ from cavmarl.core.processes import is_fork, refuse_fork
 from cavmarl.engine.compilation import compiled_before
 from cavmarl.engine.world_setup import World
 from cavmarl.handoff.coordinator.coordinator_setup import prepare_runs
+from cavmarl.handoff.coordinator.journal import Journal
+from cavmarl.handoff.shard_setup import limits_of
 from cavmarl.ownership.decisions import Neighbours
 from cavmarl.ownership.reactions import Hosting
 from cavmarl.parallel.commanded_worlds import own_error
 from cavmarl.parallel.journaled_worlds import unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
-from cavmarl.parallel.nodes.fault_phases import node_faults
-from cavmarl.parallel.nodes.faulty_coordinator import Pieces, coordinator_of
 from cavmarl.parallel.nodes.leases import lease_ticks, leases_of
 from cavmarl.parallel.nodes.link import FrameKind, NodeFrame, said_by
 from cavmarl.parallel.nodes.links import LinkLostError, Links
 from cavmarl.parallel.nodes.newcomers import Newcomer, Newcomers
 from cavmarl.parallel.nodes.node_actions import NodeCommand, read_refusal
+from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
 from cavmarl.parallel.nodes.node_cuts import PoolState, ZoneCut, read_neighbours, told_zones
 from cavmarl.parallel.nodes.node_files import files_of
 from cavmarl.parallel.nodes.node_starters import Route, Start, start_nodes, straight
@@ -108,11 +109,15 @@ class NodePool:
         self._watch = NodeWatch(self._links, lambda: self._starter.stopped())
         self._nodes: dict[int, Newcomer] = {}  # what is known of each that lives
         self._new: dict[int, tuple[str, int]] = {}  # where the others can call those of them
-        faults = node_faults(config.zones, count, num_worlds)
         runs = prepare_runs(config.zones, num_worlds)
         self._lease_ticks = lease_ticks(config)
-        self._coordinator = coordinator_of(
-            config.zones, runs, nodes_of(self.zones), self._links, faults, self._phase
+        self._coordinator = NodeCoordinator(
+            [run.run for run in runs],
+            nodes_of(self.zones),
+            limits_of(config.zones),
+            self._links,
+            [None if run.journal is None else Journal(run.journal, anew=True) for run in runs],
+            config.zones.check_invariants,
         )
         self._links.urgent = self._hear
         self._runs = [run.run.hex() for run in runs]
@@ -122,7 +127,6 @@ class NodePool:
             "recipe": recipe_of(world, base_dir),
             "num_worlds": num_worlds,
             "in_next_step": in_next_step,
-            "faults": faults.to_json() if faults else "",
             "lease_ticks": self._lease_ticks,
         }
         files = files_of(config, base_dir)
@@ -292,12 +296,6 @@ class NodePool:
             self._commit()
             lease = decide()
         return lease
-
-    def _phase(self, told: Pieces) -> dict[int, memoryview]:
-        """Begin a phase of a plan of faults; what all nodes say at its end."""
-        for number, pieces in told.items():
-            self._links.send(number, FrameKind.PHASE, self._generation, pieces)
-        return {number: frame.data for number, frame in self._take(FrameKind.PHASE).items()}
 
     def _hear(self, number: int, frame: NodeFrame) -> None:
         """Take an urgent frame; an error of a node is raised here."""

@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import CavmarlError, MessageError, NodeRefusedError
 from cavmarl.core.tracebacks import traceback_text
 from cavmarl.engine.shard_clock import ShardClock
-from cavmarl.handoff.fault_injection.injected_faults import ZoneDeath
+from cavmarl.handoff.shard_setup import limits_of
 from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.parallel.hosts.host_process import code_stamp
 from cavmarl.parallel.nodes.agent_stream import ResultStream
-from cavmarl.parallel.nodes.faulty_hosts import hosts_of
 from cavmarl.parallel.nodes.kept_states import KeptStates
 from cavmarl.parallel.nodes.link import Bytes, FrameKind, NeededNoMoreError, NodeFrame
 from cavmarl.parallel.nodes.links import LinkLostError, Links, RecoveryOrderedError
@@ -39,7 +38,7 @@ from cavmarl.parallel.nodes.node_loads import told_of
 from cavmarl.parallel.nodes.node_network import AskedNetwork
 from cavmarl.parallel.nodes.node_peers import NodePeers
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
-from cavmarl.parallel.nodes.zone_hosts import hosting_of
+from cavmarl.parallel.nodes.zone_hosts import ZoneHosts, hosting_of
 from cavmarl.parallel.nodes.zone_moves import living_of, nodes_of
 from cavmarl.parallel.worlds_job import Task, commands_of
 
@@ -83,7 +82,7 @@ class NodeProgram:
         )
         self._commands = commands_of(worlds.arrays)
         self._inputs, self._results = Inputs(worlds.arrays), ResultStream(worlds.arrays)
-        self._faults, self._lease_ticks = job["faults"], job["lease_ticks"]
+        self._lease_ticks = job["lease_ticks"]
         worlds.keep_logs()
         v2x = worlds.world.config.v2x
         if v2x.enabled and v2x.channel.external:
@@ -125,9 +124,10 @@ class NodeProgram:
         arrays = self._worlds.arrays
         carried = [arrays.controls, arrays.meta_actions]
         carried += [] if mounted is None else mounted.arrays()
-        self._hosts = hosts_of(
-            simulation, mine, nodes_of(zones), told, self._links, carried, generation,
-            self._lease_ticks, self._faults,
+        settings, division = simulation.config.zones, simulation.division
+        self._hosts = ZoneHosts(
+            division, mine, nodes_of(zones), told, limits_of(settings, division.codec.schema),
+            self._links, carried, generation, settings.check_invariants, self._lease_ticks,
         )  # fmt: skip
         self._run_own()
 
@@ -140,7 +140,7 @@ class NodeProgram:
         self._clock = ShardClock(own, MEASURED_TICKS) if every else None
         plain = NodeExecutor(own, foreign)
         executor = plain if self._clock is None else TimedNodeExecutor(plain, self._clock)
-        simulation.share(self._peers, self._hosts, self._hosts.executor(executor))
+        simulation.share(self._peers, self._hosts, executor)
 
     def _hear(self, number: int, frame: NodeFrame) -> None:
         """Take an urgent frame."""
@@ -174,8 +174,6 @@ class NodeProgram:
                     self._recover(frame)
                 elif frame.kind is FrameKind.LEASE:
                     self._hosts.note(frame.data)
-                elif frame.kind is FrameKind.PHASE:
-                    self._hosts.phase(frame)
                 else:
                     self._perform(frame)
             except RecoveryOrderedError as ordered:
@@ -416,8 +414,6 @@ def run_node(
         node.serve()
     except NodeRefusedError:
         raise
-    except ZoneDeath:
-        system.end()
     except NeededNoMoreError:
         return True
     except LinkLostError:

@@ -7,7 +7,7 @@ import select
 import socket
 import time
 from collections.abc import Mapping
-from typing import Any, NoReturn, Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 from cavmarl.parallel.hosts.listener import Listener, call
 from cavmarl.parallel.journaled_worlds import unwatched
@@ -70,10 +70,6 @@ class NodeSystem(Protocol):
         in_next_step: bool,  # when worlds begin anew
     ) -> LocalWorlds: ...
 
-    def end(self) -> NoReturn:
-        """End this process at once, as SIGKILL does."""
-        ...
-
 
 class Machine:
     """This machine's."""
@@ -99,9 +95,6 @@ class Machine:
         late = late_ticks(world.config)
         world = unwatched(world)
         return LocalWorlds(world, num_worlds, warm=True, in_next_step=in_next_step, late_ticks=late)
-
-    def end(self) -> NoReturn:
-        os._exit(1)
 
 
 MACHINE = Machine()

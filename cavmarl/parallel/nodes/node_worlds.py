@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import socket
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -325,11 +324,6 @@ class NodeWorlds(NodePool):
         return self._coordinator.in_flight(world)
 
     @property
-    def injected(self) -> Counter[tuple[str, str]]:
-        """(kind, fault) → how often a plan of faults has had it happen to a message."""
-        return self._coordinator.injected
-
-    @property
     def migrations(self) -> int:
         """How many vehicles have changed their owner since the worlds were made."""
         return self._coordinator.switched
@@ -347,6 +341,7 @@ def check_nodes(world: World, nodes: int) -> None:
             "more zones or fewer nodes"
         )
     refused = {
+        "zones.faults": (config.zones.faults, NO_TICK),
         "zones.reproducers": (config.zones.reproducers, NO_TICK),
         "workers.sensors": (
             config.workers.sensors,

@@ -31,7 +31,6 @@ from cavmarl.ownership.offers import Approach
 from cavmarl.ownership.reactions import Advance, Hosting
 from cavmarl.parallel.nodes.link import Bytes, FrameKind, NodeFrame
 from cavmarl.parallel.nodes.links import Links, RecoveryOrderedError
-from cavmarl.shards.executor import Executor
 from cavmarl.shards.shard import Commands
 from cavmarl.zones.kernels.zone_lookup import zones_of
 
@@ -41,7 +40,7 @@ _LENGTH = struct.Struct("<II")
 class Report(NamedTuple):
     """What the coordinator has to know of a world's tick beside DONE."""
 
-    # vehicle, zone that it is in, digest of its state as hex, or with a plan of faults the state
+    # vehicle, zone that it is in, digest of its state as hex
     movers: list[tuple[int, int, str]]
     births: list[tuple[int, int]]  # vehicle, zone that owns it first
     began: bool  # the world has begun anew after the tick
@@ -110,11 +109,9 @@ class ZoneHosts:
             frame = self._links.next(COORDINATOR)
             if frame.kind is FrameKind.RECOVER:
                 raise RecoveryOrderedError(frame)
-            if frame.kind is FrameKind.PHASE:
-                self.phase(frame)
-            elif frame.kind is not FrameKind.LEASE:
+            if frame.kind is not FrameKind.LEASE:
                 raise ProtocolError(f"a frame of kind {frame.kind.name}, where a lease was due")
-            elif frame.number:
+            if frame.number:
                 self.lease(frame.data)
             else:
                 self.note(frame.data)
@@ -146,20 +143,12 @@ class ZoneHosts:
         self._stirred = [True] * len(self._stirred)
         self.report()
 
-    def phase(self, frame: NodeFrame) -> None:
-        """Take and send messages as a plan of faults lets them come."""
-        raise ProtocolError("a phase of a plan of faults, and there is none")
-
     def _enter_lease(self) -> None:
         for w, leases in enumerate(self._leases):
             if leases:
                 self._change_hands(w, leases)
                 self._leases[w] = {}
         self._is_open = True
-
-    def executor(self, plain: Executor) -> Executor:
-        """What runs the phases of a tick."""
-        return plain
 
     def end(self) -> None:
         """The tick is over here; `report` tells the coordinator."""
@@ -277,16 +266,12 @@ class ZoneHosts:
                 state = division.state(w, entry.source, entry.row)
                 approaches[entry.source].append(Approach(entry.vehicle, entry.target, state))
                 self._targets[w][entry.vehicle] = entry.target
-                movers.append((entry.vehicle, entry.target, self._told(state)))
+                movers.append((entry.vehicle, entry.target, state_digest(state).hex()))
         for zone, endpoint in endpoints.items():
             if not began and (approaches[zone] or endpoint.offers.open):
                 for message in endpoint.offer(approaches[zone]):
                     self._send(w, message)
         return movers, is_late
-
-    def _told(self, state: bytes) -> str:
-        """What the coordinator has to know of a state."""
-        return state_digest(state).hex()
 
     def hear(self, number: int, frame: NodeFrame) -> None:
         """Take messages of other nodes as soon as they come."""

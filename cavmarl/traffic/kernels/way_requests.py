@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import kernel
 from cavmarl.core.records.arrays import RoadArrays, Travel
 from cavmarl.core.records.codes import DRIVER_BACKGROUND, DRIVER_SCRIPTED, EVENT_ARRIVED
-from cavmarl.driving.kernels.ways import goes_on
 from cavmarl.roads.kernels.plans import change_cost
 from cavmarl.roads.kernels.route_steps import follow_plan, plan_route
 
@@ -135,19 +134,6 @@ def time_left(roads: RoadArrays, steps: NDArray[np.void], way: int, lane: int) -
             return total
         way += step["shift"]
         lane = step["next"]
-
-
-@kernel
-def last_edge(roads: RoadArrays, travel: Travel, lane: int, way: int) -> int:
-    """EDGE row that a way leads to from a lane; -1: it has no end."""
-    edge = -1
-    for _ in range(travel.steps.shape[0]):
-        if not roads.lanes[lane]["internal"]:
-            edge = roads.lanes[lane]["edge"]
-        lane, way, _link = goes_on(roads, travel, lane, way)
-        if lane < 0:
-            return edge
-    return -1
 
 
 @kernel
