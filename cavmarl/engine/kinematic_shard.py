@@ -91,7 +91,7 @@ class KinematicShard:
         self._commands.controls[...] = 0.0
         self._is_moved = False
         self._write(np.zeros(0, dtype=VEHICLE))
-        self._shared.switch_signals(worlds)
+        self._shared.switch_signals(common_of(worlds))
 
     def spawn(self, vehicles: NDArray[np.void]) -> None:
         """Own the vehicles VEHICLE (n,) from the present tick on."""
@@ -154,7 +154,7 @@ class KinematicShard:
         self._is_moved = False
         worlds = self._shard.worlds
         worlds.ticks[0] += 1
-        self._shared.switch_signals(worlds)
+        self._shared.switch_signals(common_of(worlds))
         if worlds.ticks[0] % self._per_step == 0:
             self._tick.sense(self._everywhere)
         return int(worlds.ticks[0])

@@ -19,6 +19,7 @@ from cavmarl.core.records.codes import ACTION_IDLE
 from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.engine import world_snapshot as snapshot
 from cavmarl.engine.compilation import compiling_all, prepare_kernels
+from cavmarl.engine.compiled_step import CompiledStep, compiled_step
 from cavmarl.engine.peers import Peers
 from cavmarl.engine.shard_clock import ShardClock
 from cavmarl.engine.shared_outputs import SharedOutputs
@@ -89,6 +90,7 @@ class Simulation(WorldViews):
         self._recovery: Recovery | None = None
         self._keeper: Keeper | None = None
         self._recutter: Recutter | None = None
+        self._compiled_step: CompiledStep | None = None
         prepare_kernels()
         shared = SharedOutputs(config, network, num_worlds, observations, zeros)
         self._tick = make_tick(
@@ -250,6 +252,10 @@ class Simulation(WorldViews):
             raise
 
     def _run_ticks(self, commands: Commands) -> None:
+        self._compiled_step = compiled_step(self._tick, self._compiled_step)
+        if self._compiled_step is not None:
+            self._compiled_step.run(commands)
+            return
         ticks = self.config.clock.ticks_per_step
         if self._recutter is not None:
             partition = self._recutter.before_step(self.partition)

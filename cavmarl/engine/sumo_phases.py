@@ -69,10 +69,9 @@ class NoSumo:
 
     def switch_signals(self, tick: Tick) -> None:
         """Ask the detectors of all zones, then switch the signals once."""
-        worlds = tick.worlds
         tick.executor.detect()
-        tick.peers.share_detections(worlds)
-        tick.shared.switch_signals(worlds)
+        tick.peers.share_detections(tick.worlds)
+        tick.shared.switch_signals(tick.common)
 
     def close(self) -> None:
         """There is nothing to end."""

@@ -20,7 +20,7 @@ from cavmarl.engine.sumo_phases import GlobalTraffic, NoSumo, SumoPhases
 from cavmarl.handoff.coordinator.coordinators import Coordination, NoCoordination
 from cavmarl.handoff.division import Division
 from cavmarl.shards.executor import Executor, TeamExecutor
-from cavmarl.shards.shard import Commands, Shard
+from cavmarl.shards.shard import Commands, Shard, common_of
 from cavmarl.shards.shard_group import ShardGroup
 from cavmarl.traffic.native import NativeTraffic
 
@@ -34,6 +34,7 @@ class Tick:
         coordination: decides which zone owns which vehicle.
         peers: the processes that run the other zones.
         sumo: the simulator beside these worlds.
+        common: ticks, keys and signals of the worlds, which all zones share.
     """
 
     def __init__(
@@ -62,6 +63,7 @@ class Tick:
         self._has_agents = self._shard.config.population.agents > 0
         self._gathers = False
         worlds = self._shard.worlds
+        self.common = common_of(worlds)
         self.count_tick = bind(count_tick, worlds.ticks)
         self.occasions = bind(
             occasions,

@@ -54,6 +54,7 @@ class Division:
         gathering: what shards are called with that `gather` their ghosts: how far outside of a zone
             a ghost can be that touches a vehicle in it, and how far inside one is at a border, m.
         neighbours: (k, k) between which zones vehicles change their owner.
+        row_count: the call that notes that an undivided world has no ghosts.
         call_hand_over: the kernel, with the types of all worlds' arrays found out once.
     """
 
@@ -93,7 +94,7 @@ class Division:
         self._take_over = specialized(take_over)
         self._running = np.zeros(self.num_worlds, dtype=np.int64)
         self._count_running = bind(totals, counts=zoned.num_owned, out=self._running)
-        self._count_rows = bind(count_rows, zoned=zoned)
+        self.row_count = bind(count_rows, zoned=zoned)
         self.call_hand_over = specialized(hand_over)
         self.call_release = specialized(release)
 
@@ -174,7 +175,7 @@ class Division:
 
     def count_rows(self) -> None:
         """Instead of `exchange` where one zone is all and no coordinator asks about borders."""
-        self._count_rows()
+        self.row_count()
 
     def let_gather(self, executor: Executor) -> bool:
         """From now on let shards `exchange` as a phase, if they run side by side; whether they do.

@@ -13,7 +13,7 @@ from cavmarl.core.records.arrays import Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.engine.shared_outputs import SharedOutputs
 from cavmarl.engine.simulation import Simulation
-from cavmarl.shards.shard import COMMON, Commands, Shard, make_zoned
+from cavmarl.shards.shard import COMMON, Commands, Shard, common_of, make_zoned
 from cavmarl.shards.shard_group import ShardGroup
 from cavmarl.zones.partition.zone_halo import zone_halo
 from cavmarl.zones.partition.zone_layouts import cut_map
@@ -119,7 +119,7 @@ def test_agents_get_the_same(env: str, mode: str, agents: int, background: int) 
     rng = np.random.default_rng(5)
     start(whole, seed=5)
     halves.take(whole.worlds, {})
-    halves.shared.switch_signals(halves.shards[0].worlds)
+    halves.shared.switch_signals(common_of(halves.shards[0].worlds))
     halves.sense(np.array([True, True]))
     both = 0
     for step in range(STEPS):
@@ -133,7 +133,7 @@ def test_agents_get_the_same(env: str, mode: str, agents: int, background: int) 
             noise = rng.normal(0.0, (2.0, 0.05), size=(*whole.outputs.present.shape, 2))
             whole.step(Commands(suggested(whole) + noise, idle(whole).meta_actions))
         both += halves.take(whole.worlds, returns)
-        halves.shared.switch_signals(halves.shards[0].worlds)
+        halves.shared.switch_signals(common_of(halves.shards[0].worlds))
         halves.sense(chosen)
         for name, mine, one in zip(
             whole.outputs._fields, halves.shared.outputs, whole.outputs, strict=True
@@ -159,7 +159,7 @@ def test_signals_are_the_same(tmp_path: Path) -> None:
             whole.step(idle(whole))
         halves.take(whole.worlds, {})
         halves.executor.detect()
-        halves.shared.switch_signals(halves.shards[0].worlds)
+        halves.shared.switch_signals(common_of(halves.shards[0].worlds))
         for name in ("signal_phase", "controllers", "detected_s"):
             expected = getattr(whole.worlds, name)
             assert getattr(halves.shards[0].worlds, name).tobytes() == expected.tobytes()
