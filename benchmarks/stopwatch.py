@@ -21,7 +21,7 @@ class Stopwatch:
         empty = self.around(_Nothing())
         began = clock()
         for _ in range(CALIBRATION):
-            empty.each("nothing")
+            empty.nothing()
         self._around = (clock() - began) / CALIBRATION
         self._inside = self.spent["nothing"] / CALIBRATION
         self.clear()
@@ -49,7 +49,7 @@ class Stopwatch:
 
 
 class _Nothing:
-    def each(self, phase: str) -> None:
+    def nothing(self) -> None:
         pass
 
 
@@ -69,12 +69,10 @@ class _Timed:
         watch, clock = self._watch, self._clock
 
         def timed(*arguments: Any) -> Any:
-            # An executor's `each` runs the phase that its first argument names.
-            phase = arguments[0] if name == "each" else name
             began = clock()
             result = method(*arguments)
-            watch.spent[phase] += clock() - began
-            watch.calls[phase] += 1
+            watch.spent[name] += clock() - began
+            watch.calls[name] += 1
             return result
 
         self.__dict__[name] = timed

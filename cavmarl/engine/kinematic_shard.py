@@ -21,9 +21,9 @@ from cavmarl.engine.shared_outputs import SharedOutputs
 from cavmarl.engine.tick_setup import make_frames, make_tick
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.observed import carried_from
-from cavmarl.shards.executor import SerialExecutor
 from cavmarl.shards.shard import Commands, common_of
 from cavmarl.shards.shard_backend import VehicleControl
+from cavmarl.shards.shard_group import ShardGroup
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
 
@@ -52,7 +52,7 @@ class KinematicShard:
         self._shared = shared
         self._refuse_what_is_shared(config, network)
         self._shard = tick.shards[zone]
-        tick.executor = self._executor = SerialExecutor([self._shard])
+        tick.executor = self._executor = ShardGroup([self._shard])
         self.zone = zone
         self.reach_m = tick.division.halo.halo_m
         self._per_step = config.clock.ticks_per_step
@@ -91,7 +91,7 @@ class KinematicShard:
         self._commands.controls[...] = 0.0
         self._is_moved = False
         self._write(np.zeros(0, dtype=VEHICLE))
-        self._shared.switch_signals(worlds)
+        self._shared.switch_signals(common_of(worlds))
 
     def spawn(self, vehicles: NDArray[np.void]) -> None:
         """Own the vehicles VEHICLE (n,) from the present tick on."""
@@ -126,8 +126,8 @@ class KinematicShard:
         """Move the owned vehicles to the next tick."""
         worlds = self._shard.worlds
         if worlds.ticks[0] % self._per_step == 0:
-            self._executor.each("begin_step", self._commands)
-        self._executor.each("advance", self._commands)
+            self._executor.begin_step(self._commands)
+        self._executor.advance(self._commands)
         self._tick.leave()
         self._tick.gate.num_queue[:] = 0  # those that would follow are others' to spawn
         self._is_moved = True
@@ -149,12 +149,12 @@ class KinematicShard:
 
     def commit(self) -> int:
         """End the tick; its number."""
-        self._executor.each("resolve")
-        self._executor.each("commit")
+        self._executor.resolve()
+        self._executor.commit()
         self._is_moved = False
         worlds = self._shard.worlds
         worlds.ticks[0] += 1
-        self._shared.switch_signals(worlds)
+        self._shared.switch_signals(common_of(worlds))
         if worlds.ticks[0] % self._per_step == 0:
             self._tick.sense(self._everywhere)
         return int(worlds.ticks[0])

@@ -7,17 +7,24 @@ are worked out everywhere alike.
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.records.arrays import Gate, Outputs, Worlds
+from cavmarl.handoff.division import Division
 
 
 class Peers(Protocol):
-    """Each method returns when all processes have called it in the same place of the tick."""
+    """Each method returns when all processes have called it in the same place of the tick.
+
+    Attributes:
+        are_none: whether this process runs all zones.
+    """
+
+    are_none: bool
 
     def keep_own(self, chosen: NDArray[np.bool_]) -> None:
         """After a reset of the chosen worlds (W,), of which all have made all vehicles."""
@@ -70,3 +77,47 @@ class Peers(Protocol):
     def share_outputs(self, outputs: Outputs, chosen: NDArray[np.bool_]) -> None:
         """What the agents of the chosen worlds (W,) have got, but for their observations."""
         ...
+
+
+class NoPeers:
+    """All zones are in this process, so nothing has to be shared."""
+
+    are_none = True
+
+    def __init__(self, division: Division) -> None:
+        self._division = division
+
+    def keep_own(self, chosen: NDArray[np.bool_]) -> None:
+        """All vehicles are of this process."""
+
+    def take_up(self, gate: Gate, side: int) -> None:
+        """There is nobody to tell."""
+
+    def everybody(self, gate: Gate, side: int) -> AbstractContextManager[None]:
+        """Return at once: the rows of all zones are always here."""
+        return nullcontext()
+
+    def share_rows(self, gate: Gate, side: int) -> None:
+        """All ghosts are here."""
+
+    def running(self) -> NDArray[np.int64]:
+        """Return (W,) vehicles of each world, in all zones."""
+        return self._division.running()
+
+    def clear_ranks(self, gate: Gate) -> None:
+        """The zones of this process write all ranks."""
+
+    def share_ranks(self, gate: Gate) -> None:
+        """All ranks are here."""
+
+    def share_proposals(self, gate: Gate) -> None:
+        """All proposals are here."""
+
+    def share_leavers(self, gate: Gate) -> None:
+        """All vehicles that leave are here."""
+
+    def share_detections(self, worlds: Worlds) -> None:
+        """All detectors are here."""
+
+    def share_outputs(self, outputs: Outputs, chosen: NDArray[np.bool_]) -> None:
+        """All outputs are here."""

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.shards.executor import SerialExecutor
-from cavmarl.shards.phases import PHASES
+from cavmarl.shards.executor import PhaseExecutor
+from cavmarl.shards.phases import Phase
 from cavmarl.shards.shard import Shard
+from cavmarl.shards.shard_group import ShardGroup
 
 
-class ShardClock:
+class ShardClock(PhaseExecutor):
     """Runs the phases of a tick zone by zone and adds up what each zone takes.
 
     What is done once for all zones (ghosts, the gate, signals, owners) is in no zone's time.
@@ -27,21 +28,22 @@ class ShardClock:
         # of them is not counted: it makes ready what the others use
         every: int = 1,
     ) -> None:
-        self._hosts = [SerialExecutor((shard,)) for shard in shards]
-        self._together = SerialExecutor(shards)
+        self._alone = [ShardGroup((shard,)) for shard in shards]
+        self._together = ShardGroup(shards)
         self._every = every
         self._ticks = 0
-        self._spent_ns = np.zeros(len(self._hosts), dtype=np.int64)
+        self._spent_ns = np.zeros(len(self._alone), dtype=np.int64)
 
-    def each(self, phase: str, *arguments: Any) -> None:
-        self._ticks += phase == "advance"
+    def run(self, phase: Phase, arguments: tuple[Any, ...]) -> None:
+        """Run a phase on all shards, in some ticks one after the other."""
+        self._ticks += phase is Phase.ADVANCE
         if self._ticks % self._every:
-            self._together.each(phase, *arguments)
+            phase.run(self._together, arguments)
             return
-        for zone, host in enumerate(self._hosts):
+        for zone, group in enumerate(self._alone):
             began = time.thread_time_ns()
-            host.each(phase, *arguments)
-            if not PHASES[phase].is_beside and self._ticks > self._every:
+            phase.run(group, arguments)
+            if not phase.value.is_beside and self._ticks > self._every:
                 self._spent_ns[zone] += time.thread_time_ns() - began
 
     def take_s(self) -> NDArray[np.float64]:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
-from cavmarl.core.compiled import specialized
+from cavmarl.core.compiled.bound_call import BoundCall, bind, keep_last
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.memory import Zeros
-from cavmarl.core.records.arrays import Outputs, Worlds
+from cavmarl.core.records.arrays import Common, Outputs
 from cavmarl.engine.kernels.outputs import clear_outputs, settle_outputs
 from cavmarl.roads.kernels.signal_phases import switch_signals
 from cavmarl.roads.network import RoadNetwork
@@ -21,6 +23,7 @@ class SharedOutputs:
 
     Attributes:
         outputs: of all agents; every shard writes at the indices of its own ones.
+        chosen: (W,) that `clearing` and `settling` read.
     """
 
     def __init__(
@@ -37,30 +40,54 @@ class SharedOutputs:
         self._sim_dt_s = config.clock.sim_dt_s
         self._weights = np.array(config.terms.weight_of_each)
         self._team = (config.terms.team_share, config.terms.team_range_m)
-        self._switch_signals = specialized(switch_signals)
-        self._clear_outputs = specialized(clear_outputs)
-        self._settle_outputs = specialized(settle_outputs)
+        self.has_signals = network.arrays.signals.size > 0
+        self.chosen = np.ones(num_worlds, dtype=np.bool_)
+        self.signal_switch = keep_last(self._bind_signal_switch)
 
-    def switch_signals(self, worlds: Worlds) -> None:
+    def _bind_signal_switch(self, common: Common) -> BoundCall[None]:
+        return bind(
+            switch_signals,
+            roads=self._roads,
+            keys=common.keys,
+            ticks=common.ticks,
+            detected_s=common.detected_s,
+            dt=self._sim_dt_s,
+            controllers=common.controllers,
+            signal_phase=common.signal_phase,
+        )
+
+    @cached_property
+    def clearing(self) -> BoundCall[None]:
+        """The call that makes all agents absent."""
+        return bind(clear_outputs, outputs=self.outputs, chosen=self.chosen)
+
+    @cached_property
+    def settling(self) -> BoundCall[None]:
+        """The call that sums rewards."""
+        team_share, team_range_m = self._team
+        return bind(
+            settle_outputs,
+            outputs=self.outputs,
+            weights=self._weights,
+            team_share=team_share,
+            team_range_m=team_range_m,
+            chosen=self.chosen,
+        )
+
+    def switch_signals(self, common: Common) -> None:
         """Bring the signals to the present tick, after `detect` of all shards."""
-        if self._roads.signals.size > 0:
-            self._switch_signals(
-                self._roads,
-                worlds.keys,
-                worlds.ticks,
-                worlds.detected_s,
-                self._sim_dt_s,
-                worlds.controllers,
-                worlds.signal_phase,
-            )
+        if self.has_signals:
+            self.signal_switch(common)()
 
     def clear_outputs(self, chosen: NDArray[np.bool_]) -> None:
         """Make all agents of the chosen worlds (W,) absent, before `sense` of all shards."""
-        self._clear_outputs(self.outputs, chosen)
+        np.copyto(self.chosen, chosen)
+        self.clearing()
 
     def settle_outputs(self, chosen: NDArray[np.bool_]) -> None:
         """Finish the outputs of the chosen worlds (W,) after `sense`, before `credit`."""
-        self._settle_outputs(self.outputs, self._weights, *self._team, chosen)
+        np.copyto(self.chosen, chosen)
+        self.settling()
 
 
 def make_outputs(

@@ -19,9 +19,11 @@ from cavmarl.core.records.codes import ACTION_IDLE
 from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.engine import world_snapshot as snapshot
 from cavmarl.engine.compilation import compiling_all, prepare_kernels
+from cavmarl.engine.compiled_step import CompiledStep, compiled_step
 from cavmarl.engine.peers import Peers
 from cavmarl.engine.shard_clock import ShardClock
 from cavmarl.engine.shared_outputs import SharedOutputs
+from cavmarl.engine.sumo_phases import SumoPhases
 from cavmarl.engine.tick_setup import cut_zones, make_frames, make_tick
 from cavmarl.engine.world_views import WorldViews
 from cavmarl.handoff.coordinator.coordinator_setup import WorldRun, make_coordinators
@@ -37,8 +39,9 @@ from cavmarl.ownership.transfers import TransferLog
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.mounted.frames import Frames
 from cavmarl.sensors.observed import carried_from
-from cavmarl.shards.executor import Executor, SerialExecutor, Together
+from cavmarl.shards.executor import Executor, TeamExecutor
 from cavmarl.shards.shard import Commands, Shard
+from cavmarl.shards.shard_group import ShardGroup
 from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
 from cavmarl.traffic.sumo.sumo_traffic import SumoTraffic
@@ -87,6 +90,7 @@ class Simulation(WorldViews):
         self._recovery: Recovery | None = None
         self._keeper: Keeper | None = None
         self._recutter: Recutter | None = None
+        self._compiled_step: CompiledStep | None = None
         prepare_kernels()
         shared = SharedOutputs(config, network, num_worlds, observations, zeros)
         self._tick = make_tick(
@@ -111,8 +115,10 @@ class Simulation(WorldViews):
         if isinstance(self.demand, SumoDemand):
             tick = self._tick
             travel, zoned = tick.traffic.travel, tick.division.zoned
-            tick.sumo = SumoTraffic(
-                self.demand, self.network, travel, travel.num_fixed, zoned, blank_vehicle()
+            tick.sumo = SumoPhases(
+                SumoTraffic(
+                    self.demand, self.network, travel, travel.num_fixed, zoned, blank_vehicle()
+                )
             )
 
     def _add_coordinators(self, runs: Sequence[WorldRun] | None) -> None:
@@ -168,10 +174,13 @@ class Simulation(WorldViews):
         self.suggest(controls)
         self.step(Commands(controls, np.full(shape, ACTION_IDLE, dtype=np.int64)))
         # Once more what is only called when vehicles leave or wait.
-        tick.let_in(all_phases=True)
-        tick.executor.each("retire", tick.gate)
-        tick.executor.each("forget", tick.gate)
-        tick.executor.each("gather", *tick.division.gathering)
+        tick.let_in()
+        tick.traffic.accept(tick.gate, self._shard.worlds, tick.peers.running())
+        tick.admit()
+        tick.executor.leave(tick.gate)
+        tick.executor.retire(tick.gate)
+        tick.executor.forget(tick.gate)
+        tick.executor.gather(*tick.division.gathering)
         tick.division.rehearse_gathering()
         tick.traffic.settle(tick.gate, self._shard.worlds)
         tick.division.near(0, everybody=True)
@@ -214,19 +223,15 @@ class Simulation(WorldViews):
         self._episodes[chosen] += 1
         tick.gate = tick.traffic.draw_orders(tick.gate, worlds, chosen)
         tick.traffic.populate(tick.gate, worlds, chosen)
-        if tick.sumo is not None:
-            tick.sumo.reset(chosen, worlds)
+        tick.sumo.reset(chosen, worlds)
         tick.division.distribute(chosen)
-        if tick.peers is not None:
-            tick.peers.keep_own(chosen)
-        if tick.coordination is not None:
-            tick.coordination.reset(chosen)
-        tick.switch_signals()
+        tick.peers.keep_own(chosen)
+        tick.coordination.reset(chosen)
+        tick.sumo.switch_signals(tick)
         for part in tick.attached:
             part.reset(chosen)
         tick.sense(chosen)
-        if tick.coordination is not None:
-            tick.coordination.save()
+        tick.coordination.save()
 
     def step(self, commands: Commands) -> None:
         """One agent step: its ticks, then what the agents sense.
@@ -236,7 +241,7 @@ class Simulation(WorldViews):
             SumoError: SUMO cannot go on; the worlds are as they were before the step, but for
                 those that share zones with other processes: they end.
         """
-        if self._tick.sumo is None or self._tick.peers is not None:
+        if self.sumo is None or not self._tick.peers.are_none:
             self._run_ticks(commands)
             return
         before = [array.copy() for array in self.save()]
@@ -247,12 +252,16 @@ class Simulation(WorldViews):
             raise
 
     def _run_ticks(self, commands: Commands) -> None:
+        self._compiled_step = compiled_step(self._tick, self._compiled_step)
+        if self._compiled_step is not None:
+            self._compiled_step.run(commands)
+            return
         ticks = self.config.clock.ticks_per_step
         if self._recutter is not None:
             partition = self._recutter.before_step(self.partition)
             if partition is not None:
                 self.partition = partition
-                self._tick.executor = SerialExecutor(self._shards)
+                self._tick.executor = ShardGroup(self._shards)
         for number in range(ticks):
             self.run_tick(commands, number == 0, number == ticks - 1)
 
@@ -279,7 +288,7 @@ class Simulation(WorldViews):
 
         No further reproducers are written.
         """
-        if self._tick.sumo is not None:
+        if self.sumo is not None:
             raise JournalError("a world with SUMO beside it cannot be taken up in its middle")
         self._keeper = None
         self.seed(kept.seed, kept.first_world)
@@ -296,7 +305,7 @@ class Simulation(WorldViews):
         self._refuse_recutting("measuring the phases of a tick")
         self._tick.instrument(wrap)
 
-    def trace(self, wrap: Callable[[Any], Any], note: Callable[[str], None]) -> None:
+    def trace(self, wrap: Callable[[Executor], Executor], note: Callable[[str], None]) -> None:
         """Let `wrap(executor)` note the phases of a tick, and attached parts name theirs to `note`.
 
         A part that has phases of its own (another simulator's step, say) has a method `trace`.
@@ -306,7 +315,7 @@ class Simulation(WorldViews):
     def host(
         self,
         # called with the shards, and with what the phase `gather` is called with
-        make: Callable[[Sequence[Shard], tuple[float, float]], Together],
+        make: Callable[[Sequence[Shard], tuple[float, float]], TeamExecutor],
     ) -> None:
         """From now on let others run the phases of the shards, as `make` returns them.
 
@@ -336,8 +345,6 @@ class Simulation(WorldViews):
     ) -> None:
         """Divide the plane otherwise, where others hold zones; then `share` has to follow."""
         tick = self._tick
-        assert tick.peers is not None
-        assert tick.coordination is not None
         self.divide(partition)
         tick.division.place(vehicles, contacts)
         tick.peers.keep_own(self.everywhere)
@@ -360,8 +367,7 @@ class Simulation(WorldViews):
             )
 
     def close(self) -> None:
-        if self._tick.sumo is not None:
-            self._tick.sumo.close()
+        self._tick.sumo.close()
         for coordinator in self.coordinators:
             coordinator.close()
 
@@ -385,22 +391,18 @@ class Simulation(WorldViews):
         """
         self._put_back(saved)
         tick = self._tick
-        if tick.sumo is not None:
-            tick.sumo.catch_up(self._shard.worlds)
-        if tick.peers is not None:
-            tick.peers.keep_own(self.everywhere)
-            tick.peers.take_up(tick.gate, tick.division.side)
+        tick.sumo.catch_up(self._shard.worlds)
+        tick.peers.keep_own(self.everywhere)
+        tick.peers.take_up(tick.gate, tick.division.side)
 
     def load_own(self, saved: Sequence[NDArray[Any]], home: int) -> None:
         """`load` where other processes hold zones: each goes on with its own, one is `home`."""
         self._put_back(saved, home)
         tick = self._tick
-        if tick.sumo is not None:
-            tick.sumo.catch_up(self._shard.worlds)
-        if tick.peers is not None:
-            tick.gate.num_passing[:] = 0
-            tick.peers.take_up(tick.gate, tick.division.side)
-            tick.peers.share_rows(tick.gate, tick.division.side)
+        tick.sumo.catch_up(self._shard.worlds)
+        tick.gate.num_passing[:] = 0
+        tick.peers.take_up(tick.gate, tick.division.side)
+        tick.peers.share_rows(tick.gate, tick.division.side)
 
     def _put_back(self, saved: Sequence[NDArray[Any]], home: int | None = None) -> None:
         roots, episodes, *rest = saved
@@ -432,12 +434,12 @@ class Simulation(WorldViews):
             coordination=tick.coordination,
             has_past=self._carried_from < self.outputs.observations.shape[2],
             attached=tick.attached,
-            sumo=tick.sumo,
+            sumo=tick.sumo.traffic,
         )
 
     def suggest(self, out: NDArray[np.float64]) -> None:
         """Write what the built-in driver would do in the agents' place into `out` (W, A, 2)."""
-        self._tick.executor.each("suggest", out)
+        self._tick.executor.suggest(out)
 
     def state_hash(self, world: int = 0) -> str:
         """Hex digest of a world's state.

@@ -12,6 +12,9 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
+from cavmarl.shards.executor import Executor, PhaseExecutor
+from cavmarl.shards.phases import Phase
+
 SUMO = "sumo"  # another simulator has gone to t + Δt
 MIRROR = "mirror"  # its vehicles have been moved to where it has them
 TICK = "tick"  # the world goes on by one tick
@@ -24,7 +27,7 @@ PHASES = (SUMO, MIRROR, TICK, SENSORS, STACK, QUEUE)
 
 # Phases of the runtime's executor that are phases of a cycle.
 # The world is at t + Δt when its rows are committed; those that SUMO moves have moved by then.
-_OF_EXECUTOR = {"commit": TICK, "sense": SENSORS}
+_OF_EXECUTOR = {Phase.COMMIT: TICK, Phase.SENSE: SENSORS}
 
 
 @runtime_checkable
@@ -55,22 +58,19 @@ class StepTrace:
         if self._cycles:
             self._cycles[-1].append(phase)
 
-    def around(self, part: Any) -> Any:
-        """What stands for the runtime's executor and notes its phases; see `Simulation.trace`."""
-        return _Traced(part, self.note)
+    def around(self, executor: Executor) -> Executor:
+        """Return an executor that notes the phases of another; see `Simulation.trace`."""
+        return _Traced(executor, self.note)
 
 
-class _Traced:
-    def __init__(self, part: Any, note: Callable[[str], None]) -> None:
-        self._part = part
+class _Traced(PhaseExecutor):
+    def __init__(self, executor: Executor, note: Callable[[str], None]) -> None:
+        self._executor = executor
         self._note = note
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._part, name)
-
-    def each(self, phase: str, *arguments: Any) -> Any:
+    def run(self, phase: Phase, arguments: tuple[Any, ...]) -> None:
         """Run a phase, and note it if it is one of the cycle's."""
         named = _OF_EXECUTOR.get(phase)
         if named is not None:
             self._note(named)
-        return self._part.each(phase, *arguments)
+        phase.run(self._executor, arguments)

@@ -33,7 +33,7 @@ class Parts(NamedTuple):
     gate: Gate  # through which vehicles come and go
     traffic: NativeTraffic  # what comes
     outputs: Outputs  # what agents have got; the frames of the next observation, too
-    coordination: Coordination | None  # decides ownership; None: all is one zone
+    coordination: Coordination  # decides ownership
     has_past: bool  # an observation takes something from the one before
     attached: tuple[Attached, ...]  # what acts in each tick beside the traffic
     sumo: SumoTraffic | None  # beside the worlds; None: there is none
@@ -80,8 +80,7 @@ def load(
         parts.division.place([np.concatenate(zones) for zones in vehicles], contacts)
     else:
         parts.division.put_back(vehicles, contacts, home)
-    if parts.coordination is not None:
-        parts.coordination.reset(everywhere)
+    parts.coordination.reset(everywhere)
     return gate
 
 

@@ -131,8 +131,7 @@ class WorldViews:
         return self._tick.division.loads()
 
     def zone_view(self, world: int = 0) -> ZoneView:
-        halo_m, coordination = self.zone_loads().halo_m, self._tick.coordination
-        transfers = () if coordination is None else coordination.in_flight(world)
+        halo_m, transfers = self.zone_loads().halo_m, self._tick.coordination.in_flight(world)
         return view_zones(self._shards, self.partition, halo_m, world, transfers)
 
     def running(self) -> NDArray[np.int64]:
@@ -153,7 +152,7 @@ class WorldViews:
     @property
     def coordinators(self) -> tuple[Coordinator, ...]:
         """The coordinators, one a world; none where all is one zone."""
-        return () if self._tick.coordination is None else self._tick.coordination.coordinators
+        return self._tick.coordination.coordinators
 
     @property
     def attached(self) -> tuple[Attached, ...]:
@@ -200,7 +199,7 @@ class WorldViews:
     @property
     def sumo(self) -> SumoTraffic | None:
         """SUMO beside these worlds; None where `traffic.source` is native."""
-        return self._tick.sumo
+        return self._tick.sumo.traffic
 
     def agents_to_come(self) -> NDArray[np.bool_]:
         tick = self._tick

@@ -16,12 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import specialized
+from cavmarl.core.compiled.bound_call import bind
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.math.tallies import totals
 from cavmarl.core.records.arrays import Worlds, Zoned
 from cavmarl.handoff.coordinator.coordinator import Near
 from cavmarl.ownership.messages import Birth, Switch
 from cavmarl.shards.executor import Executor
+from cavmarl.shards.kernels.group_phases import count_rows
 from cavmarl.shards.shard import Shard
 from cavmarl.shards.vehicle_codec import TransferCodec
 from cavmarl.zones.kernels.borders import Borders, give_up, pass_on, take_over
@@ -52,6 +54,7 @@ class Division:
         gathering: what shards are called with that `gather` their ghosts: how far outside of a zone
             a ghost can be that touches a vehicle in it, and how far inside one is at a border, m.
         neighbours: (k, k) between which zones vehicles change their owner.
+        row_count: the call that notes that an undivided world has no ghosts.
         call_hand_over: the kernel, with the types of all worlds' arrays found out once.
     """
 
@@ -89,7 +92,9 @@ class Division:
         self._pass_on = specialized(pass_on)
         self._give_up = specialized(give_up)
         self._take_over = specialized(take_over)
-        self._totals = specialized(totals)
+        self._running = np.zeros(self.num_worlds, dtype=np.int64)
+        self._count_running = bind(totals, counts=zoned.num_owned, out=self._running)
+        self.row_count = bind(count_rows, zoned=zoned)
         self.call_hand_over = specialized(hand_over)
         self.call_release = specialized(release)
 
@@ -163,16 +168,14 @@ class Division:
         Where shards `gather` them, `note_gathered` has to follow before the tick is over.
         """
         if self._gatherers is not None:
-            self._gatherers.each("gather", *self.gathering)
+            self._gatherers.gather(*self.gathering)
             return
         worlds = self._shards[0].worlds
         self._exchange(worlds.next_rows, 0, len(worlds.ticks))
 
     def count_rows(self) -> None:
         """Instead of `exchange` where one zone is all and no coordinator asks about borders."""
-        zoned = self._zoned
-        zoned.num_rows[:] = zoned.num_owned
-        zoned.num_near[:] = zoned.num_owned
+        self.row_count()
 
     def let_gather(self, executor: Executor) -> bool:
         """From now on let shards `exchange` as a phase, if they run side by side; whether they do.
@@ -392,9 +395,8 @@ class Division:
 
     def running(self) -> NDArray[np.int64]:
         """(W,) vehicles of each world."""
-        running = np.empty(self.num_worlds, dtype=np.int64)
-        self._totals(self._zoned.num_owned, running)
-        return running
+        self._count_running()
+        return self._running.copy()
 
     def loads(self) -> ZoneLoads:
         owned = np.array([shard.worlds.num_owned for shard in self._shards])

@@ -8,6 +8,7 @@ from pathlib import Path
 
 _PACKAGE = Path(__file__).parents[1]
 _DECORATORS = {"kernel", "inlined_kernel"}
+_FACTORIES = {"for_each_zone"}  # functions that return a kernel
 _CORE = ("core.math", "core.records")  # folders of kernels beside those named `kernels`
 
 
@@ -53,7 +54,15 @@ def _functions(tree: ast.Module) -> Iterator[ast.FunctionDef]:
 
 
 def _defined(tree: ast.Module) -> Iterator[str]:
-    return (function.name for function in _functions(tree) if _is_kernel(function))
+    yield from (function.name for function in _functions(tree) if _is_kernel(function))
+    for statement in tree.body:
+        if (
+            isinstance(statement, ast.Assign)
+            and isinstance(statement.value, ast.Call)
+            and isinstance(statement.value.func, ast.Name)
+            and statement.value.func.id in _FACTORIES
+        ):
+            yield from (name.id for name in statement.targets if isinstance(name, ast.Name))
 
 
 def _imported(tree: ast.Module) -> Iterator[tuple[str, str]]:

@@ -2,31 +2,101 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from abc import ABC, abstractmethod
 from typing import Any, Protocol
 
-from cavmarl.shards.shard import Shard
-from cavmarl.shards.shard_group import ShardGroup
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.records.arrays import Demand, Gate
+from cavmarl.shards.phases import Phase
+from cavmarl.shards.shard import Commands
 
 
 class Executor(Protocol):
-    """Runs one phase on all shards and returns when all are through with it."""
+    """Runs each phase on all shards and returns when all have run it; see `ShardGroup`."""
 
-    def each(self, phase: str, *arguments: Any) -> None:
-        """Run the phase on every shard with the same arguments; see `ShardGroup`."""
-        ...
+    def begin_step(self, commands: Commands) -> None: ...
+    def advance(self, commands: Commands) -> None: ...
+    def dismiss(self, gate: Gate) -> None: ...
+    def choose_goals(self, demand: Demand, num_goals: int, gate: Gate) -> None: ...
+    def leave(self, gate: Gate) -> None: ...
+    def gather(self, touching_m: float, border_m: float) -> None: ...
+    def resolve(self) -> None: ...
+    def rank_lanes(self, gate: Gate) -> None: ...
+    def propose(self, demand: Demand, gate: Gate) -> None: ...
+    def admit(self, gate: Gate) -> None: ...
+    def commit(self) -> None: ...
+    def detect(self) -> None: ...
+    def sense(self, chosen: NDArray[np.bool_]) -> None: ...
+    def credit(self, chosen: NDArray[np.bool_]) -> None: ...
+    def suggest(self, out: NDArray[np.float64]) -> None: ...
+    def retire(self, gate: Gate) -> None: ...
+    def forget(self, gate: Gate) -> None: ...
 
 
-class Together(Executor, Protocol):
-    """Several that run phases side by side; after some the first of them does not wait."""
+class TeamExecutor(Executor, Protocol):
+    """Runs phases in several processes; after some phases the first process does not wait."""
 
     def meet(self) -> None:
-        """Wait until all shards are through with the last phase."""
+        """Wait until all shards have run the last phase."""
         ...
 
 
-class SerialExecutor:
-    """Shards in the caller's process, all of them or some, as one group."""
+class PhaseExecutor(ABC):
+    """An executor that treats all phases alike: it runs, measures, or notes them in `run`."""
 
-    def __init__(self, shards: Sequence[Shard]) -> None:
-        self.each: Callable[..., None] = ShardGroup(shards).each
+    @abstractmethod
+    def run(self, phase: Phase, arguments: tuple[Any, ...]) -> None:
+        """Run a phase on all shards."""
+
+    def begin_step(self, commands: Commands) -> None:
+        self.run(Phase.BEGIN_STEP, (commands,))
+
+    def advance(self, commands: Commands) -> None:
+        self.run(Phase.ADVANCE, (commands,))
+
+    def dismiss(self, gate: Gate) -> None:
+        self.run(Phase.DISMISS, (gate,))
+
+    def choose_goals(self, demand: Demand, num_goals: int, gate: Gate) -> None:
+        self.run(Phase.CHOOSE_GOALS, (demand, num_goals, gate))
+
+    def leave(self, gate: Gate) -> None:
+        self.run(Phase.LEAVE, (gate,))
+
+    def gather(self, touching_m: float, border_m: float) -> None:
+        self.run(Phase.GATHER, (touching_m, border_m))
+
+    def resolve(self) -> None:
+        self.run(Phase.RESOLVE, ())
+
+    def rank_lanes(self, gate: Gate) -> None:
+        self.run(Phase.RANK_LANES, (gate,))
+
+    def propose(self, demand: Demand, gate: Gate) -> None:
+        self.run(Phase.PROPOSE, (demand, gate))
+
+    def admit(self, gate: Gate) -> None:
+        self.run(Phase.ADMIT, (gate,))
+
+    def commit(self) -> None:
+        self.run(Phase.COMMIT, ())
+
+    def detect(self) -> None:
+        self.run(Phase.DETECT, ())
+
+    def sense(self, chosen: NDArray[np.bool_]) -> None:
+        self.run(Phase.SENSE, (chosen,))
+
+    def credit(self, chosen: NDArray[np.bool_]) -> None:
+        self.run(Phase.CREDIT, (chosen,))
+
+    def suggest(self, out: NDArray[np.float64]) -> None:
+        self.run(Phase.SUGGEST, (out,))
+
+    def retire(self, gate: Gate) -> None:
+        self.run(Phase.RETIRE, (gate,))
+
+    def forget(self, gate: Gate) -> None:
+        self.run(Phase.FORGET, (gate,))

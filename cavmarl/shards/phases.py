@@ -1,36 +1,46 @@
-"""The phases of a tick: which there are, and how each may be run. What runs them goes by this."""
+"""The phases of a tick that shards run, and how several processes may run each of them."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from enum import Enum
+from typing import Any, NamedTuple
+
+from cavmarl.shards.shard_group import ShardGroup
 
 
 class PhaseRule(NamedTuple):
     """How a phase may be run."""
 
-    may_die: bool = False  # the host of a zone may die in it by plan (docs/faults.md)
-    together: str = ""  # what the workers of one world run of it side by side; "": one runs it all
-    is_late: bool = False  # the next one asks only that it ran on the same zone: nothing waits
-    is_early: bool = False  # asks for nothing that other zones write in the phase before
-    is_beside: bool = False  # asked beside the tick: no part of what a zone costs
+    method: Callable[..., None]  # of `ShardGroup`; it calls the kernel of the phase
+    is_shared: bool = False  # the workers of one world run it side by side; if not, one runs it all
+    is_late: bool = False  # the next phase only needs this one on the same zone, so none waits
+    is_early: bool = False  # needs nothing that other zones write in the phase before
+    is_beside: bool = False  # not part of a tick, so not part of what a zone costs
 
 
-# A name, and its arguments, can be sent anywhere: a method of `ShardGroup` or `Shard`.
-PHASES = {
-    "begin_step": PhaseRule(may_die=True, together="begin_step", is_late=True),
-    "advance": PhaseRule(may_die=True, together="move"),
-    "choose_goals": PhaseRule(may_die=True),
-    "leave": PhaseRule(may_die=True),
-    "gather": PhaseRule(together="gather"),
-    "resolve": PhaseRule(may_die=True, together="resolve", is_late=True),
-    "rank_lanes": PhaseRule(may_die=True),
-    "propose": PhaseRule(may_die=True),
-    "admit": PhaseRule(may_die=True),
-    "commit": PhaseRule(may_die=True, is_early=True),
-    "detect": PhaseRule(may_die=True, is_early=True),
-    "sense": PhaseRule(may_die=True, together="sense"),
-    "credit": PhaseRule(may_die=True, together="credit"),
-    "suggest": PhaseRule(together="suggest", is_beside=True),
-    "retire": PhaseRule(),
-    "forget": PhaseRule(),
-}
+class Phase(Enum):
+    """The phases in the order of a tick; `engine/tick.py` says when each of them is run."""
+
+    BEGIN_STEP = PhaseRule(ShardGroup.begin_step, is_shared=True, is_late=True)
+    ADVANCE = PhaseRule(ShardGroup.advance)
+    MOVE = PhaseRule(ShardGroup.move, is_shared=True)
+    DISMISS = PhaseRule(ShardGroup.dismiss)
+    CHOOSE_GOALS = PhaseRule(ShardGroup.choose_goals)
+    LEAVE = PhaseRule(ShardGroup.leave)
+    GATHER = PhaseRule(ShardGroup.gather, is_shared=True)
+    RESOLVE = PhaseRule(ShardGroup.resolve, is_shared=True, is_late=True)
+    RANK_LANES = PhaseRule(ShardGroup.rank_lanes)
+    PROPOSE = PhaseRule(ShardGroup.propose)
+    ADMIT = PhaseRule(ShardGroup.admit)
+    COMMIT = PhaseRule(ShardGroup.commit, is_early=True)
+    DETECT = PhaseRule(ShardGroup.detect, is_early=True)
+    SENSE = PhaseRule(ShardGroup.sense, is_shared=True)
+    CREDIT = PhaseRule(ShardGroup.credit, is_shared=True)
+    SUGGEST = PhaseRule(ShardGroup.suggest, is_shared=True, is_beside=True)
+    RETIRE = PhaseRule(ShardGroup.retire)
+    FORGET = PhaseRule(ShardGroup.forget)
+
+    def run(self, executor: Any, arguments: tuple[Any, ...]) -> None:
+        """Call the method of this phase; an executor may override that of `ShardGroup`."""
+        getattr(executor, self.value.method.__name__)(*arguments)

@@ -36,9 +36,14 @@ class RegisteredOutputs:
             call = RegisteredFunction(name, term.function, 1, term.batched)
             self._terms.append((call, term.reach_m, column))
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing is registered."""
+        return not self._sensors and not self._terms
+
     def write(self, worlds: Worlds, chosen: NDArray[np.bool_], outputs: Outputs) -> None:
         """Write those of every owned agent of the chosen worlds (W,), after `sense`."""
-        if not self._sensors and not self._terms:
+        if self.is_empty:
             return
         for w in np.flatnonzero(chosen).tolist():
             rows = worlds.rows[w, : worlds.num_rows[w]]

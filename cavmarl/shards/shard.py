@@ -13,14 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
-from cavmarl.core.compiled import specialized
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.math.buckets import make_lists
 from cavmarl.core.math.neighbors import make_grid
 from cavmarl.core.memory import Zeros
 from cavmarl.core.records.arrays import (
     Common,
-    Gate,
     LaneGrid,
     Outputs,
     RoadArrays,
@@ -29,19 +27,14 @@ from cavmarl.core.records.arrays import (
     Worlds,
     Zoned,
 )
-from cavmarl.core.records.codes import DRIVER_BACKGROUND, DRIVER_SUMO
 from cavmarl.driving.kernels.junctions.approach import APPROACH
 from cavmarl.driving.kernels.lanes.lane_index import ENTRY
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN, lane_grid
-from cavmarl.sensors.kernels.frame_stacks import fill_stacks
-from cavmarl.sensors.kernels.observe_optional import observe_optional
-from cavmarl.sensors.kernels.observing_messages import observe_messages
 from cavmarl.sensors.observed import layout, optional_arrays, sensor_arrays
 from cavmarl.shards.kernels.world_phases import suggest
 from cavmarl.shards.registered_outputs import RegisteredOutputs
-from cavmarl.traffic.kernels.leaving import leave
 from cavmarl.v2x.kernels.v2x_records import REPORT, Mail
 from cavmarl.zones.kernels.zone_lookup import OUTER, Halo, ZoneArrays
 
@@ -113,8 +106,8 @@ class Shard:
         self.sensors = sensor_arrays(config.sensors, network)
         most_told = config.v2x.inbox.objects
         num_worlds, capacity = zoned.rows.shape[2:]
-        self._optional = optional_arrays(config.sensors, network, plans, most_told, capacity)
-        self._registered = RegisteredOutputs(config, network)
+        self.optional = optional_arrays(config.sensors, network, plans, most_told, capacity)
+        self.registered = RegisteredOutputs(config, network)
         self._floating = len(network.maps) > 1
         self._extent_m = network.room_m
         self.cut(zones, halo)
@@ -138,16 +131,14 @@ class Shard:
         )
         self.sides = (self.worlds.rows, zoned.rows[1, zone])
         self.side = self.next_side = 0  # in which of them the committed rows are
+        # The same for kernels: (2,), one array for all shards of this process.
+        self.row_sides = np.zeros(2, dtype=np.int64) if first is None else first.row_sides
         self.outputs = outputs
         self.mail: Mail | None = None  # what agents have been told over the air; None: no messages
-        self._untold = np.zeros((num_worlds, config.population.num_ids, 0), REPORT)
-        self._messages_at = layout(config.sensors).get("messages")
+        self.untold = np.zeros((num_worlds, config.population.num_ids, 0), REPORT)
+        self.messages_at = layout(config.sensors).get("messages")
         self.target_speeds = np.array(config.action.target_speeds_mps)
         self.discrete = config.action.kind == "discrete"
-        self._call_leave = specialized(leave)
-        self._call_observe_optional = specialized(observe_optional)
-        self._call_observe_messages = specialized(observe_messages)
-        self._call_fill_stacks = specialized(fill_stacks)
 
     def cut(self, zones: ZoneArrays, halo: Halo) -> None:
         """Say where its zone and the others are; a group has to be made anew after it."""
@@ -158,55 +149,14 @@ class Shard:
             seen = _seen(seen, zones, self.zone, halo.halo_m)
         self.grid = make_grid(seen, CELL_M, self.zoned.rows.shape[3], self._floating)
 
-    def turn(self) -> None:
-        """Let the next rows be on the other side, for a tick that puts rows in order."""
-        self.face(self.side, 1 - self.side)
-
-    def leave(self, gate: Gate) -> None:
-        """Hand the background vehicles of `next_rows` that have arrived to the gate."""
-        if not self.worlds.num_through.any():
-            return
-        self._call_leave(gate, self.worlds, self.worlds.next_rows, DRIVER_BACKGROUND, 1)
-
-    def dismiss(self, gate: Gate) -> None:
-        """Hand SUMO's vehicles of `next_rows` that it has no more to the gate."""
-        self._call_leave(gate, self.worlds, self.worlds.next_rows, DRIVER_SUMO, 0)
-
-    def commit(self) -> None:
-        self.face(self.next_side, self.next_side)
-
     def align(self) -> None:
         """Keep the rows on the first side, wherever a tick that is given up has them."""
         self.face(0, 0)
 
     def face(self, side: int, next_side: int) -> None:
         self.side, self.next_side = side, next_side
+        self.row_sides[:] = side, next_side
         self.worlds = self.worlds._replace(rows=self.sides[side], next_rows=self.sides[next_side])
-
-    def complete_observations(self, chosen: NDArray[np.bool_]) -> None:
-        """Write what `sense` has left: messages, optional and registered sensors, earlier frames.
-
-        And the registered terms.
-        """
-        observations, stack = self.outputs.observations, self.config.sensors.stack
-        if self._optional is not None:
-            clock = self.config.clock
-            self._call_observe_optional(
-                self.roads, self.travel, self.lane_grid, self.worlds, self.grid, self._optional,
-                self._untold if self.mail is None else self.mail.objects,
-                clock.sim_dt_s, clock.ticks_per_step, stack, chosen, observations,
-            )  # fmt: skip
-        if self.mail is not None and self._messages_at is not None:
-            messages = self.config.sensors.messages
-            self._call_observe_messages(
-                self.roads, self.plans, self.worlds, self.mail, self._messages_at.start,
-                messages.objects, messages.events, messages.signal, messages.range_m,
-                self.config.clock.sim_dt_s, stack, chosen, observations,
-            )  # fmt: skip
-        self._registered.write(self.worlds, chosen, self.outputs)
-        if stack > 1:
-            ticks_per_step = self.config.clock.ticks_per_step
-            self._call_fill_stacks(self.worlds, ticks_per_step, stack, chosen, observations)
 
     def suggest(self, out: NDArray[np.float64]) -> None:
         """Write what the built-in driver would do in the agents' place into `out` (W, A, 2)."""

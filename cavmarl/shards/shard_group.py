@@ -3,111 +3,71 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.compiled import specialized
+from cavmarl.core.compiled.bound_call import BoundCall, bind, keep_last
 from cavmarl.core.records.arrays import Demand, Gate
 from cavmarl.core.records.codes import INSERT_OPEN
 from cavmarl.shards.kernels.group_phases import (
-    FRAME,
-    Members,
     admit_each,
     advance_each,
     begin_step_each,
     choose_goals_each,
+    commit,
     credit_each,
     detect_each,
+    dismiss_each,
     drive_on_each,
+    fill_stacks_each,
     forget_each,
     gather_each,
+    leave_each,
+    observe_messages_each,
+    observe_optional_each,
     propose_each,
     rank_lanes_each,
     resolve_each,
     retire_each,
     sense_each,
+    turn,
 )
+from cavmarl.shards.kernels.zone_loop import FRAME, Members
 from cavmarl.shards.shard import TICKS_IN_ORDER, Commands, Shard, common_of
 
 
 class ShardGroup:
     """Runs the phases of some shards, whichever they are: one, those of a worker, or all.
 
-    Phases that every tick has are one call for all shards, with what does not change put together
-    once. Others, and those which have nothing to do in most ticks, go from shard to shard.
+    Each phase is one call for all shards, whose arguments are put together at the first call.
     """
 
     def __init__(
         self,
         shards: Sequence[Shard],  # of one process, by rising zones; they share clock and scratch
     ) -> None:
-        self._shards = tuple(shards)
-        first = shards[0]
-        self._first = first
-        self._config = first.config
-        self._roads = first.roads
-        self._travel = first.travel
-        self._scratch = first.scratch
-        grids = [shard.grid for shard in shards]
-        largest = max(grids, key=lambda grid: grid.newest.size)
-        self._grid = largest._replace(corner=largest.corner.copy())
-        frames = [
-            (*grid.corner.tolist(), grid.cells_per_m, grid.num_x, grid.num_y) for grid in grids
-        ]
-        self._members = Members(
-            numbers=np.array([shard.zone for shard in shards]),
-            frames=np.array(frames, dtype=FRAME),
-            zones=first.zones,
-            halo=first.halo,
-            zoned=first.zoned,
-            common=common_of(first.worlds),
-        )
-        self._controls = np.zeros_like(first.worlds.pending[:, :, 0])
-        self._advance = specialized(advance_each)
-        self._gather = specialized(gather_each)
-        self._resolve = specialized(resolve_each)
-        self._choose_goals = specialized(choose_goals_each)
-        self._rank_lanes = specialized(rank_lanes_each)
-        self._propose = specialized(propose_each)
-        self._admit = specialized(admit_each)
-        self._meta_actions = np.zeros(self._controls.shape[:2], dtype=np.int64)
-        self._begin_step = specialized(begin_step_each)
-        self._drive_on = specialized(drive_on_each)
-        self._detect = specialized(detect_each)
-        self._sense = specialized(sense_each)
-        self._credit = specialized(credit_each)
-        self._retire = specialized(retire_each)
-        self._forget = specialized(forget_each)
+        self.shards = tuple(shards)
+        self.first = shards[0]
+        self.calls = GroupCalls(self.shards)
+        # A reset may replace the gate.
+        self.gate_calls = keep_last(lambda gate: GateCalls(self.calls, gate))
 
     @property
     def sides(self) -> tuple[int, int]:
         """Where the rows are, and the next ones."""
-        return self._first.side, self._first.next_side
-
-    def each(self, phase: str, *arguments: Any) -> None:
-        """Run a phase on every shard: a method of this class or of `Shard`, by its name."""
-        together = getattr(self, phase, None)
-        if together is not None:
-            together(*arguments)
-            return
-        for shard in self._shards:
-            getattr(shard, phase)(*arguments)
+        return self.first.side, self.first.next_side
 
     def begin_step(self, commands: Commands) -> None:
-        """Open the accounts of a step, take its meta-actions, let barriers drive on."""
-        first, inserted = self._first, commands.inserted
+        """Open the accounts of a step, take its actions, let barriers drive on."""
+        inserted = commands.inserted
         if inserted.size and (inserted[..., 0] == INSERT_OPEN).any():
-            first_stop = len(self._travel.stops) - len(self._roads.lanes)
-            self._drive_on(self._members, first.side, np.array(inserted), first_stop)
-        if self._config.population.agents == 0:
-            return
-        np.copyto(self._meta_actions, commands.meta_actions)
-        self._begin_step(
-            self._members, first.side, self._roads,
-            first.discrete, self._meta_actions, first.target_speeds,
-        )  # fmt: skip
+            np.copyto(self.calls.inserted, inserted)
+            self.calls.drive_on()
+        if self.calls.has_agents:
+            np.copyto(self.calls.meta_actions, commands.meta_actions)
+            self.calls.begin_step()
 
     def advance(self, commands: Commands) -> None:
         """Decide every control from the committed rows and move the owned ones into next ones."""
@@ -116,112 +76,345 @@ class ShardGroup:
 
     def turn(self) -> None:
         """Let the next rows be on the other side, in a tick that puts rows in order."""
-        # Where a host may die alone, a store keeps tick t whole (docs/ownership.md).
-        if self._first.worlds.ticks[0] % TICKS_IN_ORDER == 0:
-            for shard in self._shards:
-                shard.turn()
+        if self.first.worlds.ticks[0] % TICKS_IN_ORDER == 0:
+            self.face(self.first.side, 1 - self.first.side)
 
     def face(self, side: int, next_side: int) -> None:
+        """Say on which side the committed rows are, and on which the next ones."""
         if self.sides != (side, next_side):
-            for shard in self._shards:
+            for shard in self.shards:
                 shard.face(side, next_side)
 
     def move(self, commands: Commands) -> None:
-        """`advance`, where the rows' sides are known."""
-        first, action = self._first, self._config.action
-        if self._controls.size:
-            np.copyto(self._controls, commands.controls)
-        self._advance(
-            self._members,
-            first.side,
-            first.next_side,
-            self._roads,
-            first.plans,
-            self._travel,
-            first.lane_grid,
-            self._scratch,
-            self._controls,
-            action.kind == "discrete",
-            action.acceleration_mps2,
-            action.steering_rad,
-            self._config.clock.sim_dt_s,
-        )
-
-    def gather(self, touching_m: float, border_m: float) -> None:
-        """Renew the ghosts of the next rows, as `kernels.exchange.gather` says."""
-        self._gather(self._members, self._first.next_side, touching_m, border_m)
-
-    def resolve(self) -> None:
-        first = self._first
-        self._resolve(self._members, first.side, first.next_side, self._scratch, self._grid)
+        """`advance`, where the sides of the rows are known."""
+        if self.calls.has_agents:
+            np.copyto(self.calls.controls, commands.controls)
+        self.calls.advance()
 
     def choose_goals(self, demand: Demand, num_goals: int, gate: Gate) -> None:
         """Give the vehicles of the next rows that need it another goal."""
-        first, dt = self._first, self._config.clock.sim_dt_s
-        self._choose_goals(
-            self._members, first.side, first.next_side,
-            demand, self._roads, self._travel, num_goals, gate, dt,
-        )  # fmt: skip
+        self.gate_calls(gate).choose_goals(demand, num_goals)()
 
     def leave(self, gate: Gate) -> None:
         """Hand the background vehicles of the next rows that have arrived to the gate."""
-        if not any(map(any, self._first.zoned.num_through.tolist())):
-            return
-        for shard in self._shards:
-            shard.leave(gate)
+        self.gate_calls(gate).leave()
+
+    def dismiss(self, gate: Gate) -> None:
+        """Hand the vehicles of the next rows that SUMO has removed to the gate."""
+        self.gate_calls(gate).dismiss()
+
+    def gather(self, touching_m: float, border_m: float) -> None:
+        """Renew the ghosts of the next rows; see `zones.kernels.ghost_exchange.gather`."""
+        self.calls.gather(touching_m, border_m)()
+
+    def resolve(self) -> None:
+        """Mark contacts between vehicles in the next rows."""
+        self.calls.resolve()
 
     def rank_lanes(self, gate: Gate) -> None:
         """Count vehicles around the places of these zones where departures may enter."""
-        first = self._first
-        self._rank_lanes(
-            self._members, first.side, first.next_side,
-            self._roads, self._travel, gate, self._scratch,
-        )  # fmt: skip
+        self.gate_calls(gate).rank_lanes()
 
     def propose(self, demand: Demand, gate: Gate) -> None:
         """Tell the gate which departures find a safe gap in these zones."""
-        first = self._first
-        self._propose(
-            self._members, first.side, first.next_side,
-            demand, self._roads, self._travel, gate, self._scratch,
-        )  # fmt: skip
+        self.gate_calls(gate).propose(demand)()
 
     def admit(self, gate: Gate) -> None:
         """Take in departures that the gate has accepted, as owned or as ghosts."""
-        first = self._first
-        self._admit(self._members, first.side, first.next_side, gate)
+        self.gate_calls(gate).admit()
 
     def commit(self) -> None:
-        if self._first.next_side != self._first.side:
-            for shard in self._shards:
-                shard.commit()
+        """Make the next rows the committed ones."""
+        self.face(self.first.next_side, self.first.next_side)
 
     def detect(self) -> None:
         """Note when owned bodies were over the detectors of actuated signals."""
-        if self._first.worlds.controllers.shape[1] == 0:
-            return
-        self._detect(self._members, self._first.side, self._roads, self._config.clock.sim_dt_s)
+        if self.calls.has_detectors:
+            self.calls.detect()
 
     def sense(self, chosen: NDArray[np.bool_]) -> None:
         """Write observations and terms of the chosen worlds' owned agents into the outputs."""
-        first, clock = self._first, self._config.clock
-        self._sense(
-            self._members, first.side, self._roads, first.plans, self._travel, self._grid,
-            first.sensors, clock.sim_dt_s, clock.ticks_per_step, chosen, first.outputs,
-        )  # fmt: skip
-        for shard in self._shards:
-            shard.complete_observations(chosen)
+        calls = self.calls
+        np.copyto(calls.chosen, chosen)
+        calls.sense()
+        if calls.has_optional:
+            calls.observe_optional()
+        if calls.has_messages:
+            calls.observe_messages()
+        for shard in self.shards:
+            shard.registered.write(shard.worlds, chosen, shard.outputs)
+        if calls.stacks:
+            calls.fill_stacks()
 
     def credit(self, chosen: NDArray[np.bool_]) -> None:
         """Add the step's rewards to the episode's of the chosen worlds' owned agents."""
-        first = self._first
-        self._credit(self._members, first.side, first.outputs.rewards, chosen)
+        np.copyto(self.calls.chosen, chosen)
+        self.calls.credit()
+
+    def suggest(self, out: NDArray[np.float64]) -> None:
+        """Write what the built-in driver would do in the agents' place into `out` (W, A, 2)."""
+        for shard in self.shards:
+            shard.suggest(out)
 
     def retire(self, gate: Gate) -> None:
         """Hand the agents' vehicles of the committed rows whose trip has ended to the gate."""
-        ticks = self._config.clock.ticks_per_step
-        self._retire(self._members, self._first.side, gate, ticks)
+        self.gate_calls(gate).retire()
 
     def forget(self, gate: Gate) -> None:
         """Drop the ghosts of vehicles that have been retired."""
-        self._forget(self._members, self._first.side, gate)
+        self.gate_calls(gate).forget()
+
+
+class GroupCalls:
+    """The kernel calls of a group, each with its arguments.
+
+    Attributes:
+        controls: (W, A, 2) that `advance` reads.
+        meta_actions: (W, A) that `begin_step` reads.
+        chosen: (W,) that `sense` and `credit` read.
+    """
+
+    def __init__(self, shards: Sequence[Shard]) -> None:
+        first = self._first = shards[0]
+        config = self._config = first.config
+        grids = [shard.grid for shard in shards]
+        largest = max(grids, key=lambda grid: grid.newest.size)
+        frames = [
+            (*grid.corner.tolist(), grid.cells_per_m, grid.num_x, grid.num_y) for grid in grids
+        ]
+        self.members = Members(
+            numbers=np.array([shard.zone for shard in shards]),
+            frames=np.array(frames, dtype=FRAME),
+            sides=first.row_sides,
+            zones=first.zones,
+            halo=first.halo,
+            zoned=first.zoned,
+            common=common_of(first.worlds),
+            grid=largest._replace(corner=largest.corner.copy()),
+        )
+        self.controls = np.zeros_like(first.worlds.pending[:, :, 0])
+        self.meta_actions = np.zeros(self.controls.shape[:2], dtype=np.int64)
+        self.chosen = np.ones(len(self.controls), dtype=np.bool_)
+        self.inserted = np.zeros((len(self.controls), config.population.insertions, 3))
+        self.has_agents = config.population.agents > 0
+        self.has_detectors = first.worlds.controllers.shape[1] > 0
+        self.has_optional = first.optional is not None
+        self.stacks = config.sensors.stack > 1
+        self.gather = keep_last(self._bind_gather)
+
+    @property
+    def has_messages(self) -> bool:
+        """Whether agents observe what they were told over the air."""
+        return self._first.mail is not None and self._first.messages_at is not None
+
+    @property
+    def has_registered(self) -> bool:
+        """Whether sensors or terms from outside of the package are asked."""
+        return not self._first.registered.is_empty
+
+    @cached_property
+    def begin_step(self) -> BoundCall[None]:
+        return bind(
+            begin_step_each,
+            members=self.members,
+            roads=self._first.roads,
+            discrete=self._first.discrete,
+            meta_actions=self.meta_actions,
+            target_speeds=self._first.target_speeds,
+        )
+
+    @cached_property
+    def drive_on(self) -> BoundCall[None]:
+        first = self._first
+        return bind(
+            drive_on_each,
+            members=self.members,
+            inserted=self.inserted,
+            first_stop=len(first.travel.stops) - len(first.roads.lanes),
+        )
+
+    @cached_property
+    def turn(self) -> BoundCall[None]:
+        return bind(turn, members=self.members, ticks_in_order=TICKS_IN_ORDER)
+
+    @cached_property
+    def commit(self) -> BoundCall[None]:
+        return bind(commit, members=self.members)
+
+    @cached_property
+    def advance(self) -> BoundCall[None]:
+        first, action = self._first, self._config.action
+        return bind(
+            advance_each,
+            members=self.members,
+            roads=first.roads,
+            plans=first.plans,
+            travel=first.travel,
+            lane_grid=first.lane_grid,
+            scratch=first.scratch,
+            commands=self.controls,
+            discrete=first.discrete,
+            accel_limit=action.acceleration_mps2,
+            steering_limit=action.steering_rad,
+            dt=self._config.clock.sim_dt_s,
+        )
+
+    def _bind_gather(self, touching_m: float, border_m: float) -> BoundCall[None]:
+        return bind(gather_each, members=self.members, touching_m=touching_m, border_m=border_m)
+
+    @cached_property
+    def resolve(self) -> BoundCall[None]:
+        return bind(resolve_each, members=self.members, scratch=self._first.scratch)
+
+    @cached_property
+    def detect(self) -> BoundCall[None]:
+        roads = self._first.roads
+        return bind(
+            detect_each,
+            members=self.members,
+            lane_place=roads.lane_place,
+            places=roads.places,
+            dt=self._config.clock.sim_dt_s,
+        )
+
+    @cached_property
+    def sense(self) -> BoundCall[None]:
+        first, clock = self._first, self._config.clock
+        return bind(
+            sense_each,
+            members=self.members,
+            roads=first.roads,
+            plans=first.plans,
+            travel=first.travel,
+            sensors=first.sensors,
+            tick_s=clock.sim_dt_s,
+            ticks_per_step=clock.ticks_per_step,
+            chosen=self.chosen,
+            outputs=first.outputs,
+        )
+
+    @cached_property
+    def observe_optional(self) -> BoundCall[None]:
+        first, clock = self._first, self._config.clock
+        return bind(
+            observe_optional_each,
+            members=self.members,
+            roads=first.roads,
+            travel=first.travel,
+            lane_grid=first.lane_grid,
+            optional=first.optional,
+            objects=first.untold if first.mail is None else first.mail.objects,
+            tick_s=clock.sim_dt_s,
+            ticks_per_step=clock.ticks_per_step,
+            stack=self._config.sensors.stack,
+            chosen=self.chosen,
+            observations=first.outputs.observations,
+        )
+
+    @cached_property
+    def observe_messages(self) -> BoundCall[None]:
+        first, messages = self._first, self._config.sensors.messages
+        assert first.messages_at is not None
+        return bind(
+            observe_messages_each,
+            members=self.members,
+            roads=first.roads,
+            plans=first.plans,
+            mail=first.mail,
+            at=first.messages_at.start,
+            objects=messages.objects,
+            events=messages.events,
+            signal=messages.signal,
+            scale_m=messages.range_m,
+            tick_s=self._config.clock.sim_dt_s,
+            stack=self._config.sensors.stack,
+            chosen=self.chosen,
+            observations=first.outputs.observations,
+        )
+
+    @cached_property
+    def fill_stacks(self) -> BoundCall[None]:
+        return bind(
+            fill_stacks_each,
+            members=self.members,
+            ticks_per_step=self._config.clock.ticks_per_step,
+            stack=self._config.sensors.stack,
+            chosen=self.chosen,
+            observations=self._first.outputs.observations,
+        )
+
+    @cached_property
+    def credit(self) -> BoundCall[None]:
+        return bind(
+            credit_each,
+            members=self.members,
+            rewards=self._first.outputs.rewards,
+            chosen=self.chosen,
+        )
+
+
+class GateCalls:
+    """The kernel calls of a group that need the gate."""
+
+    def __init__(self, calls: GroupCalls, gate: Gate) -> None:
+        self.gate = gate
+        self._members = calls.members
+        self._first = calls._first
+        self._clock = self._first.config.clock
+        self.choose_goals = keep_last(self._bind_choose_goals)
+        self.propose = keep_last(self._bind_propose)
+
+    def _bind_choose_goals(self, demand: Demand, num_goals: int) -> BoundCall[None]:
+        return bind(
+            choose_goals_each,
+            members=self._members,
+            demand=demand,
+            roads=self._first.roads,
+            travel=self._first.travel,
+            num_goals=num_goals,
+            gate=self.gate,
+            dt=self._clock.sim_dt_s,
+        )
+
+    @cached_property
+    def leave(self) -> BoundCall[None]:
+        return bind(leave_each, members=self._members, gate=self.gate)
+
+    @cached_property
+    def dismiss(self) -> BoundCall[None]:
+        return bind(dismiss_each, members=self._members, gate=self.gate)
+
+    @cached_property
+    def rank_lanes(self) -> BoundCall[None]:
+        return bind(
+            rank_lanes_each,
+            members=self._members,
+            roads=self._first.roads,
+            travel=self._first.travel,
+            gate=self.gate,
+            scratch=self._first.scratch,
+        )
+
+    def _bind_propose(self, demand: Demand) -> BoundCall[None]:
+        return bind(
+            propose_each,
+            members=self._members,
+            demand=demand,
+            roads=self._first.roads,
+            travel=self._first.travel,
+            gate=self.gate,
+            scratch=self._first.scratch,
+        )
+
+    @cached_property
+    def admit(self) -> BoundCall[None]:
+        return bind(admit_each, members=self._members, gate=self.gate)
+
+    @cached_property
+    def retire(self) -> BoundCall[None]:
+        ticks = self._clock.ticks_per_step
+        return bind(retire_each, members=self._members, gate=self.gate, ticks_per_step=ticks)
+
+    @cached_property
+    def forget(self) -> BoundCall[None]:
+        return bind(forget_each, members=self._members, gate=self.gate)

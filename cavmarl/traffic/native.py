@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cavmarl.config.action import ActionConfig
 from cavmarl.config.population import PopulationConfig
 from cavmarl.config.traffic import TrafficConfig
-from cavmarl.core.compiled import specialized
+from cavmarl.core.compiled.bound_call import BoundCall, bind, keep_last
 from cavmarl.core.errors import CapacityError
 from cavmarl.core.memory import Zeros
 from cavmarl.core.records.arrays import Demand, Gate, Travel, Worlds
@@ -43,15 +43,76 @@ FAST_FACTOR = 1.5  # a speed over the limit that hardly any driver of the demand
 JAM_GAP_M = 2.5  # between the bumpers of vehicles that stand in a queue
 
 
-class _Calls:
-    """Kernels that ticks call."""
+class TrafficCalls:
+    """The kernel calls of the departures of some worlds.
 
-    def __init__(self) -> None:
-        self.call_orders = specialized(call_orders)
-        self.insert = specialized(insert)
-        self.settle = specialized(settle)
-        self.assign_lanes = specialized(assign_lanes)
-        self.accept = specialized(accept)
+    Attributes:
+        running: (W,) vehicles of each world, in all zones, that `accept` reads.
+        inserted: (W, I, 3) that `insert` reads; see `Commands`.
+    """
+
+    def __init__(
+        self,
+        traffic: NativeTraffic,
+        gate: Gate,
+        ticks: NDArray[np.int64],  # (W,) of the worlds
+        keys: NDArray[np.uint64],  # (W,) of their random numbers
+    ) -> None:
+        self._traffic = traffic
+        self._gate = gate
+        self._ticks = ticks
+        self._keys = keys
+        self.running = np.zeros(len(ticks), dtype=np.int64)
+        self.inserted = np.zeros((len(ticks), traffic.population.insertions, 3))
+
+    @cached_property
+    def call_orders(self) -> BoundCall[None]:
+        return bind(call_orders, gate=self._gate, ticks=self._ticks)
+
+    @cached_property
+    def settle(self) -> BoundCall[None]:
+        traffic = self._traffic
+        return bind(
+            settle,
+            demand=traffic.demand,
+            roads=traffic.network.arrays,
+            travel=traffic.travel,
+            gate=self._gate,
+            ticks=self._ticks,
+            keys=self._keys,
+            dt=traffic.dt,
+        )
+
+    @cached_property
+    def insert(self) -> BoundCall[None]:
+        traffic = self._traffic
+        return bind(
+            insert,
+            demand=traffic.demand,
+            roads=traffic.network.arrays,
+            travel=traffic.travel,
+            num_goals=len(traffic.plans),
+            inserted=self.inserted,
+            gate=self._gate,
+            ticks=self._ticks,
+            keys=self._keys,
+        )
+
+    @cached_property
+    def assign_lanes(self) -> BoundCall[None]:
+        traffic = self._traffic
+        return bind(
+            assign_lanes,
+            roads=traffic.network.arrays,
+            travel=traffic.travel,
+            gate=self._gate,
+            keys=self._keys,
+        )
+
+    @cached_property
+    def accept(self) -> BoundCall[None]:
+        capacity = self._traffic.capacity
+        return bind(accept, gate=self._gate, running=self.running, capacity=capacity)
 
 
 @dataclass(frozen=True)
@@ -80,7 +141,13 @@ class NativeTraffic:
         """The same for another number of worlds, with the tables that all worlds share."""
         other = copy(self)
         object.__setattr__(other, "num_worlds", num_worlds)
-        for name in ("travel", "_travel_of_others", "_slots", "rerouting"):  # each world has a part
+        for name in (
+            "travel",
+            "_travel_of_others",
+            "_slots",
+            "rerouting",
+            "calls",
+        ):  # of each world
             vars(other).pop(name, None)
         other._check_room()
         return other
@@ -334,29 +401,35 @@ class NativeTraffic:
 
     def settle(self, gate: Gate, worlds: Worlds) -> None:
         """Count vehicles that have left, and order those that follow."""
-        self._calls.settle(self.demand, self.network.arrays, self.travel, gate, worlds, self.dt)
+        self.calls(gate, worlds.ticks, worlds.keys).settle()
 
     def assign_lanes(self, gate: Gate, worlds: Worlds) -> None:
         """Assign vehicles of the queue the lanes on which they try to enter."""
-        self._calls.assign_lanes(self.network.arrays, self.travel, gate, worlds)
+        self.calls(gate, worlds.ticks, worlds.keys).assign_lanes()
 
     def call_orders(self, gate: Gate, worlds: Worlds) -> None:
         """Put the orders that are due by the coming tick into the queue."""
         if gate.next_order.tolist() != gate.num_orders.tolist():
-            self._calls.call_orders(gate, worlds)
+            self.calls(gate, worlds.ticks, worlds.keys).call_orders()
 
     def insert(self, gate: Gate, worlds: Worlds, inserted: NDArray[np.float64]) -> None:
         """Put what is to enter in this step into the queue; `inserted` as in `Commands`."""
-        args = (self.demand, self.network.arrays, self.travel, len(self.plans))
-        self._calls.insert(*args, inserted, gate, worlds)
+        calls = self.calls(gate, worlds.ticks, worlds.keys)
+        np.copyto(calls.inserted, inserted)
+        calls.insert()
 
-    def accept(self, gate: Gate, running: NDArray[np.int64]) -> None:
+    def accept(self, gate: Gate, worlds: Worlds, running: NDArray[np.int64]) -> None:
         """Choose among vehicles that could enter; `running` (W,) are in the worlds already."""
-        self._calls.accept(gate, running, self.capacity)
+        calls = self.calls(gate, worlds.ticks, worlds.keys)
+        np.copyto(calls.running, running)
+        calls.accept()
 
     @cached_property
-    def _calls(self) -> _Calls:
-        return _Calls()
+    def calls(
+        self,
+    ) -> Callable[[Gate, NDArray[np.int64], NDArray[np.uint64]], TrafficCalls]:
+        """Return the kernel calls for a gate, and the ticks and keys of its worlds."""
+        return keep_last(partial(TrafficCalls, self))
 
     def _check_room(self) -> None:
         """Refuse a population that cannot stand on each map, bumper to bumper.

@@ -13,8 +13,8 @@ from cavmarl.core.records.arrays import Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.engine.shared_outputs import SharedOutputs
 from cavmarl.engine.simulation import Simulation
-from cavmarl.shards.executor import SerialExecutor
-from cavmarl.shards.shard import COMMON, Commands, Shard, make_zoned
+from cavmarl.shards.shard import COMMON, Commands, Shard, common_of, make_zoned
+from cavmarl.shards.shard_group import ShardGroup
 from cavmarl.zones.partition.zone_halo import zone_halo
 from cavmarl.zones.partition.zone_layouts import cut_map
 from tests.support.actuated import actuated_grid
@@ -66,7 +66,7 @@ class Halves:
             )
             shards.append(shard)
         self.shards = shards
-        self._executor = SerialExecutor(shards)
+        self.executor = ShardGroup(shards)
         min_x, _, max_x, _ = whole.network.extent_m
         self._border = 0.5 * (min_x + max_x)
 
@@ -88,16 +88,12 @@ class Halves:
                 shard.worlds.num_rows[w] = num
         return all(shard.worlds.num_owned.all() for shard in self.shards)
 
-    def each(self, phase: str, *arguments: Any) -> None:
-        """A phase of both shards."""
-        self._executor.each(phase, *arguments)
-
     def sense(self, chosen: NDArray[np.bool_]) -> None:
         """What a simulation does at the end of a step."""
         self.shared.clear_outputs(chosen)
-        self.each("sense", chosen)
+        self.executor.sense(chosen)
         self.shared.settle_outputs(chosen)
-        self.each("credit", chosen)
+        self.executor.credit(chosen)
 
 
 def returns_of(*parts: Worlds) -> Returns:
@@ -123,7 +119,7 @@ def test_agents_get_the_same(env: str, mode: str, agents: int, background: int) 
     rng = np.random.default_rng(5)
     start(whole, seed=5)
     halves.take(whole.worlds, {})
-    halves.shared.switch_signals(halves.shards[0].worlds)
+    halves.shared.switch_signals(common_of(halves.shards[0].worlds))
     halves.sense(np.array([True, True]))
     both = 0
     for step in range(STEPS):
@@ -137,7 +133,7 @@ def test_agents_get_the_same(env: str, mode: str, agents: int, background: int) 
             noise = rng.normal(0.0, (2.0, 0.05), size=(*whole.outputs.present.shape, 2))
             whole.step(Commands(suggested(whole) + noise, idle(whole).meta_actions))
         both += halves.take(whole.worlds, returns)
-        halves.shared.switch_signals(halves.shards[0].worlds)
+        halves.shared.switch_signals(common_of(halves.shards[0].worlds))
         halves.sense(chosen)
         for name, mine, one in zip(
             whole.outputs._fields, halves.shared.outputs, whole.outputs, strict=True
@@ -162,8 +158,8 @@ def test_signals_are_the_same(tmp_path: Path) -> None:
         elif tick > 0:
             whole.step(idle(whole))
         halves.take(whole.worlds, {})
-        halves.each("detect")
-        halves.shared.switch_signals(halves.shards[0].worlds)
+        halves.executor.detect()
+        halves.shared.switch_signals(common_of(halves.shards[0].worlds))
         for name in ("signal_phase", "controllers", "detected_s"):
             expected = getattr(whole.worlds, name)
             assert getattr(halves.shards[0].worlds, name).tobytes() == expected.tobytes()

@@ -9,10 +9,10 @@ import pytest
 from numpy.typing import NDArray
 
 from cavmarl.engine.simulation import Simulation
-from cavmarl.handoff.fault_injection.fault_plan import Faults
-from cavmarl.handoff.fault_injection.injected_faults import Crashes, FaultyPhases
-from cavmarl.shards.executor import Executor
+from cavmarl.shards.executor import PhaseExecutor
+from cavmarl.shards.phases import Phase
 from cavmarl.shards.shard import Commands, Shard
+from cavmarl.shards.shard_group import ShardGroup
 from tests.support.driving import drive, make_simulation, start
 
 STEPS = 40
@@ -28,7 +28,7 @@ def divided(kind: str) -> Simulation:
     return simulation
 
 
-class Strict:
+class Strict(PhaseExecutor):
     """Calls shards one after the other, and looks at who commands and who senses.
 
     Args:
@@ -39,18 +39,17 @@ class Strict:
     def __init__(self, simulation: Simulation, strangers: float) -> None:
         self.controlled = 0
         self.sensed: list[set[int]] = []
-        hosts = FaultyPhases(simulation._shards, Crashes(Faults()))._hosts
-        self._hosts = [(simulation._shards[zone], host) for zone, host in hosts]
+        self._hosts = [(shard, ShardGroup([shard])) for shard in simulation._shards]
         self._strangers = strangers
 
-    def each(self, phase: str, *arguments: Any) -> None:
-        for shard, host in self._hosts:
-            if phase in ("begin_step", "advance"):
-                host.each(phase, self._own(shard, *arguments))
-            elif phase == "sense":
-                self._sense(shard, host, *arguments)
+    def run(self, phase: Phase, arguments: tuple[Any, ...]) -> None:
+        for shard, group in self._hosts:
+            if phase in (Phase.BEGIN_STEP, Phase.ADVANCE):
+                phase.run(group, (self._own(shard, *arguments),))
+            elif phase is Phase.SENSE:
+                self._sense(shard, group, *arguments)
             else:
-                host.each(phase, *arguments)
+                phase.run(group, arguments)
 
     def _own(self, shard: Shard, commands: Commands) -> Commands:
         others = ~np.isin(np.arange(commands.controls.shape[1]), agents_of(shard))
@@ -60,11 +59,11 @@ class Strict:
         self.controlled += int(others.sum())
         return Commands(controls, meta_actions)
 
-    def _sense(self, shard: Shard, host: Executor, chosen: NDArray[np.bool_]) -> None:
+    def _sense(self, shard: Shard, group: ShardGroup, chosen: NDArray[np.bool_]) -> None:
         """Nobody's outputs but those of owned agents are written."""
         owned, outputs = agents_of(shard), shard.outputs
         before = [array.copy() for array in outputs]
-        host.each("sense", chosen)
+        group.sense(chosen)
         others = ~np.isin(np.arange(outputs.present.shape[1]), owned)
         for array, old in zip(outputs, before, strict=True):
             assert array[:, others].tobytes() == old[:, others].tobytes()

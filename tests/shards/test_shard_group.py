@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from cavmarl.engine.simulation import Simulation
+from cavmarl.shards.executor import PhaseExecutor
+from cavmarl.shards.phases import Phase
 from cavmarl.shards.shard import TICKS_IN_ORDER, Shard
 from cavmarl.shards.shard_group import ShardGroup
 from tests.support.driving import drive, idle, make_simulation, start
@@ -19,15 +21,15 @@ TIMES = {"zones.count": ZONES, "clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.2}
 Parting = Callable[[Sequence[Shard]], list[Sequence[Shard]]]
 
 
-class Groups:
+class Groups(PhaseExecutor):
     """Several groups, called one after the other, as those of several processes are."""
 
     def __init__(self, parts: Sequence[Sequence[Shard]]) -> None:
         self._groups = [ShardGroup(part) for part in parts]
 
-    def each(self, phase: str, *arguments: Any) -> None:
+    def run(self, phase: Phase, arguments: tuple[Any, ...]) -> None:
         for group in self._groups:
-            group.each(phase, *arguments)
+            phase.run(group, arguments)
 
 
 def divided(**overrides: Any) -> Simulation:
@@ -79,9 +81,9 @@ def test_a_shard_is_stepped_alone() -> None:
     own = shard.worlds.rows[0, : shard.worlds.num_owned[0]].copy()
     alone = ShardGroup([shard])
     for _ in range(2):
-        alone.each("advance", idle(simulation))
-        alone.each("resolve")
-        alone.each("commit")
+        alone.advance(idle(simulation))
+        alone.resolve()
+        alone.commit()
     rows = shard.worlds.rows[0, : len(own)]
     assert sorted(rows["id"]) == sorted(own["id"])
     assert (rows["tick"] == 2).all()
@@ -92,7 +94,7 @@ def test_who_may_be_seen_elsewhere_is_noted_while_it_is_moved() -> None:
     simulation = divided()
     division = simulation._tick.division
     for _ in range(STEPS):
-        simulation._tick.executor.each("advance", idle(simulation))
+        simulation._tick.executor.advance(idle(simulation))
         for shard in simulation._shards:
             left, low, right, high = division.halo.inner[shard.zone]
             worlds = shard.worlds
@@ -106,5 +108,5 @@ def test_who_may_be_seen_elsewhere_is_noted_while_it_is_moved() -> None:
                     np.testing.assert_array_equal(noted[name], rows[name][noted["row"]])
         simulation._tick.division.exchange()
         assert (division.zoned.num_outer == -1).all()
-        simulation._tick.executor.each("commit")
+        simulation._tick.executor.commit()
         simulation._shard.worlds.ticks[:] += 1

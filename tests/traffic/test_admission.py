@@ -88,7 +88,7 @@ def test_one_a_tick_tries_on_each_lane() -> None:
     gate = gate_of(4)
     gate.queue[0, :4]["lane"] = [MAIN[0], MAIN[0], MAIN[1], MAIN[0]]
     worlds = make_worlds(1, 12, ROADS)
-    assign_lanes(ROADS.arrays, travel("merge"), gate, worlds)
+    assign_lanes(ROADS.arrays, travel("merge"), gate, worlds.keys)
     assert gate.tries[0, :4].tolist() == [MAIN[0], -1, MAIN[1], -1]
 
 

@@ -52,9 +52,16 @@ class Kernel:
             TypeError: a kernel takes no such arguments.
             KernelError: the kernel has to be compiled, and may or can not be.
         """
-        if named or len(arguments) != self._arity:
-            arguments = self._bind(arguments, named)
+        arguments = self.in_order(arguments, named)
         return self.call_for(arguments)(arguments)
+
+    def in_order(self, arguments: tuple[Any, ...], named: dict[str, Any]) -> tuple[Any, ...]:
+        """Return all arguments of a call, defaults included, in the order of the signature."""
+        if not named and len(arguments) == self._arity:
+            return arguments
+        bound = self._signature.bind(*arguments, **named)
+        bound.apply_defaults()
+        return bound.args
 
     def call_for(self, arguments: tuple[Any, ...]) -> TypedKernel:
         """Return the kernel for the types of some arguments; it is compiled if need be."""
@@ -72,11 +79,6 @@ class Kernel:
     def _signature(self) -> inspect.Signature:
         return inspect.signature(self.py_func)
 
-    def _bind(self, arguments: tuple[Any, ...], named: dict[str, Any]) -> tuple[Any, ...]:
-        bound = self._signature.bind(*arguments, **named)
-        bound.apply_defaults()
-        return bound.args
-
     @cached_property
     def _part(self) -> Any:
         from cavmarl.core.compiled.compiler import make_part
@@ -92,7 +94,9 @@ class Kernel:
 class TypedKernel:
     """A kernel for arguments of certain types."""
 
-    __slots__ = ("enter", "name", "num_words", "offsets", "read_result", "types", "words")
+    __slots__ = (
+        "address", "enter", "name", "num_words", "offsets", "read_result", "types", "words",
+    )  # fmt: skip
 
     def __init__(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
         self.name = function.__name__
@@ -101,6 +105,7 @@ class TypedKernel:
         record_call(function, arguments)
         code = find_code(function, arguments, self.types)
         self.enter = code.enter
+        self.address = code.address
         count = sum(kind.count for kind in self.types)
         results, self.read_result = result_reader(code.result, count)
         self.num_words = count + results

@@ -32,6 +32,7 @@ _INSTALL = "pip install '.[compile]' in a checkout of cavmarl"
 class Code(NamedTuple):
     """A kernel that can be entered, for one list of argument types."""
 
+    address: int  # of the entry point
     enter: Callable[[int], int]  # takes the address of `Words`, returns 0 or an error's number
     result: str
 
@@ -96,7 +97,7 @@ def find_code(
         if source.library is not None:
             found = source.library.find(name, text, module_digest(function.__module__))
             if found is not None:
-                return Code(_ENTRY(found.address), found.result)
+                return Code(found.address, _ENTRY(found.address), found.result)
             reason = f"the wheel does not bring it for arguments of the types {text}"
         if source.choice == "prebuilt":
             raise KernelError(
@@ -123,7 +124,8 @@ def _compiled(
                 _explain(reason)
                 kernel = _compile(file, function, arguments)
                 file.save(kernel)
-    return Code(_ENTRY(_load_object(kernel)), kernel.result)
+    address = _load_object(kernel)
+    return Code(address, _ENTRY(address), kernel.result)
 
 
 def _compile(

@@ -17,7 +17,7 @@ _PACKAGE = Path(__file__).parents[2]
 _COMPILED = "core.compiled"
 # Files of that folder that decide about the code of all kernels; the others call what is compiled.
 _SHARED = tuple(f"{_COMPILED}.{name}" for name in ("arguments", "compiler", "entry_point"))
-_PARTS = (*_SHARED, f"{_COMPILED}.prefetch")
+_PARTS = (*_SHARED, f"{_COMPILED}.prefetch", f"{_COMPILED}.run_calls")
 
 
 @cache

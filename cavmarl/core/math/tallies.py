@@ -50,3 +50,19 @@ def totals(counts: NDArray[np.int64], out: NDArray[np.int64]) -> None:
         for zone in range(counts.shape[0]):
             total += counts[zone, w]
         out[w] = total
+
+
+@kernel
+def any_positive(counts: NDArray[np.int64]) -> bool:
+    """Return whether one of the counts (W,) is above 0."""
+    for w in range(counts.size):
+        if counts[w] > 0:
+            return True
+    return False
+
+
+@kernel
+def clear(counts: NDArray[np.int64]) -> None:
+    """Set all counts (W,) to 0."""
+    for w in range(counts.size):
+        counts[w] = 0

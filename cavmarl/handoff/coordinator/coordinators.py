@@ -107,9 +107,15 @@ class RowStates:
 
 
 class Coordination(Protocol):
-    """What decides ownership in W worlds, as a tick calls it."""
+    """What decides ownership in W worlds, as a tick calls it.
 
-    coordinators: tuple[Coordinator, ...]  # one a world, if they are in this process
+    Attributes:
+        coordinators: one a world, if they are in this process.
+        needs_ghosts: whether ghosts and vehicles near borders are looked for in each tick.
+    """
+
+    coordinators: tuple[Coordinator, ...]
+    needs_ghosts: bool
 
     def reset(self, chosen: NDArray[np.bool_]) -> None: ...
 
@@ -136,8 +142,39 @@ class Coordination(Protocol):
     def in_flight(self, w: int) -> list[TransferInFlight]: ...
 
 
+class NoCoordination:
+    """One zone owns all vehicles, so nothing has to be decided."""
+
+    coordinators: tuple[Coordinator, ...] = ()
+    needs_ghosts = False
+
+    def reset(self, chosen: NDArray[np.bool_]) -> None:
+        """All vehicles are of the one zone."""
+
+    def begin(self, commands: Commands) -> None:
+        """No vehicle changes its owner."""
+
+    def left(self, gate: Gate) -> None:
+        """Nothing is recorded of vehicles that leave."""
+
+    def entered(self, gate: Gate) -> None:
+        """New vehicles are of the one zone."""
+
+    def end(self) -> None:
+        """Nothing is committed."""
+
+    def save(self) -> None:
+        """Nothing is committed."""
+
+    def in_flight(self, w: int) -> list[TransferInFlight]:
+        """Return no transfers."""
+        return []
+
+
 class Coordinators:
     """The coordinators of W worlds in this process; a `Coordination`."""
+
+    needs_ghosts = True
 
     def __init__(
         self,

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from cavmarl.engine.shard_clock import ShardClock
+from cavmarl.shards.executor import PhaseExecutor
+from cavmarl.shards.phases import Phase
 from cavmarl.shards.shard import Shard
 from cavmarl.shards.shard_group import ShardGroup
 
@@ -27,19 +29,20 @@ class NodeExecutor(ShardGroup):
 
     def follow(self) -> None:
         """Let the other shards' rows be on the side of those of this node."""
-        side, next_side = self._first.side, self._first.next_side
+        side, next_side = self.sides
         for shard in self._foreign:
             if shard.side != side or shard.next_side != next_side:
                 shard.face(side, next_side)
 
 
-class TimedNodeExecutor:
-    """The same, with a clock on each zone."""
+class TimedNodeExecutor(PhaseExecutor):
+    """A `NodeExecutor` with a clock on each zone."""
 
     def __init__(self, plain: NodeExecutor, clock: ShardClock) -> None:
         self._plain, self._clock = plain, clock
 
-    def each(self, phase: str, *arguments: Any) -> None:
-        self._clock.each(phase, *arguments)
-        if phase in ("advance", "commit"):
+    def run(self, phase: Phase, arguments: tuple[Any, ...]) -> None:
+        """Run a phase and measure it."""
+        self._clock.run(phase, arguments)
+        if phase in (Phase.ADVANCE, Phase.COMMIT):
             self._plain.follow()

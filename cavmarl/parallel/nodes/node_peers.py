@@ -42,6 +42,8 @@ class NodePeers:
         owner: (W · A,) the node that has sensed for each agent last; `UNOWNED`: none.
     """
 
+    are_none = False
+
     def __init__(
         self,
         simulation: Simulation,

@@ -57,6 +57,7 @@ class ZoneHosts:
     """Those of one node, of W worlds."""
 
     coordinators: tuple[Coordinator, ...] = ()  # they are in another process
+    needs_ghosts = True
 
     def __init__(
         self,

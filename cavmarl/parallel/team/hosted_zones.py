@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.shards.phases import Phase
 from cavmarl.shards.shard import Shard
 from cavmarl.shards.shard_group import ShardGroup
 
@@ -48,21 +49,24 @@ class HostedZones:
             for shard in self._shards:
                 shard.face(side, next_side)
 
-    def each(self, name: str, *arguments: Any) -> None:
-        self._ticks += name == "move"
+    def run(self, phase: Phase, arguments: tuple[Any, ...]) -> None:
+        """Run a phase on the zones of this worker."""
+        self._ticks += phase is Phase.MOVE
         if self._spent_s is not None and self._ticks % TIMED == 0:
-            self._time_each(self._spent_s, name, *arguments)
+            self._run_timed(self._spent_s, phase, arguments)
             return
         for group in self._together:
-            group.each(name, *arguments)
+            phase.run(group, arguments)
 
-    def _time_each(self, spent_s: NDArray[np.float64], name: str, *arguments: Any) -> None:
+    def _run_timed(
+        self, spent_s: NDArray[np.float64], phase: Phase, arguments: tuple[Any, ...]
+    ) -> None:
         """The same zone by zone; the clock's time stands for all ticks until the next timed one."""
         if not self._alone:
             self._alone = [ShardGroup([shard]) for shard in self._shards]
             self._rehearsal = self._ticks  # it makes ready what later ones use
         for shard, group in zip(self._shards, self._alone, strict=True):
             began_ns = time.thread_time_ns()
-            group.each(name, *arguments)
+            phase.run(group, arguments)
             if self._ticks != self._rehearsal:
                 spent_s[shard.zone] += TIMED * 1e-9 * (time.thread_time_ns() - began_ns)

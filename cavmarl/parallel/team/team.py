@@ -31,8 +31,9 @@ from cavmarl.parallel.processes.process_barrier import (
 )
 from cavmarl.parallel.processes.shared_memory import shared_zeros
 from cavmarl.parallel.team.hosted_zones import HostedZones
-from cavmarl.shards.phases import PHASES
-from cavmarl.shards.shard import Shard
+from cavmarl.shards.executor import PhaseExecutor
+from cavmarl.shards.phases import Phase
+from cavmarl.shards.shard import Commands, Shard
 from cavmarl.shards.shard_group import ShardGroup
 
 # Words of the leader's line, behind those of `barrier`: what is called with even numbers, and what
@@ -42,9 +43,9 @@ CALLS = (2, 3)
 FAILED = 2
 CORE = 5  # a word of both: where the process was when it began with a phase
 
-# Methods of `ShardGroup` and `Shard` that are run together, by their code.
-TOGETHER = tuple(rule.together for rule in PHASES.values() if rule.together)
-END = len(TOGETHER)
+# Phases that all workers run side by side, by their code.
+SHARED = tuple(phase for phase in Phase if phase.value.is_shared)
+END = len(SHARED)
 
 
 class LeftAloneError(Exception):
@@ -58,13 +59,13 @@ class Team:
         self,
         shards: Sequence[Shard],  # one a zone, in the order of zones; their arrays are shared
         zones: Sequence[Sequence[int]],  # of each worker, to begin with; the first leads
-        # what phases are called with that are run together, by their names: for each phase all that
-        # there is to choose from; the arrays among it are shared
-        known: Mapping[str, Sequence[tuple[Any, ...]]],
+        # the arguments of shared phases: for each phase all that there are to choose from; the
+        # arrays among them are shared
+        known: Mapping[Phase, Sequence[tuple[Any, ...]]],
         # (k,) where the processor time of each zone is added up; None: not measured
         spent_s: NDArray[np.float64] | None = None,
     ) -> None:
-        self.known = {name: tuple(known.get(name, ((),))) for name in TOGETHER}
+        self.known = {phase: tuple(known.get(phase, ((),))) for phase in SHARED}
         self.everybody = ShardGroup(shards)
         self.hosts = [HostedZones(shards, hosted, spent_s) for hosted in zones]
         lines = shared_zeros((len(zones), WORDS), np.int64)
@@ -76,7 +77,7 @@ class Team:
             line[:] = 0
 
 
-class Leader:
+class Leader(PhaseExecutor):
     """Runs each phase on all shards of a world, with the help of the followers; an `Executor`."""
 
     def __init__(self, team: Team) -> None:
@@ -84,9 +85,9 @@ class Leader:
         self._everybody = team.everybody
         self._own = team.hosts[0]
         self._line, *self._others = team.lines
-        self._codes = {name: code for code, name in enumerate(TOGETHER)}
+        self._codes = {phase: code for code, phase in enumerate(SHARED)}
         self._leads = False
-        self._last = ""
+        self._last: Phase | None = None
         self._is_ahead = False  # a phase is announced and not waited for
 
     @contextmanager
@@ -97,14 +98,14 @@ class Leader:
             LeftAloneError: one of them has failed.
         """
         self._wait()
-        self._leads, self._last, self._is_ahead = True, "", False
+        self._leads, self._last, self._is_ahead = True, None, False
         try:
             yield
         finally:
             self._dismiss()
 
-    def end_after(self, phase: str) -> None:
-        """Let the followers end the command with the next phase of that name that they run."""
+    def end_after(self, phase: Phase | None) -> None:
+        """Let the followers end the command when they have run this phase."""
         self._last = phase
 
     def _dismiss(self) -> None:
@@ -117,25 +118,31 @@ class Leader:
         """From now on these zones are its own; the others are the followers'."""
         self._own.take(zones)
 
-    def each(self, phase: str, *arguments: Any) -> None:
-        """Run a phase on every shard. Raises LeftAloneError: a follower has failed."""
-        rule = PHASES[phase]
-        name = rule.together or phase
-        if name == "move":
-            self._everybody.turn()
-        which = self._which(name, arguments)
+    def advance(self, commands: Commands) -> None:
+        """Turn the rows, if they are to be put in order, and move them."""
+        self._everybody.turn()
+        self.run(Phase.MOVE, (commands,))
+
+    def run(self, phase: Phase, arguments: tuple[Any, ...]) -> None:
+        """Run a phase on every shard.
+
+        Raises:
+            LeftAloneError: a follower has failed.
+        """
+        rule = phase.value
+        which = self._which(phase, arguments)
         if (which < 0 and not rule.is_early) or rule.is_late:
             self.meet()
         if which < 0:
-            self._everybody.each(name, *arguments)
+            phase.run(self._everybody, arguments)
             return
-        self._announce(self._codes[name], which)
+        self._announce(self._codes[phase], which)
         self._is_ahead = True
-        self._own.each(name, *arguments)
+        self._own.run(phase, arguments)
         if rule.is_late:
             return
         self.meet()
-        if name == self._last:
+        if phase is self._last:
             self._dismiss()
 
     def meet(self) -> None:
@@ -148,10 +155,10 @@ class Leader:
             if line.item(FAILED):
                 raise LeftAloneError
 
-    def _which(self, name: str, arguments: tuple[Any, ...]) -> int:
+    def _which(self, phase: Phase, arguments: tuple[Any, ...]) -> int:
         """Which of what the followers know a phase is called with; -1: none, or no followers."""
-        if self._leads and name in self._codes:
-            for number, known in enumerate(self._known[name]):
+        if self._leads and phase in self._codes:
+            for number, known in enumerate(self._known[phase]):
                 if all(map(is_, arguments, known)):
                     return number
         return -1
@@ -192,7 +199,7 @@ class TeamFollower:
             code = call >> 2 & 0xFF
             if code != END:
                 try:
-                    self._run(TOGETHER[code], call)
+                    self._run(SHARED[code], call)
                 except Exception as error:
                     failure = error
                     line[FAILED] = 1
@@ -217,7 +224,7 @@ class TeamFollower:
             core = present_core()
         self._line[CORE] = core
 
-    def _run(self, name: str, call: int) -> None:
+    def _run(self, phase: Phase, call: int) -> None:
         self._get_out_of_the_way()
         self._own.face(call >> 1 & 1, call & 1)
-        self._own.each(name, *self._known[name][call >> 16])
+        self._own.run(phase, self._known[phase][call >> 16])

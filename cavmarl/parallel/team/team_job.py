@@ -14,11 +14,12 @@ from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.processes.worker_loop import Job
 from cavmarl.parallel.team.team import Leader, Team, TeamFollower
 from cavmarl.parallel.worlds_job import Task, WorldsJob
+from cavmarl.shards.phases import Phase
 from cavmarl.shards.shard import Shard
 
 # Phases that end a task for the followers; what comes after them the leader does alone, and one of
 # the followers wakes the caller in the meantime.
-LAST = {Task.STEP: "sense", Task.SUGGEST: "suggest"}
+LAST = {Task.STEP: Phase.SENSE, Task.SUGGEST: Phase.SUGGEST}
 # Tasks of the leader, of which no follower hears.
 ALONE = (Task.STATE_HASH, Task.TRAFFIC_STATS, Task.DRIVEN, Task.SIGNAL_PHASES)
 
@@ -44,13 +45,13 @@ class LeaderJob(CheckpointJob):
     def _lead(self, shards: Sequence[Shard], gathering: tuple[float, float]) -> Leader:
         commands = [(self._commands,), *((entry,) for entry in self._log.entries)]
         chosen = [(self._worlds.simulation.everywhere,)]
-        known: dict[str, Sequence[tuple[Any, ...]]] = {
-            "begin_step": commands,
-            "move": commands,
-            "gather": [gathering],
-            "sense": chosen,
-            "credit": chosen,
-            "suggest": [(self._worlds.arrays.suggested,)],
+        known: dict[Phase, Sequence[tuple[Any, ...]]] = {
+            Phase.BEGIN_STEP: commands,
+            Phase.MOVE: commands,
+            Phase.GATHER: [gathering],
+            Phase.SENSE: chosen,
+            Phase.CREDIT: chosen,
+            Phase.SUGGEST: [(self._worlds.arrays.suggested,)],
         }
         self._team = Team(shards, self._zones, known, self._spent_s)
         self._leader = Leader(self._team)
@@ -75,7 +76,7 @@ class LeaderJob(CheckpointJob):
             self._catch_up(task)
             if task == Task.STEP:
                 self._note_step()
-            self._leader.end_after(LAST.get(Task(task), ""))
+            self._leader.end_after(LAST.get(Task(task)))
             WorldsJob.perform(self, task, payload)
         if task in (Task.RESET, Task.LOAD):
             self._begin_anew()

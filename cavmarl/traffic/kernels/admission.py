@@ -98,22 +98,20 @@ def rank_lanes(
 
 
 @kernel
-def assign_lanes(roads: RoadArrays, travel: Travel, gate: Gate, worlds: Worlds) -> None:
+def assign_lanes(roads: RoadArrays, travel: Travel, gate: Gate, keys: NDArray[np.uint64]) -> None:
     """Say on which lane each departure of the queue tries, -1: on none.
 
     A lane is taken whether or not there is room: the one that waits longer goes first.
 
     `gate`: `tries` and `lane_taken` are written.
     """
-    for w in range(worlds.ticks.shape[0]):
+    for w in range(keys.size):
         if gate.num_queue[w] == 0:
             continue
         gate.lane_taken[:] = False
         for q in range(gate.num_queue[w]):
             departure = gate.queue[w, q]
-            lane = entry_lane(
-                roads, travel, worlds.keys[w], departure, gate.ranks[w, q], gate.lane_taken
-            )
+            lane = entry_lane(roads, travel, keys[w], departure, gate.ranks[w, q], gate.lane_taken)
             gate.tries[w, q] = lane
             if lane >= 0:
                 gate.lane_taken[lane] = True

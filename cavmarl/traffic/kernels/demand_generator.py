@@ -62,15 +62,17 @@ def _order(
     roads: RoadArrays,
     travel: Travel,
     gate: Gate,
-    worlds: Worlds,
+    ticks: NDArray[np.int64],
+    keys: NDArray[np.uint64],
     w: int,
     agent: int,
     trips: TripTable,
 ) -> None:
     """Number and draw one departure and put it at the end of the queue."""
-    own_map = map_of(worlds.keys[w], roads.maps.shape[0])
-    departure = gate.queue[w, _number(demand, gate, worlds, w)]
-    vehicle, key = departure["id"], worlds.keys[w]
+    key = keys[w]
+    own_map = map_of(key, roads.maps.shape[0])
+    departure = gate.queue[w, _number(demand, gate, ticks[w], key, w)]
+    vehicle = departure["id"]
     trip = _draw(trips, own_map, key, vehicle, 0)
     departure["agent"] = agent
     if agent >= 0:
@@ -85,7 +87,7 @@ def _order(
 
 
 @kernel
-def _number(demand: Demand, gate: Gate, worlds: Worlds, w: int) -> int:
+def _number(demand: Demand, gate: Gate, tick: int, key: np.uint64, w: int) -> int:
     """Put a numbered departure of the generator's type at the end of the queue; its place."""
     vehicle = gate.next_id[w]
     gate.next_id[w] = vehicle + 1
@@ -101,8 +103,8 @@ def _number(demand: Demand, gate: Gate, worlds: Worlds, w: int) -> int:
     departure["lane_code"] = LANE_GIVEN
     departure["pos_code"] = POS_GIVEN
     departure["speed_code"] = SPEED_MAX
-    departure["due"] = worlds.ticks[w]
-    spread = 2.0 * uniform(worlds.keys[w], vehicle, 0, STREAM_SPEED_FACTOR) - 1.0
+    departure["due"] = tick
+    spread = 2.0 * uniform(key, vehicle, 0, STREAM_SPEED_FACTOR) - 1.0
     departure["speed_factor"] = 1.0 + demand.speed_factor_spread * spread
     return place
 
@@ -115,7 +117,8 @@ def insert(
     num_goals: int,
     inserted: NDArray[np.float64],  # as in `Commands`
     gate: Gate,
-    worlds: Worlds,
+    ticks: NDArray[np.int64],
+    keys: NDArray[np.uint64],
 ) -> None:
     """Put what is to enter from outside at the end of the queue.
 
@@ -123,7 +126,7 @@ def insert(
     that leads to none it stands at its end. A barrier has the last STOP rows, one a lane.
     """
     lanes = roads.lanes.shape[0]
-    for w in range(worlds.ticks.shape[0]):
+    for w in range(ticks.size):
         for n in range(inserted.shape[1]):
             lane = int(inserted[w, n, 1])
             if inserted[w, n, 0] == INSERT_OPEN:
@@ -131,8 +134,8 @@ def insert(
                 continue
             if inserted[w, n, 0] == INSERT_NONE or gate.num_queue[w] >= gate.queue.shape[1]:
                 continue
-            departure = gate.queue[w, _number(demand, gate, worlds, w)]
-            first = below(worlds.keys[w], departure["id"], 0, STREAM_ROUTE, num_goals)
+            departure = gate.queue[w, _number(demand, gate, ticks[w], keys[w], w)]
+            first = below(keys[w], departure["id"], 0, STREAM_ROUTE, num_goals)
             _send(roads, departure, lane, first)
             for k in range(num_goals):
                 goal = (first + k) % num_goals
@@ -253,7 +256,7 @@ def populate(
         for n in range(demand.num_agents + demand.num_background):
             agent = n if n < demand.num_agents else -1
             trips = demand.agent_trips if agent >= 0 else demand.start_trips
-            _order(demand, roads, travel, gate, worlds, w, agent, trips)
+            _order(demand, roads, travel, gate, worlds.ticks, worlds.keys, w, agent, trips)
             departure = gate.queue[w, gate.num_queue[w] - 1]
             vehicle = departure["id"]
             kind = travel.types[departure["vtype"]]
@@ -378,7 +381,13 @@ def _next_leaving(gate: Gate, w: int, first: int) -> int:
 
 @kernel
 def settle(
-    demand: Demand, roads: RoadArrays, travel: Travel, gate: Gate, worlds: Worlds, dt: float
+    demand: Demand,
+    roads: RoadArrays,
+    travel: Travel,
+    gate: Gate,
+    ticks: NDArray[np.int64],
+    keys: NDArray[np.uint64],
+    dt: float,
 ) -> None:
     """Count the vehicles that have left, and order those that follow.
 
@@ -388,7 +397,7 @@ def settle(
     `demand`: the generator's tables. `gate`: counts, sums and queue are written; `passing` holds
     those that left, and is emptied.
     """
-    for w in range(worlds.ticks.shape[0]):
+    for w in range(ticks.size):
         for n in range(gate.num_passing[w]):
             # Those before n are not read any more.
             found = _next_leaving(gate, w, n)
@@ -407,22 +416,23 @@ def settle(
             if not demand.reenter or ordered:
                 continue
             if agent < 0:
-                _order(demand, roads, travel, gate, worlds, w, -1, demand.enter_trips)
+                _order(demand, roads, travel, gate, ticks, keys, w, -1, demand.enter_trips)
             elif demand.seats:
-                _order(demand, roads, travel, gate, worlds, w, agent, demand.agent_trips)
+                _order(demand, roads, travel, gate, ticks, keys, w, agent, demand.agent_trips)
             elif gate.num_entered[w] < demand.num_ids:
                 follower = gate.num_entered[w]
                 gate.num_entered[w] = follower + 1
-                _order(demand, roads, travel, gate, worlds, w, follower, demand.agent_trips)
+                trips = demand.agent_trips
+                _order(demand, roads, travel, gate, ticks, keys, w, follower, trips)
         gate.num_passing[w] = 0
 
 
 @kernel
-def call_orders(gate: Gate, worlds: Worlds) -> None:
+def call_orders(gate: Gate, ticks: NDArray[np.int64]) -> None:
     """Put the ordered departures that are due by the coming tick at the end of the queue."""
-    for w in range(worlds.ticks.shape[0]):
+    for w in range(ticks.size):
         n = gate.next_order[w]
-        while n < gate.num_orders[w] and gate.orders[w, n]["due"] <= worlds.ticks[w] + 1:
+        while n < gate.num_orders[w] and gate.orders[w, n]["due"] <= ticks[w] + 1:
             departure = gate.queue[w, gate.num_queue[w]]
             gate.queue[w, gate.num_queue[w]] = gate.orders[w, n]
             departure["id"] = gate.next_id[w]

@@ -1,0 +1,127 @@
+"""`CompiledStep`: the ticks of a step as one compiled call, for plain undivided worlds.
+
+In a small world Python needs longer to go from phase to phase than the phases take. The calls here
+are those that `Tick` makes, in its order; a test holds that both give the same bytes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cavmarl.core.compiled.bound_call import CallSequence, bind
+from cavmarl.core.math.tallies import any_positive, clear, totals
+from cavmarl.engine.tick import Tick
+from cavmarl.shards.shard import Commands
+from cavmarl.shards.shard_group import ShardGroup
+
+
+class CompiledStep:
+    """The ticks of a step, from the first to the sensing at its end."""
+
+    def __init__(self, tick: Tick, group: ShardGroup) -> None:
+        self.gate = tick.gate
+        self.group = group
+        self._tick = tick
+        self._ticks = CallSequence()
+        for _ in range(group.first.config.clock.ticks_per_step):
+            self._add_tick(self._ticks)
+        if group.calls.has_agents:
+            self._add_sense(self._ticks)
+
+    def run(self, commands: Commands) -> None:
+        """Run the step."""
+        calls = self.group.calls
+        self._tick.begin_step(commands)
+        if calls.has_agents:
+            np.copyto(calls.controls, commands.controls)
+            calls.chosen[:] = self._tick.shared.chosen[:] = True
+        self._ticks.run()
+        self.group.face(*calls.members.sides.tolist())
+
+    def _add_tick(self, sequence: CallSequence) -> None:
+        """Append the phases of a tick; see `Tick.run`."""
+        tick, calls = self._tick, self.group.calls
+        sequence.call(calls.turn)
+        sequence.call(calls.advance)
+        self._add_leave(sequence)
+        sequence.call(tick.division.row_count)
+        sequence.call(calls.resolve)
+        self._add_enter(sequence)
+        sequence.call(calls.commit)
+        sequence.call(tick.count_tick)
+        if calls.has_detectors:
+            sequence.call(calls.detect)
+        if tick.shared.has_signals:
+            sequence.call(tick.shared.signal_switch(tick.common))
+
+    def _add_leave(self, sequence: CallSequence) -> None:
+        """Append what `Tick.leave` calls."""
+        tick, calls = self._tick, self.group.gate_calls(self.gate)
+        worlds, traffic = tick.worlds, tick.traffic
+        sequence.call(tick.occasions)
+        with sequence.only_if(tick.occasions, 0):
+            sequence.call(calls.choose_goals(traffic.demand, len(traffic.plans)))
+        with sequence.only_if(tick.occasions, 1):
+            sequence.call(calls.leave)
+            some_pass = bind(any_positive, self.gate.num_passing)
+            sequence.call(some_pass)
+            with sequence.only_if(some_pass):
+                sequence.call(traffic.calls(self.gate, worlds.ticks, worlds.keys).settle)
+
+    def _add_enter(self, sequence: CallSequence) -> None:
+        """Append what `Tick.let_in` calls."""
+        tick, calls = self._tick, self.group.gate_calls(self.gate)
+        gate, worlds = self.gate, tick.worlds
+        traffic = tick.traffic.calls(gate, worlds.ticks, worlds.keys)
+        if gate.orders.shape[1]:
+            sequence.call(traffic.call_orders)
+        some_wait = bind(any_positive, gate.num_queue)
+        sequence.call(some_wait)
+        with sequence.only_if(some_wait):
+            sequence.call(calls.rank_lanes)
+            sequence.call(traffic.assign_lanes)
+            sequence.call(calls.propose(tick.traffic.demand))
+            some_pass = bind(any_positive, gate.num_passing)
+            sequence.call(some_pass)
+            with sequence.only_if(some_pass):
+                sequence.call(
+                    bind(totals, counts=tick.division.zoned.num_owned, out=traffic.running)
+                )
+                sequence.call(traffic.accept)
+                sequence.call(calls.admit)
+                sequence.call(bind(clear, gate.num_passing))
+
+    def _add_sense(self, sequence: CallSequence) -> None:
+        """Append what `Tick.sense` calls."""
+        shared, calls = self._tick.shared, self.group.calls
+        sequence.call(shared.clearing)
+        sequence.call(calls.sense)
+        if calls.has_optional:
+            sequence.call(calls.observe_optional)
+        if calls.stacks:
+            sequence.call(calls.fill_stacks)
+        sequence.call(shared.settling)
+        sequence.call(calls.credit)
+
+
+def compiled_step(tick: Tick, last: CompiledStep | None) -> CompiledStep | None:
+    """Return the compiled step of worlds that can have one.
+
+    Args:
+        tick: of the worlds.
+        last: what this function returned before; it is used again if nothing has changed.
+    """
+    group = tick.executor
+    if (
+        type(group) is not ShardGroup
+        or len(group.shards) != 1
+        or tick.coordination.needs_ghosts
+        or tick.attached
+        or tick.sumo.traffic is not None
+        or tick.traffic.rerouting is not None
+        or group.calls.has_registered
+    ):
+        return None
+    if last is None or last.gate is not tick.gate or last.group is not group:
+        return CompiledStep(tick, group)
+    return last

@@ -1,0 +1,128 @@
+"""What SUMO beside a world does in a tick, and what the world does instead where there is none."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.records.arrays import Worlds
+from cavmarl.engine.step_trace import MIRROR, SUMO
+from cavmarl.traffic.sumo.sumo_traffic import SumoTraffic
+
+if TYPE_CHECKING:
+    from cavmarl.engine.tick import Tick
+
+
+class GlobalTraffic(Protocol):
+    """The part of a tick that another simulator may take over.
+
+    Attributes:
+        traffic: SUMO, or None.
+    """
+
+    @property
+    def traffic(self) -> SumoTraffic | None: ...
+
+    def reset(self, chosen: NDArray[np.bool_], worlds: Worlds) -> None:
+        """Begin an episode in the chosen worlds (W,)."""
+        ...
+
+    def catch_up(self, worlds: Worlds) -> None:
+        """Go to the ticks of worlds whose state was loaded; errors as of `SumoTraffic`."""
+        ...
+
+    def follow(self, tick: Tick) -> None:
+        """Move the vehicles of the other simulator, after ours have moved."""
+        ...
+
+    def let_in(self, tick: Tick) -> None:
+        """Add the vehicles that the other simulator has let in."""
+        ...
+
+    def switch_signals(self, tick: Tick) -> None:
+        """Bring the signals to the present tick."""
+        ...
+
+    def close(self) -> None:
+        """End the other simulator."""
+        ...
+
+
+class NoSumo:
+    """There is no other simulator: signals are switched by their own programs."""
+
+    traffic: SumoTraffic | None = None
+
+    def reset(self, chosen: NDArray[np.bool_], worlds: Worlds) -> None:
+        """Nothing begins."""
+
+    def catch_up(self, worlds: Worlds) -> None:
+        """Nothing has a tick of its own."""
+
+    def follow(self, tick: Tick) -> None:
+        """There are no other vehicles."""
+
+    def let_in(self, tick: Tick) -> None:
+        """There are no other vehicles."""
+
+    def switch_signals(self, tick: Tick) -> None:
+        """Ask the detectors of all zones, then switch the signals once."""
+        tick.executor.detect()
+        tick.peers.share_detections(tick.worlds)
+        tick.shared.switch_signals(tick.common)
+
+    def close(self) -> None:
+        """There is nothing to end."""
+
+
+class SumoPhases:
+    """SUMO beside the worlds of a tick."""
+
+    def __init__(self, traffic: SumoTraffic) -> None:
+        self.traffic: SumoTraffic | None = traffic
+        self._sumo = traffic
+
+    def reset(self, chosen: NDArray[np.bool_], worlds: Worlds) -> None:
+        """Start SUMO anew in the chosen worlds (W,)."""
+        self._sumo.reset(chosen, worlds)
+
+    def catch_up(self, worlds: Worlds) -> None:
+        """Repeat what SUMO did up to the worlds' ticks."""
+        self._sumo.catch_up(worlds)
+
+    def follow(self, tick: Tick) -> None:
+        """Let SUMO take its step; then its vehicles move to their new places, or leave."""
+        sumo, gate, worlds, side = self._sumo, tick.gate, tick.worlds, tick.division.next_side
+        tick.note_phase(SUMO)
+        with tick.all_rows(True, side):
+            sumo.step(worlds, side)
+            if not sumo.drives:
+                sumo.send_on(gate, worlds, side)
+                return
+        tick.note_phase(MIRROR)
+        if sumo.mirror(worlds, side):
+            tick.executor.dismiss(gate)
+            tick.coordination.left(gate)
+            sumo.forgive(gate)
+        tick.peers.share_leavers(gate)
+        if any(gate.num_passing.tolist()):
+            tick.traffic.settle(gate, worlds)
+
+    def let_in(self, tick: Tick) -> None:
+        """Add the vehicles that SUMO has let in: as its own, or to the queue as ours."""
+        sumo, gate, worlds = self._sumo, tick.gate, tick.worlds
+        tick.meet()
+        if not sumo.drives:
+            sumo.order(gate, worlds)
+        elif sumo.let_in(gate, worlds, tick.peers.running()):
+            tick.admit()
+
+    def switch_signals(self, tick: Tick) -> None:
+        """Show what the signals of SUMO show."""
+        self._sumo.show(tick.worlds)
+
+    def close(self) -> None:
+        """End SUMO."""
+        self._sumo.close()

@@ -1,0 +1,74 @@
+"""Bound calls and sequences of them give what the same calls give from Python."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cavmarl.core.compiled import kernel
+from cavmarl.core.compiled.bound_call import CallSequence, bind
+
+
+@kernel
+def add(numbers: NDArray[np.int64], amount: int) -> None:
+    for n in range(numbers.size):
+        numbers[n] += amount
+
+
+@kernel
+def compare(numbers: NDArray[np.int64], limit: int) -> tuple[bool, bool]:
+    return numbers[0] > limit, numbers[0] < limit
+
+
+@kernel
+def is_even(numbers: NDArray[np.int64]) -> bool:
+    return bool(numbers[0] % 2 == 0)
+
+
+def test_a_bound_call_sees_changes_of_its_arrays_and_takes_arguments_by_name() -> None:
+    numbers = np.arange(3)
+    call = bind(add, amount=2, numbers=numbers)
+    call()
+    numbers[0] = 10
+    call()
+    assert numbers.tolist() == [12, 5, 6]
+    assert bind(compare, numbers, 11)() == (True, False)
+
+
+def test_an_argument_of_a_kind_that_kernels_do_not_take_is_refused() -> None:
+    if not bind(is_even, np.zeros(1, dtype=np.int64)).is_compiled:
+        pytest.skip("without the compiler any argument is taken")
+    with pytest.raises(TypeError, match="pass NumPy arrays"):
+        bind(add, [1, 2], 1)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("start", range(6))
+def test_a_sequence_makes_the_calls_whose_conditions_hold(start: int) -> None:
+    numbers, expected = np.array([start]), np.array([start])
+    test, parity = bind(compare, numbers, 3), bind(is_even, numbers)
+    sequence = CallSequence()
+    sequence.call(test)
+    with sequence.only_if(test, 0):
+        sequence.call(bind(add, numbers, 10))
+        sequence.call(parity)
+        with sequence.only_if(parity):
+            sequence.call(bind(add, numbers, 100))
+    with sequence.only_if(test, 1):
+        sequence.call(bind(add, numbers, 1000))
+    sequence.call(bind(add, numbers, 10000))
+    for _ in range(3):
+        sequence.run()
+        above, below = bool(expected[0] > 3), bool(expected[0] < 3)
+        if above:
+            expected += 10
+            if expected[0] % 2 == 0:
+                expected += 100
+        if below:
+            expected += 1000
+        expected += 10000
+    assert numbers.tolist() == expected.tolist()
+
+
+def test_an_empty_sequence_does_nothing() -> None:
+    CallSequence().run()

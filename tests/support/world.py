@@ -1,0 +1,43 @@
+"""What tests need of a running world that its public interface does not show."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from cavmarl.engine.simulation import Simulation
+from cavmarl.shards.executor import Executor, PhaseExecutor
+from cavmarl.shards.phases import Phase
+
+
+class PhaseLog(PhaseExecutor):
+    """Passes phases on to another executor and keeps their order."""
+
+    def __init__(self, executor: Executor) -> None:
+        self.phases: list[Phase] = []
+        self._executor = executor
+
+    def run(self, phase: Phase, arguments: tuple[Any, ...]) -> None:
+        self.phases.append(phase)
+        phase.run(self._executor, arguments)
+
+
+def executor_of(simulation: Simulation) -> Executor:
+    """Return what runs the phases of the shards."""
+    return simulation._tick.executor
+
+
+def use_executor(simulation: Simulation, executor: Executor) -> None:
+    """Let another executor run the phases of the shards."""
+    simulation._tick.executor = executor
+
+
+def log_phases(simulation: Simulation) -> PhaseLog:
+    """Return a log of the phases; steps of the world are run phase by phase from now on."""
+    log = PhaseLog(executor_of(simulation))
+    use_executor(simulation, log)
+    return log
+
+
+def is_compiled(simulation: Simulation) -> bool:
+    """Return whether the last step was one compiled call."""
+    return simulation._compiled_step is not None
