@@ -3,8 +3,6 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 READY := .venv/.ready
-# Debian keeps Python's venv in a package of its own; root can fetch it.
-VENV_PACKAGE := { test "$$(id -u)" = 0 && apt-get update && apt-get install --yes python3-venv; }
 OLDEST := .venv-oldest
 LIBRARIES := .venv-libraries
 TOOLS := .venv-tools
@@ -30,7 +28,7 @@ FUZZ_TARGETS ?= network programs buildings map cached zones demand sumocfg entry
 # Tests start many processes: none is to parse the sources anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help demo test quick ray check bench bounds soak model fuzz oldest libraries maps rules lock sbom audit kernels wheel record pictures docs clean
+.PHONY: help demo test quick emulated ray check bench bounds soak model fuzz oldest libraries maps rules lock sbom audit kernels wheel record pictures docs clean
 .DEFAULT_GOAL := help
 
 help: ## say what there is
@@ -50,6 +48,9 @@ test: $(READY) ## the tests but the slow ones; those of kernels that have a twin
 quick: $(READY) ## unit tests of what has changed since main, the nearest first, for a minute
 	$(BIN)/python $(KERNELS)
 	$(BIN)/python -m tests.support.touched
+
+emulated: $(READY) ## a step of a golden row on a processor that qemu-user emulates
+	$(BIN)/python -m tests.golden.portability --emulated
 
 ray: $(READY) ## the tests that start a Ray cluster
 	$(BIN)/python $(KERNELS)
@@ -103,8 +104,8 @@ maps: $(READY) ## make the maps of all entries anew from the options beside them
 	    sed --in-place '2,/^-->$$/d' $$name && \
 	    { test $$folder != envs/cities/map || gzip --force --best --no-name $$name; }) || exit 1; done
 
-record: $(READY) ## after a change of behaviour: golden rows, zoo, scores, generated blocks; PART=scores, ROWS=all
-	$(BIN)/python -m tests.record $(PART) $(if $(filter all,$(ROWS)),--all-rows)
+record: $(READY) ## after a change of behaviour: golden rows, zoo, scores, generated blocks; PART=scores
+	$(BIN)/python -m tests.record $(PART)
 
 rules: $(READY) $(TOOLS)/.ready ## ask ASAM's checker whether exported OpenDRIVE keeps its rules
 	$(BIN)/pytest tests/maps/exports/test_opendrive_rules.py
@@ -139,7 +140,7 @@ clean: ## remove .venv, builds and caches; runs/ stays
 $(READY): pyproject.toml constraints/exact.txt
 	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	    echo "cavmarl needs Python 3.11 or newer: make PYTHON=/path/to/python3.11" >&2; exit 1; }
-	@"$(PYTHON)" -c 'import ensurepip, venv' 2>/dev/null || $(VENV_PACKAGE) || { \
+	@"$(PYTHON)" -c 'import ensurepip, venv' 2>/dev/null || { \
 	    echo "Python's venv is missing; on Debian: sudo apt-get install python3-venv" >&2; exit 1; }
 	test -x $(BIN)/pip || "$(PYTHON)" -m venv --clear .venv
 	$(BIN)/python -m pip install $$(grep '^torch==' constraints/exact.txt) --constraint constraints/exact.txt

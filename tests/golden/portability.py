@@ -1,11 +1,13 @@
 """Golden rows and trained drivers on other processors, as far as this machine can imitate them.
 
-    python -m tests.golden.portability [--quick]
+    python -m tests.golden.portability [--quick|--emulated]
 
-drives some rows of `worlds.py` and the episodes of some trained drivers, first as this machine
+drives the rows of `worlds.py` and the episodes of some trained drivers, first as this machine
 does it, then with the settings of `PROCESSORS`, each time with maps that are read anew. It prints
 a line for each run. The exit code is 1 if the bytes of a run differ from those of the first one.
-Recorded hashes are not used. `--quick` leaves out what takes longer than a minute.
+Recorded hashes are not used. `--quick` leaves out what takes longer than a minute. `--emulated`
+drives one step on the processors that `qemu-x86_64` emulates, and on the one whose kernels they
+have.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -86,11 +88,14 @@ PROCESSORS = {
 }
 _DRIVER = "driver "
 TASKS = (
-    *("two", "merge", "rig", "v2x", "demand", "trained", "town"),
+    *worlds.ROWS,
     *(f"{_DRIVER}{name}" for name in ("merge_ippo", "roundabout_ippo", "intersection_ippo")),
 )
 QUICK_TASKS = ("two", "trained")
 SHORT_TASKS = ("two:5", "rig:2")  # for emulation: with the number of steps
+FIRST_STEP = ("two:1",)
+QUICK = tuple(name for name, processor in PROCESSORS.items() if processor.is_quick)
+EMULATED = ("kernels for Haswell", "emulated EPYC")
 
 
 def run_task(task: str, folder: str) -> dict[str, str]:
@@ -138,18 +143,25 @@ def reason_to_skip(processor: Processor) -> str:
     return ""
 
 
-def compare(is_quick: bool) -> int:
-    """Run all tasks on all processors, print what differs, and return the exit code."""
+def compare(
+    names: Iterable[str], tasks: tuple[str, ...], short: tuple[str, ...] = SHORT_TASKS
+) -> int:
+    """Run tasks on processors, print what differs, and return the exit code.
+
+    Args:
+        names: of `PROCESSORS`.
+        tasks: what is run on each.
+        short: what is run on emulated processors instead.
+    """
     has_failed = False
-    tasks = QUICK_TASKS if is_quick else TASKS
+    processors = {name: PROCESSORS[name] for name in names}
+    is_emulated = any(processor.emulated for processor in processors.values())
     with tempfile.TemporaryDirectory() as folder:
         worlds.write_inputs(folder)
-        asked = tasks if is_quick else (*tasks, *SHORT_TASKS)
+        asked = tuple(dict.fromkeys((*tasks, *short) if is_emulated else tasks))
         expected = dict(zip(asked, hashes(Processor({}), asked, folder), strict=True))
-        for name, processor in PROCESSORS.items():
-            if is_quick and not processor.is_quick:
-                continue
-            mine = SHORT_TASKS if processor.emulated else tasks
+        for name, processor in processors.items():
+            mine = short if processor.emulated else tasks
             skipped = reason_to_skip(processor)
             found = iter([]) if skipped else hashes(processor, mine, folder)
             for task in mine:
@@ -171,11 +183,14 @@ def main() -> int:
     """Compare processors; with `--run`, run one task and print its hashes."""
     parser = argparse.ArgumentParser(description="Compare runs on imitated processors.")
     parser.add_argument("--quick", action="store_true", help="less than a minute")
+    parser.add_argument("--emulated", action="store_true", help="one step on emulated processors")
     parser.add_argument("--run", metavar="FOLDER", help=argparse.SUPPRESS)
     parser.add_argument("task", nargs="?", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.run is None:
-        return compare(given.quick)
+        if given.emulated:
+            return compare(EMULATED, FIRST_STEP, FIRST_STEP)
+        return compare(QUICK, QUICK_TASKS) if given.quick else compare(PROCESSORS, TASKS)
     print(json.dumps(run_task(given.task, given.run)))
     return 0
 

@@ -5,17 +5,17 @@ from __future__ import annotations
 import pytest
 
 from tests.golden import portability
-from tests.golden.portability import Processor, compare
+from tests.golden.portability import PROCESSORS, QUICK, QUICK_TASKS, TASKS, Processor, compare
 
 
 def test_numpy_and_the_c_library_do_not_matter(capsys: pytest.CaptureFixture[str]) -> None:
-    assert compare(is_quick=True) == 0, capsys.readouterr().out
+    assert compare(QUICK, QUICK_TASKS) == 0, capsys.readouterr().out
     assert capsys.readouterr().out.count("same") >= 2
 
 
 @pytest.mark.slow
 def test_the_processor_does_not_matter(capsys: pytest.CaptureFixture[str]) -> None:
-    assert compare(is_quick=False) == 0, capsys.readouterr().out
+    assert compare(PROCESSORS, TASKS) == 0, capsys.readouterr().out
     with capsys.disabled():  # what was skipped belongs to the result
         print(capsys.readouterr().out)
 
@@ -23,14 +23,13 @@ def test_the_processor_does_not_matter(capsys: pytest.CaptureFixture[str]) -> No
 def test_a_difference_is_reported(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    processors = {name: Processor({"CASE": name}, is_quick=True) for name in ("other", "failing")}
+    processors = {name: Processor({"CASE": name}) for name in ("other", "failing")}
     found = {"": [{"states": "1"}], "other": [{"states": "2"}], "failing": [{"error": "no memory"}]}
     monkeypatch.setattr(portability, "PROCESSORS", processors)
-    monkeypatch.setattr(portability, "QUICK_TASKS", ("two",))
     monkeypatch.setattr(
         portability, "hashes", lambda processor, *_: iter(found[processor.settings.get("CASE", "")])
     )
-    assert compare(is_quick=True) == 1
+    assert compare(processors, ("two",)) == 1
     other, failing = capsys.readouterr().out.splitlines()
     assert other.endswith("DIFFERENT: states")
     assert failing.endswith("DIFFERENT: no memory")

@@ -1,6 +1,6 @@
 """Record again all that a change of behaviour makes stale: `make record`, or one part of it.
 
-    python -m tests.record [golden|zoo|scores|blocks [NAME ...]] [--all-rows] [--processes N]
+    python -m tests.record [golden|zoo|scores|blocks [NAME ...]] [--processes N]
 
 Without a part, all four are recorded, in this order:
 
@@ -40,8 +40,7 @@ class RecordError(CavmarlError):
 
 def golden(names: Sequence[str], given: argparse.Namespace) -> None:
     """Write golden rows."""
-    more = ["--realism"] if given.all_rows else []
-    _run("-m", "tests.golden.worlds", "--write", *more, *names)
+    _run("-m", "tests.golden.worlds", *names)
 
 
 def zoo(names: Sequence[str], given: argparse.Namespace) -> None:
@@ -124,9 +123,6 @@ def main() -> int:
     )
     parser.add_argument("part", nargs="?", choices=PARTS, help="default: all parts")
     parser.add_argument("names", nargs="*", metavar="NAME", help="default: everything of the part")
-    parser.add_argument(
-        "--all-rows", action="store_true", help="golden: also rows of realism, which take minutes"
-    )
     parser.add_argument(
         "--processes",
         type=int,
