@@ -1,6 +1,6 @@
 """The car-following models by name: of the package, of SUMO, and registered from outside.
 
-A model of the package is a code, a branch in `kernels/following.py` and a line in `MODELS`.
+A model of the package is a code, a branch in `driving/kernels/following.py` and a line in `MODELS`.
 """
 
 from __future__ import annotations

@@ -149,7 +149,7 @@ class ShardGroup:
         )
 
     def gather(self, touching_m: float, border_m: float) -> None:
-        """Renew the ghosts of the next rows, as `kernels.exchange.gather` says."""
+        """Renew the ghosts of the next rows, as `ghost_exchange.gather` says."""
         self._gather(self._members, self._first.next_side, touching_m, border_m)
 
     def resolve(self) -> None:
