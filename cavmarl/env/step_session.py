@@ -31,8 +31,8 @@ class StepSession:
     """The running worlds of one environment.
 
     A step takes decoded actions, declared events and insertions. After each reset and step, the
-    session records the worlds and calls the functions that watch them. A copy or a pickle of it has worlds
-    of its own, which go on bit for bit; it neither records nor is watched.
+    session records the worlds and calls the functions that watch them. A copy or a pickle of it has
+    worlds of its own, which go on bit for bit; it neither records nor is watched.
 
     Args:
         worlds: that are stepped.

@@ -51,7 +51,7 @@ class LaneGrid(NamedTuple):
 
 
 class Scripts(NamedTuple):
-    """Where scripted vehicles and pedestrians are in each tick; see `scenarios.movement_scripts`."""
+    """Where scripted vehicles and pedestrians are, by tick; see `scenarios.movement_scripts`."""
 
     frames: NDArray[np.void]  # FRAME (num_frames,), by VEHICLE["goal"] of a scripted row
     covers: NDArray[np.void]  # COVER (num_covers,) of lanes by bodies
