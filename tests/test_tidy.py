@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.cpu_time import ARGUED_S, argued, costs_of_files, known_costs, rare_tests
+from tests.support.references import Package
 from tests.support.tiers import ALONE_FILES, is_needed
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -112,3 +113,11 @@ def test_the_files_of_costs_and_of_argued_ones_name_tests_that_are_there() -> No
         path, test, *_ = name.split("::")
         function = test.split("[", 1)[0]
         assert re.search(rf"\b{function}\b", (ROOT / path).read_text(encoding="utf-8")), name
+
+
+def test_names_in_docstrings_and_comments_lead_somewhere() -> None:
+    """To a module, a member of a class, a key of `env.yaml` or a file of the repository."""
+    package = Package()
+    assert package.dead() == []
+    text = '"""See `runtime.pool`, `engine.tick.Tick.sense`, `zones.count` and `gone/there.py`."""'
+    assert list(package.dead_in(text)) == ["gone/there.py", "runtime.pool"]

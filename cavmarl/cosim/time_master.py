@@ -122,7 +122,7 @@ KEPT_EVENTS = 10_000
 
 
 class _Worlds(Protocol):
-    """What of `stepping.SteppedWorlds` a master needs."""
+    """The part of `step_arrays.SteppedWorlds` that a master needs."""
 
     @property
     def simulation(self) -> Simulation: ...

@@ -8,7 +8,7 @@ rows.
 
 Frames as in `roads.network`: x, y, z is the centre of the body; heading counter-clockwise from
 east; `s` and `d` are the centre's place on the lane, d positive to the left. Indices that point at
-nothing are -1. The codes (DRIVER_*, HOLD_*, EVENT_*) are those of `kernels.codes`. Units: metres,
+nothing are -1. The codes (DRIVER_*, HOLD_*, EVENT_*) are those of `records.codes`. Units: metres,
 seconds and radians unless the name says otherwise.
 """
 

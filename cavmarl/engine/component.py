@@ -1,8 +1,8 @@
 """What acts in each tick beside the traffic: mounted sensors, messages, scripts, other simulators.
 
-Each part is made in `attaching`, keeps its state in arrays (W, …) and is asked at fixed points of a
-tick. It reads the rows of all shards and writes only what is its own, so that nothing depends on
-how a world is divided.
+Each part is made by `tick_setup.attach`, keeps its state in arrays (W, …) and is asked at fixed
+points of a tick. It reads the rows of all shards and writes only what is its own, so that nothing
+depends on how a world is divided.
 """
 
 from __future__ import annotations

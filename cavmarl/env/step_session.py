@@ -31,8 +31,8 @@ class StepSession:
     """The running worlds of one environment.
 
     A step takes decoded actions, declared events and insertions. After each reset and step, the
-    session records the worlds and calls those who watch them. A copy or a pickle of it has worlds
-    of its own, which go on bit for bit; it neither records nor is watched.
+    session records the worlds and calls the functions that watch them. A copy or a pickle of it has
+    worlds of its own, which go on bit for bit; it neither records nor is watched.
 
     Args:
         worlds: that are stepped.
@@ -199,7 +199,7 @@ class StepSession:
         ]
 
     def _look(self, chosen: NDArray[np.bool_] | None = None) -> None:
-        """Record the chosen worlds (W,), or all, as they are now, and call those who watch."""
+        """Record the chosen worlds (W,), or all, as they are now, and call the watchers."""
         if self._recorder is not None:
             every = range(len(self.worlds.arrays.mask))
             some = every if chosen is None else np.flatnonzero(chosen).tolist()

@@ -270,9 +270,9 @@ class CavVectorEnv(WorldsEnvironment):
             observations (W, A, D), rewards (W, A), terminations (W, A): the agent's vehicle ended;
             truncations (W, A): its trip was cut at the episode's horizon, or its own; and infos:
             `mask` (W, A) agents that act next; `acted` (W, A) agents that acted in this step, so
-            their rewards count; `terms` (W, A, T) in the order of `config.TERMS`; `arrivals` (W,)
-            vehicles that reached their goal since the reset, agents included; `episode_over` (W,)
-            which worlds are over;
+            their rewards count; `terms` (W, A, T) in the order of `config.terms.TERMS`;
+            `arrivals` (W,) vehicles that reached their goal since the reset, agents included;
+            `episode_over` (W,) which worlds are over;
             `final_observations` (W, A, D) before a reset and with the last ones of agents that
             left: the same array as the observations in a step where none did.
 

@@ -342,7 +342,7 @@ class Division:
         x, y = self._x.item(place), self._y.item(place)
         min_x, min_y, max_x, max_y = self._rects[outside]
         dx, dy = max(min_x - x, 0.0, x - max_x), max(min_y - y, 0.0, y - max_y)
-        return math.sqrt(dx * dx + dy * dy)  # as `kernels.handing_over.release` does
+        return math.sqrt(dx * dx + dy * dy)  # as `kernels.handoff.release` does
 
     def owned(self, w: int, zone: int) -> NDArray[np.void]:
         """VEHICLE (n,), the committed rows that a zone owns; a view."""

@@ -1,6 +1,6 @@
 """Extension, off by default: other zones, where measured cost has gathered in a few.
 
-Only the proposal: the map is cut anew by recursive bisection (`roads.zone_layouts`), which then
+Only the proposal: the map is cut anew by recursive bisection (`partition.zone_layouts`), which then
 shares out measured cost and not lanes. Whether a world is cut so, and how its vehicles get there,
 is the caller's.
 """

@@ -32,7 +32,7 @@ log = logging.getLogger("cavmarl.workers")
 
 
 class OrderedWorlds(ABC):
-    """What is the same wherever the worlds live; see `arrays.SteppedWorlds`."""
+    """What is the same wherever the worlds live; see `step_arrays.SteppedWorlds`."""
 
     arrays: StepArrays  # what goes in and comes out
     placement: StepPlacement  # which worker hosts what

@@ -1,6 +1,6 @@
 """`TopDownRenderer`: a world from above, as a picture.
 
-`WorldView` is what `env.render()` shows.
+`WorldView` is what `CavEnv.render()` shows.
 """
 
 from __future__ import annotations

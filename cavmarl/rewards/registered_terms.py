@@ -35,9 +35,9 @@ def register_term(
     Args:
         name: of the term.
         function: its number, of an `AgentView` at the end of the step; if `batched`, its numbers
-            (n,), of a `BatchView`. It must not depend on the order of `view.others`; that is
+            (n,), of a `BatchView`. It must not depend on the order of `AgentView.others`; that is
             checked when it is first used.
-        reach_m: how far away the centres of `view.others` can be; 0: it looks at none.
+        reach_m: how far away the centres of `AgentView.others` can be; 0: it looks at none.
         batched: whether it answers for all agents of a world at once, and not once an agent.
 
     Raises:

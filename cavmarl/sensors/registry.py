@@ -68,9 +68,9 @@ def register_sensor(
         name: of the sensor.
         sense: its numbers, of an `AgentView` at the end of the step, one a feature; if `batched`,
             those of all agents (n, number of features), of a `BatchView`. They must not depend on
-            the order of `view.others`; that is checked when it is first used.
+            the order of `AgentView.others`; that is checked when it is first used.
         features: what each number is; names are unique.
-        reach_m: how far away the centres of `view.others` can be; 0: it looks at none.
+        reach_m: how far away the centres of `AgentView.others` can be; 0: it looks at none.
         batched: whether it answers for all agents of a world at once, and not once an agent.
 
     Raises:

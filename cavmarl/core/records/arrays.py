@@ -2,7 +2,7 @@
 
 W is the number of worlds stepped together, C the rows a world can hold, A the agents, L lanes, K
 links, G goals. The record dtypes are described where they are made: `roads.network`,
-`roads.routing`, `shard.vehicles`, `traffic.native`.
+`roads.routing`, `driving.vehicles`, `traffic.native`.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class LaneGrid(NamedTuple):
 
 
 class Scripts(NamedTuple):
-    """Where scripted vehicles and pedestrians are, tick by tick; see `traffic.scripts`."""
+    """Where scripted vehicles and pedestrians are, by tick; see `scenarios.movement_scripts`."""
 
     frames: NDArray[np.void]  # FRAME (num_frames,), by VEHICLE["goal"] of a scripted row
     covers: NDArray[np.void]  # COVER (num_covers,) of lanes by bodies

@@ -17,7 +17,7 @@ from cavmarl.core.records.codes import COUNT_ARRIVED, EVENTS_OF_FATE, EVENTS_THA
 
 
 class Results(NamedTuple):
-    """See `stepping.arrays.StepArrays`, of which these are some."""
+    """See `step_arrays.StepArrays`, of which these are some."""
 
     rewards: NDArray[np.float32]  # (W, A)
     terms: NDArray[np.float32]  # (W, A, T)

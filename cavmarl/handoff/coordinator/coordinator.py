@@ -3,8 +3,8 @@
 It decides which zone advances which vehicle to the next tick, and sees it done. How rows change
 hands is done by the division.
 
-There are two: `coordinator.Coordinator` sends messages, which may be lost, to hosts that may die;
-`direct.LocalCoordinator` lives in the process of all of its zones.
+There are two: `MessageCoordinator` sends messages, which may be lost, to hosts that may die;
+`LocalCoordinator` lives in the process of all of its zones.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from cavmarl.ownership.messages import Birth, Message, Record, Removed, Switch
 
 
 class Near(NamedTuple):
-    """A vehicle that another zone has to be told of; see `kernels.borders.NEAR`."""
+    """A vehicle that another zone has to be told of; see `zones.kernels.borders.NEAR`."""
 
     vehicle: int
     source: int

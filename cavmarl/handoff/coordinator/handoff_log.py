@@ -17,7 +17,7 @@ from cavmarl.zones.kernels.handoff import NOT_OWNED
 
 
 class OwnerChange(NamedTuple):
-    """A change of owner; see `kernels.handing_over.CHANGE`."""
+    """A change of owner; see `zones.kernels.handoff.CHANGE`."""
 
     tick: int
     vehicle: int

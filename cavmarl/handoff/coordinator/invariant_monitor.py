@@ -1,9 +1,9 @@
 """`InvariantMonitor`: the invariants of ownership, checked after every tick of every world.
 
-What it needs of the vehicles is taken in one compiled pass over their rows (`kernels.monitor`),
-which finds vehicles that have come and gone; what it knows of owners comes from the coordinators'
-records, and costs what changes in them. The words of an error are found when there is one
-(`runtime.violations`).
+What it needs of the vehicles is taken in one compiled pass over their rows
+(`kernels.invariant_checks`), which finds vehicles that have come and gone; what it knows of owners
+comes from the coordinators' records, and costs what changes in them. The words of an error are
+found when there is one (`coordinator.violations`).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The coordinator's log on disk: what has been decided is there before it is told to any zone.
 
-A line is a record of `ownership.records`. Nothing is kept in memory, and an append is one write: a
-process that dies leaves whole lines, and at most one that is cut short. `MemoryJournal` takes the
-same calls and keeps the records in a list.
+A line is a record of `ownership.log_records`. Nothing is kept in memory, and an append is one
+write: a process that dies leaves whole lines, and at most one that is cut short. `MemoryJournal`
+takes the same calls and keeps the records in a list.
 """
 
 from __future__ import annotations

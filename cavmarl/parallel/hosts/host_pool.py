@@ -1,10 +1,10 @@
 """`HostPool`: hosts that do one job together, command by command, and survive their deaths.
 
-It is `runtime.pool` for processes that share no memory with the caller. So the caller keeps what
-they leave behind: of each part an image of its state, every few commands, and the inputs of the
-orders since. When all hosts have carried out an order, the pool commits it. The part of one that is
-gone is given to a host that is free, with the image and those inputs: it reads the same and does
-the same.
+It is `processes.worker_pool` for processes that share no memory with the caller. So the caller
+keeps what they leave behind: of each part an image of its state, every few commands, and the inputs
+of the orders since. When all hosts have carried out an order, the pool commits it. The part of one
+that is gone is given to a host that is free, with the image and those inputs: it reads the same and
+does the same.
 """
 
 from __future__ import annotations

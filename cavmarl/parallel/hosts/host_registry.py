@@ -14,7 +14,7 @@ from cavmarl.parallel.hosts.listener import Listener
 
 ENDED = (EOFError, ConnectionError)  # of a connection, as it does when the process at its end dies
 
-SILENCE_S = 0.8  # of a host that is at work, and tells so every `host.BEAT_S`
+SILENCE_S = 0.8  # of a host that is at work, and tells so every `host_process.BEAT_S`
 
 
 class Launcher(Protocol):
@@ -23,7 +23,11 @@ class Launcher(Protocol):
     address: str  # of this machine, under which they reach it
 
     def start(self, place: tuple[str, int], secret: bytes) -> None:
-        """Start all of them; each runs `host.serve`. Raises WorkerError: they cannot be started."""
+        """Start all hosts; each runs `host_process.serve`.
+
+        Raises:
+            WorkerError: they cannot be started.
+        """
         ...
 
     def restart(self, number: int) -> None:

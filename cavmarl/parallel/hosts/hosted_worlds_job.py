@@ -61,7 +61,7 @@ def _sensed(frames: Frames) -> Iterator[Array]:
 
 
 def host_worlds(recipe: str, place: tuple[str, int], secret: bytes, number: int) -> None:
-    """The whole life of a process that hosts worlds; see `hosts.host.serve`."""
+    """The whole life of a process that hosts worlds; see `host_process.serve`."""
     serve(partial(HostedWorlds, json.loads(recipe)), place, secret, number)
 
 

@@ -13,7 +13,7 @@ from contextlib import suppress
 
 from cavmarl.parallel.processes.process_barrier import usable_cores
 
-UNKNOWN = -1  # as `barrier.present_core` says it where nothing is compiled
+UNKNOWN = -1  # as `process_barrier.present_core` says it where nothing is compiled
 
 
 def homes(

@@ -92,7 +92,7 @@ class ForkServer:
 
     def __init__(
         self,
-        program: str,  # module that is run, and calls `worker.serve`
+        program: str,  # module that is run, and calls `worker_loop.serve`
         start: Mapping[str, Any],  # what it is told, as JSON knows it; descriptors by number
         descriptors: tuple[int, ...],  # that it and its workers get
     ) -> None:

@@ -37,7 +37,7 @@ _FIRST_IMAGE_BYTES = 1 << 12
 class Program(NamedTuple):
     """What the workers of a pool run."""
 
-    module: str  # that is run as a program and calls `worker.serve`
+    module: str  # that is run as a program and calls `worker_loop.serve`
     recipe: Mapping[str, Any]  # from which it makes the jobs, as JSON knows it
     parts: tuple[str, ...]  # what each worker hosts, in words
     # that the jobs share with the pool, and the pool gives back; the recipe names their descriptors

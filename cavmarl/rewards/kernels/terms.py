@@ -1,7 +1,7 @@
 """The named terms of one agent's step. Reward and evaluation read the same numbers.
 
 One function a term, all with the same arguments' names; `write_terms` calls them in the order of
-`config.TERMS`.
+`config.terms.TERMS`.
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ def write_terms(
     i: int,  # row of the agent's vehicle
     grid: Grid,  # filled from these rows
     step_s: float,  # seconds a step
-    out: NDArray[np.float32],  # (NUM_TERMS,) in the order of `config.TERMS`
+    out: NDArray[np.float32],  # (NUM_TERMS,) in the order of `config.terms.TERMS`
 ) -> None:
     row = rows[i]
     out[0] = _progress(row, step_s)

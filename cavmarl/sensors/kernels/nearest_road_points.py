@@ -3,7 +3,7 @@
 Gulino et al.: "Waymax: an accelerated, data-driven simulator for large-scale autonomous driving
 research", NeurIPS 2023: each object sees the `k` points of lanes, lines and edges that are nearest
 to it, with place, direction and type. The points of a map never change: they are sorted into cells
-once, by `roads.roadgraph`.
+once, by `observed.roadgraph`.
 """
 
 from __future__ import annotations

@@ -100,7 +100,7 @@ class DemandFile:
     def draw(self, key: int, until_s: float | None = None) -> NDArray[np.void]:
         """The orders of one episode: a pure function of the key.
 
-        `key`: of the world and episode, see `kernels.rng.world_key`. `until_s`: no vehicle departs
+        `key`: of the world and episode, see `math.rng.world_key`. `until_s`: no vehicle departs
         at or after this time; the end of the files' simulation if None.
 
         Returns ORDER (n,), sorted by departure, at one time in the order of the files.

@@ -29,7 +29,7 @@ from cavmarl.traffic.trip_ways import TripWays
 log = logging.getLogger(__name__)
 NAMED = 5  # of the ids that are left out
 
-# Classes with lanes of their own that road networks leave out: see `roads.selection`.
+# Classes with lanes of their own that road networks leave out: see `sumo_net.selection`.
 _PARTLY_MAPPED = sum(1 << VEHICLE_CLASSES.index(name) for name in ("bicycle", "tram"))
 
 

@@ -32,7 +32,7 @@ _SKIPPED = frozenset(
 )
 
 
-# `roads.signal_plans` reads them.
+# `sumo_net.signal_plans` reads them.
 _PROGRAMS = frozenset(("tlLogic", "WAUT", "wautJunction"))
 
 

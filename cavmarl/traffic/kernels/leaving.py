@@ -1,4 +1,7 @@
-"""Vehicles that are through leave their shard; the gate settles with them (`departures.settle`)."""
+"""Vehicles that are through leave their shard.
+
+The gate settles with them in `demand_generator.settle`.
+"""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ ROW_LINES = 6  # of memory, that a VEHICLE row takes
 @kernel
 def exchange(
     zones: ZoneArrays,
-    halo: Halo,  # from `roads.zone_halo.zone_halo`, for the same partition
+    halo: Halo,  # from `partition.zone_halo.zone_halo`, for the same partition
     touching_m: float,  # no ghost further outside of a zone can touch one of its vehicles
     borders: Borders,  # when a vehicle is near one
     # the ghosts and how many there are, border and num_border are written. Of the owned rows those
@@ -47,9 +47,9 @@ def exchange(
 ) -> None:
     """Renew all ghosts of some worlds from the owned rows, and note vehicles near a border.
 
-    Zone z needs a vehicle if and only if a driver there may ask about it (`zones.is_seen`). A
-    vehicle that has left its own zone's rectangle, because its transfer is late, is published like
-    any other, to the zone that it is in as well.
+    Zone z needs a vehicle if and only if a driver there may ask about it: see
+    `visibility_tests.find_looks`. A vehicle that has left its own zone's rectangle, because its
+    transfer is late, is published like any other, to the zone that it is in as well.
     """
     # No other vehicle can be behind a border by then.
     border_m = borders.max_speed_mps * borders.ahead_s

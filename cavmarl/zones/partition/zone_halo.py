@@ -21,7 +21,7 @@ _ROUNDING_M = 1e-6
 
 
 def zone_halo(partition: ZonePartition, halo_m: float) -> Halo:
-    """What `kernels.exchange.exchange` takes, where all vehicles within the halo are seen."""
+    """What `ghost_exchange.exchange` takes, where all vehicles within the halo are seen."""
     if not (math.isfinite(halo_m) and halo_m >= 0.0):
         raise ConfigError(f"halo_m = {halo_m!r}: must be a finite number from 0")
     near = partition.within(halo_m)

@@ -3,7 +3,7 @@
 A file's docstring says what happens. It defines
 
 - `NEEDS`, what a map must have for it, in words;
-- `Parameters`, a frozen dataclass of `settings.setting`s and `settings.switch`es;
+- `Parameters`, a frozen dataclass of `scene.setting`s and `scene.switch`es;
 - `places(streets, parameters)`, by name where on a map it can be played;
 - `stage(streets, place, parameters)`, the `Scene` at one of these places.
 """

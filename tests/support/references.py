@@ -1,0 +1,156 @@
+"""Dotted names and files in backticks in docstrings and comments of the package: the dead ones."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+from cavmarl.config.env import EnvConfig
+from cavmarl.config.io import dotted_keys
+
+ROOT = Path(__file__).resolve().parents[2]
+
+# First parts of names that are not of the package: of libraries, of highway-env, of a logger.
+OTHERS = frozenset(
+    """
+    copy defusedxml dtype flags gymnasium httpx numba numpy ray select socket sumolib time
+    IDMVehicle TimeLimit Vehicle utils
+    """.split()
+)
+LOGGERS = frozenset(["cavmarl.workers"])
+
+_DOTTED = re.compile(r"`([A-Za-z_]\w*(?:\.[A-Za-z_]\w*)+)(?:\([^`]*\))?`")
+_FILE = re.compile(r"`([\w./-]+\.py)`")
+_COMMENT = re.compile(r"#\s(.*)")
+_DATA = ("html", "json", "jsonl", "parquet", "safetensors", "xml", "yaml", "zst")  # endings
+
+
+class _Members:
+    """Names inside of a class, its attributes among them, and its bases."""
+
+    def __init__(self, node: ast.ClassDef) -> None:
+        self.bases = [base.id for base in node.bases if isinstance(base, ast.Name)]
+        self.names = set(_defined(node.body))
+        for part in ast.walk(node):
+            if isinstance(part, ast.Attribute) and isinstance(part.ctx, ast.Store):
+                self.names.add(part.attr)
+
+
+def _defined(body: list[ast.stmt]) -> Iterator[str]:
+    """Names that statements define or import, those under an `if` too."""
+    for node in body:
+        match node:
+            case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
+                yield node.name
+            case ast.Assign():
+                targets = [part for target in node.targets for part in ast.walk(target)]
+                yield from (part.id for part in targets if isinstance(part, ast.Name))
+            case ast.AnnAssign(target=ast.Name(id=name)):
+                yield name
+            case ast.Import() | ast.ImportFrom():
+                yield from ((alias.asname or alias.name).split(".")[0] for alias in node.names)
+            case ast.If():
+                yield from _defined(node.body)
+
+
+def _annotated(tree: ast.Module) -> dict[str, set[str]]:
+    """Classes in the annotations of parameters and fields of a module, by their names."""
+    found: dict[str, set[str]] = defaultdict(set)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.arg) and node.annotation is not None:
+            name, annotation = node.arg, node.annotation
+        elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            name, annotation = node.target.id, node.annotation
+        else:
+            continue
+        found[name] |= {part.id for part in ast.walk(annotation) if isinstance(part, ast.Name)}
+    return found
+
+
+class Package:
+    """The modules, classes and keys that a docstring can refer to."""
+
+    def __init__(self) -> None:
+        self.sources: dict[str, str] = {}
+        self._classes: dict[str, list[_Members]] = defaultdict(list)
+        self._modules: dict[str, list[str]] = defaultdict(list)  # by the last part of their name
+        self._keys = dotted_keys(EnvConfig)
+        trees: dict[str, ast.Module] = {}
+        for path in sorted((ROOT / "cavmarl").rglob("*.py")):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+            text = self.sources[name] = path.read_text(encoding="utf-8")
+            tree = trees[name] = ast.parse(text)
+            self._modules[name.rpartition(".")[2]].append(name)
+            for node in ast.walk(tree):
+                if isinstance(node, ast.ClassDef):
+                    self._classes[node.name].append(_Members(node))
+        self._tops = {name: set(_defined(tree.body)) for name, tree in trees.items()}
+
+    def dead(self) -> list[str]:
+        """Place and name of each reference that leads nowhere."""
+        return [
+            f"{module}: `{name}`"
+            for module, source in self.sources.items()
+            for name in self.dead_in(source)
+        ]
+
+    def dead_in(self, source: str) -> Iterator[str]:
+        """Names and files in the docstrings and comments of a source that lead nowhere."""
+        tree = ast.parse(source)
+        annotated, text = _annotated(tree), "\n".join([*_strings(tree), *_COMMENT.findall(source)])
+        for name in _FILE.findall(text):
+            if "NAME" not in name and not self._is_file(name):
+                yield name
+        for name in _DOTTED.findall(text):
+            parts = name.split(".")
+            if parts[-1] == "py" or parts[-1] in _DATA or parts[0] in OTHERS or name in LOGGERS:
+                continue
+            holders = annotated.get(parts[0], set())
+            is_field = any(self._has(holder, parts[1]) for holder in holders)
+            if not (is_field or self._is_key(name) or self._is_name(parts)):
+                yield name
+
+    def _is_file(self, name: str) -> bool:
+        if "/" in name:
+            return (ROOT / name).is_file() or (ROOT / "cavmarl" / name).is_file()
+        return name.removesuffix(".py") in self._modules
+
+    def _is_key(self, name: str) -> bool:
+        """Whether it is a key of `env.yaml`, a section of it, or the end of one."""
+        return any(
+            f".{key}.".find(f".{name}.") >= 0 or name.startswith(f"{key}.") for key in self._keys
+        )
+
+    def _is_name(self, parts: list[str]) -> bool:
+        """Whether parts are a module by its last names, something in one, or a class member."""
+        if self._has(parts[0], parts[1]):
+            return True
+        for size in range(1, len(parts) + 1):
+            for module in self._modules[parts[size - 1]]:
+                if module.split(".")[-size:] == parts[:size] and self._is_in(module, parts[size:]):
+                    return True
+        return False
+
+    def _is_in(self, module: str, names: list[str]) -> bool:
+        if not names:
+            return True
+        is_top = names[0] in self._tops[module]
+        return is_top and (len(names) == 1 or self._has(names[0], names[1]))
+
+    def _has(self, class_name: str, attribute: str) -> bool:
+        return any(
+            attribute in members.names or any(self._has(base, attribute) for base in members.bases)
+            for members in self._classes.get(class_name, ())
+        )
+
+
+def _strings(tree: ast.Module) -> Iterator[str]:
+    """Each string that is a statement."""
+    for node in ast.walk(tree):
+        match node:
+            case ast.Expr(value=ast.Constant(value=str(text))):
+                yield text
