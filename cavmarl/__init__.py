@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from cavmarl.env.parallel import CavEnv, parallel_env
     from cavmarl.env.registration import env, raw_env
     from cavmarl.env.vector import CavVectorEnv, make_vec
+    from cavmarl.env.world_arguments import WorldArguments
     from cavmarl.parallel.backends import register_backend
     from cavmarl.policies.policy import Policy, load_policy
     from cavmarl.recordings.extra_tables import RecordOptions
@@ -108,6 +109,7 @@ __all__ = [
     "WorkerDeathError",
     "WorkerError",
     "WorkerFailureError",
+    "WorldArguments",
     "entries",
     "env",
     "load_policy",
@@ -134,6 +136,7 @@ _LATE = {
     "parallel_env": "env.parallel",
     "raw_env": "env.registration",
     "RecordOptions": "recordings.extra_tables",
+    "WorldArguments": "env.world_arguments",
     "register_backend": "parallel.backends",
     "register_driver_model": "driving.driver_models",
     "register_sensor": "sensors.registry",

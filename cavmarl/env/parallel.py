@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from itertools import compress
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
-from cavmarl.config.driver_form import with_sensors_of
-from cavmarl.config.registry import load_config
 from cavmarl.core.errors import ActionError, ConfigError, EpisodeError
 from cavmarl.core.seeds import check_seed
 from cavmarl.engine.spaces import (
@@ -22,14 +20,12 @@ from cavmarl.engine.spaces import (
     observation_space,
     state_space,
 )
-from cavmarl.engine.world_setup import check_agents, make_world
 from cavmarl.env.actions import LENIENT
 from cavmarl.env.agent_dicts import AgentDicts, Listed, Observation
-from cavmarl.env.drawn_worlds import RENDER_MODES, check_rendering
-from cavmarl.env.recorded_worlds import Record, check_recording
+from cavmarl.env.drawn_worlds import RENDER_MODES
 from cavmarl.env.step_session import StepSession
+from cavmarl.env.world_arguments import WorldArguments, start_worlds
 from cavmarl.env.worlds_environment import WorldsEnvironment
-from cavmarl.parallel.backends import check_hosts, make_worlds, places_of
 from cavmarl.parallel.step_arrays import SteppedWorlds
 from cavmarl.sensors.mounted.frames import SensorFrames
 
@@ -43,47 +39,17 @@ Stepped = tuple[
 
 
 def parallel_env(
-    env: str | Path = "merge",
-    *,
-    zones: int | None = None,
-    workers: int | str | None = None,
-    hosts: str | None = None,
-    nodes: int | None = None,
-    sensor_workers: int | None = None,
-    agents: int | None = None,
-    background: int | None = None,
-    seed: int | None = None,
-    max_cycles: int | None = None,
-    sensors_of: str | Path | None = None,
-    render_mode: str | None = None,
-    record: Record | None = None,
-    lenient: bool = False,
-    overrides: Mapping[str, Any] | None = None,
+    env: str | Path = "merge", *, lenient: bool = False, **world: Unpack[WorldArguments]
 ) -> CavEnv:
     """Make a PettingZoo parallel environment.
 
     Args:
         env: name of an entry of `envs/`, a folder with an env.yaml, or a map file.
-        zones: shadows zones.count, how many shards run the world; results do not depend on it.
-        workers: processes that the zones are shared out over; 0: the caller's process runs them.
-            Results do not depend on it. "ray": as with hosts="ray", as many as are of use.
-        hosts: "ray": workers or nodes run on the machines of a Ray cluster (docs/cluster.md).
-            None: on this one. HOST:PORT: where nodes that are started by hand join.
-        nodes: in place of workers: processes that share nothing, each with some zones of each
-            world (docs/nodes.md). Results do not depend on it.
-        sensor_workers: shadows workers.sensors, how many processes the sensors of `rig` are shared
-            out over (docs/sensor_workers.md). Results do not depend on it.
-        agents: shadows population.agents.
-        background: shadows population.background.
-        seed: of the first reset, if that is given none.
-        max_cycles: steps until truncation; shadows horizon_s.
-        sensors_of: a trained driver, whose sensors and actions the agents get.
-        render_mode: `human`, `rgb_array` or None.
-        record: a new folder to record into, or `RecordOptions` (docs/recordings.md).
         lenient: for libraries that act for absent agents, or beyond the bounds: values are clipped,
             actions of agents that have left ignored, and missing ones are the last, or 0. Sets
             action.out_of_range, .missing_action and .late_actions; traffic_stats() counts each.
-        overrides: values for any other key, such as `{"sensors.lidar.rays": 32}`.
+        world: zones, workers, hosts, nodes, sensor_workers, agents, background, seed, max_cycles,
+            sensors_of, render_mode, record and overrides, as `WorldArguments` describes them.
 
     Raises:
         ConfigError: a key, value or combination that cannot work.
@@ -92,22 +58,12 @@ def parallel_env(
         WorkerError: worker processes cannot be started, or have no memory.
         MissingExtraError, RecordingError: no Ray, or pyarrow; `record` cannot be written.
     """
-    workers, hosts = places_of(workers, hosts, nodes)
-    check_hosts(workers, hosts)
-    first_seed = None if seed is None else check_seed(seed)
+    overrides = world.get("overrides")
     if lenient and isinstance(overrides, Mapping | None):
-        overrides = {**LENIENT, **(overrides or {})}
-    config, base_dir = load_config(
-        env, zones=zones, sensor_workers=sensor_workers, agents=agents, background=background,
-        max_cycles=max_cycles, overrides=with_sensors_of(overrides, sensors_of),
-    )  # fmt: skip
-    check_agents(config)
-    check_rendering(config, render_mode, 1, workers, hosts)
-    check_recording(config, record, 1, workers, hosts)
-    world = make_world(config, base_dir)
-    worlds = make_worlds(world, base_dir, 1, workers, hosts, in_next_step=True)
-    made = CavEnv(worlds, seed=first_seed, render_mode=render_mode)
-    made.record(record)
+        world["overrides"] = {**LENIENT, **(overrides or {})}
+    worlds = start_worlds(env, 1, True, RENDER_MODES, **world)
+    made = CavEnv(worlds, seed=world.get("seed"), render_mode=world.get("render_mode"))
+    made.record(world.get("record"))
     return made
 
 
@@ -143,7 +99,9 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
     def __init__(
         self, worlds: SteppedWorlds, *, seed: int | None = None, render_mode: str | None = None
     ) -> None:
-        super().__init__(StepSession(worlds, seed=seed), render_mode)
+        super().__init__(
+            StepSession(worlds, seed=None if seed is None else check_seed(seed)), render_mode
+        )
         config = self.config
         self.metadata = {**type(self).metadata, **self.metadata}
         self.ghosts_of: int | None = None

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ConfigError, EpisodeError
-from cavmarl.core.seeds import first_seed
+from cavmarl.core.seeds import check_seed, first_seed
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.vehicle_way import way_ahead
 from cavmarl.engine.world_frame import WorldFrame, frame_of
@@ -63,7 +63,7 @@ class StepSession:
         self.is_ready = False
         self.simulated_s = 0.0
         self._in_place = in_place
-        self._first_seed = seed
+        self._first_seed = None if seed is None else check_seed(seed)
         self._copy = WorldCopy()
         self._recorder: WorldRecorder | None = None
         self._watchers: tuple[Callable[[], None], ...] = ()

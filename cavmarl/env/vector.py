@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, Unpack
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
@@ -13,24 +12,18 @@ from numpy.typing import NDArray
 
 from cavmarl.balance.balance_plan import Plan
 from cavmarl.balance.plan_text import describe_plan
-from cavmarl.config.driver_form import with_sensors_of
-from cavmarl.config.registry import load_config
 from cavmarl.core.errors import ConfigError, EpisodeError
-from cavmarl.core.seeds import check_seed
 from cavmarl.engine.spaces import (
     action_space,
     flat_observation_space,
     frames_space,
     sensed_observation,
 )
-from cavmarl.engine.world_setup import check_agents, make_world
 from cavmarl.env.autoreset import known_mode, present_mode, refuse_over, with_rows
-from cavmarl.env.drawn_worlds import check_rendering
-from cavmarl.env.recorded_worlds import Record, check_recording
 from cavmarl.env.saved_state import load_session, save_session
 from cavmarl.env.step_session import StepSession
+from cavmarl.env.world_arguments import WorldArguments, start_worlds
 from cavmarl.env.worlds_environment import WorldsEnvironment
-from cavmarl.parallel.backends import check_hosts, make_worlds, places_of
 from cavmarl.parallel.step_arrays import SteppedWorlds
 from cavmarl.sensors.mounted.frames import SensorFrames
 
@@ -48,44 +41,19 @@ def make_vec(
     env: str | Path = "merge",
     *,
     num_envs: int = 1,
-    zones: int | None = None,
-    workers: int | str | None = None,
-    hosts: str | None = None,
-    nodes: int | None = None,
-    sensor_workers: int | None = None,
-    agents: int | None = None,
-    background: int | None = None,
-    seed: int | None = None,
-    max_cycles: int | None = None,
-    sensors_of: str | Path | None = None,
     autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
     copy: bool = True,
-    render_mode: str | None = None,
-    record: Record | None = None,
-    overrides: Mapping[str, Any] | None = None,
+    **world: Unpack[WorldArguments],
 ) -> CavVectorEnv:
     """Make `num_envs` worlds of one environment that are stepped together.
 
     Args:
         env: name of an entry of `envs/`, a folder with an env.yaml, or a map file.
         num_envs: number of worlds.
-        zones: shadows zones.count, how many shards run the world; results do not depend on it.
-        workers: processes that the worlds are shared out over, whole worlds each; where there are
-            more of them than worlds, the zones of each world. 0: all run in the caller's process.
-            "ray": as with hosts="ray", as many as CPUs and worlds. No result depends on it.
-        hosts: "ray": on a Ray cluster (docs/cluster.md). None: here. HOST:PORT: where nodes join.
-        nodes: in place of workers: processes with zones that share nothing (docs/nodes.md).
-        sensor_workers: shadows workers.sensors: processes for `rig` (docs/sensor_workers.md).
-        agents: shadows population.agents.
-        background: shadows population.background.
-        seed: of the first reset, if that is given none.
-        max_cycles: steps until truncation; shadows horizon_s.
-        sensors_of: a trained driver, whose sensors and actions the agents get.
         autoreset_mode: when a world that is over begins anew; see `CavVectorEnv`.
         copy: False returns observations without a copy.
-        render_mode: `rgb_array` or None.
-        record: a new folder to record into, or `RecordOptions` (docs/recordings.md).
-        overrides: values for any other key.
+        world: zones, workers, hosts, nodes, sensor_workers, agents, background, seed, max_cycles,
+            sensors_of, render_mode, record and overrides, as `WorldArguments` describes them.
 
     Raises:
         ConfigError: a key, value or combination that cannot work.
@@ -95,22 +63,16 @@ def make_vec(
         MissingExtraError, RecordingError: `hosts` or `record` without its extra; a taken path.
     """
     num_envs, mode = _checked(num_envs), known_mode(autoreset_mode)
-    workers, hosts = places_of(workers, hosts, nodes)
-    check_hosts(workers, hosts)
-    first_seed = None if seed is None else check_seed(seed)
-    config, base_dir = load_config(
-        env, zones=zones, sensor_workers=sensor_workers, agents=agents, background=background,
-        max_cycles=max_cycles, overrides=with_sensors_of(overrides, sensors_of),
-    )  # fmt: skip
-    check_agents(config)
-    check_rendering(config, render_mode, num_envs, workers, hosts, ("rgb_array",))
-    check_recording(config, record, num_envs, workers, hosts)
-    world = make_world(config, base_dir)
     in_next_step = mode is not AutoresetMode.SAME_STEP
-    worlds = make_worlds(world, base_dir, num_envs, workers, hosts, in_next_step)
-    forms: dict[str, Any] = {"copy": copy, "render_mode": render_mode, "seed": first_seed}
-    made = CavVectorEnv(worlds, disabled=mode is AutoresetMode.DISABLED, **forms)
-    made.record(record)
+    worlds = start_worlds(env, num_envs, in_next_step, ("rgb_array",), **world)
+    made = CavVectorEnv(
+        worlds,
+        seed=world.get("seed"),
+        copy=copy,
+        disabled=mode is AutoresetMode.DISABLED,
+        render_mode=world.get("render_mode"),
+    )
+    made.record(world.get("record"))
     return made
 
 
@@ -160,10 +122,7 @@ class CavVectorEnv(WorldsEnvironment):
         disabled: bool = False,
         render_mode: str | None = None,
     ) -> None:
-        super().__init__(
-            StepSession(worlds, in_place=True, seed=None if seed is None else check_seed(seed)),
-            render_mode,
-        )
+        super().__init__(StepSession(worlds, in_place=True, seed=seed), render_mode)
         config, form = self.config, self.config.observation
         self.num_envs = num_envs = len(worlds.arrays.mask)
         self.num_agents = len(self.possible_agents)

@@ -1,0 +1,98 @@
+"""`WorldArguments`: the keywords that `make_vec` and `parallel_env` share, and what they make."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypedDict, Unpack
+
+from cavmarl.config.driver_form import with_sensors_of
+from cavmarl.config.registry import load_config
+from cavmarl.core.seeds import check_seed
+from cavmarl.engine.world_setup import check_agents, make_world
+from cavmarl.env.drawn_worlds import check_rendering
+from cavmarl.env.recorded_worlds import Record, check_recording
+from cavmarl.parallel.backends import check_hosts, make_worlds, places_of
+from cavmarl.parallel.step_arrays import SteppedWorlds
+
+
+class WorldArguments(TypedDict, total=False):
+    """Keywords of `make_vec` and `parallel_env` that say which worlds are made, and where they run.
+
+    Attributes:
+        zones: shadows zones.count, how many shards run the world; results do not depend on it.
+        workers: processes that the worlds are shared out over, whole worlds each; where there are
+            more of them than worlds, the zones of each world. 0: all run in the caller's process.
+            "ray": as with hosts="ray", as many as are of use. Results do not depend on it.
+        hosts: "ray": workers or nodes run on the machines of a Ray cluster (docs/cluster.md).
+            None: on this one. HOST:PORT: where nodes that are started by hand join.
+        nodes: in place of workers: processes that share nothing, each with some zones of each
+            world (docs/nodes.md). Results do not depend on it.
+        sensor_workers: shadows workers.sensors, how many processes the sensors of `rig` are shared
+            out over (docs/sensor_workers.md). Results do not depend on it.
+        agents: shadows population.agents.
+        background: shadows population.background.
+        seed: of the first reset, if that is given none.
+        max_cycles: steps until truncation; shadows horizon_s.
+        sensors_of: a trained driver, whose sensors and actions the agents get.
+        render_mode: `rgb_array` or None; `parallel_env` also takes `human`.
+        record: a new folder to record into, or `RecordOptions` (docs/recordings.md).
+        overrides: values for any other key, such as `{"sensors.lidar.rays": 32}`.
+    """
+
+    zones: int | None
+    workers: int | str | None
+    hosts: str | None
+    nodes: int | None
+    sensor_workers: int | None
+    agents: int | None
+    background: int | None
+    seed: int | None
+    max_cycles: int | None
+    sensors_of: str | Path | None
+    render_mode: str | None
+    record: Record | None
+    overrides: Mapping[str, Any] | None
+
+
+def start_worlds(
+    env: str | Path,
+    num_worlds: int,
+    in_next_step: bool,
+    render_modes: tuple[str, ...],
+    **given: Unpack[WorldArguments],
+) -> SteppedWorlds:
+    """Make the worlds that the arguments name, after all arguments are checked.
+
+    Args:
+        env: name of an entry of `envs/`, a folder with an env.yaml, or a map file.
+        num_worlds: how many of them.
+        in_next_step: when a world that is over begins anew; see `SteppedWorlds`.
+        render_modes: that are possible.
+        given: as `WorldArguments` describes them.
+
+    Raises:
+        TypeError: an argument of another name.
+        ConfigError, PolicyError, MapError, WorkerError, MissingExtraError: as of `make_vec`.
+    """
+    known = WorldArguments.__annotations__
+    if unknown := [name for name in given if name not in known]:
+        raise TypeError(f"unexpected keyword argument {unknown[0]!r}; there are {', '.join(known)}")
+    workers, hosts = places_of(given.get("workers"), given.get("hosts"), given.get("nodes"))
+    check_hosts(workers, hosts)
+    if (seed := given.get("seed")) is not None:
+        check_seed(seed)
+    config, base_dir = load_config(
+        env,
+        zones=given.get("zones"),
+        sensor_workers=given.get("sensor_workers"),
+        agents=given.get("agents"),
+        background=given.get("background"),
+        max_cycles=given.get("max_cycles"),
+        overrides=with_sensors_of(given.get("overrides"), given.get("sensors_of")),
+    )
+    check_agents(config)
+    check_rendering(config, given.get("render_mode"), num_worlds, workers, hosts, render_modes)
+    check_recording(config, given.get("record"), num_worlds, workers, hosts)
+    world = make_world(config, base_dir)
+    return make_worlds(world, base_dir, num_worlds, workers, hosts, in_next_step)
