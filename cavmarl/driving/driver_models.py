@@ -1,7 +1,8 @@
 """The car-following models by name: of the package, of SUMO, and registered from outside.
 
-A model of the package is a code, a branch in `driving/kernels/models/following.py` and a line in `MODELS`;
-with a line in `AS_SUMO` of `vehicle_types`, its drivers also look ahead and yield as SUMO's do.
+A model of the package is a code, a branch in `driving/kernels/models/following.py` and a line in
+`MODELS`; with a line in `AS_SUMO` of `vehicle_types`, its drivers also look ahead and yield as
+SUMO's do.
 """
 
 from __future__ import annotations

@@ -197,7 +197,6 @@ class Tick:
         if any(gate.num_passing.tolist()):
             self.executor.forget(gate)
             self.traffic.settle(gate, self.worlds)
-            self.coordination.save()
 
     def instrument(self, wrap: Callable[[Any], Any]) -> None:
         """Put `wrap(part)` in the place of each part that runs phases, to time them."""

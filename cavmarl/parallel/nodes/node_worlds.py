@@ -341,8 +341,6 @@ def check_nodes(world: World, nodes: int) -> None:
             "more zones or fewer nodes"
         )
     refused = {
-        "zones.faults": (config.zones.faults, NO_TICK),
-        "zones.reproducers": (config.zones.reproducers, NO_TICK),
         "workers.sensors": (
             config.workers.sensors,
             "each node senses for its own vehicles; use more nodes in place of sensor workers",
