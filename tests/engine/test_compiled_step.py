@@ -64,9 +64,7 @@ def compare(compiled: Simulation, plain: Simulation, steps: int = STEPS) -> None
 def test_worlds_are_the_same(name: str) -> None:
     env, mode, overrides = WORLDS[name]
     made = [
-        make_simulation(
-            env, mode=mode, agents=5, background=20, num_worlds=2, overrides=overrides
-        )
+        make_simulation(env, mode=mode, agents=5, background=20, num_worlds=2, overrides=overrides)
         for _ in range(2)
     ]
     compare(*made)
@@ -81,9 +79,7 @@ def test_actuated_signals_and_ordered_departures_are_the_same(tmp_path: Path) ->
 
 def test_barriers_are_the_same() -> None:
     compiled, plain = (
-        make_simulation(
-            "grid4x4", mode="respawn", agents=4, overrides={"population.insertions": 3}
-        )
+        make_simulation("grid4x4", mode="respawn", agents=4, overrides={"population.insertions": 3})
         for _ in range(2)
     )
     log_phases(plain)

@@ -22,11 +22,13 @@ from cavmarl.core.errors import (
 from cavmarl.driving.vehicles import RECORD_VERSION, VEHICLE
 from cavmarl.engine.simulation import Simulation
 from cavmarl.sensors.observed import carried_from
+from cavmarl.shards.phases import Phase
 from cavmarl.shards.shard import Commands
 from cavmarl.shards.vehicle_codec import GROUPS, TransferCodec, layout_text
 from tests.support.demand_worlds import make
 from tests.support.driving import idle, make_simulation, start, suggested
 from tests.support.generated import check_block, table
+from tests.support.world import PhaseLog, executor_of, use_executor
 
 ROOT = Path(__file__).resolve().parents[2]
 GOLDEN = Path(__file__).parent / "transfer_v1.json"
@@ -101,6 +103,21 @@ def carry_everybody(simulation: Simulation) -> None:
             codec.unpack(state, int(vehicle), int(worlds.ticks[w]), worlds.rows, w, i)
 
 
+class Carrier(PhaseLog):
+    """Carries all vehicles after the last phase that moves them, and keeps their rows."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        super().__init__(executor_of(simulation))
+        self.seen = np.zeros(0, dtype=VEHICLE)
+        self._simulation = simulation
+
+    def run(self, phase: Phase, arguments: tuple[Any, ...]) -> None:
+        super().run(phase, arguments)
+        if phase is Phase.DETECT:
+            carry_everybody(self._simulation)
+            self.seen = np.concatenate([self.seen, self._simulation.vehicles(0)])
+
+
 def trace(simulation: Simulation, steps: int = 60) -> list[bytes]:
     """Everything that agents get and the worlds' states, step by step."""
     found, rng = [], np.random.default_rng(1)
@@ -114,21 +131,13 @@ def trace(simulation: Simulation, steps: int = 60) -> list[bytes]:
 
 
 @pytest.mark.parametrize("kind", ["continuous", "discrete"])
-def test_who_is_carried_every_tick_goes_on_bit_for_bit(
-    hilly: tuple[Path, Path], kind: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_who_is_carried_every_tick_goes_on_bit_for_bit(hilly: tuple[Path, Path], kind: str) -> None:
     expected = trace(rough_world(hilly, **{"action.kind": kind}))
     carried = rough_world(hilly, **{"action.kind": kind})
-    advance, seen = carried._tick._advance, np.zeros(0, dtype=VEHICLE)
-
-    def advance_and_carry(commands: Commands) -> None:
-        nonlocal seen
-        advance(commands)
-        carry_everybody(carried)
-        seen = np.concatenate([seen, carried.vehicles(0)])
-
-    monkeypatch.setattr(carried._tick, "_advance", advance_and_carry)
+    carrier = Carrier(carried)
+    use_executor(carried, carrier)
     assert trace(carried) == expected
+    seen = carrier.seen
     assert len(np.unique(seen["vtype"])) >= 4  # the generator's cars, and those of the demand
     assert len(np.unique(seen["length"])) >= 3
     assert np.ptp(seen["z"]) > 1.0
