@@ -14,7 +14,6 @@ pytest.importorskip("sumo", reason="needs the extra 'sumo'")
 pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
 
 CLOCK = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.2, "sensors.signal.timing": False}
-FAULTS = '{"seed": 3, "crash_rate": 0.02}'
 
 
 def overrides(source: str, demand: Path) -> dict[str, object]:
@@ -39,24 +38,6 @@ def test_zones_change_nothing(tmp_path: Path, source: str) -> None:
         assert result.steps == 100
     *_, four, nine = found.results
     assert min(four.crossings, nine.crossings) > 0
-
-
-@pytest.mark.parametrize("source", MODES)
-def test_a_tick_that_is_begun_again_steps_sumo_once(tmp_path: Path, source: str) -> None:
-    found = verify_zones(
-        "grid4x4",
-        (4,),
-        steps=60,
-        seed=2,
-        agents=4,
-        background=0,
-        overrides=overrides(source, tiny_file(tmp_path)),
-        faults=FAULTS,
-        check=True,
-    )
-    (result,) = found.results
-    assert result.difference is None, result
-    assert result.figures.to_dict()["zone_deaths"]
 
 
 @pytest.mark.parametrize("source", MODES)

@@ -29,6 +29,10 @@ MODES = {"seats": "respawn", "entering": "open"}
 REMOVED = {
     "zones.policy": "a vehicle is handed over after zones.max_deferred_ticks, as with 'force'",
     "zones.grace_ticks": "add these ticks to zones.max_deferred_ticks",
+    "zones.faults": "run `cavmarl verify ENV --nodes N --faults campaign`, which injects faults "
+    "into simulated nodes and real ones",
+    "zones.reproducers": "run `cavmarl verify ENV --nodes N --faults simulated`, which names the "
+    "seed of each run that fails",
 }
 
 

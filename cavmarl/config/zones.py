@@ -32,10 +32,6 @@ class ZonesConfig(Section, key="zones"):
             it drives to is told.
         journal: file for the coordinator's log; empty: none. It must not exist.
         check_invariants: watch the invariants of ownership at run time.
-        faults: a plan of faults to inject, as JSON or a file of it; empty: none.
-        reproducers: folder for ticks that every host of a zone died of, from which they can be run
-            again. With it, what a zone's code raises is the death of its host. Empty: only where
-            faults kill hosts, and then the system's folder for temporary files.
         repartition_steps: every so many steps zones become others by bisection of where the
             vehicles are,
             if that shares them out better; results do not depend on it. 0: they stay.
@@ -53,8 +49,6 @@ class ZonesConfig(Section, key="zones"):
     approach_ticks: Annotated[int, Whole(1, 1000)] = 2
     journal: str = ""
     check_invariants: bool = False
-    faults: str = ""
-    reproducers: str = ""
     repartition_steps: Annotated[int, Whole(0, 1_000_000)] = 0
     repartition_tolerance: Annotated[float, Within(0.0, 100.0)] = 0.1
 
@@ -64,10 +58,4 @@ class ZonesConfig(Section, key="zones"):
             "layout",
             self.layout in ZONE_LAYOUTS or self.layout.endswith(ZONE_FILE_SUFFIXES),
             f"must be {', '.join(ZONE_LAYOUTS)}, or a zone file ({', '.join(ZONE_FILE_SUFFIXES)})",
-        )
-        self.need(
-            "repartition_steps",
-            not (self.repartition_steps and (self.faults or self.reproducers)),
-            "vehicles that change their zone must not be late: leave out zones.faults and "
-            "zones.reproducers, or let zones stay",
         )

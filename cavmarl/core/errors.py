@@ -38,7 +38,6 @@ A message names the thing, the place and the cure.
 from __future__ import annotations
 
 import importlib
-from pathlib import Path
 from types import ModuleType
 
 
@@ -136,38 +135,16 @@ class ProtocolError(CavmarlError):
 
 
 class LostTickError(ProtocolError):
-    """A tick that every host of a zone, or every coordinator, died of: it is not tried for ever.
+    """A tick that every host of a zone died of: it is not tried for ever.
 
     Attributes:
         tick: the tick.
-        zone: the zone whose hosts died; None: the coordinators.
-        cause: what the last host died of, where that is known; the point at which coordinators did.
-        reproducer: the file from which `cavmarl verify --replay` runs that tick again, or why there
-            is none; nothing if none was asked for.
+        zone: the zone whose hosts died.
     """
 
-    reproducer: Path | str = ""
-
-    def __init__(self, tick: int, deaths: int, zone: int | None = None, cause: str = "") -> None:
-        if zone is None:
-            words = f"the coordinator could not reach tick {tick}: {deaths} of them died"
-            words += f" at '{cause}'"
-        else:
-            words = f"zone {zone} could not reach tick {tick}: {deaths} hosts in a row died"
-            words += f", the last one {cause}" if cause else ""
-        super().__init__(words)
-        self.tick, self.zone, self.cause = tick, zone, cause
-
-    def __str__(self) -> str:
-        """With the way to see it again."""
-        match self.reproducer:
-            case Path():
-                again = f"; to run that tick again: cavmarl verify --replay {self.reproducer}"
-            case "":
-                again = ""
-            case why:
-                again = f"; it cannot be run again: {why}"
-        return super().__str__() + again
+    def __init__(self, tick: int, deaths: int, zone: int) -> None:
+        super().__init__(f"zone {zone} could not reach tick {tick}: {deaths} hosts in a row died")
+        self.tick, self.zone = tick, zone
 
 
 class MessageError(ProtocolError):
@@ -179,7 +156,7 @@ class MessageError(ProtocolError):
 
 
 class JournalError(ProtocolError):
-    """A log, or the file of a lost tick, that cannot be written, read or replayed."""
+    """A log that cannot be written, read or replayed."""
 
 
 class WorkerError(CavmarlError):

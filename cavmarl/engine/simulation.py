@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
-from cavmarl.core.errors import CapacityError, ConfigError, JournalError, LostTickError, SumoError
+from cavmarl.core.errors import CapacityError, ConfigError, SumoError
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.math.rng import world_key
 from cavmarl.core.memory import Zeros
@@ -27,10 +26,6 @@ from cavmarl.engine.world_views import WorldViews
 from cavmarl.handoff.coordinator.coordinator_setup import WorldRun, make_coordinators
 from cavmarl.handoff.coordinator.coordinators import Coordination, Coordinators
 from cavmarl.handoff.coordinator.handoff_log import HandoffLog
-from cavmarl.handoff.fault_injection.committed_store import CommittedStore
-from cavmarl.handoff.fault_injection.recovery import Recovery
-from cavmarl.handoff.fault_injection.reproducer_file import Reproducer
-from cavmarl.handoff.fault_injection.reproducer_recording import Keeper, RecordedTick, sources_of
 from cavmarl.handoff.repartitioning import Recutter
 from cavmarl.ownership.messages import Switch
 from cavmarl.ownership.transfers import TransferLog
@@ -84,8 +79,6 @@ class Simulation(WorldViews):
         self.everywhere = np.ones(num_worlds, dtype=np.bool_)  # (W,) all of the worlds
         self.frames: Frames = make_frames(config, num_worlds, zeros) if frames is None else frames
         self.transfers: tuple[TransferLog, ...] = ()
-        self._recovery: Recovery | None = None
-        self._keeper: Keeper | None = None
         self._recutter: Recutter | None = None
         prepare_kernels()
         shared = SharedOutputs(config, network, num_worlds, observations, zeros)
@@ -118,7 +111,7 @@ class Simulation(WorldViews):
     def _add_coordinators(self, runs: Sequence[WorldRun] | None) -> None:
         """Coordinators, and what makes other zones, where the settings ask for them."""
         zones = self.config.zones
-        watched = zones.journal or zones.check_invariants or zones.faults or zones.reproducers
+        watched = zones.journal or zones.check_invariants
         if self.partition.count > 1 or watched:
             self._let_coordinate(runs)
         coordination = self._tick.coordination
@@ -138,27 +131,14 @@ class Simulation(WorldViews):
     def _let_coordinate(self, runs: Sequence[WorldRun] | None) -> None:
         """Let coordinators decide ownership; with one zone there are none."""
         tick = self._tick
-        refereeing = make_coordinators(
+        setup = make_coordinators(
             self.config.zones,
-            self._shards,
             tick.division,
-            self._shared_arrays,
             longest_move_m(self.network, tick.traffic.travel, self.config.clock.sim_dt_s),
             runs=runs,
         )
-        tick.coordination = refereeing.coordination
-        self._recovery = refereeing.recovery
-        tick.hosts_may_die = refereeing.recovery is not None
-        self.transfers = refereeing.transfers
-        if refereeing.phases is not None:
-            tick.executor = refereeing.phases
-        if refereeing.store is not None:
-            sources = sources_of(self.network, self.demand, self.partition)
-            (coordinator,) = self.coordinators
-            self._keeper = Keeper(self.config, sources, refereeing.store, coordinator)
-
-    def _shared_arrays(self) -> Iterator[NDArray[Any]]:
-        return snapshot.committed(self._parts())
+        tick.coordination = setup.coordination
+        self.transfers = setup.transfers
 
     def _call_every_kernel(self) -> None:
         tick = self._tick
@@ -176,7 +156,7 @@ class Simulation(WorldViews):
         tick.traffic.settle(tick.gate, self._shard.worlds)
         tick.division.near(0, everybody=True)
         with suppress(ConfigError):
-            tick.division.hand_over(0, Switch(-1, 0, 0, 0, False), None)
+            tick.division.hand_over(0, Switch(-1, 0, 0, 0, False))
         book = HandoffLog(tick.division, 0)
         book.release(book.hand_over(True, sum(tick.division.counts(0)), ()))
         book.reset(0)
@@ -225,14 +205,11 @@ class Simulation(WorldViews):
         for part in tick.attached:
             part.reset(chosen)
         tick.sense(chosen)
-        if tick.coordination is not None:
-            tick.coordination.save()
 
     def step(self, commands: Commands) -> None:
         """One agent step: its ticks, then what the agents sense.
 
         Raises:
-            LostTickError: as of `run_tick`.
             SumoError: SUMO cannot go on; the worlds are as they were before the step, but for
                 those that share zones with other processes: they end.
         """
@@ -257,39 +234,8 @@ class Simulation(WorldViews):
             self.run_tick(commands, number == 0, number == ticks - 1)
 
     def run_tick(self, commands: Commands, is_first: bool, is_last: bool) -> None:
-        """One tick of a step, begun again as often as it takes where hosts may die.
-
-        Raises:
-            LostTickError: every host of a zone, or every coordinator, died of it.
-        """
-        if self._recovery is None:
-            self._tick.run(commands, is_first, is_last)
-            return
-        try:
-            self._recovery.run(partial(self._tick.run, commands, is_first, is_last))
-        except LostTickError as error:
-            if self._keeper is not None:
-                episode = int(self._episodes[0])
-                moment = (self._seed, self._first_world, episode, commands, is_first, is_last)
-                error.reproducer = self._keeper.keep(error, RecordedTick(*moment))
-            raise
-
-    def resume(self, kept: Reproducer) -> None:
-        """Go to the committed tick of a reproducer; `run_tick` runs the next one.
-
-        No further reproducers are written.
-        """
-        if self._tick.sumo is not None:
-            raise JournalError("a world with SUMO beside it cannot be taken up in its middle")
-        self._keeper = None
-        self.seed(kept.seed, kept.first_world)
-        self._episodes[:] = kept.episode - 1
-        self.reset()
-        self._tick.division.align()
-        notes = CommittedStore(self._shards, self._shared_arrays).adopt(kept.image)
-        if isinstance(self._tick.coordination, Coordinators):
-            self._tick.coordination.take_up(kept.records, notes)
-            self._tick.coordination.save()
+        """One tick of a step."""
+        self._tick.run(commands, is_first, is_last)
 
     def instrument(self, wrap: Callable[[Any], Any]) -> None:
         """Put `wrap(part)` in the place of each part that phases are calls of, to time them."""
@@ -346,8 +292,6 @@ class Simulation(WorldViews):
 
     def time_shards(self, every: int = 1) -> ShardClock:
         """From now on run phases zone by zone, with a clock on each."""
-        if self._recovery is not None:
-            raise ConfigError("zones.faults: shards are timed where no host dies; leave it out")
         self._refuse_recutting("measuring what each zone costs")
         clock = ShardClock(self._shards, every)
         self._tick.executor = clock

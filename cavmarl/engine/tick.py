@@ -29,7 +29,6 @@ class Tick:
 
     Attributes:
         executor: runs the phases of the shards, wherever they are hosted.
-        hosts_may_die: in any phase, so also those are gone through in which nothing is to be done.
     """
 
     def __init__(
@@ -50,7 +49,6 @@ class Tick:
         self.executor: Executor = SerialExecutor(shards)
         self.coordination: Coordination | None = None  # decides ownership; None: all is one zone
         self.sumo: SumoTraffic | None = None  # beside these worlds; None: there is none
-        self.hosts_may_die = False
         self.peers: Peers | None = None  # hold the other zones; None: all are in this process
         self._shard = shards[0]
         self._is_undivided = len(shards) == 1
@@ -161,7 +159,7 @@ class Tick:
         )
         if begins_second:
             self.executor.each("choose_goals", traffic.demand, len(traffic.plans), gate)
-        if some_arrived or self.hosts_may_die:
+        if some_arrived:
             self.executor.each("leave", gate)
             if any(gate.num_passing.tolist()):
                 self._note_left()
@@ -189,7 +187,7 @@ class Tick:
                 self._admit()
         traffic.call_orders(gate, worlds)
         if any(gate.num_queue.tolist()):
-            self.let_in(all_phases=self.hosts_may_die)
+            self.let_in(all_phases=False)
 
     def let_in(self, all_phases: bool) -> None:
         """Rank → assign → propose, and if any departure has found a gap, accept → admit."""
@@ -230,8 +228,6 @@ class Tick:
         if any(gate.num_passing.tolist()):
             self.executor.each("forget", gate)
             self.traffic.settle(gate, self._shard.worlds)
-            if self.coordination is not None:
-                self.coordination.save()
 
     def instrument(self, wrap: Callable[[Any], Any]) -> None:
         """Put `wrap(part)` in the place of each part that phases are calls of, to time them."""

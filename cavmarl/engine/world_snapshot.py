@@ -157,15 +157,6 @@ def _fixed(parts: Parts) -> Iterator[Array]:
         yield from part.arrays()
 
 
-def committed(parts: Parts) -> Iterator[Array]:
-    """What a tick changes beside the shards' own and what they have in common."""
-    yield from arrays_of(parts.gate, Gate, Use.COMMITTED)
-    yield from arrays_of(parts.outputs, Outputs, Use.COMMITTED)
-    yield from _of_rerouting(parts)
-    for part in parts.attached:
-        yield from part.arrays()
-
-
 def _of_rerouting(parts: Parts) -> Iterator[Array]:
     if parts.traffic.rerouting is not None:
         yield from parts.traffic.rerouting.arrays()

@@ -19,7 +19,6 @@ from cavmarl.engine.traffic_stats import TrafficStats, count_traffic
 from cavmarl.engine.v2x_component import Messaging
 from cavmarl.handoff.coordinator.coordinator import Coordinator
 from cavmarl.handoff.division import Division, ZoneLoads
-from cavmarl.handoff.fault_injection.recovery import Recovery, Revival
 from cavmarl.handoff.repartitioning import Recut, Recutter
 from cavmarl.handoff.zone_view import ZoneView, view_zones
 from cavmarl.roads.network import RoadNetwork
@@ -39,7 +38,6 @@ class WorldViews:
     partition: ZonePartition  # the zones
     _shards: Sequence[Shard]
     _tick: Tick
-    _recovery: Recovery | None
     _recutter: Recutter | None
 
     @property
@@ -186,11 +184,6 @@ class WorldViews:
 
     def ticks(self) -> NDArray[np.int64]:
         return self._shard.worlds.ticks
-
-    @property
-    def revivals(self) -> Sequence[Revival]:
-        """What it took to go on after each death; see `zones.faults`."""
-        return () if self._recovery is None else self._recovery.revivals
 
     @property
     def recuts(self) -> Sequence[Recut]:

@@ -270,9 +270,8 @@ class _Imbalance:
 
 
 def _zone_clock(vec: CavVectorEnv) -> ShardClock | None:
-    """Times the zones of divided worlds; None where hosts die, whose ticks are begun again."""
-    zones = vec.config.zones
-    if vec.simulation.partition.count == 1 or zones.faults or zones.reproducers:
+    """Times the zones of divided worlds; None of undivided ones."""
+    if vec.simulation.partition.count == 1:
         return None
     return vec.simulation.time_shards(TIMED_TICKS)
 

@@ -7,7 +7,6 @@ had it as a ghost already, and goes on with the state that it was sent.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple
@@ -148,7 +147,7 @@ class Division:
             place = self.owned(w, zone)[row]
             target = zone_of(self.zones, place["x"], place["y"])
             if target != zone:
-                self.hand_over(w, Switch(vehicle, zone, target, 0, False), None, row)
+                self.hand_over(w, Switch(vehicle, zone, target, 0, False), row)
             settled.append(Birth(vehicle, target, state))
         return settled
 
@@ -211,7 +210,7 @@ class Division:
     ) -> None:
         """Give every vehicle to the zone that it is in, whatever zone owned it before."""
         first = self._shards[0].worlds
-        # A host that died in the middle of a tick may have left a step that is not what this says.
+        # A tick that was not ended may have left a step that is not what this says.
         self._zoned.step_at[...] = 0
         for w, rows in enumerate(vehicles):
             first.rows[w, : len(rows)] = rows
@@ -277,10 +276,9 @@ class Division:
         self,
         w: int,
         switch: Switch,  # the vehicle, its source and its target
-        state: bytes | None,  # what the new owner goes on with; None: the old one's row as it is
         hint: int = 0,  # the row where the old one probably keeps it
     ) -> int:  # the row where the new one keeps it
-        """Let a vehicle change its owner, by its committed row."""
+        """Let a vehicle change its owner, which goes on with the old one's committed row."""
         place = self._pass_on(
             switch.vehicle, switch.source, hint, switch.target, switch.epoch,
             self._zoned, self._side(self._shards[0].worlds.rows), w,
@@ -289,12 +287,6 @@ class Division:
             raise ConfigError(f"zone {switch.source} does not own vehicle {switch.vehicle}")
         if place == -2:
             raise self.unseen(switch.vehicle, switch.target)
-        if state is not None:
-            target = self._shards[switch.target].worlds
-            tick = int(target.ticks[w])
-            self.codec.unpack(state, switch.vehicle, tick, target.rows, w, place)
-            row = target.rows[w, place]
-            row["owner"], row["epoch"] = switch.target, switch.epoch
         return place
 
     def give_up(self, w: int, zone: int, vehicle: int) -> None:
@@ -319,27 +311,6 @@ class Division:
             f"vehicle {vehicle} entered zone {zone}, which has not seen it come: the halo is too "
             "narrow"
         )
-
-    def depth_m(
-        self,
-        w: int,
-        vehicle: int,
-        zone: int,  # that owns it
-        outside: int,  # of which zone
-        hint: int,  # the row where its owner probably keeps it
-    ) -> float | None:  # the distance in m, 0 inside; None: its owner does not have it
-        """How far outside of a zone a vehicle is, by its committed row."""
-        place = (self.side, zone, w, hint)
-        num = self._zoned.num_owned.item(zone, w)
-        if hint >= num or self._ids.item(place) != vehicle:
-            found = np.flatnonzero(self._ids[self.side, zone, w, :num] == vehicle)
-            if not len(found):
-                return None
-            place = (self.side, zone, w, int(found[0]))
-        x, y = self._x.item(place), self._y.item(place)
-        min_x, min_y, max_x, max_y = self._rects[outside]
-        dx, dy = max(min_x - x, 0.0, x - max_x), max(min_y - y, 0.0, y - max_y)
-        return math.sqrt(dx * dx + dy * dy)  # as `kernels.handing_over.release` does
 
     def owned(self, w: int, zone: int) -> NDArray[np.void]:
         """VEHICLE (n,), the committed rows that a zone owns; a view."""

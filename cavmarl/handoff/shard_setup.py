@@ -155,11 +155,7 @@ def limits_of(settings: ZonesConfig, schema: int = 1) -> Limits:
 
 def _limits_at_borders(settings: ZonesConfig, late_ticks: int) -> Limits:
     """Deadlines of hand-overs; where nothing is lost they are those of leases (decision 013)."""
-    limits = limits_of(settings)
-    may_be_late = settings.faults or settings.reproducers
-    if may_be_late:
-        return limits
-    return replace(limits, deferral=late_ticks)
+    return replace(limits_of(settings), deferral=late_ticks)
 
 
 def _approach_m(config: EnvConfig, fastest_mps: float) -> float:

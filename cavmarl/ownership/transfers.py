@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from cavmarl.ownership.messages import (
     COORDINATOR,
@@ -16,7 +16,6 @@ from cavmarl.ownership.messages import (
     Ack,
     Begin,
     Commit,
-    Done,
     Message,
     Nack,
     Prepare,
@@ -61,39 +60,15 @@ class Transfer(NamedTuple):
         return self.tick - self.approached if self.approached >= 0 else 1 + self.waited
 
 
-class Surroundings(Protocol):
-    """What the core does not know of itself."""
-
-    def depth_m(self, vehicle: int, target: int) -> float | None:
-        """How far outside of its owner's zone a vehicle near another one is; None: unknown."""
-        ...
-
-    def release_depth_m(self, vehicle: int, source: int, target: int) -> float | None:
-        """How far outside of its old zone a vehicle is that has changed; None: it has left."""
-        ...
-
-    def now_ms(self) -> float: ...
-
-
 @dataclass(slots=True)
 class _Approach:
     first: int
     last: int
     offers: int
     state_bytes: int
-    depth_m: float | None = None
-    began_ms: float | None = None
-
-
-@dataclass(slots=True)
-class _Switching:
-    depth_m: float | None
-    began_ms: float | None
-    ended_ms: float | None = None
 
 
 _NEVER = _Approach(-1, -1, 0, 0)
-UNKNOWN = _Switching(None, None)
 
 
 class TransferLog:
@@ -106,7 +81,6 @@ class TransferLog:
     def __init__(
         self,
         lifetime: int,  # ticks after which a state that is not refreshed is forgotten
-        surroundings: Surroundings | None = None,  # tells depths and times; None: they are left out
     ) -> None:
         self.episode = -1  # of the newest record
         self.ask: Callable[[], None] = lambda: None
@@ -115,11 +89,9 @@ class TransferLog:
         self._num_later = 0
         self._counts: Counter[str] = Counter()
         self._lifetime = lifetime
-        self._surroundings = surroundings
         self._approaches: dict[tuple[int, int, int], _Approach] = {}  # vehicle, target, epoch
         self._waited: dict[int, int] = {}
         self._begun: Begin | None = None
-        self._switching: dict[int, _Switching] = {}
 
     @property
     def rows(self) -> deque[Transfer]:
@@ -158,11 +130,7 @@ class TransferLog:
                     key = (vehicle, message.target, epoch)
                     known = self._approaches.get(key)
                     if known is None:
-                        new = _Approach(message.tick, message.tick, 1, len(state))
-                        if self._surroundings is not None:
-                            new.depth_m = self._surroundings.depth_m(vehicle, message.target)
-                            new.began_ms = self._surroundings.now_ms()
-                        self._approaches[key] = new
+                        self._approaches[key] = _Approach(message.tick, message.tick, 1, len(state))
                     else:
                         known.last = max(known.last, message.tick)
                         known.offers += 1
@@ -171,8 +139,6 @@ class TransferLog:
                 for vehicle, epoch in message.entries:
                     if self._approaches.pop((vehicle, message.target, epoch), None) is not None:
                         self._counts["aborted"] += 1
-            case Done() if message.confirmed:
-                self._confirmed(message)
             case Ack() if destination == COORDINATOR:
                 self._counts["acknowledged"] += len(message.entries)
             case Nack() if destination == COORDINATOR:
@@ -208,20 +174,6 @@ class TransferLog:
     def _begin(self, record: Begin) -> None:
         self._begun = record
         self._counts["deferred"] += len(record.deferred)
-        self._switching = {}
-        around = self._surroundings
-        if around is not None:
-            for switch in record.switches:
-                depth_m = around.depth_m(switch.vehicle, switch.target)
-                self._switching[switch.vehicle] = _Switching(depth_m, around.now_ms())
-
-    def _confirmed(self, message: Done) -> None:
-        if self._surroundings is None:
-            return
-        for vehicle, _ in message.confirmed:
-            switching = self._switching.get(vehicle)
-            if switching is not None:
-                switching.ended_ms = self._surroundings.now_ms()
 
     def _commit(self, record: Commit) -> None:
         begun, self._begun = self._begun, None
@@ -229,27 +181,18 @@ class TransferLog:
             return
         gone = {entry.vehicle for entry in record.removed}
         for switch in begun.switches:
-            vehicle = switch.vehicle
-            switching = self._switching.get(vehicle, UNKNOWN)
-            self._note(record.episode, record.tick, switch, switching, vehicle in gone)
+            self._note(record.episode, record.tick, switch, switch.vehicle in gone)
         self._waited = dict(begun.deferred)
         oldest = record.tick - self._lifetime
         for key in [key for key, known in self._approaches.items() if known.last < oldest]:
             del self._approaches[key]
             self._counts["expired"] += 1
 
-    def _note(
-        self, episode: int, tick: int, switch: Switch, switching: _Switching, removed: bool
-    ) -> None:
+    def _note(self, episode: int, tick: int, switch: Switch, removed: bool) -> None:
         vehicle, source, target, epoch, forced = switch
         found = self._approaches.pop((vehicle, target, epoch - 1), _NEVER)
-        began_ms = switching.began_ms if found.began_ms is None else found.began_ms
-        ended_ms, around = switching.ended_ms, self._surroundings
-        release_m = None if around is None else around.release_depth_m(vehicle, source, target)
         row = Transfer(
             episode, tick, vehicle, source, target, epoch, forced, removed, found.first,
-            self._waited.get(vehicle, 0), found.offers, found.state_bytes, found.depth_m,
-            switching.depth_m, release_m,
-            None if began_ms is None or ended_ms is None else ended_ms - began_ms,
+            self._waited.get(vehicle, 0), found.offers, found.state_bytes,
         )  # fmt: skip
         self._add(row)

@@ -1,4 +1,4 @@
-"""Worlds with a journal or a plan of faults: where they can run, and what workers receive."""
+"""Worlds with a journal: where they can run, and what workers receive."""
 
 from __future__ import annotations
 
@@ -9,35 +9,34 @@ from pathlib import Path
 from cavmarl.config.zones import ZonesConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import World
-from cavmarl.handoff.coordinator.coordinator_setup import WorldRun, check_faults, prepare_runs
+from cavmarl.handoff.coordinator.coordinator_setup import WorldRun, prepare_runs
 from cavmarl.parallel.work_shares import Part
 
 RunText = tuple[str, str]  # the run in hex, and its journal; empty: it has none
 
 
 def is_watched(zones: ZonesConfig) -> bool:
-    """Whether what coordinators do is written down or struck by faults, beside the results."""
-    return bool(zones.journal or zones.faults)
+    """Whether what coordinators do is written down, beside the results."""
+    return bool(zones.journal)
 
 
 def unwatched(world: World) -> World:
     """The same world without that, to make tables or load kernels with."""
-    zones = replace(world.config.zones, journal="", faults="", reproducers="")
+    zones = replace(world.config.zones, journal="")
     return world._replace(config=replace(world.config, zones=zones))
 
 
 def refuse_watched(zones: ZonesConfig, where: str, cure: str) -> None:
     """Refuse what only the workers of whole worlds on this machine can have."""
-    for name in ("journal", "faults"):
-        if getattr(zones, name):
-            raise ConfigError(f"zones.{name} = {getattr(zones, name)!r} {where}: {cure}")
+    if zones.journal:
+        raise ConfigError(f"zones.journal = {zones.journal!r} {where}: {cure}")
 
 
 def check_watched(world: World, parts: Sequence[Part], may_change: bool) -> None:
-    """See that worlds with a journal or faults can be run by these workers.
+    """See that worlds with a journal can be run by these workers.
 
     Raises:
-        ConfigError: a world is divided among workers, or moves; or the faults cannot be.
+        ConfigError: a world is divided among workers, or moves.
     """
     zones = world.config.zones
     if not is_watched(zones):
@@ -56,7 +55,6 @@ def check_watched(world: World, parts: Sequence[Part], may_change: bool) -> None
             "of worlds that move from worker to worker",
             "a journal stays in its process; leave workers.balance_steps 0",
         )
-    check_faults(zones, world.partition.count, num_worlds)
 
 
 def runs_as_text(zones: ZonesConfig, num_worlds: int) -> list[RunText]:

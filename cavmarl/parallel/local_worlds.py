@@ -368,8 +368,6 @@ def kept_elsewhere(config: EnvConfig) -> str:
         "traffic.source = sumo…": config.traffic.source == "sumo-traffic",
         "workers.sensors": config.workers.sensors,
         "zones.journal": zones.journal,
-        "zones.faults": zones.faults,
-        "zones.reproducers": zones.reproducers,
     }
     return next((key for key, is_so in kept.items() if is_so), "")
 

@@ -28,8 +28,6 @@ _OF_FILES = (
     "map.buildings",
     "traffic.demand",
     "zones.journal",
-    "zones.faults",
-    "zones.reproducers",
 )
 
 

@@ -8,7 +8,6 @@ from typing import NamedTuple
 class PhaseRule(NamedTuple):
     """How a phase may be run."""
 
-    may_die: bool = False  # the host of a zone may die in it by plan (docs/faults.md)
     together: str = ""  # what the workers of one world run of it side by side; "": one runs it all
     is_late: bool = False  # the next one asks only that it ran on the same zone: nothing waits
     is_early: bool = False  # asks for nothing that other zones write in the phase before
@@ -17,19 +16,19 @@ class PhaseRule(NamedTuple):
 
 # A name, and its arguments, can be sent anywhere: a method of `ShardGroup` or `Shard`.
 PHASES = {
-    "begin_step": PhaseRule(may_die=True, together="begin_step", is_late=True),
-    "advance": PhaseRule(may_die=True, together="move"),
-    "choose_goals": PhaseRule(may_die=True),
-    "leave": PhaseRule(may_die=True),
+    "begin_step": PhaseRule(together="begin_step", is_late=True),
+    "advance": PhaseRule(together="move"),
+    "choose_goals": PhaseRule(),
+    "leave": PhaseRule(),
     "gather": PhaseRule(together="gather"),
-    "resolve": PhaseRule(may_die=True, together="resolve", is_late=True),
-    "rank_lanes": PhaseRule(may_die=True),
-    "propose": PhaseRule(may_die=True),
-    "admit": PhaseRule(may_die=True),
-    "commit": PhaseRule(may_die=True, is_early=True),
-    "detect": PhaseRule(may_die=True, is_early=True),
-    "sense": PhaseRule(may_die=True, together="sense"),
-    "credit": PhaseRule(may_die=True, together="credit"),
+    "resolve": PhaseRule(together="resolve", is_late=True),
+    "rank_lanes": PhaseRule(),
+    "propose": PhaseRule(),
+    "admit": PhaseRule(),
+    "commit": PhaseRule(is_early=True),
+    "detect": PhaseRule(is_early=True),
+    "sense": PhaseRule(together="sense"),
+    "credit": PhaseRule(together="credit"),
     "suggest": PhaseRule(together="suggest", is_beside=True),
     "retire": PhaseRule(),
     "forget": PhaseRule(),

@@ -116,7 +116,6 @@ class ShardGroup:
 
     def turn(self) -> None:
         """Let the next rows be on the other side, in a tick that puts rows in order."""
-        # Where a host may die alone, a store keeps tick t whole (docs/ownership.md).
         if self._first.worlds.ticks[0] % TICKS_IN_ORDER == 0:
             for shard in self._shards:
                 shard.turn()

@@ -1,6 +1,6 @@
 """The state of worlds: which arrays outlive a tick, and which part keeps which, in one table.
 
-What saves, moves, commits or digests worlds takes its arrays from here. Beside these there
+What saves, moves or digests worlds takes its arrays from here. Beside these there
 are the owned rows, the arrays of rerouting, and those of attached parts (`Attached.arrays`).
 """
 
@@ -13,18 +13,17 @@ from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
-from cavmarl.core.records.arrays import Common, Gate, Outputs, Zoned
+from cavmarl.core.records.arrays import Common, Gate, Outputs
 
 
 class Use(Enum):
     """What is done with an array of the state."""
 
     SAVED = auto()  # in checkpoints, and with a world that changes its worker
-    COMMITTED = auto()  # in the store from which a tick is begun again
     DIGESTED = auto()  # in the hash of a world's state
 
 
-S, C, D = Use.SAVED, Use.COMMITTED, Use.DIGESTED
+S, D = Use.SAVED, Use.DIGESTED
 
 
 class StateArray(NamedTuple):
@@ -37,36 +36,27 @@ class StateArray(NamedTuple):
 
 
 STATE = (
-    StateArray(Common, "ticks", (S, C, D), 4),
-    StateArray(Common, "keys", (S, C, D), 5),
-    StateArray(Common, "signal_phase", (S, C, D), 1),
-    StateArray(Common, "controllers", (S, C, D), 2),
-    StateArray(Common, "detected_s", (S, C, D), 3),
-    StateArray(Common, "pending", (S, C)),  # digested agent by agent
-    StateArray(Common, "cues", (S, C, D), 6),
-    StateArray(Zoned, "num_owned", (C,)),
-    StateArray(Zoned, "num_rows", (C,)),
-    StateArray(Zoned, "num_through", (C,)),
-    StateArray(Zoned, "num_touching", (C,)),
-    StateArray(Zoned, "num_contacts", (C,)),  # saved as the sum of all zones
-    StateArray(Gate, "next_order", (S, C, D), 8),
-    StateArray(Gate, "queue", (C,)),  # saved and digested as far as vehicles wait
-    StateArray(Gate, "num_queue", (S, C)),
-    StateArray(Gate, "next_id", (S, C, D), 7),
-    StateArray(Gate, "num_entered", (S, C, D), 9),
-    StateArray(Gate, "counts", (S, C)),
-    StateArray(Gate, "sums", (S, C)),
-    StateArray(Gate, "num_passing", (C,)),  # between two steps no vehicle is passing the gate
-    StateArray(Gate, "lane_taken", (C,)),
-    StateArray(Outputs, "observations", (S, C)),  # saved where an observation has earlier frames
-    StateArray(Outputs, "terms", (S, C)),
-    StateArray(Outputs, "rewards", (S, C)),
-    StateArray(Outputs, "terminated", (S, C)),
-    StateArray(Outputs, "present", (S, C)),
-    StateArray(Outputs, "acted", (S, C)),
-    StateArray(Outputs, "events", (S, C)),
-    StateArray(Outputs, "vehicle_ids", (S, C)),
-    StateArray(Outputs, "places", (C,)),  # written before each use
+    StateArray(Common, "ticks", (S, D), 4),
+    StateArray(Common, "keys", (S, D), 5),
+    StateArray(Common, "signal_phase", (S, D), 1),
+    StateArray(Common, "controllers", (S, D), 2),
+    StateArray(Common, "detected_s", (S, D), 3),
+    StateArray(Common, "pending", (S,)),  # digested agent by agent
+    StateArray(Common, "cues", (S, D), 6),
+    StateArray(Gate, "next_order", (S, D), 8),
+    StateArray(Gate, "num_queue", (S,)),
+    StateArray(Gate, "next_id", (S, D), 7),
+    StateArray(Gate, "num_entered", (S, D), 9),
+    StateArray(Gate, "counts", (S,)),
+    StateArray(Gate, "sums", (S,)),
+    StateArray(Outputs, "observations", (S,)),  # saved where an observation has earlier frames
+    StateArray(Outputs, "terms", (S,)),
+    StateArray(Outputs, "rewards", (S,)),
+    StateArray(Outputs, "terminated", (S,)),
+    StateArray(Outputs, "present", (S,)),
+    StateArray(Outputs, "acted", (S,)),
+    StateArray(Outputs, "events", (S,)),
+    StateArray(Outputs, "vehicle_ids", (S,)),
 )
 
 

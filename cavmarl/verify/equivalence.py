@@ -7,7 +7,7 @@ every step the hashes of all worlds and everything that `step` returned.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -19,10 +19,8 @@ from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.config.zones import MAX_ZONES, ZONE_FILE_SUFFIXES
 from cavmarl.core.errors import ConfigError, ProtocolError
 from cavmarl.env.vector import make_vec
-from cavmarl.handoff.fault_injection.fault_plan import read_faults
 from cavmarl.verify.determinism import MAX_STEPS
 from cavmarl.verify.differences import Difference, DrivenRun, find_difference, same_bytes, snapshot
-from cavmarl.verify.fault_figures import FaultFigures, HandOverClock
 from cavmarl.zones.kernels.zone_lookup import zones_of
 from cavmarl.zones.partition.zone_file import read_zones
 
@@ -39,10 +37,6 @@ class ZoneResult:
     vehicles: float  # in all worlds, on average over the steps
     world: int | None  # the first that differs; None if all were equal
     difference: Difference | None  # in it; None if all were equal
-    figures: FaultFigures  # hand-overs, and what faults did to them
-
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(replace(self, figures=FaultFigures())) | {"figures": self.figures.to_dict()}
 
 
 @dataclass(frozen=True)
@@ -61,8 +55,7 @@ class Equivalence:
         return all(result.difference is None for result in self.results)
 
     def to_dict(self) -> dict[str, Any]:
-        results = [result.to_dict() for result in self.results]
-        return {**asdict(replace(self, results=())), "results": results, "holds": self.holds}
+        return {**asdict(self), "holds": self.holds}
 
 
 def verify_zones(
@@ -73,7 +66,6 @@ def verify_zones(
     layout: str | Path | None = None,
     policy: str | Path = "idm",
     worlds: int = 1,
-    faults: str | Path | None = None,
     check: bool = False,
     journals: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -88,7 +80,6 @@ def verify_zones(
         layout: shadows zones.layout; a zone file is named from the working directory.
         policy: as in `load_policy`; its random numbers have the root of the worlds'.
         worlds: stepped together.
-        faults: what is done to the divided worlds, as `fault_plan.read_faults` takes it.
         check: watch the invariants of ownership in the divided worlds.
         journals: folder for the journals of the divided worlds, one for each number of zones.
         progress: called after each step with its number and `steps`.
@@ -102,7 +93,7 @@ def verify_zones(
     """
     check_count("steps", steps, MAX_STEPS)
     spec = WorldSpec.of(env, **keys)
-    divided = _divided(spec, layout, faults, check)
+    divided = _divided(spec, layout, check)
     plain = {key: value for key, value in divided.items() if not key.startswith("zones.")}
 
     def run(count: int, settings: Mapping[str, Any]) -> DrivenRun:
@@ -112,7 +103,6 @@ def verify_zones(
         )
 
     whole = run(1, plain)
-    # A world of one zone is as plain as the first: only a divided one has hosts that die.
     compared = [
         _Compared(run(count, divided | _journal(journals, count) if count > 1 else plain))
         for count in _counts(zones, divided)
@@ -132,18 +122,12 @@ def verify_zones(
     return Equivalence(spec.env, worlds, steps, ticks, hashes, results)
 
 
-def _divided(
-    spec: WorldSpec, layout: str | Path | None, faults: str | Path | None, check: bool
-) -> dict[str, Any]:
+def _divided(spec: WorldSpec, layout: str | Path | None, check: bool) -> dict[str, Any]:
     settings = dict(spec.overrides)
-    for name, given in (("layout", layout), ("faults", faults)):
-        if given is not None:
-            key = f"zones.{name}"
-            if key in settings:
-                raise ConfigError(f"{key} stands in overrides and is given as {name}; use one")
-            settings[key] = (
-                _layout(str(given)) if name == "layout" else read_faults(str(given)).to_json()
-            )
+    if layout is not None:
+        if "zones.layout" in settings:
+            raise ConfigError("zones.layout stands in overrides and is given as layout; use one")
+        settings["zones.layout"] = _layout(str(layout))
     return settings | ({"zones.check_invariants": True} if check else {})
 
 
@@ -175,9 +159,6 @@ class _Compared:
 
     def __init__(self, run: DrivenRun) -> None:
         self._run = run
-        self._clocks = [HandOverClock() for _ in run.vec.simulation.coordinators]
-        for coordinator, clock in zip(run.vec.simulation.coordinators, self._clocks, strict=True):
-            coordinator.watch(clock)
         self._steps = 0
         self._crossings = 0
         self._vehicles = 0
@@ -210,7 +191,6 @@ class _Compared:
             self._vehicles / (self._steps + 1),
             self._world,
             self.difference,
-            FaultFigures.of(simulation, self._clocks),
         )
 
     def _compare(self, step: int, whole: DrivenRun) -> None:

@@ -1,8 +1,7 @@
-"""Followed worlds that worker processes run, with faults and sensor workers: same results."""
+"""Followed worlds that worker processes run, with sensor workers: same results."""
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import threading
@@ -28,7 +27,6 @@ RIG: dict[str, dict[str, Any]] = {
     "lidar": {"type": "lidar", "rate_hz": 10, "rays": 16, "z_m": 1.6, "noise": [0.02]},
     "wheels": {"type": "odometry", "rate_hz": 20, "noise": [0.1]},
 }
-ROUGH = json.dumps({"seed": 3, "messages": {"Prepare": {"drop": 0.3}}, "crash_rate": 0.01})
 Seen = tuple[list[str], list[FollowerView]]
 
 
@@ -138,13 +136,10 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Seen:
 @pytest.mark.parametrize(
     "how",
     [
-        {"zones.faults": ROUGH},
         {"sensor_workers": 1},
-        {"zones.faults": ROUGH, "sensor_workers": 1},
         {"workers": 1},
         {"workers": 2},
         {"workers": 1, "sensor_workers": 1},
-        {"workers": 1, "sensor_workers": 1, "zones.faults": ROUGH},
     ],
     ids=str,
 )

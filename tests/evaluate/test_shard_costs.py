@@ -57,10 +57,3 @@ def test_numbers_are_checked(simulation: Simulation) -> None:
         measure_shards(simulation, 1, 0, steps=4, before=1)
     with pytest.raises(ConfigError, match="before = 0"):
         next(measure_rounds(simulation, 1, 1, before=0))
-
-
-def test_where_hosts_die_nothing_is_timed() -> None:
-    faults = '{"crash_rate": 0.1}'
-    make = world_maker("grid4x4", seconds=60, overrides={"zones.faults": faults})
-    with pytest.raises(ConfigError, match="no host dies"):
-        make(4).time_shards()

@@ -110,7 +110,6 @@ def test_worlds_of_workers_are_cut_anew_too() -> None:
     [
         ({"zones.repartition_steps": -1}, "zones.repartition_steps"),
         ({"zones.repartition_tolerance": float("nan")}, "zones.repartition_tolerance"),
-        ({"zones.repartition_steps": 5, "zones.faults": '{"drop": 0.1}'}, "must not be late"),
     ],
 )
 def test_what_cannot_be_cut_anew_is_refused(overrides: dict[str, Any], words: str) -> None:

@@ -9,9 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from cavmarl.engine.simulation import Simulation
-from cavmarl.handoff.fault_injection.fault_plan import Faults
-from cavmarl.handoff.fault_injection.injected_faults import Crashes, FaultyPhases
-from cavmarl.shards.executor import Executor
+from cavmarl.shards.executor import Executor, SerialExecutor
 from cavmarl.shards.shard import Commands, Shard
 from tests.support.driving import drive, make_simulation, start
 
@@ -39,8 +37,7 @@ class Strict:
     def __init__(self, simulation: Simulation, strangers: float) -> None:
         self.controlled = 0
         self.sensed: list[set[int]] = []
-        hosts = FaultyPhases(simulation._shards, Crashes(Faults()))._hosts
-        self._hosts = [(simulation._shards[zone], host) for zone, host in hosts]
+        self._hosts = [(shard, SerialExecutor((shard,))) for shard in simulation.shards]
         self._strangers = strangers
 
     def each(self, phase: str, *arguments: Any) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from cavmarl.ownership.limits import Limits
-from cavmarl.ownership.messages import Prepare, Record
+from cavmarl.ownership.messages import Record
 from cavmarl.ownership.trace import LOG, Trace
 from cavmarl.ownership.transfer_summary import TransferSummary
 from cavmarl.ownership.transfers import KEPT_ROWS, Transfer, TransferLog
@@ -64,42 +64,6 @@ def test_the_rows_of_a_campaign_are_the_switches_of_its_log() -> None:
     assert log.counts["deferred"] == simulator.deferred
     assert all(row.waited <= Limits().deferral for row in log.rows)
     assert all(row.forced or row.offers for row in log.rows)
-
-
-class Around:
-    """Depths by vehicle, and a clock that goes on by one when it is asked."""
-
-    def __init__(self, depths: dict[int, float]) -> None:
-        self.depths, self.ms = depths, 0.0
-
-    def depth_m(self, vehicle: int, target: int) -> float | None:
-        return self.depths.get(vehicle)
-
-    def release_depth_m(self, vehicle: int, source: int, target: int) -> float | None:
-        return {(7, 0, 1): 4.5}.get((vehicle, source, target))
-
-    def now_ms(self) -> float:
-        self.ms += 1.0
-        return self.ms
-
-
-def test_depths_and_times_come_from_outside() -> None:
-    bench = Bench()
-    bench.tick(births=[(7, 0)], offers=[(7, 1)])
-    bench.tick(movers=[(7, 1)])
-    around = Around({7: -3.0})
-    log = TransferLog(Limits().lifetime, around)
-    for destination, item in bench.trace.entries:
-        if isinstance(item, Record):
-            log.logged([item])
-        else:
-            log.delivered(destination, item)
-            if isinstance(item, Prepare):
-                around.depths[7] = 2.5  # it drives on
-    (row,) = log.rows
-    assert (row.prepare_depth_m, row.switch_depth_m, row.release_depth_m) == (-3.0, 2.5, 4.5)
-    assert row.ms == 2.0  # the state, BEGIN, DONE
-    assert row.ticks == row.tick - row.approached == 1
 
 
 def test_rows_do_not_grow_for_ever_and_can_be_taken_away() -> None:

@@ -55,12 +55,6 @@ def _sumo(source: str) -> Callable[[Path], Keywords]:
     return keywords
 
 
-def _faults(folder: Path) -> Keywords:
-    plan = folder / "faults.json"
-    plan.write_text('{"seed": 1, "messages": {"Prepare": {"drop": 0.3}}}')
-    return _with(zones__faults=str(plan))(folder)
-
-
 FEATURES: dict[str, Callable[[Path], Keywords]] = {
     "frames, discrete actions, seats": _with(
         sensors__stack=3, action__kind="discrete", population__mode="respawn"
@@ -88,7 +82,6 @@ FEATURES: dict[str, Callable[[Path], Keywords]] = {
     "a journal": lambda folder: _with(zones__journal=str(folder / "run.jsonl"))(folder),
     "invariant checks": _with(zones__check_invariants=True),
     "repartitions": _with(zones__repartition_steps=3),
-    "planned faults": _faults,
 }
 PLACES: dict[str, Keywords] = {
     "zones": {"zones": 3},
@@ -100,7 +93,7 @@ PLACES: dict[str, Keywords] = {
 }
 # What an undivided world, beside which others are run, does not know.
 ONLY_DIVIDED = (
-    "zones.faults", "zones.journal", "zones.check_invariants", "zones.repartition_steps",
+    "zones.journal", "zones.check_invariants", "zones.repartition_steps",
     "workers.balance_steps", "workers.monitor_cpu",
 )  # fmt: skip
 OF_ONE_WORLD = "of one world over"
@@ -111,14 +104,10 @@ REFUSED = {
     ("a network simulator", "workers"): OF_THE_CALLER,
     ("a network simulator", "zones over workers"): OF_THE_CALLER,
     ("a journal", "zones over workers"): OF_ONE_WORLD,
-    ("planned faults", "zones over workers"): OF_ONE_WORLD,
     ("repartitions", "zones over workers"): "needs zones that stay",
     ("sensor workers", "nodes"): NOT_OVER_NODES,
     ("a network simulator", "worlds on Ray"): OF_THE_CALLER,
     ("a journal", "worlds on Ray"): NOT_ON_HOSTS,
-    ("planned faults", "worlds on Ray"): NOT_ON_HOSTS,
-    ("planned faults", "nodes"): NOT_OVER_NODES,
-    ("planned faults", "nodes on Ray"): NOT_OVER_NODES,
     ("sensor workers", "worlds on Ray"): "leave out the hosts",
     ("balance by LoadScore", "worlds on Ray"): "or leave out the hosts",
     ("sensor workers", "nodes on Ray"): NOT_OVER_NODES,

@@ -1,9 +1,8 @@
-"""Worlds with a journal or a plan of faults on workers: the same results, and the same journal."""
+"""Worlds with a journal on workers: the same results, and the same journal."""
 
 from __future__ import annotations
 
 import itertools
-import json
 import os
 import signal
 from pathlib import Path
@@ -16,24 +15,10 @@ from cavmarl import CavVectorEnv
 from cavmarl.core.errors import ConfigError, JournalError
 from cavmarl.handoff.coordinator.journal import Journal
 from cavmarl.parallel.pooled_worlds import PooledWorlds
-from tests.support.faulted import BUSY
+from tests.support.replayed import BUSY
 from tests.support.vec_runs import Make
 
 STEPS = 12
-ROUGH = json.dumps(
-    {
-        "seed": 5,
-        "messages": {"Prepare": {"drop": 0.2}, "Step": {"drop": 0.1}, "Done": {"duplicate": 0.2}},
-        "crash_rate": 0.003,
-        "crashes": [
-            {"tick": 3, "point": "BEGIN torn"},
-            {"tick": 5, "point": "COMMIT torn"},
-            {"tick": 7, "point": "commit", "zone": 1},
-        ],
-    }
-)
-STRANGER = json.dumps({"crashes": [{"tick": 1, "point": "commit", "zone": 7}]})
-LOSSY = json.dumps({"seed": 5, "messages": {"Prepare": {"drop": 0.3}, "Ack": {"delay": 0.3}}})
 
 
 @pytest.fixture(autouse=True)
@@ -64,18 +49,12 @@ def _journals(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
-@pytest.mark.parametrize(
-    ("worlds", "workers", "faults"),
-    [(1, 1, ""), (2, 2, ""), (1, 1, ROUGH), (2, 1, LOSSY)],
-    ids=["one", "two", "one and deaths", "two and losses"],
-)
-def test_nobody_can_tell(
-    make: Make, tmp_path: Path, worlds: int, workers: int, faults: str
-) -> None:
+@pytest.mark.parametrize(("worlds", "workers"), [(1, 1), (2, 2), (2, 1)])
+def test_nobody_can_tell(make: Make, tmp_path: Path, worlds: int, workers: int) -> None:
     def run(name: str, number: int, kills: bool = False) -> tuple[list[Any], dict[str, bytes]]:
         folder = tmp_path / name
         folder.mkdir()
-        settings = {**BUSY, "zones.journal": str(folder / "run.jsonl"), "zones.faults": faults}
+        settings = {**BUSY, "zones.journal": str(folder / "run.jsonl")}
         vec = make("grid4x4", num_envs=worlds, zones=2, workers=number, overrides=settings)
         found = _drive(vec, kills)
         vec.close()
@@ -86,12 +65,6 @@ def test_nobody_can_tell(
     assert all(content.count(b"\n") > 2 * STEPS for content in journals.values())
     assert run("workers", workers) == (alone, journals)
     assert run("killed", workers, kills=True) == (alone, journals)
-
-
-def test_faults_alone(make: Make) -> None:
-    plain = _drive(make("grid4x4", zones=2, overrides=BUSY))
-    settings = {**BUSY, "zones.faults": ROUGH}
-    assert _drive(make("grid4x4", zones=2, workers=1, overrides=settings), kills=True) == plain
 
 
 def test_a_journal_that_is_there_is_left_alone(make: Make, tmp_path: Path) -> None:
@@ -119,13 +92,10 @@ def test_a_journal_is_locked_until_its_world_is_closed(
     ("more", "words"),
     [
         ({"workers": 2, "zones.journal": "x.jsonl"}, r"zones\.journal.*at most workers=1"),
-        ({"workers": 2, "zones.faults": LOSSY}, r"zones\.faults.*at most workers=1"),
         (
-            {"num_envs": 3, "workers": 2, "zones.faults": LOSSY, "workers.balance_steps": 5},
+            {"num_envs": 3, "workers": 2, "zones.journal": "x.jsonl", "workers.balance_steps": 5},
             r"leave workers\.balance_steps 0",
         ),
-        ({"num_envs": 2, "workers": 2, "zones.faults": ROUGH}, "one world at a time, not in 2"),
-        ({"workers": 1, "zones.faults": STRANGER}, "zone 7 cannot die"),
     ],
 )
 def test_what_cannot_be_is_refused(make: Make, more: dict[str, Any], words: str) -> None:

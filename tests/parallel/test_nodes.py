@@ -328,10 +328,6 @@ def test_one_environment_of_pettingzoo() -> None:
         ({"nodes": 2, "zones": 2, "hosts": "127.0.0.1:7600"}, "without workers.key_file"),
         ({"nodes": 2, "zones": 2, "sensor_workers": 1}, "workers.sensors = 1"),
         (
-            {"nodes": 2, "zones": 2, "overrides": {"zones.reproducers": "x"}},
-            r"zones\.reproducers = 'x'",
-        ),
-        (
             {"nodes": 2, "zones": 2, "overrides": {"workers.monitor_cpu": True}},
             r"workers\.monitor_cpu = True.*set workers\.balance_steps",
         ),

@@ -167,12 +167,6 @@ def test_with_workers_that_have_whole_worlds() -> None:
     assert _drive(num_envs=2, sensor_workers=2) == both
 
 
-def test_ticks_that_are_begun_again() -> None:
-    plan = Path(__file__).parents[2] / "examples" / "faults.json"
-    settings = {"zones.faults": str(plan)}
-    assert _drive(zones=4, overrides=settings, sensor_workers=2) == _drive()
-
-
 @pytest.mark.slow
 def test_ten_thousand_steps_without_a_frame_of_another_tick() -> None:
     settings = {"horizon_s": 2000.0, "clock.ctrl_dt_s": 0.05}

@@ -28,7 +28,7 @@ from cavmarl.sensors.kernels.panorama import (
 from cavmarl.sensors.mounted.backdrop import lane_strips
 from cavmarl.sensors.mounted.lidar import lidar_fan
 from cavmarl.verify.equivalence import verify_zones
-from tests.support.faulted import BUSY, ROUGH, record, replay
+from tests.support.replayed import BUSY
 
 FRONT = {"x_m": 1.0, "z_m": 1.3}
 TILTED = {"x_m": -1.0, "y_m": 0.4, "z_m": 1.5, "yaw_deg": 100.0, "pitch_deg": -8.0, "roll_deg": 5.0}
@@ -51,11 +51,6 @@ def test_divided_worlds_see_what_the_undivided_one_does() -> None:
         assert result.difference is None, result
         assert result.steps == 20
     assert sum(result.crossings for result in found.results) > 10
-
-
-def test_ticks_that_are_begun_again_see_the_same() -> None:
-    vec = replay(record("grid4x4", WORLD, 15), 4, ROUGH)
-    assert len(vec.simulation.revivals) > 0
 
 
 def test_workers_see_the_same() -> None:

@@ -17,7 +17,7 @@ from cavmarl.env.vector import CavVectorEnv
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.shards.shard import Commands
 from cavmarl.verify.equivalence import verify_zones
-from tests.support.faulted import BUSY, ROUGH, record, replay
+from tests.support.replayed import BUSY
 
 PLACE = {"x_m": 1.5, "y_m": -0.5, "z_m": 1.2, "yaw_deg": 20.0}
 RIG: dict[str, Any] = {
@@ -50,12 +50,6 @@ def test_divided_worlds_sense_what_the_undivided_one_does(rig: dict[str, Any]) -
         assert result.difference is None, result
         assert result.steps == 30
     assert sum(result.crossings for result in found.results) > 20
-
-
-@pytest.mark.parametrize("rig", [{"rig": RIG}, TEN], ids=["rig", "ten"])
-def test_ticks_that_are_begun_again_sense_the_same(rig: dict[str, Any]) -> None:
-    vec = replay(record("grid4x4", {**BUSY, **rig}, 20), 4, ROUGH)
-    assert len(vec.simulation.revivals) > 0
 
 
 def _drive(vec: CavVectorEnv, steps: int = 8) -> list[bytes]:

@@ -12,11 +12,9 @@ import pytest
 from cavmarl.core.records.codes import DRIVER_SCRIPTED
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.evaluate.scenarios.scenario_runs import make_scenario
-from cavmarl.handoff.fault_injection.fault_plan import Faults
 from cavmarl.policies.policy import load_policy
 from cavmarl.zones.partition.zone_file import write_zones
 from cavmarl.zones.partition.zone_partition import ZonePartition
-from tests.support.faulted import NOISE
 from tests.traffic.test_scenarios import NAMES, ROOMY
 
 STEPS = 75
@@ -65,19 +63,6 @@ def test_a_border_through_the_place_changes_nothing(name: str, tmp_path: Path) -
         vec = divided(name, tmp_path, count, whole)
         assert hashes(vec) == expected
         assert vec.simulation.partition.count == count
-
-
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("count", [2, pytest.param(9, marks=pytest.mark.slow)])
-def test_nor_do_hosts_that_die_and_ticks_that_are_begun_again(
-    name: str, count: int, tmp_path: Path
-) -> None:
-    whole = make_scenario(name, density="low")
-    expected = hashes(whole, steps=40)
-    faults = Faults(seed=5, messages=NOISE, crash_rate=0.01)
-    vec = divided(name, tmp_path, count, whole, **{"zones.faults": faults.to_json()})
-    assert hashes(vec, steps=40) == expected
-    assert vec.simulation.revivals
 
 
 @pytest.mark.slow

@@ -8,7 +8,6 @@ import pytest
 
 from cavmarl import make_vec
 from cavmarl.verify.equivalence import verify_zones
-from tests.support.faulted import BUSY, ROUGH
 
 FAST = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.2}
 OBSERVED = {
@@ -79,23 +78,3 @@ def test_worker_processes_say_the_same() -> None:
         return found
 
     assert seen(zones=2, workers=2) == seen()
-
-
-@pytest.mark.parametrize("channel", [{}, LOSSY], ids=["ideal", "lossy"])
-def test_ticks_that_are_begun_again_say_the_same(channel: dict[str, Any]) -> None:
-    rates = ("cam.rate_hz", "denm.rate_hz", "perception.rate_hz", "roadside.rate_hz")
-    overrides = dict(BUSY) | OBSERVED | channel | {f"v2x.{rate}": 5.0 for rate in rates}
-    whole = make_vec("grid4x4", overrides=overrides)
-    faults = {"zones.faults": ROUGH.to_json()}
-    harmed = make_vec("grid4x4", zones=4, overrides=overrides | faults)
-    observations = [env.reset(seed=1)[0] for env in (whole, harmed)]
-    for _ in range(25):
-        actions = whole.suggest_actions()
-        assert (actions == harmed.suggest_actions()).all()
-        observations = [env.step(actions)[0] for env in (whole, harmed)]
-        assert observations[0].tobytes() == observations[1].tobytes()
-        assert whole.state_hash() == harmed.state_hash()
-        mails = [env.simulation.messages.arrays() for env in (whole, harmed)]
-        for ours, theirs in zip(*mails, strict=True):
-            assert ours.tobytes() == theirs.tobytes()
-    assert harmed.simulation.revivals

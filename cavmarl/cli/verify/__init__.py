@@ -21,7 +21,6 @@ from cavmarl.cli.output import (
     write_json,
 )
 from cavmarl.cli.verify import options
-from cavmarl.cli.verify.faults import check_campaign, print_figures, verify_campaign
 from cavmarl.cli.verify.kills import verify_with_kills
 from cavmarl.cli.verify.nodes import (
     CAMPAIGN,
@@ -30,7 +29,7 @@ from cavmarl.cli.verify.nodes import (
     verify_over_nodes,
 )
 from cavmarl.config.world_spec import WorldSpec, with_sensors_of_drivers
-from cavmarl.core.errors import ConfigError, LostTickError
+from cavmarl.core.errors import ConfigError
 from cavmarl.core.progress import counting
 
 if TYPE_CHECKING:
@@ -56,7 +55,6 @@ def verify(
     hosts: options.Hosts = None,
     check: options.Check = False,
     journal: options.Journal = None,
-    replay: options.Replay = None,
     json_path: JsonPath = None,
 ) -> None:
     """Drive divided worlds beside the undivided one; exit code 1 and where one first differs.
@@ -65,12 +63,6 @@ def verify(
     """
     if hosts is not None and kill is None:
         raise ConfigError(f"--hosts {hosts}: goes with --kill only")
-    if replay is not None:
-        given = (zones, steps, layout, faults, journal, kill, worlds)
-        shadows = (world.agents, world.background, world.overrides or None)
-        if check or any(value is not None for value in (*given, *shadows)):
-            raise ConfigError("--replay: all else stands in the file; beside it goes ENV only")
-        return _run_again(replay, env, json_path)
     counts = None if zones is None else _counts(zones)
     if env is not None:
         world = with_sensors_of_drivers(world, [policy])
@@ -93,17 +85,15 @@ def verify(
         run |= {"zones": one, "worlds": worlds, "workers": workers, "hosts": hosts}
         return verify_with_kills(console, strict, kill, json_path, **run)
     run |= {"worlds": 1 if worlds is None else worlds}
-    if nodes is None and faults == CAMPAIGN:
-        check_campaign(layout, run.pop("worlds"), journal)
-        run |= {"zones": counts, "steps": 40 if steps is None else steps, "seeds": seeds}
-        return verify_campaign(console, strict, json_path, **run)
+    if nodes is None and faults is not None:
+        raise ConfigError(f"--faults {faults}: goes with --nodes only")
     run |= {"steps": 200 if steps is None else steps}
     if nodes is not None:
         run |= {"kills": kill or 0, "zones": one}
         return verify_over_nodes(console, strict, _counts(nodes), json_path, **run)
     if env is None:
-        raise ConfigError("verify: name an environment; without one goes --faults campaign only")
-    run |= {"layout": layout, "faults": faults, "check": check, "journals": journal}
+        raise ConfigError("verify: name an environment")
+    run |= {"layout": layout, "check": check, "journals": journal}
     return _verify_zones(console, world, env, counts, json_path, **run)
 
 
@@ -124,8 +114,6 @@ def _verify_zones(
         found = verify_zones(world, counts, progress=progress, **run)
     write_json(json_path, found.to_dict())
     console.print(_table(found, world.seed))
-    if run["faults"] is not None:
-        print_figures(console, found)
     for result in found.results:
         if result.difference is not None:
             console.print(_sentence(result, found.worlds), markup=False, soft_wrap=True)
@@ -135,38 +123,9 @@ def _verify_zones(
     console.print(f"state after tick {found.ticks}: {hashes}", highlight=False, soft_wrap=True)
 
 
-def _run_again(path: Path, env: str | None, json_path: Path | None) -> None:
-    """As it was, then without the faults of its plan; exit code 1 if it fails as it was.
-
-    What a zone's code raises without faults is not caught: its traceback is what one looks for.
-    """
-    from cavmarl.handoff.fault_injection.reproducer_file import read_reproducer
-    from cavmarl.verify.replay import changed_versions, replay_tick, world_of
-
-    console = Console(soft_wrap=True, highlight=False, markup=False)
-    kept = read_reproducer(path)
-    world = world_of(kept, env)
-    console.print(f"{kept.config['name']}, tick {kept.tick} of the run, on record: {kept.cause}")
-    for change in changed_versions(kept):
-        console.print(f"note: {change}")
-    found = {"recorded": kept.cause, "failure": "", "state_hash": ""}
-    try:
-        found["state_hash"] = replay_tick(kept, world)
-        console.print(f"as it was: reached, state {found['state_hash']}")
-    except LostTickError as error:
-        found["failure"] = str(error)
-        console.print(f"as it was: {error}")
-    write_json(json_path, found)
-    if found["failure"]:
-        found["state_hash"] = replay_tick(kept, world, faults=False)
-        console.print(f"without faults: reached, state {found['state_hash']}")
-        write_json(json_path, found)
-        raise typer.Exit(1)
-
-
 _CURES = {
     "--faults": "worlds over nodes are verified with --faults simulated or campaign, those over "
-    "workers without; a plan of faults goes with --zones",
+    "workers without",
     "--layout": "use --set zones.layout=FILE",
     "--journal": "use --set zones.journal=FILE",
 }

@@ -14,17 +14,17 @@ Env = Annotated[
     str | None,
     typer.Argument(
         metavar="[ENV]",
-        help="Name, folder or map file of an environment; of a campaign, default: a busy grid.",
+        help="Name, folder or map file of an environment.",
     ),
 ]
 Zones = Annotated[
     str | None,
     about(
-        "Numbers of zones; default: 1,2,4,9, or what a zone file has; of a campaign 4,9.",
+        "Numbers of zones; default: 1,2,4,9, or what a zone file has.",
         metavar="K,K,…",
     ),
 ]
-Steps = Annotated[int | None, about("Compared steps; default: 200, of a campaign 40 a run.")]
+Steps = Annotated[int | None, about("Compared steps; default: 200, of a campaign fewer a run.")]
 Layout = Annotated[
     str | None, about(f"{', '.join(ZONE_LAYOUTS)}, or a zone file; default: the environment's.")
 ]
@@ -34,14 +34,13 @@ Worlds = Annotated[
 Faults = Annotated[
     str | None,
     about(
-        "JSON file of faults in the divided worlds, see docs/faults.md; `campaign`: "
-        "the whole matrix.",
-        metavar="PLAN",
+        "With --nodes: faults between simulated nodes, and with `campaign` between processes, too.",
+        metavar="simulated|campaign",
     ),
 ]
 Seeds = Annotated[
     int,
-    about("Of a campaign: runs in which any process dies at any time; over nodes, of each fault."),
+    about("Of a campaign: runs of each fault."),
 ]
 Kill = Annotated[
     int | None,
@@ -67,12 +66,4 @@ Hosts = Annotated[
 Check = Annotated[bool, about("Check the invariants of ownership, too.", "--check")]
 Journal = Annotated[
     Path | None, about("Folder for the journals of the divided worlds.", metavar="DIR")
-]
-Replay = Annotated[
-    Path | None,
-    about(
-        "Run a tick again that every host of a zone died of, see docs/faults.md; beside "
-        "it goes ENV only, where the map is found.",
-        metavar="FILE",
-    ),
 ]

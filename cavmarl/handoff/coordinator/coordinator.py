@@ -3,20 +3,19 @@
 It decides which zone advances which vehicle to the next tick, and sees it done. How rows change
 hands is done by the division.
 
-There are two: `coordinator.Coordinator` sends messages, which may be lost, to hosts that may die;
-`direct.LocalCoordinator` lives in the process of all of its zones.
+`LocalCoordinator` lives in the process of all of its zones; over nodes there is another one,
+`NodeCoordinator`.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import NamedTuple, Protocol
 
-from cavmarl.handoff.coordinator.journal import AnyJournal
+from cavmarl.handoff.coordinator.journal import Journal
 from cavmarl.ownership.directory import Directory
-from cavmarl.ownership.messages import Birth, Message, Record, Removed, Switch
+from cavmarl.ownership.messages import Birth, Record, Removed
 
 
 class Near(NamedTuple):
@@ -30,16 +29,6 @@ class Near(NamedTuple):
     depth_m: float
 
 
-class ArrivingVehicle(NamedTuple):
-    """A vehicle that changes its owner now, with the state that the new one has been sent of it.
-
-    None: nothing has been sent; the new owner takes the old one's row as it is.
-    """
-
-    switch: Switch
-    state: bytes | None
-
-
 class Watcher(Protocol):
     """Is told what happens, as `ownership.trace.Trace` is."""
 
@@ -47,13 +36,11 @@ class Watcher(Protocol):
         """Records, in the order of the journal."""
         ...
 
-    def delivered(self, destination: int, message: Message) -> None: ...
-
 
 class Coordinator(ABC):
     """Decides ownership, tick by tick: `begin`, then the zones' work, then `end`."""
 
-    def __init__(self, directory: Directory, journal: AnyJournal | None) -> None:
+    def __init__(self, directory: Directory, journal: Journal | None) -> None:
         self._directory = directory
         self.journal = journal  # what takes the records
         self.switched = 0  # vehicles that have changed their owner
@@ -108,8 +95,7 @@ class Coordinator(ABC):
         """Decide the way to the next tick, and let rows change hands.
 
         Raises:
-            ProtocolError: a vehicle was lost or doubled; it cannot be decided, or a zone does not
-                answer.
+            ProtocolError: a vehicle was lost or doubled, or it cannot be decided.
             ConfigError: a zone has not seen a vehicle that enters it.
         """
 
@@ -117,23 +103,16 @@ class Coordinator(ABC):
     def end(
         self,
         rows: Callable[[int], int],  # zone → digest of its rows
-        # zone → digest of its rows in the store; None: where `rows` are is the store
-        stored: Callable[[int], int] | None = None,
     ) -> None:
         """Commit the tick, through which every zone is.
 
         Raises:
-            ProtocolError: a vehicle was lost or doubled; a zone does not answer.
-            StoreError: the store holds other rows than a zone told of.
+            ProtocolError: a vehicle was lost or doubled.
         """
 
     @abstractmethod
     def in_flight(self) -> list[tuple[int, int, int, str]]:
         """(vehicle, owner, zone that it was offered to, how it stands), between two ticks."""
-
-    @abstractmethod
-    def dropped(self) -> Counter[tuple[str, str]]:
-        """(kind, reason) → messages or entries that did not count, at any of the parties."""
 
     def close(self) -> None:
         """Close the journal."""

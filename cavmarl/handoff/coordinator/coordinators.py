@@ -2,108 +2,21 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from hashlib import blake2b
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import ProtocolError
 from cavmarl.core.records.arrays import Gate
-from cavmarl.handoff.coordinator.coordinator import ArrivingVehicle, Coordinator, Near
+from cavmarl.handoff.coordinator.coordinator import Coordinator
 from cavmarl.handoff.coordinator.invariant_monitor import InvariantMonitor
 from cavmarl.handoff.coordinator.row_digests import RowDigests
 from cavmarl.handoff.division import Division
-from cavmarl.handoff.fault_injection.committed_store import CommittedStore, Notes
-from cavmarl.handoff.fault_injection.message_coordinator import MessageCoordinator
 from cavmarl.handoff.zone_view import TransferInFlight
-from cavmarl.ownership.ledger import state_digest
-from cavmarl.ownership.messages import Record
 from cavmarl.shards.shard import Commands
 from cavmarl.zones.kernels.zone_lookup import zones_of
-
-
-class NearBorders:
-    """What rows of transfers need to know: vehicles near a border, and those that crossed one.
-
-    Attributes:
-        places: vehicle that has changed its owner in it → the row that it had there; to be set.
-    """
-
-    def __init__(self, division: Division, world: int) -> None:
-        self.places: Mapping[int, int] = {}
-        self._division = division
-        self._world = world
-        self.near: Sequence[Near] = ()  # of the tick that is on its way; to be set
-        self._depths: dict[tuple[int, int], float] = {}
-        self._told: Sequence[Near] = ()
-
-    def depth_m(self, vehicle: int, target: int) -> float | None:
-        """How far outside of its owner's zone, less than 0 inside; None: it was not near."""
-        if self._told is not self.near:
-            self._told = self.near
-            self._depths = {(entry.vehicle, entry.target): entry.depth_m for entry in self.near}
-        return self._depths.get((vehicle, target))
-
-    def release_depth_m(self, vehicle: int, source: int, target: int) -> float | None:
-        """How far outside of its old zone a vehicle is that has changed; None: it has left."""
-        hint = self.places.get(vehicle, 0)
-        return self._division.depth_m(self._world, vehicle, target, source, hint)
-
-    @staticmethod
-    def now_ms() -> float:
-        """Of the process's clock."""
-        return 1e3 * time.perf_counter()
-
-
-class RowStates:
-    """States of one world's vehicles at the committed tick, read from the rows of their owners."""
-
-    def __init__(self, division: Division, world: int) -> None:
-        self.borders = NearBorders(division, world)  # vehicles near a border when the tick began
-        self._division = division
-        self._world = world
-        self._known: dict[int, bytes] = {}
-
-    def forget(self) -> None:
-        self._known.clear()
-
-    def look(self, everybody: bool) -> list[Near]:
-        """Vehicles near a border; see `Division.near`."""
-        found = self._division.near(self._world, everybody)
-        self.borders.near = found
-        return found
-
-    def change(self, entries: Sequence[ArrivingVehicle]) -> None:
-        """Let rows change hands, of vehicles that `look` has found."""
-        if entries:
-            rows = {entry.vehicle: entry.row for entry in self.borders.near}
-            self.borders.places = {
-                switch.vehicle: self._division.hand_over(
-                    self._world, switch, state, rows.get(switch.vehicle, 0)
-                )
-                for switch, state in entries
-            }
-
-    def near(self, entry: Near) -> bytes:
-        """Of a vehicle near a border, whose row is known."""
-        found = self._known.get(entry.vehicle)
-        if found is None:
-            found = self._division.state(self._world, entry.source, entry.row)
-            self._known[entry.vehicle] = found
-        return found
-
-    def state(self, vehicle: int) -> bytes:
-        found = self._known.get(vehicle)
-        if found is None:
-            found = self._division.state(self._world, *self._division.find(self._world, vehicle))
-            self._known[vehicle] = found
-        return found
-
-    def digest_of(self, vehicle: int) -> bytes:
-        return state_digest(self.state(vehicle))
 
 
 class Coordination(Protocol):
@@ -129,10 +42,6 @@ class Coordination(Protocol):
         """All zones of this process are through with the tick."""
         ...
 
-    def save(self) -> None:
-        """What has changed between two ticks is committed."""
-        ...
-
     def in_flight(self, w: int) -> list[TransferInFlight]: ...
 
 
@@ -143,20 +52,14 @@ class Coordinators:
         self,
         division: Division,  # whose rows change hands
         coordinators: Sequence[Coordinator],  # one a world
-        states: Sequence[RowStates],  # of the vehicles of each world, as the coordinators read them
         digests: RowDigests | None = None,  # of zones' rows; None: not needed
-        # keeps what is committed; None: no process can die alone
-        store: CommittedStore | None = None,
         monitor: InvariantMonitor | None = None,  # checks every tick that is committed; None: none
     ) -> None:
         self.coordinators = tuple(coordinators)
         self._division = division
-        self._states = tuple(states)
         self._digests = digests
-        self._store = store
         self._monitor = monitor
         self._rows = [self._live(w) for w in range(len(self.coordinators))]
-        self._in_store = [self._stored(w) for w in range(len(self.coordinators))]
         # Worlds whose rows have changed since their ghosts were renewed.
         self._stirred = [True] * len(self.coordinators)
 
@@ -185,52 +88,19 @@ class Coordinators:
             )
 
     def end(self) -> None:
-        """Commit the tick that all zones have computed."""
-        if self._store is not None:
-            self._store.write(tuple((c.notes()[0], ()) for c in self.coordinators))
-        for w, coordinator in enumerate(self.coordinators):
-            coordinator.end(self._rows[w], self._in_store[w])
-        if self._store is not None:
-            self._store.flip()
-        if self._monitor is not None:
-            self.check()
-
-    def check(self) -> None:
-        """Look whether the invariants hold in the tick that has been committed.
+        """Commit the tick that all zones have computed.
 
         Raises:
-            ProtocolError: one does not.
+            ProtocolError: an invariant does not hold in it.
         """
+        for w, coordinator in enumerate(self.coordinators):
+            coordinator.end(self._rows[w])
         if self._monitor is not None:
             for w, coordinator in enumerate(self.coordinators):
                 self._monitor.end(w, coordinator.notes()[0])
 
-    def save(self) -> None:
-        """What has changed between two ticks is committed."""
-        if self._store is not None:
-            self._store.write(tuple(coordinator.notes() for coordinator in self.coordinators))
-            self._store.flip()
-
     def in_flight(self, w: int) -> list[TransferInFlight]:
         return [TransferInFlight(*entry) for entry in self.coordinators[w].in_flight()]
-
-    def load(self) -> None:
-        """Take everything back to what is committed."""
-        if self._store is None:
-            raise ProtocolError("the committed state is not kept")
-        self._division.align()
-        for w, notes in enumerate(self._store.load()):
-            self.coordinators[w].resume(*notes)
-            self._stirred[w] = True
-
-    def take_up(self, records: Sequence[Record], notes: Sequence[Notes]) -> None:
-        """Go on in the one world where others have stopped."""
-        (coordinator,) = self.coordinators
-        if not isinstance(coordinator, MessageCoordinator):
-            raise ProtocolError("a coordinator without messages cannot go on in the middle of one")
-        coordinator.take_up(records)
-        coordinator.resume(*notes[0])
-        self._stirred[0] = True
 
     def left(self, gate: Gate) -> None:
         for w, coordinator in enumerate(self.coordinators):
@@ -252,12 +122,6 @@ class Coordinators:
         if digests is None:
             return lambda zone: 0
         return lambda zone: digests.of(self._division.owned(w, zone))
-
-    def _stored(self, w: int) -> Callable[[int], int] | None:
-        digests, store = self._digests, self._store
-        if digests is None or store is None:
-            return None
-        return lambda zone: digests.of(store.written(zone, w))
 
 
 def _digest(commands: Commands, w: int) -> bytes:

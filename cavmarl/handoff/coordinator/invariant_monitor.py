@@ -8,7 +8,7 @@ records, and costs what changes in them. The words of an error are found when th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,7 @@ from cavmarl.handoff.kernels.invariant_checks import (
     watch,
 )
 from cavmarl.ownership.limits import Limits
-from cavmarl.ownership.messages import Birth, Commit, Item, Message, Record, Reset
+from cavmarl.ownership.messages import Birth, Commit, Record, Reset
 from cavmarl.ownership.trace import LOG, TraceEntry, describe
 from cavmarl.ownership.trace_check import Owner, TraceChecker
 
@@ -61,11 +61,9 @@ class OwnersOnRecord:
         self,
         zones: int,
         limits: Limits,
-        is_direct: bool = False,
-        near: Sequence[Container[int]] | None = None,  # zone → its neighbours; None: all
     ) -> None:
         self.entered = self.left = 0  # vehicles that zones have begun to own, since the reset
-        self._checker = TraceChecker(limits.deferral, limits.lifetime, is_direct, near)
+        self._checker = TraceChecker(limits.deferral, limits.lifetime, is_direct=True)
         self._sums = np.zeros(zones, dtype=np.uint64)
         self._current = self._sums  # with what records that are still to come add to them
         self.ask: Callable[[], None] = _nothing
@@ -79,20 +77,12 @@ class OwnersOnRecord:
     def logged(self, records: Iterable[Record]) -> None:
         """Note records. Raises ProtocolError: one that a correct run does not leave here."""
         for record in records:
-            self._take(LOG, record)
+            self._take(record)
             if isinstance(record, Reset):
                 self.entered = self.left = 0
                 self._current = self._sums = np.zeros_like(self._sums)
             elif isinstance(record, Commit):
                 self._commit()
-
-    def delivered(self, destination: int, message: Message) -> None:
-        """Note a message that has arrived.
-
-        Raises:
-            ProtocolError: one that a correct run does not leave here.
-        """
-        self._take(destination, message)
 
     def foretold(self, changes: Iterable[OwnerChange]) -> None:
         """Changes of owner of the committed tick, of which records will tell later."""
@@ -110,13 +100,13 @@ class OwnersOnRecord:
             _add(sums, zone, int(owner_hash(vehicle, 0)))
         return sums
 
-    def _take(self, destination: int, item: Item) -> None:
-        entry = TraceEntry(destination, item)
+    def _take(self, record: Record) -> None:
+        entry = TraceEntry(LOG, record)
         try:
             self._checker.take(entry)
         except ProtocolError as error:
             raise ProtocolError(
-                f"tick {item.tick}: order of records and messages: {describe(entry)}: {error}"
+                f"tick {record.tick}: order of records: {describe(entry)}: {error}"
             ) from None
 
     def _commit(self) -> None:

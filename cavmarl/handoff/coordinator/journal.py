@@ -1,8 +1,7 @@
 """The coordinator's log on disk: what has been decided is there before it is told to any zone.
 
 A line is a record of `ownership.records`. Nothing is kept in memory, and an append is one write: a
-process that dies leaves whole lines, and at most one that is cut short. `MemoryJournal` takes the
-same calls and keeps the records in a list.
+process that dies leaves whole lines, and at most one that is cut short.
 """
 
 from __future__ import annotations
@@ -10,8 +9,7 @@ from __future__ import annotations
 import os
 import sys
 import weakref
-from collections.abc import Iterable, Iterator, Sequence
-from copy import copy
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Literal, Self, TypeAlias, get_args
@@ -161,17 +159,6 @@ class Journal:
         """What has been written, from the first line on; errors as of `JournalReader`."""
         return iter(JournalReader(self.path))
 
-    def reopened(self) -> Journal:
-        """What another process finds when the one that wrote here has died."""
-        self.close()
-        sync: Sync = "fsync" if self._fsync else "flush"
-        return Journal(self.path, resume=True, sync=sync)
-
-    def tear(self, records: Sequence[Record]) -> None:
-        """Write as a process does that dies meanwhile: half of the first line."""
-        line = copy(self._chain).write(records[0]).encode()
-        self._file.write(line[: len(line) // 2])
-
     def __enter__(self) -> Self:
         return self
 
@@ -214,47 +201,3 @@ class Journal:
             f"{self.path}: the journal cannot be written ({error.strerror}); "
             "make room there, or choose another path"
         )
-
-
-class MemoryJournal:
-    """A journal for tests, and for runs that are not replayed."""
-
-    def __init__(self) -> None:
-        self.records: list[Record] = []  # all of them
-        self._closed = False
-
-    @property
-    def sequence(self) -> int:
-        return len(self.records)
-
-    def append(self, records: Iterable[Record]) -> None:
-        if self._closed:
-            raise JournalError("the journal is closed")
-        self.records += records
-
-    def close(self) -> None:
-        self._closed = True
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
-
-    def read(self) -> Iterator[Record]:
-        return iter(self.records)
-
-    def reopened(self) -> MemoryJournal:
-        """What another process finds when the one that wrote here has died."""
-        return self
-
-    def tear(self, records: Sequence[Record]) -> None:
-        """Half of a record is none."""
-
-
-AnyJournal: TypeAlias = Journal | MemoryJournal

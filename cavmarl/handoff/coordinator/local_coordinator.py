@@ -15,7 +15,6 @@ Callers that need changes in their own tick register with `foretell`.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from itertools import repeat
 from typing import NamedTuple
@@ -26,7 +25,7 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import ProtocolError
 from cavmarl.handoff.coordinator.coordinator import Coordinator
 from cavmarl.handoff.coordinator.handoff_log import HandoffLog, OwnerChange
-from cavmarl.handoff.coordinator.journal import AnyJournal
+from cavmarl.handoff.coordinator.journal import Journal
 from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.ledger import world_digest
 from cavmarl.ownership.messages import Begin, Birth, Commit, Removed, Switch, ZoneLedger
@@ -54,7 +53,7 @@ class LocalCoordinator(Coordinator):
     def __init__(
         self,
         directory: Directory,
-        journal: AnyJournal | None,  # takes the records; None: not kept
+        journal: Journal | None,  # takes the records; None: not kept
         book: HandoffLog,  # hands rows over
         counts: Callable[[], list[int]],  # how many vehicles each zone owns now, by its rows
         transfers: TransferLog,  # told of all that goes on
@@ -127,7 +126,7 @@ class LocalCoordinator(Coordinator):
             switches = tuple(map(_switch, self._book.newest(changed)))
             self._record(self._begun(self._tick + 1, switches, self._new, inputs))
 
-    def end(self, rows: Callable[[int], int], stored: Callable[[int], int] | None = None) -> None:
+    def end(self, rows: Callable[[int], int]) -> None:
         """Commit, if the zones own what they should, as `Coordinator.end` says."""
         changed, self._is_open = self._changed, False
         self._tick += 1
@@ -220,9 +219,6 @@ class LocalCoordinator(Coordinator):
             for vehicle, target in self._book.coming()
             if vehicle in owners
         )
-
-    def dropped(self) -> Counter[tuple[str, str]]:
-        return Counter()
 
     def _check(self, births: Iterable[Birth]) -> None:
         """Compare what zones should own with their rows, where all that have left are on record."""

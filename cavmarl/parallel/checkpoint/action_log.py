@@ -1,8 +1,8 @@
 """`ActionLog` records all inputs of some worlds since they were made; `ActionLogJob` keeps one.
 
 A checkpoint log keeps images, and ownership is in none of them: a successor gives each vehicle to
-the zone that it is in. That changes no result, but a journal would tell of it, and a plan of faults
-would strike others. So the successor of such worlds goes through everything again.
+the zone that it is in. That changes no result, but a journal would tell of it. So the successor of
+worlds with a journal goes through everything again.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class ActionLog:
             os.pwrite(self._fd, row.tobytes(), number * row.itemsize)
         except OSError as error:
             raise WorkerError(
-                f"no memory for what worlds with a journal or faults are told ({error.strerror}): "
+                f"no memory for what worlds with a journal are told ({error.strerror}): "
                 "make the environment anew now and then, or use workers=0"
             ) from error
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from cavmarl.core.errors import MessageError, ProtocolError
 from cavmarl.handoff.coordinator.invariant_monitor import OwnersOnRecord
-from cavmarl.handoff.coordinator.journal import AnyJournal
+from cavmarl.handoff.coordinator.journal import Journal
 from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.decisions import Neighbours
 from cavmarl.ownership.directory import Directory
@@ -44,7 +44,7 @@ class _World:
         run: bytes,
         zones: int,
         limits: Limits,
-        journal: AnyJournal | None,
+        journal: Journal | None,
         is_checked: bool,
     ) -> None:
         self.states = CrossingDigests()
@@ -56,7 +56,7 @@ class _World:
         self.answered: set[tuple[int, int]] = set()
         self.has_told = False  # of the present episode, by a STEP to each zone
         self.has_begun = False  # before the first reset nodes have rows of no episode
-        self.on_record = OwnersOnRecord(zones, limits, is_direct=True) if is_checked else None
+        self.on_record = OwnersOnRecord(zones, limits) if is_checked else None
 
     def check_owned(self, w: int, reports: Sequence[Report]) -> None:
         """Compare the vehicles that zones own by their rows with the records.
@@ -110,7 +110,7 @@ class NodeCoordinator:
         node_of: Sequence[int],  # zone → the node that hosts it
         limits: Limits,
         links: Links,  # to all nodes
-        journals: Sequence[AnyJournal | None],  # of each world
+        journals: Sequence[Journal | None],  # of each world
         is_checked: bool = False,  # whether it is checked what zones own
     ) -> None:
         self._worlds = [

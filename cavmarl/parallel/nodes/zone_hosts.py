@@ -178,9 +178,6 @@ class ZoneHosts:
             self._targets[w] = {}
             self._stirred[w] = True
 
-    def save(self) -> None:
-        """Nothing is kept apart of what is in the rows."""
-
     def in_flight(self, w: int) -> list[TransferInFlight]:
         return [
             TransferInFlight(vehicle, zone, target, "offered")

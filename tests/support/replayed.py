@@ -1,8 +1,8 @@
-"""Divided worlds that are harmed on purpose, held step by step against the undivided one."""
+"""Divided worlds, compared step by step with a recorded run of the undivided one."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,11 +10,10 @@ from typing import Any
 from numpy.typing import NDArray
 
 from cavmarl import CavVectorEnv, make_vec
-from cavmarl.handoff.fault_injection.fault_plan import MESSAGES, Faults
-from cavmarl.ownership.messages import Message, Record, Step
+from cavmarl.ownership.limits import Limits
+from cavmarl.ownership.messages import Record
 from cavmarl.ownership.trace import LOG, TraceEntry
 from cavmarl.ownership.trace_check import TraceChecker
-from cavmarl.ownership.transport import Rates
 from cavmarl.verify.differences import Arrays, same_bytes, step_results
 
 # Long ticks, so that a few of them are enough for many to go over borders.
@@ -29,32 +28,18 @@ BUSY: Mapping[str, Any] = {
     "population.agents": 6,
     "population.background": 110,
 }
-NOISE: Mapping[str, Rates] = {kind: Rates(0.1, 0.1, 0.1, 0.1, 0.05) for kind in MESSAGES}
-ROUGH = Faults(seed=5, messages=NOISE, crash_rate=0.002)
-"""Anybody dies at any time, and messages are lost, late, doubled, out of order and damaged."""
 
 
 class Checked:
-    """A watcher that lets the trace checker judge all that happens.
+    """A watcher that lets the trace checker judge all records."""
 
-    A STEP that is sent again has to say the same, too.
-    """
-
-    def __init__(self, deferral: int, lifetime: int = 16, is_direct: bool = False) -> None:
-        self._checker = TraceChecker(deferral, lifetime, is_direct)
-        self._sent: dict[tuple[int, int], bytes] = {}
+    def __init__(self) -> None:
+        limits = Limits()
+        self._checker = TraceChecker(limits.deferral, limits.lifetime, is_direct=True)
 
     def logged(self, records: Iterable[Record]) -> None:
         for record in records:
             self._checker.take(TraceEntry(LOG, record))
-
-    def delivered(self, destination: int, message: Message) -> None:
-        self._checker.take(TraceEntry(destination, message))
-        if isinstance(message, Step):
-            for vehicle, _, forced, _, state in message.enter:
-                if forced:
-                    told = self._sent.setdefault((message.tick, vehicle), state)
-                    assert told == state, f"vehicle {vehicle} on its way to tick {message.tick}"
 
 
 @dataclass
@@ -92,24 +77,16 @@ def record(
 def replay(
     run: Recorded,
     zones: int,
-    faults: Faults | None = None,
     settings: Mapping[str, Any] | None = None,
-    watchers: Sequence[Any] = (),
 ) -> CavVectorEnv:
     """Drive a divided world through the same run; it is the same after every step.
 
     The trace of each world is checked, too, and hand-overs happen.
     """
     wanted = run.settings | dict(settings or {})
-    if faults is not None:
-        wanted["zones.faults"] = faults.to_json()
     vec = make_vec(run.env, num_envs=run.worlds, zones=zones, overrides=wanted)
     for coordinator in vec.simulation.coordinators:
-        deadlines = vec.simulation.config.zones
-        longest = deadlines.max_deferred_ticks
-        coordinator.watch(Checked(longest, is_direct=faults is None))
-        for watcher in watchers:
-            coordinator.watch(watcher)
+        coordinator.watch(Checked())
     follow(run, vec)
     assert vec.simulation.migrations > 0
     return vec

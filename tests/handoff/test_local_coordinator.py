@@ -1,8 +1,7 @@
-"""The coordinator of a divided world: its journal, what it counts, who watches it."""
+"""The coordinator of a divided world in one process: its journal, and what it counts."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,25 +9,18 @@ import pytest
 
 from cavmarl import make_vec
 from cavmarl.core.errors import ProtocolError
-from cavmarl.core.records.codes import DRIVER_AGENT, EVENT_COLLIDED
 from cavmarl.engine.world_setup import load_world
 from cavmarl.handoff.coordinator import local_coordinator as direct
-from cavmarl.handoff.coordinator.coordinator import Near
 from cavmarl.handoff.coordinator.journal import JournalReader
 from cavmarl.handoff.coordinator.journal_summary import owners_at
 from cavmarl.handoff.coordinator.local_coordinator import LocalCoordinator
-from cavmarl.handoff.fault_injection.fault_plan import Crash, Faults
-from cavmarl.handoff.fault_injection.message_coordinator import MessageCoordinator
 from cavmarl.ownership.log_records import replay as replay_records
-from cavmarl.ownership.messages import Begin, Commit, Reset
-from cavmarl.ownership.trace import LOG, Trace
-from cavmarl.ownership.transport import Rates
+from cavmarl.ownership.messages import Begin
 from cavmarl.zones.kernels.handoff import LATE
 from cavmarl.zones.partition.zone_file import write_zones
 from cavmarl.zones.partition.zone_partition import ZonePartition
 from tests.cli.test_main import run as command
-from tests.support.driving import idle, make_simulation, start
-from tests.support.faulted import BUSY, QUICK, ROUGH, Recorded, record, replay
+from tests.support.replayed import BUSY, QUICK, Recorded, record, replay
 
 ZONES = 4
 STEPS = 15
@@ -39,11 +31,9 @@ def busy() -> Recorded:
     return record("grid4x4", BUSY, STEPS)
 
 
-def test_at05_the_journal_of_a_run_with_deaths_names_the_owners(
-    busy: Recorded, tmp_path: Path
-) -> None:
+def test_the_journal_of_a_run_names_the_owners(busy: Recorded, tmp_path: Path) -> None:
     path = tmp_path / "run.jsonl"
-    vec = replay(busy, ZONES, ROUGH, {"zones.journal": str(path)})
+    vec = replay(busy, ZONES, {"zones.journal": str(path)})
     table = vec.simulation.coordinators[0].directory.table
     records = tuple(JournalReader(path))
     told = replay_records(records)
@@ -58,53 +48,12 @@ def test_at05_the_journal_of_a_run_with_deaths_names_the_owners(
     assert command("journal", str(path)) == 0
 
 
-def test_a_journal_on_disk_outlives_its_coordinator_at_every_line(
-    busy: Recorded, tmp_path: Path
-) -> None:
-    points = ("BEGIN torn", "BEGIN written", "COMMIT torn", "COMMIT written")
-    deaths = tuple(Crash(tick, point) for tick in range(1, 2 * STEPS, 3) for point in points)
-    path = tmp_path / "run.jsonl"
-    vec = replay(busy, ZONES, Faults(crashes=deaths), {"zones.journal": str(path)})
-    assert len(vec.simulation.revivals) == len(deaths)
-    commits = [r.tick for r in JournalReader(path) if isinstance(r, Commit)]
-    assert commits == list(range(1, 2 * STEPS + 1))
-
-
 def test_each_world_has_a_journal_of_its_own(tmp_path: Path) -> None:
     run = record("grid4x4", BUSY, 6, worlds=2)
-    vec = replay(run, 2, None, {"zones.journal": str(tmp_path / "run.jsonl")})
+    vec = replay(run, 2, {"zones.journal": str(tmp_path / "run.jsonl")})
     for w, coordinator in enumerate(vec.simulation.coordinators):
         told = replay_records(JournalReader(tmp_path / f"run.{w}.jsonl"))
         assert told.owners == coordinator.directory.table.owners
-
-
-def on_record(path: Path) -> list[object]:
-    """What a journal says, but for what is drawn anew for every run."""
-    told: list[object] = []
-    for entry in JournalReader(path):
-        if isinstance(entry, Commit):
-            zones = [(z.zone, z.incarnation, z.owned.vehicles, z.rows) for z in entry.zones]
-            told.append((entry.tick, entry.removed, zones, entry.world))
-        else:
-            told.append(replace(entry, run=b"") if isinstance(entry, Reset) else entry)
-    return told
-
-
-@pytest.mark.parametrize("env", ["grid4x4", "merge", "town"])
-def test_without_messages_the_same_is_put_on_record_as_with_them(env: str, tmp_path: Path) -> None:
-    settings = {"clock.sim_dt_s": 0.1}
-    run = record(env, settings, 40)
-    direct, sent = tmp_path / "direct.jsonl", tmp_path / "sent.jsonl"
-    one = replay(run, 4, None, {"zones.journal": str(direct)})
-    two = replay(run, 4, Faults(), {"zones.journal": str(sent)})
-    assert isinstance(one.simulation.coordinators[0], LocalCoordinator)
-    assert isinstance(two.simulation.coordinators[0], MessageCoordinator)
-    assert on_record(direct) == on_record(sent)
-    for name in ("switched", "acknowledged", "aborted", "removed"):
-        mine, theirs = one.simulation.transfers[0], two.simulation.transfers[0]
-        assert mine.counts[name] == theirs.counts[name], name
-    kept = [row._replace(ms=None, state_bytes=0) for row in mine.rows]
-    assert kept == [row._replace(ms=None, state_bytes=0) for row in theirs.rows]
 
 
 def just_before_the_end_of(edge: str, path: Path) -> Path:
@@ -124,7 +73,7 @@ def just_before_the_end_of(edge: str, path: Path) -> Path:
 
 
 def test_who_leaves_in_the_tick_of_its_change_is_told_from_others(tmp_path: Path) -> None:
-    """With messages and without: the trip ends in 3.5 m, and a tick takes the car up to 2.8 m."""
+    """The trip ends in 3.5 m, and a tick takes the car up to 2.8 m."""
     demand = tmp_path / "grid.rou.xml"
     demand.write_text(
         '<routes><flow id="a" from="C3D3" to="D3right3" begin="0" end="60" period="2"/></routes>',
@@ -140,22 +89,18 @@ def test_who_leaves_in_the_tick_of_its_change_is_told_from_others(tmp_path: Path
         "zones.hysteresis_m": 0.0,
     }
     run = record("grid4x4", settings, 150)
-    logs = [replay(run, 2, faults).simulation.transfers[0] for faults in (None, Faults())]
-    direct, sent = ([row._replace(ms=None, state_bytes=0) for row in log.rows] for log in logs)
-    assert direct == sent
-    gone = [row.removed for row in direct]
+    log = replay(run, 2).simulation.transfers[0]
+    gone = [row.removed for row in log.rows]
     assert 3 < sum(gone) < len(gone) - 3
-    assert [log.counts["removed"] for log in logs] == [sum(gone)] * 2
-    assert [row.release_depth_m is None for row in direct] == gone
+    assert log.counts["removed"] == sum(gone)
+    assert [row.release_depth_m is None for row in log.rows] == gone
 
 
 def test_whoever_turns_away_from_a_border_is_forgotten() -> None:
     run = record("grid4x4", {**BUSY, "zones.approach_ticks": 30}, 2 * STEPS)
-    direct, sent = replay(run, ZONES).simulation, replay(run, ZONES, Faults()).simulation
-    assert direct.transfers[0].counts["aborted"] > 0
-    on_their_way = [entry[:3] for entry in direct.coordinators[0].in_flight()]
-    assert on_their_way == [entry[:3] for entry in sent.coordinators[0].in_flight()]
-    assert len(on_their_way) > 5
+    simulation = replay(run, ZONES).simulation
+    assert simulation.transfers[0].counts["aborted"] > 0
+    assert len(simulation.coordinators[0].in_flight()) > 5
 
 
 def test_a_world_of_few_vehicles_has_room_for_all_changes_that_wait() -> None:
@@ -223,39 +168,6 @@ def test_a_vehicle_that_is_lost_is_missed(busy: Recorded) -> None:
             vec.step(vec.suggest_actions())
 
 
-def test_hand_overs_are_counted_once_whoever_dies(busy: Recorded) -> None:
-    deaths = tuple(
-        Crash(tick, point)
-        for tick in range(1, 2 * STEPS)
-        for point in ("BEGIN torn", "STEP sent", "COMMIT torn", "COMMIT written")
-    )
-    calm, harmed = replay(busy, ZONES), replay(busy, ZONES, Faults(crashes=deaths))
-    rows = harmed.simulation.transfers[0].rows
-    assert harmed.simulation.migrations == len(rows) == calm.simulation.migrations
-
-
-def test_what_did_not_count_is_known_after_its_party_has_died(busy: Recorded) -> None:
-    rates = Rates(duplicate=1.0, longest_delay=4)
-    messages = dict.fromkeys(("Prepare", "Step", "Done", "Ack"), rates)
-    everybody = (*range(ZONES), None)
-    last = tuple(Crash(2 * STEPS, "advance", zone) for zone in everybody)
-    vec = replay(busy, ZONES, Faults(messages=messages, crashes=last))
-    (coordinator,) = vec.simulation.coordinators
-    assert coordinator.dropped()["Step", "tick"] > sum(
-        endpoint.dropped["Step", "tick"] for endpoint in coordinator.endpoints.values()
-    )
-    assert coordinator.dropped()["Done", "tick"] > coordinator.directory.dropped["Done", "tick"]
-
-
-def test_at06_a_watcher_sees_the_log_and_every_arrival(busy: Recorded) -> None:
-    trace = Trace()
-    vec = replay(busy, ZONES, ROUGH, watchers=[trace])
-    log = [entry.item for entry in trace.entries if entry.destination == LOG]
-    assert sum(len(r.switches) for r in log if isinstance(r, Begin)) == vec.simulation.migrations
-    assert any(entry.destination == 0 for entry in trace.entries)
-    assert trace.text().count("COMMIT") == 2 * STEPS
-
-
 def test_the_journal_tells_actions_apart(tmp_path: Path) -> None:
     told = []
     for name, throttle in (("one", 0.0), ("again", 0.0), ("other", 0.5)):
@@ -285,30 +197,3 @@ def test_an_undivided_world_has_a_journal_if_asked_for_one(tmp_path: Path) -> No
     assert {zone for zone, _ in owners.values()} == {0}
     undivided = make_vec("grid4x4", num_envs=1, agents=4, background=10)
     assert not undivided.simulation.coordinators, "nobody keeps what nobody asks for"
-
-
-def test_all_rows_are_looked_at_where_the_list_of_those_near_a_border_is_stale(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    plan = '{"crashes": [{"tick": 3, "point": "resolve", "zone": 1}]}'
-    settings = {"zones.count": 4, "zones.faults": plan, "clock.ctrl_dt_s": 0.05}
-    simulation = make_simulation("grid4x4", mode="respawn", agents=4, overrides=settings)
-    start(simulation, seed=1)
-    division, looked = simulation._tick.division, []
-    near = division.near
-
-    def look(w: int, everybody: bool) -> list[Near]:
-        looked.append((simulation.coordinators[0].tick + 1, everybody))
-        return near(w, everybody)
-
-    monkeypatch.setattr(division, "near", look)
-    for step in range(5):
-        if step == 4:
-            # Somebody is taken out between two ticks, and the last row moves to its place.
-            rows = simulation._shards[0].worlds.rows
-            rows[0, 0]["driver"], rows[0, 0]["events"] = DRIVER_AGENT, EVENT_COLLIDED
-            rows[0, 0]["departed"] = -9
-            simulation.outputs.terminated[0, 0] = True
-            simulation.retire_agents()
-        simulation.step(idle(simulation))
-    assert looked == [(1, True), (2, False), (3, False), (3, True), (4, False), (5, True)]

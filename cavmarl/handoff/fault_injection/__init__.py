@@ -1,1 +1,0 @@
-"""Lost messages and dying hosts by plan, and recovery from the committed state."""
