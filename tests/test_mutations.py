@@ -16,4 +16,4 @@ def test_no_row_is_passed_over() -> None:
 @pytest.mark.parametrize("mutation", read_table(), ids=lambda mutation: str(mutation.number))
 def test_a_row_fits_the_code(mutation: Mutation) -> None:
     assert mutated(mutation) != (ROOT / mutation.file).read_text()
-    assert all((ROOT / test).exists() for test in mutation.tests.split())
+    assert all((ROOT / test.partition("::")[0]).exists() for test in mutation.tests.split())

@@ -9,7 +9,6 @@ from cavmarl.core.errors import ProtocolError
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import Birth, Deferral, Switch
 from cavmarl.ownership.readiness import Readiness
-from cavmarl.ownership.safeguards import Safeguards
 from cavmarl.ownership.table import Table
 from cavmarl.ownership.transitions import State
 
@@ -66,14 +65,12 @@ class Decisions:
         readiness: Readiness,
         store: CommittedStates,
         limits: Limits,
-        safeguards: Safeguards,
         neighbours: Neighbours | None = None,  # None: each zone has all others
     ) -> None:
         self.neighbours = neighbours
         self._readiness = readiness
         self._store = store
         self._limits = limits
-        self._safeguards = safeguards
 
     def switches(
         self, table: Table, movers: Iterable[tuple[int, int]]
@@ -87,21 +84,17 @@ class Decisions:
         for vehicle, zone in sorted(movers):
             _check_exist(table, vehicle, zone)
             source, epoch = table.owners[vehicle]
-            target = zone
-            if not self._safeguards.target_by_position:
-                target = self._readiness.holder(vehicle, table.tick, zone)
-            if target == source:
+            if zone == source:
                 continue
-            if self.neighbours and self.neighbours.is_teleport(vehicle, source, target):
+            if self.neighbours and self.neighbours.is_teleport(vehicle, source, zone):
                 teleports.append(vehicle)
             waited = table.deferred.get(vehicle, 0)
-            may_wait = waited < self._limits.deferral or not self._safeguards.deadline
-            if self._ready(table, vehicle, target, epoch):
-                switches.append(Switch(vehicle, source, target, epoch + 1, False))
-            elif may_wait:
+            if self._ready(table, vehicle, zone, epoch):
+                switches.append(Switch(vehicle, source, zone, epoch + 1, False))
+            elif waited < self._limits.deferral:
                 deferred.append(Deferral(vehicle, waited + 1))
             else:
-                switches.append(Switch(vehicle, source, target, epoch + 1, True))
+                switches.append(Switch(vehicle, source, zone, epoch + 1, True))
         gone = {switch.vehicle for switch in switches}
         return tuple(switches), tuple(deferred), tuple(v for v in teleports if v in gone)
 
@@ -113,10 +106,7 @@ class Decisions:
                 raise ProtocolError(
                     f"vehicle {vehicle} begins in zone {zone}, which does not exist"
                 )
-            used = vehicle in table.owners or vehicle in ids
-            if self._safeguards.removed_is_final:
-                used = used or vehicle in table.seen
-            if used or vehicle < 0:
+            if vehicle in table.seen or vehicle in ids or vehicle < 0:
                 raise ProtocolError(
                     f"vehicle {vehicle} begins: an episode uses an id once, and none below 0"
                 )

@@ -39,7 +39,6 @@ from cavmarl.ownership.messages import (
 from cavmarl.ownership.planning import all_removed, check_done
 from cavmarl.ownership.reactions import Hosting
 from cavmarl.ownership.readiness import Readiness
-from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 from cavmarl.ownership.table import Table
 from cavmarl.ownership.transitions import State
 
@@ -69,21 +68,19 @@ class Directory:
         zones: Iterable[int],
         store: CommittedStates,
         limits: Limits | None = None,
-        safeguards: Safeguards = ALL_ON,
         neighbours: Neighbours | None = None,  # None: each zone has all others
     ) -> None:
         self.run = run
-        self.table = Table(zones, safeguards)
+        self.table = Table(zones)
         self.dones: dict[int, Done] = {}  # zone → its DONE for the tick in progress
         self.is_quiet = False  # the tick in progress is one of `begin_quiet`
-        self.readiness = Readiness(safeguards)  # what targets have acknowledged
+        self.readiness = Readiness()  # what targets have acknowledged
         self.dropped: Counter[tuple[str, str]] = Counter()
         self.refusals: Counter[Refusal] = Counter()
         self._payloads: Mapping[int, bytes] = {}
         self._store = store
         self._limits = Limits() if limits is None else limits
-        self._safeguards = safeguards
-        self._decisions = Decisions(self.readiness, store, self._limits, safeguards, neighbours)
+        self._decisions = Decisions(self.readiness, store, self._limits, neighbours)
 
     @classmethod
     def restore(
@@ -92,23 +89,15 @@ class Directory:
         zones: Iterable[int],
         store: CommittedStates,
         limits: Limits | None = None,
-        safeguards: Safeguards = ALL_ON,
         neighbours: Neighbours | None = None,
     ) -> Directory:
         """The coordinator that wrote these records. Send what `resend` says before all else."""
         if not records or not isinstance(records[0], Reset):
             raise JournalError("a log begins with a RESET, which names the run")
-        directory = cls(records[0].run, zones, store, limits, safeguards, neighbours)
+        directory = cls(records[0].run, zones, store, limits, neighbours)
         for record in records:
             directory.table.apply(record)
         return directory
-
-    def again(self, records: Sequence[Record]) -> Directory:
-        """Another coordinator of the same world, with the state of a log; see `restore`."""
-        zones = tuple(self.table.hosts)
-        return Directory.restore(
-            records, zones, self._store, self._limits, self._safeguards, self._decisions.neighbours
-        )
 
     def know(self, neighbours: Neighbours) -> None:
         """From now on let vehicles change between neighbours only."""
@@ -122,8 +111,6 @@ class Directory:
         tick = table.tick + self.is_quiet if table.plan is None else table.plan.record.tick
         episode = table.episode + 1
         self.dones, self.is_quiet = {}, False
-        if not self._safeguards.tick_never_resets:
-            tick, episode = 0, 0
         return self._logged(Reset(episode, tick, self.run))
 
     def host(self, zone: int, worker: int) -> Output:
@@ -135,7 +122,7 @@ class Directory:
         if table.plan is not None:
             if table.states[zone] is State.HOSTED:
                 raise ProtocolError(f"zone {zone} moves in the middle of a tick: fence it first")
-            if table.repeats[zone] >= self._limits.repeats and self._safeguards.repeat_limit:
+            if table.repeats[zone] >= self._limits.repeats:
                 raise LostTickError(table.plan.record.tick, table.repeats[zone] + 1, zone)
         incarnation = table.hosts[zone][1] + 1
         output = self._logged(Host(table.episode, table.tick, zone, incarnation, worker))
@@ -177,8 +164,7 @@ class Directory:
         switches, deferred, teleports = self._decisions.switches(table, movers)
         decided = (switches, deferred, new, inputs, teleports)
         begun = self._logged(Begin(table.episode, table.tick + 1, *decided))
-        records = begun.records if self._safeguards.log_before_send else ()
-        return Output(records, self.resend(payloads=payloads or {}).messages)
+        return Output(begun.records, self.resend(payloads=payloads or {}).messages)
 
     def check_births(self, births: Sequence[Birth]) -> None:
         """See that new vehicles are new.
@@ -235,9 +221,7 @@ class Directory:
         output = self._logged(Commit(begin.episode, begin.tick, all_removed(dones), zones, world))
         self.dones = {}
         self.readiness.forget(table.tick)
-        if self._safeguards.log_before_send:
-            return output
-        return Output((begin, *output.records))
+        return output
 
     def begin_quiet(self) -> bool:
         """Begin a tick of which there is nothing to say: no vehicle changes its owner, none is new.
@@ -292,27 +276,23 @@ class Directory:
     # Inside
 
     def _misfit(self, message: Message) -> str | None:
-        guards, table = self._safeguards, self.table
-        if message.run != self.run and guards.run_fence:
+        table = self.table
+        if message.run != self.run:
             return "run"
-        if message.episode != table.episode and guards.tick_never_resets:
+        if message.episode != table.episode:
             return "episode"
         if not isinstance(message, (Done, Ack, Nack, Need)):
             return "kind"
         if message.zone not in table.hosts:
             return "zone"
-        checked = guards.done_incarnation if isinstance(message, Done) else guards.ack_incarnation
-        if checked and not table.alive(message.zone, message.incarnation):
+        if not table.alive(message.zone, message.incarnation):
             return "incarnation"
         current = table.plan is not None and message.tick == table.tick + 1
         if isinstance(message, (Ack, Nack)):
             current = current or (self.is_quiet and message.tick == table.tick + 1)
-            fresh = current or message.tick == table.tick or not guards.ack_freshness
-            return None if fresh else "tick"
-        if isinstance(message, Done):
-            if message.zone in self.dones:
-                return "answered"
-            current = current or not guards.done_tick
+            return None if current or message.tick == table.tick else "tick"
+        if isinstance(message, Done) and message.zone in self.dones:
+            return "answered"
         return None if current else "tick"
 
     def _on_ack(self, ack: Ack) -> None:
@@ -324,8 +304,6 @@ class Directory:
                 self.dropped["Ack", "unknown"] += 1
 
     def _on_need(self, need: Need) -> Output:
-        if not self._safeguards.reattach:
-            return SILENCE
         plan = self.table.planned
         for vehicle in need.vehicles:
             switch = plan.switches.get(vehicle)
@@ -336,15 +314,13 @@ class Directory:
         return self.resend((need.zone,))
 
     def _check_dones(self, rows: Mapping[int, int]) -> None:
-        if self._safeguards.digest_before_commit:
-            wrong = tuple(zone for zone, done in self.dones.items() if rows.get(zone) != done.rows)
-            for zone in wrong:
-                del self.dones[zone]
-            if wrong:
-                raise StoreError(tuple(sorted(wrong)))
-        if self._safeguards.ledger:
-            for done in self.dones.values():
-                check_done(self.run, self.table.planned, done, self.table.owners)
+        wrong = tuple(zone for zone, done in self.dones.items() if rows.get(zone) != done.rows)
+        for zone in wrong:
+            del self.dones[zone]
+        if wrong:
+            raise StoreError(tuple(sorted(wrong)))
+        for done in self.dones.values():
+            check_done(self.run, self.table.planned, done, self.table.owners)
 
     def _step(self, zone: int) -> Step:
         return make_step(self.table, zone, self._store, self._payloads.get(zone, b""))

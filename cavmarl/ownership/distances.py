@@ -14,7 +14,6 @@ from dataclasses import dataclass
 
 from cavmarl.core.errors import ConfigError
 from cavmarl.ownership.limits import Limits
-from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,13 +34,13 @@ class Distances:
                 "shorten them"
             )
 
-    def offers(self, depth_m: float, safeguards: Safeguards = ALL_ON) -> bool:
+    def offers(self, depth_m: float) -> bool:
         """Whether the owner offers the vehicle to the zone behind the border."""
-        return depth_m > (-self.approach_m if safeguards.early_offer else 0.0)
+        return depth_m > -self.approach_m
 
-    def switches(self, depth_m: float, safeguards: Safeguards = ALL_ON) -> bool:
+    def switches(self, depth_m: float) -> bool:
         """Whether the vehicle has crossed, and is a mover for `Directory.begin`."""
-        return depth_m > (self.hysteresis_m if safeguards.hysteresis else 0.0)
+        return depth_m > self.hysteresis_m
 
     def releases(self, depth_m: float) -> bool:
         """Whether the vehicle is out of the sight of the zone that it left."""

@@ -33,7 +33,6 @@ from cavmarl.ownership.messages import (
 from cavmarl.ownership.offers import Approach, Offers
 from cavmarl.ownership.reactions import Advance, Hosting, Reaction
 from cavmarl.ownership.replicas import Replicas
-from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 from cavmarl.ownership.transitions import Event, Party, State, after
 
 NOTHING = Reaction()
@@ -47,7 +46,7 @@ class Endpoint:
         dropped: (kind, reason) → messages or entries that did not count.
     """
 
-    def __init__(self, hosting: Hosting, limits: Limits, safeguards: Safeguards = ALL_ON) -> None:
+    def __init__(self, hosting: Hosting, limits: Limits) -> None:
         self.run, self.episode = hosting.run, hosting.episode
         self.zone, self.incarnation = hosting.zone, hosting.incarnation
         self.tick = hosting.tick  # the tick that the rows are at
@@ -55,14 +54,12 @@ class Endpoint:
         self.owned = dict(hosting.owned)  # vehicle → epoch
         self.tally = tally(self.run, self.owned)
         self.retained: dict[int, int] = {}
-        self.replicas = Replicas(limits, safeguards)  # states of vehicles that may come
+        self.replicas = Replicas(limits)  # states of vehicles that may come
         self.offers = Offers(limits)  # states that neighbours were offered
         self.dropped: Counter[tuple[str, str]] = Counter()
         self._answer: Done | None = None
         self._entering: tuple[Confirmed, ...] = ()
-        self._overwrites: dict[int, bytes] = {}
         self._limits = limits
-        self._safeguards = safeguards
 
     def row_state(self, vehicle: int) -> State:
         if vehicle in self.owned:
@@ -164,10 +161,10 @@ class Endpoint:
         )  # fmt: skip
 
     def _misfit(self, message: Message) -> str | None:
-        if message.run != self.run and self._safeguards.run_fence:
+        if message.run != self.run:
             return "run"
         newer = isinstance(message, Step) and message.episode > self.episode
-        if message.episode != self.episode and not newer and self._safeguards.tick_never_resets:
+        if message.episode != self.episode and not newer:
             return "episode"
         match message:
             case Step(zone=zone, incarnation=incarnation):
@@ -185,10 +182,9 @@ class Endpoint:
     def _on_step(self, step: Step) -> Reaction:
         if step.episode > self.episode:
             self._begin_episode(step)
-        if step.tick == self.tick and self._answer is not None and self._safeguards.answer_again:
+        if step.tick == self.tick and self._answer is not None:
             return Reaction((self._answer,))
-        stale = step.tick <= self.tick and self._safeguards.step_tick
-        if stale or step.tick > self.tick + 1 or self.lease is not None:
+        if step.tick != self.tick + 1 or self.lease is not None:
             return self._drop(step, "tick")
         needed = tuple(
             vehicle
@@ -204,10 +200,8 @@ class Endpoint:
     def _take_lease(self, step: Step) -> Advance:
         release = self._release()
         leave = tuple(vehicle for vehicle, _ in step.leave)
-        if self._safeguards.one_step_lease:
-            for vehicle in leave:
-                self._leave(vehicle)
-        overwrites, self._overwrites = tuple(self._overwrites.items()), {}
+        for vehicle in leave:
+            self._leave(vehicle)
         enter = []
         for vehicle, epoch, forced, _, state in step.enter:
             self._own(vehicle, epoch, Event.IN)
@@ -215,12 +209,11 @@ class Endpoint:
             enter.append((vehicle, state if forced else replica))
         for vehicle, _ in step.spawn:
             self._own(vehicle, 0, Event.SPAWN)
-        if self._safeguards.ledger and step.owned != self.tally:
+        if step.owned != self.tally:
             step.owned.check(self.tally, f"zone {self.zone} on its way to tick {step.tick}")
         self._hold(step.tick, tuple(Confirmed(vehicle, epoch) for vehicle, epoch, *_ in step.enter))
         return Advance(
-            self.episode, step.tick, release, leave, overwrites + tuple(enter), step.spawn,
-            step.payload,
+            self.episode, step.tick, release, leave, tuple(enter), step.spawn, step.payload,
         )  # fmt: skip
 
     def _release(self) -> tuple[int, ...]:
@@ -245,13 +238,12 @@ class Endpoint:
         epoch = self.owned.pop(vehicle)
         self.tally = self.tally.minus(self.run, vehicle, epoch)
         self.offers.forget(vehicle)
-        if self._safeguards.copy_until_commit:
-            self.retained[vehicle] = epoch
+        self.retained[vehicle] = epoch
 
     def _begin_episode(self, step: Step) -> None:
         self.episode, self.tick, self.lease, self._answer = step.episode, step.committed, None, None
         self.owned, self.retained, self.tally = {}, {}, OwnedTally()
-        self.replicas = Replicas(self._limits, self._safeguards)
+        self.replicas = Replicas(self._limits)
         self.offers = Offers(self._limits)
 
     def _on_prepare(self, message: Prepare) -> Reaction:
@@ -259,8 +251,6 @@ class Endpoint:
         for offer in message.entries:
             own = self.owned.get(offer.vehicle, -1)
             if own >= offer.epoch:
-                if not self._safeguards.replica_slot:
-                    self._overwrites[offer.vehicle] = offer.state
                 self.dropped["Prepare", "owned"] += 1
                 continue
             taken = self.replicas.prepare(offer, message.tick, message.schema)

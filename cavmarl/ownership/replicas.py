@@ -13,7 +13,6 @@ from typing import NamedTuple
 from cavmarl.ownership.ledger import state_digest
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import Offer, Refusal
-from cavmarl.ownership.safeguards import Safeguards
 from cavmarl.ownership.transitions import Event, Party, State, after
 
 
@@ -33,12 +32,11 @@ class Replicas:
         fences: vehicle → (epoch, tick) of the newest PREPARE or ABORT heard.
     """
 
-    def __init__(self, limits: Limits, safeguards: Safeguards) -> None:
+    def __init__(self, limits: Limits) -> None:
         self.held: dict[int, Replica] = {}  # vehicle → replica
         self.fences: dict[int, tuple[int, int]] = {}
         self._heard: defaultdict[int, list[int]] = defaultdict(list)  # tick → vehicles
         self._limits = limits
-        self._safeguards = safeguards
 
     def state(self, vehicle: int) -> State:
         return State.PREPARED if vehicle in self.held else State.EMPTY
@@ -48,9 +46,9 @@ class Replicas:
         held = self.held.get(offer.vehicle)
         if not self._newer(offer.vehicle, offer.epoch, tick):
             return held is not None and held[:3] == (offer.epoch, tick, offer.digest)
-        if self._safeguards.state_digest and state_digest(offer.state) != offer.digest:
+        if state_digest(offer.state) != offer.digest:
             return Refusal.DIGEST  # damaged on its way: not heard, so it may be sent again
-        if self._safeguards.state_schema and schema != self._limits.schema:
+        if schema != self._limits.schema:
             return self.refuse(offer, tick, Refusal.SCHEMA)
         if held is None and len(self.held) >= self._limits.capacity:
             return self.refuse(offer, tick, Refusal.LOAD)
@@ -66,20 +64,15 @@ class Replicas:
 
     def abort(self, vehicle: int, epoch: int, tick: int) -> bool:
         """Drop a replica; False if the message is older than what has been heard."""
-        if self._safeguards.abort_fence and not self._newer(vehicle, epoch, tick):
+        if not self._newer(vehicle, epoch, tick):
             return False
         after(Party.REPLICA, self.state(vehicle), Event.ABORT)
         self.held.pop(vehicle, None)
-        if self._safeguards.fence_stays:
-            self._raise_fence(vehicle, epoch, tick)
-        else:
-            self.fences.pop(vehicle, None)
+        self._raise_fence(vehicle, epoch, tick)
         return True
 
     def exact(self, vehicle: int, epoch: int, tick: int, digest: bytes) -> bool:
         held = self.held.get(vehicle)
-        if held is not None and not self._safeguards.exact_promotion:
-            return True
         return held is not None and held[:3] == (epoch, tick, digest)
 
     def take(self, vehicle: int) -> bytes:
@@ -90,8 +83,6 @@ class Replicas:
 
     def expire(self, now: int) -> None:
         """Drop what has not been refreshed for the lifetime, with its fence."""
-        if not self._safeguards.replica_lifetime:
-            return
         last = now - self._limits.lifetime
         if not self._heard or min(self._heard) > last:
             return

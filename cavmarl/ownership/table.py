@@ -25,7 +25,6 @@ from cavmarl.ownership.messages import (
     Switch,
 )
 from cavmarl.ownership.planning import OwnershipPlan, make_plan
-from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 from cavmarl.ownership.transitions import Event, Party, State, after
 
 _Move: TypeAlias = tuple[int, int, int, bool]
@@ -45,7 +44,7 @@ class Table:
         counts: zone → how many vehicles it owned at the committed tick.
     """
 
-    def __init__(self, zones: Iterable[int], safeguards: Safeguards = ALL_ON) -> None:
+    def __init__(self, zones: Iterable[int]) -> None:
         self.run, self.tick, self.episode = b"", 0, -1
         self.owners: dict[int, tuple[int, int]] = {}
         self.deferred: dict[int, int] = {}
@@ -54,7 +53,6 @@ class Table:
         self.seen = SeenIds()  # ids that have been in the episode
         self.repeats: Counter[int] = Counter()  # zone → new hosts in the tick in progress
         self.plan: OwnershipPlan | None = None  # the tick in progress, or None
-        self._safeguards = safeguards
         self.counts = dict.fromkeys(self.hosts, 0)
         self._tallies = dict.fromkeys(self.hosts, OwnedTally())
         self._moves: list[_Move] = []  # that are not in the tallies yet
@@ -205,10 +203,7 @@ class Table:
         self.hosts[record.zone] = (record.worker, record.incarnation)
         if self.plan is not None:
             self.repeats[record.zone] += 1
-            if self._safeguards.reattach:
-                self.plan.attach.update(
-                    entry.vehicle for entry in self.plan.enter.get(record.zone, ())
-                )
+            self.plan.attach.update(entry.vehicle for entry in self.plan.enter.get(record.zone, ()))
 
     def _check_zones(self, zones: Iterable[int]) -> None:
         unknown = sorted(set(zones) - self.hosts.keys())

@@ -269,7 +269,6 @@ def test_an_arrival_that_nobody_has_told_of(monkeypatch: pytest.MonkeyPatch) -> 
     simulation = watched()
     coordination: Any = simulation._tick.coordination
     coordinator = coordination.coordinators[0]
-    coordinator._births.append(Birth(8_888, 0, b""))
     monkeypatch.setattr(coordinator, "notes", lambda: ((Birth(8_888, 0, b""),), ()))
     with pytest.raises(ProtocolError, match="vehicle 8888 of zone 0, epoch 0, is lost"):
         drive(simulation)

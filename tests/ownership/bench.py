@@ -21,7 +21,6 @@ from cavmarl.ownership.messages import (
     Step,
 )
 from cavmarl.ownership.offers import Approach
-from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 from cavmarl.ownership.trace import Trace
 from cavmarl.ownership.trace_check import check_trace
 from tests.ownership.explorer import version
@@ -32,11 +31,9 @@ RUN = bytes(range(16))
 class Bench:
     """Zones 0, 1, … of one world."""
 
-    def __init__(
-        self, zones: int = 2, limits: Limits | None = None, safeguards: Safeguards = ALL_ON
-    ) -> None:
-        self.limits, self.safeguards = limits or Limits(), safeguards
-        self.directory = Directory(RUN, range(zones), self, self.limits, safeguards)
+    def __init__(self, zones: int = 2, limits: Limits | None = None) -> None:
+        self.limits = limits or Limits()
+        self.directory = Directory(RUN, range(zones), self, self.limits)
         self.trace, self.log = Trace(), list[Record]()
         self.endpoints: dict[int, Endpoint] = {}
         self.entered: dict[int, bytes] = {}
@@ -58,7 +55,7 @@ class Bench:
 
     def host(self, zone: int) -> Output:
         output = self.note(self.directory.host(zone, worker=zone))
-        self.endpoints[zone] = Endpoint(self.directory.hosting(zone), self.limits, self.safeguards)
+        self.endpoints[zone] = Endpoint(self.directory.hosting(zone), self.limits)
         return output
 
     def crash(self, zone: int) -> Output:

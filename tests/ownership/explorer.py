@@ -40,7 +40,6 @@ from cavmarl.ownership.offers import Approach, Offers
 from cavmarl.ownership.planning import OwnershipPlan
 from cavmarl.ownership.readiness import Readiness
 from cavmarl.ownership.replicas import Replicas
-from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 from cavmarl.ownership.table import Table
 
 RUN = bytes(16)
@@ -71,7 +70,6 @@ class Small:
     window: int = 0
     turns_away: bool = True
     limits: Limits = ONE_TICK
-    safeguards: Safeguards = ALL_ON
 
 
 class Node(NamedTuple):
@@ -148,7 +146,7 @@ class Explorer:
 
     def _first(self) -> Node:
         small = self.small
-        directory = Directory(RUN, range(small.zones), None, small.limits, small.safeguards)  # type: ignore[arg-type]
+        directory = Directory(RUN, range(small.zones), None, small.limits)  # type: ignore[arg-type]
         log = list(directory.reset().records)
         for zone in range(small.zones):
             log += directory.host(zone, zone).records
@@ -289,7 +287,7 @@ class Explorer:
     def _restart(self, node: Node) -> Node:
         small, log = self.small, self._logs[node.directory]
         directory = Directory.restore(
-            log, range(small.zones), None, small.limits, small.safeguards  # type: ignore[arg-type]
+            log, range(small.zones), None, small.limits  # type: ignore[arg-type]
         )  # fmt: skip
         directory = fork(directory)
         sent = self._stirred(directory.resend().messages)
@@ -351,7 +349,7 @@ class Explorer:
 
     def _endpoint(self, directory: Directory, zone: int) -> int:
         hosting = directory.hosting(zone)
-        return self._keep(Endpoint(hosting, self.small.limits, self.small.safeguards))
+        return self._keep(Endpoint(hosting, self.small.limits))
 
     def _stirred(self, sent: Iterable[Message]) -> frozenset[tuple[int, int]]:
         """Messages as items of the soup. Copies for the source are left out: nobody repeats."""
@@ -365,9 +363,8 @@ class Explorer:
 
     def _remembered(self, number: int, tick: int) -> bool:
         message = self._messages[number]
-        guards = self.small.safeguards
         if isinstance(message, Step | Done | Need):
-            return message.tick > tick or not (guards.step_tick and guards.done_tick)
+            return message.tick > tick
         oldest = tick - self.small.window
         return (
             message.tick >= oldest if isinstance(message, Prepare | Abort) else message.tick >= tick

@@ -1,4 +1,4 @@
-"""One scenario for each safeguard: it passes with all of them on, and fails without that one."""
+"""One scenario for each remedy of the protocol; docs/ownership.md lists them with their holes."""
 
 from __future__ import annotations
 
@@ -12,55 +12,60 @@ from cavmarl.ownership.directory import StoreError
 from cavmarl.ownership.distances import Distances
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import Ack, Confirmed, Done, Held, Nack, Need, Prepare, Removed
-from cavmarl.ownership.safeguards import Safeguards
-from cavmarl.ownership.store import MemoryStore
-from cavmarl.ownership.transport import FaultPlan, Rates
 from tests.ownership.bench import Bench
 from tests.ownership.explorer import Explorer, Small, version
 from tests.ownership.simulator import Simulator
 from tests.ownership.toy import ToyWorld
+from tests.support.lossy_network import FaultPlan, Rates
+from tests.support.memory_store import MemoryStore
 
 OTHER_RUN = bytes(reversed(range(16)))
 
 
-def explored(safeguards: Safeguards, **small: object) -> None:
+def explored(**small: object) -> None:
     """In every state all invariants hold, and the end can be reached."""
-    states, reached = Explorer(Small(safeguards=safeguards, **small)).run()  # type: ignore[arg-type]
+    states, reached = Explorer(Small(**small)).run()  # type: ignore[arg-type]
     assert states == reached
 
 
 # The lease and the switch
 
 
-def one_step_lease(safeguards: Safeguards) -> None:
-    explored(replace(safeguards, ledger=False), ticks=2)
+def one_step_lease() -> None:
+    """H1: OUT ends the authority of the source before IN begins another."""
+    explored(ticks=2)
 
 
-def copy_until_commit(safeguards: Safeguards) -> None:
-    explored(safeguards, ticks=2)
+def copy_until_commit() -> None:
+    """H2: the source keeps its frozen row until the switch commits."""
+    explored(ticks=2)
 
 
-def exact_promotion(safeguards: Safeguards) -> None:
-    bench = approached(Bench(safeguards=safeguards))
+def exact_promotion() -> None:
+    """H3: a host promotes the exact replica, or asks for the state."""
+    bench = approached(Bench())
     step = bench.begin(movers=[(7, 1)])[1]
     stale = replace(step, enter=(step.enter[0]._replace(digest=b"of another state"),))
     (answer,) = bench.give(stale)
     assert answer == Need(bench.directory.run, 0, 2, 1, 1, (7,))
 
 
-def reattach(safeguards: Safeguards) -> None:
-    bench = approached(Bench(safeguards=safeguards))
+def reattach() -> None:
+    """H9: a target without its replica is sent the state again."""
+    bench = approached(Bench())
     bench.begin(movers=[(7, 1)])
     bench.pass_on(bench.crash(1).messages)
     assert bench.entered.get(7) == version(7, 1)
 
 
-def deadline(safeguards: Safeguards) -> None:
-    explored(safeguards, ticks=3, limits=Limits(deferral=0))
+def deadline() -> None:
+    """H14: after D ticks the hand-off is forced."""
+    explored(ticks=3, limits=Limits(deferral=0))
 
 
-def target_by_position(safeguards: Safeguards) -> None:
-    bench = Bench(3, safeguards=safeguards)
+def target_by_position() -> None:
+    """H17, H18: the target is where the vehicle is, not was."""
+    bench = Bench(3)
     bench.tick(births=[(7, 0)], offers=[(7, 1)])
     bench.begin(movers=[(7, 2)])
     assert not bench.directory.table.planned.switches, "it is not where it was prepared"
@@ -69,24 +74,27 @@ def target_by_position(safeguards: Safeguards) -> None:
 # Acknowledgements
 
 
-def ack_freshness(safeguards: Safeguards) -> None:
-    bench = approached(Bench(safeguards=replace(safeguards, ack_digest=False)))
+def ack_freshness() -> None:
+    """H3, H4: an ACK counts for its own tick and epoch only."""
+    bench = approached(Bench())
     bench.tick()
     bench.begin(movers=[(7, 1)])
     bench.judge()
     assert not bench.directory.table.planned.switches
 
 
-def ack_incarnation(safeguards: Safeguards) -> None:
-    bench = approached(Bench(safeguards=safeguards))
+def ack_incarnation() -> None:
+    """H8, H26: an ACK of a dead process counts for nothing."""
+    bench = approached(Bench())
     bench.crash(1)
     bench.begin(movers=[(7, 1)])
     bench.judge()
     assert not bench.directory.table.planned.switches
 
 
-def ack_digest(safeguards: Safeguards) -> None:
-    bench = Bench(safeguards=safeguards)
+def ack_digest() -> None:
+    """H25: an ACK names the digest of the state that it holds."""
+    bench = Bench()
     bench.tick(births=[(7, 0)])
     held = Held(7, 0, b"of another state")
     bench.directory.on_message(Ack(bench.directory.run, 0, 1, 1, 1, 0, (held,)))
@@ -94,15 +102,17 @@ def ack_digest(safeguards: Safeguards) -> None:
     assert not bench.directory.table.planned.switches
 
 
-def state_digest(safeguards: Safeguards) -> None:
-    bench, prepare = prepared(safeguards)
+def state_digest() -> None:
+    """H25: a state that does not match its digest is refused."""
+    bench, prepare = prepared()
     entry = prepare.entries[0]._replace(state=b"damaged on its way")
     (answer,) = bench.give(replace(prepare, entries=(entry,)))
     assert isinstance(answer, Nack)
 
 
-def state_schema(safeguards: Safeguards) -> None:
-    bench, prepare = prepared(safeguards)
+def state_schema() -> None:
+    """H25: a state of another schema is refused."""
+    bench, prepare = prepared()
     (answer,) = bench.give(replace(prepare, schema=2))
     assert isinstance(answer, Nack)
 
@@ -110,8 +120,9 @@ def state_schema(safeguards: Safeguards) -> None:
 # Replicas
 
 
-def abort_fence(safeguards: Safeguards) -> None:
-    bench, prepare = prepared(safeguards)
+def abort_fence() -> None:
+    """H5: an older ABORT does not drop a newer replica."""
+    bench, prepare = prepared()
     (abort,) = bench.offer(0)
     bench.commit()
     (step, other) = bench.begin()
@@ -124,8 +135,9 @@ def abort_fence(safeguards: Safeguards) -> None:
     assert prepare.tick == 1
 
 
-def fence_stays(safeguards: Safeguards) -> None:
-    bench, prepare = prepared(safeguards)
+def fence_stays() -> None:
+    """H6: the fence stays when the replica goes."""
+    bench, prepare = prepared()
     bench.commit()
     (step, _) = bench.begin()
     bench.give(bench.give(step)[0])
@@ -135,8 +147,9 @@ def fence_stays(safeguards: Safeguards) -> None:
     assert 7 not in bench.endpoints[1].replicas.held
 
 
-def replica_slot(safeguards: Safeguards) -> None:
-    bench, prepare = prepared(safeguards)
+def replica_slot() -> None:
+    """H7: a PREPARE never touches the row that is owned."""
+    bench, prepare = prepared()
     bench.pass_on([prepare])
     bench.commit()
     bench.tick(movers=[(7, 1)])
@@ -146,8 +159,9 @@ def replica_slot(safeguards: Safeguards) -> None:
     assert not bench.entered, "a late state has reached the row that is owned"
 
 
-def replica_lifetime(safeguards: Safeguards) -> None:
-    bench = approached(Bench(safeguards=safeguards, limits=Limits(lifetime=3)))
+def replica_lifetime() -> None:
+    """I8: a replica that is not refreshed expires."""
+    bench = approached(Bench(limits=Limits(lifetime=3)))
     bench.endpoints[0].offers.open.clear()  # as in a source that died and knows of nothing
     for _ in range(5):
         bench.tick()
@@ -158,29 +172,35 @@ def replica_lifetime(safeguards: Safeguards) -> None:
 # Ticks, runs, episodes, processes
 
 
-def log_before_send(safeguards: Safeguards) -> None:
-    explored(safeguards, ticks=2, coordinator_crashes=1)
+def log_before_send() -> None:
+    """H11, H23: a decision is logged before anyone hears of it."""
+    explored(ticks=2, coordinator_crashes=1)
 
 
-def done_incarnation(safeguards: Safeguards) -> None:
-    explored(safeguards, ticks=2, false_alarms=1)
+def done_incarnation() -> None:
+    """H12: a DONE of a fenced process counts for nothing."""
+    explored(ticks=2, false_alarms=1)
 
 
-def step_tick(safeguards: Safeguards) -> None:
-    explored(replace(safeguards, answer_again=False), ticks=2)
+def step_tick() -> None:
+    """H13: a STEP is executed once."""
+    explored(ticks=2)
 
 
-def done_tick(safeguards: Safeguards) -> None:
-    explored(safeguards, ticks=2)
+def done_tick() -> None:
+    """H13: a DONE counts for its own tick only."""
+    explored(ticks=2)
 
 
-def answer_again(safeguards: Safeguards) -> None:
+def answer_again() -> None:
+    """H13: a repeated STEP is answered, from memory."""
     plan = FaultPlan(rates={"Done": Rates(drop=0.5)})
-    Simulator(ToyWorld(), plan=plan, safeguards=safeguards, patience=60).run(5)
+    Simulator(ToyWorld(), plan=plan, patience=60).run(5)
 
 
-def tick_never_resets(safeguards: Safeguards) -> None:
-    bench = Bench(safeguards=safeguards)
+def tick_never_resets() -> None:
+    """H15: a reset begins an episode, and the ticks go on."""
+    bench = Bench()
     late = [bench.give(step)[0] for step in bench.begin()]
     for done in late:
         bench.give(done)
@@ -192,8 +212,9 @@ def tick_never_resets(safeguards: Safeguards) -> None:
     assert bench.directory.waiting_for() == (0, 1)
 
 
-def run_fence(safeguards: Safeguards) -> None:
-    bench = Bench(safeguards=safeguards)
+def run_fence() -> None:
+    """H15: messages of another run are dropped."""
+    bench = Bench()
     step = bench.begin()[0]
     (done,) = bench.give(step)
     bench.directory.on_message(replace(done, run=OTHER_RUN))
@@ -201,8 +222,9 @@ def run_fence(safeguards: Safeguards) -> None:
     assert not bench.endpoints[1].on_message(replace(step, run=OTHER_RUN, zone=1)).messages
 
 
-def repeat_limit(safeguards: Safeguards) -> None:
-    bench = Bench(safeguards=safeguards)
+def repeat_limit() -> None:
+    """H22: a tick that kills every host ends in an error."""
+    bench = Bench()
     bench.begin()
     for _ in range(bench.limits.repeats):
         bench.crash(1)
@@ -213,22 +235,24 @@ def repeat_limit(safeguards: Safeguards) -> None:
 # The ledger and the committed store
 
 
-def removed_is_final(safeguards: Safeguards) -> None:
-    bench = Bench(safeguards=safeguards)
+def removed_is_final() -> None:
+    """H19: an id that has been in the episode never returns."""
+    bench = Bench()
     bench.tick(births=[(7, 0)])
     bench.tick(removed=[7])
     with pytest.raises(ProtocolError, match="vehicle 7"):
         bench.begin(births=[(7, 1)])
 
 
-def ledger(safeguards: Safeguards) -> None:
+def ledger() -> None:
+    """I6: nothing is lost or doubled, or the tick is not committed."""
     for lie in (
         lambda done: replace(done, removed=(Removed(8, 0),)),
         lambda done: replace(done, confirmed=(Confirmed(7, 1),)),
         lambda done: replace(done, owned=done.owned._replace(vehicles=0)),
         lambda done: replace(done, owned=done.owned._replace(digest=1)),
     ):
-        bench = Bench(safeguards=safeguards)
+        bench = Bench()
         bench.tick(births=[(7, 0), (8, 1)])
         dones = [bench.give(step)[0] for step in bench.begin()]
         assert isinstance(dones[0], Done)
@@ -238,25 +262,26 @@ def ledger(safeguards: Safeguards) -> None:
             bench.commit()
 
 
-def double_buffer(safeguards: Safeguards) -> None:
+def double_buffer() -> None:
+    """H10: tick t stays whole until t+1 is committed."""
     world = ToyWorld()
-    simulator = Simulator(
-        world, safeguards=safeguards, crashes=lambda tick, point, zone: point == "half written"
-    )
+    simulator = Simulator(world, crashes=lambda tick, point, zone: point == "half written")
     simulator.run(5)
     assert simulator.digests == world.undivided(5)
 
 
-def segment_per_incarnation(safeguards: Safeguards) -> None:
-    store = MemoryStore(safeguards)
+def segment_per_incarnation() -> None:
+    """H28: a process writes to a segment of its own."""
+    store = MemoryStore()
     store.write(0, 2, 7, b"of the living host")
     store.write(0, 1, 7, b"of the zombie")
     store.commit(1, {0: 2})
     assert store.state(7) == b"of the living host"
 
 
-def digest_before_commit(safeguards: Safeguards) -> None:
-    bench = Bench(safeguards=safeguards)
+def digest_before_commit() -> None:
+    """H28: what is stored is what DONE told of."""
+    bench = Bench()
     for step in bench.begin():
         bench.give(bench.give(step)[0])
     with pytest.raises(StoreError, match="zones \\[1\\]"):
@@ -267,21 +292,23 @@ def digest_before_commit(safeguards: Safeguards) -> None:
 # Distances
 
 
-def hysteresis(safeguards: Safeguards) -> None:
+def hysteresis() -> None:
+    """H16: a vehicle that weaves on a border does not change owner."""
     distances = Distances(approach_m=20.0, hysteresis_m=2.0, overlap_m=100.0)
     side, changes = 0, 0
     for tick in range(40):
         x = 1.0 if tick % 2 else -1.0  # the border is at 0
         depth = x if side == 0 else -x
-        if distances.switches(depth, safeguards):
+        if distances.switches(depth):
             side, changes = 1 - side, changes + 1
     assert changes <= 1
 
 
-def early_offer(safeguards: Safeguards) -> None:
+def early_offer() -> None:
+    """H20: a vehicle is offered before it crosses."""
     distances = Distances(approach_m=5.0, hysteresis_m=1.0, overlap_m=100.0)
     depths = [-9.0 + 2.0 * tick for tick in range(10)]
-    offered = next(tick for tick, depth in enumerate(depths) if distances.offers(depth, safeguards))
+    offered = next(tick for tick, depth in enumerate(depths) if distances.offers(depth))
     crossed = next(tick for tick, depth in enumerate(depths) if depth > 0.0)
     assert offered < crossed
 
@@ -292,9 +319,9 @@ def approached(bench: Bench) -> Bench:
     return bench
 
 
-def prepared(safeguards: Safeguards) -> tuple[Bench, Prepare]:
+def prepared() -> tuple[Bench, Prepare]:
     """Tick 1 is computed, not committed; zone 0 has sent a PREPARE that has not arrived."""
-    bench = Bench(safeguards=safeguards)
+    bench = Bench()
     for step in bench.begin(births=[(7, 0)]):
         bench.give(bench.give(step)[0])
     (prepare,) = bench.offer(0, (7, 1))
@@ -302,7 +329,7 @@ def prepared(safeguards: Safeguards) -> tuple[Bench, Prepare]:
     return bench, prepare
 
 
-SCENARIOS: dict[str, Callable[[Safeguards], None]] = {
+SCENARIOS: dict[str, Callable[[], None]] = {
     scenario.__name__: scenario
     for scenario in (
         one_step_lease, copy_until_commit, exact_promotion, reattach, deadline,

@@ -27,13 +27,12 @@ from cavmarl.ownership.messages import (
 )
 from cavmarl.ownership.offers import Approach
 from cavmarl.ownership.reactions import Advance
-from cavmarl.ownership.safeguards import ALL_ON, Safeguards
-from cavmarl.ownership.store import MemoryStore
 from cavmarl.ownership.trace import Trace
 from cavmarl.ownership.trace_check import check_trace
-from cavmarl.ownership.transport import FaultPlan, Network
 from tests.ownership.protocol_invariants import Monitor
 from tests.ownership.toy import ToyWorld
+from tests.support.lossy_network import FaultPlan, Network
+from tests.support.memory_store import MemoryStore
 
 RUN = bytes(range(16))
 APPROACH = 4
@@ -76,12 +75,11 @@ class Simulator:
         plan: FaultPlan | None = None,
         crashes: Crashes = lambda tick, point, party: False,
         limits: Limits | None = None,
-        safeguards: Safeguards = ALL_ON,
         patience: int = 400,
     ) -> None:
-        self.world, self.limits, self.safeguards = world, limits or Limits(), safeguards
+        self.world, self.limits = world, limits or Limits()
         self.network = Network(plan)
-        self.store = MemoryStore(safeguards)
+        self.store = MemoryStore()
         self.trace, self.monitor = Trace(), Monitor(self.limits)
         self.log, self.chain, self.log_tick = "", LogChain(), 0
         self.digests: list[int] = []
@@ -91,7 +89,7 @@ class Simulator:
         self.zombies: list[ZoneHost] = []
         self.next_id, self.patience = 0, patience
         self._crashes, self._struck = crashes, set[tuple[int, str, int]]()
-        self.directory = Directory(RUN, world.zones, self.store, self.limits, safeguards)
+        self.directory = Directory(RUN, world.zones, self.store, self.limits)
         self._do(self.directory.reset())
         for zone in world.zones:
             self._host(zone)
@@ -200,7 +198,7 @@ class Simulator:
         self.chain = LogChain()
         records = tuple(self.chain.read(line) for line in self.log.splitlines())
         zones, limits = self.world.zones, self.limits
-        self.directory = Directory.restore(records, zones, self.store, limits, self.safeguards)
+        self.directory = Directory.restore(records, zones, self.store, limits)
         self._flip()
         for zone in zones:
             if zone not in self.hosts:
@@ -223,7 +221,7 @@ class Simulator:
         self._write(output)
         hosting = self.directory.hosting(zone)
         rows = {vehicle: self.store.state(vehicle) for vehicle in hosting.owned}
-        endpoint = Endpoint(hosting, self.limits, self.safeguards)
+        endpoint = Endpoint(hosting, self.limits)
         self.hosts[zone] = ZoneHost(endpoint, rows, episode=hosting.episode)
         self.network.send(output.messages)
 

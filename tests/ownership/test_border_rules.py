@@ -18,7 +18,6 @@ from cavmarl.ownership.messages import (
     Switch,
 )
 from cavmarl.ownership.offers import Approach
-from cavmarl.ownership.safeguards import ALL_ON
 from cavmarl.ownership.trace import LOG, TraceEntry
 from cavmarl.ownership.trace_check import TraceChecker
 from tests.ownership.bench import Bench, version
@@ -79,7 +78,7 @@ def test_r31_offering_switching_and_releasing_have_distances_of_their_own() -> N
 
 
 def test_r35_offers_name_vehicles_of_their_own() -> None:
-    bench, _ = prepared(ALL_ON)
+    bench, _ = prepared()
     with pytest.raises(ProtocolError, match="offers vehicle 8"):
         bench.endpoints[0].offer([Approach(8, 1, b"")])
 

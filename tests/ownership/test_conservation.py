@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from cavmarl.ownership.messages import COORDINATOR, Message
-from cavmarl.ownership.transport import FaultPlan, Network, Rates
 from tests.ownership.bench import Bench
 from tests.ownership.toy import number
+from tests.support.lossy_network import FaultPlan, Network, Rates
 
 ZONES = 4
 VEHICLES = 400

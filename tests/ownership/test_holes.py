@@ -11,7 +11,6 @@ from dataclasses import replace
 from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import Birth, Done, Nack, Refusal, Step
-from cavmarl.ownership.safeguards import ALL_ON
 from cavmarl.ownership.transitions import State
 from tests.ownership import scenarios
 from tests.ownership.bench import Bench, version
@@ -25,7 +24,7 @@ def test_h01_no_two_owners() -> None:
     for step in bench.begin(movers=[(7, 1)]):
         bench.give(step)
         assert sum(7 in endpoint.owned for endpoint in bench.endpoints.values()) <= 1
-    scenarios.one_step_lease(ALL_ON)
+    scenarios.one_step_lease()
 
 
 def test_h02_no_vehicle_without_an_owner_or_a_copy() -> None:
@@ -37,7 +36,7 @@ def test_h02_no_vehicle_without_an_owner_or_a_copy() -> None:
     bench.give(second)
     assert bench.endpoints[0].row_state(7) is State.RETAINED
     assert bench.endpoints[1].row_state(7) is State.AUTHORITATIVE
-    scenarios.copy_until_commit(ALL_ON)
+    scenarios.copy_until_commit()
 
 
 def test_h03_no_jump_back_in_time() -> None:
@@ -48,7 +47,7 @@ def test_h03_no_jump_back_in_time() -> None:
 
 
 def test_h04_a_late_ack_after_a_turn_back() -> None:
-    bench, prepare = prepared(ALL_ON)
+    bench, prepare = prepared()
     (ack,) = bench.give(prepare)
     bench.commit()
     bench.tick()  # it turns back: an ABORT goes to the target
@@ -58,15 +57,15 @@ def test_h04_a_late_ack_after_a_turn_back() -> None:
 
 
 def test_h05_a_late_abort() -> None:
-    scenarios.abort_fence(ALL_ON)
+    scenarios.abort_fence()
 
 
 def test_h06_a_late_prepare_after_an_abort() -> None:
-    scenarios.fence_stays(ALL_ON)
+    scenarios.fence_stays()
 
 
 def test_h07_a_doubled_prepare_after_a_return_trip() -> None:
-    bench, prepare = prepared(ALL_ON)
+    bench, prepare = prepared()
     bench.give(prepare)
     bench.commit()
     bench.directory.on_message(bench.give(prepare)[0])
@@ -75,11 +74,11 @@ def test_h07_a_doubled_prepare_after_a_return_trip() -> None:
     assert not bench.give(prepare)
     bench.tick(movers=[(7, 1)])
     assert bench.entered[7] == version(7, 3)
-    scenarios.replica_slot(ALL_ON)
+    scenarios.replica_slot()
 
 
 def test_h08_a_target_that_died_after_its_ack() -> None:
-    scenarios.ack_incarnation(ALL_ON)
+    scenarios.ack_incarnation()
 
 
 def test_h09_a_target_that_dies_after_the_switch() -> None:
@@ -88,11 +87,11 @@ def test_h09_a_target_that_dies_after_the_switch() -> None:
     bench.crash(1)
     bench.tick()
     assert bench.endpoints[1].owned == {7: 1}
-    scenarios.reattach(ALL_ON)
+    scenarios.reattach()
 
 
 def test_h10_a_source_that_dies_in_its_step() -> None:
-    scenarios.double_buffer(ALL_ON)
+    scenarios.double_buffer()
 
 
 def test_h11_a_coordinator_that_dies_between_decision_and_cleanup() -> None:
@@ -100,11 +99,11 @@ def test_h11_a_coordinator_that_dies_between_decision_and_cleanup() -> None:
     steps = bench.begin(movers=[(7, 1)])
     bench.directory = Directory.restore(bench.log, range(2), bench)
     assert bench.directory.resend().messages == steps
-    scenarios.log_before_send(ALL_ON)
+    scenarios.log_before_send()
 
 
 def test_h12_a_worker_that_was_wrongly_suspected() -> None:
-    scenarios.done_incarnation(ALL_ON)
+    scenarios.done_incarnation()
 
 
 def test_h13_a_repeated_step_and_an_old_done() -> None:
@@ -127,16 +126,16 @@ def test_h14_the_source_does_not_stay_for_ever() -> None:
     for _ in range(3):
         bench.tick(movers=[(7, 1)])
     assert bench.owner(7) == 1
-    scenarios.deadline(ALL_ON)
+    scenarios.deadline()
 
 
 def test_h15_a_reset_does_not_bring_old_messages_back() -> None:
-    scenarios.tick_never_resets(ALL_ON)
-    scenarios.run_fence(ALL_ON)
+    scenarios.tick_never_resets()
+    scenarios.run_fence()
 
 
 def test_h16_a_car_that_weaves_on_a_border() -> None:
-    scenarios.hysteresis(ALL_ON)
+    scenarios.hysteresis()
 
 
 def test_h17_a_corner_of_four_zones() -> None:
@@ -164,14 +163,14 @@ def test_h19_removed_and_born_in_the_middle_of_a_transfer() -> None:
     bench.tick()
     assert bench.endpoints[0].owned == {8: 0}
     assert not bench.endpoints[1].owned
-    scenarios.removed_is_final(ALL_ON)
+    scenarios.removed_is_final()
 
 
 def test_h20_the_approach_prepares_and_the_position_decides() -> None:
     bench = approached(Bench())
     bench.tick(offers=[(7, 1)])
     assert bench.owner(7) == 0, "an ACK alone moves nobody"
-    scenarios.early_offer(ALL_ON)
+    scenarios.early_offer()
 
 
 def test_h22_a_dead_node_does_not_stop_the_clock() -> None:
@@ -200,7 +199,7 @@ def test_h24_a_state_is_carried_byte_for_byte() -> None:
 
 
 def test_h25_states_of_other_content_or_schema_are_refused_with_the_reason() -> None:
-    bench, prepare = prepared(ALL_ON)
+    bench, prepare = prepared()
     damaged = replace(prepare, entries=(prepare.entries[0]._replace(state=b""),))
     for message, reason in (
         (damaged, Refusal.DIGEST),
@@ -212,7 +211,7 @@ def test_h25_states_of_other_content_or_schema_are_refused_with_the_reason() -> 
 
 
 def test_h26_a_zone_that_moves_in_the_middle_of_a_transfer() -> None:
-    bench, prepare = prepared(ALL_ON)
+    bench, prepare = prepared()
     (ack,) = bench.give(prepare)
     bench.commit()
     bench.host(1)
@@ -224,8 +223,8 @@ def test_h26_a_zone_that_moves_in_the_middle_of_a_transfer() -> None:
 
 
 def test_h28_a_wild_write_does_not_become_the_truth() -> None:
-    scenarios.segment_per_incarnation(ALL_ON)
-    scenarios.digest_before_commit(ALL_ON)
+    scenarios.segment_per_incarnation()
+    scenarios.digest_before_commit()
 
 
 def test_a_swap_of_two_and_a_hundred_crossings_in_one_tick() -> None:

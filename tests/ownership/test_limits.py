@@ -10,7 +10,7 @@ from cavmarl.core.errors import ConfigError, ProtocolError
 from cavmarl.ownership.distances import Distances
 from cavmarl.ownership.ledger import OwnedTally, SeenIds, tally
 from cavmarl.ownership.limits import Limits
-from cavmarl.ownership.transport import Rates
+from tests.support.lossy_network import Rates
 
 RUN = bytes(range(16))
 

@@ -7,19 +7,18 @@ import re
 from dataclasses import fields
 from pathlib import Path
 
-from cavmarl.ownership import safeguards
 from cavmarl.ownership.codec import KINDS as MESSAGES
 from cavmarl.ownership.log_records import KINDS as RECORDS
 from cavmarl.ownership.messages import Message, Record
-from cavmarl.ownership.safeguards import Safeguards
 from cavmarl.ownership.transitions import Party, mermaid
 from tests.ownership import test_border_rules, test_rules
+from tests.ownership.scenarios import SCENARIOS
 from tests.support.generated import check_block, table
 
 PAGE = Path(__file__).resolve().parents[2] / "docs/ownership.md"
 
 
-def meaning(kind: type) -> str:
+def meaning(kind: object) -> str:
     return " ".join((inspect.getdoc(kind) or "").split("\n\n")[0].split())
 
 
@@ -43,11 +42,10 @@ def test_the_page_shows_every_transition() -> None:
     check_block(PAGE, "diagrams", "\n\n".join(parts))
 
 
-def test_the_page_lists_every_safeguard() -> None:
-    lines = re.findall(r"    (\w+): bool = True  # (.*?): (.*)", inspect.getsource(safeguards))
-    assert [name for name, _, _ in lines] == [field.name for field in fields(Safeguards)]
-    rows = [(hole, remedy, f"`{name}`") for name, hole, remedy in lines]
-    check_block(PAGE, "safeguards", table(("hole", "remedy", "switch"), rows))
+def test_the_page_lists_every_remedy() -> None:
+    told = [(meaning(scenario).rstrip("."), name) for name, scenario in SCENARIOS.items()]
+    rows = [(*text.split(": ", 1), f"`{name}`") for text, name in told]
+    check_block(PAGE, "remedies", table(("hole", "remedy", "scenario"), rows))
 
 
 def test_the_program_of_the_page_runs() -> None:

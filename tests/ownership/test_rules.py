@@ -29,12 +29,11 @@ from cavmarl.ownership.messages import (
     Removed,
     Step,
 )
-from cavmarl.ownership.safeguards import ALL_ON
-from cavmarl.ownership.store import MemoryStore
 from cavmarl.ownership.transitions import State
-from cavmarl.ownership.transport import FaultPlan, Network, Rates
 from tests.ownership.bench import Bench, version
 from tests.ownership.scenarios import approached, prepared
+from tests.support.lossy_network import FaultPlan, Network, Rates
+from tests.support.memory_store import MemoryStore
 
 
 def test_r01_a_host_advances_with_a_step_and_once() -> None:
@@ -199,7 +198,7 @@ def test_r14_the_epoch_rises_by_one_with_each_switch() -> None:
 
 
 def test_r15_only_what_is_newer_than_the_fence_counts() -> None:
-    bench, prepare = prepared(ALL_ON)
+    bench, prepare = prepared()
     assert bench.give(replace(prepare, tick=2))
     assert not bench.give(prepare)
     endpoint = bench.endpoints[1]
@@ -211,7 +210,7 @@ def test_r15_only_what_is_newer_than_the_fence_counts() -> None:
 
 
 def test_r16_what_is_older_than_the_lifetime_is_gone_and_not_heard() -> None:
-    bench, prepare = prepared(ALL_ON)
+    bench, prepare = prepared()
     bench.commit()
     for _ in range(bench.limits.lifetime):
         bench.tick()
@@ -223,7 +222,7 @@ def test_r16_what_is_older_than_the_lifetime_is_gone_and_not_heard() -> None:
 
 
 def test_r17_a_state_that_comes_never_touches_the_row_that_is_owned() -> None:
-    bench, prepare = prepared(ALL_ON)
+    bench, prepare = prepared()
     owner = bench.endpoints[0]
     owner.on_message(replace(prepare, target=0))
     assert owner.dropped["Prepare", "owned"] == 1
@@ -231,7 +230,7 @@ def test_r17_a_state_that_comes_never_touches_the_row_that_is_owned() -> None:
 
 
 def test_r18_a_target_gets_one_prepare_or_abort_a_tick_and_some_more_tries() -> None:
-    bench, _ = prepared(ALL_ON)
+    bench, _ = prepared()
     endpoint = bench.endpoints[0]
     tries = [endpoint.offer_again() for _ in range(4)]
     assert [len(messages) for messages in tries] == [1, 1, 0, 0]
@@ -256,7 +255,7 @@ def test_r19_a_refusal_has_a_reason_and_is_followed_by_silence() -> None:
         offered.append(sum(isinstance(message, Prepare) for message in sent))
     assert offered == [1, 0, 0, 0, 1, 0, 0, 0]
     assert bench.directory.refusals == {Refusal.LOAD: 2}
-    other, prepare = prepared(ALL_ON)
+    other, prepare = prepared()
     target = other.endpoints[1]
     (nack,) = target.refuse(prepare).messages
     assert isinstance(nack, Nack)
@@ -321,7 +320,7 @@ def test_r24_a_living_zone_moves_between_ticks_only() -> None:
 
 
 def test_r25_a_removed_vehicle_is_gone_for_the_episode() -> None:
-    bench, prepare = prepared(ALL_ON)
+    bench, prepare = prepared()
     bench.commit()
     bench.tick(removed=[7])
     assert not bench.give(prepare), "the source has withdrawn it"

@@ -6,9 +6,9 @@ import pytest
 
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import COORDINATOR
-from cavmarl.ownership.transport import FaultPlan, Rates
 from tests.ownership.simulator import COORDINATOR_POINTS, ZONE_POINTS, Simulator
 from tests.ownership.toy import ToyWorld, number
+from tests.support.lossy_network import FaultPlan, Rates
 
 TICKS = 25
 LAYOUTS = {

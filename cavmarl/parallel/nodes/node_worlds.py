@@ -51,11 +51,6 @@ from cavmarl.shards.shard import Commands
 from cavmarl.v2x.v2x_messages import NetworkSimulator, check_external
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
-NO_TICK = (
-    "no process has all rows of the committed tick; what a zone's code raises is raised by the "
-    "step; use the same zones without nodes"
-)
-
 
 class NodeWorlds(NodePool):
     """W worlds over n nodes; a `SteppedWorlds`.

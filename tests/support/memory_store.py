@@ -1,8 +1,7 @@
 """The committed store in memory: what a store has to promise, in its smallest form.
 
 It holds the state of every vehicle at the committed tick, and room for the next. Each process
-writes to a segment of its own, and only `commit` makes segments the truth. The runtime's store
-promises the same of NumPy rows; tests of the protocol use this one.
+writes to a segment of its own, and only `commit` makes segments the truth.
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from cavmarl.ownership.ledger import row_hash, state_digest, world_digest
-from cavmarl.ownership.safeguards import ALL_ON, Safeguards
 
 
 class MemoryStore:
@@ -20,11 +18,10 @@ class MemoryStore:
         segments: (zone, incarnation) → what that process has written for the next tick.
     """
 
-    def __init__(self, safeguards: Safeguards = ALL_ON) -> None:
+    def __init__(self) -> None:
         self.tick = 0  # the committed tick
         self.committed: dict[int, bytes] = {}  # vehicle → state at that tick
         self.segments: dict[tuple[int, int], dict[int, bytes]] = {}
-        self._safeguards = safeguards
 
     def state(self, vehicle: int) -> bytes:
         return self.committed[vehicle]
@@ -34,16 +31,14 @@ class MemoryStore:
 
     def write(self, zone: int, incarnation: int, vehicle: int, state: bytes) -> None:
         """One row of the next tick, from the process of that incarnation."""
-        self.segments.setdefault(self._segment(zone, incarnation), {})[vehicle] = state
-        if not self._safeguards.double_buffer:
-            self.committed[vehicle] = state
+        self.segments.setdefault((zone, incarnation), {})[vehicle] = state
 
     def clear(self, zone: int, incarnation: int) -> None:
         """Throw away what a process has written."""
-        self.segments.pop(self._segment(zone, incarnation), None)
+        self.segments.pop((zone, incarnation), None)
 
     def digest(self, zone: int, incarnation: int) -> int:
-        rows = self.segments.get(self._segment(zone, incarnation), {})
+        rows = self.segments.get((zone, incarnation), {})
         return world_digest(row_hash(vehicle, state) for vehicle, state in rows.items())
 
     def commit(self, tick: int, incarnations: Mapping[int, int]) -> None:
@@ -55,7 +50,7 @@ class MemoryStore:
         self.committed = {
             vehicle: state
             for zone, incarnation in sorted(incarnations.items())
-            for vehicle, state in self.segments.get(self._segment(zone, incarnation), {}).items()
+            for vehicle, state in self.segments.get((zone, incarnation), {}).items()
         }
         self.tick = tick
         self.segments.clear()
@@ -66,6 +61,3 @@ class MemoryStore:
 
     def world(self) -> int:
         return world_digest(row_hash(vehicle, state) for vehicle, state in self.committed.items())
-
-    def _segment(self, zone: int, incarnation: int) -> tuple[int, int]:
-        return (zone, incarnation if self._safeguards.segment_per_incarnation else 0)
