@@ -24,6 +24,7 @@ LOGGERS = frozenset(["cavmarl.workers"])
 
 _DOTTED = re.compile(r"`([A-Za-z_]\w*(?:\.[A-Za-z_]\w*)+)(?:\([^`]*\))?`")
 _FILE = re.compile(r"`([\w./-]+\.py)`")
+_DOCSTRING = re.compile(r'"""(.*?)"""', re.DOTALL)
 _COMMENT = re.compile(r"#\s(.*)")
 _DATA = ("html", "json", "jsonl", "parquet", "safetensors", "xml", "yaml", "zst")  # endings
 
@@ -85,7 +86,7 @@ class Package:
             text = self.sources[name] = path.read_text(encoding="utf-8")
             tree = trees[name] = ast.parse(text)
             self._modules[name.rpartition(".")[2]].append(name)
-            for node in ast.walk(tree):
+            for node in tree.body:
                 if isinstance(node, ast.ClassDef):
                     self._classes[node.name].append(_Members(node))
         self._tops = {name: set(_defined(tree.body)) for name, tree in trees.items()}
@@ -100,8 +101,7 @@ class Package:
 
     def dead_in(self, source: str) -> Iterator[str]:
         """Names and files in the docstrings and comments of a source that lead nowhere."""
-        tree = ast.parse(source)
-        annotated, text = _annotated(tree), "\n".join([*_strings(tree), *_COMMENT.findall(source)])
+        text = "\n".join([*_DOCSTRING.findall(source), *_COMMENT.findall(source)])
         for name in _FILE.findall(text):
             if "NAME" not in name and not self._is_file(name):
                 yield name
@@ -109,9 +109,10 @@ class Package:
             parts = name.split(".")
             if parts[-1] == "py" or parts[-1] in _DATA or parts[0] in OTHERS or name in LOGGERS:
                 continue
-            holders = annotated.get(parts[0], set())
-            is_field = any(self._has(holder, parts[1]) for holder in holders)
-            if not (is_field or self._is_key(name) or self._is_name(parts)):
+            if self._is_key(name) or self._is_name(parts):
+                continue
+            holders = _annotated(ast.parse(source)).get(parts[0], set())
+            if not any(self._has(holder, parts[1]) for holder in holders):
                 yield name
 
     def _is_file(self, name: str) -> bool:
@@ -146,11 +147,3 @@ class Package:
             attribute in members.names or any(self._has(base, attribute) for base in members.bases)
             for members in self._classes.get(class_name, ())
         )
-
-
-def _strings(tree: ast.Module) -> Iterator[str]:
-    """Each string that is a statement."""
-    for node in ast.walk(tree):
-        match node:
-            case ast.Expr(value=ast.Constant(value=str(text))):
-                yield text
