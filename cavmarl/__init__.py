@@ -59,7 +59,8 @@ if TYPE_CHECKING:
     from cavmarl.env.registration import env, raw_env
     from cavmarl.env.vector import CavVectorEnv, make_vec
     from cavmarl.parallel.backends import register_backend
-    from cavmarl.policies.policy import Policy, load_policy
+    from cavmarl.policies.loading import load_policy
+    from cavmarl.policies.policy import Policy
     from cavmarl.recordings.extra_tables import RecordOptions
     from cavmarl.rewards.registered_terms import register_term
     from cavmarl.sensors.observed.feature import Feature
@@ -129,7 +130,7 @@ _LATE = {
     "Feature": "sensors.observed.feature",
     "Policy": "policies.policy",
     "env": "env.registration",
-    "load_policy": "policies.policy",
+    "load_policy": "policies.loading",
     "make_vec": "env.vector",
     "parallel_env": "env.parallel",
     "raw_env": "env.registration",

@@ -33,7 +33,7 @@ from cavmarl.evaluate.evaluation import (
     read_evaluation,
 )
 from cavmarl.evaluate.provenance.manifest import hash_of_file
-from cavmarl.policies.policy import policy_files
+from cavmarl.policies.loading import policy_files
 
 RESULT_FOLDER = "result"
 TABLES = (TRIPS_FILE, EPISODES_FILE, TRACKS_FILE)  # the same each time they are made
