@@ -237,21 +237,6 @@ class LidarObservationConfig(Section, key="sensors.lidar_observation"):
 
 
 @dataclass(frozen=True)
-class RoadgraphConfig(Section, key="sensors.roadgraph"):
-    """The nearest points of the road network, as Waymax's `roadgraph_points`.
-
-    Attributes:
-        points: how many; 0 switches the sensor off.
-        range_m: distance up to which a point is seen.
-        spacing_m: largest distance between one point of a line and the next.
-    """
-
-    points: Annotated[int, Whole(0, 2048)] = 0
-    range_m: Annotated[float, Within(1.0, 300.0)] = 50.0
-    spacing_m: Annotated[float, Within(0.25, 50.0)] = 2.0
-
-
-@dataclass(frozen=True)
 class MessagesConfig(Section, key="sensors.messages"):
     """What the vehicle has been told over the air, see `v2x`.
 
@@ -352,7 +337,6 @@ class SensorsConfig(Section, key="sensors"):
     kinematics: KinematicsConfig = field(default_factory=KinematicsConfig)
     occupancy_grid: OccupancyGridConfig = field(default_factory=OccupancyGridConfig)
     lidar_observation: LidarObservationConfig = field(default_factory=LidarObservationConfig)
-    roadgraph: RoadgraphConfig = field(default_factory=RoadgraphConfig)
     messages: MessagesConfig = field(default_factory=MessagesConfig)
     way: WayConfig = field(default_factory=WayConfig)
     conflicts: ConflictsConfig = field(default_factory=ConflictsConfig)
@@ -371,7 +355,6 @@ class SensorsConfig(Section, key="sensors"):
             self.kinematics.vehicles_count,
             len(self.occupancy_grid.features),
             self.lidar_observation.cells,
-            self.roadgraph.points,
             self.messages.objects,
             self.messages.events,
             self.messages.signal,

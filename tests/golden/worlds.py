@@ -61,7 +61,7 @@ fast: {clock: {sim_dt_s: 0.1, ctrl_dt_s: 0.2}}, discrete: {action: {kind: discre
 stack: {observation: {kind: dict}, sensors: {stack: 4}},
 late: {clock: {control_latency_ticks: 3}, terms: {team_share: 0.4}},
 sensors: {sensors: {stack: 3, signal.timing: true, lanes.range_m: 80.0, lidar.rays: 32,
-  lidar.speeds: true, lidar_observation.cells: 16, roadgraph.points: 60,
+  lidar.speeds: true, lidar_observation.cells: 16,
   kinematics.vehicles_count: 8, kinematics.observe_intentions: true, kinematics.features: [
     presence, x, y, vx, vy, heading, cos_h, sin_h, cos_d, sin_d, long_off, lat_off, ang_off],
   occupancy_grid.features: [presence, vx, vy, heading, long_off, on_road]}},

@@ -1,4 +1,4 @@
-"""The sensors that most environments leave off: highway-env's, road points, those for any map."""
+"""The sensors that most environments leave off: highway-env's, and those for any map."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from cavmarl.core.records.arrays import LaneGrid, RoadArrays, Travel, Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.sensors.kernels.highway_lidar import observe_lidar_cells
 from cavmarl.sensors.kernels.kinematics_observation import observe_kinematics
-from cavmarl.sensors.kernels.nearest_road_points import observe_roadgraph
 from cavmarl.sensors.kernels.observing_conflicts import forget_others, observe_conflicts
 from cavmarl.sensors.kernels.observing_history import observe_history
 from cavmarl.sensors.kernels.observing_way import observe_way
@@ -41,7 +40,7 @@ def observe_optional(
     more, N), the inboxes of vehicles; N is 0 where there are no messages. `observations`:
     (W, A, D), the parts 0 before.
     """
-    kinematics, occupancy, lidar_cells, roadgraph, path, conflicts, history = further
+    kinematics, occupancy, lidar_cells, path, conflicts, history = further
     for w in range(chosen.size):
         if not chosen[w]:
             continue
@@ -63,8 +62,6 @@ def observe_optional(
                 observe_occupancy(roads, lane_grid, rows, i, grid, occupancy, out)
             if lidar_cells.cells > 0:
                 observe_lidar_cells(rows, i, grid, lidar_cells, out)
-            if roadgraph.num_points > 0:
-                observe_roadgraph(row, roadgraph, out)
             phase = worlds.signal_phase[w]
             if path.distances_m.size > 0 or path.lines > 0:
                 time = worlds.ticks[w] * tick_s

@@ -65,32 +65,6 @@ class LidarCells(NamedTuple):
     echoes: NDArray[np.void]  # ECHO (cells,) scratch
 
 
-class RoadPoints(NamedTuple):
-    """Points of a road map in square cells; see `kernels.roadgraph`."""
-
-    min_x: float  # m, corner of cell (0, 0)
-    min_y: float
-    cell_m: float
-    num_x: int
-    num_y: int
-    start: NDArray[np.int32]  # (num_x * num_y + 1,) points of cell c: [start[c], start[c + 1])
-    points: NDArray[np.void]  # ROAD_POINT (N,)
-
-
-class RoadgraphSensor(NamedTuple):
-    """The nearest points of the road network: see `kernels.roadgraph`."""
-
-    at: int
-    num_points: int  # 0: off
-    range_m: float
-    road_map: RoadPoints
-    near_point: NDArray[np.int64]  # (N,) scratch
-    near_squared: NDArray[np.float64]
-    sorted_point: NDArray[np.int64]  # (N,) scratch; the answer
-    sorted_squared: NDArray[np.float64]
-    ring_start: NDArray[np.int64]  # (NUM_RINGS + 1,) scratch
-
-
 RANKED = record(
     ("counts", np.float64),  # m, what it is ranked by
     ("near", np.float64),  # m, the gap of its approach
@@ -142,7 +116,6 @@ class OptionalSensors(NamedTuple):
     kinematics: KinematicsSensor
     occupancy: OccupancyGrid
     lidar_cells: LidarCells
-    roadgraph: RoadgraphSensor
     way: WaySensor
     conflicts: ConflictsSensor
     history: HistorySensor

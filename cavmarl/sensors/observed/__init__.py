@@ -21,7 +21,7 @@ from cavmarl.sensors.kernels.lidar_2d import ECHO, ray_directions
 from cavmarl.sensors.kernels.sensor_arrays import OptionalSensors
 from cavmarl.sensors.observed import ego_features as seen
 from cavmarl.sensors.observed import highway_kinematics as kinematics
-from cavmarl.sensors.observed import lidar_observation, occupancy_grid, roadgraph, way_features
+from cavmarl.sensors.observed import lidar_observation, occupancy_grid, way_features
 from cavmarl.sensors.observed.feature import Sensor
 from cavmarl.sensors.observed.highway import goal_places
 
@@ -48,7 +48,6 @@ SENSORS: tuple[Sensor, ...] = (
         lidar_observation.reach_m,
         lidar_observation.shape,
     ),
-    Sensor("roadgraph", roadgraph.features, shape=roadgraph.shape),
     Sensor("messages", seen.messages),  # they come from the bus, which knows no zones
     Sensor("way", way_features.way),
     Sensor(
@@ -67,7 +66,7 @@ MAX_NEIGHBORS_TRIED = 256
 # Those that `observe_optional` writes.
 FURTHER = frozenset(
     (
-        "kinematics", "occupancy_grid", "lidar_observation", "roadgraph",
+        "kinematics", "occupancy_grid", "lidar_observation",
         "way", "conflicts", "history",
     )
 )  # fmt: skip
@@ -207,7 +206,6 @@ def optional_arrays(
         kinematics=kinematics.settings(config, starts["kinematics"], network, goals),
         occupancy=occupancy_grid.settings(config, starts["occupancy_grid"], network, goals),
         lidar_cells=lidar_observation.settings(config, starts["lidar_observation"]),
-        roadgraph=roadgraph.settings(config, starts["roadgraph"], network),
         way=way_features.way_settings(config, starts["way"]),
         conflicts=way_features.conflicts_settings(
             config,
