@@ -20,7 +20,7 @@ from cavmarl.cli.output import Seed, about
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import load_world
 from cavmarl.evaluate.driven_worlds import DrivenWorld
-from cavmarl.policies.policy import driver_keys, load_policy, policy_files
+from cavmarl.policies.loading import driver_keys, load_policy, policy_files
 
 ENV = "ring22"
 HUMAN = "human"  # one more of them in the agent's seat

@@ -60,7 +60,8 @@ if TYPE_CHECKING:
     from cavmarl.env.vector import CavVectorEnv, make_vec
     from cavmarl.env.world_arguments import WorldArguments
     from cavmarl.parallel.backends import register_backend
-    from cavmarl.policies.policy import Policy, load_policy
+    from cavmarl.policies.loading import load_policy
+    from cavmarl.policies.policy import Policy
     from cavmarl.recordings.extra_tables import RecordOptions
     from cavmarl.rewards.registered_terms import register_term
     from cavmarl.sensors.observed.feature import Feature
@@ -131,7 +132,7 @@ _LATE = {
     "Feature": "sensors.observed.feature",
     "Policy": "policies.policy",
     "env": "env.registration",
-    "load_policy": "policies.policy",
+    "load_policy": "policies.loading",
     "make_vec": "env.vector",
     "parallel_env": "env.parallel",
     "raw_env": "env.registration",

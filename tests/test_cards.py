@@ -13,7 +13,6 @@ from cavmarl.config.sensors import (
     LidarObservationConfig,
     NeighborsConfig,
     OccupancyGridConfig,
-    RoadgraphConfig,
     RouteAheadConfig,
     SensorsConfig,
     SignalAheadConfig,
@@ -42,7 +41,6 @@ OPTIONAL = (
         occupancy_grid=OccupancyGridConfig(features=("presence", "vx", "vy", "on_road")),
     ),
     replace(OFF, kinematics=KinematicsConfig(), lidar_observation=LidarObservationConfig(cells=16)),
-    replace(OFF, kinematics=KinematicsConfig(), roadgraph=RoadgraphConfig(points=200)),
 )
 
 

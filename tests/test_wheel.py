@@ -118,7 +118,7 @@ if __name__ == "__main__":
     drive(zones=4, nodes=2)
     drive(overrides={"rig": "ten_sensors"})
     drive(overrides={"v2x.enabled": True, "sensors.messages.objects": 4})
-    drive(overrides={"sensors.lidar.rays": 16, "sensors.roadgraph.points": 20, "sensors.stack": 2})
+    drive(overrides={"sensors.lidar.rays": 16, "sensors.way.lines": 2, "sensors.stack": 2})
     print("driven")
 """
 PREBUILT = {"CAVMARL_KERNELS": "prebuilt"}

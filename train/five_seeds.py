@@ -39,7 +39,7 @@ from cavmarl.evaluate import EvaluationReport, evaluate
 from cavmarl.evaluate.provenance.training_record import CHECKPOINT_FILE, is_trained
 from cavmarl.evaluate.statistics import Interval, bounded_interval, mean_interval
 from cavmarl.learning.options import run_to_end
-from cavmarl.policies.policy import driver_keys
+from cavmarl.policies.loading import driver_keys
 
 PROGRAM = Path(__file__).with_name("ppo.py")
 GOES_ON = "the same command goes on from the last checkpoints"

@@ -36,8 +36,8 @@ from cavmarl.learning.phase_times import PhaseTimes
 from cavmarl.learning.run_folder import RunFolder, parse_run
 from cavmarl.learning.scales import Scales
 from cavmarl.parallel.local_worlds import kept_elsewhere
+from cavmarl.policies.loading import driver_keys, policy_files
 from cavmarl.policies.network_files import NetworkConfig
-from cavmarl.policies.policy import driver_keys, policy_files
 
 PHASES = ("simulation", "transfer", "inference", "learning")
 RED_LIGHT = TERMS.index("red_light")

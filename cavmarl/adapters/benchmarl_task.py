@@ -25,9 +25,9 @@ DECIDED = ("num_envs", "device", "action.kind")
 class CavTaskClass(TaskClass):  # type: ignore[misc] # found in an environment of its own only
     """One environment; BenchMARL says how many worlds, where, and which kind of action.
 
-    In `seats` worlds, the default, a seat whose vehicle ended gets a new one. BenchMARL's losses
+    In `respawn` worlds, the default, a seat whose vehicle ended gets a new one. BenchMARL's losses
     know no mask: they also count the steps in which an agent has no vehicle, whose observation and
-    reward are 0. These are few in `seats`, and many in `closed` and `entering` worlds.
+    reward are 0. These are few in `respawn`, and many in `closed` and `open` worlds.
 
     Args:
         name: of the task; in lower case it is that of the environment, unless `config` has `env`.

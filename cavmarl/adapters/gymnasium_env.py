@@ -26,7 +26,7 @@ class CavEgoEnv(WithSpec, OwnWorlds, gymnasium.Env[Any, Any]):
     arrived; `speed` of a vehicle that has left is the last one that was seen.
 
     An episode is the trip of one vehicle. In `closed` worlds, the default, the others leave one by
-    one; in `entering` and `seats` worlds new ones come for those that leave.
+    one; in `open` and `respawn` worlds new ones come for those that leave.
 
     Args:
         env: as for `parallel_env`.

@@ -23,9 +23,9 @@ DECIDED = ("agents", "population.budget")
 class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
     """The agents of one or more worlds as rows, for programs written for vectors of single agents.
 
-    A row is an agent id of a world; row `w · A + a` is agent a of world w. In `seats` worlds, the
+    A row is an agent id of a world; row `w · A + a` is agent a of world w. In `respawn` worlds, the
     default, a row whose vehicle ended gets a new one as soon as there is room. In `closed` worlds
-    it waits until the world begins anew, and in `entering` worlds each row is used once an episode,
+    it waits until the world begins anew, and in `open` worlds each row is used once an episode,
     from when its agent enters.
 
     Rows end singly (terminations), and all that have a vehicle at the horizon (truncations).

@@ -33,8 +33,8 @@ class CavRllibEnv(OwnWorlds, MultiAgentEnv):  # type: ignore[misc] # found in an
     knows have ended, also where others enter in that very step: these are then the agents of its
     next episode, for which the same world goes on.
 
-    In `seats` worlds an id is a seat; the end of its vehicle is `infos[agent]["vehicle_done"]`, and
-    RLlib's values go on across it, so that `closed` and `entering` worlds are learnt more exactly.
+    In `respawn` worlds an id is a seat: its vehicle ends with `infos[agent]["vehicle_done"]`, and
+    RLlib's values go on across it, so that `closed` and `open` worlds are learnt more exactly.
 
     Each environment of an env runner is a world of its own, seeded by RLlib.
 

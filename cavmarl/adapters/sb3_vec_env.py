@@ -34,8 +34,8 @@ Indices = int | Iterable[int] | None
 class CavSb3VecEnv(WithSpec, OwnWorlds, VecEnv):
     """W worlds with A agents each as W · A environments that share one policy; row w · A + a.
 
-    In `seats` worlds, the default, a row whose vehicle ended gets a new one as soon as there is
-    room. In `closed` worlds it waits until the world begins anew, and in `entering` worlds each row
+    In `respawn` worlds, the default, a row whose vehicle ended gets a new one as soon as there is
+    room. In `closed` worlds it waits until the world begins anew, and in `open` worlds each row
     is used once an episode, from when its agent enters.
 
     A row that ended is `done` and carries its last observation as `terminal_observation`, whether

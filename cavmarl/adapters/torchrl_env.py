@@ -52,7 +52,7 @@ class CavTorchRLEnv(OwnWorlds, EnvBase):  # type: ignore[misc] # TorchRL is not 
       by; `("next", "car", "observation")` still has the last observations of the old episode;
     - `("next", "car", "info", term)`: (W, A, 1) each term by its name.
 
-    Every population can be used; agents enter and leave where the mask changes. In `seats` worlds
+    Every population can be used; agents enter and leave where the mask changes. In `respawn` worlds
     an agent that is done gets another vehicle while its world goes on.
 
     Args:

@@ -136,7 +136,7 @@ def measure_training(
     )
     if worlds % workers:
         raise ConfigError(f"{worlds} worlds over {workers} workers: must be the same for each")
-    needs = {"torch": "torch", "highway_env": "highway", "stable_baselines3": "sb3"}
+    needs = {"torch": "train", "highway_env": "bench", "stable_baselines3": "train"}
     for module, extra in needs.items():
         require(module, extra)
     from cavmarl.bench.highway_rows import HighwayRows

@@ -37,14 +37,24 @@ from cavmarl.cli import (
 )
 from cavmarl.cli.output import about, print_error
 from cavmarl.cli.verify import determinism as verify_determinism
-from cavmarl.core.errors import CavmarlError
+from cavmarl.config.removed_keys import removed_option
+from cavmarl.core.errors import CavmarlError, ConfigError
 from cavmarl.core.tracebacks import print_traceback
 
 __all__ = ["app", "main"]
 
 
 class _Group(TyperGroup):
-    """Loads `map` when it is asked for: what it stands on takes longer than other commands do."""
+    """The commands. `map` is loaded when it is asked for: its imports take longer than the rest."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run a command; of an option that was removed, say what replaced it."""
+        try:
+            return super().invoke(ctx)
+        except Exception as error:
+            if refusal := removed_option(getattr(error, "option_name", None)):
+                raise ConfigError(refusal) from error
+            raise
 
     def list_commands(self, ctx: Any) -> list[str]:
         return [*super().list_commands(ctx), "map"]

@@ -33,7 +33,7 @@ def demo(
     """Adapt `cities_ippo` to `merge`, evaluate, drive `town`; leave a page and videos."""
     from cavmarl.env.parallel import parallel_env
     from cavmarl.evaluate.page import write_page
-    from cavmarl.policies.policy import driver_keys
+    from cavmarl.policies.loading import driver_keys
 
     if not 0.0 < minutes <= 600.0 or not 0.0 < seconds <= 3600.0:
         raise ConfigError("--minutes must be above 0, at most 600; --seconds above 0, at most 3600")

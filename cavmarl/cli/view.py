@@ -126,7 +126,7 @@ def drive(
 
     Episodes follow one another; the traffic of the last one is returned.
     """
-    from cavmarl.policies.policy import load_policy
+    from cavmarl.policies.loading import load_policy
     from cavmarl.render.video import VideoWriter
 
     driver = load_policy(policy, world)

@@ -135,7 +135,6 @@ def load_config(
         ConfigError: a key, a type or a value that cannot work, with the nearest that can.
     """
     from cavmarl.config.io import read_yaml, validate
-    from cavmarl.config.renamed import with_current_names
 
     found = find_entry(env)
     if found.is_dir():
@@ -144,7 +143,7 @@ def load_config(
         if isinstance(keys, dict) and isinstance(keys.get("rig"), str):
             keys["rig"] = load_rig(keys["rig"], base_dir)
         _refuse_code(keys, where)
-        config = validate(EnvConfig, with_current_names(keys, where), where)
+        config = validate(EnvConfig, keys, where)
     else:
         base_dir, where = found.parent, str(found)
         config = EnvConfig(
@@ -173,8 +172,7 @@ def load_config(
             shadow(raw, key, load_rig(str(value), base_dir) if is_named else value)
         if max_cycles is not None:
             raw["horizon_s"] = _horizon_s(max_cycles, raw)
-        where = f"{where}, overridden"
-        config = validate(EnvConfig, with_current_names(raw, where), where)
+        config = validate(EnvConfig, raw, f"{where}, overridden")
     return config, base_dir
 
 

@@ -274,21 +274,6 @@ class LidarObservationConfig(
 
 
 @dataclass(frozen=True)
-class RoadgraphConfig(SensorSection, key="sensors.roadgraph", switches=("points",)):
-    """The nearest points of the road network, as Waymax's `roadgraph_points`.
-
-    Attributes:
-        points: how many; 0 switches the sensor off.
-        range_m: distance up to which a point is seen.
-        spacing_m: largest distance between one point of a line and the next.
-    """
-
-    points: Annotated[int, Whole(0, 2048)] = 0
-    range_m: Annotated[float, Within(1.0, 300.0)] = 50.0
-    spacing_m: Annotated[float, Within(0.25, 50.0)] = 2.0
-
-
-@dataclass(frozen=True)
 class MessagesConfig(
     SensorSection, key="sensors.messages", switches=("objects", "events", "signal")
 ):
@@ -395,7 +380,6 @@ class SensorsConfig(Section, key="sensors"):
     kinematics: KinematicsConfig = field(default_factory=KinematicsConfig)
     occupancy_grid: OccupancyGridConfig = field(default_factory=OccupancyGridConfig)
     lidar_observation: LidarObservationConfig = field(default_factory=LidarObservationConfig)
-    roadgraph: RoadgraphConfig = field(default_factory=RoadgraphConfig)
     messages: MessagesConfig = field(default_factory=MessagesConfig)
     way: WayConfig = field(default_factory=WayConfig)
     conflicts: ConflictsConfig = field(default_factory=ConflictsConfig)

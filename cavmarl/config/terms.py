@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from cavmarl.config.checks import Section, Within, check, check_finite
+from cavmarl.config.removed_keys import removed_key
+from cavmarl.core.errors import ConfigError
 from cavmarl.core.extensions import REGISTERED_TERMS
 
 # The named terms of one step, in the order of every terms array (`rewards/kernels/terms.py`).
@@ -54,6 +56,8 @@ class TermsConfig(Section, key="terms"):
         super().__post_init__()
         for name, weight in self.weights.items():
             known = (*TERMS, *REGISTERED_TERMS.names)
+            if name not in known and (refusal := removed_key(f"terms.weights.{name}")):
+                raise ConfigError(refusal)
             check(
                 name in known,
                 "terms.weights",

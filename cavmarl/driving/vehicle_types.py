@@ -61,6 +61,9 @@ VTYPE = np.dtype(
     align=True,
 )
 
+# The fields that say what a type is; the others follow from them.
+STATED_FIELDS = [name for name in VTYPE.names or () if name != "as_sumo"]
+
 
 class ClassDefaults(NamedTuple):
     """The values of a type of which only the class is known, named and measured as in `VTYPE`."""

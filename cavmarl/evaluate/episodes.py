@@ -25,7 +25,8 @@ from cavmarl.evaluate.standing import StandingWatch
 from cavmarl.evaluate.tables import EPISODE, TRACK, TRANSFER, TRIP
 from cavmarl.evaluate.transfer_rows import TransferRecorder
 from cavmarl.parallel.local_worlds import LocalWorlds
-from cavmarl.policies.policy import Policy, load_policy
+from cavmarl.policies.loading import load_policy
+from cavmarl.policies.policy import Policy
 from cavmarl.recordings.extra_tables import RecordOptions
 from cavmarl.roads.kernels.map_draw import map_of
 from cavmarl.zones.partition.zone_statistics import imbalance

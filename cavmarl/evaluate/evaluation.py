@@ -61,7 +61,7 @@ from cavmarl.evaluate.transfer_rows import transfers_of
 from cavmarl.handoff.coordinator.coordinator_setup import journal_path
 from cavmarl.ownership.transfer_summary import TransferSummary
 from cavmarl.parallel.local_worlds import LocalWorlds
-from cavmarl.policies.policy import load_policy
+from cavmarl.policies.loading import load_policy
 from cavmarl.recordings.extra_tables import RecordOptions
 
 Rows = NDArray[np.void]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.driver_names import TOGETHER
 from cavmarl.config.registry import agent_entries
-from cavmarl.config.renamed import REMOVED
+from cavmarl.config.removed_keys import removed_key
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import CavmarlError, ConfigError, ManifestError, PolicyError
 from cavmarl.core.machine import describe_hardware
@@ -34,7 +34,7 @@ from cavmarl.evaluate.evaluation import (
     read_evaluation,
 )
 from cavmarl.evaluate.provenance.manifest import hash_of_file
-from cavmarl.policies.policy import policy_files
+from cavmarl.policies.loading import policy_files
 
 RESULT_FOLDER = "result"
 TABLES = (TRIPS_FILE, EPISODES_FILE, TRACKS_FILE)  # the same each time they are made
@@ -249,9 +249,8 @@ def _check_world(document: Mapping[str, Any], name: str, spec: WorldSpec) -> Non
     here = json.loads(json.dumps(describe_world(*load_world(spec.env, **spec.keywords))))
     there = document["world"]
     others = [key for key in _WORLD_KEYS if here[key] != there[key]]
-    removed = {f"config.{key}" for key in REMOVED}
     differing = _differing("config", there["config"], here["config"])
-    others += [key for key in differing if key not in removed]
+    others += [key for key in differing if removed_key(key.removeprefix("config.")) is None]
     if others:
         raise ManifestError(
             f"{name}: its result is of {there['environment']}, but {others[0]} is another in this "

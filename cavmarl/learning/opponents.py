@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cavmarl.env.vector import CavVectorEnv
-from cavmarl.policies.policy import load_policy
+from cavmarl.policies.loading import load_policy
 
 Mask = NDArray[np.bool_]
 

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 from numpy.typing import ArrayLike
 
-from cavmarl.config.renamed import OLD_TERMS
 from cavmarl.config.terms import TERMS, TermsConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.extensions import REGISTERED_TERMS
@@ -45,9 +44,7 @@ def register_term(
     """
     if not 0.0 <= reach_m < math.inf:
         raise ConfigError(f"term '{name}': reach_m = {reach_m}: must be a distance from 0")
-    REGISTERED_TERMS.add(
-        name, RegisteredTerm(function, float(reach_m), batched), function, (*TERMS, *OLD_TERMS)
-    )
+    REGISTERED_TERMS.add(name, RegisteredTerm(function, float(reach_m), batched), function, TERMS)
 
 
 def terms_reach_m(config: TermsConfig) -> float:

@@ -67,10 +67,6 @@ def observed_shapes(config: EnvConfig, observation: NDArray[np.float32]) -> list
     if "route" in parts:
         scale = sensors.route.points * sensors.route.spacing_m
         shapes.append(_places("route", "points", parts["route"].reshape(-1, 2) * scale))
-    if "roadgraph" in parts:
-        rows = parts["roadgraph"].reshape(sensors.roadgraph.points, -1)
-        seen = rows[rows[:, 0] > 0.5, 1:3] * sensors.roadgraph.range_m
-        shapes.append(_places("roadgraph", "points", seen))
     if "occupancy_grid" in parts:
         shapes.append(_occupancy(sensors.occupancy_grid, parts["occupancy_grid"]))
     return shapes

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cavmarl.driving.vehicles import STATE_FIELDS
 from cavmarl.env.vector import CavVectorEnv, StepResult
-from cavmarl.policies.policy import load_policy
+from cavmarl.policies.loading import load_policy
 
 Arrays = dict[str, NDArray[Any]]
 

@@ -12,7 +12,7 @@ from typing import Protocol
 from cavmarl.core.errors import require
 from cavmarl.core.listening import is_loopback
 from cavmarl.env.parallel import CavEnv
-from cavmarl.policies.policy import load_policy
+from cavmarl.policies.loading import load_policy
 from cavmarl.recordings.recording import Recording
 from cavmarl.viewer.run_loads import RunLoads
 from cavmarl.viewer.shown_recording import ShownRecording, recording_stages

@@ -31,7 +31,6 @@ INK, DARK = (200, 40, 120), (28, 32, 40)
 EVERY = {
     "sensors.lidar.rays": 96,
     "sensors.neighbors.count": 8,
-    "sensors.roadgraph.points": 120,
     "v2x.enabled": True,
     "sensors.kinematics.vehicles_count": 8,
     "sensors.occupancy_grid.features": ["presence", "on_road"],

@@ -13,7 +13,7 @@ import pytest
 
 import cavmarl
 from cavmarl.cosim.stack.stack import REFERENCE_RIG
-from cavmarl.policies.policy import load_policy
+from cavmarl.policies.loading import load_policy
 
 RIG: dict[str, Any] = {"clock.ctrl_dt_s": 0.05, "rig": REFERENCE_RIG}
 

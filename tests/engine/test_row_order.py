@@ -27,7 +27,6 @@ SENSORS = {
     "sensors.kinematics.order": "shuffled",
     "sensors.occupancy_grid.features": ["presence", "vx", "on_road"],
     "sensors.lidar_observation.cells": 16,
-    "sensors.roadgraph.points": 30,
     "sensors.stack": 3,
 }
 

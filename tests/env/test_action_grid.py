@@ -15,7 +15,7 @@ from cavmarl.core.errors import ActionError, PolicyError
 from cavmarl.env.actions import ActionDecoder
 from cavmarl.env.parallel import parallel_env
 from cavmarl.env.vector import CavVectorEnv, make_vec
-from cavmarl.policies.policy import load_policy
+from cavmarl.policies.loading import load_policy
 
 GRID = ActionConfig(kind="grid", acceleration_mps2=5.0, steering_rad=0.5)
 MEANINGS = [(5.0 * throttle, 0.5 * steering) for throttle, steering in GRID.pairs]

@@ -14,7 +14,7 @@ from cavmarl.adapters.gymnasium_env import CavEgoEnv
 from cavmarl.core.errors import ConfigError, PolicyError
 from cavmarl.env.parallel import parallel_env
 from cavmarl.env.vector import CavVectorEnv, make_vec
-from cavmarl.policies.policy import driver_keys, load_policy
+from cavmarl.policies.loading import driver_keys, load_policy
 
 SMALL: dict[str, Any] = {"agents": 2, "background": 2}
 

@@ -13,7 +13,7 @@ from cavmarl import make_vec
 from cavmarl.config.registry import agent_entries, load_config
 from cavmarl.core.errors import ConfigError, ManifestError, PolicyError
 from cavmarl.evaluate.zoo import TABLES, cross, verify_entry, zoo_entries
-from cavmarl.policies.policy import load_policy, policy_files
+from cavmarl.policies.loading import load_policy, policy_files
 from tests.golden.zoo import OTHER, SAME, record
 
 pytestmark = pytest.mark.integration  # a manifest asks git for the commit

@@ -28,7 +28,7 @@ from numpy._core import _multiarray_umath as numpy_core
 from cavmarl.core.cache_folder import cache_dir
 from cavmarl.evaluate.provenance.manifest import hash_of_file, read_closed
 from cavmarl.evaluate.zoo import RESULT_FOLDER, TABLES, entry_job
-from cavmarl.policies.policy import policy_files
+from cavmarl.policies.loading import policy_files
 from tests.golden import worlds
 
 

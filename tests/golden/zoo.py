@@ -21,7 +21,7 @@ from cavmarl.core.whole_file import draft_folder
 from cavmarl.evaluate.evaluation import load_report
 from cavmarl.evaluate.provenance.manifest import read_closed
 from cavmarl.evaluate.zoo import RESULT_FOLDER, TABLES, entry_job
-from cavmarl.policies.policy import policy_files
+from cavmarl.policies.loading import policy_files
 
 SAME, OTHER = "same results as before", "recorded anew"
 

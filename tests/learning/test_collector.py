@@ -10,8 +10,8 @@ import torch
 
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.learning.actor_critic import ActorCritic
+from cavmarl.policies.loading import load_policy
 from cavmarl.policies.network_files import NetworkConfig
-from cavmarl.policies.policy import load_policy
 from tests.support.training import load_program
 
 PPO = load_program("ppo")

@@ -7,7 +7,7 @@ import pytest
 import cavmarl
 from benchmarks import ring22
 from cavmarl.core.errors import PolicyError
-from cavmarl.policies.policy import load_policy
+from cavmarl.policies.loading import load_policy
 
 
 def test_one_gentle_driver_raises_the_speed_of_all_by_more_than_flows_57_percent() -> None:

@@ -16,8 +16,9 @@ from cavmarl.core.errors import ConfigError, PolicyError
 from cavmarl.cosim.stack.stack import REFERENCE_RIG
 from cavmarl.env.parallel import CavEnv, parallel_env
 from cavmarl.env.vector import make_vec
+from cavmarl.policies.loading import driver_keys, load_policy, policy_files
 from cavmarl.policies.network_files import RESIDUAL_PARTS
-from cavmarl.policies.policy import Policy, driver_keys, load_policy, policy_files
+from cavmarl.policies.policy import Policy
 from tests.support.saved_drivers import save_driver, small_vec
 
 SCRIPTED = ("idm", "random_actions")

@@ -12,7 +12,7 @@ import pytest
 from cavmarl.env.parallel import parallel_env
 from cavmarl.env.vector import make_vec
 from cavmarl.evaluate.evaluation import evaluate, load_tables
-from cavmarl.policies.policy import load_policy
+from cavmarl.policies.loading import load_policy
 
 STEPS = 60
 

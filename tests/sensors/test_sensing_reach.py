@@ -53,12 +53,11 @@ ON: dict[str, dict[str, Any]] = {
         "sensors.lidar_observation.cells": 64,
         "sensors.lidar_observation.maximum_range_m": 75.0,
     },
-    "roadgraph": {"sensors.roadgraph.points": 20},
     "way": {"sensors.way.distances_m": [5.0, 40.0], "sensors.way.lines": 2},
     "conflicts": {"sensors.conflicts.count": 6, "sensors.conflicts.range_m": 70.0},
     "history": {"sensors.history.steps": 2},
 }
-BLIND = {"route", "signal", "roadgraph", "way", "history"}  # look at no vehicle
+BLIND = {"route", "signal", "way", "history"}  # look at no vehicle
 # Shows an inbox, which one bus fills for all zones, however far away senders are (tests/v2x).
 TOLD = {"messages"}
 
@@ -177,4 +176,4 @@ def test_rays_see_the_corner_of_a_body_whose_centre_is_beyond_their_range() -> N
     simulation = world("grid4x4", "lidar")
     config = simulation.config.sensors
     assert sensing_reach_m(config, RADIUS_M) == config.lidar.range_m + RADIUS_M
-    assert sensing_reach_m(world("grid4x4", "roadgraph").config.sensors, 9.0) == TTC_REACH_M
+    assert sensing_reach_m(world("grid4x4", "way").config.sensors, 9.0) == TTC_REACH_M

@@ -12,7 +12,7 @@ import pytest
 from cavmarl.core.records.codes import DRIVER_SCRIPTED
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.evaluate.scenarios.scenario_runs import make_scenario
-from cavmarl.policies.policy import load_policy
+from cavmarl.policies.loading import load_policy
 from cavmarl.zones.partition.zone_file import write_zones
 from cavmarl.zones.partition.zone_partition import ZonePartition
 from tests.traffic.test_scenarios import NAMES, ROOMY

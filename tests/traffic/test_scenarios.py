@@ -16,7 +16,7 @@ from cavmarl.driving.kernels.junctions.gaps import link_signal
 from cavmarl.env.parallel import parallel_env
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.evaluate.scenarios.scenario_runs import ScenarioRun, make_scenario, run_scenario
-from cavmarl.policies.policy import load_policy
+from cavmarl.policies.loading import load_policy
 from cavmarl.roads.network import SIGNAL_STATES
 from cavmarl.traffic.scenarios.library import load_scenario, scenario_names, summary_of
 from cavmarl.traffic.scenarios.scene import describe

@@ -16,7 +16,7 @@ import pytest
 
 from cavmarl.config.terms import TERMS
 from cavmarl.env.vector import make_vec
-from cavmarl.policies.policy import load_policy
+from cavmarl.policies.loading import load_policy
 
 pytest.importorskip("torch")
 SCRIPT = Path(__file__).resolve().parents[2] / "train" / "ppo.py"

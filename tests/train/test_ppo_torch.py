@@ -25,7 +25,7 @@ from cavmarl.learning.actor_critic import load_network
 from cavmarl.learning.checkpoint import read_checkpoint, write_checkpoint
 from cavmarl.learning.run_folder import parse_run
 from cavmarl.parallel.pooled_worlds import PooledWorlds
-from cavmarl.policies.policy import load_policy
+from cavmarl.policies.loading import load_policy
 from tests.support.training import TRAIN, load_program
 
 CONFIGS = sorted((TRAIN.parent / "configs" / "train").glob("*.yaml"))

@@ -75,7 +75,7 @@ def test_a_library_trains_a_driver_that_evaluate_takes(
     assert header == "updates,agent_steps,seconds,trips,trip_return,success"
     assert len(rows) == 2
     from cavmarl.env.vector import make_vec
-    from cavmarl.policies.policy import load_policy
+    from cavmarl.policies.loading import load_policy
 
     vec = make_vec("merge")
     observations, infos = vec.reset(seed=0)

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from cavmarl.env.parallel import parallel_env
-from cavmarl.policies.policy import load_policy
+from cavmarl.policies.loading import load_policy
 from cavmarl.viewer.audience import Audience
 from cavmarl.viewer.shown_run import ShownRun
 from cavmarl.viewer.stage import first_stage

@@ -31,7 +31,6 @@ def told() -> Any:
     sensors = {
         "sensors.lidar.rays": 72,
         "sensors.occupancy_grid": grid,
-        "sensors.roadgraph.points": 20,
     }
     env = parallel_env("merge", agents=4, background=20, overrides={"rig": RIG, **sensors})
     env.reset(seed=3)
@@ -114,7 +113,7 @@ def test_pictures_are_small_enough_and_all_kinds_are_told(told: Any) -> None:
     assert shapes["roof"]["kind"] == "rays"
     assert shapes["tower"]["kind"] == "points"
     assert len(shapes["motion"]["rows"]) == 6
-    assert {"route", "roadgraph"} <= set(shapes)
+    assert "route" in shapes
     json.dumps(told[0], allow_nan=False)
 
 

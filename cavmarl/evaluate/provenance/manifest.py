@@ -20,7 +20,7 @@ from typing import Any
 from cavmarl.core.errors import ManifestError
 from cavmarl.core.machine import describe_machine
 from cavmarl.core.whole_file import write_whole
-from cavmarl.policies.policy import policy_files
+from cavmarl.policies.loading import policy_files
 
 MANIFEST_FILE = "manifest.json"
 SCHEMA = 2

@@ -30,7 +30,7 @@ from cavmarl.evaluate.scenarios.criticality import (
     post_encroachment_s,
     trace_of,
 )
-from cavmarl.policies.policy import load_policy
+from cavmarl.policies.loading import load_policy
 
 DENSITIES = {"none": 0.0, "low": 2.0, "high": 8.0}
 """Background vehicles a kilometre of lane."""

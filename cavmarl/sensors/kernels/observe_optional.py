@@ -1,4 +1,4 @@
-"""The sensors that most environments leave off: highway-env's, road points, those for any map."""
+"""The sensors that most environments leave off: highway-env's, and those for any map."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.sensors.kernels.frame_stacks import has_entered, newest_frame
 from cavmarl.sensors.kernels.highway_lidar import LidarCells, observe_lidar_cells
 from cavmarl.sensors.kernels.kinematics_observation import KinematicsSensor, observe_kinematics
-from cavmarl.sensors.kernels.nearest_road_points import RoadgraphSensor, observe_roadgraph
 from cavmarl.sensors.kernels.observing_conflicts import (
     ConflictsSensor,
     forget_others,
@@ -34,7 +33,6 @@ class OptionalSensors(NamedTuple):
     kinematics: KinematicsSensor
     occupancy_grid: OccupancyGrid
     lidar_observation: LidarCells
-    roadgraph: RoadgraphSensor
     way: WaySensor
     conflicts: ConflictsSensor
     history: HistorySensor
@@ -64,7 +62,6 @@ def observe_optional(
     kinematics = optional.kinematics
     occupancy_grid = optional.occupancy_grid
     lidar_observation = optional.lidar_observation
-    roadgraph = optional.roadgraph
     way = optional.way
     conflicts = optional.conflicts
     history = optional.history
@@ -89,8 +86,6 @@ def observe_optional(
                 observe_occupancy(roads, lane_grid, rows, i, grid, occupancy_grid, out)
             if lidar_observation.cells > 0:
                 observe_lidar_cells(rows, i, grid, lidar_observation, out)
-            if roadgraph.num_points > 0:
-                observe_roadgraph(row, roadgraph, out)
             phase = worlds.signal_phase[w]
             if way.distances_m.size > 0 or way.lines > 0:
                 time = worlds.ticks[w] * tick_s

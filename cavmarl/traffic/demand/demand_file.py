@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import DemandError
+from cavmarl.driving.vehicle_types import STATED_FIELDS, VTYPE
 from cavmarl.roads.network import RoadNetwork, content_of
 from cavmarl.traffic.demand.definition_collector import DefinitionCollector
 from cavmarl.traffic.demand.demand_records import ORDER, POS_GIVEN, Choices
@@ -90,7 +91,8 @@ class DemandFile:
             elif isinstance(value, DeviceOptions):
                 digest.update(repr(value).encode())
             elif isinstance(value, np.ndarray):
-                digest.update(content_of(value))
+                stated = value[STATED_FIELDS] if value.dtype == VTYPE else value
+                digest.update(content_of(stated))
             elif isinstance(value, tuple):
                 digest.update("\0".join(value).encode())
             elif isinstance(value, int):

@@ -7,7 +7,7 @@ import { Seat } from "./driving.js";
 import { drawLabels, drawSensed } from "./overlay.js";
 import { $, addEvents, element, notice, showLegend, showLoads, showScale, showVehicle } from "./panels.js";
 import { Placing } from "./placing.js";
-import { showPictures, Shapes } from "./shapes.js";
+import { showPictures, Shapes } from "./sensed_shapes.js";
 import { decodeFrame, decodeMap, FRAME, kindOf, MAP, Roster, ROSTER } from "./protocol.js";
 import { drawStill } from "./still.js";
 import { TimeLine } from "./timeline.js";

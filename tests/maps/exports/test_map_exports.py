@@ -14,7 +14,6 @@ from cavmarl.cli.map import app
 from cavmarl.core.errors import ConfigError, MapError
 from cavmarl.maps.exports.geojson import write_geojson
 from cavmarl.maps.exports.lanelet import write_lanelet2
-from cavmarl.maps.exports.left_handed import swap_positions, swap_turns
 from cavmarl.maps.exports.opendrive import write_opendrive
 from cavmarl.maps.exports.opendrive_lanes import LANES
 from cavmarl.maps.heights.draping import HeightOptions
@@ -107,26 +106,6 @@ def test_lanelets_are_read_back_and_lead_on(town: Path, tmp_path: Path) -> None:
         lanes = (link["from_lane"], link["next_lane"])
         one, other = (by_name[network.lane_ids[lane]] for lane in lanes)
         assert lanelet2.geometry.follows(one, other)
-
-
-def test_the_left_handed_frame_mirrors_motion() -> None:
-    """A vehicle on a left-hand curve: positions, headings and rates agree in both frames."""
-    t = np.linspace(0.0, 2.0, 201)
-    heading, rate = 0.3 + 0.5 * t, np.full_like(t, 0.5)
-    speed = 10.0
-    velocity = speed * np.stack([np.cos(heading), np.sin(heading)], axis=1)
-    place = np.cumsum(velocity * (t[1] - t[0]), axis=0)
-
-    other, turned = swap_positions(place), swap_turns(heading)
-    moved = np.diff(other, axis=0)
-    assert np.arctan2(moved[:, 1], moved[:, 0]) == pytest.approx(turned[1:], abs=1e-9)
-    assert np.gradient(turned, t) == pytest.approx(swap_turns(rate))
-    assert swap_positions(velocity) == pytest.approx(
-        speed * np.stack([np.cos(turned), np.sin(turned)], axis=1)
-    )
-    assert (swap_positions(other) == place).all()
-    assert (swap_turns(turned) == heading).all()
-    assert swap_positions(np.array([[1.0, 2.0, 3.0]])).tolist() == [[1.0, -2.0, 3.0]]
 
 
 def test_the_command_exports(town: Path, tmp_path: Path) -> None:

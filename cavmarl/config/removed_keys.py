@@ -1,0 +1,45 @@
+"""Keys and command-line options that were removed, and what to use in their place.
+
+An entry here only improves the refusal: a removed name is an unknown one, and has no effect.
+"""
+
+from __future__ import annotations
+
+# Dotted key of env.yaml → what replaced it. An entry covers the keys inside it, too.
+REMOVED_KEYS = {
+    "sensors.roadgraph": "use sensors.lanes, sensors.route and sensors.way for the roads ahead",
+    "terms.weights.comfort": "use terms.weights.jerk",
+    "terms.weights.speed": "use terms.weights.speeding",
+    "terms.weights.time_to_collision": "use terms.weights.ttc_risk",
+    "workers.repeats": "use workers.max_retries",
+    "workers.tolerance": "use workers.imbalance_tolerance",
+    "workers.watch": "use workers.monitor_cpu",
+    "zones.check": "use zones.check_invariants",
+    "zones.faults": "run `cavmarl verify nodes ENV --faults campaign`, which injects faults into "
+    "simulated nodes and real ones",
+    "zones.grace_ticks": "add these ticks to zones.max_deferred_ticks",
+    "zones.policy": "a vehicle is handed over after zones.max_deferred_ticks, as with 'force'",
+    "zones.recut_steps": "use zones.repartition_steps",
+    "zones.recut_tolerance": "use zones.repartition_tolerance",
+    "zones.reproducers": "run `cavmarl verify nodes ENV --faults simulated`, which names the seed of "
+    "each run that fails",
+}
+
+# Option of the command line → what replaced it.
+REMOVED_OPTIONS: dict[str, str] = {}
+
+
+def removed_key(key: str) -> str | None:
+    """Return the refusal of a dotted key that was removed, or that is inside a removed one."""
+    parts = key.split(".")
+    names = (".".join(parts[:depth]) for depth in range(len(parts), 0, -1))
+    return next((_refusal(name, REMOVED_KEYS) for name in names if name in REMOVED_KEYS), None)
+
+
+def removed_option(option: str | None) -> str | None:
+    """Return the refusal of an option that was removed."""
+    return _refusal(option, REMOVED_OPTIONS) if option in REMOVED_OPTIONS else None
+
+
+def _refusal(name: str, table: dict[str, str]) -> str:
+    return f"{name} was removed: {table[name]}"

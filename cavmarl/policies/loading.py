@@ -1,0 +1,134 @@
+"""Loading of policies: how a name or a path becomes a policy that drives in an environment.
+
+`agents/` holds the policies that come with cavmarl: `NAME.py` defines `make_policy(env)`; a folder
+holds the weights of a trained network. Both are files that are read, not modules that are imported.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from pettingzoo import ParallelEnv
+
+from cavmarl.config.driver_form import (
+    CONFIG_FILE,
+    WEIGHTS_FILE,
+    differing_keys,
+    form_of,
+    form_of_driver,
+)
+from cavmarl.config.driver_names import SHIELDED, find_driver, name_of_driver, shared_drivers
+from cavmarl.core.errors import PolicyError
+from cavmarl.core.tracebacks import fault_in
+from cavmarl.engine.spaces import flat_observation_space
+from cavmarl.env.parallel import CavEnv
+from cavmarl.env.vector import CavVectorEnv
+from cavmarl.policies.policy import Environment, NetworkPolicy, Policy, SharedPolicy
+from cavmarl.policies.shield import ShieldedPolicy
+
+
+def load_policy(policy: str | Path, env: Environment) -> Policy:
+    """Seat a policy in an environment.
+
+    Args:
+        policy: a name of `agents/`, a folder with model.safetensors and config.json, or a `.py`
+            file that defines `make_policy(env)`; several with `+` between them share the agents by
+            turns (`merge_ippo+idm`: agents 0, 2, … and agents 1, 3, …); `shielded:` before a driver
+            lets the built-in one act where that would brake harder.
+        env: a `CavEnv`, also wrapped, or a `CavVectorEnv`.
+
+    Raises:
+        PolicyError: nothing of that name, a broken file, or a network made for other observations
+            or actions than this environment's.
+    """
+    if isinstance(env, ParallelEnv):
+        env = env.unwrapped
+    if not isinstance(env, CavEnv | CavVectorEnv):
+        raise PolicyError(
+            f"env is a {type(env).__name__}: pass what parallel_env() or make_vec() returned"
+        )
+    if parts := shared_drivers(policy):
+        return SharedPolicy(env, [load_policy(part, env) for part in parts])
+    if isinstance(policy, str) and policy.startswith(SHIELDED):
+        return ShieldedPolicy(env, load_policy(policy.removeprefix(SHIELDED), env))
+    path = find_driver(policy)
+    if path.is_dir():
+        return _load_network_policy(path, env)
+    return _load_script(path, env)
+
+
+def policy_files(policy: str | Path) -> tuple[Path, ...]:
+    """The files that make a policy what it is: its script, or its weights and their description."""
+    if parts := shared_drivers(policy):
+        return tuple(dict.fromkeys(file for part in parts for file in policy_files(part)))
+    path = find_driver(policy.removeprefix(SHIELDED) if isinstance(policy, str) else policy)
+    if not path.is_dir():
+        return (path,)
+    files = (path / WEIGHTS_FILE, path / CONFIG_FILE)
+    for file in files:
+        if not file.is_file():
+            raise PolicyError(f"no {file.name} in {path}: not the folder of a trained driver")
+    return files
+
+
+def _load_script(path: Path, env: Environment) -> Policy:
+    """Run a `.py` file and let its `make_policy` seat the policy."""
+    spec = importlib.util.spec_from_file_location(f"cavmarl_policy_{path.stem}", path)
+    if spec is None or spec.loader is None:
+        raise PolicyError(f"{path}: not a Python file")
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:  # the file is the user's: it may raise anything
+        raise PolicyError(fault_in(path, error)) from error
+    make_policy = getattr(module, "make_policy", None)
+    if not inspect.isfunction(make_policy):
+        raise PolicyError(f"{path}: defines no function make_policy(env)")
+    policy = make_policy(env)
+    if not isinstance(policy, Policy):
+        raise PolicyError(
+            f"{path}: make_policy returned a {type(policy).__name__}, not a cavmarl.Policy"
+        )
+    return policy
+
+
+def _load_network_policy(folder: Path, env: Environment) -> NetworkPolicy:
+    from cavmarl.policies.driver_network import load_driver_network  # imports pydantic
+
+    network = load_driver_network(folder)
+    config, name, here = network.config, name_of_driver(folder), env.config
+    size = flat_observation_space(here).shape[0]
+    if unlike := differing_keys(form_of(config.sensors, config.action), here):
+        lines = (f"{key} is {there} for it, {ours} here" for key, (there, ours) in unlike.items())
+        cure = {key: there for key, (there, _) in unlike.items()}
+        raise PolicyError(
+            f"The policy {name} expects different {_parts(unlike)} from those that this "
+            f"environment provides ({'; '.join(lines)}). It observes {config.sensed} numbers, and "
+            f"this environment gives {size}. Add --sensors-of {name} to the command, or "
+            f"sensors_of={name!r} in Python, or pass these overrides: {cure}"
+        )
+    if config.sensed != size:
+        raise PolicyError(
+            f"{name}: observes {config.sensed} numbers, but its sensors give {size} in "
+            "this version: train it again"
+        )
+    return NetworkPolicy(env, network)
+
+
+def _parts(keys: Iterable[str]) -> str:
+    """Return the parts of an environment that the keys belong to, in words."""
+    found = {key.partition(".")[0] for key in keys}
+    names = {"sensors": "sensors", "action": "actions"}
+    return " and ".join(name for key, name in names.items() if key in found)
+
+
+def driver_keys(policy: str | Path) -> dict[str, Any]:
+    """Return what a trained driver sees and does: overrides that make any environment fit for it.
+
+    Raises PolicyError: nothing of that name, or no trained driver.
+    """
+    return form_of_driver(policy)
