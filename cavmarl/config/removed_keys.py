@@ -21,8 +21,8 @@ REMOVED_KEYS = {
     "zones.policy": "a vehicle is handed over after zones.max_deferred_ticks, as with 'force'",
     "zones.recut_steps": "use zones.repartition_steps",
     "zones.recut_tolerance": "use zones.repartition_tolerance",
-    "zones.reproducers": "run `cavmarl verify nodes ENV --faults simulated`, which names the seed of "
-    "each run that fails",
+    "zones.reproducers": "run `cavmarl verify nodes ENV --faults simulated`, which names the seed "
+    "of each run that fails",
 }
 
 # Option of the command line → what replaced it.

@@ -132,7 +132,9 @@ class Shard:
         self.sides = (self.worlds.rows, zoned.rows[1, zone])
         self.side = self.next_side = 0  # in which of them the committed rows are
         # The same for kernels: (2,), one array for all shards of this process.
-        self.row_sides = np.zeros(2, dtype=np.int64) if first is None else first.row_sides
+        self.row_sides: NDArray[np.int64] = (
+            np.zeros(2, dtype=np.int64) if first is None else first.row_sides
+        )
         self.outputs = outputs
         self.mail: Mail | None = None  # what agents have been told over the air; None: no messages
         self.untold = np.zeros((num_worlds, config.population.num_ids, 0), REPORT)

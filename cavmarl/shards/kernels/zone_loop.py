@@ -114,7 +114,7 @@ _OF_ZONE = {
 }
 
 
-def for_each_zone(phase: Callable[..., None]) -> Callable[..., None]:
+def for_each_zone(phase: Callable[..., object]) -> Callable[..., None]:
     """Return a kernel `NAME_each(members, ...)` that calls the kernel `phase` in each zone.
 
     Parameters of `phase` that are named in `_OF_ZONE` are filled in for each zone. The others
