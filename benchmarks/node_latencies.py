@@ -23,6 +23,7 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.core.processes import start_python
 from cavmarl.engine.world_setup import make_world
 from cavmarl.env.vector import CavVectorEnv
+from cavmarl.parallel.backend_name import NODES, BackendName
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.shards.shard import Commands
@@ -82,7 +83,9 @@ class _Worlds:
         config, base_dir = load_config(
             env, zones=nodes, agents=1, background=background, max_cycles=1_000_000
         )
-        self.nodes = NodeWorlds(make_world(config, base_dir), base_dir, 1, nodes)
+        self.nodes = NodeWorlds(
+            make_world(config, base_dir), base_dir, 1, BackendName(NODES, nodes)
+        )
         self.ticks_per_step = config.clock.ticks_per_step
         self.vec = CavVectorEnv(self.nodes)
         self.vec.reset(seed=1)

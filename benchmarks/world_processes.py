@@ -21,6 +21,7 @@ from cavmarl.core.huge_pages import huge_heap
 from cavmarl.core.processes import start_python
 from cavmarl.engine.world_setup import make_world
 from cavmarl.env.vector import CavVectorEnv
+from cavmarl.parallel.backend_name import NODES, BackendName
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.shards.shard import Commands
@@ -147,9 +148,11 @@ class _World:
         if nodes == 0:
             self._worlds = LocalWorlds(world, 1)
         elif network is None:
-            self._worlds = NodeWorlds(world, base_dir, 1, nodes)
+            self._worlds = NodeWorlds(world, base_dir, 1, BackendName(NODES, nodes))
         else:
-            self._worlds = NodeWorlds(world, base_dir, 1, nodes, route=network.route)
+            self._worlds = NodeWorlds(
+                world, base_dir, 1, BackendName(NODES, nodes), route=network.route
+            )
         self._ticks = config.clock.ticks_per_step
         self._is_realtime = is_realtime
         self.vec = CavVectorEnv(self._worlds)

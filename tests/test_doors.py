@@ -146,7 +146,7 @@ def test_a_driver_model_from_outside(examples: dict[str, ModuleType]) -> None:
 
 
 def test_a_backend_from_outside(examples: dict[str, ModuleType]) -> None:
-    assert run({}, hosts="at_most_two")[:2] == run({})[:2]
+    assert run({}, backend="at_most_two")[:2] == run({})[:2]
 
 
 def test_a_sensor_is_asked_in_every_step() -> None:
@@ -194,8 +194,8 @@ def test_unknown_and_taken_names_are_refused() -> None:
         cavmarl.parallel_env(ENV, overrides={"terms.weights": {"headwind": 1.0}})
     with pytest.raises(ConfigError, match=r"cavmarl.register_sensor"):
         cavmarl.parallel_env(ENV, overrides={"sensors.registered": ["nose"]})
-    with pytest.raises(ConfigError, match=r"hosts = 'moon'"):
-        cavmarl.parallel_env(ENV, hosts="moon")
+    with pytest.raises(ConfigError, match=r"backend = 'moon': there is no backend"):
+        cavmarl.parallel_env(ENV, backend="moon")
     with pytest.raises(ConfigError, match="one of cavmarl's own"):
         cavmarl.register_term("speeding", nothing)
     with pytest.raises(ConfigError, match="one of cavmarl's own"):

@@ -56,7 +56,8 @@ class Args:
     num_envs: Annotated[int, "worlds that are stepped together"] = 16
     settings: Annotated[str, "other keys of the environment: KEY=VALUE, by commas"] = ""
     zones: Annotated[int, "zones a world; 0: as the environment says"] = 0
-    workers: Annotated[int, "processes that the worlds are shared out over; 0: this one"] = 0
+    backend: Annotated[str, "where the worlds run: local, processes:N, nodes:N, ray:N, …"] = ""
+    workers: Annotated[int, "short form: N for --backend processes:N; 0: see --backend"] = 0
     seed: Annotated[int, "root of all random numbers"] = 0
     total_agent_steps: Annotated[int, "decisions to learn from"] = 4_000_000
     minutes: Annotated[float, "stop after this time, whatever is left; 0: no limit"] = 0.0
@@ -412,7 +413,8 @@ def opened(args: Args) -> Iterator[Run]:
         args.env,
         num_envs=args.num_envs,
         zones=args.zones or None,
-        workers=args.workers,
+        backend=args.backend or None,
+        workers=args.workers or None,
         agents=args.agents or None,
         background=None if args.background < 0 else args.background,
         overrides=own | parse_settings([word for word in args.settings.split(",") if word]),

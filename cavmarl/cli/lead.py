@@ -15,7 +15,16 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cavmarl.cli.output import JsonPath, about, grid, print_error, with_world, write_json
+from cavmarl.cli.output import (
+    Backend,
+    JsonPath,
+    Workers,
+    about,
+    grid,
+    print_error,
+    with_world,
+    write_json,
+)
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError, FollowerError
 
@@ -82,7 +91,8 @@ def lead(
         about("Mount the sensors that the reference stack drives with."),
     ] = "none",
     zones: Annotated[int | None, about("Shadows zones.count.")] = None,
-    workers: Annotated[int, about("Worker processes; 0: the master's own process.")] = 0,
+    backend: Backend = None,
+    workers: Workers = None,
     json_path: JsonPath = None,
 ) -> None:
     """Run a world as its time master; followers that join over a socket drive its agents."""
@@ -98,7 +108,7 @@ def lead(
     if rig in RIGS:
         given = {"clock.ctrl_dt_s": 0.05, "rig": RIGS[rig], **world.overrides}
         world = replace(world, overrides=given)
-    made = parallel_env(world.env, zones=zones, workers=workers, **world.keywords)
+    made = parallel_env(world.env, zones=zones, backend=backend, workers=workers, **world.keywords)
     with (
         closing(made),
         FollowedWorld(

@@ -80,11 +80,12 @@ def node(
 
 def _join(join: str, key_file: Path, wait_s: float) -> None:
     """Host zones until the caller ends; it does not return."""
+    from cavmarl.parallel.backend_name import read_address
     from cavmarl.parallel.nodes.newcomers import ANYONE
     from cavmarl.parallel.nodes.node_process import run_node
-    from cavmarl.parallel.nodes.node_starters import place_of, read_key
+    from cavmarl.parallel.nodes.node_starters import read_key
 
-    place, key = place_of(join), read_key(key_file)
+    place, key = read_address(join), read_key(key_file)
     console = Console()
     until_s = time.monotonic() + wait_s
     while True:

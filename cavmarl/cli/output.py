@@ -67,6 +67,14 @@ def about_file(text: str, *names: str) -> Any:
     return about(text, *names, callback=_writable)
 
 
+Backend = Annotated[
+    str | None,
+    about(
+        "Where the worlds run: local, processes:N, nodes:N, nodes:N@HOST:PORT, ray:N or ray "
+        "[default: local]."
+    ),
+]
+Workers = Annotated[int | None, about("Short form: N for --backend processes:N, 0 for local.")]
 Environment = Annotated[
     str, typer.Argument(metavar="ENV", help="Environment: a name, folder or map file.")
 ]

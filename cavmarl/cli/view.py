@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Annotated
 from rich.console import Console
 
 from cavmarl.cli.output import (
+    Backend,
     JsonPath,
     PolicyName,
     RecordAlso,
     RecordPath,
+    Workers,
     about,
     recorded,
     with_world,
@@ -45,7 +47,8 @@ def view(
         int | None, about("Outline the ghosts of this zone of a divided world.")
     ] = None,
     zones: Annotated[int | None, about("Zones that the world is divided into.")] = None,
-    workers: Annotated[int | None, about("Processes that run the zones.")] = None,
+    backend: Backend = None,
+    workers: Workers = None,
     web: Annotated[bool, about("Show it in a browser, from a page that is served here.")] = False,
     port: WebPort = DEFAULT_PORT,
     host: WebHost = "127.0.0.1",
@@ -68,7 +71,14 @@ def view(
         _check_web(seconds, video, ghosts_of, worlds, record)
         options = WebOptions(host, port, token, watch_token, control=not watch_only)
         many = [
-            parallel_env(world.env, zones=zones, workers=workers, record=kept, **world.keywords)
+            parallel_env(
+                world.env,
+                zones=zones,
+                backend=backend,
+                workers=workers,
+                record=kept,
+                **world.keywords,
+            )
             for _ in range(worlds)
         ]
         stats = show_worlds(many, policy, world.seed, options, say, seconds)
@@ -83,7 +93,13 @@ def view(
         check_display()
     mode = "human" if video is None else "rgb_array"
     made = parallel_env(
-        world.env, zones=zones, workers=workers, render_mode=mode, record=kept, **world.keywords
+        world.env,
+        zones=zones,
+        backend=backend,
+        workers=workers,
+        render_mode=mode,
+        record=kept,
+        **world.keywords,
     )
     made.ghosts_of = ghosts_of
     console = Console()

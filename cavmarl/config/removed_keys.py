@@ -1,4 +1,4 @@
-"""Keys and command-line options that were removed, and what to use in their place.
+"""Keys, keywords and command-line options that were removed, and what to use in their place.
 
 An entry here only improves the refusal: a removed name is an unknown one, and has no effect.
 """
@@ -26,7 +26,10 @@ REMOVED_KEYS = {
 }
 
 # Option of the command line → what replaced it.
-REMOVED_OPTIONS: dict[str, str] = {}
+REMOVED_OPTIONS = {"--hosts": "use --backend ray:N"}
+
+# Keyword of `make_vec` and `parallel_env` → what replaced it.
+REMOVED_ARGUMENTS = {"hosts": "use backend='ray:N' or backend='nodes:N@HOST:PORT'"}
 
 
 def removed_key(key: str) -> str | None:
@@ -39,6 +42,11 @@ def removed_key(key: str) -> str | None:
 def removed_option(option: str | None) -> str | None:
     """Return the refusal of an option that was removed."""
     return _refusal(option, REMOVED_OPTIONS) if option in REMOVED_OPTIONS else None
+
+
+def removed_argument(name: str) -> str | None:
+    """Return the refusal of a keyword that was removed."""
+    return _refusal(name, REMOVED_ARGUMENTS) if name in REMOVED_ARGUMENTS else None
 
 
 def _refusal(name: str, table: dict[str, str]) -> str:

@@ -178,7 +178,7 @@ class WorkerDeathError(WorkerError):
             f"worker {worker} ({part}) could not do its {what} (order {order}): {len(causes)} "
             f"processes died of it ({', '.join(causes)}). SIGKILL is sent by a user, or by the "
             "system when memory runs out; what a process prints stands on standard error; "
-            "workers=0 runs the same in this process"
+            "backend='local' runs the same in this process"
         )
         self.worker, self.part, self.order, self.causes = worker, part, order, tuple(causes)
 

@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from weakref import WeakValueDictionary
 
-import numpy as np
-
 from cavmarl.config.env import BY_MAP, EnvConfig
 from cavmarl.config.registry import (
     entries,
@@ -214,17 +212,6 @@ def find_map(env: str | Path) -> Path:
     if str(env) not in entries() and Path(env).is_file():
         return map_file(env).resolve()
     return map_file(resolve_map(*load_config(env))).resolve()
-
-
-def check_workers(workers: int | None) -> int:
-    """How many worker processes share some worlds out; 0: none, the caller's process runs them."""
-    if workers is None:
-        return 0
-    if isinstance(workers, bool) or not isinstance(workers, (int, np.integer)):
-        raise ConfigError(f"workers = {workers!r}: must be a whole number")
-    if workers < 0:
-        raise ConfigError(f"workers = {workers}: must be a number from 0")
-    return int(workers)
 
 
 def check_agents(config: EnvConfig) -> None:

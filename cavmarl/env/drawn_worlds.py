@@ -17,6 +17,7 @@ from cavmarl.core.records.codes import (
 )
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_frame import ENDED, NONE_ENDED
+from cavmarl.parallel.backend_name import BackendName
 from cavmarl.parallel.backends import shows_state
 from cavmarl.parallel.journaled_worlds import unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
@@ -39,8 +40,7 @@ def check_rendering(
     config: EnvConfig,
     render_mode: str | None,
     num_worlds: int,
-    workers: int | str | None,
-    hosts: str | None,
+    backend: BackendName,
     modes: tuple[str, ...] = RENDER_MODES,
 ) -> None:
     """Refuse what cannot be drawn.
@@ -53,12 +53,11 @@ def check_rendering(
     if render_mode not in modes:
         raise ConfigError(f"render_mode = {render_mode!r}: must be {' or '.join(modes)}, or None")
     with_sumo = config.traffic.source != "native"
-    is_here = not workers and hosts in (None, "local")
-    if not is_here and (with_sumo or not shows_state(num_worlds, workers, hosts)):
+    if not backend.is_local and (with_sumo or not shows_state(num_worlds, backend)):
         what = f" and traffic.source = {config.traffic.source!r}" if with_sumo else ""
         raise ConfigError(
-            f"render_mode = {render_mode!r} with workers = {workers or hosts!r}{what}: such worlds "
-            "are only drawn in the caller's process; use workers=0"
+            f"render_mode = {render_mode!r} with backend = '{backend}'{what}: such worlds are only "
+            "drawn in the caller's process; use backend='local'"
         )
 
 

@@ -48,7 +48,7 @@ def parallel_env(
         lenient: for libraries that act for absent agents, or beyond the bounds: values are clipped,
             actions of agents that have left ignored, and missing ones are the last, or 0. Sets
             action.out_of_range, .missing_action and .late_actions; traffic_stats() counts each.
-        world: zones, workers, hosts, nodes, sensor_workers, agents, background, seed, max_cycles,
+        world: zones, backend, workers, nodes, sensor_workers, agents, background, seed, max_cycles,
             sensors_of, render_mode, record and overrides, as `WorldArguments` describes them.
 
     Raises:

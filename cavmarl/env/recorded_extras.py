@@ -53,7 +53,7 @@ def check_extras(config: EnvConfig, include: Iterable[str], is_here: bool) -> No
             not (config.v2x.enabled or config.zones.count > 1)
             and "none are sent: set v2x.enabled, or zones.count above 1"
         )
-        or (not is_here and "they are only seen in the caller's process: use workers=0"),
+        or (not is_here and "they are only seen in the caller's process: use backend='local'"),
     }
     for name in include:
         if reasons[name]:

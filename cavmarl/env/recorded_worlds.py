@@ -18,6 +18,7 @@ from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_description import describe_world
 from cavmarl.engine.world_frame import WorldFrame
 from cavmarl.env.recorded_extras import RecordedExtras, check_extras
+from cavmarl.parallel.backend_name import BackendName
 from cavmarl.parallel.backends import shows_state
 from cavmarl.parallel.local_worlds import LocalWorlds, kept_elsewhere
 from cavmarl.parallel.step_arrays import SteppedWorlds
@@ -32,8 +33,7 @@ def check_recording(
     config: EnvConfig,
     record: Record | None,
     num_worlds: int,
-    workers: int | str | None,
-    hosts: str | None,
+    backend: BackendName,
 ) -> None:
     """Refuse to record worlds whose state cannot be had here.
 
@@ -42,18 +42,18 @@ def check_recording(
     """
     if record is None:
         return
-    options, is_here = RecordOptions.of(record), not workers and hosts in (None, "local")
-    check_extras(config, options.include, is_here)
-    if is_here:
+    options = RecordOptions.of(record)
+    check_extras(config, options.include, backend.is_local)
+    if backend.is_local:
         return
     key = kept_elsewhere(config)
     if not key and config.traffic.source != "native":
         key = f"traffic.source = {config.traffic.source!r}"
-    if key or not shows_state(num_worlds, workers, hosts):
+    if key or not shows_state(num_worlds, backend):
         what = f" and {key}" if key else ""
         raise ConfigError(
-            f"record = {str(options.path)!r} with workers = {workers or hosts!r}{what}: such "
-            "worlds are only recorded in the caller's process; use workers=0"
+            f"record = {str(options.path)!r} with backend = '{backend}'{what}: such worlds are "
+            "only recorded in the caller's process; use backend='local'"
         )
 
 

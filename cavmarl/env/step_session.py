@@ -188,7 +188,7 @@ class StepSession:
         if key and not isinstance(self.worlds, LocalWorlds):
             raise ConfigError(
                 f"{key}: frames of such worlds can only be had in the caller's process; use "
-                "workers=0"
+                "backend='local'"
             )
         simulation, told, arrays = self.present(), self.insertions.told, self.worlds.arrays
         return [

@@ -52,7 +52,7 @@ def make_vec(
         num_envs: number of worlds.
         autoreset_mode: when a world that is over begins anew; see `CavVectorEnv`.
         copy: False returns observations without a copy.
-        world: zones, workers, hosts, nodes, sensor_workers, agents, background, seed, max_cycles,
+        world: zones, backend, workers, nodes, sensor_workers, agents, background, seed, max_cycles,
             sensors_of, render_mode, record and overrides, as `WorldArguments` describes them.
 
     Raises:
@@ -60,7 +60,7 @@ def make_vec(
         PolicyError: `sensors_of` is no trained driver.
         MapError: the map cannot be read or driven.
         WorkerError: worker processes cannot be started, or have no memory.
-        MissingExtraError, RecordingError: `hosts` or `record` without its extra; a taken path.
+        MissingExtraError, RecordingError: no Ray, or pyarrow; `record` cannot be written.
     """
     num_envs, mode = _checked(num_envs), known_mode(autoreset_mode)
     in_next_step = mode is not AutoresetMode.SAME_STEP

@@ -8,11 +8,13 @@ from typing import Any, TypedDict, Unpack
 
 from cavmarl.config.driver_form import with_sensors_of
 from cavmarl.config.registry import load_config
+from cavmarl.config.removed_keys import removed_argument
+from cavmarl.core.errors import ConfigError
 from cavmarl.core.seeds import check_seed
 from cavmarl.engine.world_setup import check_agents, make_world
 from cavmarl.env.drawn_worlds import check_rendering
 from cavmarl.env.recorded_worlds import Record, check_recording
-from cavmarl.parallel.backends import check_hosts, make_worlds, places_of
+from cavmarl.parallel.backends import find_backend, make_worlds
 from cavmarl.parallel.step_arrays import SteppedWorlds
 
 
@@ -21,13 +23,14 @@ class WorldArguments(TypedDict, total=False):
 
     Attributes:
         zones: shadows zones.count, how many shards run the world; results do not depend on it.
-        workers: processes that the worlds are shared out over, whole worlds each; where there are
-            more of them than worlds, the zones of each world. 0: all run in the caller's process.
-            "ray": as with hosts="ray", as many as are of use. Results do not depend on it.
-        hosts: "ray": workers or nodes run on the machines of a Ray cluster (docs/cluster.md).
-            None: on this one. HOST:PORT: where nodes that are started by hand join.
-        nodes: in place of workers: processes that share nothing, each with some zones of each
-            world (docs/nodes.md). Results do not depend on it.
+        backend: where the worlds run (docs/workers.md). Results do not depend on it.
+            "local": in the caller's process. "processes:N": in N worker processes of this machine.
+            "nodes:N": in N processes that share nothing (docs/nodes.md), started on this machine.
+            "nodes:N@HOST:PORT": in N nodes that are started by hand and join there. "ray:N": in N
+            actors of a Ray cluster (docs/cluster.md), "ray": in as many as are of use.
+            The name of a registered backend: there, "name:N" with N workers.
+        workers: short form: N for "processes:N", 0 for "local".
+        nodes: short form: N for "nodes:N".
         sensor_workers: shadows workers.sensors, how many processes the sensors of `rig` are shared
             out over (docs/sensor_workers.md). Results do not depend on it.
         agents: shadows population.agents.
@@ -41,8 +44,8 @@ class WorldArguments(TypedDict, total=False):
     """
 
     zones: int | None
-    workers: int | str | None
-    hosts: str | None
+    backend: str | None
+    workers: int | None
     nodes: int | None
     sensor_workers: int | None
     agents: int | None
@@ -75,11 +78,12 @@ def start_worlds(
         TypeError: an argument of another name.
         ConfigError, PolicyError, MapError, WorkerError, MissingExtraError: as of `make_vec`.
     """
+    if refusal := next(filter(None, map(removed_argument, given)), None):
+        raise ConfigError(refusal)
     known = WorldArguments.__annotations__
     if unknown := [name for name in given if name not in known]:
         raise TypeError(f"unexpected keyword argument {unknown[0]!r}; there are {', '.join(known)}")
-    workers, hosts = places_of(given.get("workers"), given.get("hosts"), given.get("nodes"))
-    check_hosts(workers, hosts)
+    backend = find_backend(given.get("backend"), given.get("workers"), given.get("nodes"))
     if (seed := given.get("seed")) is not None:
         check_seed(seed)
     config, base_dir = load_config(
@@ -92,7 +96,7 @@ def start_worlds(
         overrides=with_sensors_of(given.get("overrides"), given.get("sensors_of")),
     )
     check_agents(config)
-    check_rendering(config, given.get("render_mode"), num_worlds, workers, hosts, render_modes)
-    check_recording(config, given.get("record"), num_worlds, workers, hosts)
+    check_rendering(config, given.get("render_mode"), num_worlds, backend, render_modes)
+    check_recording(config, given.get("record"), num_worlds, backend)
     world = make_world(config, base_dir)
-    return make_worlds(world, base_dir, num_worlds, workers, hosts, in_next_step)
+    return make_worlds(world, base_dir, num_worlds, backend, in_next_step)

@@ -62,7 +62,7 @@ DRIVER_FILES = (WEIGHTS_FILE, CONFIG_FILE, CSV_FILE)
 
 # Settings that a resumed run may be given anew.
 CAN_CHANGE = frozenset(
-    "total_agent_steps minutes resume threads device zones workers tensorboard "
+    "total_agent_steps minutes resume threads device zones backend workers tensorboard "
     "checkpoint_updates".split()
 )
 

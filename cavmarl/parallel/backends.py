@@ -2,98 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Protocol
 
 from cavmarl.core.errors import ConfigError
-from cavmarl.engine.world_setup import World, check_workers
+from cavmarl.engine.world_setup import World
+from cavmarl.parallel.backend_name import (
+    LOCAL,
+    NODES,
+    OWN,
+    PROCESSES,
+    RAY,
+    BackendName,
+    read_backend,
+)
 from cavmarl.parallel.hosts.remote_worlds import RemoteWorlds
-from cavmarl.parallel.nodes.node_starters import place_of
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.parallel.pooled_worlds import PooledWorlds
 from cavmarl.parallel.sensor_workers.sensor_worker_setup import local_worlds
 from cavmarl.parallel.step_arrays import SteppedWorlds
 
-LOCAL, PROCESSES, RAY, NODES = "local", "processes", "ray", "nodes"
-AT = "@"  # between `nodes` and where they are started
-
 
 class MakeWorlds(Protocol):
+    """Makes worlds of a registered backend."""
+
     def __call__(
         self,
         world: World,  # what each is made of
         base_dir: Path,  # the folder that its relative files start from
         num_worlds: int,  # W
-        workers: int | None,  # how many run them; None: as many as are of use
+        workers: int | None,  # N of `backend="name:N"`; None of `backend="name"`
         in_next_step: bool,  # when worlds begin anew; see `SteppedWorlds`
     ) -> SteppedWorlds:
-        """Worlds that are stepped together."""
+        """Return worlds that are stepped together."""
         ...
 
 
-@dataclass(frozen=True)
-class Backend:
-    make: MakeWorlds  # makes them there
-    # whether the number of workers, or the name in its place, has to be given
-    needs_workers: bool = False
-    # whether the caller can have the state of so many worlds with so many workers, to draw it
-    shows_state: Callable[[int, int | None], bool] = lambda num_worlds, workers: False
-
-
-def _is_split(num_worlds: int, workers: int | None) -> bool:
-    """Whether there are more workers than worlds: each hosts some zones of all of them."""
-    return workers is not None and workers > num_worlds
-
-
-def _always(num_worlds: int, workers: int | None) -> bool:
-    return True
-
-
-def _local(
-    world: World, base_dir: Path, num_worlds: int, workers: int | None, in_next_step: bool
-) -> SteppedWorlds:
-    return local_worlds(world, base_dir, num_worlds, in_next_step)
-
-
-def _processes(
-    world: World, base_dir: Path, num_worlds: int, workers: int | None, in_next_step: bool
-) -> SteppedWorlds:
-    return PooledWorlds(world, base_dir, num_worlds, int(workers or 1), in_next_step)
-
-
-def _ray(
-    world: World, base_dir: Path, num_worlds: int, workers: int | None, in_next_step: bool
-) -> SteppedWorlds:
-    if workers is not None and _is_split(num_worlds, workers):
-        return NodeWorlds(world, base_dir, num_worlds, workers, in_next_step, RAY)
-    return RemoteWorlds(world, base_dir, num_worlds, workers, in_next_step)
-
-
-def _nodes(
-    world: World,
-    base_dir: Path,
-    num_worlds: int,
-    workers: int | None,
-    in_next_step: bool,
-    hosts: str = "",
-) -> SteppedWorlds:
-    return NodeWorlds(world, base_dir, num_worlds, int(workers or 1), in_next_step, hosts)
-
-
-_BACKENDS = {
-    LOCAL: Backend(_local, shows_state=_always),
-    PROCESSES: Backend(_processes, needs_workers=True, shows_state=_always),
-    RAY: Backend(_ray, needs_workers=True, shows_state=_is_split),
-    NODES: Backend(_nodes, needs_workers=True, shows_state=_always),
-}
-_OWN = frozenset(_BACKENDS)
+_REGISTERED: dict[str, MakeWorlds] = {}
 
 
 def register_backend(name: str, make: MakeWorlds) -> None:
-    """Add a place where worlds run, which `hosts` of `make_vec` and `parallel_env` can name.
+    """Add a place where worlds run, which `backend` of `make_vec` and `parallel_env` can name.
 
     Args:
         name: of the backend.
@@ -104,88 +53,46 @@ def register_backend(name: str, make: MakeWorlds) -> None:
     """
     if not name.isidentifier():
         raise ConfigError(f"backend {name!r}: must be a name of letters, digits and _")
-    if name in _OWN:
+    if name in OWN:
         raise ConfigError(f"backend '{name}': one of cavmarl's own; take another name")
-    _BACKENDS[name] = Backend(make)
+    _REGISTERED[name] = make
 
 
-def places_of(
-    workers: int | str | None, hosts: str | None, nodes: int | None
-) -> tuple[int | str | None, str | None]:
-    """`workers` and `hosts` where worlds may be over nodes instead; `_backend` reads them."""
-    if nodes is None:
-        return workers, hosts
-    if workers:
-        raise ConfigError(
-            f"nodes = {nodes!r} with workers = {workers!r}: nodes are processes of their own; "
-            "leave one out"
-        )
-    if hosts not in (None, RAY):
-        place_of(str(hosts))
-    if not check_workers(nodes):
-        raise ConfigError(f"nodes = {nodes!r}: must be 1 or more; leave it out for this process")
-    return nodes, NODES if hosts is None else f"{NODES}{AT}{hosts}"
+def find_backend(
+    backend: str | None = None, workers: int | None = None, nodes: int | None = None
+) -> BackendName:
+    """Read where worlds run; arguments and errors as of `read_backend`."""
+    return read_backend(backend, workers, nodes, _REGISTERED)
 
 
-def _backend(name: str) -> Backend | None:
-    """The one of a name, which for nodes may say where they are started."""
-    kind, _, where = name.partition(AT)
-    if where and kind == NODES:
-        return replace(_BACKENDS[NODES], make=partial(_nodes, hosts=where))
-    return _BACKENDS.get(name)
-
-
-def check_hosts(workers: int | str | None, hosts: str | None) -> tuple[str, int | None]:
-    """The backend that both name, and its number of workers, None where it finds that out."""
-    known = ", ".join(f"'{name}'" for name in sorted(_BACKENDS, key=lambda name: name != RAY))
-    if hosts is not None and _backend(hosts) is None:
-        raise ConfigError(f"hosts = {hosts!r}: must be {known}, or None for this machine")
-    if isinstance(workers, str) and (workers not in _BACKENDS or workers in (LOCAL, PROCESSES)):
-        names = ", ".join(f"'{name}'" for name in _BACKENDS if name not in (LOCAL, PROCESSES))
-        raise ConfigError(f"workers = {workers!r}: must be a whole number, or {names}")
-    if isinstance(workers, str):
-        if hosts not in (None, workers):
-            raise ConfigError(f"workers = {workers!r} with hosts = {hosts!r}: name one of both")
-        return workers, None
-    number = check_workers(workers)
-    if hosts is None:
-        return (PROCESSES, number) if number else (LOCAL, 0)
-    if hosts == LOCAL and number:
-        raise ConfigError(
-            f"hosts = 'local' with workers = {number}: it has none; name 'processes', or leave "
-            "one out"
-        )
-    backend = _backend(hosts)
-    if backend is not None and backend.needs_workers and not number:
-        by_name = "" if hosts in _OWN - {RAY} else f", or workers='{hosts}'"
-        raise ConfigError(f"hosts = '{hosts}' without workers: say how many{by_name}")
-    return hosts, number or None
-
-
-def shows_state(num_worlds: int, workers: int | str | None, hosts: str | None) -> bool:
-    """Whether this process can have the state of the worlds; the rest as of `check_hosts`."""
-    name, number = check_hosts(workers, hosts)
-    backend = _backend(name)
-    return backend is not None and backend.shows_state(num_worlds, number)
+def shows_state(num_worlds: int, backend: BackendName) -> bool:
+    """Return whether this process can have the state of the worlds, to draw or record them."""
+    if backend.kind == RAY:
+        return backend.is_split(num_worlds)
+    return backend.kind in OWN
 
 
 def make_worlds(
     world: World,  # what each is made of
     base_dir: Path,  # the folder that its relative files start from
     num_worlds: int,  # W
-    # how many run them; 0 or None: this process; a backend's name: as many as are of use there
-    workers: int | str | None = None,
-    hosts: str | None = None,  # a backend's name; None: this machine
+    backend: BackendName,  # where they run
     in_next_step: bool = False,  # when worlds begin anew; see `SteppedWorlds`
 ) -> SteppedWorlds:
-    """Worlds of the backend that `workers` and `hosts` name.
+    """Make worlds.
 
     Raises:
-        ConfigError: workers or hosts that cannot be, or a setting that they cannot have.
-        MissingExtraError: hosts on Ray without Ray.
+        ConfigError: a setting that worlds of this backend cannot have.
+        MissingExtraError: a backend on Ray without Ray.
         WorkerError: no process, no cluster, or no memory.
     """
-    name, number = check_hosts(workers, hosts)
-    backend = _backend(name)
-    assert backend is not None
-    return backend.make(world, base_dir, num_worlds, number, in_next_step)
+    count = backend.count
+    if backend.kind == LOCAL:
+        return local_worlds(world, base_dir, num_worlds, in_next_step)
+    if backend.kind == PROCESSES:
+        return PooledWorlds(world, base_dir, num_worlds, count or 1, in_next_step)
+    if backend.kind == NODES or (backend.kind == RAY and backend.is_split(num_worlds)):
+        return NodeWorlds(world, base_dir, num_worlds, backend, in_next_step)
+    if backend.kind == RAY:
+        return RemoteWorlds(world, base_dir, num_worlds, count, in_next_step)
+    return _REGISTERED[backend.kind](world, base_dir, num_worlds, count, in_next_step)

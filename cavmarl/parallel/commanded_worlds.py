@@ -157,8 +157,8 @@ class OrderedWorlds(ABC):
 def uncopied() -> ConfigError:
     """What a copy or a pickle of worlds in other processes ends in."""
     return ConfigError(
-        "workers: worlds that worker processes run cannot be copied; use workers=0, or make the "
-        "environment once more, with the same seed"
+        "workers: worlds that worker processes run cannot be copied; use backend='local', "
+        "or make the environment once more, with the same seed"
     )
 
 
@@ -179,7 +179,7 @@ def unconnected() -> ConfigError:
     """What connecting a network simulator to worlds in workers ends in."""
     return ConfigError(
         "v2x.channel.external: a network simulator is in the caller's process, and worlds over "
-        "workers do not ask it; use workers=0, or nodes"
+        "workers do not ask it; use backend='local', or nodes"
     )
 
 

@@ -119,7 +119,9 @@ class PooledWorlds(OrderedWorlds):
     @property
     def simulation(self) -> Simulation:
         """Refused: the worlds live in other processes."""
-        raise ConfigError("the worlds live in worker processes: use workers=0 to look into them")
+        raise ConfigError(
+            "the worlds live in worker processes: use backend='local' to look into them"
+        )
 
     def save_worlds(self) -> list[bytes]:
         self._order(Task.SAVE, commits=False)

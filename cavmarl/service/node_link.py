@@ -147,8 +147,7 @@ class NodeLink:
         keys = {"workers.key_file": self._in_memory(session, key), "workers.join_timeout_s": JOIN_S}
         shown = f"[{host}]" if ":" in host else host
         return {
-            "nodes": document["nodes"],
-            "hosts": f"{shown}:{port}",
+            "backend": f"nodes:{document['nodes']}@{shown}:{port}",
             "overrides": world_keywords(document)["overrides"] | keys,
         }
 

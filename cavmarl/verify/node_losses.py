@@ -21,6 +21,7 @@ from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import make_world
 from cavmarl.env.vector import CavVectorEnv, make_vec
+from cavmarl.parallel.backend_name import NODES, BackendName
 from cavmarl.parallel.nodes.node_starters import Route, straight
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.verify.determinism import MAX_STEPS
@@ -129,7 +130,7 @@ class ComparedWorlds:
         whole = make_vec(spec.env, num_envs=worlds, **spec.keywords)
         config, base_dir = load_config(spec.env, zones=zones, **spec.keywords)
         world = make_world(config, base_dir)
-        self.worlds = NodeWorlds(world, base_dir, worlds, nodes, route=route)
+        self.worlds = NodeWorlds(world, base_dir, worlds, BackendName(NODES, nodes), route=route)
         try:
             vecs = (whole, CavVectorEnv(self.worlds))
             self._runs = [DrivenRun(vec, policy, spec.seed) for vec in vecs]

@@ -23,6 +23,7 @@ from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError, NodeRefusedError, WorkerDeathError
 from cavmarl.engine.world_setup import World, make_world
 from cavmarl.env.vector import CavVectorEnv, make_vec
+from cavmarl.parallel.backend_name import NODES, BackendName
 from cavmarl.parallel.nodes.link import HEAD_BYTES, MAGIC, FrameKind
 from cavmarl.parallel.nodes.node_process import run_node
 from cavmarl.parallel.nodes.node_starters import NodeStarter, Route
@@ -386,13 +387,13 @@ class _Run:
         ghosts = self._drawn.random() < 0.5
 
         def start(
-            hosts: str, nodes: int, settings: WorkersConfig, base_dir: Path, route: Route
+            backend: BackendName, settings: WorkersConfig, base_dir: Path, route: Route
         ) -> tuple[NodeStarter, SimulatedListener]:
-            starter = SimulatedNodes(machine, self._drawn, ghosts, nodes)
+            starter = SimulatedNodes(machine, self._drawn, ghosts, line.nodes)
             return starter, starter.listener
 
         worlds = NodeWorlds(
-            self._world, self._base_dir, 1, line.nodes,
+            self._world, self._base_dir, 1, BackendName(NODES, line.nodes),
             system=machine.system(machine.caller), start=start,
         )  # fmt: skip
         try:

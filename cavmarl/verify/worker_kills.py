@@ -12,12 +12,14 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from threading import Timer
-from typing import Any, Literal, Unpack
+from typing import Any, Unpack
 
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError, EvaluationError
 from cavmarl.core.machine import describe_hardware
 from cavmarl.env.vector import CavVectorEnv, make_vec
+from cavmarl.parallel.backend_name import PROCESSES, RAY, BackendName
+from cavmarl.parallel.backends import find_backend
 from cavmarl.parallel.hosts.host_pool import HostPool
 from cavmarl.parallel.hosts.remote_worlds import RemoteWorlds
 from cavmarl.parallel.pooled_worlds import PooledWorlds
@@ -72,8 +74,8 @@ def verify_kills(
     env: str | Path | WorldSpec,
     kills: int,
     *,
-    workers: int = 2,
-    hosts: Literal["ray"] | None = None,
+    backend: str | None = None,
+    workers: int | None = None,
     worlds: int | None = None,
     steps: int | None = None,
     policy: str | Path = "idm",
@@ -86,8 +88,9 @@ def verify_kills(
     Args:
         env: as in `make_vec`, like the other keywords; the seed is that of the kills, too.
         kills: how many signals; three in four are SIGKILL, the others SIGSTOP.
-        workers: over which the worlds are shared out.
-        hosts: "ray": they are actors of a Ray cluster, all on this machine.
+        backend: where the worlds run, `processes:N` or `ray:N` (on this machine); default:
+            `processes:2`.
+        workers: short form: N for `processes:N`.
         worlds: stepped together; default: two a worker.
         steps: how many; default: three a kill.
         policy: as in `load_policy`.
@@ -102,14 +105,22 @@ def verify_kills(
     spec = WorldSpec.of(env, **keys)
     seed = spec.seed
     steps = 3 * kills + FIRST_STEPS if steps is None else steps
-    if kills < 1 or workers < 1:
-        raise ConfigError(f"{kills} kills of {workers} workers: must be at least 1 of each")
+    where = find_backend(backend, workers)
+    if backend is None and workers is None:
+        where = BackendName(PROCESSES, 2)
+    if where.kind not in (PROCESSES, RAY) or where.count is None:
+        raise ConfigError(
+            f"backend = '{where}': workers are killed of 'processes:N' or 'ray:N'; nodes by "
+            "verify --nodes N --kill K"
+        )
+    if kills < 1:
+        raise ConfigError(f"{kills} kills: must be at least 1")
     if steps < kills + FIRST_STEPS:
         raise ConfigError(f"{steps} steps: {kills} kills need at least {kills + FIRST_STEPS}")
-    worlds = 2 * workers if worlds is None else worlds
+    worlds = 2 * where.count if worlds is None else worlds
     wanted = {"num_envs": worlds, "zones": zones, **spec.keywords}
     whole = make_vec(spec.env, **wanted)
-    parted = make_vec(spec.env, workers=workers, hosts=hosts, **wanted)
+    parted = make_vec(spec.env, backend=str(where), **wanted)
     try:
         killer = _Killer(_pool(parted), random.Random(seed))
         runs = [DrivenRun(vec, policy, seed) for vec in (whole, parted)]
@@ -134,8 +145,8 @@ def verify_kills(
     finally:
         parted.close()
     return KillReport(
-        spec.env, worlds, workers, steps, different, tuple(killer.found), killer.step_ms(), ping_us,
-        hashes, describe_hardware(),
+        spec.env, worlds, where.count, steps, different, tuple(killer.found), killer.step_ms(),
+        ping_us, hashes, describe_hardware(),
     )  # fmt: skip
 
 

@@ -166,7 +166,7 @@ def test_followers_see_the_same(
 def test_a_trace_needs_the_masters_process(address: Path) -> None:
     with (
         closing(make_env(workers=1)) as env,
-        pytest.raises(ConfigError, match="use workers=0"),
+        pytest.raises(ConfigError, match="use backend='local'"),
     ):
         FollowedWorld(env, address, trace=StepTrace())
     assert not address.exists()

@@ -88,8 +88,8 @@ PLACES: dict[str, Keywords] = {
     "workers": {"num_envs": 2, "workers": 2},
     "zones over workers": {"zones": 2, "workers": 2},
     "nodes": {"zones": 3, "nodes": 2},
-    "worlds on Ray": {"num_envs": 2, "workers": 2, "hosts": "ray"},
-    "nodes on Ray": {"zones": 3, "nodes": 2, "hosts": "ray"},
+    "worlds on Ray": {"num_envs": 2, "backend": "ray:2"},
+    "nodes on Ray": {"zones": 3, "backend": "ray:2"},
 }
 # What an undivided world, beside which others are run, does not know.
 ONLY_DIVIDED = (
@@ -98,7 +98,7 @@ ONLY_DIVIDED = (
 )  # fmt: skip
 OF_ONE_WORLD = "of one world over"
 OF_THE_CALLER = "a network simulator is in the caller's process"
-NOT_ON_HOSTS = "leave out hosts"
+NOT_ON_HOSTS = "use processes:N"
 NOT_OVER_NODES = "worlds over nodes do not have it"
 REFUSED = {
     ("a network simulator", "workers"): OF_THE_CALLER,
@@ -108,8 +108,8 @@ REFUSED = {
     ("sensor workers", "nodes"): NOT_OVER_NODES,
     ("a network simulator", "worlds on Ray"): OF_THE_CALLER,
     ("a journal", "worlds on Ray"): NOT_ON_HOSTS,
-    ("sensor workers", "worlds on Ray"): "leave out the hosts",
-    ("balance by LoadScore", "worlds on Ray"): "or leave out the hosts",
+    ("sensor workers", "worlds on Ray"): "use backend='processes:N'",
+    ("balance by LoadScore", "worlds on Ray"): "or use backend='processes:N'",
     ("sensor workers", "nodes on Ray"): NOT_OVER_NODES,
 }
 

@@ -127,8 +127,8 @@ def test_what_goes_over_the_wire(
     wire = Proxy(place)
     crowd.call(place)
     crowd.call(wire.place, keeps_files=True)
-    hosts = "{}:{}".format(*place)
-    vec = make("grid4x4", zones=4, nodes=2, hosts=hosts, **keyed(key_file), **WANTED)
+    backend = "nodes:2@{}:{}".format(*place)
+    vec = make("grid4x4", zones=4, backend=backend, **keyed(key_file), **WANTED)
     said = bytes(wire.said) + b"".join(wire.heard)
     assert (b"grid4x4" in said) == (b"cavN" in said) == (not is_elsewhere)
     assert KEY.encode() not in said
@@ -161,7 +161,7 @@ def test_a_node_that_joins_later_takes_the_place_of_a_lost_one(
     crowd.call(place, 2)
     one = make("grid4x4", **WANTED)
     vec = make(
-        "grid4x4", zones=4, nodes=2, hosts="{}:{}".format(*place), **keyed(key_file), **WANTED
+        "grid4x4", zones=4, backend="nodes:2@{}:{}".format(*place), **keyed(key_file), **WANTED
     )
     worlds = over_nodes(vec)
     for each in (one, vec):
@@ -222,7 +222,7 @@ def test_zones_that_change_their_node(make: Make, uneven: list[int], is_lost: bo
 def test_hosts_of_ray_are_nodes(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(node_starters, "RayActors", WorldHosts)
     one = make("grid4x4", **WANTED)
-    vec = make("grid4x4", zones=4, nodes=2, hosts="ray", **WANTED)
+    vec = make("grid4x4", zones=4, backend="ray:2", **WANTED)
     worlds = over_nodes(vec)
     for each in (one, vec):
         each.reset(seed=3)
@@ -287,9 +287,9 @@ def test_a_caller_waits_for_so_long(key_file: Path) -> None:
     limited = keyed(key_file, **{"workers.join_timeout_s": 1.0})
     with closing(Listener("127.0.0.1", b"", port)):
         with pytest.raises(WorkerError, match=f"cannot listen on 127.0.0.1:{port}"):
-            make_vec("grid4x4", zones=2, nodes=2, hosts=f"127.0.0.1:{port}", **limited)
+            make_vec("grid4x4", zones=2, backend=f"nodes:2@127.0.0.1:{port}", **limited)
     with pytest.raises(WorkerError, match="0 of 2 nodes have joined at"):
-        make_vec("grid4x4", zones=2, nodes=2, hosts=f"127.0.0.1:{port}", **limited)
+        make_vec("grid4x4", zones=2, backend=f"nodes:2@127.0.0.1:{port}", **limited)
 
 
 def test_a_key_is_a_secret(tmp_path: Path) -> None:
@@ -331,7 +331,7 @@ def test_a_node_by_its_command(make: Make, key_file: Path, tmp_path: Path) -> No
     process = subprocess.Popen(
         [sys.executable, "-m", "cavmarl", *words], stdout=subprocess.PIPE, text=True
     )
-    vec = make(net, zones=2, nodes=1, hosts=f"127.0.0.1:{port}", **keyed(key_file), agents=2)
+    vec = make(net, zones=2, backend=f"nodes:1@127.0.0.1:{port}", **keyed(key_file), agents=2)
     vec.reset(seed=1)
     vec.close()
     said, _ = process.communicate(timeout=WAIT_S)

@@ -140,7 +140,7 @@ def test_what_cannot_be_connected_is_refused(make: Make) -> None:
     own = make(**WANTED, zones=2, nodes=2, overrides={"v2x.enabled": True})
     with pytest.raises(ConfigError, match="the channel is our own"):
         own.worlds.connect_network(Delayed())
-    with pytest.raises(ConfigError, match="use workers=0, or nodes"):
+    with pytest.raises(ConfigError, match="use backend='local', or nodes"):
         make_vec("grid4x4", workers=1, overrides=EXTERNAL)
 
 

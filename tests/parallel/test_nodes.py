@@ -324,8 +324,8 @@ def test_one_environment_of_pettingzoo() -> None:
         ({"nodes": 5, "zones": 4}, "hosted by 1 to 4 nodes"),
         ({"nodes": 0}, "nodes = 0"),
         ({"nodes": 2, "workers": 2}, "leave one out"),
-        ({"nodes": 2, "hosts": "here"}, "must be HOST:PORT"),
-        ({"nodes": 2, "zones": 2, "hosts": "127.0.0.1:7600"}, "without workers.key_file"),
+        ({"backend": "nodes:2@here"}, "must be HOST:PORT"),
+        ({"backend": "nodes:2@127.0.0.1:7600", "zones": 2}, "without workers.key_file"),
         ({"nodes": 2, "zones": 2, "sensor_workers": 1}, "workers.sensors = 1"),
         (
             {"nodes": 2, "zones": 2, "overrides": {"workers.monitor_cpu": True}},
@@ -340,7 +340,7 @@ def test_bad_input(arguments: dict[str, Any], words: str) -> None:
 
 def test_what_needs_the_worlds_here_is_refused(make: Make) -> None:
     vec = make("grid4x4", zones=2, nodes=2, **WANTED)
-    with pytest.raises(ConfigError, match="use workers=0"):
+    with pytest.raises(ConfigError, match="use backend='local'"):
         _ = vec.simulation
     with pytest.raises(ConfigError, match="cannot be copied"):
         vec.worlds.__reduce__()

@@ -77,7 +77,7 @@ def test_the_processes_end_with_the_environment() -> None:
     env.reset(seed=0)
     assert isinstance(env.worlds, PooledWorlds)
     pids = env.worlds.pool.pids
-    with pytest.raises(ConfigError, match="workers=0"):
+    with pytest.raises(ConfigError, match="backend='local'"):
         _ = env.simulation
     env.close()
     assert alive(pids) == []
@@ -88,17 +88,13 @@ def test_the_processes_end_with_the_environment() -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"hosts": "mars", "workers": 1}, r"hosts = 'mars': must be 'ray'"),
-        ({"hosts": "ray"}, r"hosts = 'ray' without workers"),
-        ({"workers": "two"}, r"workers = 'two': must be a whole number, or 'ray'"),
-        ({"workers": -1, "hosts": "ray"}, r"workers = -1: must be a number from 0"),
         (
-            {"workers": 5, "hosts": "ray", "zones": 4},
+            {"backend": "ray:5", "zones": 4},
             r"nodes = 5: a world of 4 zone",
         ),
-        ({"workers": "ray", "render_mode": "rgb_array"}, r"workers = 'ray': such worlds are only"),
+        ({"backend": "ray", "render_mode": "rgb_array"}, r"backend = 'ray': such worlds are only"),
     ],
 )
-def test_hosts_that_cannot_be(arguments: dict[str, Any], words: str) -> None:
+def test_backends_that_cannot_be(arguments: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         parallel_env("ring", **arguments)

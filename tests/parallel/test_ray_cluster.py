@@ -30,25 +30,20 @@ def test_nodes_that_are_too_busy_are_given_none() -> None:
 
 
 def test_more_workers_than_cpus() -> None:
-    with pytest.raises(ConfigError, match=r"workers = 4.*3 free CPUs on 2 nodes.*ray start"):
+    with pytest.raises(ConfigError, match=r"backend = 'ray:4'.*3 free CPUs on 2 nodes.*ray start"):
         choose_nodes([Node("a", 2, IDLE), Node("b", 1, IDLE)], 4)
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"workers": 2, "hosts": "slurm"}, r"hosts = 'slurm': must be 'ray'"),
-        ({"workers": "all"}, r"workers = 'all': must be a whole number, or 'ray'"),
-        ({"hosts": "ray"}, "without workers"),
-        ({"workers": 0, "hosts": "ray"}, "without workers"),
-        ({"workers": -1, "hosts": "ray"}, "workers = -1"),
-        ({"workers": 3, "hosts": "ray", "num_envs": 2}, "nodes = 3: a world of 1 zone"),
-        ({"workers": 5, "hosts": "ray", "zones": 4}, "nodes = 5: a world of 4 zone"),
+        ({"backend": "ray:3", "num_envs": 2}, "nodes = 3: a world of 1 zone"),
+        ({"backend": "ray:5", "zones": 4}, "nodes = 5: a world of 4 zone"),
         (
-            {"workers": "ray", "sensor_workers": 1, "overrides": {"rig": "ten_sensors"}},
-            "workers.sensors = 1, hosts = 'ray': sensor workers are on the machine",
+            {"backend": "ray", "sensor_workers": 1, "overrides": {"rig": "ten_sensors"}},
+            "workers.sensors = 1, backend = 'ray': sensor workers are on the machine",
         ),
-        ({"workers": "ray", "overrides": {"zones.journal": "a.jsonl"}}, "zones.journal"),
+        ({"backend": "ray", "overrides": {"zones.journal": "a.jsonl"}}, "zones.journal"),
     ],
 )
 def test_settings_that_cannot_be(arguments: dict[str, object], words: str) -> None:
@@ -59,4 +54,4 @@ def test_settings_that_cannot_be(arguments: dict[str, object], words: str) -> No
 def test_ray_is_asked_for_where_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "ray", None)
     with pytest.raises(MissingExtraError, match=r"'ray'.*pip install '\.\[ray\]'"):
-        make_vec("ring", workers="ray")
+        make_vec("ring", backend="ray")

@@ -52,18 +52,18 @@ def test_what_becomes_of_the_worlds_of_each_host() -> None:
 @pytest.mark.parametrize(
     "arguments",
     [
-        {"env": "grid4x4", "zones": 4, "workers": 3},
-        {"env": "merge", "autoreset_mode": "NextStep", "workers": 2},
-        {"env": "town", "overrides": STACKED, "workers": 2},
+        {"env": "grid4x4", "zones": 4, "backend": "ray:3"},
+        {"env": "merge", "autoreset_mode": "NextStep", "backend": "ray:2"},
+        {"env": "town", "overrides": STACKED, "backend": "ray:2"},
     ],
 )
 def test_worlds_that_move_are_the_same(
     make: Make, uneven: list[int], arguments: dict[str, Any]
 ) -> None:
     wanted = WANTED | arguments
-    whole = drive(make(**{**wanted, "workers": 0}), steps=20)
+    whole = drive(make(**{**wanted, "backend": "local"}), steps=20)
     wanted["overrides"] = {**wanted.get("overrides", {}), **RESTLESS}
-    vec = make(hosts="ray", **wanted)
+    vec = make(**wanted)
     assert same(drive(vec, steps=20), whole)
     assert sum(uneven) > 0
     assert remote(vec).deaths == []
@@ -90,14 +90,14 @@ def test_vehicles_that_find_their_own_way_keep_it(
     whole = make(net, **wanted)
     before = drive(whole, steps=400)
     assert whole.traffic_stats()["rerouted"] > 0
-    assert same(drive(make(net, workers=2, hosts="ray", **wanted), steps=400), before)
+    assert same(drive(make(net, backend="ray:2", **wanted), steps=400), before)
     assert sum(uneven) > 0
 
 
 def test_chosen_worlds_begin_anew_wherever_they_are(make: Make, uneven: list[int]) -> None:
     chosen = np.array([False, True, False, True, True])
     found = []
-    for more in ({}, {"workers": 2, "hosts": "ray"}):
+    for more in ({}, {"backend": "ray:2"}):
         vec = make("merge", num_envs=5, agents=2, overrides=RESTLESS, **more)
         drive(vec, steps=9)
         observations, infos = vec.reset(options={"reset_mask": chosen})
@@ -113,7 +113,7 @@ def test_hosts_that_die_while_worlds_move(
 ) -> None:
     """Before the order is sent, while it is carried out, or when it is through."""
     whole = drive(make("grid4x4", **WANTED), steps=20)
-    vec = make("grid4x4", workers=2, hosts="ray", overrides=RESTLESS, **WANTED)
+    vec = make("grid4x4", backend="ray:2", overrides=RESTLESS, **WANTED)
     rng = random.Random(2)
     run, timers = HostPool.run, []
 
@@ -132,7 +132,7 @@ def test_hosts_that_die_while_worlds_move(
 
 def test_who_dies_later_comes_back_with_what_it_had_last(make: Make, uneven: list[int]) -> None:
     whole = drive(make("grid4x4", **WANTED), steps=24)
-    vec = make("grid4x4", workers=2, hosts="ray", overrides=RESTLESS, **WANTED)
+    vec = make("grid4x4", backend="ray:2", overrides=RESTLESS, **WANTED)
 
     def strike(step: int) -> None:
         if step % 7 == 5:
@@ -149,7 +149,7 @@ def test_a_move_that_is_interrupted_leaves_every_world_somewhere(
     make: Make, uneven: list[int], monkeypatch: pytest.MonkeyPatch, is_through: bool
 ) -> None:
     whole = drive(make("ring", **WANTED))
-    vec = make("ring", workers=2, hosts="ray", overrides=RESTLESS, **WANTED)
+    vec = make("ring", backend="ray:2", overrides=RESTLESS, **WANTED)
     run, failed = HostPool.run, []
 
     def interrupt(self: HostPool, task: int, *args: Any, **more: Any) -> Any:
@@ -178,7 +178,7 @@ def test_a_move_that_is_interrupted_leaves_every_world_somewhere(
 def test_a_case_that_is_not_what_was_packed(
     make: Make, uneven: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    vec = make("ring", workers=2, hosts="ray", overrides=RESTLESS, **WANTED)
+    vec = make("ring", backend="ray:2", overrides=RESTLESS, **WANTED)
     unpack = RemoteWorlds._unpack
 
     def spoil(self: RemoteWorlds, bounds: Any) -> None:
@@ -195,7 +195,7 @@ def test_a_case_that_is_not_what_was_packed(
 
 def test_the_plan_is_that_of_the_hosts_and_on_record(make: Make, tmp_path: Path) -> None:
     overrides = {"workers.balance_steps": 3, "workers.imbalance_tolerance": 0.0}
-    vec = make("ring", workers=2, hosts="ray", overrides=overrides, **WANTED)
+    vec = make("ring", backend="ray:2", overrides=overrides, **WANTED)
     begin_training(tmp_path, "test", {"seed": 1}, remote(vec).world, vec.plans)
     drive(vec)
     end_training(tmp_path, [], vec.plans)
@@ -207,6 +207,6 @@ def test_the_plan_is_that_of_the_hosts_and_on_record(make: Make, tmp_path: Path)
 
 def test_only_this_machine_is_watched() -> None:
     with pytest.raises(
-        ConfigError, match=r"workers\.monitor_cpu = True, hosts = 'ray'.*leave it out"
+        ConfigError, match=r"workers\.monitor_cpu = True, backend = 'ray'.*use backend"
     ):
-        make_vec("ring", workers=1, hosts="ray", overrides={"workers.monitor_cpu": True})
+        make_vec("ring", backend="ray:1", overrides={"workers.monitor_cpu": True})

@@ -23,7 +23,7 @@ import psutil, ray
 from cavmarl import make_vec
 
 if __name__ == "__main__":
-    first, second = (make_vec("ring", workers=1, hosts="ray") for _ in range(2))
+    first, second = (make_vec("ring", backend="ray:1") for _ in range(2))
     assert first.reset(seed=0)[0].tobytes() == second.reset(seed=0)[0].tobytes()
     first.close()
     second.step(second.suggest_actions())
@@ -51,7 +51,7 @@ from cavmarl import make_vec
 if __name__ == "__main__":
     wanted = {"agents": 4, "background": 20}
     one = make_vec("grid4x4", **wanted)
-    vec = make_vec("grid4x4", zones=4, nodes=2, hosts="ray", **wanted)
+    vec = make_vec("grid4x4", zones=4, backend="ray:2", **wanted)
     for each in (one, vec):
         each.reset(seed=1)
     os.kill(vec.worlds.pids[0], signal.SIGKILL)
@@ -82,7 +82,7 @@ def test_nodes_are_actors_and_a_lost_one_comes_back() -> None:
 def test_hosts_are_killed_and_nobody_can_tell() -> None:
     command = ["verify", "ring", "--agents", "3", "--background", "4", "--kill", "2"]
     done = subprocess.run(
-        [sys.executable, "-m", "cavmarl", *command, "--hosts", "ray"],
+        [sys.executable, "-m", "cavmarl", *command, "--backend", "ray:2"],
         cwd=ROOT, capture_output=True, text=True, timeout=200,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -92,7 +92,7 @@ def test_hosts_are_killed_and_nobody_can_tell() -> None:
 def test_zones_over_ray_are_verified_as_nodes() -> None:
     world = ["town", "--agents", "3", "--worlds", "1", "--zones", "4"]
     done = subprocess.run(
-        [sys.executable, "-m", "cavmarl", "verify", *world, "--kill", "2", "--hosts", "ray"],
+        [sys.executable, "-m", "cavmarl", "verify", *world, "--kill", "2", "--backend", "ray:2"],
         cwd=ROOT, capture_output=True, text=True, timeout=200,
     )  # fmt: skip
     assert done.returncode == 2
@@ -102,7 +102,7 @@ def test_zones_over_ray_are_verified_as_nodes() -> None:
 def test_a_cluster_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
     with pytest.raises(WorkerError, match=r"no Ray cluster at 127.0.0.1:1.*ray start --head"):
-        make_vec("ring", workers=1, hosts="ray")
+        make_vec("ring", backend="ray:1")
 
 
 def test_ray_understands_the_file_of_machines() -> None:
@@ -118,4 +118,4 @@ def test_ray_understands_the_file_of_machines() -> None:
 def test_a_client_is_no_member(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RAY_ADDRESS", "ray://127.0.0.1:10001")
     with pytest.raises(ConfigError, match="on a node of the cluster"):
-        make_vec("ring", workers=1, hosts="ray")
+        make_vec("ring", backend="ray:1")

@@ -82,7 +82,7 @@ def nodes_of(pids: list[int]) -> list[int]:
 def test_machines_change_nothing(make: Make, cluster: Any, arguments: dict[str, Any]) -> None:
     wanted = WANTED | arguments
     here = drive(make(**wanted))
-    vec = make(workers=2, hosts="ray", **wanted)
+    vec = make(backend="ray:2", **wanted)
     assert same(drive(vec), here)
     assert same(drive(vec), here)
     assert remote(vec).deaths == []
@@ -92,7 +92,7 @@ def test_machines_change_nothing(make: Make, cluster: Any, arguments: dict[str, 
 def test_chosen_worlds_begin_anew_on_their_machines(make: Make, cluster: Any) -> None:
     chosen = np.array([False, True, False, True, True])
     found = []
-    for arguments in ({}, {"workers": "ray"}):
+    for arguments in ({}, {"backend": "ray"}):
         vec = make("grid4x4", **WANTED, **arguments)
         drive(vec, steps=3)
         if arguments:
@@ -107,7 +107,7 @@ def test_chosen_worlds_begin_anew_on_their_machines(make: Make, cluster: Any) ->
 def test_an_actor_that_dies_is_not_missed(
     make: Make, cluster: Any, whole: Any, how: signal.Signals
 ) -> None:
-    vec = make("grid4x4", workers=2, hosts="ray", **WANTED)
+    vec = make("grid4x4", backend="ray:2", **WANTED)
     struck: list[int] = []
     times: list[float] = []
 
@@ -124,7 +124,7 @@ def test_an_actor_that_dies_is_not_missed(
 
 
 def test_an_actor_that_dies_in_the_middle_of_a_step(make: Make, cluster: Any, whole: Any) -> None:
-    vec = make("grid4x4", workers=2, hosts="ray", **WANTED)
+    vec = make("grid4x4", backend="ray:2", **WANTED)
     timers: list[Timer] = []
 
     def strike(step: int) -> None:
@@ -140,7 +140,7 @@ def test_an_actor_that_dies_in_the_middle_of_a_step(make: Make, cluster: Any, wh
     assert len(remote(vec).deaths) == 2
 
 
-@pytest.mark.parametrize("more", [{"workers": 1, "hosts": "ray"}, {"workers": "ray"}])
+@pytest.mark.parametrize("more", [{"backend": "ray:1"}, {"backend": "ray"}])
 def test_the_view_of_pettingzoo_is_the_one_of_one_process(
     cluster: Any, more: dict[str, Any]
 ) -> None:
@@ -156,7 +156,7 @@ def test_the_view_of_pettingzoo_is_the_one_of_one_process(
 
     assert drive_view(env, before=kill) == whole
     assert pool.deaths
-    with pytest.raises(ConfigError, match="workers=0"):
+    with pytest.raises(ConfigError, match="backend='local'"):
         _ = env.simulation
     pids = pool.pids
     env.close()
@@ -170,7 +170,7 @@ def test_worlds_that_move_between_nodes_are_the_same(
 ) -> None:
     """The host that dies has worlds by then that it had not been started with."""
     whole = drive(make("grid4x4", **WANTED), steps=16)
-    vec = make("grid4x4", workers=3, hosts="ray", overrides=RESTLESS, **WANTED)
+    vec = make("grid4x4", backend="ray:3", overrides=RESTLESS, **WANTED)
     vec.reset(seed=0)
     assert len(set(nodes_of(remote(vec).pool.pids))) == 2
 
@@ -186,7 +186,7 @@ def test_worlds_that_move_between_nodes_are_the_same(
 
 def test_zones_of_one_world_are_hosted_by_nodes(cluster: Any) -> None:
     whole = drive_view(parallel_env("grid4x4", **settings("open", "dict")))
-    env = parallel_env("grid4x4", workers=2, hosts="ray", **settings("open", "dict"))
+    env = parallel_env("grid4x4", backend="ray:2", **settings("open", "dict"))
     assert isinstance(env.worlds, NodeWorlds)
     assert drive_view(env) == whole
     env.close()
@@ -194,16 +194,16 @@ def test_zones_of_one_world_are_hosted_by_nodes(cluster: Any) -> None:
 
 def test_errors_are_those_of_one_process(make: Make, cluster: Any) -> None:
     with pytest.raises(CapacityError, match=r"population\.agents"):
-        make("ring", num_envs=2, workers=1, hosts="ray", agents=4, background=400)
-    with pytest.raises(ConfigError, match=r"workers = 4.*3 free CPUs on 2 nodes"):
-        make("ring", num_envs=4, workers=4, hosts="ray")
-    vec = make("ring", num_envs=2, workers=1, hosts="ray")
-    with pytest.raises(ConfigError, match="workers=0"):
+        make("ring", num_envs=2, backend="ray:1", agents=4, background=400)
+    with pytest.raises(ConfigError, match=r"backend = 'ray:4'.*3 free CPUs on 2 nodes"):
+        make("ring", num_envs=4, backend="ray:4")
+    vec = make("ring", num_envs=2, backend="ray:1")
+    with pytest.raises(ConfigError, match="backend='local'"):
         _ = vec.simulation
 
 
 def test_nothing_is_left_behind_and_the_cluster_stays(make: Make, cluster: Any) -> None:
-    vec = make("ring", num_envs=2, workers=2, hosts="ray")
+    vec = make("ring", num_envs=2, backend="ray:2")
     vec.reset(seed=0)
     pids = remote(vec).pool.pids
     vec.close()
@@ -215,7 +215,7 @@ def test_nothing_is_left_behind_and_the_cluster_stays(make: Make, cluster: Any) 
 def test_a_node_that_dies_is_not_missed(make: Make, cluster: Any, whole: Any) -> None:
     """All its processes at once; what it hosted goes on at the other node."""
     node = cluster.add_node(num_cpus=1)
-    vec = make("grid4x4", workers=4, hosts="ray", **WANTED)
+    vec = make("grid4x4", backend="ray:4", **WANTED)
     raylet = node.all_processes["raylet"][0].process.pid
     vec.reset(seed=0)
     pids = remote(vec).pool.pids
@@ -237,7 +237,7 @@ import ray
 from cavmarl import make_vec
 
 if __name__ == "__main__":
-    vec = make_vec("ring", num_envs=2, workers=2, hosts="ray")
+    vec = make_vec("ring", num_envs=2, backend="ray:2")
     vec.reset(seed=0)
     print("pids", *vec.worlds.pool.pids, flush=True)
     os.kill(os.getpid(), signal.SIGKILL)

@@ -162,7 +162,7 @@ def test_a_recording_takes_no_others_place(good: Path, tmp_path: Path) -> None:
 
 def test_worlds_that_cannot_be_seen_are_not_recorded(tmp_path: Path) -> None:
     settings = {"zones.journal": str(tmp_path / "journal.jsonl")}
-    with pytest.raises(ConfigError, match=r"record = .*use workers=0"):
+    with pytest.raises(ConfigError, match=r"record = .*use backend='local'"):
         make_vec("ring", workers=1, record=tmp_path / "run", overrides=settings)
     assert not (tmp_path / "run").exists()
 

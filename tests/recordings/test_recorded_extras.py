@@ -118,7 +118,7 @@ def test_messages_are_all_that_were_sent(tmp_path: Path) -> None:
         (("pictures",), {}, "must be of observations, samples, messages"),
         (("samples",), {}, "no vehicle carries sensors: set rig"),
         (("messages",), {}, "none are sent: set v2x.enabled"),
-        (("messages",), {"workers": 2, "zones": 2}, "use workers=0"),
+        (("messages",), {"workers": 2, "zones": 2}, "use backend='local'"),
         (
             ("observations",),
             {"overrides": {**RIG, "observation.mode": "sensors", "observation.kind": "dict"}},

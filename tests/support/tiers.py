@@ -27,7 +27,7 @@ _OF_PROCESSES = re.compile(
     r"|^from tests\.support\.(dead_ends|world_hosts|service) import"
     r"|^from tests\.support\.chromium import"
     r"|importorskip\(\"(libsumo|ray)\""
-    r"|\bworkers=(?!0\b)|\bhosts=|\bnodes=",
+    r"|\bworkers=(?!0\b)|\bbackend=\"(?!local)|\bnodes=",
     re.MULTILINE,
 )
 _STARTS = {"subprocess.Popen", "os.fork", "os.posix_spawn", "os.system"}

@@ -51,8 +51,8 @@ def verify(
     seeds: options.Seeds = 12,
     kill: options.Kill = None,
     nodes: options.Nodes = None,
-    workers: options.Workers = 2,
-    hosts: options.Hosts = None,
+    backend: options.Backend = None,
+    workers: options.Workers = None,
     check: options.Check = False,
     journal: options.Journal = None,
     json_path: JsonPath = None,
@@ -61,8 +61,9 @@ def verify(
 
     With --kill: worlds whose workers are killed beside undisturbed ones.
     """
-    if hosts is not None and kill is None:
-        raise ConfigError(f"--hosts {hosts}: goes with --kill only")
+    for option, value in (("--backend", backend), ("--workers", workers)):
+        if value is not None and (kill is None or nodes is not None):
+            raise ConfigError(f"{option} {value}: goes with --kill only, and without --nodes")
     counts = None if zones is None else _counts(zones)
     if env is not None:
         world = with_sensors_of_drivers(world, [policy])
@@ -82,7 +83,7 @@ def verify(
         run |= {"faults": faults, "zones": one, "seeds": seeds}
         return verify_node_campaign(console, strict, _counts(nodes), json_path, **run)
     if kill is not None and nodes is None:
-        run |= {"zones": one, "worlds": worlds, "workers": workers, "hosts": hosts}
+        run |= {"zones": one, "worlds": worlds, "backend": backend, "workers": workers}
         return verify_with_kills(console, strict, kill, json_path, **run)
     run |= {"worlds": 1 if worlds is None else worlds}
     if nodes is None and faults is not None:

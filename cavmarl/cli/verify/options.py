@@ -58,11 +58,14 @@ Nodes = Annotated[
         metavar="N,N,…",
     ),
 ]
-Workers = Annotated[int, about("With --kill: workers that run the worlds.")]
-Hosts = Annotated[
+Backend = Annotated[
     str | None,
-    about("With --kill: the workers are actors of a Ray cluster on this machine.", metavar="ray"),
+    about(
+        "With --kill: where the worlds run: processes:N, or ray:N for a Ray cluster on this "
+        "machine [default: processes:2]."
+    ),
 ]
+Workers = Annotated[int | None, about("Short form: N for --backend processes:N.")]
 Check = Annotated[bool, about("Check the invariants of ownership, too.", "--check")]
 Journal = Annotated[
     Path | None, about("Folder for the journals of the divided worlds.", metavar="DIR")

@@ -109,8 +109,8 @@ def choose_nodes(known: Sequence[Node], workers: int) -> list[str]:  # names of 
     free = sum(node.cpus for node in known)
     if workers > free:
         raise ConfigError(
-            f"workers = {workers}: the Ray cluster has {free} free CPUs on {len(known)} nodes; use "
-            "fewer workers, or add nodes (ray start --address=…); ray status shows their users"
+            f"backend = 'ray:{workers}': the Ray cluster has {free} free CPUs on {len(known)} "
+            "nodes; use fewer, or add nodes (ray start --address=…); ray status shows their users"
         )
     left = list(known)
     chosen: list[str] = []

@@ -61,7 +61,7 @@ class RemoteWorlds(OrderedWorlds):
         config = world.config
         refuse_external(config.v2x)
         refuse_watched(
-            config.zones, "of worlds on hosts", "run them on this machine; leave out hosts"
+            config.zones, "of worlds on hosts", "run them on this machine; use processes:N"
         )
         refuse_on_hosts(config.workers)
         if not compiled_before():
@@ -100,7 +100,9 @@ class RemoteWorlds(OrderedWorlds):
     @property
     def simulation(self) -> Simulation:
         """Refused: the worlds live elsewhere."""
-        raise ConfigError("the worlds live on other machines: use workers=0 to look into them")
+        raise ConfigError(
+            "the worlds live on other machines: use backend='local' to look into them"
+        )
 
     def _pids(self) -> Mapping[int, int]:
         return dict.fromkeys(range(len(self._mine)), 0)  # not measured: they run elsewhere
@@ -189,13 +191,13 @@ def refuse_on_hosts(workers: WorkersConfig) -> None:
     """Refuse what worlds on several machines cannot have."""
     if workers.monitor_cpu:
         raise ConfigError(
-            "workers.monitor_cpu = True, hosts = 'ray': sees one machine; leave it out "
-            "(Ray tells what is reserved on each node), or leave out the hosts"
+            "workers.monitor_cpu = True, backend = 'ray': sees one machine; leave it out "
+            "(Ray tells what is reserved on each node), or use backend='processes:N'"
         )
     if workers.sensors:
         raise ConfigError(
-            f"workers.sensors = {workers.sensors}, hosts = 'ray': sensor workers are on the "
-            "machine of the worlds; leave it 0, or leave out the hosts"
+            f"workers.sensors = {workers.sensors}, backend = 'ray': sensor workers are on the "
+            "machine of the worlds; leave it 0, or use backend='processes:N'"
         )
 
 

@@ -23,6 +23,7 @@ from cavmarl.handoff.coordinator.journal import Journal
 from cavmarl.handoff.shard_setup import limits_of
 from cavmarl.ownership.decisions import Neighbours
 from cavmarl.ownership.reactions import Hosting
+from cavmarl.parallel.backend_name import BackendName
 from cavmarl.parallel.commanded_worlds import own_error
 from cavmarl.parallel.journaled_worlds import unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
@@ -77,16 +78,15 @@ class NodePool:
         world: World,  # what each is made of
         base_dir: Path,  # the folder that its relative files start from
         num_worlds: int,  # W
-        nodes: int,  # n, from 1 to the zones of a world
+        backend: BackendName,  # what starts n nodes, from 1 to the zones of a world
         in_next_step: bool = False,  # when worlds begin anew; see `SteppedWorlds`
-        hosts: str = "",  # what starts the nodes; see `start_nodes`
         route: Route = straight,  # where to call in order to reach a place
         system: NodeSystem = MACHINE,  # that the nodes are on
         start: Start = start_nodes,  # starts them
     ) -> None:
         self.world, self._route = world, route
         self.in_next_step = in_next_step
-        config, count = world.config, world.partition.count
+        config, count, nodes = world.config, world.partition.count, backend.count or 1
         layout = layout_of(config, world.capacity, num_worlds).items()
         self.arrays = StepArrays.of({name: np.zeros(shape, kind) for name, (kind, shape) in layout})
         self._placement = StepPlacement(world, 1, nodes, is_here=False)
@@ -130,7 +130,7 @@ class NodePool:
             "lease_ticks": self._lease_ticks,
         }
         files = files_of(config, base_dir)
-        self._starter, listener = start(hosts, nodes, config.workers, base_dir, route)
+        self._starter, listener = start(backend, config.workers, base_dir, route)
         self._newcomers = Newcomers(listener, job, files, self._room, system)
         try:
             self._begin(nodes)

@@ -12,6 +12,7 @@ from cavmarl.config.workers import WorkersConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.huge_pages import huge_heap
 from cavmarl.core.processes import start_python
+from cavmarl.parallel.backend_name import RAY, BackendName
 from cavmarl.parallel.hosts.host_registry import Launcher
 from cavmarl.parallel.hosts.listener import Listener
 from cavmarl.parallel.hosts.ray_actors import RayActors
@@ -20,8 +21,7 @@ from cavmarl.parallel.nodes.node_system import NodeListener
 from cavmarl.parallel.processes.watchdog import is_stopped
 
 NODE = "cavmarl.parallel.nodes.local_node"  # the program of a node
-LOCAL = "127.0.0.1"  # where nodes of this machine meet
-RAY = "ray"
+LOOPBACK = "127.0.0.1"  # where nodes of this machine meet
 MIN_KEY = 32  # characters of a key file
 END_S = 5.0  # for nodes to end by themselves
 
@@ -190,14 +190,13 @@ class JoinedNodes:
 
 
 Start: TypeAlias = Callable[
-    [str, int, WorkersConfig, Path, Route], tuple[NodeStarter, NodeListener]
+    [BackendName, WorkersConfig, Path, Route], tuple[NodeStarter, NodeListener]
 ]
 """Begins to start nodes; arguments as of `start_nodes`."""
 
 
 def start_nodes(
-    hosts: str,  # "": this machine; "ray"; else HOST:PORT, for nodes that are started by hand
-    nodes: int,
+    backend: BackendName,  # nodes of this machine, of Ray, or that are started by hand
     settings: WorkersConfig,
     base_dir: Path,  # the folder that a relative key file starts from
     route: Route,  # for nodes of this machine
@@ -205,32 +204,25 @@ def start_nodes(
     """Begin to start nodes; they call the listener.
 
     Raises:
-        ConfigError: a place or a key file that cannot be.
+        ConfigError: a key file that cannot be.
         MissingExtraError: Ray is not installed.
         WorkerError: the port cannot be listened on, or nodes cannot be started.
     """
-    if hosts == "":
-        listener = Listener(LOCAL)
-        return LocalNodes(nodes, listener, route(listener.place), settings.max_retries), listener
-    if hosts == RAY:
+    nodes = backend.count or 1
+    if backend.kind == RAY:
         actors = RayActors(run_on_ray, lambda workers: "", nodes, nodes)
         listener = Listener(actors.address)
         return RayNodes(actors, listener, settings.max_retries), listener
-    host, port = place_of(hosts)
+    if backend.address is None:
+        listener = Listener(LOOPBACK)
+        return LocalNodes(nodes, listener, route(listener.place), settings.max_retries), listener
+    host, port = backend.address
     if not settings.key_file:
         raise ConfigError(
-            f"hosts = {hosts!r} without workers.key_file: name the file with the key that nodes "
-            "have to know"
+            f"backend = '{backend}' without workers.key_file: name the file with the key that "
+            "nodes have to know"
         )
     return JoinedNodes(), Listener(host, read_key(base_dir / settings.key_file), port)
-
-
-def place_of(text: str) -> tuple[str, int]:
-    """HOST:PORT, read. Raises ConfigError: it is none."""
-    host, colon, port = text.rpartition(":")
-    if not (host and colon and port.isascii() and port.isdigit() and 0 < int(port) < 1 << 16):
-        raise ConfigError(f"{text!r}: must be HOST:PORT, as 192.168.1.10:7600")
-    return host, int(port)
 
 
 def read_key(path: Path) -> bytes:

@@ -23,6 +23,7 @@ from cavmarl.engine.world_setup import World
 from cavmarl.handoff.repartitioning import Recut, is_due
 from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.transfers import TransferLog
+from cavmarl.parallel.backend_name import BackendName
 from cavmarl.parallel.commanded_worlds import uncopied
 from cavmarl.parallel.mover import Mover
 from cavmarl.parallel.nodes.agent_stream import ResultStream
@@ -69,17 +70,14 @@ class NodeWorlds(NodePool):
         world: World,  # what each is made of
         base_dir: Path,  # the folder that its relative files start from
         num_worlds: int,  # W
-        nodes: int,  # n, from 1 to the zones of a world
+        backend: BackendName,  # what starts n nodes, from 1 to the zones of a world
         in_next_step: bool = False,  # when worlds begin anew; see `SteppedWorlds`
-        hosts: str = "",  # what starts the nodes; see `start_nodes`
         route: Route = straight,  # where nodes of this machine call in order to reach a place
         system: NodeSystem = MACHINE,  # that the nodes are on
         start: Start = start_nodes,  # starts them
     ) -> None:
-        check_nodes(world, nodes)
-        super().__init__(
-            world, base_dir, num_worlds, nodes, in_next_step, hosts, route, system, start
-        )
+        check_nodes(world, backend.count or 1)
+        super().__init__(world, base_dir, num_worlds, backend, in_next_step, route, system, start)
         count, every = world.partition.count, world.config.workers.balance_steps
         self._spent_s = np.zeros((1, count))
         self._ticks_done = self._ticks_told = 0
@@ -297,7 +295,7 @@ class NodeWorlds(NodePool):
     @property
     def simulation(self) -> Simulation:
         """Refused: the worlds live elsewhere."""
-        raise ConfigError("the worlds live in nodes: use workers=0 to look into them")
+        raise ConfigError("the worlds live in nodes: use backend='local' to look into them")
 
     @property
     def plans(self) -> tuple[Plan, ...]:

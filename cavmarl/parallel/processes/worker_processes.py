@@ -80,7 +80,7 @@ class WorkerProcesses:
         self._heard: set[int] = set()  # workers whose messages have woken this side, and lie there
         try:
             if not hasattr(os, "pidfd_open"):
-                raise WorkerError("workers need Linux 5.3 or later: use workers=0")
+                raise WorkerError("workers need Linux 5.3 or later: use backend='local'")
             self._make_memory()
             self._start()
         except BaseException:
