@@ -229,14 +229,14 @@ def _kills(
         for number in range(kills):
             for _ in range(LEAST_STEPS + draws.randrange(50)):
                 worlds.step()
-            recoveries, replacements = worlds.nodes.recoveries, worlds.nodes.replacements
-            os.kill(worlds.nodes.pids[draws.randrange(nodes)], signal.SIGKILL)
+            recoveries, replacements = worlds.nodes.pool.recoveries, worlds.nodes.pool.replacements
+            os.kill(worlds.nodes.pool.pids[draws.randrange(nodes)], signal.SIGKILL)
             began_s = time.perf_counter()
-            while worlds.nodes.recoveries == recoveries:
+            while worlds.nodes.pool.recoveries == recoveries:
                 worlds.step()
             waited_ms.append(1e3 * (time.perf_counter() - began_s))
             until_s = time.perf_counter() + REPLACED_S
-            while worlds.nodes.replacements == replacements:
+            while worlds.nodes.pool.replacements == replacements:
                 worlds.step()
                 if time.perf_counter() > until_s:
                     raise ConfigError(f"no other node has joined within {REPLACED_S:g} s")

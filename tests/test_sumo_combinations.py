@@ -98,7 +98,7 @@ def test_a_worker_dies_beside_all_sensors_and_messages(tmp_path: Path, source: s
             for one in (plain, vec):
                 one.step(one.suggest_actions())
             assert results(plain) == results(vec), step
-        assert len(vec.worlds.deaths) == 2
+        assert len(vec.worlds.pool.deaths) == 2
     finally:
         vec.close()
         plain.close()

@@ -1,28 +1,26 @@
-"""`OrderedWorlds`: worlds that live elsewhere, and do what they are told."""
+"""`CommandedWorlds`: worlds in other processes, which do what they are told."""
 
 from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-import cavmarl.core.errors
 from cavmarl.balance.balance_plan import Plan
 from cavmarl.balance.load_snapshot import LoadSnapshot
 from cavmarl.balance.plan_text import describe_plan
-from cavmarl.config.v2x import V2xConfig
-from cavmarl.core.errors import CavmarlError, ConfigError, WorkerDeathError, WorkerFailureError
-from cavmarl.parallel.hosts.host_pool import HostPool
+from cavmarl.core.errors import WorkerDeathError, WorkerFailureError
+from cavmarl.engine.world_setup import World
 from cavmarl.parallel.mover import Mover
-from cavmarl.parallel.processes.worker_pool import Death, Pool
 from cavmarl.parallel.step_arrays import Driven, StepArrays
 from cavmarl.parallel.step_placement import StepPlacement
+from cavmarl.parallel.tasks import Task
 from cavmarl.parallel.work_shares import Part
-from cavmarl.parallel.worlds_job import Task
+from cavmarl.parallel.world_errors import own_error, unconnected, uncopied, unsaved
 from cavmarl.shards.shard import Commands
 from cavmarl.v2x.v2x_messages import NetworkSimulator
 
@@ -31,13 +29,32 @@ ASKED_AT_ONCE = 500  # agents: an answer is one message
 log = logging.getLogger("cavmarl.workers")
 
 
-class OrderedWorlds(ABC):
-    """What is the same wherever the worlds live; see `step_arrays.SteppedWorlds`."""
+class CommandedPool(Protocol):
+    """The processes that have the worlds."""
 
-    arrays: StepArrays  # what goes in and comes out
-    placement: StepPlacement  # which worker hosts what
-    pool: Pool | HostPool  # that runs them
-    mover: Mover | None = None  # has that changed; None: it does not change
+    def close(self) -> None:
+        """End the processes, and a cluster that was started for them."""
+        ...
+
+
+class CommandedWorlds(ABC):
+    """What is the same in all processes that worlds run in; see `step_arrays.SteppedWorlds`.
+
+    Attributes:
+        world: what each world is made of.
+        in_next_step: when worlds begin anew.
+        arrays: inputs and outputs of a step.
+        placement: which worker or node hosts what.
+        mover: changes the placement between steps; None: it does not change.
+        pool: the processes.
+    """
+
+    world: World
+    in_next_step: bool
+    arrays: StepArrays
+    placement: StepPlacement
+    mover: Mover | None = None
+    pool: CommandedPool
     _steps = 0  # since the last reset of all
 
     @property
@@ -49,12 +66,7 @@ class OrderedWorlds(ABC):
         """Process of each worker on this machine."""
         return {worker: pid for worker, pid in self._pids().items() if pid}
 
-    @property
-    def deaths(self) -> list[Death]:
-        return self.pool.deaths
-
     def close(self) -> None:
-        """End the processes, and a cluster that was started for them."""
         self.pool.close()
 
     @abstractmethod
@@ -70,16 +82,11 @@ class OrderedWorlds(ABC):
 
     @abstractmethod
     def _send(self, task: Task, payload: Any, commits: bool) -> None:
-        """Let all workers do a task."""
+        """Let all workers or nodes do a task, and write what comes out to `arrays`."""
 
     @abstractmethod
-    def _ask(
-        self,
-        task: Task,
-        world: int,  # its number; numbers from the end count as they do for arrays
-        more: Any = None,  # than the world that the worker has to know
-    ) -> Any:
-        """Let the worker of a world answer."""
+    def _ask(self, task: Task, world: int, payload: Any) -> Any:
+        """Let the worker or node of a world do a task about it, and return its answer."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         raise uncopied()
@@ -127,21 +134,26 @@ class OrderedWorlds(ABC):
         return self.arrays.ticks.copy()
 
     def state_hash(self, world: int) -> str:
-        return str(self._ask(Task.STATE_HASH, world))
+        return str(self._asked(Task.STATE_HASH, world))
 
     def traffic_stats(self, world: int) -> dict[str, float]:
-        found: dict[str, float] = self._ask(Task.TRAFFIC_STATS, world)
+        found: dict[str, float] = self._asked(Task.TRAFFIC_STATS, world)
         return found
 
     def driven(self, world: int, agents: Sequence[int]) -> list[Driven]:
         found = []
         for first in range(0, len(agents), ASKED_AT_ONCE):
-            some = list(agents[first : first + ASKED_AT_ONCE])
-            found += [Driven(*row) for row in self._ask(Task.DRIVEN, world, some)]
+            some = list(map(int, agents[first : first + ASKED_AT_ONCE]))
+            found += [Driven(*row) for row in self._asked(Task.DRIVEN, world, some)]
         return found
 
     def signal_phases(self, world: int) -> NDArray[np.int32]:
-        return np.array(self._ask(Task.SIGNAL_PHASES, world), dtype=np.int32)
+        return np.array(self._asked(Task.SIGNAL_PHASES, world), dtype=np.int32)
+
+    def _asked(self, task: Task, world: int, more: Any = None) -> Any:
+        """Ask about a world; numbers from the end count as they do for arrays."""
+        number = range(len(self.arrays.mask))[world]
+        return self._ask(task, number, number if more is None else [number, more])
 
     def _order(self, task: Task, payload: Any = None, commits: bool = True) -> None:
         """`_send`, with the errors that the worlds would raise in this process."""
@@ -152,41 +164,3 @@ class OrderedWorlds(ABC):
         except WorkerDeathError as death:
             death.add_note(f"in step {self._steps + 1} since the reset")
             raise
-
-
-def uncopied() -> ConfigError:
-    """What a copy or a pickle of worlds in other processes ends in."""
-    return ConfigError(
-        "workers: worlds that worker processes run cannot be copied; use backend='local', "
-        "or make the environment once more, with the same seed"
-    )
-
-
-def unsaved() -> ConfigError:
-    """What saving worlds on other machines ends in."""
-    return ConfigError(
-        "hosts: worlds on the machines of a cluster are not saved; use workers of this machine"
-    )
-
-
-def refuse_external(v2x: V2xConfig) -> None:
-    """Refuse what asks a part of the caller's process in each tick."""
-    if v2x.enabled and v2x.channel.external:
-        raise unconnected()
-
-
-def unconnected() -> ConfigError:
-    """What connecting a network simulator to worlds in workers ends in."""
-    return ConfigError(
-        "v2x.channel.external: a network simulator is in the caller's process, and worlds over "
-        "workers do not ask it; use backend='local', or nodes"
-    )
-
-
-def own_error(failure: WorkerFailureError) -> CavmarlError:
-    """An error that the worlds raise on purpose, as they would raise it in this process."""
-    kind = getattr(cavmarl.core.errors, failure.kind, None)
-    if not isinstance(kind, type) or not issubclass(kind, CavmarlError):
-        return failure
-    takes_text = "__init__" not in vars(kind)
-    return kind(failure.text) if takes_text else failure

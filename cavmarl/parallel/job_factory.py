@@ -23,9 +23,9 @@ from cavmarl.parallel.processes.worker_loop import Job, serve
 from cavmarl.parallel.recipe import CHANGED, world_of
 from cavmarl.parallel.sensor_workers.sensor_worker_setup import sensor_workers_of
 from cavmarl.parallel.step_arrays import StepArrays, layout_of
+from cavmarl.parallel.tasks import commands_of
 from cavmarl.parallel.team.team_job import LeaderJob
 from cavmarl.parallel.work_shares import Part
-from cavmarl.parallel.worlds_job import commands_of
 
 
 def make_jobs(recipe: Mapping[str, Any]) -> list[Job]:

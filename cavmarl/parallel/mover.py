@@ -13,8 +13,8 @@ from cavmarl.balance.load_snapshot import LoadSnapshot
 from cavmarl.core.errors import WorkerError
 from cavmarl.parallel.processes.shared_memory import Segment, arrays_in, size_of
 from cavmarl.parallel.step_placement import StepPlacement
+from cavmarl.parallel.tasks import Task
 from cavmarl.parallel.work_shares import Part, parts_of
-from cavmarl.parallel.worlds_job import Task
 
 _OUTBOX_BYTES = 1 << 12  # of what a worker leaves for others; it grows
 

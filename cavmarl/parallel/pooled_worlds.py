@@ -16,7 +16,7 @@ from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
 from cavmarl.parallel.checkpoint.checkpoint_log import make_segments
 from cavmarl.parallel.checkpoint.world_bytes import SavedWorlds
-from cavmarl.parallel.commanded_worlds import OrderedWorlds, own_error, refuse_external
+from cavmarl.parallel.commanded_worlds import CommandedWorlds
 from cavmarl.parallel.journaled_worlds import check_watched, is_watched, runs_as_text, unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.mover import Mover, MovingMemory
@@ -27,13 +27,14 @@ from cavmarl.parallel.recipe import recipe_of
 from cavmarl.parallel.sensor_workers.sensor_worker_setup import warn_if_crowded
 from cavmarl.parallel.step_arrays import StepArrays, layout_of
 from cavmarl.parallel.step_placement import StepPlacement
+from cavmarl.parallel.tasks import TASK_NAMES, Task
 from cavmarl.parallel.work_shares import Part, parts_of
-from cavmarl.parallel.worlds_job import TASK_NAMES, Task
+from cavmarl.parallel.world_errors import own_error, refuse_external
 
 PROGRAM = "cavmarl.parallel.job_factory"
 
 
-class PooledWorlds(OrderedWorlds):
+class PooledWorlds(CommandedWorlds):
     """W worlds over m worker processes.
 
     Raises:
@@ -103,7 +104,7 @@ class PooledWorlds(OrderedWorlds):
             raise own_error(failure) from failure
         self._saved = [SavedWorlds(one) for one in saved]
         self._parts = parts
-        self._asked = _leaders(parts)
+        self._leader_of = _leaders(parts)
         self.placement.watch(self._pids())
 
     def _make_mover(self, num_worlds: int, workers: int) -> MovingMemory | None:
@@ -134,7 +135,7 @@ class PooledWorlds(OrderedWorlds):
 
     def _settle(self, parts: list[Part]) -> None:
         self._parts = parts
-        self._asked = _leaders(parts)
+        self._leader_of = _leaders(parts)
         self.pool.rename(_names(parts))
 
     def _pids(self) -> dict[int, int]:
@@ -143,10 +144,8 @@ class PooledWorlds(OrderedWorlds):
     def _send(self, task: Task, payload: Any, commits: bool) -> None:
         self.pool.run(task, payload, commits)
 
-    def _ask(self, task: Task, world: int, more: Any = None) -> Any:
-        number = range(len(self.arrays.mask))[world]
-        payload = number if more is None else [number, more]
-        return self.pool.ask(self._asked[number], task, payload)
+    def _ask(self, task: Task, world: int, payload: Any) -> Any:
+        return self.pool.ask(self._leader_of[world], task, payload)
 
 
 def _warn_of_few_cores(workers: int) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -13,32 +12,7 @@ from numpy.typing import NDArray
 from cavmarl.parallel.checkpoint.world_bytes import SavedWorlds
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.processes.worker_loop import Job
-from cavmarl.parallel.step_arrays import StepArrays
-from cavmarl.shards.shard import Commands
-
-
-class Task(IntEnum):
-    """What a worker can be asked for."""
-
-    STEP = 0
-    RESET = 1
-    SUGGEST = 2
-    STATE_HASH = 3
-    TRAFFIC_STATS = 4
-    PACK = 5
-    UNPACK = 6
-    HOST = 7
-    WRITE_STATES = 8
-    DRIVEN = 9
-    SIGNAL_PHASES = 10
-    SAVE = 11
-    LOAD = 12
-    LOADS = 13
-    PROPOSE = 14
-    CUT = 15
-
-
-TASK_NAMES = tuple(task.name.lower().replace("_", " ") for task in Task)
+from cavmarl.parallel.tasks import WORLD_TASKS, Task, commands_of
 
 
 class WorldsJob(Job):
@@ -55,28 +29,13 @@ class WorldsJob(Job):
         self._commands = commands_of(worlds.arrays)
 
     def perform(self, task: int, payload: Any) -> Any:
-        worlds = self._worlds
-        if task == Task.STEP:
-            worlds.step(self._commands)
-        elif task == Task.RESET:
-            worlds.reset(payload["seed"], payload["first_world"] + self._first)
-        elif task == Task.SUGGEST:
-            worlds.suggest()
-        elif task == Task.WRITE_STATES:
-            worlds.write_states()
-        elif task == Task.STATE_HASH:
-            return worlds.state_hash(payload - self._first)
-        elif task == Task.TRAFFIC_STATS:
-            return worlds.traffic_stats(payload - self._first)
-        elif task == Task.DRIVEN:
-            return worlds.driven(payload[0] - self._first, payload[1])
-        elif task == Task.SIGNAL_PHASES:
-            return worlds.signal_phases(payload - self._first).tolist()
-        elif task == Task.SAVE:
-            self.saved_worlds.put(worlds.save_worlds())
-        elif task == Task.LOAD:
-            worlds.load_worlds(self.saved_worlds.take())
-        return None
+        if task == Task.LOAD:
+            payload = self.saved_worlds.take()
+        found = WORLD_TASKS[Task(task)].perform(self._worlds, payload, self._first)
+        if task == Task.SAVE:
+            self.saved_worlds.put(found)
+            return None
+        return found
 
     def timed_step(self) -> NDArray[np.float64]:
         """Step; (W,) the processor time of each world, which share it by their vehicles."""
@@ -91,8 +50,3 @@ class WorldsJob(Job):
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:
         self._worlds.load(saved)
-
-
-def commands_of(arrays: StepArrays) -> Commands:
-    """What agents do in the next step; views."""
-    return Commands(arrays.controls, arrays.meta_actions, arrays.declared, arrays.inserted)

@@ -126,7 +126,7 @@ def _run(spec: WorldSpec, line: FaultLine, zones: int, steps: int, policy: str |
                 line.different.append(spec.seed)
         except WorkerDeathError:
             line.ended += 1
-        line.lost += pair.worlds.losses
+        line.lost += pair.worlds.pool.losses
     finally:
         network.close()
 

@@ -157,14 +157,14 @@ class ComparedWorlds:
                     latest_s = 1e-3 * LATEST * statistics.median(calm_ms)
                     timers.append(Timer(drawn.uniform(0.0, latest_s), strikes[step]))
                     timers[-1].start()
-                before, began = self.worlds.recoveries, time.perf_counter()
+                before, began = self.worlds.pool.recoveries, time.perf_counter()
                 second = self._runs[1].step()
                 took_ms = 1e3 * (time.perf_counter() - began)
                 one, other = self._hashes()
                 if not same_bytes(first, second) or one != other:
                     different = step
                     break
-                lost = self.worlds.recoveries > before
+                lost = self.worlds.pool.recoveries > before
                 (recovery_ms if lost else calm_ms).append(took_ms)
                 note(step + 1)
             for timer in timers:
@@ -176,11 +176,13 @@ class ComparedWorlds:
             self.worlds.close()
         median_ms = statistics.median(calm_ms) if calm_ms else 0.0
         above_ms = tuple(took_ms - median_ms for took_ms in recovery_ms)
-        return NodeRun(self._nodes, self.worlds.losses, migrations, different, median_ms, above_ms)
+        return NodeRun(
+            self._nodes, self.worlds.pool.losses, migrations, different, median_ms, above_ms
+        )
 
     def strike(self, drawn: random.Random, number: signal.Signals) -> None:
         """Send a signal to a node that has got none yet."""
-        living = [pid for pid in self.worlds.pids if pid not in self._struck]
+        living = [pid for pid in self.worlds.pool.pids if pid not in self._struck]
         if living:
             pid = drawn.choice(living)
             self._struck.add(pid)

@@ -408,8 +408,8 @@ class _Run:
                     if worlds.state_hash(0) != reference.hashes[step]:
                         raise AssertionError(f"another state after step {step}")
         finally:
-            line.lost += worlds.losses
-            line.back += worlds.recoveries
+            line.lost += worlds.pool.losses
+            line.back += worlds.pool.recoveries
             worlds.close()
 
     def _strike(self, name: str) -> None:

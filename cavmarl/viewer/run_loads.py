@@ -69,7 +69,7 @@ class RunLoads:
         snapshot = nodes.node_snapshot()
         if is_first:  # their watches have only begun
             return
-        pids = dict(enumerate(nodes.pids))
+        pids = dict(enumerate(nodes.pool.pids))
         self._tell(load_rows(pids, snapshot, nodes.plans, nodes.world.partition.count))
 
     def _tell(self, rows: list[dict[str, Any]]) -> None:

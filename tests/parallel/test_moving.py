@@ -22,7 +22,7 @@ from cavmarl.core.errors import NoAdmissibleWorkerError
 from cavmarl.parallel.pooled_worlds import PooledWorlds
 from cavmarl.parallel.processes.worker_pool import Pool
 from cavmarl.parallel.step_placement import StepPlacement
-from cavmarl.parallel.worlds_job import Task
+from cavmarl.parallel.tasks import Task
 from tests.support.pools import strike_soon
 from tests.support.rerouting import CARS, DEVICE, FLOW, make_map, write_demand
 from tests.support.sumo_worlds import write_stops

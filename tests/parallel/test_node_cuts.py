@@ -53,7 +53,7 @@ def test_zones_that_are_cut_anew_change_nothing(
     worlds = over_nodes(vec)
     assert len(worlds.recuts) > 2
     assert all(cut.before > cut.after and cut.moved > 0 for cut in worlds.recuts)
-    assert worlds.recoveries == 0
+    assert worlds.pool.recoveries == 0
 
 
 def test_vehicles_that_look_for_their_way_are_where_they_were(make: Make, tmp_path: Path) -> None:
@@ -79,16 +79,16 @@ def test_nodes_that_are_lost_before_and_after_a_cut(
     whole = drive(make("grid4x4", **wanted), steps=24)
     vec = make("grid4x4", zones=4, nodes=4, overrides=OFTEN, **wanted)
     worlds = over_nodes(vec)
-    first = worlds.zones
+    first = worlds.pool.zones
 
     def strike(step: int) -> None:
         if step in (5, 7, 18):
-            os.kill(worlds.pids[step % len(worlds.pids)], signal.SIGKILL)
+            os.kill(worlds.pool.pids[step % len(worlds.pool.pids)], signal.SIGKILL)
 
     assert same(drive(vec, steps=24, before=strike), whole)
-    assert (worlds.losses, worlds.recoveries > 2) == (3, True)
+    assert (worlds.pool.losses, worlds.pool.recoveries > 2) == (3, True)
     assert len(worlds.recuts) > 1
-    assert worlds.zones != first or worlds.replacements
+    assert worlds.pool.zones != first or worlds.pool.replacements
 
 
 def test_a_cut_that_is_interrupted_is_as_if_it_had_not_been(
@@ -98,15 +98,15 @@ def test_a_cut_that_is_interrupted_is_as_if_it_had_not_been(
     for vec in vecs:
         vec.reset(seed=2)
     worlds = over_nodes(vecs[1])
-    know, interrupted = worlds._coordinator.know, []
+    know, interrupted = worlds.pool.coordinator.know, []
 
     def interrupt(neighbours: Any) -> None:
         if not interrupted:
-            interrupted.append(worlds._steps)
+            interrupted.append(worlds._steps_begun)
             raise KeyboardInterrupt
         know(neighbours)
 
-    monkeypatch.setattr(worlds._coordinator, "know", interrupt)
+    monkeypatch.setattr(worlds.pool.coordinator, "know", interrupt)
     for step in range(10):
         actions = vecs[0].suggest_actions()
         vecs[0].step(actions)

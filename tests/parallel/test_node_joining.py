@@ -138,11 +138,11 @@ def test_what_goes_over_the_wire(
             wire.spoiler = bytes(100)
 
     assert same(drive(vec, steps=20, before=spoil), whole)
-    assert over_nodes(vec).losses == 1
+    assert over_nodes(vec).pool.losses == 1
     said = bytes(wire.said) + b"".join(wire.heard)
     assert (b"cavN" in said) == (not is_elsewhere)
     assert KEY.encode() not in said
-    newcomers = over_nodes(vec)._newcomers
+    newcomers = over_nodes(vec).pool.newcomers
     for heard in wire.heard:  # said again, it is nothing
         with socket.create_connection(place) as stranger, suppress(OSError):
             stranger.sendall(heard)
@@ -150,7 +150,7 @@ def test_what_goes_over_the_wire(
                 newcomers.look(10.0)
             assert newcomers.ready == []
             assert stranger.recv(1 << 16)[:4] != b"cavN"
-    assert over_nodes(vec).losses == 1
+    assert over_nodes(vec).pool.losses == 1
     wire.close()
 
 
@@ -166,14 +166,14 @@ def test_a_node_that_joins_later_takes_the_place_of_a_lost_one(
     worlds = over_nodes(vec)
     for each in (one, vec):
         each.reset(seed=3)
-    os.kill(worlds.pids[0], signal.SIGKILL)
+    os.kill(worlds.pool.pids[0], signal.SIGKILL)
     crowd.call(place)
-    lost = step_alike(one, vec, lambda: bool(worlds.replacements))
-    assert (worlds.losses, worlds.recoveries, worlds.replacements) == (1, 1, 1)
-    assert worlds.zones == [[0, 1], [2, 3]]
-    os.kill(worlds.pids[1], signal.SIGKILL)  # now the new one has all
-    step_alike(one, vec, lambda: worlds.zones[1] == [])
-    assert worlds.zones == [[0, 1, 2, 3], []]
+    lost = step_alike(one, vec, lambda: bool(worlds.pool.replacements))
+    assert (worlds.pool.losses, worlds.pool.recoveries, worlds.pool.replacements) == (1, 1, 1)
+    assert worlds.pool.zones == [[0, 1], [2, 3]]
+    os.kill(worlds.pool.pids[1], signal.SIGKILL)  # now the new one has all
+    step_alike(one, vec, lambda: worlds.pool.zones[1] == [])
+    assert worlds.pool.zones == [[0, 1, 2, 3], []]
     assert lost > 1
 
 
@@ -197,9 +197,9 @@ def test_a_node_of_this_machine_is_started_again(make: Make) -> None:
     worlds = over_nodes(vec)
     for each in (one, vec):
         each.reset(seed=3)
-    os.kill(worlds.pids[1], signal.SIGKILL)
-    step_alike(one, vec, lambda: bool(worlds.replacements))
-    assert worlds.zones == [[0, 1], [2, 3]]
+    os.kill(worlds.pool.pids[1], signal.SIGKILL)
+    step_alike(one, vec, lambda: bool(worlds.pool.replacements))
+    assert worlds.pool.zones == [[0, 1], [2, 3]]
 
 
 @pytest.mark.parametrize("is_lost", [False, True])
@@ -210,13 +210,13 @@ def test_zones_that_change_their_node(make: Make, uneven: list[int], is_lost: bo
 
     def strike(step: int) -> None:
         if is_lost and step == 9:
-            os.kill(over_nodes(vec).pids[1], signal.SIGKILL)
+            os.kill(over_nodes(vec).pool.pids[1], signal.SIGKILL)
 
     assert same(drive(vec, steps=20, before=strike), whole)
     mover = over_nodes(vec).mover
     assert mover is not None
     assert mover.moves == sum(uneven) > 0
-    assert over_nodes(vec)._generation > 1 + is_lost
+    assert over_nodes(vec).pool.generation > 1 + is_lost
 
 
 def test_hosts_of_ray_are_nodes(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -226,9 +226,9 @@ def test_hosts_of_ray_are_nodes(make: Make, monkeypatch: pytest.MonkeyPatch) -> 
     worlds = over_nodes(vec)
     for each in (one, vec):
         each.reset(seed=3)
-    os.kill(worlds.pids[0], signal.SIGKILL)
-    step_alike(one, vec, lambda: bool(worlds.replacements))
-    assert worlds.zones == [[0, 1], [2, 3]]
+    os.kill(worlds.pool.pids[0], signal.SIGKILL)
+    step_alike(one, vec, lambda: bool(worlds.pool.replacements))
+    assert worlds.pool.zones == [[0, 1], [2, 3]]
 
 
 def test_a_node_that_the_others_cannot_reach(
@@ -253,7 +253,7 @@ def test_a_node_that_the_others_cannot_reach(
             max(wires, key=lambda wire: len(wire.heard)).cut()
 
     assert same(drive(vec, steps=20, before=cut), whole)
-    assert over_nodes(vec).losses == 1
+    assert over_nodes(vec).pool.losses == 1
     for wire in wires:
         wire.close()
 
@@ -261,7 +261,7 @@ def test_a_node_that_the_others_cannot_reach(
 def test_a_crowd_of_strangers_disturbs_nobody(make: Make, whole: Any) -> None:
     vec = make("grid4x4", zones=4, nodes=2, **WANTED)
     worlds = over_nodes(vec)
-    address, port = worlds._newcomers.place.split(":")
+    address, port = worlds.pool.newcomers.place.split(":")
     before = psutil.Process().num_fds()
     strangers: list[socket.socket] = []
 
@@ -272,11 +272,11 @@ def test_a_crowd_of_strangers_disturbs_nobody(make: Make, whole: Any) -> None:
                 strangers[-1].sendall(secrets.token_bytes(100))
 
     assert same(drive(vec, steps=20, before=call_often), whole)
-    assert worlds.losses == 0
+    assert worlds.pool.losses == 0
     assert psutil.Process().num_fds() <= before + len(strangers) + MAX_CALLERS
     for stranger in strangers:
         stranger.close()
-    pids = worlds.pids
+    pids = worlds.pool.pids
     vec.close()
     assert psutil.Process().num_fds() < before
     assert not any(map(psutil.pid_exists, pids))

@@ -97,9 +97,9 @@ def test_zones_leave_nodes_whose_machine_others_keep_busy(
     monkeypatch.setattr(StepPlacement, "round", dear)
     vec = make("grid4x4", zones=4, nodes=2, overrides=watched, **WANTED)
     worlds = over_nodes(vec)
-    assert worlds.zones == [[0, 1], [2, 3]]
+    assert worlds.pool.zones == [[0, 1], [2, 3]]
     assert same(drive(vec), whole)
     assert len(said) > 3
-    assert [len(zones) for zones in worlds.zones] == [1, 3]
+    assert [len(zones) for zones in worlds.pool.zones] == [1, 3]
     assert worlds.plans[0].homes.count(0) == 1
     assert [rejected.worker for rejected in worlds.plans[0].rejections] == [0]

@@ -80,10 +80,10 @@ def test_a_step_that_is_done_again_is_not_asked_again(make: Make) -> None:
 
     def strike(step: int) -> None:
         if step in (4, 11):
-            os.kill(worlds.pids[0 if step == 4 else 1], signal.SIGKILL)
+            os.kill(worlds.pool.pids[0 if step == 4 else 1], signal.SIGKILL)
 
     assert same(drive(vec, steps=20, before=strike), whole)
-    assert worlds.losses == 2
+    assert worlds.pool.losses == 2
     assert here.calls == there.calls
 
 
@@ -127,7 +127,7 @@ def test_a_simulator_that_fails_is_no_loss_of_nodes(
         for one in (vec, alone):
             one.step(actions)
         assert vec.state_hash() == alone.state_hash()
-    assert over_nodes(vec).losses == 0
+    assert over_nodes(vec).pool.losses == 0
 
 
 def test_what_cannot_be_connected_is_refused(make: Make) -> None:

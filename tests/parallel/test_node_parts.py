@@ -33,7 +33,7 @@ def lose_one(vec: CavVectorEnv, at: int) -> Callable[[int], None]:
 
     def strike(step: int) -> None:
         if step == at:
-            pid = drawn.choice(worlds.pids)
+            pid = drawn.choice(worlds.pool.pids)
             Timer(drawn.uniform(0.0, 0.01), os.kill, (pid, signal.SIGKILL)).start()
 
     return strike
@@ -47,7 +47,7 @@ def test_rigs(make: Make, mode: str) -> None:
     whole = drive(one)
     vec = make("town", zones=4, nodes=2, **wanted)
     assert same(drive(vec, before=lose_one(vec, 7)), whole)
-    assert over_nodes(vec).recoveries == 1
+    assert over_nodes(vec).pool.recoveries == 1
     for name, frames in one.worlds.arrays.frames.items():
         for ours, theirs in zip(vec.worlds.arrays.frames[name], frames, strict=True):
             assert np.array_equal(ours, theirs), name
@@ -69,7 +69,7 @@ def test_messages_between_vehicles(make: Make) -> None:
     whole = drive(make("grid4x4", **wanted))
     vec = make("grid4x4", zones=4, nodes=3, **wanted)
     assert same(drive(vec, before=lose_one(vec, 6)), whole)
-    assert over_nodes(vec).recoveries == 1
+    assert over_nodes(vec).pool.recoveries == 1
 
 
 def test_scripted_scenes(make: Make) -> None:
@@ -81,7 +81,7 @@ def test_scripted_scenes(make: Make) -> None:
     whole = drive(make("grid4x4", **wanted), steps=40)
     vec = make("grid4x4", zones=4, nodes=3, **wanted)
     assert same(drive(vec, steps=40, before=lose_one(vec, 20)), whole)
-    assert over_nodes(vec).recoveries == 1
+    assert over_nodes(vec).pool.recoveries == 1
 
 
 def test_vehicles_that_look_for_another_way(make: Make, tmp_path: Path) -> None:
@@ -98,7 +98,7 @@ def test_vehicles_that_look_for_another_way(make: Make, tmp_path: Path) -> None:
     whole = drive(one, steps=300)
     vec = make(net, zones=3, nodes=2, **wanted)
     assert same(drive(vec, steps=300, before=lose_one(vec, 221)), whole)
-    assert over_nodes(vec).recoveries == 1
+    assert over_nodes(vec).pool.recoveries == 1
     assert one.traffic_stats()["rerouted"] > 0, "nobody has taken another way"
 
 
@@ -113,4 +113,4 @@ def test_sumo_beside_the_world(make: Make, tmp_path: Path, source: str) -> None:
     whole = drive(make("merge", **wanted), steps=20)
     vec = make("merge", zones=2, nodes=2, **wanted)
     assert same(drive(vec, steps=20, before=lose_one(vec, 10)), whole)
-    assert over_nodes(vec).recoveries == 1
+    assert over_nodes(vec).pool.recoveries == 1

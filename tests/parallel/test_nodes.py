@@ -52,8 +52,8 @@ def test_nobody_can_tell(make: Make, arguments: dict[str, Any], nodes: int) -> N
     vec = make(zones=4, nodes=nodes, **wanted)
     assert same(drive(vec), whole)
     assert same(drive(vec), whole)
-    assert len(over_nodes(vec).pids) == nodes
-    assert over_nodes(vec).recoveries == 0
+    assert len(over_nodes(vec).pool.pids) == nodes
+    assert over_nodes(vec).pool.recoveries == 0
 
 
 def test_an_action_that_comes_to_the_wrong_node_is_refused_and_sent_to_the_owner(
@@ -63,14 +63,14 @@ def test_an_action_that_comes_to_the_wrong_node_is_refused_and_sent_to_the_owner
     vec = make("grid4x4", zones=4, nodes=3, **WANTED)
     worlds = over_nodes(vec)
     assert same(drive(vec), whole)
-    assert (worlds.migrations > 0, worlds.redirected) == (True, 0)
+    assert (worlds.migrations > 0, worlds.pool.redirected) == (True, 0)
 
     def mistake(step: int) -> None:
-        owned = worlds._owner >= 0
-        worlds._owner[owned] = (worlds._owner[owned] + 1) % 3
+        owned = worlds.pool.owner >= 0
+        worlds.pool.owner[owned] = (worlds.pool.owner[owned] + 1) % 3
 
     assert same(drive(vec, before=mistake), whole)
-    assert worlds.redirected > 50
+    assert worlds.pool.redirected > 50
 
 
 def test_a_node_is_told_what_its_own_agents_do() -> None:
@@ -128,7 +128,7 @@ def test_a_fork_neither_steps_nor_ends_the_nodes(make: Make) -> None:
     vec, whole = make(zones=4, nodes=2, env="grid4x4", **WANTED), make(env="grid4x4", **WANTED)
     assert "the nodes are those of process" in said_in_fork(lambda: drive(vec), vec.close)
     assert same(drive(vec), drive(whole))
-    assert over_nodes(vec).recoveries == 0
+    assert over_nodes(vec).pool.recoveries == 0
 
 
 def test_actuated_signals_and_a_demand(make: Make, tmp_path: Path) -> None:
@@ -143,7 +143,7 @@ def test_no_memory_is_shared(make: Make) -> None:
     """No node has a mapping in common with another process that both can write."""
     vec = make("grid4x4", zones=4, nodes=2, **WANTED)
     drive(vec, steps=3)
-    for pid in over_nodes(vec).pids:
+    for pid in over_nodes(vec).pool.pids:
         shared = [
             region.path
             for region in psutil.Process(pid).memory_maps(grouped=False)
@@ -162,7 +162,9 @@ class Killer:
 
     def __call__(self, step: int) -> None:
         if step in self._steps:
-            pid = self._random.choice([pid for pid in self._worlds.pids if pid not in self._struck])
+            pid = self._random.choice(
+                [pid for pid in self._worlds.pool.pids if pid not in self._struck]
+            )
             self._struck.append(pid)
             Timer(self._random.uniform(0.0, 0.01), os.kill, (pid, signal.SIGKILL)).start()
 
@@ -173,8 +175,8 @@ def test_nodes_that_are_lost_at_any_time(make: Make, env: str, seed: int) -> Non
     whole = drive(make(env, **wanted), steps=40)
     vec = make(env, zones=4, nodes=4, **wanted)
     assert same(drive(vec, steps=40, before=Killer(vec, seed, 4, 17, 30)), whole)
-    assert over_nodes(vec).recoveries == 3
-    assert over_nodes(vec).losses == 3
+    assert over_nodes(vec).pool.recoveries == 3
+    assert over_nodes(vec).pool.losses == 3
 
 
 def test_a_node_that_stops_is_taken_for_lost(make: Make) -> None:
@@ -183,10 +185,10 @@ def test_a_node_that_stops_is_taken_for_lost(make: Make) -> None:
 
     def strike(step: int) -> None:
         if step == 5:
-            os.kill(over_nodes(vec).pids[1], signal.SIGSTOP)
+            os.kill(over_nodes(vec).pool.pids[1], signal.SIGSTOP)
 
     assert same(drive(vec, before=strike), whole)
-    assert over_nodes(vec).losses == 1
+    assert over_nodes(vec).pool.losses == 1
 
 
 def test_two_nodes_apart_are_lost_at_once(make: Make) -> None:
@@ -197,10 +199,10 @@ def test_two_nodes_apart_are_lost_at_once(make: Make) -> None:
     def strike(step: int) -> None:
         if step == 5:
             for number in (0, 2):
-                os.kill(worlds.pids[number], signal.SIGKILL)
+                os.kill(worlds.pool.pids[number], signal.SIGKILL)
 
     assert same(drive(vec, before=strike), whole)
-    assert worlds.losses == 2
+    assert worlds.pool.losses == 2
 
 
 def test_commands_that_are_alike_are_done_as_often_as_they_were_given(make: Make) -> None:
@@ -211,7 +213,7 @@ def test_commands_that_are_alike_are_done_as_often_as_they_were_given(make: Make
     still = np.zeros_like(vecs[0].suggest_actions())
     for step in range(60):
         if step == 50:  # by then states were kept several times
-            os.kill(over_nodes(vecs[1]).pids[0], signal.SIGKILL)
+            os.kill(over_nodes(vecs[1]).pool.pids[0], signal.SIGKILL)
         for vec in vecs:
             vec.step(still)
         assert vecs[0].state_hash() == vecs[1].state_hash(), step
@@ -224,7 +226,7 @@ def test_an_interrupted_step_can_be_taken_again(
     vecs = [make("grid4x4", **WANTED), make("grid4x4", zones=4, nodes=2, **WANTED)]
     for vec in vecs:
         vec.reset(seed=2)
-    coordinator = over_nodes(vecs[1])._coordinator
+    coordinator = over_nodes(vecs[1]).pool.coordinator
     begin = coordinator.begin
     for step in range(6):
         actions = vecs[0].suggest_actions()
@@ -242,7 +244,7 @@ def test_an_interrupted_step_can_be_taken_again(
         for vec in vecs:
             vec.step(actions)
         assert vecs[0].state_hash() == vecs[1].state_hash(), step
-    assert over_nodes(vecs[1]).recoveries == 0
+    assert over_nodes(vecs[1]).pool.recoveries == 0
 
 
 def test_nodes_that_are_lost_while_states_are_kept(
@@ -253,8 +255,8 @@ def test_nodes_that_are_lost_while_states_are_kept(
     whole = drive(make("grid4x4", **WANTED))
     vec = make("grid4x4", zones=4, nodes=4, **WANTED)
     worlds = over_nodes(vec)
-    doomed = {5: worlds.pids[0], 6: worlds.pids[2]}
-    commit, steps = worlds._commit, [0]
+    doomed = {5: worlds.pool.pids[0], 6: worlds.pool.pids[2]}
+    commit, steps = worlds.pool._commit, [0]
 
     def strike_and_commit() -> list[memoryview]:
         if steps[0] in doomed:  # all nodes have been told to keep a state, and are in the step
@@ -264,16 +266,16 @@ def test_nodes_that_are_lost_while_states_are_kept(
     def note(step: int) -> None:
         steps[0] = step
 
-    monkeypatch.setattr(worlds, "_commit", strike_and_commit)
+    monkeypatch.setattr(worlds.pool, "_commit", strike_and_commit)
     assert same(drive(vec, before=note), whole)
-    assert (worlds.losses, worlds.recoveries) == (2, 2)
+    assert (worlds.pool.losses, worlds.pool.recoveries) == (2, 2)
 
 
 def test_a_node_and_the_one_that_keeps_its_state_are_lost(make: Make) -> None:
     vec = make("grid4x4", zones=4, nodes=4, **WANTED)
     vec.reset(seed=1)
     for number in (1, 2):
-        os.kill(over_nodes(vec).pids[number], signal.SIGKILL)
+        os.kill(over_nodes(vec).pool.pids[number], signal.SIGKILL)
     with pytest.raises(WorkerDeathError, match="node 1 was lost"):
         vec.step(vec.suggest_actions())
 
@@ -281,7 +283,7 @@ def test_a_node_and_the_one_that_keeps_its_state_are_lost(make: Make) -> None:
 def test_the_only_node_is_lost(make: Make) -> None:
     vec = make("grid4x4", zones=2, nodes=1, **WANTED)
     vec.reset(seed=1)
-    os.kill(over_nodes(vec).pids[0], signal.SIGKILL)
+    os.kill(over_nodes(vec).pool.pids[0], signal.SIGKILL)
     with pytest.raises(WorkerDeathError, match="node 0 was lost"):
         vec.step(vec.suggest_actions())
 
@@ -289,7 +291,7 @@ def test_the_only_node_is_lost(make: Make) -> None:
 def test_nothing_stays_behind(make: Make) -> None:
     vec = make("grid4x4", zones=2, nodes=2, **WANTED)
     vec.reset(seed=1)
-    pids = over_nodes(vec).pids
+    pids = over_nodes(vec).pool.pids
     vec.close()
     assert not any(map(psutil.pid_exists, pids))
 
@@ -323,7 +325,7 @@ def test_one_environment_of_pettingzoo() -> None:
     [
         ({"nodes": 5, "zones": 4}, "hosted by 1 to 4 nodes"),
         ({"nodes": 0}, "nodes = 0"),
-        ({"nodes": 2, "workers": 2}, "leave one out"),
+        ({"nodes": 2, "workers": 2}, "leave out workers, or nodes"),
         ({"backend": "nodes:2@here"}, "must be HOST:PORT"),
         ({"backend": "nodes:2@127.0.0.1:7600", "zones": 2}, "without workers.key_file"),
         ({"nodes": 2, "zones": 2, "sensor_workers": 1}, "workers.sensors = 1"),
@@ -413,7 +415,7 @@ def test_a_node_that_is_lost_while_zones_are_given_out_is_replaced(
     vec = make("grid4x4", zones=4, nodes=nodes, **WANTED)
     assert len(set(struck)) == 2
     assert same(drive(vec), whole)
-    assert (over_nodes(vec).losses, over_nodes(vec).recoveries) == (2, 0)
+    assert (over_nodes(vec).pool.losses, over_nodes(vec).pool.recoveries) == (2, 0)
     struck.clear()
     with pytest.raises(WorkerError, match=f"node {nodes - 1} ended with -9 before it had begun"):
         make("grid4x4", zones=4, nodes=nodes, overrides={"workers.max_retries": 1}, **WANTED)

@@ -19,7 +19,7 @@ from cavmarl.evaluate.provenance.training_record import begin_training, end_trai
 from cavmarl.parallel.checkpoint.world_states import WorldMove, moves_of
 from cavmarl.parallel.hosts.host_pool import HostPool
 from cavmarl.parallel.hosts.remote_worlds import RemoteWorlds
-from cavmarl.parallel.worlds_job import Task
+from cavmarl.parallel.tasks import Task
 from tests.parallel.test_moving import RESTLESS, STACKED, uneven
 from tests.support.pools import strike_soon
 from tests.support.rerouting import CARS, DEVICE, FLOW, make_map, write_demand
@@ -66,7 +66,7 @@ def test_worlds_that_move_are_the_same(
     vec = make(**wanted)
     assert same(drive(vec, steps=20), whole)
     assert sum(uneven) > 0
-    assert remote(vec).deaths == []
+    assert remote(vec).pool.deaths == []
     mover = remote(vec).mover
     assert mover is not None
     assert mover.moves == sum(uneven)
@@ -126,7 +126,7 @@ def test_hosts_that_die_while_worlds_move(
 
     monkeypatch.setattr(HostPool, "run", strike)
     assert same(drive(vec, steps=20, before=lambda _: [t.join() for t in timers]), whole)
-    assert len(remote(vec).deaths) >= 3
+    assert len(remote(vec).pool.deaths) >= 3
     assert sum(uneven) > 0
 
 
@@ -140,7 +140,7 @@ def test_who_dies_later_comes_back_with_what_it_had_last(make: Make, uneven: lis
             os.kill(remote(vec).pool.pids[step % 2], signal.SIGKILL)
 
     assert same(drive(vec, steps=24, before=strike), whole)
-    assert len(remote(vec).deaths) == 3
+    assert len(remote(vec).pool.deaths) == 3
     assert sum(uneven) > 0
 
 

@@ -54,14 +54,15 @@ if __name__ == "__main__":
     vec = make_vec("grid4x4", zones=4, backend="ray:2", **wanted)
     for each in (one, vec):
         each.reset(seed=1)
-    os.kill(vec.worlds.pids[0], signal.SIGKILL)
+    os.kill(vec.worlds.pool.pids[0], signal.SIGKILL)
     until_s = time.monotonic() + 60.0
-    while not vec.worlds.replacements and time.monotonic() < until_s:
+    while not vec.worlds.pool.replacements and time.monotonic() < until_s:
         actions = one.suggest_actions()
         for each in (one, vec):
             each.step(actions)
         time.sleep(0.01)
-    print(one.state_hash() == vec.state_hash(), vec.worlds.losses, vec.worlds.replacements)
+    pool = vec.worlds.pool
+    print(one.state_hash() == vec.state_hash(), pool.losses, pool.replacements)
     children = psutil.Process().children(recursive=True)
     vec.close()
     gone, alive = psutil.wait_procs(children, timeout=20)

@@ -85,7 +85,7 @@ def test_machines_change_nothing(make: Make, cluster: Any, arguments: dict[str, 
     vec = make(backend="ray:2", **wanted)
     assert same(drive(vec), here)
     assert same(drive(vec), here)
-    assert remote(vec).deaths == []
+    assert remote(vec).pool.deaths == []
     assert len(set(nodes_of(remote(vec).pool.pids))) == 2
 
 
@@ -118,7 +118,7 @@ def test_an_actor_that_dies_is_not_missed(
             os.kill(struck[-1], how)
 
     assert same(drive(vec, before=strike), whole)
-    assert [death.worker for death in remote(vec).deaths] == [0, 1]
+    assert [death.worker for death in remote(vec).pool.deaths] == [0, 1]
     assert psutil.Process(remote(vec).pool.pids[0]).create_time() < times[0]  # the spare one
     await_true(lambda: not any(psutil.pid_exists(pid) for pid in struck), for_s=20.0)
 
@@ -137,7 +137,7 @@ def test_an_actor_that_dies_in_the_middle_of_a_step(make: Make, cluster: Any, wh
     for timer in timers:
         timer.join()
     remote(vec).pool.ping()
-    assert len(remote(vec).deaths) == 2
+    assert len(remote(vec).pool.deaths) == 2
 
 
 @pytest.mark.parametrize("more", [{"backend": "ray:1"}, {"backend": "ray"}])
@@ -180,7 +180,7 @@ def test_worlds_that_move_between_nodes_are_the_same(
             os.kill(remote(vec).pool.pids[step % 3], signal.SIGKILL)
 
     assert same(drive(vec, steps=16, before=strike), whole)
-    assert len(remote(vec).deaths) == 2
+    assert len(remote(vec).pool.deaths) == 2
     assert sum(uneven) > 0
 
 
@@ -227,7 +227,7 @@ def test_a_node_that_dies_is_not_missed(make: Make, cluster: Any, whole: Any) ->
             await_true(lambda: not psutil.pid_exists(pids[victim]))  # it ends with its raylet
 
     assert same(drive(vec, before=strike), whole)
-    assert victim in {death.worker for death in remote(vec).deaths}
+    assert victim in {death.worker for death in remote(vec).pool.deaths}
     assert raylet not in nodes_of(remote(vec).pool.pids)
 
 

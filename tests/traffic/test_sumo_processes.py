@@ -25,7 +25,7 @@ from cavmarl.engine.world_description import describe_world
 from cavmarl.engine.world_setup import load_world, make_world
 from cavmarl.parallel.hosts.hosted_worlds_job import HostedWorlds
 from cavmarl.parallel.recipe import fingerprint
-from cavmarl.parallel.worlds_job import Task
+from cavmarl.parallel.tasks import Task
 from cavmarl.traffic.sumo.sumo_input import free_libsumo
 from tests.support.driving import drive, start
 from tests.support.forked_processes import ForkedProcess
@@ -293,7 +293,7 @@ def test_a_worker_that_dies_is_followed(tmp_path: Path, source: str, zones: int)
             if step % 20 == 19:
                 hashes = [[one.state_hash(w) for w in range(worlds)] for one in (plain, vec)]
                 assert hashes[0] == hashes[1], step
-        assert len(vec.worlds.deaths) >= 6
+        assert len(vec.worlds.pool.deaths) >= 6
     finally:
         plain.close()
         vec.close()
@@ -321,7 +321,7 @@ def test_a_sumo_of_a_worker_that_dies_runs_again_with_the_next_step(
             for one in (plain, vec):
                 one.step(actions)
         assert [vec.state_hash(w) for w in range(2)] == [plain.state_hash(w) for w in range(2)]
-        assert not vec.worlds.deaths
+        assert not vec.worlds.pool.deaths
     finally:
         plain.close()
         vec.close()

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import WorkerError
 from cavmarl.handoff.coordinator.journal import Journal
 from cavmarl.parallel.local_worlds import LocalWorlds
-from cavmarl.parallel.worlds_job import Task, WorldsJob
+from cavmarl.parallel.tasks import Task
+from cavmarl.parallel.worlds_job import WorldsJob
 from cavmarl.shards.shard import COMMANDS, Commands
 
 _READ_AT_ONCE = 64  # entries

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import SumoError
 from cavmarl.parallel.checkpoint.checkpoint_log import CheckpointLog
 from cavmarl.parallel.local_worlds import LocalWorlds
-from cavmarl.parallel.worlds_job import Task, WorldsJob
+from cavmarl.parallel.tasks import Task
+from cavmarl.parallel.worlds_job import WorldsJob
 
 AGAIN_S = 0.04  # a successor goes through no more steps again than take that long
 

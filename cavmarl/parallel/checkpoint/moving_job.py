@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.processes.state_image import Image
-from cavmarl.parallel.worlds_job import Task, WorldsJob
+from cavmarl.parallel.tasks import Task
+from cavmarl.parallel.worlds_job import WorldsJob
 
 Array = NDArray[Any]
 Share = list[Array]

@@ -18,7 +18,8 @@ from cavmarl.parallel.processes.shared_memory import Segment
 from cavmarl.parallel.processes.state_image import Image
 from cavmarl.parallel.recipe import ELSEWHERE, world_of
 from cavmarl.parallel.step_arrays import StepArrays
-from cavmarl.parallel.worlds_job import Task, WorldsJob
+from cavmarl.parallel.tasks import Task
+from cavmarl.parallel.worlds_job import WorldsJob
 from cavmarl.sensors.mounted.frames import Frames
 
 Array = NDArray[Any]

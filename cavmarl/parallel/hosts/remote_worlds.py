@@ -18,7 +18,7 @@ from cavmarl.engine.compilation import compiled_before
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
 from cavmarl.parallel.checkpoint.world_states import WorldMove, buffers, moves_of
-from cavmarl.parallel.commanded_worlds import OrderedWorlds, own_error, refuse_external
+from cavmarl.parallel.commanded_worlds import CommandedWorlds
 from cavmarl.parallel.hosts.host_commands import Arrays, HostProgram
 from cavmarl.parallel.hosts.host_pool import HostPool
 from cavmarl.parallel.hosts.host_process import code_stamp
@@ -30,13 +30,14 @@ from cavmarl.parallel.mover import Mover
 from cavmarl.parallel.recipe import recipe_of
 from cavmarl.parallel.step_arrays import StepArrays, layout_of
 from cavmarl.parallel.step_placement import StepPlacement
+from cavmarl.parallel.tasks import TASK_NAMES, Task
 from cavmarl.parallel.work_shares import Part, parts_of
-from cavmarl.parallel.worlds_job import TASK_NAMES, Task
+from cavmarl.parallel.world_errors import own_error, refuse_external
 
 Array = NDArray[np.uint8]
 
 
-class RemoteWorlds(OrderedWorlds):
+class RemoteWorlds(CommandedWorlds):
     """W worlds over m hosts, whole worlds each.
 
     Raises:
@@ -178,13 +179,12 @@ class RemoteWorlds(OrderedWorlds):
         self._leaving = {}
         self._look()
 
-    def _ask(self, task: Task, world: int, more: Any = None) -> Any:
+    def _ask(self, task: Task, world: int, payload: Any) -> Any:
         if self.pool.sizes != self._sizes:
             self._look()
-        number = range(len(self.arrays.mask))[world]
-        k = bisect_right(self._bounds, number) - 1
-        number -= self._bounds[k]
-        return self.pool.ask(k, task, number if more is None else [number, more])
+        k = bisect_right(self._bounds, world) - 1
+        number = world - self._bounds[k]  # a host counts its worlds from 0
+        return self.pool.ask(k, task, [number, payload[1]] if task == Task.DRIVEN else number)
 
 
 def refuse_on_hosts(workers: WorkersConfig) -> None:

@@ -11,13 +11,13 @@ from typing import Any
 
 from cavmarl.core.errors import WorkerError, WorkerFailureError
 from cavmarl.ownership.decisions import Neighbours
-from cavmarl.parallel.commanded_worlds import own_error
 from cavmarl.parallel.hosts.host_process import code_stamp
 from cavmarl.parallel.nodes.link import FrameKind, Link, NodeFrame
 from cavmarl.parallel.nodes.links import LinkLostError, Links
 from cavmarl.parallel.nodes.node_cuts import read_neighbours
 from cavmarl.parallel.nodes.node_files import WorldFile
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeListener, NodeSystem
+from cavmarl.parallel.world_errors import own_error
 
 log = logging.getLogger("cavmarl.nodes")
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.parallel.step_arrays import StepArrays
-from cavmarl.parallel.worlds_job import Task
+from cavmarl.parallel.tasks import Task
 
 _HEAD = struct.Struct("<II")
 _INPUTS: Mapping[Task, tuple[str, ...]] = {
@@ -50,13 +50,14 @@ class Inputs:
         return at
 
 
-def worlds_payload(saved: Sequence[bytes], only_reads: bool = False) -> dict[str, Any]:
-    """Worlds as bytes, as a payload; see `LocalWorlds.save_worlds`."""
-    return {"saved_worlds": [b64encode(one).decode() for one in saved], "only_reads": only_reads}
+def worlds_payload(saved: Sequence[bytes]) -> list[str]:
+    """Return worlds that were saved as bytes as a payload; see `LocalWorlds.save_worlds`."""
+    return [b64encode(one).decode() for one in saved]
 
 
-def saved_of(payload: Mapping[str, Any]) -> list[bytes]:
-    return [b64decode(one) for one in payload["saved_worlds"]]
+def saved_of(payload: Sequence[str]) -> list[bytes]:
+    """Return the saved worlds of a payload."""
+    return [b64decode(one) for one in payload]
 
 
 def _flat(array: NDArray[Any]) -> NDArray[np.uint8]:

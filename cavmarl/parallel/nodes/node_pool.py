@@ -7,7 +7,7 @@ import logging
 import math
 import os
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -24,26 +24,30 @@ from cavmarl.handoff.shard_setup import limits_of
 from cavmarl.ownership.decisions import Neighbours
 from cavmarl.ownership.reactions import Hosting
 from cavmarl.parallel.backend_name import BackendName
-from cavmarl.parallel.commanded_worlds import own_error
 from cavmarl.parallel.journaled_worlds import unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.nodes.leases import lease_ticks, leases_of
 from cavmarl.parallel.nodes.link import FrameKind, NodeFrame, said_by
 from cavmarl.parallel.nodes.links import LinkLostError, Links
 from cavmarl.parallel.nodes.newcomers import Newcomer, Newcomers
-from cavmarl.parallel.nodes.node_actions import NodeCommand, read_refusal
+from cavmarl.parallel.nodes.node_actions import NodeCommand, ZoneRects, read_refusal
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
 from cavmarl.parallel.nodes.node_cuts import PoolState, ZoneCut, read_neighbours, told_zones
 from cavmarl.parallel.nodes.node_files import files_of
-from cavmarl.parallel.nodes.node_starters import Route, Start, start_nodes, straight
+from cavmarl.parallel.nodes.node_starters import LocalNodes, Route, Start, start_nodes, straight
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.nodes.node_watch import NodeWatch, SilentNodeError
 from cavmarl.parallel.nodes.zone_hosts import read_report, told_hostings
-from cavmarl.parallel.nodes.zone_moves import ZoneMoves, living_of, moves_of, name_of, nodes_of
+from cavmarl.parallel.nodes.zone_moves import (
+    ZoneMoves,
+    Zones,
+    living_of,
+    moves_of,
+    name_of,
+    nodes_of,
+)
 from cavmarl.parallel.recipe import recipe_of
-from cavmarl.parallel.step_arrays import StepArrays, layout_of
-from cavmarl.parallel.step_placement import StepPlacement
-from cavmarl.parallel.work_shares import parts_of
+from cavmarl.parallel.world_errors import own_error
 from cavmarl.zones.kernels.agent_frames import UNOWNED
 
 log = logging.getLogger("cavmarl.nodes")
@@ -59,6 +63,12 @@ class NodePool:
     Attributes:
         zones: that each node hosts.
         pids: of the nodes' processes, each on its machine.
+        tellers: numbers of the nodes of the last results.
+        owner: (W · A,) the node that owns each agent, as far as is known.
+        partition: the zones' rectangles, as `node_cuts.told_zones` gives them.
+        coordinator: of the ownership of vehicles.
+        newcomers: nodes that have joined and host nothing yet.
+        generation: how often nodes have come and gone.
         losses: how many nodes were lost.
         recoveries: how often the worlds have gone back because of that.
         replacements: how many nodes host zones in the place of others.
@@ -69,30 +79,31 @@ class NodePool:
         WorkerError: a node cannot be started.
     """
 
-    _owner: NDArray[np.int32]  # (W · A,) the node that owns each agent, as far as is known
-    _tellers: Sequence[int] = ()  # the nodes of the last results
+    owner: NDArray[np.int32]
+    tellers: Sequence[int] = ()
     _performed: NodeCommand | None = None  # what they do now
+    _exchanged = 0  # answers of a network simulator that nodes have got in the present command
 
     def __init__(
         self,
         world: World,  # what each is made of
         base_dir: Path,  # the folder that its relative files start from
         num_worlds: int,  # W
+        zones: Zones,  # that each node hosts to begin with
         backend: BackendName,  # what starts n nodes, from 1 to the zones of a world
-        in_next_step: bool = False,  # when worlds begin anew; see `SteppedWorlds`
+        in_next_step: bool,  # when worlds begin anew; see `SteppedWorlds`
+        *,
+        answer: Callable[[memoryview], bytes],  # what a network simulator says to an EXCHANGE
         route: Route = straight,  # where to call in order to reach a place
         system: NodeSystem = MACHINE,  # that the nodes are on
         start: Start = start_nodes,  # starts them
     ) -> None:
-        self.world, self._route = world, route
-        self.in_next_step = in_next_step
-        config, count, nodes = world.config, world.partition.count, backend.count or 1
-        layout = layout_of(config, world.capacity, num_worlds).items()
-        self.arrays = StepArrays.of({name: np.zeros(shape, kind) for name, (kind, shape) in layout})
-        self._placement = StepPlacement(world, 1, nodes, is_here=False)
-        self.zones = self._homes = parts_of(self._placement.plans, count)[0].zones
+        self._is_native = world.config.traffic.source == "native"
+        self._route, self._answer = route, answer
+        config, nodes = world.config, backend.count or 1
+        self.zones = self._homes = zones
         self._living = living_of(self.zones)
-        self._generation = 0
+        self.generation = 0
         self._teller = 0
         self._cut = ZoneCut(told_zones(world.partition), Neighbours(()))
         self._state = PoolState(1, self.zones, 0, self._cut)  # that all nodes can go back to
@@ -104,6 +115,8 @@ class NodePool:
         self._is_torn = False
         self.losses = self.recoveries = self.replacements = self.redirected = 0
         self._timeout_s, self._pid = config.workers.timeout_s, os.getpid()
+        self._join_timeout_s = config.workers.join_timeout_s
+        self.owner = np.full(num_worlds * config.population.num_ids, UNOWNED, dtype=np.int32)
         self._ticks_per_step = config.clock.ticks_per_step
         self._links = Links(_nothing, system)
         self._watch = NodeWatch(self._links, lambda: self._starter.stopped())
@@ -111,7 +124,7 @@ class NodePool:
         self._new: dict[int, tuple[str, int]] = {}  # where the others can call those of them
         runs = prepare_runs(config.zones, num_worlds)
         self._lease_ticks = lease_ticks(config)
-        self._coordinator = NodeCoordinator(
+        self.coordinator = NodeCoordinator(
             [run.run for run in runs],
             nodes_of(self.zones),
             limits_of(config.zones),
@@ -131,7 +144,7 @@ class NodePool:
         }
         files = files_of(config, base_dir)
         self._starter, listener = start(backend, config.workers, base_dir, route)
-        self._newcomers = Newcomers(listener, job, files, self._room, system)
+        self.newcomers = Newcomers(listener, job, files, self._room, system)
         try:
             self._begin(nodes)
         except BaseException:
@@ -140,25 +153,23 @@ class NodePool:
 
     def _begin(self, nodes: int) -> None:
         """Wait until so many nodes have joined, and give them their zones, again if one is lost."""
-        join_timeout_s = self.world.config.workers.join_timeout_s
-        self._owner = np.full(self.arrays.mask.size, UNOWNED, dtype=np.int32)
         hostings: list[list[Hosting]] = []
         while self._new or len(self._nodes) < nodes:
             try:
                 missing = nodes - len(self._nodes)
-                self._newcomers.await_ready(missing, join_timeout_s, self._trouble)
+                self.newcomers.await_ready(missing, self._join_timeout_s, self._trouble)
                 self._seat()
                 neighbours = self._nodes[0].neighbours
                 assert neighbours is not None
                 self._cut = self._cut._replace(neighbours=neighbours)
                 self._state = self._state._replace(cut=self._cut)
-                hostings = hostings or self._coordinator.host(neighbours)
+                hostings = hostings or self.coordinator.host(neighbours)
                 self._tell_zones(hostings, ZoneMoves(self.zones, {}, []), begins=True)
                 self._commit()
                 self._new.clear()
             except LinkLostError as lost:
                 self._lose(lost, has_begun=False)
-                self._generation += 1  # what nodes say of this attempt counts no more
+                self.generation += 1  # what nodes say of this attempt counts no more
         self._is_torn = False
 
     def _trouble(self) -> str | None:
@@ -170,14 +181,33 @@ class NodePool:
     def pids(self) -> list[int]:
         return [self._nodes[number].pid for number in sorted(self._nodes)]
 
+    @property
+    def num_nodes(self) -> int:
+        """How many nodes host zones if none is lost."""
+        return len(self._homes)
+
+    @property
+    def machines(self) -> list[tuple[str, int]]:
+        """The machine and the process of each living node."""
+        return [(node.machine, node.pid) for node in self._nodes.values()]
+
+    @property
+    def is_here(self) -> bool:
+        """Whether the nodes are processes of this machine that the pool has started."""
+        return isinstance(self._starter, LocalNodes)
+
+    @property
+    def partition(self) -> ZoneRects:
+        return self._cut.partition
+
     def _room(self) -> int:
         return len(self._homes) - len(self._nodes) + SPARES
 
     def _seat(self) -> None:
         """Let those that are ready host the zones that a lost node had at the beginning."""
         empty = [n for n in range(len(self._homes)) if n not in self._nodes]
-        for ready in list(self._newcomers.ready)[: len(empty)]:
-            newcomer, connection = self._newcomers.take(ready)
+        for ready in list(self.newcomers.ready)[: len(empty)]:
+            newcomer, connection = self.newcomers.take(ready)
             number = newcomer.asked if newcomer.asked in empty else empty[0]
             empty.remove(number)
             assert newcomer.place is not None
@@ -196,7 +226,7 @@ class NodePool:
         while missing := [n for n in self._living if n not in found] if found else self._living:
             wait = partial(self._links.take, missing)
             for number, frame in self._watch.wait(self._living, self._timeout_s, wait).items():
-                if frame.number == self._generation:
+                if frame.number == self.generation:
                     found[number] = frame
         for number, frame in found.items():
             if frame.kind is not kind:
@@ -230,6 +260,16 @@ class NodePool:
             self._keep_again_s = self._links.now_s() + KEEP_S
         return results
 
+    def move(self, zones: Zones) -> None:
+        """Let the zones have other homes from now on; errors as of `run`."""
+        before, self._homes = self._homes, zones
+        self._is_torn, self._opened = True, None
+        try:
+            self._insist(None)
+        except BaseException:
+            self._homes = before
+            raise
+
     def _insist(self, command: NodeCommand | None) -> list[memoryview]:
         """Do a command, or none, again and again, until no node is lost meanwhile."""
         while True:
@@ -249,11 +289,11 @@ class NodePool:
         They get it from those that have it now, out of the newest state. With SUMO none can: what
         SUMO was told up to now is in no state.
         """
-        if self.world.config.traffic.source != "native":
+        if not self._is_native:
             return False
-        self._newcomers.look(0.0)
+        self.newcomers.look(0.0)
         is_fresh = self._state.zones == self.zones and not self._is_torn
-        if not (self._newcomers.ready and is_fresh and len(self._nodes) < len(self._homes)):
+        if not (self.newcomers.ready and is_fresh and len(self._nodes) < len(self._homes)):
             return False
         before = len(self._nodes)
         self._seat()
@@ -263,36 +303,36 @@ class NodePool:
 
     def _begin_state(self) -> None:
         """Let all nodes keep what they have before the next command."""
-        switched = self._coordinator.switched
+        switched = self.coordinator.switched
         self._opened = PoolState(self._next_state, self.zones, switched, self._cut)
         self._next_state += 1
 
     def _perform(self, command: NodeCommand) -> list[memoryview]:
         """Do a command once. Raises LinkLostError: a node is lost."""
         kept = self._opened.number if self._opened and self._log and command is self._log[-1] else 0
-        self._performed = command
+        self._performed, self._exchanged = command, 0
         leases = leases_of(command.ticks, self._lease_ticks)
         lease = self._begin_lease() if leases else {}
         for number in self._living:
-            pieces = command.of_node(number, self._owner, lease.get(number, b""))
+            pieces = command.of_node(number, self.owner, lease.get(number, b""))
             self._links.send(number, FrameKind.COMMAND, kept, pieces)
         if not command.changes:
             return [frame.data for frame in self._take(FrameKind.RESULT).values()]
         results = self._commit()
         for _ in range(1, leases):
-            self._coordinator.lease(self._begin_lease(), self._ticks_per_step)
+            self.coordinator.lease(self._begin_lease(), self._ticks_per_step)
             results = self._commit()
         if command.cut is not None:
             self._cut = ZoneCut(command.cut, read_neighbours(json.loads(bytes(results[0]))))
-            self._coordinator.know(self._cut.neighbours)
+            self.coordinator.know(self._cut.neighbours)
         return results
 
     def _begin_lease(self) -> dict[int, bytes]:
         """What nodes are to be told before the next ticks."""
-        decide = partial(self._watch.wait, self._living, self._timeout_s, self._coordinator.begin)
+        decide = partial(self._watch.wait, self._living, self._timeout_s, self.coordinator.begin)
         lease = decide()
-        while self._coordinator.is_late:
-            self._coordinator.lease(lease, 0)
+        while self.coordinator.is_late:
+            self.coordinator.lease(lease, 0)
             self._commit()
             lease = decide()
         return lease
@@ -301,7 +341,7 @@ class NodePool:
         """Take an urgent frame; an error of a node is raised here."""
         if frame.kind is FrameKind.MISSED:
             peer = int.from_bytes(frame.data, "little")
-            if frame.number == self._generation and peer in self._nodes:
+            if frame.number == self.generation and peer in self._nodes:
                 self._watch.hear_missed(number, peer)
         elif frame.kind is FrameKind.FAILED:
             name, text, trace = said_by(frame)
@@ -309,11 +349,30 @@ class NodePool:
             raise own_error(failure) from failure
         elif frame.kind is FrameKind.PONG:
             self._watch.hear_pong(number, frame)
+        elif frame.kind is FrameKind.EXCHANGE:
+            if frame.number == self.generation:
+                self._exchange(frame)
         elif frame.kind is FrameKind.NOT_MINE:
-            if frame.number == self._generation:
+            if frame.number == self.generation:
                 self._send_on(frame)
         else:
-            self._coordinator.hear(number, frame)
+            self.coordinator.hear(number, frame)
+
+    def _exchange(self, frame: NodeFrame) -> None:
+        """Tell all nodes what stations receive; of a step that is done again, what they did.
+
+        Raises:
+            MessageError: no step is taken.
+        """
+        known = None if self._performed is None else self._performed.receptions
+        if known is None:
+            raise MessageError("messages are sent where no step is taken")
+        if self._exchanged == len(known):
+            known.append(self._answer(frame.data))
+        for node in self._living:
+            answer = known[self._exchanged]
+            self._links.send(node, FrameKind.RECEPTIONS, self.generation, [answer])
+        self._exchanged += 1
 
     def _send_on(self, frame: NodeFrame) -> None:
         """Send actions that a node refuses to the owners that it names.
@@ -321,14 +380,14 @@ class NodePool:
         Raises:
             MessageError: there are no such agents, or owners.
         """
-        found = read_refusal(frame.data, self._owner.size, set(self._living))
+        found = read_refusal(frame.data, self.owner.size, set(self._living))
         if self._performed is None or (actions := self._performed.actions) is None:
             raise MessageError("actions are refused where there are none")
         for owner in np.unique(found[1]).tolist():
             agents = found[0, found[1] == owner]
-            self._owner[agents] = owner
+            self.owner[agents] = owner
             self.redirected += len(agents)
-            self._links.send(owner, FrameKind.ACTIONS, self._generation, [actions.some(agents)])
+            self._links.send(owner, FrameKind.ACTIONS, self.generation, [actions.some(agents)])
 
     def _lose(self, lost: LinkLostError, has_begun: bool = True) -> None:
         """A node is gone: nothing of it counts any more.
@@ -368,11 +427,11 @@ class NodePool:
         self._opened = None
         moves = moves_of(state.zones, self._homes, self._lost, self._nodes, state.number)
         self.zones, self._living = moves.zones, living_of(moves.zones)
-        self._owner[~np.isin(self._owner, self._living)] = UNOWNED  # of lost ones any may be
-        self._generation += 1
+        self.owner[~np.isin(self.owner, self._living)] = UNOWNED  # of lost ones any may be
+        self.generation += 1
         self._cut = state.cut
-        self._coordinator.know(state.cut.neighbours)
-        hostings = self._coordinator.recover(nodes_of(self.zones), state.switched)
+        self.coordinator.know(state.cut.neighbours)
+        hostings = self.coordinator.recover(nodes_of(self.zones), state.switched)
         self._tell_zones(hostings, moves, begins=False)
         self._commit()
         self._new.clear()
@@ -402,7 +461,7 @@ class NodePool:
         }
         for number in self._living:
             data = json.dumps({**told, "number": number}).encode()
-            self._links.send(number, FrameKind.RECOVER, self._generation, [data])
+            self._links.send(number, FrameKind.RECOVER, self.generation, [data])
 
     def _first_teller(self) -> int:
         """The node that tells what all know alike: one that has been there in the last step."""
@@ -424,13 +483,13 @@ class NodePool:
         for number in sorted(frames, key=self._teller.__ne__):  # else by rising numbers
             try:
                 messages, said, more = read_report(frames[number].data, len(self._runs))
-                self._coordinator.check(number, messages)
+                self.coordinator.check(number, messages)
             except (ValueError, TypeError, struct.error, ProtocolError) as error:
                 raise LinkLostError(number, MessageError(f"no report: {error}")) from error
             told[number] = messages, said
             results.append(more)
-        self._coordinator.commit(told)
-        self._tellers = list(told)
+        self.coordinator.commit(told)
+        self.tellers = list(told)
         return results
 
     def close(self) -> None:
@@ -438,8 +497,8 @@ class NodePool:
         if is_fork(self._pid):
             return
         self._links.end(END_S)
-        self._newcomers.close()
-        self._coordinator.close()
+        self.newcomers.close()
+        self.coordinator.close()
         self._starter.close()
 
 

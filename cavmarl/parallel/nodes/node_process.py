@@ -19,6 +19,7 @@ from cavmarl.engine.shard_clock import ShardClock
 from cavmarl.handoff.shard_setup import limits_of
 from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.parallel.hosts.host_process import code_stamp
+from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.nodes.agent_stream import ResultStream
 from cavmarl.parallel.nodes.kept_states import KeptStates
 from cavmarl.parallel.nodes.link import Bytes, FrameKind, NeededNoMoreError, NodeFrame
@@ -40,11 +41,38 @@ from cavmarl.parallel.nodes.node_peers import NodePeers
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.nodes.zone_hosts import ZoneHosts, hosting_of
 from cavmarl.parallel.nodes.zone_moves import living_of, nodes_of
-from cavmarl.parallel.worlds_job import Task, commands_of
+from cavmarl.parallel.tasks import WORLD_TASKS, Task, WorldTask, commands_of
 
 MEASURED_TICKS = 10  # one of so many shows what zones cost
 MEETING_S = 60.0  # for the other nodes to call
 DIFFERENT = "are read as something else on this machine: {} is the caller's folder"
+
+
+def _saved(payload: Any, first: int) -> dict[str, Any]:
+    return {"saved": saved_of(payload)}
+
+
+def _nothing(payload: None, first: int) -> dict[str, Any]:
+    return {}
+
+
+def _states(worlds: LocalWorlds) -> NDArray[np.float32]:
+    worlds.write_states()
+    return worlds.arrays.states
+
+
+def _proposal(worlds: LocalWorlds) -> Any:
+    return proposal_of(worlds.simulation)
+
+
+# What the first node answers: an array as its bytes, all else as JSON.
+_OF_FIRST: dict[Task, WorldTask] = {
+    **WORLD_TASKS,
+    Task.WRITE_STATES: WorldTask(_states, _nothing),
+    Task.SAVE: WorldTask(LocalWorlds.save_worlds, _nothing, worlds_payload),
+    Task.CHECK: WorldTask(LocalWorlds.refusal, _saved),
+    Task.PROPOSE: WorldTask(_proposal, _nothing),
+}
 
 
 class NodeProgram:
@@ -63,6 +91,16 @@ class NodeProgram:
         self._number = -1  # until the caller has said it
         self._generation = 0
         self._actions: deque[NodeFrame] = deque()  # that have been sent here after all
+        # Tasks that all nodes do, each for its zones; the first node does the others.
+        self._of_all: dict[Task, Callable[[Any, memoryview, int], None]] = {
+            Task.STEP: self._step,
+            Task.RESET: self._reset,
+            Task.LOAD: self._load,
+            Task.CUT: self._cut,
+            Task.COSTS: self._tell_costs,
+            Task.LOADS: self._tell_loads,
+            Task.SUGGEST: self._suggest,
+        }
 
     def join(self) -> None:
         """Load the world, and say where other nodes can call.
@@ -269,44 +307,52 @@ class NodeProgram:
             raise RecoveryOrderedError(None)
 
     def _perform(self, frame: NodeFrame) -> None:
-        worlds, peers = self._worlds, self._peers
         task, payload, at = command_of(frame.data)
         self._kept.settle()
         if frame.number:
             self._kept.keep(frame.number, self._living)
-        match task:
-            case Task.STEP:
-                at = self._await_actions(frame.data, at)
-                at = self._inputs.take(task, frame.data, at)
-                self._hosts.lease(frame.data[at:])
-                peers.begin_step()
-                worlds.step(self._commands)
-                self._hosts.report([self._results_of(worlds.simulation.everywhere, of_step=True)])
-            case Task.RESET:
-                self._inputs.take(task, frame.data, at)
-                worlds.reset(payload["seed"], payload["first_world"])
-                self._hosts.report([self._results_of(worlds.arrays.chosen, of_step=False)])
-            case Task.LOAD if not payload["only_reads"]:
-                worlds.load_worlds(saved_of(payload))
-                self._hosts.report()
-            case Task.CUT:
-                cut_worlds(worlds.simulation, peers, payload)
-                self._run_own()
-                said = told_neighbours(worlds.simulation)
-                self._hosts.report([json.dumps(said).encode()])
-            case Task.HOST:
-                spent_s = [] if self._clock is None else self._clock.take_s().tolist()
-                self._answer([json.dumps(list(zip(self.zones, spent_s, strict=False))).encode()])
-            case Task.LOADS:
-                said = [self._number, *told_of(payload, self._links, worlds.simulation, self.zones)]
-                self._answer([json.dumps(said).encode()])
-            case Task.SUGGEST:
-                worlds.suggest()
-                where = np.flatnonzero(peers.own.reshape(-1))
-                found = worlds.arrays.suggested.reshape(-1, 2)[where]
-                self._answer([where.data, found.reshape(-1).data])
-            case _:
-                self._look(task, payload)
+        if perform := self._of_all.get(task):
+            perform(payload, frame.data, at)
+        else:
+            self._look(task, payload)
+
+    def _step(self, payload: None, data: memoryview, at: int) -> None:
+        worlds = self._worlds
+        at = self._await_actions(data, at)
+        at = self._inputs.take(Task.STEP, data, at)
+        self._hosts.lease(data[at:])
+        self._peers.begin_step()
+        worlds.step(self._commands)
+        self._hosts.report([self._results_of(worlds.simulation.everywhere, of_step=True)])
+
+    def _reset(self, payload: Any, data: memoryview, at: int) -> None:
+        self._inputs.take(Task.RESET, data, at)
+        WORLD_TASKS[Task.RESET].perform(self._worlds, payload)
+        self._hosts.report([self._results_of(self._worlds.arrays.chosen, of_step=False)])
+
+    def _load(self, payload: Any, data: memoryview, at: int) -> None:
+        WORLD_TASKS[Task.LOAD].perform(self._worlds, saved_of(payload))
+        self._hosts.report()
+
+    def _cut(self, payload: Any, data: memoryview, at: int) -> None:
+        simulation = self._worlds.simulation
+        cut_worlds(simulation, self._peers, payload)
+        self._run_own()
+        self._hosts.report([json.dumps(told_neighbours(simulation)).encode()])
+
+    def _tell_costs(self, payload: None, data: memoryview, at: int) -> None:
+        spent_s = [] if self._clock is None else self._clock.take_s().tolist()
+        self._answer([json.dumps(list(zip(self.zones, spent_s, strict=False))).encode()])
+
+    def _tell_loads(self, payload: Any, data: memoryview, at: int) -> None:
+        told = told_of(payload, self._links, self._worlds.simulation, self.zones)
+        self._answer([json.dumps([self._number, *told]).encode()])
+
+    def _suggest(self, payload: None, data: memoryview, at: int) -> None:
+        WORLD_TASKS[Task.SUGGEST].perform(self._worlds, payload)
+        where = np.flatnonzero(self._peers.own.reshape(-1))
+        found = self._worlds.arrays.suggested.reshape(-1, 2)[where]
+        self._answer([where.data, found.reshape(-1).data])
 
     def _await_actions(self, data: memoryview, at: int) -> int:
         """Return when it is known what all agents of this node do in the next step: their end.
@@ -338,33 +384,13 @@ class NodeProgram:
 
     def _look(self, task: Task, payload: Any) -> None:
         """Answer what only the first node can, which has the whole world meanwhile."""
-        worlds, answer = self._worlds, None
+        worlds, answer = self._worlds, list[Bytes]()
         with self._peers.whole(worlds.simulation):
             if self._is_first:
-                answer = self._found(task, payload)
-        self._answer([] if answer is None else answer)
-
-    def _found(self, task: Task, payload: Any) -> list[Bytes]:
-        worlds = self._worlds
-        found: Any
-        if task == Task.WRITE_STATES:
-            worlds.write_states()
-            return [worlds.arrays.states.reshape(-1).data]
-        if task == Task.STATE_HASH:
-            found = worlds.state_hash(payload)
-        elif task == Task.SAVE:
-            found = worlds_payload(worlds.save_worlds())
-        elif task == Task.LOAD:
-            found = worlds.refusal(saved_of(payload))
-        elif task == Task.TRAFFIC_STATS:
-            found = worlds.traffic_stats(payload)
-        elif task == Task.DRIVEN:
-            found = worlds.driven(*payload)
-        elif task == Task.PROPOSE:
-            found = proposal_of(worlds.simulation)
-        else:
-            found = worlds.signal_phases(payload).tolist()
-        return [json.dumps(found).encode()]
+                found = _OF_FIRST[task].perform(worlds, payload)
+                is_array = isinstance(found, np.ndarray)
+                answer = [found.reshape(-1).data if is_array else json.dumps(found).encode()]
+        self._answer(answer)
 
     @property
     def _is_first(self) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import socket
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,21 +13,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.balance.balance_plan import Plan
 from cavmarl.balance.load_score import Candidate, Utilisation
 from cavmarl.balance.load_snapshot import NO_GPU, LoadSnapshot, idle_snapshot
 from cavmarl.balance.probe import MEASURED
-from cavmarl.core.errors import ConfigError, MessageError
+from cavmarl.core.errors import ConfigError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
 from cavmarl.handoff.repartitioning import Recut, is_due
 from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.parallel.backend_name import BackendName
-from cavmarl.parallel.commanded_worlds import uncopied
+from cavmarl.parallel.commanded_worlds import CommandedWorlds
 from cavmarl.parallel.mover import Mover
 from cavmarl.parallel.nodes.agent_stream import ResultStream
-from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
 from cavmarl.parallel.nodes.node_actions import Actions, NodeCommand
 from cavmarl.parallel.nodes.node_cuts import read_zones
 from cavmarl.parallel.nodes.node_frames import (
@@ -44,26 +42,30 @@ from cavmarl.parallel.nodes.node_loads import (
 )
 from cavmarl.parallel.nodes.node_network import NetworkFailedError, answer_of, read_asked
 from cavmarl.parallel.nodes.node_pool import NodePool
-from cavmarl.parallel.nodes.node_starters import LocalNodes, Route, Start, start_nodes, straight
+from cavmarl.parallel.nodes.node_starters import Route, Start, start_nodes, straight
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
-from cavmarl.parallel.step_arrays import Driven
-from cavmarl.parallel.worlds_job import Task
+from cavmarl.parallel.step_arrays import StepArrays, layout_of
+from cavmarl.parallel.step_placement import StepPlacement
+from cavmarl.parallel.tasks import Task
+from cavmarl.parallel.work_shares import Part, parts_of
 from cavmarl.shards.shard import Commands
 from cavmarl.v2x.v2x_messages import NetworkSimulator, check_external
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
 
-class NodeWorlds(NodePool):
-    """W worlds over n nodes; a `SteppedWorlds`.
+class NodeWorlds(CommandedWorlds):
+    """W worlds over n nodes, which share out the zones of each world.
 
     Attributes:
-        mover: has zones change their node by what they cost; None: they stay.
+        pool: the nodes.
         recuts: when worlds have been cut anew.
 
     Raises:
         ConfigError: a setting that such worlds cannot have, or more nodes than zones.
         WorkerError: a node cannot be started.
     """
+
+    pool: NodePool
 
     def __init__(
         self,
@@ -72,61 +74,56 @@ class NodeWorlds(NodePool):
         num_worlds: int,  # W
         backend: BackendName,  # what starts n nodes, from 1 to the zones of a world
         in_next_step: bool = False,  # when worlds begin anew; see `SteppedWorlds`
+        *,
         route: Route = straight,  # where nodes of this machine call in order to reach a place
         system: NodeSystem = MACHINE,  # that the nodes are on
         start: Start = start_nodes,  # starts them
     ) -> None:
-        check_nodes(world, backend.count or 1)
-        super().__init__(world, base_dir, num_worlds, backend, in_next_step, route, system, start)
-        count, every = world.partition.count, world.config.workers.balance_steps
-        self._spent_s = np.zeros((1, count))
-        self._ticks_done = self._ticks_told = 0
-        self.recuts: list[Recut] = []
-        self._everywhere = np.ones(num_worlds, dtype=np.bool_)
-        self._results = ResultStream(self.arrays)
-        self._steps = 0
+        config, count, nodes = world.config, world.partition.count, backend.count or 1
+        check_nodes(world, nodes)
+        self.world, self.in_next_step = world, in_next_step
+        layout = layout_of(config, world.capacity, num_worlds).items()
+        self.arrays = StepArrays.of({name: np.zeros(shape, kind) for name, (kind, shape) in layout})
+        self.placement = StepPlacement(world, 1, nodes, is_here=False)
+        zones = parts_of(self.plans, count)[0].zones
         self._network: NetworkSimulator | None = None
-        self._exchanged = 0  # answers of it that nodes have got in the present command
+        self._results = ResultStream(self.arrays)
+        self._everywhere = np.ones(num_worlds, dtype=np.bool_)
+        self._writers: dict[Task, Callable[[Sequence[memoryview]], None]] = {
+            Task.RESET: self._write_begun,
+            Task.STEP: self._write_stepped,
+            Task.SUGGEST: self._write_suggested,
+            Task.WRITE_STATES: self._write_states,
+        }
+        self.pool = NodePool(
+            world, base_dir, num_worlds, zones, backend, in_next_step,
+            answer=self._answer, route=route, system=system, start=start,
+        )  # fmt: skip
+        self._spent_s = np.zeros((1, count))
+        self._ticks_per_step = config.clock.ticks_per_step
+        self._ticks_done = self._ticks_told = 0
+        self._steps_begun = 0  # since the worlds were made
+        self.recuts: list[Recut] = []
         self._told: dict[int, list[Any]] = {}  # what nodes have said of themselves last
-        self.mover = Mover(self._placement, count, every, self._spent_s) if every else None
-        if world.config.workers.monitor_cpu:
+        if every := config.workers.balance_steps:
+            self.mover = Mover(self.placement, count, every, self._spent_s)
+        if config.workers.monitor_cpu:
             self.node_snapshot(TO_BALANCE)  # from now on they watch
 
-    def reset(self, seed: int | None, first_world: int) -> None:
-        arrays = self.arrays
-        results = self.run(self._command(Task.RESET, {"seed": seed, "first_world": first_world}))
-        self._write(results, arrays.chosen, of_step=False)
-        if not arrays.chosen.all():
-            arrays.observations[~arrays.mask] = 0.0
-
     def step(self, commands: Commands) -> None:
-        """Let the agents act, and reset the worlds whose episode is over, now or a step later."""
-        arrays = self.arrays
-        if commands.controls is not arrays.controls:
-            arrays.controls[:] = commands.controls
-            arrays.meta_actions[:] = commands.meta_actions
+        """See `CommandedWorlds.step`; before that zones are cut anew, if it is time."""
         self._cut_anew()
-        if self.mover is not None:
-            self.mover.before_step(self._move, self._seen)
-        for told, array in (
-            (commands.declared, arrays.declared),
-            (commands.inserted, arrays.inserted),
-        ):
-            if array.size:
-                array[:] = told if told.size else 0
-        results = self.run(self._command(Task.STEP))
-        self._ticks_done += self._ticks_per_step
-        self._write(results, self._everywhere, of_step=True)
+        super().step(commands)
 
     def _cut_anew(self) -> None:
         """Every so many steps cut the zones by their vehicles; see `zones.repartition_steps`."""
-        self._steps += 1
-        if not is_due(self._steps, self.world.config.zones.repartition_steps):
+        self._steps_begun += 1
+        if not is_due(self._steps_begun, self.world.config.zones.repartition_steps):
             return
-        if proposal := self._asked(Task.PROPOSE, None):
+        if proposal := self._ask_first(Task.PROPOSE):
             zones, *figures = proposal
-            self.run(self._command(Task.CUT, zones))
-            self.recuts.append(Recut(self._steps - 1, *figures))
+            self._order(Task.CUT, zones)
+            self.recuts.append(Recut(self._steps_begun - 1, *figures))
 
     def connect_network(self, network: NetworkSimulator) -> None:
         """From now on let a network simulator of this process decide receptions.
@@ -137,85 +134,88 @@ class NodeWorlds(NodePool):
         check_external(self.world.config.v2x)
         self._network = network
 
-    def run(self, command: NodeCommand) -> list[memoryview]:
-        try:
-            return super().run(command)
-        except NetworkFailedError as failed:
-            raise failed.error from None
-
-    def _perform(self, command: NodeCommand) -> list[memoryview]:
-        self._exchanged = 0
-        return super()._perform(command)
-
-    def _hear(self, number: int, frame: NodeFrame) -> None:
-        if frame.kind is not FrameKind.EXCHANGE:
-            super()._hear(number, frame)
-        elif frame.number == self._generation:
-            self._exchange(frame)
-
-    def _exchange(self, frame: NodeFrame) -> None:
-        """Tell all nodes what stations receive; of a step that is done again, what they did."""
-        known = None if self._performed is None else self._performed.receptions
-        if known is None:
-            raise MessageError("messages are sent where no step is taken")
-        if self._exchanged == len(known):
-            latency = self.world.config.v2x.channel.latency_ticks
-            asked = read_asked(frame.data, len(self.arrays.mask), latency)
-            known.append(answer_of(self._network, asked))
-        for node in self._living:
-            answer = known[self._exchanged]
-            self._links.send(node, FrameKind.RECEPTIONS, self._generation, [answer])
-        self._exchanged += 1
+    def _answer(self, data: memoryview) -> bytes:
+        """Return what the network simulator says; errors as of `answer_of`."""
+        latency = self.world.config.v2x.channel.latency_ticks
+        return answer_of(self._network, read_asked(data, len(self.arrays.mask), latency))
 
     def _seen(self) -> LoadSnapshot:
         """Ask what zones have cost, before they are balanced by it; how busy all nodes are.
 
         Those that are not watched, or lost, are taken to be idle.
         """
-        for data in self.run(self._command(Task.HOST)):
+        for data in self._run(Task.COSTS):
             for zone, spent_s in json.loads(bytes(data)):
                 self._spent_s[0, zone] += spent_s
-        idle = idle_snapshot(len(self._homes))
+        idle = idle_snapshot(self.pool.num_nodes)
         if not self.world.config.workers.monitor_cpu:
             return idle
         seen = self.node_snapshot(TO_BALANCE)
         states = {one.worker: one for one in (*idle.workers, *seen.workers)}
         return replace(seen, workers=tuple(states[node] for node in sorted(states)))
 
-    def _move(self, task: Task, zones: list[Any], commits: bool) -> None:
-        """Let zones have other homes from now on."""
-        before, self._homes = self._homes, zones[0]
-        self._is_torn, self._opened = True, None
-        try:
-            self._insist(None)
-        except BaseException:
-            self._homes = before
-            raise
+    def _send(self, task: Task, payload: Any, commits: bool) -> None:
+        if task == Task.HOST:
+            self.pool.move(payload[0])
+            return
+        results = self._run(task, payload)
+        if write := self._writers.get(task):
+            write(results)
 
-    def _command(self, task: Task, payload: Any = None) -> NodeCommand:
-        loads = task == Task.LOAD and not payload["only_reads"]
-        changes = loads or task in (Task.STEP, Task.RESET, Task.CUT)
+    def _settle(self, parts: list[Part]) -> None:
+        """The pool has noted it when zones have moved."""
+
+    def _run(self, task: Task, payload: Any = None) -> list[memoryview]:
+        """Let all nodes do a task; what each has found."""
+        try:
+            return self.pool.run(self._command(task, payload))
+        except NetworkFailedError as failed:
+            raise failed.error from None
+
+    def _command(self, task: Task, payload: Any) -> NodeCommand:
+        changes = task in (Task.STEP, Task.RESET, Task.LOAD, Task.CUT)
         pieces = pieces_of(task, payload, self.arrays)
         if task != Task.STEP:
             return NodeCommand(pieces, changes, 0, cut=payload if task == Task.CUT else None)
         actions = Actions.of(self.arrays)
         return NodeCommand(pieces, changes, self._ticks_per_step, actions, receptions=[])
 
+    def _ask(self, task: Task, world: int, payload: Any) -> Any:
+        return self._ask_first(task, payload)
+
+    def _ask_first(self, task: Task, payload: Any = None) -> Any:
+        """Return what the first node answers, which has the whole worlds meanwhile."""
+        return json.loads(bytes(self._run(task, payload)[0]))
+
+    def _write_begun(self, results: Sequence[memoryview]) -> None:
+        arrays = self.arrays
+        self._write(results, arrays.chosen, of_step=False)
+        if not arrays.chosen.all():
+            arrays.observations[~arrays.mask] = 0.0
+
+    def _write_stepped(self, results: Sequence[memoryview]) -> None:
+        self._ticks_done += self._ticks_per_step
+        self._write(results, self._everywhere, of_step=True)
+
     def _write(
         self, results: Sequence[memoryview], chosen: NDArray[np.bool_], of_step: bool
     ) -> None:
-        for n, (number, data) in enumerate(zip(self._tellers, results, strict=True)):
-            self._results.take(data, chosen, of_step, n == 0, number, self._owner)
+        pool = self.pool
+        for n, (number, data) in enumerate(zip(pool.tellers, results, strict=True)):
+            self._results.take(data, chosen, of_step, n == 0, number, pool.owner)
 
-    def suggest(self) -> None:
-        """Write what the built-in driver would do in the agents' place."""
+    def _write_suggested(self, results: Sequence[memoryview]) -> None:
         suggested = self.arrays.suggested
         suggested[...] = 0.0
-        for data in self.run(self._command(Task.SUGGEST)):
+        for data in results:
             num = len(data) // (8 + suggested.itemsize * 2)
             where = np.frombuffer(data, np.int64, num)
             found = np.frombuffer(data, suggested.dtype, 2 * num, 8 * num)
             suggested.reshape(-1, 2)[where] = found.reshape(-1, 2)
+
+    def _write_states(self, results: Sequence[memoryview]) -> None:
+        found = np.frombuffer(results[0], self.arrays.states.dtype)
+        self.arrays.states[...] = found.reshape(self.arrays.states.shape)
 
     def node_loads(self) -> list[NodeLoad]:
         """What each node has done since this was asked last, by rising numbers.
@@ -224,7 +224,7 @@ class NodeWorlds(NodePool):
         """
         found = []
         ticks, self._ticks_told = self._ticks_done - self._ticks_told, self._ticks_done
-        for data in self.run(self._command(Task.LOADS)):
+        for data in self._run(Task.LOADS):
             node, *now = json.loads(bytes(data))
             before = self._told.get(node)
             is_same = before is not None and before[0] <= now[0]
@@ -238,44 +238,16 @@ class NodeWorlds(NodePool):
         Other purposes have times of their own. What this run itself computes there does not count.
         """
         here: dict[str, list[int]] = {socket.gethostname(): [os.getpid()]}
-        for node in self._nodes.values():
-            here.setdefault(node.machine, []).append(node.pid)
-        asked = self._command(Task.LOADS, MachineAsked(purpose, here))
-        found = [json.loads(bytes(data)) for data in self.run(asked)]
+        for machine, pid in self.pool.machines:
+            here.setdefault(machine, []).append(pid)
+        asked = MachineAsked(purpose, here)
+        found = [json.loads(bytes(data)) for data in self._run(Task.LOADS, asked)]
         states = tuple(Candidate(node, Utilisation(*shares)) for node, shares, _ in found)
         source = next((source for *_, source in found if source != NO_GPU), NO_GPU)
         return LoadSnapshot(states, source, MEASURED)
 
-    def _asked(self, task: Task, payload: Any) -> Any:
-        return json.loads(bytes(self.run(self._command(task, payload))[0]))
-
-    def write_states(self) -> None:
-        data = self.run(self._command(Task.WRITE_STATES))[0]
-        found = np.frombuffer(data, self.arrays.states.dtype)
-        self.arrays.states[...] = found.reshape(self.arrays.states.shape)
-
-    def ticks(self) -> NDArray[np.int64]:
-        return self.arrays.ticks.copy()
-
-    def state_hash(self, world: int) -> str:
-        return str(self._asked(Task.STATE_HASH, self._number(world)))
-
-    def traffic_stats(self, world: int) -> dict[str, float]:
-        found: dict[str, float] = self._asked(Task.TRAFFIC_STATS, self._number(world))
-        return found
-
-    def driven(self, world: int, agents: Sequence[int]) -> list[Driven]:
-        found = self._asked(Task.DRIVEN, [self._number(world), list(map(int, agents))])
-        return [Driven(*row) for row in found]
-
-    def signal_phases(self, world: int) -> NDArray[np.int32]:
-        return np.array(self._asked(Task.SIGNAL_PHASES, self._number(world)), dtype=np.int32)
-
-    def _number(self, world: int) -> int:
-        return range(len(self.arrays.mask))[world]
-
     def save_worlds(self) -> list[bytes]:
-        return saved_of(self._asked(Task.SAVE, None))
+        return saved_of(self._ask_first(Task.SAVE))
 
     def load_worlds(self, saved: Sequence[bytes]) -> None:
         """Go on from what `save_worlds` gave; `arrays` stay as they are.
@@ -283,46 +255,38 @@ class NodeWorlds(NodePool):
         Raises:
             ConfigError: it is of other worlds.
         """
-        if refusal := self._asked(Task.LOAD, worlds_payload(saved, only_reads=True)):
+        payload = worlds_payload(saved)
+        if refusal := self._ask_first(Task.CHECK, payload):
             raise ConfigError(refusal)
-        self.run(self._command(Task.LOAD, worlds_payload(saved)))
+        self._order(Task.LOAD, payload)
 
     @property
     def partition(self) -> ZonePartition:
         """The zones as they are now; a cut gives the worlds others."""
-        return read_zones(self._cut.partition)
+        return read_zones(self.pool.partition)
 
     @property
     def simulation(self) -> Simulation:
         """Refused: the worlds live elsewhere."""
         raise ConfigError("the worlds live in nodes: use backend='local' to look into them")
 
-    @property
-    def plans(self) -> tuple[Plan, ...]:
-        return self._placement.plans
-
-    @property
-    def worker_pids(self) -> dict[int, int]:
+    def _pids(self) -> dict[int, int]:
         """Those of nodes of this machine; others measure their machines, see `node_snapshot`."""
-        is_here = isinstance(self._starter, LocalNodes)
-        return dict(enumerate(self.pids)) if is_here else {}
+        return dict(enumerate(self.pool.pids)) if self.pool.is_here else {}
 
     @property
     def transfers(self) -> tuple[TransferLog, ...]:
         """What became of each change of owner, by worlds."""
-        return self._coordinator.transfers
+        return self.pool.coordinator.transfers
 
     def in_flight(self, world: int) -> Sequence[TransferInFlight]:
         """Vehicles of one world whose next zone holds their state already."""
-        return self._coordinator.in_flight(world)
+        return self.pool.coordinator.in_flight(world)
 
     @property
     def migrations(self) -> int:
         """How many vehicles have changed their owner since the worlds were made."""
-        return self._coordinator.switched
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        raise uncopied()
+        return self.pool.coordinator.switched
 
 
 def check_nodes(world: World, nodes: int) -> None:

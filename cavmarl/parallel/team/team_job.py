@@ -12,8 +12,9 @@ from cavmarl.parallel.checkpoint.checkpoint_job import CheckpointJob
 from cavmarl.parallel.checkpoint.checkpoint_log import CheckpointLog
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.processes.worker_loop import Job
+from cavmarl.parallel.tasks import Task
 from cavmarl.parallel.team.team import Leader, Team, TeamFollower
-from cavmarl.parallel.worlds_job import Task, WorldsJob
+from cavmarl.parallel.worlds_job import WorldsJob
 from cavmarl.shards.phases import Phase
 from cavmarl.shards.shard import Shard
 
