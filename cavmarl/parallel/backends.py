@@ -17,6 +17,7 @@ from cavmarl.parallel.backend_name import (
     read_backend,
 )
 from cavmarl.parallel.hosts.remote_worlds import RemoteWorlds
+from cavmarl.parallel.nodes.node_groups import NodeGroups
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.parallel.pooled_worlds import PooledWorlds
 from cavmarl.parallel.sensor_workers.sensor_worker_setup import local_worlds
@@ -91,8 +92,10 @@ def make_worlds(
         return local_worlds(world, base_dir, num_worlds, in_next_step)
     if backend.kind == PROCESSES:
         return PooledWorlds(world, base_dir, num_worlds, count or 1, in_next_step)
-    if backend.kind == NODES or (backend.kind == RAY and backend.is_split(num_worlds)):
+    if backend.kind in (NODES, RAY) and (count == 1 or backend.is_split(num_worlds)):
         return NodeWorlds(world, base_dir, num_worlds, backend, in_next_step)
+    if backend.kind == NODES:
+        return NodeGroups(world, base_dir, num_worlds, backend, in_next_step)
     if backend.kind == RAY:
         return RemoteWorlds(world, base_dir, num_worlds, count, in_next_step)
     return _REGISTERED[backend.kind](world, base_dir, num_worlds, count, in_next_step)

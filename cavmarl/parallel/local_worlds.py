@@ -78,6 +78,7 @@ class LocalWorlds:
                 arrays = arrays._replace(observations=self.simulation.outputs.observations)
         self.arrays = arrays  # what goes into a step, and what comes out
         self._horizon = world.config.max_steps
+        self._late_ticks = late_ticks
         self._steps = np.zeros(num_worlds, dtype=np.int64)
         self._waiting = np.zeros(num_worlds, dtype=np.bool_)  # over, and not begun anew yet
         self._results = Results(*(getattr(arrays, name) for name in Results._fields))
@@ -269,6 +270,16 @@ class LocalWorlds:
         make, parts = self.__reduce__()
         copied: LocalWorlds = make(*parts)
         return copied
+
+    def of_number(self, num_worlds: int) -> LocalWorlds:
+        """Return so many worlds of the same environment, which have not begun yet."""
+        return LocalWorlds(
+            self.world,
+            num_worlds,
+            in_next_step=self.in_next_step,
+            like=self,
+            late_ticks=self._late_ticks,
+        )
 
     def connect_network(self, network: NetworkSimulator) -> None:
         """From now on let a network simulator decide receptions; errors as of `Bus.connect`."""

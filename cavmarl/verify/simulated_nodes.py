@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import random
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -59,6 +59,7 @@ class SimulatedNodes:
     def __init__(
         self, machine: SimulatedMachine, drawn: random.Random, ghosts: bool, nodes: int
     ) -> None:
+        self.count = nodes
         self._machine, self._drawn = machine, drawn
         self._ghosts = ghosts  # whether processes that are taken for lost may go on
         self.listener = SimulatedListener(machine, machine.caller)
@@ -75,7 +76,7 @@ class SimulatedNodes:
         process.not_before_s = self._machine.now_s + self._drawn.uniform(*STARTED_S)
         return process
 
-    def trouble(self) -> str | None:
+    def trouble(self, begun: Collection[int]) -> str | None:
         return None
 
     def retry(self, number: int, pid: int, is_silent: bool) -> str | None:
@@ -387,7 +388,11 @@ class _Run:
         ghosts = self._drawn.random() < 0.5
 
         def start(
-            backend: BackendName, settings: WorkersConfig, base_dir: Path, route: Route
+            backend: BackendName,
+            num_worlds: int,
+            settings: WorkersConfig,
+            base_dir: Path,
+            route: Route,
         ) -> tuple[NodeStarter, SimulatedListener]:
             starter = SimulatedNodes(machine, self._drawn, ghosts, line.nodes)
             return starter, starter.listener

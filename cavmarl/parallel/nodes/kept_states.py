@@ -14,10 +14,12 @@ from typing import Any
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import WorkerError
+from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.parallel.checkpoint.world_bytes import from_bytes, to_bytes
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.nodes.link import Bytes, FrameKind, NodeFrame
 from cavmarl.parallel.nodes.links import Links
+from cavmarl.traffic.sumo.sumo_history import ToldLog
 
 Array = NDArray[Any]
 KEPT = 2  # so many states: the newest may not have come everywhere
@@ -26,8 +28,11 @@ KEPT = 2  # so many states: the newest may not have come everywhere
 class KeptStates:
     """Those of one node."""
 
-    def __init__(self, worlds: LocalWorlds, links: Links, number: int) -> None:
+    def __init__(
+        self, worlds: LocalWorlds, logs: Sequence[ToldLog], links: Links, number: int
+    ) -> None:
         self._worlds = worlds
+        self._logs = logs  # of what SUMO is told
         self._links = links
         self._number = number
         self._own: dict[int, Bytes] = {}  # by numbers of states
@@ -53,6 +58,22 @@ class KeptStates:
         if len(living) > 1:
             to = living[(living.index(self._number) + 1) % len(living)]
             self._links.send(to, FrameKind.KEEP, state, [data])
+        else:
+            told = to_bytes([log.words for log in self._logs])
+            self._links.send(COORDINATOR, FrameKind.KEEP, state, [told, data])
+
+    def take_over(self, state: int, data: Bytes) -> None:
+        """Have a state that the coordinator has kept for the node before this one.
+
+        Raises:
+            ConfigError: it is of other worlds.
+        """
+        _drop_later(self._own, -1)
+        like = [*(log.words for log in self._logs), *self._worlds.save()]
+        found = from_bytes(data, like)
+        for log, words in zip(self._logs, found, strict=False):
+            log.take_up(words)
+        self._own[state] = to_bytes(found[len(self._logs) :])
 
     def take(self, number: int, frame: NodeFrame) -> None:
         """What another node wants to have kept here."""

@@ -9,32 +9,34 @@ import os
 import struct
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import MessageError, ProtocolError, WorkerError, WorkerFailureError
+from cavmarl.core.errors import (
+    MessageError,
+    ProtocolError,
+    WorkerDeathError,
+    WorkerError,
+    WorkerFailureError,
+)
 from cavmarl.core.processes import is_fork, refuse_fork
-from cavmarl.engine.compilation import compiled_before
 from cavmarl.engine.world_setup import World
-from cavmarl.handoff.coordinator.coordinator_setup import prepare_runs
+from cavmarl.handoff.coordinator.coordinator_setup import WorldRun
 from cavmarl.handoff.coordinator.journal import Journal
 from cavmarl.handoff.shard_setup import limits_of
 from cavmarl.ownership.decisions import Neighbours
 from cavmarl.ownership.reactions import Hosting
-from cavmarl.parallel.backend_name import BackendName
-from cavmarl.parallel.journaled_worlds import unwatched
-from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.nodes.kept_states import KEPT
 from cavmarl.parallel.nodes.leases import lease_ticks, leases_of
-from cavmarl.parallel.nodes.link import FrameKind, NodeFrame, said_by
+from cavmarl.parallel.nodes.link import Bytes, FrameKind, NodeFrame, said_by
 from cavmarl.parallel.nodes.links import LinkLostError, Links
-from cavmarl.parallel.nodes.newcomers import Newcomer, Newcomers
+from cavmarl.parallel.nodes.newcomers import Newcomer
 from cavmarl.parallel.nodes.node_actions import NodeCommand, ZoneRects, read_refusal
 from cavmarl.parallel.nodes.node_coordinator import NodeCoordinator
 from cavmarl.parallel.nodes.node_cuts import PoolState, ZoneCut, read_neighbours, told_zones
-from cavmarl.parallel.nodes.node_files import files_of
-from cavmarl.parallel.nodes.node_starters import LocalNodes, Route, Start, start_nodes, straight
+from cavmarl.parallel.nodes.node_starters import Route, straight
+from cavmarl.parallel.nodes.node_supply import NodeSupply
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.nodes.node_watch import NodeWatch, SilentNodeError
 from cavmarl.parallel.nodes.zone_hosts import read_report, told_hostings
@@ -46,7 +48,6 @@ from cavmarl.parallel.nodes.zone_moves import (
     name_of,
     nodes_of,
 )
-from cavmarl.parallel.recipe import recipe_of
 from cavmarl.parallel.world_errors import own_error
 from cavmarl.zones.kernels.agent_frames import UNOWNED
 
@@ -54,7 +55,6 @@ log = logging.getLogger("cavmarl.nodes")
 
 KEEP_S = 0.2  # so much of work may have to be done again
 END_S = 1.0  # for nodes to hear that they are needed no more
-SPARES = 1  # nodes more than are wanted that may wait for another one's end
 
 
 class NodePool:
@@ -87,20 +87,18 @@ class NodePool:
     def __init__(
         self,
         world: World,  # what each is made of
-        base_dir: Path,  # the folder that its relative files start from
-        num_worlds: int,  # W
+        runs: Sequence[WorldRun],  # (W,) of the worlds
         zones: Zones,  # that each node hosts to begin with
-        backend: BackendName,  # what starts n nodes, from 1 to the zones of a world
-        in_next_step: bool,  # when worlds begin anew; see `SteppedWorlds`
+        supply: NodeSupply,  # where the nodes come from
         *,
         answer: Callable[[memoryview], bytes],  # what a network simulator says to an EXCHANGE
-        route: Route = straight,  # where to call in order to reach a place
         system: NodeSystem = MACHINE,  # that the nodes are on
-        start: Start = start_nodes,  # starts them
+        route: Route = straight,  # where to call in order to reach a place
     ) -> None:
         self._is_native = world.config.traffic.source == "native"
-        self._route, self._answer = route, answer
-        config, nodes = world.config, backend.count or 1
+        self._supply, self._route, self._answer = supply, route, answer
+        self.newcomers = supply.newcomers
+        config = world.config
         self.zones = self._homes = zones
         self._living = living_of(self.zones)
         self.generation = 0
@@ -109,20 +107,21 @@ class NodePool:
         self._state = PoolState(1, self.zones, 0, self._cut)  # that all nodes can go back to
         self._opened: PoolState | None = None  # that they keep before the next command
         self._next_state = 2
+        self._kept: dict[int, Bytes] = {}  # states of the only node that there was, by numbers
         self._keep_again_s = -math.inf  # by the clock of `_links`
         self._log: list[NodeCommand] = []  # since that state
         self._lost: list[int] = []
         self._is_torn = False
+        self._successions = 0  # in the present command
+        self._max_retries = config.workers.max_retries
         self.losses = self.recoveries = self.replacements = self.redirected = 0
         self._timeout_s, self._pid = config.workers.timeout_s, os.getpid()
-        self._join_timeout_s = config.workers.join_timeout_s
-        self.owner = np.full(num_worlds * config.population.num_ids, UNOWNED, dtype=np.int32)
+        self.owner = np.full(len(runs) * config.population.num_ids, UNOWNED, dtype=np.int32)
         self._ticks_per_step = config.clock.ticks_per_step
         self._links = Links(_nothing, system)
-        self._watch = NodeWatch(self._links, lambda: self._starter.stopped())
+        self._watch = NodeWatch(self._links, self._stopped)
         self._nodes: dict[int, Newcomer] = {}  # what is known of each that lives
         self._new: dict[int, tuple[str, int]] = {}  # where the others can call those of them
-        runs = prepare_runs(config.zones, num_worlds)
         self._lease_ticks = lease_ticks(config)
         self.coordinator = NodeCoordinator(
             [run.run for run in runs],
@@ -134,19 +133,8 @@ class NodePool:
         )
         self._links.urgent = self._hear
         self._runs = [run.run.hex() for run in runs]
-        if not compiled_before():
-            LocalWorlds(unwatched(world), 1, warm=True)
-        job = {
-            "recipe": recipe_of(world, base_dir),
-            "num_worlds": num_worlds,
-            "in_next_step": in_next_step,
-            "lease_ticks": self._lease_ticks,
-        }
-        files = files_of(config, base_dir)
-        self._starter, listener = start(backend, config.workers, base_dir, route)
-        self.newcomers = Newcomers(listener, job, files, self._room, system)
         try:
-            self._begin(nodes)
+            self._begin(len(zones))
         except BaseException:
             self.close()
             raise
@@ -157,8 +145,7 @@ class NodePool:
         while self._new or len(self._nodes) < nodes:
             try:
                 missing = nodes - len(self._nodes)
-                self.newcomers.await_ready(missing, self._join_timeout_s, self._trouble)
-                self._seat()
+                self._seat(missing)
                 neighbours = self._nodes[0].neighbours
                 assert neighbours is not None
                 self._cut = self._cut._replace(neighbours=neighbours)
@@ -172,10 +159,13 @@ class NodePool:
                 self.generation += 1  # what nodes say of this attempt counts no more
         self._is_torn = False
 
-    def _trouble(self) -> str | None:
-        """Why nodes that are awaited do not come. Raises LinkLostError: one that had is lost."""
+    def _pump(self) -> None:
+        """Hear the nodes that are there. Raises LinkLostError: one of them is lost."""
         self._links.pump(0.0)
-        return self._starter.trouble()
+
+    def _stopped(self) -> set[int]:
+        stopped = self._supply.stopped()
+        return {number for number, node in self._nodes.items() if node.asked in stopped}
 
     @property
     def pids(self) -> list[int]:
@@ -192,22 +182,13 @@ class NodePool:
         return [(node.machine, node.pid) for node in self._nodes.values()]
 
     @property
-    def is_here(self) -> bool:
-        """Whether the nodes are processes of this machine that the pool has started."""
-        return isinstance(self._starter, LocalNodes)
-
-    @property
     def partition(self) -> ZoneRects:
         return self._cut.partition
 
-    def _room(self) -> int:
-        return len(self._homes) - len(self._nodes) + SPARES
-
-    def _seat(self) -> None:
-        """Let those that are ready host the zones that a lost node had at the beginning."""
+    def _seat(self, num: int, waits: bool = True) -> None:
+        """Let nodes that are ready host the zones that lost nodes had at the beginning."""
         empty = [n for n in range(len(self._homes)) if n not in self._nodes]
-        for ready in list(self.newcomers.ready)[: len(empty)]:
-            newcomer, connection = self.newcomers.take(ready)
+        for newcomer, connection in self._supply.take(num, self._pump, waits):
             number = newcomer.asked if newcomer.asked in empty else empty[0]
             empty.remove(number)
             assert newcomer.place is not None
@@ -242,6 +223,7 @@ class NodePool:
             WorkerDeathError: no node has kept the zones of lost ones, or too many were lost.
         """
         refuse_fork(self._pid, "the nodes")
+        self._successions = 0
         if command.changes and self._links.now_s() > self._keep_again_s:
             if not self._replace_lost():
                 self._begin_state()
@@ -259,6 +241,11 @@ class NodePool:
             self._log = self._log[-1:]
             self._keep_again_s = self._links.now_s() + KEEP_S
         return results
+
+    def undo(self) -> None:
+        """Let the last command, which has changed the worlds, never have been given."""
+        self._is_torn, self._opened = True, None
+        self._log.pop()
 
     def move(self, zones: Zones) -> None:
         """Let the zones have other homes from now on; errors as of `run`."""
@@ -291,12 +278,12 @@ class NodePool:
         """
         if not self._is_native:
             return False
-        self.newcomers.look(0.0)
+        is_ready = self._supply.look()
         is_fresh = self._state.zones == self.zones and not self._is_torn
-        if not (self.newcomers.ready and is_fresh and len(self._nodes) < len(self._homes)):
-            return False
         before = len(self._nodes)
-        self._seat()
+        if not (is_ready and is_fresh and before < len(self._homes)):
+            return False
+        self._seat(len(self._homes) - before, waits=False)
         self.replacements += len(self._nodes) - before
         self._is_torn, self._opened = True, None
         return True
@@ -349,6 +336,10 @@ class NodePool:
             raise own_error(failure) from failure
         elif frame.kind is FrameKind.PONG:
             self._watch.hear_pong(number, frame)
+        elif frame.kind is FrameKind.KEEP:
+            self._kept[frame.number] = frame.data
+            for old in sorted(self._kept)[:-KEPT]:
+                del self._kept[old]
         elif frame.kind is FrameKind.EXCHANGE:
             if frame.number == self.generation:
                 self._exchange(frame)
@@ -410,8 +401,8 @@ class NodePool:
         zones = name_of(self._homes[number])
         log.warning("node %d on %s (%s) is lost: %s", number, node.machine, zones, lost)
         if has_begun:
-            self._starter.replace(node.asked, is_silent)
-        elif why := self._starter.retry(node.asked, node.pid, is_silent):
+            self._supply.replace(node, is_silent)
+        elif why := self._supply.retry(node, is_silent):
             raise WorkerError(why) from lost
 
     def _recover(self) -> None:
@@ -425,28 +416,55 @@ class NodePool:
         """
         state = self._state
         self._opened = None
-        moves = moves_of(state.zones, self._homes, self._lost, self._nodes, state.number)
+        moves, kept = self._moves()
         self.zones, self._living = moves.zones, living_of(moves.zones)
         self.owner[~np.isin(self.owner, self._living)] = UNOWNED  # of lost ones any may be
         self.generation += 1
         self._cut = state.cut
         self.coordinator.know(state.cut.neighbours)
         hostings = self.coordinator.recover(nodes_of(self.zones), state.switched)
-        self._tell_zones(hostings, moves, begins=False)
+        self._tell_zones(hostings, moves, begins=False, kept=kept)
         self._commit()
         self._new.clear()
         self._is_torn = False
         self._keep_again_s = -math.inf
-        self.recoveries += bool(moves.heirs)
+        self.recoveries += bool(moves.heirs or kept)
+
+    def _moves(self) -> tuple[ZoneMoves, Bytes]:
+        """Return which node hosts which zones from now on, and the state if it is kept here.
+
+        If the only node is lost, another one takes its place.
+
+        Raises:
+            WorkerDeathError: what a lost node had is kept nowhere, or too many were lost.
+        """
+        state = self._state
+        hosts, kept = living_of(state.zones), self._kept.get(state.number)
+        if kept is None or len(hosts) > 1 or hosts[0] in self._nodes:
+            moves = moves_of(state.zones, self._homes, self._lost, self._nodes, state.number)
+            return moves, b""
+        self._successions += 1
+        if self._successions > self._max_retries:
+            causes = [f"node {hosts[0]} was lost"] * self._successions
+            name = name_of(state.zones[hosts[0]])
+            raise WorkerDeathError(hosts[0], name, state.number, "step", causes)
+        if not self._nodes:
+            self._seat(1)
+        successor = min(self._nodes)
+        zones: Zones = [[] for _ in self._homes]
+        zones[successor] = state.zones[hosts[0]]
+        return ZoneMoves(zones, {}, []), kept
 
     def _tell_zones(
         self,
         hostings: Sequence[Sequence[Hosting]],
         moves: ZoneMoves,
         begins: bool,
+        kept: Bytes = b"",  # the state, if only this process has it
     ) -> None:
         """Let the nodes host their zones from now on."""
         told = {
+            "num_worlds": len(self._runs),
             "begins": begins,
             "lost": self._lost,
             "heirs": list(moves.heirs.items()),
@@ -461,7 +479,8 @@ class NodePool:
         }
         for number in self._living:
             data = json.dumps({**told, "number": number}).encode()
-            self._links.send(number, FrameKind.RECOVER, self.generation, [data])
+            size = len(data).to_bytes(8, "little")
+            self._links.send(number, FrameKind.RECOVER, self.generation, [size, data, kept])
 
     def _first_teller(self) -> int:
         """The node that tells what all know alike: one that has been there in the last step."""
@@ -497,9 +516,7 @@ class NodePool:
         if is_fork(self._pid):
             return
         self._links.end(END_S)
-        self.newcomers.close()
         self.coordinator.close()
-        self._starter.close()
 
 
 def _nothing(number: int, frame: NodeFrame) -> None:

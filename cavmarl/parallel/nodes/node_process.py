@@ -115,19 +115,22 @@ class NodeProgram:
         files = [WorldFile(*told) for told in job["files"]]
         self._fetch(files)
         recipe = recipe_with(job["recipe"], files)
-        self._worlds = worlds = self._system.worlds_of(
-            recipe, DIFFERENT, job["num_worlds"], job["in_next_step"]
-        )
-        self._commands = commands_of(worlds.arrays)
-        self._inputs, self._results = Inputs(worlds.arrays), ResultStream(worlds.arrays)
+        worlds = self._system.worlds_of(recipe, DIFFERENT, job["num_worlds"], job["in_next_step"])
+        self._run_worlds(worlds)
         self._lease_ticks = job["lease_ticks"]
-        worlds.keep_logs()
-        v2x = worlds.world.config.v2x
-        if v2x.enabled and v2x.channel.external:
-            self._network = AskedNetwork(links, worlds.simulation.messages)
         self._listener = self._system.listen(self._address, self._secret)
         said = [*self._listener.place, *told_neighbours(worlds.simulation)]
         links.send(COORDINATOR, FrameKind.READY, 0, [json.dumps(said).encode()])
+
+    def _run_worlds(self, worlds: LocalWorlds) -> None:
+        """Do commands with these worlds from now on."""
+        self._worlds = worlds
+        self._commands = commands_of(worlds.arrays)
+        self._inputs, self._results = Inputs(worlds.arrays), ResultStream(worlds.arrays)
+        self._logs = worlds.keep_logs()
+        v2x = worlds.world.config.v2x
+        if v2x.enabled and v2x.channel.external:
+            self._network = AskedNetwork(self._links, worlds.simulation.messages)
 
     def _fetch(self, files: Sequence[WorldFile]) -> None:
         """Get those that this machine does not have."""
@@ -244,12 +247,18 @@ class NodeProgram:
 
     def _recover(self, frame: NodeFrame) -> None:
         """Begin, or go back to a state that was kept, with the zones that the coordinator names."""
-        links, told = self._links, json.loads(bytes(frame.data))
+        links, data = self._links, frame.data
+        at = 8 + int.from_bytes(data[:8], "little")
+        told = json.loads(bytes(data[8:at]))
         self._generation = frame.number
         if self._number < 0:
             self._number = int(told["number"])
+            if told["num_worlds"] != len(self._worlds.arrays.mask):
+                before = self._worlds
+                self._run_worlds(before.of_number(told["num_worlds"]))
+                before.close()
             self._taken = ActionsTaken(self._worlds.arrays, self._number)
-            self._kept = KeptStates(self._worlds, links, self._number)
+            self._kept = KeptStates(self._worlds, self._logs, links, self._number)
             links.urgent = self._hear
         self._tells = told["first"] == self._number
         if self._network is not None:
@@ -273,6 +282,8 @@ class NodeProgram:
             self._peers.keep_own(self._worlds.simulation.everywhere)
             self._kept.keep(state, self._living)
         else:
+            if len(data) > at:
+                self._kept.take_over(state, data[at:])
             adopted = [number for number, heir in told["heirs"] if heir == self._number]
             donors = [donor for donor, taker in told["donors"] if taker == self._number]
             takers = [taker for donor, taker in told["donors"] if donor == self._number]

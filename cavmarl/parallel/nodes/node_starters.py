@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
@@ -13,7 +13,6 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.core.huge_pages import huge_heap
 from cavmarl.core.processes import start_python
 from cavmarl.parallel.backend_name import RAY, BackendName
-from cavmarl.parallel.hosts.host_registry import Launcher
 from cavmarl.parallel.hosts.listener import Listener
 from cavmarl.parallel.hosts.ray_actors import RayActors
 from cavmarl.parallel.nodes.node_process import run_on_ray
@@ -37,8 +36,17 @@ def straight(place: tuple[str, int]) -> tuple[str, int]:
 class NodeStarter(Protocol):
     """Starts nodes, and starts others in the place of those that are lost."""
 
-    def trouble(self) -> str | None:
-        """Why a node does not come, in words; one that was killed before it began begins again."""
+    @property
+    def count(self) -> int:
+        """How many nodes there are to be."""
+        ...
+
+    def trouble(self, begun: Collection[int]) -> str | None:
+        """Why a node does not come, in words; one that was killed before it began begins again.
+
+        Args:
+            begun: processes of the nodes that have begun, which are not looked at.
+        """
         ...
 
     def retry(self, number: int, pid: int, is_silent: bool) -> str | None:
@@ -66,6 +74,7 @@ class LocalNodes:
         place: tuple[str, int],
         max_retries: int,  # of nodes that are killed or stopped before they have begun
     ) -> None:
+        self.count = nodes
         self._listener, self._place = listener, place
         self._retries = max_retries
         self._seen_stopped: set[int] = set()
@@ -85,14 +94,14 @@ class LocalNodes:
             pipe.write(f"{self._listener.secret.hex()}\n")
         return process
 
-    def trouble(self) -> str | None:
-        stopped = self.stopped()
+    def trouble(self, begun: Collection[int]) -> str | None:
+        stopped = {n for n in self.stopped() if self._processes[n].pid not in begun}
         for number in stopped & self._seen_stopped:  # at two looks
             self._processes[number].kill()
             self._processes[number].wait()
         self._seen_stopped = stopped
         for number, process in enumerate(self._processes):
-            if process.poll() is not None:
+            if process.pid not in begun and process.poll() is not None:
                 is_killed = process.returncode < 0
                 why = self.retry(number, process.pid, False) if is_killed else self._ended(number)
                 if why is not None:
@@ -138,15 +147,16 @@ class RayNodes:
 
     def __init__(
         self,
-        actors: Launcher,
+        actors: RayActors,
         listener: Listener,
         max_retries: int,  # of nodes that are lost while they are given their zones
     ) -> None:
         self._actors = actors
+        self.count = actors.workers
         self._retries = max_retries
         actors.start(listener.place, listener.secret)
 
-    def trouble(self) -> str | None:
+    def trouble(self, begun: Collection[int]) -> str | None:
         return self._actors.trouble()
 
     def retry(self, number: int, pid: int, is_silent: bool) -> str | None:
@@ -172,7 +182,10 @@ class RayNodes:
 class JoinedNodes:
     """Nodes that are started by hand: `cavmarl node --join`."""
 
-    def trouble(self) -> str | None:
+    def __init__(self, count: int) -> None:
+        self.count = count
+
+    def trouble(self, begun: Collection[int]) -> str | None:
         return None
 
     def retry(self, number: int, pid: int, is_silent: bool) -> str | None:
@@ -190,13 +203,14 @@ class JoinedNodes:
 
 
 Start: TypeAlias = Callable[
-    [BackendName, WorkersConfig, Path, Route], tuple[NodeStarter, NodeListener]
+    [BackendName, int, WorkersConfig, Path, Route], tuple[NodeStarter, NodeListener]
 ]
 """Begins to start nodes; arguments as of `start_nodes`."""
 
 
 def start_nodes(
     backend: BackendName,  # nodes of this machine, of Ray, or that are started by hand
+    num_worlds: int,  # so many actors of Ray are of use where the backend does not say how many
     settings: WorkersConfig,
     base_dir: Path,  # the folder that a relative key file starts from
     route: Route,  # for nodes of this machine
@@ -210,7 +224,8 @@ def start_nodes(
     """
     nodes = backend.count or 1
     if backend.kind == RAY:
-        actors = RayActors(run_on_ray, lambda workers: "", nodes, nodes)
+        at_most = backend.count or num_worlds
+        actors = RayActors(run_on_ray, lambda workers: "", backend.count, at_most)
         listener = Listener(actors.address)
         return RayNodes(actors, listener, settings.max_retries), listener
     if backend.address is None:
@@ -222,7 +237,7 @@ def start_nodes(
             f"backend = '{backend}' without workers.key_file: name the file with the key that "
             "nodes have to know"
         )
-    return JoinedNodes(), Listener(host, read_key(base_dir / settings.key_file), port)
+    return JoinedNodes(nodes), Listener(host, read_key(base_dir / settings.key_file), port)
 
 
 def read_key(path: Path) -> bytes:

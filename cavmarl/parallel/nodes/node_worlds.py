@@ -8,7 +8,7 @@ import socket
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from cavmarl.balance.probe import MEASURED
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
+from cavmarl.handoff.coordinator.coordinator_setup import WorldRun, prepare_runs
 from cavmarl.handoff.repartitioning import Recut, is_due
 from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.transfers import TransferLog
@@ -43,6 +44,7 @@ from cavmarl.parallel.nodes.node_loads import (
 from cavmarl.parallel.nodes.node_network import NetworkFailedError, answer_of, read_asked
 from cavmarl.parallel.nodes.node_pool import NodePool
 from cavmarl.parallel.nodes.node_starters import Route, Start, start_nodes, straight
+from cavmarl.parallel.nodes.node_supply import NodeSupply
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 from cavmarl.parallel.step_arrays import StepArrays, layout_of
 from cavmarl.parallel.step_placement import StepPlacement
@@ -51,6 +53,14 @@ from cavmarl.parallel.work_shares import Part, parts_of
 from cavmarl.shards.shard import Commands
 from cavmarl.v2x.v2x_messages import NetworkSimulator, check_external
 from cavmarl.zones.partition.zone_partition import ZonePartition
+
+
+class WorldShare(NamedTuple):
+    """The part of more worlds that one node hosts."""
+
+    arrays: StepArrays  # of these worlds
+    runs: Sequence[WorldRun]  # the same
+    supply: NodeSupply  # of all nodes
 
 
 class NodeWorlds(CommandedWorlds):
@@ -78,12 +88,13 @@ class NodeWorlds(CommandedWorlds):
         route: Route = straight,  # where nodes of this machine call in order to reach a place
         system: NodeSystem = MACHINE,  # that the nodes are on
         start: Start = start_nodes,  # starts them
+        share: WorldShare | None = None,  # of more worlds; None: these are all
     ) -> None:
-        config, count, nodes = world.config, world.partition.count, backend.count or 1
+        config, count = world.config, world.partition.count
+        nodes = 1 if share else backend.count or 1
         check_nodes(world, nodes)
         self.world, self.in_next_step = world, in_next_step
-        layout = layout_of(config, world.capacity, num_worlds).items()
-        self.arrays = StepArrays.of({name: np.zeros(shape, kind) for name, (kind, shape) in layout})
+        self.arrays = share.arrays if share else empty_arrays(world, num_worlds)
         self.placement = StepPlacement(world, 1, nodes, is_here=False)
         zones = parts_of(self.plans, count)[0].zones
         self._network: NetworkSimulator | None = None
@@ -95,10 +106,19 @@ class NodeWorlds(CommandedWorlds):
             Task.SUGGEST: self._write_suggested,
             Task.WRITE_STATES: self._write_states,
         }
-        self.pool = NodePool(
-            world, base_dir, num_worlds, zones, backend, in_next_step,
-            answer=self._answer, route=route, system=system, start=start,
+        runs = share.runs if share else prepare_runs(config.zones, num_worlds)
+        self._supply = share.supply if share else NodeSupply(
+            world, base_dir, num_worlds, backend, in_next_step,
+            route=route, system=system, start=start,
         )  # fmt: skip
+        self._owns_supply = share is None
+        try:
+            self.pool = NodePool(
+                world, runs, zones, self._supply, answer=self._answer, system=system, route=route
+            )
+        except BaseException:
+            self._close_supply()
+            raise
         self._spent_s = np.zeros((1, count))
         self._ticks_per_step = config.clock.ticks_per_step
         self._ticks_done = self._ticks_told = 0
@@ -110,6 +130,14 @@ class NodeWorlds(CommandedWorlds):
         if config.workers.monitor_cpu:
             self.node_snapshot(TO_BALANCE)  # from now on they watch
 
+    def close(self) -> None:
+        super().close()
+        self._close_supply()
+
+    def _close_supply(self) -> None:
+        if self._owns_supply:
+            self._supply.close()
+
     def step(self, commands: Commands) -> None:
         """See `CommandedWorlds.step`; before that zones are cut anew, if it is time."""
         self._cut_anew()
@@ -120,7 +148,7 @@ class NodeWorlds(CommandedWorlds):
         self._steps_begun += 1
         if not is_due(self._steps_begun, self.world.config.zones.repartition_steps):
             return
-        if proposal := self._ask_first(Task.PROPOSE):
+        if proposal := self.ask(Task.PROPOSE):
             zones, *figures = proposal
             self._order(Task.CUT, zones)
             self.recuts.append(Recut(self._steps_begun - 1, *figures))
@@ -157,8 +185,12 @@ class NodeWorlds(CommandedWorlds):
     def _send(self, task: Task, payload: Any, commits: bool) -> None:
         if task == Task.HOST:
             self.pool.move(payload[0])
-            return
-        results = self._run(task, payload)
+        else:
+            self.perform(task, payload)
+
+    def perform(self, task: Task, payload: Any = None) -> None:
+        """Let all nodes do a task, and write what comes out to `arrays`."""
+        results = self._run(task, worlds_payload(payload) if task == Task.LOAD else payload)
         if write := self._writers.get(task):
             write(results)
 
@@ -181,9 +213,9 @@ class NodeWorlds(CommandedWorlds):
         return NodeCommand(pieces, changes, self._ticks_per_step, actions, receptions=[])
 
     def _ask(self, task: Task, world: int, payload: Any) -> Any:
-        return self._ask_first(task, payload)
+        return self.ask(task, payload)
 
-    def _ask_first(self, task: Task, payload: Any = None) -> Any:
+    def ask(self, task: Task, payload: Any = None) -> Any:
         """Return what the first node answers, which has the whole worlds meanwhile."""
         return json.loads(bytes(self._run(task, payload)[0]))
 
@@ -247,7 +279,7 @@ class NodeWorlds(CommandedWorlds):
         return LoadSnapshot(states, source, MEASURED)
 
     def save_worlds(self) -> list[bytes]:
-        return saved_of(self._ask_first(Task.SAVE))
+        return saved_of(self.ask(Task.SAVE))
 
     def load_worlds(self, saved: Sequence[bytes]) -> None:
         """Go on from what `save_worlds` gave; `arrays` stay as they are.
@@ -255,10 +287,13 @@ class NodeWorlds(CommandedWorlds):
         Raises:
             ConfigError: it is of other worlds.
         """
-        payload = worlds_payload(saved)
-        if refusal := self._ask_first(Task.CHECK, payload):
+        self.check_worlds(saved)
+        self._order(Task.LOAD, saved)
+
+    def check_worlds(self, saved: Sequence[bytes]) -> None:
+        """Raises ConfigError: worlds were saved that these cannot go on from."""
+        if refusal := self.ask(Task.CHECK, worlds_payload(saved)):
             raise ConfigError(refusal)
-        self._order(Task.LOAD, payload)
 
     @property
     def partition(self) -> ZonePartition:
@@ -272,7 +307,7 @@ class NodeWorlds(CommandedWorlds):
 
     def _pids(self) -> dict[int, int]:
         """Those of nodes of this machine; others measure their machines, see `node_snapshot`."""
-        return dict(enumerate(self.pool.pids)) if self.pool.is_here else {}
+        return dict(enumerate(self.pool.pids)) if self._supply.is_here else {}
 
     @property
     def transfers(self) -> tuple[TransferLog, ...]:
@@ -287,6 +322,12 @@ class NodeWorlds(CommandedWorlds):
     def migrations(self) -> int:
         """How many vehicles have changed their owner since the worlds were made."""
         return self.pool.coordinator.switched
+
+
+def empty_arrays(world: World, num_worlds: int) -> StepArrays:
+    """Return arrays for the inputs and outputs of a step."""
+    layout = layout_of(world.config, world.capacity, num_worlds).items()
+    return StepArrays.of({name: np.zeros(shape, kind) for name, (kind, shape) in layout})
 
 
 def check_nodes(world: World, nodes: int) -> None:

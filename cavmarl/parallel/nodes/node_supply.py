@@ -1,0 +1,132 @@
+"""`NodeSupply`: the nodes that pools can have, from their start until they have joined."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from threading import RLock
+
+from cavmarl.core.processes import is_fork
+from cavmarl.engine.compilation import compiled_before
+from cavmarl.engine.world_setup import World
+from cavmarl.parallel.backend_name import BackendName
+from cavmarl.parallel.journaled_worlds import unwatched
+from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.nodes.leases import lease_ticks
+from cavmarl.parallel.nodes.link import Link
+from cavmarl.parallel.nodes.newcomers import Newcomer, Newcomers
+from cavmarl.parallel.nodes.node_files import files_of
+from cavmarl.parallel.nodes.node_starters import LocalNodes, Route, Start, start_nodes, straight
+from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
+from cavmarl.parallel.recipe import recipe_of
+
+SPARES = 1  # nodes more than are wanted that may wait for another one's end
+
+
+class NodeSupply:
+    """Starts nodes, lets them join, and gives them to pools, which may run in several threads.
+
+    Attributes:
+        count: how many nodes the pools have together if none is lost.
+        newcomers: nodes that have joined and belong to no pool.
+
+    Raises:
+        ConfigError: a setting that nodes cannot have.
+        MissingExtraError: Ray is not installed.
+        WorkerError: a node cannot be started.
+    """
+
+    def __init__(
+        self,
+        world: World,  # what each is made of
+        base_dir: Path,  # the folder that its relative files start from
+        num_worlds: int,  # W of all pools; a node is ready for its share of them
+        backend: BackendName,  # what starts the nodes
+        in_next_step: bool,  # when worlds begin anew; see `SteppedWorlds`
+        *,
+        by_worlds: bool = False,  # each node hosts worlds of its own
+        route: Route = straight,  # where to call in order to reach a place
+        system: NodeSystem = MACHINE,  # that the nodes are on
+        start: Start = start_nodes,  # starts them
+    ) -> None:
+        config = world.config
+        if not compiled_before():
+            LocalWorlds(unwatched(world), 1, warm=True)
+        self._join_timeout_s = config.workers.join_timeout_s
+        self._lock, self._pid = RLock(), os.getpid()
+        self._begun: list[int] = []  # processes of the nodes of pools
+        files = files_of(config, base_dir)
+        self._starter, listener = start(backend, num_worlds, config.workers, base_dir, route)
+        self.count = self._starter.count
+        job = {
+            "recipe": recipe_of(world, base_dir),
+            "num_worlds": -(-num_worlds // self.count) if by_worlds else num_worlds,
+            "in_next_step": in_next_step,
+            "lease_ticks": lease_ticks(config),
+        }
+        self.newcomers = Newcomers(listener, job, files, self._room, system)
+
+    @property
+    def is_here(self) -> bool:
+        """Whether the nodes are processes of this machine that this one has started."""
+        return isinstance(self._starter, LocalNodes)
+
+    def _room(self) -> int:
+        return self.count - len(self._begun) + SPARES
+
+    def look(self) -> bool:
+        """Hear nodes that want to join; return whether one is ready."""
+        with self._lock:
+            self.newcomers.look(0.0)
+            return bool(self.newcomers.ready)
+
+    def take(
+        self, num: int, trouble: Callable[[], None], waits: bool = True
+    ) -> list[tuple[Newcomer, Link]]:
+        """Return nodes that are ready, and their connections.
+
+        Args:
+            num: how many at most; as many, if they are awaited.
+            trouble: called while they are awaited.
+            waits: whether they are awaited.
+
+        Raises:
+            CavmarlError: what one of them has raised.
+            WorkerError: they do not come in time.
+        """
+
+        def why() -> str | None:
+            trouble()
+            return self._starter.trouble(self._begun)
+
+        with self._lock:
+            newcomers = self.newcomers
+            if waits:
+                newcomers.await_ready(num, self._join_timeout_s, why)
+            found = [newcomers.take(number) for number in list(newcomers.ready)[:num]]
+            self._begun += [newcomer.pid for newcomer, _ in found]
+            return found
+
+    def replace(self, node: Newcomer, is_silent: bool) -> None:
+        """A node of a pool is lost: start another one in its place."""
+        with self._lock:
+            self._begun.remove(node.pid)
+            self._starter.replace(node.asked, is_silent)
+
+    def retry(self, node: Newcomer, is_silent: bool) -> str | None:
+        """Start a node again that was lost before it had begun; else why not, in words."""
+        with self._lock:
+            self._begun.remove(node.pid)
+            return self._starter.retry(node.asked, node.pid, is_silent)
+
+    def stopped(self) -> set[int]:
+        """Return the numbers of nodes, as they were started, whose processes are stopped."""
+        return self._starter.stopped()
+
+    def close(self) -> None:
+        """Send away the nodes that wait, and end the processes; a fork has no right to."""
+        if is_fork(self._pid):
+            return
+        self.newcomers.close()
+        self._starter.close()
