@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 
 from cavmarl import ConfigError, make_vec
+from cavmarl.balance.load_snapshot import LoadSnapshot
 from cavmarl.core.errors import WorkerDeathError
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.parallel.nodes.node_groups import NodeGroups
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
+from cavmarl.parallel.step_placement import StepPlacement
 from cavmarl.parallel.tasks import Task
 from tests.support.vec_runs import Make, drive, same
 
@@ -177,10 +179,84 @@ def test_worlds_over_nodes_are_drawn(make: Make) -> None:
     ("arguments", "words"),
     [
         ({"num_envs": 2, "sensor_workers": 1}, r"workers\.sensors = 1"),
-        ({"overrides": {"workers.balance_steps": 3}}, r"balance_steps = 3: whole worlds on nodes"),
         ({"overrides": {"workers.monitor_cpu": True}}, r"monitor_cpu = True: whole worlds on node"),
+        (
+            {"overrides": {"workers.balance_steps": 3, "zones.journal": "a.jsonl"}},
+            r"zones\.journal = 'a.jsonl' with workers\.balance_steps",
+        ),
     ],
 )
 def test_what_cannot_be_is_refused(arguments: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         make_vec(backend="nodes:2", **WANTED | arguments)
+
+
+RESTLESS = {"workers.balance_steps": 3, "workers.imbalance_tolerance": 0.0}
+
+
+@pytest.fixture
+def uneven(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Rounds of balance in which worlds seem to cost something else each time."""
+    spent, rounds = StepPlacement.round, list[int]()
+
+    def turn(self: StepPlacement, spent_s: Any, steps: int, seen: LoadSnapshot) -> bool:
+        dear = len(rounds) % len(spent_s)
+        rounds.append(dear)
+        spent_s[dear] += 10.0 ** len(rounds)
+        return spent(self, spent_s, steps, seen)
+
+    monkeypatch.setattr(StepPlacement, "round", turn)
+    return rounds
+
+
+@pytest.mark.parametrize(
+    ("arguments", "at"),
+    [
+        ({"num_envs": 6}, {}),
+        ({"num_envs": 6, "zones": 2}, {4: [0], 7: [1], 10: [0, 1]}),
+        ({"env": "merge", "num_envs": 5, "autoreset_mode": "NextStep"}, {}),
+        ({"env": "town", "num_envs": 4, "overrides": {"sensors.stack": 3}}, {6: [1]}),
+    ],
+)
+def test_worlds_that_move_are_the_same(
+    make: Make, uneven: list[int], arguments: dict[str, Any], at: dict[int, list[int]]
+) -> None:
+    wanted = WANTED | arguments
+    whole = drive(make(**wanted | {"zones": 1}), steps=20)
+    wanted["overrides"] = {**wanted.get("overrides", {}), **RESTLESS}
+    vec = make(backend="nodes:2", **wanted)
+    assert same(drive(vec, steps=20, before=kill(vec, at)), whole)
+    mover = vec.worlds.mover
+    assert mover is not None
+    assert mover.moves > 3
+    assert sum(group.pool.losses for group in groups_of(vec)) == sum(map(len, at.values()))
+
+
+def test_a_move_that_is_interrupted_leaves_worlds_where_they_were(
+    make: Make, uneven: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wanted = WANTED | {"num_envs": 6}
+    whole = make(**wanted)
+    vec = make(backend="nodes:2", overrides=RESTLESS, **wanted)
+    for each in (whole, vec):
+        each.reset(seed=3)
+    group, calls = groups_of(vec)[1], [0]
+    become = group.become
+
+    def interrupt(*worlds: Any) -> None:
+        calls[0] += 1
+        if calls[0] in (1, 4):
+            raise KeyboardInterrupt
+        become(*worlds)
+
+    monkeypatch.setattr(group, "become", interrupt)
+    for _ in range(20):
+        actions = whole.suggest_actions()
+        whole.step(actions)
+        try:
+            vec.step(actions)
+        except KeyboardInterrupt:
+            vec.step(actions)
+        hashes = [[each.state_hash(w) for w in range(6)] for each in (whole, vec)]
+        assert hashes[0] == hashes[1]
+    assert calls[0] > 5

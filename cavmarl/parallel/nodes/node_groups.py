@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.balance.load_snapshot import LoadSnapshot, idle_snapshot
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
@@ -21,6 +22,7 @@ from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.parallel.backend_name import BackendName
 from cavmarl.parallel.commanded_worlds import CommandedWorlds
+from cavmarl.parallel.mover import Mover
 from cavmarl.parallel.nodes.node_starters import Route, Start, start_nodes, straight
 from cavmarl.parallel.nodes.node_supply import NodeSupply
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
@@ -40,7 +42,7 @@ class NodeGroups(CommandedWorlds):
 
     Each node has a coordinator and a thread of its own, and all do a command at the same time. The
     state of the worlds of each node is kept in this process: if a node is lost, another one goes on
-    from there.
+    from there. With `workers.balance_steps` worlds change their node between steps.
 
     Attributes:
         pool: where the nodes come from.
@@ -80,14 +82,17 @@ class NodeGroups(CommandedWorlds):
             self.placement = StepPlacement(world, num_worlds, self.pool.count, is_here=False)
             parts = parts_of(self.plans, world.partition.count)
             self._bounds = [part.first for part in parts] + [num_worlds]
-            runs = prepare_runs(world.config.zones, num_worlds)
+            self._runs = prepare_runs(world.config.zones, num_worlds)
             for first, last in pairwise(self._bounds):
-                share = WorldShare(self.arrays.part(first, last), runs[first:last], self.pool)
+                share = WorldShare(self.arrays.part(first, last), self._runs[first:last], self.pool)
                 group = NodeWorlds(
                     world, base_dir, last - first, backend, in_next_step,
                     route=route, system=system, share=share,
                 )  # fmt: skip
                 self.groups.append(group)
+            self._spent_s = np.zeros((num_worlds, 1))
+            if (every := world.config.workers.balance_steps) and len(self.groups) > 1:
+                self.mover = Mover(self.placement, world.partition.count, every, self._spent_s)
         except BaseException:
             self.close()
             raise
@@ -146,14 +151,55 @@ class NodeGroups(CommandedWorlds):
             return {}
         return {k: pid for k, group in enumerate(self.groups) for pid in group.pool.pids}
 
+    def _seen(self) -> LoadSnapshot:
+        """Ask what worlds have cost, before they are balanced by it."""
+        costs = self._side_by_side(NodeWorlds.world_costs_s, self.groups, _ignore)
+        self._spent_s[:, 0] += np.concatenate(costs)
+        return idle_snapshot(len(self.groups))
+
     def _settle(self, parts: list[Part]) -> None:
-        """Worlds stay where they are."""
+        """They have noted it when worlds moved."""
+
+    def _move(self, bounds: Sequence[int]) -> None:
+        """Let worlds change their node; on an error all are where they were.
+
+        Args:
+            bounds: the first world of each node, and the end of the last one's.
+        """
+        before = self._bounds
+        changed = [k for k in range(len(self.groups)) if before[k : k + 2] != bounds[k : k + 2]]
+        saved: list[bytes] = [b""] * bounds[-1]
+        groups = [self.groups[k] for k in changed]
+        for k, worlds in zip(
+            changed, self._side_by_side(NodeWorlds.save_worlds, groups, _ignore), strict=True
+        ):
+            saved[slice(*before[k : k + 2])] = worlds
+
+        def have(bounds: Sequence[int]) -> None:
+            def become(k: int) -> None:
+                part = slice(*bounds[k : k + 2])
+                arrays = self.arrays.part(part.start, part.stop)
+                self.groups[k].become(arrays, self._runs[part], saved[part])
+
+            self._side_by_side(become, changed, _ignore)
+            self._bounds = list(bounds)
+
+        try:
+            have(bounds)
+        except BaseException:
+            have(before)
+            raise
 
     def _group_of(self, world: int) -> int:
         return bisect_right(self._bounds, world) - 1
 
     def _send(self, task: Task, payload: Any, commits: bool) -> None:
         """Let all nodes do a task; if it fails anywhere, no worlds have changed."""
+        if task == Task.PACK:  # worlds move in one go
+            return
+        if task == Task.UNPACK:
+            self._move(payload)
+            return
         payloads = [payload] * len(self.groups)
         if task == Task.RESET:
             payloads = [
@@ -208,16 +254,17 @@ class NodeGroups(CommandedWorlds):
 
 def check_groups(world: World) -> None:
     """Refuse what worlds that nodes share out cannot have."""
-    workers = world.config.workers
-    for key, value in (
-        ("balance_steps", workers.balance_steps),
-        ("monitor_cpu", workers.monitor_cpu),
-    ):
-        if value:
-            raise ConfigError(
-                f"workers.{key} = {value!r}: whole worlds on nodes stay there; leave it out, use "
-                "backend='processes:N', or more nodes than worlds"
-            )
+    config = world.config
+    if config.workers.monitor_cpu:
+        raise ConfigError(
+            "workers.monitor_cpu = True: whole worlds on nodes are balanced by what they cost; "
+            "leave it out, or use backend='processes:N' or more nodes than worlds"
+        )
+    if config.workers.balance_steps and config.zones.journal:
+        raise ConfigError(
+            f"zones.journal = {config.zones.journal!r} with workers.balance_steps: a journal is "
+            "begun anew when its world moves to another node; leave one out"
+        )
 
 
 def _undo(job: tuple[NodeWorlds, Any]) -> None:

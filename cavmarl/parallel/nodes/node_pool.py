@@ -100,52 +100,72 @@ class NodePool:
         self.newcomers = supply.newcomers
         config = world.config
         self.zones = self._homes = zones
-        self._living = living_of(self.zones)
         self.generation = 0
-        self._teller = 0
-        self._cut = ZoneCut(told_zones(world.partition), Neighbours(()))
-        self._state = PoolState(1, self.zones, 0, self._cut)  # that all nodes can go back to
-        self._opened: PoolState | None = None  # that they keep before the next command
-        self._next_state = 2
-        self._kept: dict[int, Bytes] = {}  # states of the only node that there was, by numbers
-        self._keep_again_s = -math.inf  # by the clock of `_links`
-        self._log: list[NodeCommand] = []  # since that state
+        self._next_state = 1
         self._lost: list[int] = []
         self._is_torn = False
         self._successions = 0  # in the present command
         self._max_retries = config.workers.max_retries
         self.losses = self.recoveries = self.replacements = self.redirected = 0
         self._timeout_s, self._pid = config.workers.timeout_s, os.getpid()
-        self.owner = np.full(len(runs) * config.population.num_ids, UNOWNED, dtype=np.int32)
+        self._num_ids = config.population.num_ids
+        self._partition = told_zones(world.partition)
         self._ticks_per_step = config.clock.ticks_per_step
         self._links = Links(_nothing, system)
         self._watch = NodeWatch(self._links, self._stopped)
         self._nodes: dict[int, Newcomer] = {}  # what is known of each that lives
         self._new: dict[int, tuple[str, int]] = {}  # where the others can call those of them
-        self._lease_ticks = lease_ticks(config)
-        self.coordinator = NodeCoordinator(
-            [run.run for run in runs],
-            nodes_of(self.zones),
-            limits_of(config.zones),
-            self._links,
-            [None if run.journal is None else Journal(run.journal, anew=True) for run in runs],
-            config.zones.check_invariants,
-        )
+        self._lease_ticks, self._settings = lease_ticks(config), config.zones
         self._links.urgent = self._hear
-        self._runs = [run.run.hex() for run in runs]
+        self._prepare(runs)
         try:
-            self._begin(len(zones))
+            self._begin()
         except BaseException:
             self.close()
             raise
 
-    def _begin(self, nodes: int) -> None:
-        """Wait until so many nodes have joined, and give them their zones, again if one is lost."""
+    def _prepare(self, runs: Sequence[WorldRun]) -> None:
+        """Have worlds that have not begun."""
+        self.zones = self._homes
+        self._living = living_of(self.zones)
+        self._teller = 0
+        self._cut = ZoneCut(self._partition, Neighbours(()))
+        # What all nodes can go back to, and what they keep before the next command.
+        self._state = PoolState(self._next_state, self.zones, 0, self._cut)
+        self._opened: PoolState | None = None
+        self._next_state += 1
+        self._kept: dict[int, Bytes] = {}  # states of the only node that there was, by numbers
+        self._keep_again_s = -math.inf  # by the clock of `_links`
+        self._log: list[NodeCommand] = []  # since the state
+        self.owner = np.full(len(runs) * self._num_ids, UNOWNED, dtype=np.int32)
+        self.coordinator = NodeCoordinator(
+            [run.run for run in runs],
+            nodes_of(self.zones),
+            limits_of(self._settings),
+            self._links,
+            [None if run.journal is None else Journal(run.journal, anew=True) for run in runs],
+            self._settings.check_invariants,
+        )
+        self._runs = [run.run.hex() for run in runs]
+
+    def begin_anew(self, runs: Sequence[WorldRun]) -> None:
+        """Let the nodes have other worlds, or another number of them, which have not begun.
+
+        Raises:
+            WorkerError: too many nodes were lost.
+        """
+        self.coordinator.close()
+        self.generation += 1
+        self._prepare(runs)
+        self._begin()
+
+    def _begin(self) -> None:
+        """Wait until all nodes have joined, and give them their zones, again if one is lost."""
         hostings: list[list[Hosting]] = []
-        while self._new or len(self._nodes) < nodes:
+        while True:
             try:
-                missing = nodes - len(self._nodes)
-                self._seat(missing)
+                if missing := self.num_nodes - len(self._nodes):
+                    self._seat(missing)
                 neighbours = self._nodes[0].neighbours
                 assert neighbours is not None
                 self._cut = self._cut._replace(neighbours=neighbours)
@@ -153,11 +173,13 @@ class NodePool:
                 hostings = hostings or self.coordinator.host(neighbours)
                 self._tell_zones(hostings, ZoneMoves(self.zones, {}, []), begins=True)
                 self._commit()
-                self._new.clear()
             except LinkLostError as lost:
                 self._lose(lost, has_begun=False)
                 self.generation += 1  # what nodes say of this attempt counts no more
-        self._is_torn = False
+            else:
+                self._new.clear()
+                self._is_torn = False
+                return
 
     def _pump(self) -> None:
         """Hear the nodes that are there. Raises LinkLostError: one of them is lost."""

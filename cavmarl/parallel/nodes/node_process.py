@@ -251,12 +251,12 @@ class NodeProgram:
         at = 8 + int.from_bytes(data[:8], "little")
         told = json.loads(bytes(data[8:at]))
         self._generation = frame.number
-        if self._number < 0:
+        before = self._worlds
+        if told["num_worlds"] != len(before.arrays.mask) or (told["begins"] and self._number >= 0):
+            self._run_worlds(before.of_number(told["num_worlds"]))
+            before.close()
+        if self._number < 0 or self._worlds is not before:
             self._number = int(told["number"])
-            if told["num_worlds"] != len(self._worlds.arrays.mask):
-                before = self._worlds
-                self._run_worlds(before.of_number(told["num_worlds"]))
-                before.close()
             self._taken = ActionsTaken(self._worlds.arrays, self._number)
             self._kept = KeptStates(self._worlds, self._logs, links, self._number)
             links.urgent = self._hear
@@ -353,7 +353,9 @@ class NodeProgram:
 
     def _tell_costs(self, payload: None, data: memoryview, at: int) -> None:
         spent_s = [] if self._clock is None else self._clock.take_s().tolist()
-        self._answer([json.dumps(list(zip(self.zones, spent_s, strict=False))).encode()])
+        of_zones = list(zip(self.zones, spent_s, strict=False))
+        running = self._worlds.simulation.running().tolist()
+        self._answer([json.dumps([of_zones, running]).encode()])
 
     def _tell_loads(self, payload: Any, data: memoryview, at: int) -> None:
         told = told_of(payload, self._links, self._worlds.simulation, self.zones)

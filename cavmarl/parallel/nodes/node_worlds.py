@@ -94,12 +94,10 @@ class NodeWorlds(CommandedWorlds):
         nodes = 1 if share else backend.count or 1
         check_nodes(world, nodes)
         self.world, self.in_next_step = world, in_next_step
-        self.arrays = share.arrays if share else empty_arrays(world, num_worlds)
+        self._have(share.arrays if share else empty_arrays(world, num_worlds))
         self.placement = StepPlacement(world, 1, nodes, is_here=False)
         zones = parts_of(self.plans, count)[0].zones
         self._network: NetworkSimulator | None = None
-        self._results = ResultStream(self.arrays)
-        self._everywhere = np.ones(num_worlds, dtype=np.bool_)
         self._writers: dict[Task, Callable[[Sequence[memoryview]], None]] = {
             Task.RESET: self._write_begun,
             Task.STEP: self._write_stepped,
@@ -125,7 +123,8 @@ class NodeWorlds(CommandedWorlds):
         self._steps_begun = 0  # since the worlds were made
         self.recuts: list[Recut] = []
         self._told: dict[int, list[Any]] = {}  # what nodes have said of themselves last
-        if every := config.workers.balance_steps:
+        every = config.workers.balance_steps
+        if every and share is None:
             self.mover = Mover(self.placement, count, every, self._spent_s)
         if config.workers.monitor_cpu:
             self.node_snapshot(TO_BALANCE)  # from now on they watch
@@ -172,8 +171,8 @@ class NodeWorlds(CommandedWorlds):
 
         Those that are not watched, or lost, are taken to be idle.
         """
-        for data in self._run(Task.COSTS):
-            for zone, spent_s in json.loads(bytes(data)):
+        for of_zones, _ in self._costs():
+            for zone, spent_s in of_zones:
                 self._spent_s[0, zone] += spent_s
         idle = idle_snapshot(self.pool.num_nodes)
         if not self.world.config.workers.monitor_cpu:
@@ -181,6 +180,32 @@ class NodeWorlds(CommandedWorlds):
         seen = self.node_snapshot(TO_BALANCE)
         states = {one.worker: one for one in (*idle.workers, *seen.workers)}
         return replace(seen, workers=tuple(states[node] for node in sorted(states)))
+
+    def _costs(self) -> list[Any]:
+        """Return what each node has spent on its zones since it was asked last.
+
+        Of each node: pairs of a zone and s of processor time, and the vehicles of each world.
+        """
+        return [json.loads(bytes(data)) for data in self._run(Task.COSTS)]
+
+    def world_costs_s(self) -> NDArray[np.float64]:
+        """Return the processor time (W,) of each world; worlds share it by their vehicles."""
+        found = np.zeros(len(self.arrays.mask))
+        for of_zones, running in self._costs():
+            vehicles = np.array(running, dtype=np.float64) + 1.0
+            found += vehicles * (sum(spent_s for _, spent_s in of_zones) / vehicles.sum())
+        return found
+
+    def become(self, arrays: StepArrays, runs: Sequence[WorldRun], saved: Sequence[bytes]) -> None:
+        """Have other worlds from now on, as they were saved; errors as of `NodePool.begin_anew`."""
+        self._have(arrays)
+        self.pool.begin_anew(runs)
+        self.perform(Task.LOAD, saved)
+
+    def _have(self, arrays: StepArrays) -> None:
+        self.arrays = arrays
+        self._results = ResultStream(arrays)
+        self._everywhere = np.ones(len(arrays.mask), dtype=np.bool_)
 
     def _send(self, task: Task, payload: Any, commits: bool) -> None:
         if task == Task.HOST:
