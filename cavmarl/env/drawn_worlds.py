@@ -39,7 +39,6 @@ _ENDS = {
 def check_rendering(
     config: EnvConfig,
     render_mode: str | None,
-    num_worlds: int,
     backend: BackendName,
     modes: tuple[str, ...] = RENDER_MODES,
 ) -> None:
@@ -53,7 +52,7 @@ def check_rendering(
     if render_mode not in modes:
         raise ConfigError(f"render_mode = {render_mode!r}: must be {' or '.join(modes)}, or None")
     with_sumo = config.traffic.source != "native"
-    if not backend.is_local and (with_sumo or not shows_state(num_worlds, backend)):
+    if not backend.is_local and (with_sumo or not shows_state(backend)):
         what = f" and traffic.source = {config.traffic.source!r}" if with_sumo else ""
         raise ConfigError(
             f"render_mode = {render_mode!r} with backend = '{backend}'{what}: such worlds are only "

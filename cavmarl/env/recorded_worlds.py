@@ -32,7 +32,6 @@ Record: TypeAlias = RecordOptions | str | Path
 def check_recording(
     config: EnvConfig,
     record: Record | None,
-    num_worlds: int,
     backend: BackendName,
 ) -> None:
     """Refuse to record worlds whose state cannot be had here.
@@ -49,7 +48,7 @@ def check_recording(
     key = kept_elsewhere(config)
     if not key and config.traffic.source != "native":
         key = f"traffic.source = {config.traffic.source!r}"
-    if key or not shows_state(num_worlds, backend):
+    if key or not shows_state(backend):
         what = f" and {key}" if key else ""
         raise ConfigError(
             f"record = {str(options.path)!r} with backend = '{backend}'{what}: such worlds are "

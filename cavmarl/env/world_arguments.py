@@ -96,7 +96,7 @@ def start_worlds(
         overrides=with_sensors_of(given.get("overrides"), given.get("sensors_of")),
     )
     check_agents(config)
-    check_rendering(config, given.get("render_mode"), num_worlds, backend, render_modes)
-    check_recording(config, given.get("record"), num_worlds, backend)
+    check_rendering(config, given.get("render_mode"), backend, render_modes)
+    check_recording(config, given.get("record"), backend)
     world = make_world(config, base_dir)
     return make_worlds(world, base_dir, num_worlds, backend, in_next_step)

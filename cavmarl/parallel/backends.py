@@ -16,7 +16,6 @@ from cavmarl.parallel.backend_name import (
     BackendName,
     read_backend,
 )
-from cavmarl.parallel.hosts.remote_worlds import RemoteWorlds
 from cavmarl.parallel.nodes.node_groups import NodeGroups
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.parallel.pooled_worlds import PooledWorlds
@@ -66,10 +65,8 @@ def find_backend(
     return read_backend(backend, workers, nodes, _REGISTERED)
 
 
-def shows_state(num_worlds: int, backend: BackendName) -> bool:
+def shows_state(backend: BackendName) -> bool:
     """Return whether this process can have the state of the worlds, to draw or record them."""
-    if backend.kind == RAY:
-        return backend.is_split(num_worlds)
     return backend.kind in OWN
 
 
@@ -92,10 +89,8 @@ def make_worlds(
         return local_worlds(world, base_dir, num_worlds, in_next_step)
     if backend.kind == PROCESSES:
         return PooledWorlds(world, base_dir, num_worlds, count or 1, in_next_step)
-    if backend.kind in (NODES, RAY) and (count == 1 or backend.is_split(num_worlds)):
-        return NodeWorlds(world, base_dir, num_worlds, backend, in_next_step)
-    if backend.kind == NODES:
-        return NodeGroups(world, base_dir, num_worlds, backend, in_next_step)
-    if backend.kind == RAY:
-        return RemoteWorlds(world, base_dir, num_worlds, count, in_next_step)
+    if backend.kind in (NODES, RAY):
+        by_zones = count == 1 or backend.is_split(num_worlds)
+        make = NodeWorlds if by_zones else NodeGroups
+        return make(world, base_dir, num_worlds, backend, in_next_step)
     return _REGISTERED[backend.kind](world, base_dir, num_worlds, count, in_next_step)

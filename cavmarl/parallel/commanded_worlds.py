@@ -20,7 +20,7 @@ from cavmarl.parallel.step_arrays import Driven, StepArrays
 from cavmarl.parallel.step_placement import StepPlacement
 from cavmarl.parallel.tasks import Task
 from cavmarl.parallel.work_shares import Part
-from cavmarl.parallel.world_errors import own_error, unconnected, uncopied, unsaved
+from cavmarl.parallel.world_errors import own_error, unconnected, uncopied
 from cavmarl.shards.shard import Commands
 from cavmarl.v2x.v2x_messages import NetworkSimulator
 
@@ -121,11 +121,13 @@ class CommandedWorlds(ABC):
     def write_states(self) -> None:
         self._order(Task.WRITE_STATES, commits=False)
 
+    @abstractmethod
     def save_worlds(self) -> list[bytes]:
-        raise unsaved()
+        """Return the state of each world, for `load_worlds` of any number of zones and workers."""
 
+    @abstractmethod
     def load_worlds(self, saved: Sequence[bytes]) -> None:
-        raise unsaved()
+        """Go on from what `save_worlds` gave; `arrays` stay as they are."""
 
     def connect_network(self, network: NetworkSimulator) -> None:
         raise unconnected()

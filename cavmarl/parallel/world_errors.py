@@ -15,13 +15,6 @@ def uncopied() -> ConfigError:
     )
 
 
-def unsaved() -> ConfigError:
-    """Return the refusal to save worlds on other machines."""
-    return ConfigError(
-        "hosts: worlds on the machines of a cluster are not saved; use workers of this machine"
-    )
-
-
 def unconnected() -> ConfigError:
     """Return the refusal to connect a network simulator with worlds in workers."""
     return ConfigError(

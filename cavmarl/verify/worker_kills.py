@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import random
 import signal
-import socket
 import statistics
 import time
 from collections.abc import Callable
@@ -18,10 +17,8 @@ from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError, EvaluationError
 from cavmarl.core.machine import describe_hardware
 from cavmarl.env.vector import CavVectorEnv, make_vec
-from cavmarl.parallel.backend_name import PROCESSES, RAY, BackendName
+from cavmarl.parallel.backend_name import PROCESSES, BackendName
 from cavmarl.parallel.backends import find_backend
-from cavmarl.parallel.hosts.host_pool import HostPool
-from cavmarl.parallel.hosts.remote_worlds import RemoteWorlds
 from cavmarl.parallel.pooled_worlds import PooledWorlds
 from cavmarl.parallel.processes.worker_pool import Death, Pool
 from cavmarl.verify.differences import Arrays, DrivenRun, same_bytes
@@ -88,8 +85,7 @@ def verify_kills(
     Args:
         env: as in `make_vec`, like the other keywords; the seed is that of the kills, too.
         kills: how many signals; three in four are SIGKILL, the others SIGSTOP.
-        backend: where the worlds run, `processes:N` or `ray:N` (on this machine); default:
-            `processes:2`.
+        backend: where the worlds run, `processes:N`; default: `processes:2`.
         workers: short form: N for `processes:N`.
         worlds: stepped together; default: two a worker.
         steps: how many; default: three a kill.
@@ -108,9 +104,9 @@ def verify_kills(
     where = find_backend(backend, workers)
     if backend is None and workers is None:
         where = BackendName(PROCESSES, 2)
-    if where.kind not in (PROCESSES, RAY) or where.count is None:
+    if where.kind != PROCESSES or where.count is None:
         raise ConfigError(
-            f"backend = '{where}': workers are killed of 'processes:N' or 'ray:N'; nodes by "
+            f"backend = '{where}': workers are killed of 'processes:N'; nodes by "
             "verify --nodes N --kill K"
         )
     if kills < 1:
@@ -124,7 +120,6 @@ def verify_kills(
     try:
         killer = _Killer(_pool(parted), random.Random(seed))
         runs = [DrivenRun(vec, policy, seed) for vec in (whole, parted)]
-        _refuse_elsewhere(killer.pool)
         ping_us = _ping_us(killer.pool)
         struck = set(killer.random.sample(range(FIRST_STEPS, steps), kills))
         different = None
@@ -150,13 +145,12 @@ def verify_kills(
     )  # fmt: skip
 
 
-def _pool(vec: CavVectorEnv) -> Pool | HostPool:
-    if not isinstance(vec.worlds, PooledWorlds | RemoteWorlds):
-        raise ConfigError("fewer worlds than workers on Ray: use verify --nodes, or more worlds")
+def _pool(vec: CavVectorEnv) -> Pool:
+    assert isinstance(vec.worlds, PooledWorlds)
     return vec.worlds.pool
 
 
-def _ping_us(pool: Pool | HostPool) -> float:
+def _ping_us(pool: Pool) -> float:
     """What an empty command to all workers takes, at the median."""
     found = []
     for _ in range(PINGS):
@@ -166,19 +160,10 @@ def _ping_us(pool: Pool | HostPool) -> float:
     return 1e6 * statistics.median(found)
 
 
-def _refuse_elsewhere(pool: Pool | HostPool) -> None:
-    """Only processes of this machine can be killed."""
-    if isinstance(pool, HostPool) and {*pool.machines} != {socket.gethostname()}:
-        raise ConfigError(
-            f"hosts on {', '.join(sorted({*pool.machines}))}: processes are killed on this machine "
-            "only; unset RAY_ADDRESS for a cluster of its own"
-        )
-
-
 class _Killer:
     """Sends the signals to workers of a pool and finds out what became of them."""
 
-    def __init__(self, pool: Pool | HostPool, random: random.Random) -> None:
+    def __init__(self, pool: Pool, random: random.Random) -> None:
         self.random = random
         self.found: list[Kill] = []
         self.pool = pool
@@ -193,9 +178,6 @@ class _Killer:
     def watch(self, run: Callable[[], Arrays], step: int, strikes: bool) -> Arrays:
         timer = None
         if strikes:
-            if isinstance(self.pool, HostPool):  # one death at a time: Ray takes seconds for a host
-                self.finish(step)
-                self.pool.await_spare()
             delay_s = self.random.uniform(0.0, LATEST * statistics.median(self._calm_s))
             timer = Timer(delay_s, self._strike, (self._choose(),))
             timer.start()
@@ -220,10 +202,7 @@ class _Killer:
     def _strike(self, target: tuple[int, signal.Signals]) -> None:
         worker, how = target
         self._sent[worker] = how, time.monotonic()
-        if isinstance(self.pool, Pool):
-            os.kill(self.pool.pids[worker], how)
-        elif not self.pool.signal(worker, how):  # it is being replaced
-            del self._sent[worker]
+        os.kill(self.pool.pids[worker], how)
 
     def _match(self, step: int) -> None:
         """Say of each new death what it was; one of itself is an error."""

@@ -67,7 +67,7 @@ def test_the_workers_of_one_world_are_killed(capsys: pytest.CaptureFixture[str])
         (("verify", "ring", "--backend", "ray:2"), ("--backend ray:2", "--kill")),
         (("verify", "ring", "--kill", "1", "--backend", "slurm"), ("backend = 'slurm'", "'ray'")),
         (("verify", "ring", "--kill", "1", "--backend", "nodes:2"), ("'nodes:2'", "--nodes N")),
-        (("verify", "ring", "--kill", "1", "--hosts", "ray"), ("--hosts was removed", "ray:N")),
+        (("verify", "ring", "--kill", "1", "--hosts", "ray"), ("--hosts was removed", "--backend")),
         (("verify", "ring", "--kill", "0"), ("0 kills", "at least 1")),
         (("verify", "ring", "--kill", "5", "--steps", "7"), ("7 steps", "at least 15")),
         (("verify", "ring", "--kill", "1", "--zones", "1,2"), ("--zones 1,2", "one number")),

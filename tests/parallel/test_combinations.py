@@ -88,6 +88,7 @@ PLACES: dict[str, Keywords] = {
     "workers": {"num_envs": 2, "workers": 2},
     "zones over workers": {"zones": 2, "workers": 2},
     "nodes": {"zones": 3, "nodes": 2},
+    "worlds over nodes": {"num_envs": 2, "nodes": 2},
     "worlds on Ray": {"num_envs": 2, "backend": "ray:2"},
     "nodes on Ray": {"zones": 3, "backend": "ray:2"},
 }
@@ -98,7 +99,7 @@ ONLY_DIVIDED = (
 )  # fmt: skip
 OF_ONE_WORLD = "of one world over"
 OF_THE_CALLER = "a network simulator is in the caller's process"
-NOT_ON_HOSTS = "use processes:N"
+BY_COSTS = "whole worlds on nodes are balanced by what they cost"
 NOT_OVER_NODES = "worlds over nodes do not have it"
 REFUSED = {
     ("a network simulator", "workers"): OF_THE_CALLER,
@@ -106,10 +107,10 @@ REFUSED = {
     ("a journal", "zones over workers"): OF_ONE_WORLD,
     ("repartitions", "zones over workers"): "needs zones that stay",
     ("sensor workers", "nodes"): NOT_OVER_NODES,
-    ("a network simulator", "worlds on Ray"): OF_THE_CALLER,
-    ("a journal", "worlds on Ray"): NOT_ON_HOSTS,
-    ("sensor workers", "worlds on Ray"): "use backend='processes:N'",
-    ("balance by LoadScore", "worlds on Ray"): "or use backend='processes:N'",
+    ("sensor workers", "worlds over nodes"): NOT_OVER_NODES,
+    ("balance by LoadScore", "worlds over nodes"): BY_COSTS,
+    ("sensor workers", "worlds on Ray"): NOT_OVER_NODES,
+    ("balance by LoadScore", "worlds on Ray"): BY_COSTS,
     ("sensor workers", "nodes on Ray"): NOT_OVER_NODES,
 }
 
@@ -180,6 +181,11 @@ def test_zones_over_workers(make: Make, tmp_path: Path, feature: str) -> None:
 @hosted
 def test_over_nodes(make: Make, tmp_path: Path, feature: str) -> None:
     check(make, tmp_path, feature, "nodes")
+
+
+@hosted
+def test_worlds_over_nodes(make: Make, tmp_path: Path, feature: str) -> None:
+    check(make, tmp_path, feature, "worlds over nodes")
 
 
 def test_the_table_of_the_page_is_this_one() -> None:

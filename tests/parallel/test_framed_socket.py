@@ -13,12 +13,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import cavmarl.parallel.hosts.listener as door_module
+import cavmarl.parallel.network.listener as door_module
 from cavmarl.core.errors import (
     MessageError,
 )
-from cavmarl.parallel.hosts.framed_socket import MAGIC, VERSION, FramedSocket, Kind
-from cavmarl.parallel.hosts.listener import Listener, PendingConnection, knock
+from cavmarl.parallel.network.framed_socket import MAGIC, VERSION, FramedSocket, Kind
+from cavmarl.parallel.network.listener import Listener, PendingConnection, knock
 
 ARRAYS = [
     np.arange(12, dtype=np.float64).reshape(3, 4),

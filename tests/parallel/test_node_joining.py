@@ -27,7 +27,7 @@ from cavmarl.core.errors import (
     WorkerError,
 )
 from cavmarl.env.vector import CavVectorEnv
-from cavmarl.parallel.hosts.listener import MAX_CALLERS, Listener
+from cavmarl.parallel.network.listener import MAX_CALLERS, Listener
 from cavmarl.parallel.nodes import node_starters
 from cavmarl.parallel.nodes.link import Link
 from cavmarl.parallel.nodes.newcomers import ANYONE, Newcomer, Newcomers

@@ -14,7 +14,7 @@ from cavmarl.core.errors import MessageError
 from cavmarl.ownership.decisions import Neighbours
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import Done
-from cavmarl.parallel.hosts.encryption import encrypted
+from cavmarl.parallel.network.encryption import encrypted
 from cavmarl.parallel.nodes.link import MAX_FRAME, FrameKind, NodeFrame, said_by
 from cavmarl.parallel.nodes.links import LinkLostError, Links
 from cavmarl.parallel.nodes.meeting import call_node, calls_of

@@ -12,9 +12,9 @@ import pytest
 
 from cavmarl.core.errors import MessageError, MissingExtraError, NodeRefusedError
 from cavmarl.ownership.messages import COORDINATOR
-from cavmarl.parallel.hosts.framed_socket import VERSION
-from cavmarl.parallel.hosts.host_process import code_stamp
-from cavmarl.parallel.hosts.listener import Listener, call
+from cavmarl.parallel.network.code_stamp import code_stamp
+from cavmarl.parallel.network.framed_socket import VERSION
+from cavmarl.parallel.network.listener import Listener, call
 from cavmarl.parallel.nodes import newcomers as newcomers_module
 from cavmarl.parallel.nodes.link import FrameKind
 from cavmarl.parallel.nodes.links import LinkLostError, Links

@@ -281,11 +281,16 @@ def test_a_node_and_the_one_that_keeps_its_state_are_lost(make: Make) -> None:
 
 
 def test_the_only_node_is_lost(make: Make) -> None:
+    """The caller keeps its states, and another node takes its place."""
+    whole = drive(make("grid4x4", **WANTED))
     vec = make("grid4x4", zones=2, nodes=1, **WANTED)
-    vec.reset(seed=1)
-    os.kill(over_nodes(vec).pool.pids[0], signal.SIGKILL)
-    with pytest.raises(WorkerDeathError, match="node 0 was lost"):
-        vec.step(vec.suggest_actions())
+
+    def strike(step: int) -> None:
+        if step in (2, 6):
+            os.kill(over_nodes(vec).pool.pids[0], signal.SIGKILL)
+
+    assert same(drive(vec, before=strike), whole)
+    assert (over_nodes(vec).pool.losses, over_nodes(vec).pool.recoveries) == (2, 2)
 
 
 def test_nothing_stays_behind(make: Make) -> None:

@@ -92,7 +92,6 @@ def test_the_processes_end_with_the_environment() -> None:
             {"backend": "ray:5", "zones": 4},
             r"nodes = 5: a world of 4 zone",
         ),
-        ({"backend": "ray", "render_mode": "rgb_array"}, r"backend = 'ray': such worlds are only"),
     ],
 )
 def test_backends_that_cannot_be(arguments: dict[str, Any], words: str) -> None:

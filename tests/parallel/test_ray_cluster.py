@@ -7,7 +7,7 @@ import pytest
 from cavmarl import ConfigError, make_vec
 from cavmarl.balance.load_score import Utilisation
 from cavmarl.core.errors import MissingExtraError, NoAdmissibleWorkerError
-from cavmarl.parallel.hosts.ray_cluster import Node, choose_nodes
+from cavmarl.parallel.network.ray_cluster import Node, choose_nodes
 
 IDLE = Utilisation(0.0, 0.0)
 
@@ -41,9 +41,9 @@ def test_more_workers_than_cpus() -> None:
         ({"backend": "ray:5", "zones": 4}, "nodes = 5: a world of 4 zone"),
         (
             {"backend": "ray", "sensor_workers": 1, "overrides": {"rig": "ten_sensors"}},
-            "workers.sensors = 1, backend = 'ray': sensor workers are on the machine",
+            "workers.sensors = 1: worlds over nodes",
         ),
-        ({"backend": "ray", "overrides": {"zones.journal": "a.jsonl"}}, "zones.journal"),
+        ({"backend": "ray", "overrides": {"workers.monitor_cpu": True}}, "workers.monitor_cpu"),
     ],
 )
 def test_settings_that_cannot_be(arguments: dict[str, object], words: str) -> None:

@@ -23,7 +23,7 @@ __all__ = ["ALONE_FILES", "ProcessWatch", "is_needed", "mark", "skip_if_late"]
 
 _OF_PROCESSES = re.compile(
     r"^import (subprocess|multiprocessing|libsumo)\b"
-    r"|^from tests\.support\.(sumo_worlds|netgenerate|junction_scenes|toy_hosts|toy_job) import"
+    r"|^from tests\.support\.(sumo_worlds|netgenerate|junction_scenes|toy_job) import"
     r"|^from tests\.support\.(dead_ends|world_hosts|service) import"
     r"|^from tests\.support\.chromium import"
     r"|importorskip\(\"(libsumo|ray)\""
@@ -36,8 +36,8 @@ _DEAR_FOLDERS = ("tests/cosim/", "tests/train/")
 
 RAY_FILES = (
     "tests/parallel/test_ray_combinations.py",
-    "tests/parallel/test_remote_start.py",
-    "tests/parallel/test_remote_worlds.py",
+    "tests/parallel/test_ray_start.py",
+    "tests/parallel/test_ray_worlds.py",
 )
 
 _IN_RAY = "test_in_an_actor_of_ray"  # begins the name of a test that starts a cluster

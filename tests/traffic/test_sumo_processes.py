@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
 import time
-from dataclasses import asdict
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -15,17 +14,13 @@ import psutil
 import pytest
 
 from cavmarl import make_vec
-from cavmarl.config.registry import load_config
 from cavmarl.core.errors import (
     ConfigError,
     DemandError,
     SumoError,
 )
 from cavmarl.engine.world_description import describe_world
-from cavmarl.engine.world_setup import load_world, make_world
-from cavmarl.parallel.hosts.hosted_worlds_job import HostedWorlds
-from cavmarl.parallel.recipe import fingerprint
-from cavmarl.parallel.tasks import Task
+from cavmarl.engine.world_setup import load_world
 from cavmarl.traffic.sumo.sumo_input import free_libsumo
 from tests.support.driving import drive, start
 from tests.support.forked_processes import ForkedProcess
@@ -346,35 +341,23 @@ def test_a_worker_dies_whose_sumo_was_told_too_much_to_keep(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("source", MODES)
-def test_a_host_elsewhere_goes_on_with_what_another_one_sends(tmp_path: Path, source: str) -> None:
-    config, base_dir = load_config(
-        "grid4x4", agents=3, background=0, overrides=settings(tiny_file(tmp_path), source)
-    )
-    recipe = {
-        "config": asdict(config),
-        "extensions": [],
-        "base_dir": str(base_dir.resolve()),
-        "fingerprint": fingerprint(make_world(config, base_dir)),
-        "in_next_step": False,
-        "measures": False,
-        "size": 1,
-    }
-    hosts = [HostedWorlds(json.loads(json.dumps(recipe))) for _ in range(2)]
-    try:
-        for array in hosts[0].inputs(Task.RESET, None):
-            array[:] = True
-        hosts[0].perform(Task.RESET, {"seed": 4, "first_world": 0})
-        for _ in range(30):
-            hosts[0].perform(Task.STEP, None)
-        hosts[1].load([array.copy() for array in hosts[0].save()])
-        for _ in range(10):
-            for host in hosts:
-                host.perform(Task.STEP, None)
-        first, second = (host.perform(Task.STATE_HASH, 0).answer for host in hosts)
-        assert first == second
-    finally:
-        for host in hosts:
-            host.close()
+def test_a_node_goes_on_with_what_another_one_has_left(tmp_path: Path, source: str) -> None:
+    wanted = {"num_envs": 2, "agents": 3, "background": 0}
+    wanted["overrides"] = settings(tiny_file(tmp_path), source)
+    with (
+        closing(make_vec("grid4x4", **wanted)) as one,
+        closing(make_vec("grid4x4", backend="nodes:2", **wanted)) as vec,
+    ):
+        for each in (one, vec):
+            each.reset(seed=4)
+        for step in range(40):
+            if step == 30:
+                os.kill(vec.worlds.groups[1].pool.pids[0], signal.SIGKILL)
+            actions = one.suggest_actions()
+            for each in (one, vec):
+                each.step(actions)
+        assert [one.state_hash(w) for w in range(2)] == [vec.state_hash(w) for w in range(2)]
+        assert [group.pool.losses for group in vec.worlds.groups] == [0, 1]
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="asks Linux for a process's settings")

@@ -60,10 +60,7 @@ Nodes = Annotated[
 ]
 Backend = Annotated[
     str | None,
-    about(
-        "With --kill: where the worlds run: processes:N, or ray:N for a Ray cluster on this "
-        "machine [default: processes:2]."
-    ),
+    about("With --kill: where the worlds run, processes:N [default: processes:2]."),
 ]
 Workers = Annotated[int | None, about("Short form: N for --backend processes:N.")]
 Check = Annotated[bool, about("Check the invariants of ownership, too.", "--check")]

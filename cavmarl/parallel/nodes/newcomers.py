@@ -11,7 +11,7 @@ from typing import Any
 
 from cavmarl.core.errors import WorkerError, WorkerFailureError
 from cavmarl.ownership.decisions import Neighbours
-from cavmarl.parallel.hosts.host_process import code_stamp
+from cavmarl.parallel.network.code_stamp import code_stamp
 from cavmarl.parallel.nodes.link import FrameKind, Link, NodeFrame
 from cavmarl.parallel.nodes.links import LinkLostError, Links
 from cavmarl.parallel.nodes.node_cuts import read_neighbours

@@ -26,7 +26,7 @@ from cavmarl.parallel.mover import Mover
 from cavmarl.parallel.nodes.node_starters import Route, Start, start_nodes, straight
 from cavmarl.parallel.nodes.node_supply import NodeSupply
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
-from cavmarl.parallel.nodes.node_worlds import NodeWorlds, WorldShare, empty_arrays
+from cavmarl.parallel.nodes.node_worlds import NodeWorlds, WorldShare, check_nodes, empty_arrays
 from cavmarl.parallel.step_placement import StepPlacement
 from cavmarl.parallel.tasks import Task, commands_of
 from cavmarl.parallel.work_shares import Part, parts_of
@@ -260,6 +260,7 @@ def check_groups(world: World) -> None:
             "workers.monitor_cpu = True: whole worlds on nodes are balanced by what they cost; "
             "leave it out, or use backend='processes:N' or more nodes than worlds"
         )
+    check_nodes(world, 1)
     if config.workers.balance_steps and config.zones.journal:
         raise ConfigError(
             f"zones.journal = {config.zones.journal!r} with workers.balance_steps: a journal is "

@@ -18,8 +18,8 @@ from cavmarl.core.tracebacks import traceback_text
 from cavmarl.engine.shard_clock import ShardClock
 from cavmarl.handoff.shard_setup import limits_of
 from cavmarl.ownership.messages import COORDINATOR
-from cavmarl.parallel.hosts.host_process import code_stamp
 from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.network.code_stamp import code_stamp
 from cavmarl.parallel.nodes.agent_stream import ResultStream
 from cavmarl.parallel.nodes.kept_states import KeptStates
 from cavmarl.parallel.nodes.link import Bytes, FrameKind, NeededNoMoreError, NodeFrame

@@ -13,8 +13,8 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.core.huge_pages import huge_heap
 from cavmarl.core.processes import start_python
 from cavmarl.parallel.backend_name import RAY, BackendName
-from cavmarl.parallel.hosts.listener import Listener
-from cavmarl.parallel.hosts.ray_actors import RayActors
+from cavmarl.parallel.network.listener import Listener
+from cavmarl.parallel.network.ray_actors import RayActors
 from cavmarl.parallel.nodes.node_process import run_on_ray
 from cavmarl.parallel.nodes.node_system import NodeListener
 from cavmarl.parallel.processes.watchdog import is_stopped

@@ -9,9 +9,9 @@ import time
 from collections.abc import Mapping
 from typing import Any, Protocol, TypeAlias
 
-from cavmarl.parallel.hosts.listener import Listener, call
 from cavmarl.parallel.journaled_worlds import unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.network.listener import Listener, call
 from cavmarl.parallel.nodes.leases import late_ticks
 from cavmarl.parallel.recipe import world_of
 

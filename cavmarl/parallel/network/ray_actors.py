@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from cavmarl.core.errors import WorkerError, require
-from cavmarl.parallel.hosts.ray_cluster import choose_nodes, join, leave, nodes_with
+from cavmarl.parallel.network.ray_cluster import choose_nodes, join, leave, nodes_with
 
 ENDS_S = 3.0  # for actors to return by themselves: Ray prints a complaint for each that is killed
 SPARES = 1  # hosts that wait for another one's death: a new actor takes seconds

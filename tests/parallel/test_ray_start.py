@@ -80,26 +80,6 @@ def test_nodes_are_actors_and_a_lost_one_comes_back() -> None:
     assert said[-1] == "left: []"
 
 
-def test_hosts_are_killed_and_nobody_can_tell() -> None:
-    command = ["verify", "ring", "--agents", "3", "--background", "4", "--kill", "2"]
-    done = subprocess.run(
-        [sys.executable, "-m", "cavmarl", *command, "--backend", "ray:2"],
-        cwd=ROOT, capture_output=True, text=True, timeout=200,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert "equal in all 16 steps" in done.stdout
-
-
-def test_zones_over_ray_are_verified_as_nodes() -> None:
-    world = ["town", "--agents", "3", "--worlds", "1", "--zones", "4"]
-    done = subprocess.run(
-        [sys.executable, "-m", "cavmarl", "verify", *world, "--kill", "2", "--backend", "ray:2"],
-        cwd=ROOT, capture_output=True, text=True, timeout=200,
-    )  # fmt: skip
-    assert done.returncode == 2
-    assert "use verify --nodes" in done.stderr
-
-
 def test_a_cluster_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
     with pytest.raises(WorkerError, match=r"no Ray cluster at 127.0.0.1:1.*ray start --head"):

@@ -25,13 +25,13 @@ from collections.abc import Iterator
 from contextlib import suppress
 
 from cavmarl.core.errors import MessageError, WorkerError
-from cavmarl.parallel.hosts.encryption import (
+from cavmarl.parallel.network.encryption import (
     EncryptedSocket,
     encrypted,
     leaves_this_machine,
     prepare,
 )
-from cavmarl.parallel.hosts.framed_socket import MAGIC, VERSION, FramedSocket
+from cavmarl.parallel.network.framed_socket import MAGIC, VERSION, FramedSocket
 
 NONCE = 16  # bytes of a random number
 PROOF = 32  # of an HMAC

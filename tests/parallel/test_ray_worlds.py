@@ -1,4 +1,4 @@
-"""Worlds on a Ray cluster of two nodes are the worlds of one process, whichever host dies."""
+"""Worlds on a Ray cluster of two nodes are the worlds of one process, whichever node dies."""
 
 from __future__ import annotations
 
@@ -18,11 +18,9 @@ import psutil
 import pytest
 
 from cavmarl import CapacityError, ConfigError, parallel_env
-from cavmarl.core.errors import WorkerError
 from cavmarl.env.vector import CavVectorEnv
-from cavmarl.parallel.hosts.remote_worlds import RemoteWorlds
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
-from tests.parallel.test_moving import RESTLESS, uneven
+from tests.parallel.test_node_groups import RESTLESS, groups_of, pids_of, uneven
 from tests.parallel.test_parallel_worlds import drive as drive_view
 from tests.parallel.test_parallel_worlds import settings
 from tests.support.vec_runs import STEPS, Make, drive, same
@@ -61,9 +59,8 @@ def whole(make: Make) -> Any:
     return drive(make("grid4x4", **WANTED))
 
 
-def remote(vec: CavVectorEnv) -> RemoteWorlds:
-    assert isinstance(vec.worlds, RemoteWorlds)
-    return vec.worlds
+def losses_of(vec: CavVectorEnv) -> list[int]:
+    return [group.pool.losses for group in groups_of(vec)]
 
 
 def nodes_of(pids: list[int]) -> list[int]:
@@ -85,8 +82,8 @@ def test_machines_change_nothing(make: Make, cluster: Any, arguments: dict[str, 
     vec = make(backend="ray:2", **wanted)
     assert same(drive(vec), here)
     assert same(drive(vec), here)
-    assert remote(vec).pool.deaths == []
-    assert len(set(nodes_of(remote(vec).pool.pids))) == 2
+    assert losses_of(vec) == [0, 0]
+    assert len(set(nodes_of(pids_of(vec)))) == 2
 
 
 def test_chosen_worlds_begin_anew_on_their_machines(make: Make, cluster: Any) -> None:
@@ -96,8 +93,8 @@ def test_chosen_worlds_begin_anew_on_their_machines(make: Make, cluster: Any) ->
         vec = make("grid4x4", **WANTED, **arguments)
         drive(vec, steps=3)
         if arguments:
-            assert len(remote(vec).pool.pids) == 3
-            os.kill(remote(vec).pool.pids[0], signal.SIGKILL)
+            assert len(pids_of(vec)) == 3
+            os.kill(pids_of(vec)[0], signal.SIGKILL)
         observations, infos = vec.reset(options={"reset_mask": chosen})
         found.append([observations, infos["mask"], *(vec.state_hash(w) for w in range(5))])
     assert same(*found)
@@ -107,19 +104,19 @@ def test_chosen_worlds_begin_anew_on_their_machines(make: Make, cluster: Any) ->
 def test_an_actor_that_dies_is_not_missed(
     make: Make, cluster: Any, whole: Any, how: signal.Signals
 ) -> None:
-    vec = make("grid4x4", backend="ray:2", **WANTED)
+    vec = make("grid4x4", backend="ray:2", overrides={"workers.timeout_s": 2.0}, **WANTED)
     struck: list[int] = []
     times: list[float] = []
 
     def strike(step: int) -> None:
         if step % 6 == 3:
-            struck.append(remote(vec).pool.pids[step // 6])
+            struck.append(pids_of(vec)[step // 6])
             times.append(time.time())
             os.kill(struck[-1], how)
 
     assert same(drive(vec, before=strike), whole)
-    assert [death.worker for death in remote(vec).pool.deaths] == [0, 1]
-    assert psutil.Process(remote(vec).pool.pids[0]).create_time() < times[0]  # the spare one
+    assert losses_of(vec) == [1, 1]
+    assert psutil.Process(pids_of(vec)[0]).create_time() < times[0]  # the spare one
     await_true(lambda: not any(psutil.pid_exists(pid) for pid in struck), for_s=20.0)
 
 
@@ -129,15 +126,15 @@ def test_an_actor_that_dies_in_the_middle_of_a_step(make: Make, cluster: Any, wh
 
     def strike(step: int) -> None:
         if step in (2, 9):
-            pid = remote(vec).pool.pids[step % 2]
+            pid = pids_of(vec)[step % 2]
             timers.append(Timer(0.001 * step, os.kill, (pid, signal.SIGKILL)))
             timers[-1].start()
 
     assert same(drive(vec, before=strike), whole)
     for timer in timers:
         timer.join()
-    remote(vec).pool.ping()
-    assert len(remote(vec).pool.deaths) == 2
+    drive(vec, steps=1)
+    assert losses_of(vec) == [1, 1]
 
 
 @pytest.mark.parametrize("more", [{"backend": "ray:1"}, {"backend": "ray"}])
@@ -146,23 +143,19 @@ def test_the_view_of_pettingzoo_is_the_one_of_one_process(
 ) -> None:
     whole = drive_view(parallel_env("grid4x4", **settings("open", "dict")))
     env = parallel_env("grid4x4", **settings("open", "dict"), **more)
-    assert isinstance(env.worlds, RemoteWorlds)
-    pool = env.worlds.pool
+    pools = [group.pool for group in getattr(env.worlds, "groups", [env.worlds])]
 
     def kill(step: int) -> None:
         if step % 9 == 4:
-            pool.await_spare()
-            os.kill(pool.pids[0], signal.SIGKILL)
+            os.kill(pools[0].pids[0], signal.SIGKILL)
 
     assert drive_view(env, before=kill) == whole
-    assert pool.deaths
+    assert pools[0].losses > 0
     with pytest.raises(ConfigError, match="backend='local'"):
         _ = env.simulation
-    pids = pool.pids
+    pids = pools[0].pids
     env.close()
     await_true(lambda: not any(psutil.pid_exists(pid) for pid in pids))
-    with pytest.raises(WorkerError, match="closed"):
-        env.reset(seed=0)
 
 
 def test_worlds_that_move_between_nodes_are_the_same(
@@ -172,15 +165,14 @@ def test_worlds_that_move_between_nodes_are_the_same(
     whole = drive(make("grid4x4", **WANTED), steps=16)
     vec = make("grid4x4", backend="ray:3", overrides=RESTLESS, **WANTED)
     vec.reset(seed=0)
-    assert len(set(nodes_of(remote(vec).pool.pids))) == 2
+    assert len(set(nodes_of(pids_of(vec)))) == 2
 
     def strike(step: int) -> None:
         if step in (5, 11):
-            remote(vec).pool.await_spare()
-            os.kill(remote(vec).pool.pids[step % 3], signal.SIGKILL)
+            os.kill(pids_of(vec)[step % 3], signal.SIGKILL)
 
     assert same(drive(vec, steps=16, before=strike), whole)
-    assert len(remote(vec).pool.deaths) == 2
+    assert sum(losses_of(vec)) == 2
     assert sum(uneven) > 0
 
 
@@ -205,7 +197,7 @@ def test_errors_are_those_of_one_process(make: Make, cluster: Any) -> None:
 def test_nothing_is_left_behind_and_the_cluster_stays(make: Make, cluster: Any) -> None:
     vec = make("ring", num_envs=2, backend="ray:2")
     vec.reset(seed=0)
-    pids = remote(vec).pool.pids
+    pids = pids_of(vec)
     vec.close()
     await_true(lambda: not any(psutil.pid_exists(pid) for pid in pids))
     await_true(lambda: ray.available_resources().get("CPU") == 3.0)
@@ -218,7 +210,7 @@ def test_a_node_that_dies_is_not_missed(make: Make, cluster: Any, whole: Any) ->
     vec = make("grid4x4", backend="ray:4", **WANTED)
     raylet = node.all_processes["raylet"][0].process.pid
     vec.reset(seed=0)
-    pids = remote(vec).pool.pids
+    pids = pids_of(vec)
     victim = nodes_of(pids).index(raylet)
 
     def strike(step: int) -> None:
@@ -227,8 +219,8 @@ def test_a_node_that_dies_is_not_missed(make: Make, cluster: Any, whole: Any) ->
             await_true(lambda: not psutil.pid_exists(pids[victim]))  # it ends with its raylet
 
     assert same(drive(vec, before=strike), whole)
-    assert victim in {death.worker for death in remote(vec).pool.deaths}
-    assert raylet not in nodes_of(remote(vec).pool.pids)
+    assert losses_of(vec)[victim] == 1
+    assert raylet not in nodes_of(pids_of(vec))
 
 
 KILLED = """
@@ -239,7 +231,7 @@ from cavmarl import make_vec
 if __name__ == "__main__":
     vec = make_vec("ring", num_envs=2, backend="ray:2")
     vec.reset(seed=0)
-    print("pids", *vec.worlds.pool.pids, flush=True)
+    print("pids", *(group.pool.pids[0] for group in vec.worlds.groups), flush=True)
     os.kill(os.getpid(), signal.SIGKILL)
 """
 

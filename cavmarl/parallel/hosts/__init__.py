@@ -1,1 +1,0 @@
-"""Workers on other machines: frames over sockets, and Ray's actors that run them."""

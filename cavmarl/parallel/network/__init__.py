@@ -1,0 +1,1 @@
+"""Connections with processes that share nothing, and the Ray cluster that may start them."""
