@@ -13,6 +13,7 @@ from cavmarl.client.world_flows import flatten, pack
 from cavmarl.core.errors import CapacityError, ConfigError, MissingExtraError
 from cavmarl.env.vector import make_vec
 from cavmarl.parallel.local_worlds import LocalWorlds, kept_elsewhere
+from cavmarl.parallel.nodes.node_groups import NodeGroups
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.service.configurations import world_keywords
 from cavmarl.service.refusals import problem
@@ -50,7 +51,7 @@ class SessionWorld:
             **(world_keywords(document) | keys),
         )
         # Their zones are here or at nodes, never at workers.
-        self._worlds: LocalWorlds | NodeWorlds = self._vec.worlds  # type: ignore[assignment]
+        self._worlds: LocalWorlds | NodeWorlds | NodeGroups = self._vec.worlds  # type: ignore[assignment]
         self._told = [0] * len(self._worlds.transfers)  # transfers that the service has of each
         self._last = b""  # the answer to the last command
         self.is_changed = self.is_commanded = False
