@@ -22,6 +22,7 @@ from cavmarl.parallel.world_errors import own_error
 log = logging.getLogger("cavmarl.nodes")
 
 LOOK_MS = 20.0  # between looks for callers, before the worlds begin
+END_S = 1.0  # for those that wait to hear that they are needed no more
 ANYONE = (1 << 32) - 1  # the number of a node that takes any
 
 
@@ -112,6 +113,10 @@ class Newcomers:
             if why is not None:
                 raise WorkerError(why)
 
+    def asked(self, number: int) -> int:
+        """Return the number with which one of them was started."""
+        return self._all[number].asked
+
     def take(self, number: int) -> tuple[Newcomer, Link]:
         """One that is ready, and its connection."""
         self.ready.remove(number)
@@ -174,5 +179,5 @@ class Newcomers:
 
     def close(self) -> None:
         """Send all away, and hear no more."""
-        self._links.end(0.0)
+        self._links.end(END_S)
         self._listener.close()

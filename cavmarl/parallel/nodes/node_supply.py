@@ -15,7 +15,7 @@ from cavmarl.parallel.journaled_worlds import unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
 from cavmarl.parallel.nodes.leases import lease_ticks
 from cavmarl.parallel.nodes.link import Link
-from cavmarl.parallel.nodes.newcomers import Newcomer, Newcomers
+from cavmarl.parallel.nodes.newcomers import ANYONE, Newcomer, Newcomers
 from cavmarl.parallel.nodes.node_files import files_of
 from cavmarl.parallel.nodes.node_starters import LocalNodes, Route, Start, start_nodes, straight
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
@@ -55,6 +55,7 @@ class NodeSupply:
             LocalWorlds(unwatched(world), 1, warm=True)
         self._join_timeout_s = config.workers.join_timeout_s
         self._lock, self._pid = RLock(), os.getpid()
+        self._are_there = False  # all nodes that the pools want have been there
         self._begun: list[int] = []  # processes of the nodes of pools
         files = files_of(config, base_dir)
         self._starter, listener = start(backend, num_worlds, config.workers, base_dir, route)
@@ -101,12 +102,20 @@ class NodeSupply:
             return self._starter.trouble(self._begun)
 
         with self._lock:
-            newcomers = self.newcomers
-            if waits:
-                newcomers.await_ready(num, self._join_timeout_s, why)
-            found = [newcomers.take(number) for number in list(newcomers.ready)[:num]]
+            newcomers, wanted = self.newcomers, num
+            while waits and len(self._usable()) < num:
+                newcomers.await_ready(wanted, self._join_timeout_s, why)
+                wanted = len(newcomers.ready) + 1
+            found = [newcomers.take(number) for number in self._usable()[:num]]
             self._begun += [newcomer.pid for newcomer, _ in found]
+            self._are_there |= len(self._begun) == self.count
             return found
+
+    def _usable(self) -> list[int]:
+        """Return which are ready; none that was started to spare before all others were there."""
+        newcomers, spares = self.newcomers, range(self.count, ANYONE)
+        ready = newcomers.ready
+        return [n for n in ready if self._are_there or newcomers.asked(n) not in spares]
 
     def replace(self, node: Newcomer, is_silent: bool) -> None:
         """A node of a pool is lost: start another one in its place."""
