@@ -98,7 +98,7 @@ class LocalWorlds:
 
     def in_flight(self, world: int) -> Sequence[TransferInFlight]:
         """Vehicles of one world whose next zone holds their state already."""
-        return self.simulation.zone_view(world).transfers
+        return self.simulation.zones.view(world).transfers
 
     def reset(self, seed: int | None, first_world: int) -> None:
         arrays, chosen = self.arrays, self.arrays.chosen

@@ -291,7 +291,7 @@ def test_the_monitor_takes_as_much_memory_as_it_began_with() -> None:
 
 
 def test_ghosts_that_are_handed_out_cannot_be_written(simulation: Simulation) -> None:
-    ghosts = simulation.ghosts(1)
+    ghosts = simulation.zones.ghosts(1)
     assert len(ghosts)
     with pytest.raises(ValueError, match="read-only"):
         ghosts["x"][0] = 0.0

@@ -33,7 +33,7 @@ def test_owners_stand_beside_the_vehicles_and_ghosts_are_those_near(divided: Sim
     for _ in range(10):
         drive(divided)
         for world in range(2):
-            view, rows = divided.zone_view(world), divided.vehicles(world)
+            view, rows = divided.zones.view(world), divided.vehicles(world)
             for row, owner in zip(rows, view.owners.tolist(), strict=True):
                 away = [squared_distance(rects, k, row["x"], row["y"]) for k in range(len(rects))]
                 # Who has crossed in this tick is handed over when the next one begins.
@@ -47,7 +47,7 @@ def test_owners_stand_beside_the_vehicles_and_ghosts_are_those_near(divided: Sim
 
 
 def test_a_view_stays_what_it_was(divided: Simulation) -> None:
-    view = divided.zone_view()
+    view = divided.zones.view()
     before = [ghosts.copy() for ghosts in view.ghosts]
     for _ in range(20):
         drive(divided)

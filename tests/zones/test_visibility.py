@@ -45,13 +45,13 @@ def driven(path: Path, **overrides: object) -> DrivenWorld:
 
 
 def ghosts(world: DrivenWorld) -> int:
-    return int(world.simulation.zone_loads().ghosts.sum())
+    return int(world.simulation.zones.loads().ghosts.sum())
 
 
 def test_a_named_halo_is_seen_whole_and_nobody_can_tell(blocks: Path) -> None:
     """More ghosts, the same world."""
     narrow = driven(blocks)
-    whole = driven(blocks, **{"zones.halo_m": narrow.simulation.zone_loads().halo_m})
+    whole = driven(blocks, **{"zones.halo_m": narrow.simulation.zones.loads().halo_m})
     assert ghosts(narrow) < 0.9 * ghosts(whole)
     assert narrow.simulation.state_hash() == whole.simulation.state_hash()
 

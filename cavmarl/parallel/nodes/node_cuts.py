@@ -78,4 +78,4 @@ def cut_worlds(simulation: Simulation, peers: NodePeers, told: Sequence[Sequence
     with peers.whole(simulation):
         vehicles = [division.vehicles(w).copy() for w in range(division.num_worlds)]
         contacts = division.contacts()
-    simulation.cut(read_zones(told), vehicles, contacts)
+    simulation.zones.repartition(read_zones(told), vehicles, contacts)

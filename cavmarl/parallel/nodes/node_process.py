@@ -140,7 +140,7 @@ class NodeProgram:
         self._clock = ShardClock(own, MEASURED_TICKS) if every else None
         plain = NodeExecutor(own, foreign)
         executor = plain if self._clock is None else TimedNodeExecutor(plain, self._clock)
-        simulation.share(self._peers, self._hosts, executor)
+        simulation.zones.host_zones(self._peers, self._hosts, executor)
 
     def _hear(self, number: int, frame: NodeFrame) -> None:
         """Take an urgent frame."""
@@ -221,7 +221,7 @@ class NodeProgram:
         zones = told["zones"]
         others = [node for node, some in enumerate(zones) if some and node != self._number]
         self._meet({node: (host, port) for node, (host, port) in told["places"]}, others)
-        self._worlds.simulation.divide(read_zones(told["partition"]))
+        self._worlds.simulation.zones.set_zones(read_zones(told["partition"]))
         self._share(zones, told["runs"], told["hostings"], frame.number)
         for node in others:
             links.send(node, FrameKind.SYNC, frame.number)
