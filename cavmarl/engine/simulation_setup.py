@@ -57,9 +57,9 @@ def call_rare_kernels(tick: Tick) -> None:
     tick.executor.gather(*division.gathering)
     division.rehearse_gathering()
     tick.traffic.settle(gate, tick.worlds)
-    division.near(0, everybody=True)
+    division.changes.near(0, everybody=True)
     with suppress(ConfigError):
-        division.hand_over(0, Switch(-1, 0, 0, 0, False))
+        division.changes.hand_over(0, Switch(-1, 0, 0, 0, False))
     book = HandoffLog(division, 0)
     book.release(book.hand_over(True, sum(division.counts(0)), ()))
     book.reset(0)

@@ -55,14 +55,14 @@ class Halves:
             shard = Shard(
                 whole.config,
                 whole.network,
-                traffic.plans,
-                traffic.travel,
-                zoned,
-                self.shared.outputs,
-                zone,
-                partition.arrays,
-                halo,
-                shards[0] if shards else None,
+                plans=traffic.plans,
+                travel=traffic.travel,
+                zoned=zoned,
+                outputs=self.shared.outputs,
+                zone=zone,
+                zones=partition.arrays,
+                halo=halo,
+                first=shards[0] if shards else None,
             )
             shards.append(shard)
         self.shards = shards

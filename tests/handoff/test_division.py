@@ -88,9 +88,9 @@ def test_a_vehicle_that_a_zone_has_not_seen_come_is_an_error() -> None:
         shard.worlds.num_rows[:] = shard.worlds.num_owned
     division = simulation._tick.division
     with pytest.raises(ConfigError, match=f"vehicle {here} entered zone 3, which has not seen"):
-        division.hand_over(0, Switch(here, 0, 3, 1, False))
+        division.changes.hand_over(0, Switch(here, 0, 3, 1, False))
     with pytest.raises(ConfigError, match=f"zone 0 does not own vehicle {there}"):
-        division.hand_over(0, Switch(there, 0, 3, 1, False))
+        division.changes.hand_over(0, Switch(there, 0, 3, 1, False))
 
 
 def test_a_collision_over_a_border_is_found_once_and_of_both() -> None:

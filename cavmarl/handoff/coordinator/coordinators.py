@@ -111,7 +111,7 @@ class Coordinators:
         """Zones are others, between two ticks: at the next one all vehicles are checked."""
         for w, coordinator in enumerate(self.coordinators):
             births, gone = coordinator.notes()
-            coordinator.resume(self._division.settle_newborn(w, births), gone)
+            coordinator.resume(self._division.changes.settle_newborn(w, births), gone)
             self._stirred[w] = True
 
     def begin(self, commands: Commands) -> None:

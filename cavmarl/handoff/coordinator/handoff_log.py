@@ -39,8 +39,8 @@ class HandoffLog:
         self._division = division
         self._world = world
         self._book = division.book
-        self._hand_over = division.call_hand_over
-        self._release = division.call_release
+        self._hand_over = division.changes.hand_over_all
+        self._release = division.changes.release_all
         self._neighbours = division.neighbours
         self._teleports: set[tuple[int, int]] = set()  # tick and vehicle, of changes not taken yet
 
@@ -108,7 +108,7 @@ class HandoffLog:
             raise ConfigError(f"zone {change.source} does not own vehicle {change.vehicle}")
         if not self._division.neighbours[change.source, change.target]:
             raise self._no_neighbour(change)
-        raise self._division.unseen(change.vehicle, change.target)
+        raise self._division.changes.unseen(change.vehicle, change.target)
 
     def _no_neighbour(self, change: OwnerChange) -> ProtocolError:
         zones = np.flatnonzero(self._division.neighbours[change.source]).tolist()

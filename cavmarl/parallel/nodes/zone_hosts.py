@@ -212,7 +212,7 @@ class ZoneHosts:
         endpoints = self._endpoints[w].values()
         if self._began[w] or self._stirred[w] or self._gone[w] or self._births[w]:
             return False
-        if self._is_checked or self._division.near(w, everybody=False):
+        if self._is_checked or self._division.changes.near(w, everybody=False):
             return False
         if any(endpoint.offers.open for endpoint in endpoints):
             return False
@@ -253,14 +253,14 @@ class ZoneHosts:
         everybody, self._stirred[w] = self._stirred[w] or began, False
         approaches: dict[int, list[Approach]] = {zone: [] for zone in endpoints}
         movers, is_late = [], False
-        for entry in division.near(w, everybody):
+        for entry in division.changes.near(w, everybody):
             endpoint = endpoints.get(entry.source)
             if not entry.crossed or endpoint is None:
                 continue
             if began or entry.vehicle not in endpoint.owned:
                 is_late = True
             else:
-                state = division.state(w, entry.source, entry.row)
+                state = division.changes.state(w, entry.source, entry.row)
                 approaches[entry.source].append(Approach(entry.vehicle, entry.target, state))
                 self._targets[w][entry.vehicle] = entry.target
                 movers.append((entry.vehicle, entry.target, state_digest(state).hex()))
@@ -309,18 +309,18 @@ class ZoneHosts:
         for zone, advance in leases.items():
             for vehicle in advance.leave:
                 self._send_agent(w, zone, vehicle)
-                division.give_up(w, zone, vehicle)
+                division.changes.give_up(w, zone, vehicle)
                 left.add(vehicle)
         for zone, advance in leases.items():
             owned = self._endpoints[w][zone].owned
             for vehicle, state in advance.enter:
-                division.take_over(w, zone, vehicle, owned[vehicle], state)
+                division.changes.take_over(w, zone, vehicle, owned[vehicle], state)
                 if vehicle not in left:
                     self._take_agent(w, vehicle)
 
     def _agent(self, w: int, vehicle: int) -> int:
         """The agent whose vehicle it is; -1: none."""
-        zone, row = self._division.find(w, vehicle)
+        zone, row = self._division.changes.find(w, vehicle)
         return int(self._division.owned(w, zone)["agent"][row])
 
     def _send_agent(self, w: int, zone: int, vehicle: int) -> None:
