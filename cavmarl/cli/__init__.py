@@ -36,20 +36,27 @@ from cavmarl.cli import (
     zoo,
 )
 from cavmarl.cli.output import about, print_error
-from cavmarl.cli.verify import determinism as verify_determinism
-from cavmarl.core.errors import CavmarlError
+from cavmarl.core.errors import CavmarlError, ConfigError
 from cavmarl.core.tracebacks import print_traceback
 
 __all__ = ["app", "main"]
 
 
+REMOVED = {"verify-determinism": "verify determinism"}  # command → what replaces it
+
+
 class _Group(TyperGroup):
-    """Loads `map` when it is asked for: what it stands on takes longer than other commands do."""
+    """Loads `map` when it is asked for: what it stands on takes longer than other commands do.
+
+    Refuses commands that have been removed, and names what replaces them.
+    """
 
     def list_commands(self, ctx: Any) -> list[str]:
         return [*super().list_commands(ctx), "map"]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        if cmd_name in REMOVED:
+            raise ConfigError(f"{cmd_name} is no command: use cavmarl {REMOVED[cmd_name]}")
         if cmd_name != "map":
             return super().get_command(ctx, cmd_name)
         found = typer.main.get_group(import_module("cavmarl.cli.map").app)
@@ -68,8 +75,6 @@ app.command()(evaluate.evaluate)
 app.command()(evaluate.report)
 app.command()(suite.suite)
 app.command()(baseline.baseline)
-app.command()(verify.verify)
-app.command()(verify_determinism.verify_determinism)
 app.command()(journal.journal)
 app.command()(plan.plan)
 app.command()(lead.lead)
@@ -92,6 +97,7 @@ app.command("list")(listing.list_entries)
 app.add_typer(demand.app, name="demand")
 app.add_typer(bench.app, name="bench")
 app.add_typer(scenario.app, name="scenario")
+app.add_typer(verify.app, name="verify")
 app.add_typer(zoo.app, name="zoo")
 
 

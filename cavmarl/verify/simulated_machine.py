@@ -98,7 +98,8 @@ class SimulatedMachine:
         self.numbers = count(100)  # of sockets
         self.connections: list[tuple[SimulatedSocket, SimulatedSocket]] = []
         self._events: list[tuple[float, int, Callable[[], None]]] = []
-        self._moves = count()
+        self._moves = count()  # of processes, in all
+        self._event_numbers = count()  # of two events at the same time the first one comes first
         self._threads: list[threading.Thread] = []
         self.frames = count()
         self.before_send: Callable[[SimulatedSocket, bytes], None] = lambda end, data: None
@@ -145,7 +146,7 @@ class SimulatedMachine:
 
     def at(self, delay_s: float, act: Callable[[], None]) -> None:
         """Let something happen later."""
-        heapq.heappush(self._events, (self.now_s + delay_s, next(self._moves), act))
+        heapq.heappush(self._events, (self.now_s + delay_s, next(self._event_numbers), act))
 
     def end(self, process: SimulatedProcess) -> None:
         """As SIGKILL: it does nothing more, and its connections end."""
@@ -204,7 +205,7 @@ class SimulatedMachine:
 
     def close(self) -> None:
         """End all processes but the caller."""
-        self.stuck = ""
+        self.stuck, self._moves = "", count()
         for process in list(self.processes):
             if process is not self.caller:
                 self.end(process)

@@ -63,6 +63,21 @@ MIXES = (NONE, *map(str, FAULTS), TWO, FOUR, MANY_TOLERATED, MANY, *map(str, CAL
 RATES = {MANY_TOLERATED: TOLERATED_RATES, MANY: {**TOLERATED_RATES, **SEVERE_RATES}}
 
 
+# A world in which many vehicles change their zone, for campaigns that name none.
+BUSY = WorldSpec(
+    env="grid4x4",
+    overrides={
+        "population.mode": "respawn",
+        "population.agents": 8,
+        "population.background": 120,
+        "clock.sim_dt_s": 0.1,
+        "clock.ctrl_dt_s": 0.4,
+        "clock.control_latency_ticks": 3,
+        "sensors.stack": 2,
+    },
+)
+
+
 class SimulatedNodes:
     """Starts nodes as processes of a simulated machine; a `NodeStarter`."""
 
@@ -263,7 +278,7 @@ class _Run:
         self._machine.caller.clock = random_clock(self._drawn)
         self._faults = SimulatedFaults(self._machine, self._drawn, RATES.get(line.mix, {}))
         self._losses = 0  # nodes that are lost
-        # when the newest state was kept that all nodes can go back to: nodes lost before, and living
+        # nodes lost before, and living when, all nodes kept the state that they can go back to
         self._losses_before, self._living = 0, line.nodes
 
     def whole(self) -> None:
