@@ -7,7 +7,7 @@ import random
 import signal
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -108,8 +108,13 @@ def verify_nodes(
         drawn = random.Random(spec.seed)
         struck = drawn.sample(range(FIRST_STEPS, steps), min(kills, number - 1))
         kill = partial(pair.strike, drawn, signal.SIGKILL)
-        found.append(pair.compare(steps, dict.fromkeys(struck, kill).get, note))
+        due = partial(_due, dict[int, Callable[[], object]].fromkeys(struck, kill))
+        found.append(pair.compare(steps, due, note))
     return NodeReport(spec.env, count, worlds, steps, tuple(found))
+
+
+def _due(strikes: Mapping[int, Callable[[], object]], step: int) -> Callable[[], object] | None:
+    return strikes.get(step)
 
 
 class ComparedWorlds:
@@ -140,7 +145,7 @@ class ComparedWorlds:
     def compare(
         self,
         steps: int,
-        due: Callable[[int], Callable[[], None] | None],  # step → what happens during it
+        due: Callable[[int], Callable[[], object] | None],  # step → what happens during it
         note: Callable[[int], None],
         goes_on: Callable[[int], bool] = lambda step: False,  # after more steps than `steps`
     ) -> NodeRun:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 SIMULATED, PROCESSES, CAMPAIGN = "simulated", "processes", "campaign"
 NODES = "2,3,4"
-STEPS, SEEDS, PROCESS_RUNS = 200, 75, 3
+STEPS, SEEDS, PROCESS_RUNS = 200, 65, 3
 
 Env = Annotated[
     str | None,
