@@ -69,7 +69,10 @@ def test_the_workers_of_one_world_are_killed(capsys: pytest.CaptureFixture[str])
         ),
         (("verify", "workers", "ring", "--kill", "0"), ("0 kills", "at least 1")),
         (("verify", "workers", "ring", "--kill", "5", "--steps", "7"), ("7 steps", "at least 15")),
-        (("verify", "workers", "ring", "--kill", "1", "--zones", "1,2"), ("--zones", "1,2")),
+        (
+            ("verify", "workers", "ring", "--kill", "1", "--zones", "1,2"),
+            ("--zones", "valid integer"),
+        ),
         (
             ("verify", "workers", "ring", "--kill", "1", "--layout", "grid"),
             ("No such option", "--layout"),
