@@ -69,13 +69,7 @@ REACHABLE_LINES = 72_500  # from `make_vec` and `parallel_env`
 SHARED_MODULE_NAMES: set[str] = set()
 
 # Public classes of one name in several modules.
-SHARED_CLASS_NAMES = set(
-    """
-    Answer Camera Change Clock Collector Control Difference Entry Follower Heard Host Image Job
-    Line Measured Moment Monitor Mount Move Outcome Parameters Placement Plan Pose Program Rates
-    Refusal Replica Room Row Run Samples Scene Schedule Seat Selection Sensor SensorJob Sight
-    Within Simulation Snapshot State Spread SumoConfig Tally Tick Turn Watch Window World
-    """.split()
+SHARED_CLASS_NAMES = {"Job", "Parameters", "Spread", "Turn", "Within"}
 )
 
 # Persons where the field says vehicle, zone, worker. These numbers may only fall.

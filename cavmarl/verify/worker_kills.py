@@ -141,7 +141,9 @@ def verify_kills(
 
 def _pool(vec: CavVectorEnv) -> Pool | HostPool:
     if not isinstance(vec.worlds, PooledWorlds | RemoteWorlds):
-        raise ConfigError("fewer worlds than workers on Ray: use verify --nodes, or more worlds")
+        raise ConfigError(
+            "fewer worlds than workers on Ray: use cavmarl verify nodes, or more worlds"
+        )
     return vec.worlds.pool
 
 

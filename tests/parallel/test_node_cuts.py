@@ -160,7 +160,7 @@ def test_simulated_nodes_fail_while_zones_are_cut_anew(
 
     monkeypatch.setattr(node_process, "cut_worlds", counted)
     found = verify_simulated_nodes(
-        "merge", [3], mixes=[mix], seeds=2, agents=3, background=20, zones=3, steps=10,
+        "merge", [3], mixes=[mix], seeds=6, agents=3, background=20, zones=3, steps=10,
         overrides={"zones.repartition_steps": 2, "zones.repartition_tolerance": 0.0},
     )  # fmt: skip
     (line,) = found.lines

@@ -80,7 +80,7 @@ def test_nodes_are_actors_and_a_lost_one_comes_back() -> None:
 
 
 def test_hosts_are_killed_and_nobody_can_tell() -> None:
-    command = ["verify", "ring", "--agents", "3", "--background", "4", "--kill", "2"]
+    command = ["verify", "workers", "ring", "--agents", "3", "--background", "4", "--kill", "2"]
     done = subprocess.run(
         [sys.executable, "-m", "cavmarl", *command, "--hosts", "ray"],
         cwd=ROOT, capture_output=True, text=True, timeout=200,
@@ -92,11 +92,14 @@ def test_hosts_are_killed_and_nobody_can_tell() -> None:
 def test_zones_over_ray_are_verified_as_nodes() -> None:
     world = ["town", "--agents", "3", "--worlds", "1", "--zones", "4"]
     done = subprocess.run(
-        [sys.executable, "-m", "cavmarl", "verify", *world, "--kill", "2", "--hosts", "ray"],
+        [
+            sys.executable, "-m", "cavmarl", "verify", "workers", *world, "--kill", "2",
+            "--hosts", "ray",
+        ],
         cwd=ROOT, capture_output=True, text=True, timeout=200,
     )  # fmt: skip
     assert done.returncode == 2
-    assert "use verify --nodes" in done.stderr
+    assert "use cavmarl verify nodes" in done.stderr
 
 
 def test_a_cluster_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -96,9 +96,11 @@ class KeptStates:
                 self._links.send(taker, FrameKind.GIVE, generation, [data])
         for donor in donors:
             check()
+            self._links.wanted = (donor,)
             while donor not in self._given or self._given[donor].number != generation:
                 self._links.pump(None)
                 check()  # it may take what is awaited
+            self._links.wanted = ()
             given = from_bytes(self._given.pop(donor).data, like)
             if saved is None:
                 saved = given

@@ -21,7 +21,15 @@ Urgent: TypeAlias = Callable[[int, NodeFrame], None]
 
 
 class SilenceError(Exception):
-    """Nothing has come for long."""
+    """Nothing has come for long.
+
+    Attributes:
+        awaited: nodes of which an answer to another node is awaited.
+    """
+
+    def __init__(self, text: str, awaited: Collection[int] = ()) -> None:
+        super().__init__(text)
+        self.awaited = awaited
 
 
 class LinkLostError(Exception):
@@ -52,7 +60,7 @@ class Links:
         self._poll = system.poll()
         self._by_socket: dict[int, tuple[int, Link]] = {}
         self._heard: deque[tuple[int, NodeFrame]] = deque()  # urgent frames, and their senders
-        self.wanted: Collection[int] = ()  # whose frames `take` waits for
+        self.wanted: Collection[int] = ()  # whose frames this process waits for
         self.waited_s = 0.0
         self.sent_bytes = 0
         self.sent_frames = 0
@@ -69,7 +77,7 @@ class Links:
 
     @property
     def awaited(self) -> list[int]:
-        """Whose frames `take` waits for."""
+        """Nodes whose frames this process waits for."""
         links = self._links
         return sorted(n for n in self.wanted if n not in links or not links[n].frames)
 

@@ -235,9 +235,10 @@ class NodeCoordinator:
         """
         until_s = self._links.now_s() + timeout_s
         for world in self._worlds:
-            while world.movers and not world.answered.issuperset(world.movers):
+            while missing := set(world.movers) - world.answered:
                 if self._links.now_s() > until_s:
-                    raise SilenceError(f"offers are not answered within {timeout_s:g} s")
+                    targets = {self._node_of[zone] for _, zone in missing}
+                    raise SilenceError(f"offers are not answered within {timeout_s:g} s", targets)
                 self._links.pump(1e3 * timeout_s)
         lease, messages = dict.fromkeys(self._node_of, b""), self._decide()
         return lease | self._by_node(messages) if messages else lease

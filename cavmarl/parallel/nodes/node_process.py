@@ -223,6 +223,10 @@ class NodeProgram:
         self._meet({node: (host, port) for node, (host, port) in told["places"]}, others)
         self._worlds.simulation.zones.set_zones(read_zones(told["partition"]))
         self._share(zones, told["runs"], told["hostings"], frame.number)
+        state, mine = int(told["state"]), zones[self._number]
+        if told["begins"]:  # what is kept elsewhere has come when the SYNC after it comes
+            self._peers.keep_own(self._worlds.simulation.everywhere)
+            self._kept.keep(state, self._living)
         for node in others:
             links.send(node, FrameKind.SYNC, frame.number)
         for node in others:
@@ -230,11 +234,7 @@ class NodeProgram:
                 found = links.next(node)
                 if found.kind is FrameKind.SYNC and found.number == frame.number:
                     break
-        state, mine = int(told["state"]), zones[self._number]
-        if told["begins"]:
-            self._peers.keep_own(self._worlds.simulation.everywhere)
-            self._kept.keep(state, self._living)
-        else:
+        if not told["begins"]:
             adopted = [number for number, heir in told["heirs"] if heir == self._number]
             donors = [donor for donor, taker in told["donors"] if taker == self._number]
             takers = [taker for donor, taker in told["donors"] if donor == self._number]
@@ -257,8 +257,11 @@ class NodeProgram:
                 found = call_node(self._system, places[other], self._secret, number, times, other)
                 links.add(other, found)
         if is_new:
-            callers = [node for node in others if node not in places or node > number]
+            links.wanted = callers = [
+                node for node in others if node not in places or node > number
+            ]
             called = calls_of(self._system, self._listener, callers, times, MEETING_S, self._check)
+            links.wanted = ()
             for other, connection in called.items():
                 links.add(other, connection)
 

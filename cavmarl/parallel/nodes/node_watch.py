@@ -54,8 +54,8 @@ class NodeWatch:
         """What comes of waiting, again and again as long as all nodes answer meanwhile.
 
         Raises:
-            SilentNodeError: one does not, its process is stopped, or another one waits for it in
-                vain.
+            SilentNodeError: one does not, its process is stopped, another one waits for it in
+                vain, or it has not answered another one in two silences.
             WorkerError: all answer, and nothing comes of it.
         """
         silence: SilenceError | None = None
@@ -63,8 +63,10 @@ class NodeWatch:
             try:
                 return self._wait(timeout_s, wait)
             except SilenceError as error:
-                silence = error
+                before, silence = silence, error
                 self._ask(living)
+                for number in sorted(set(before.awaited if before else ()) & set(error.awaited)):
+                    raise SilentNodeError(number, MessageError("it answers no offers")) from error
         raise WorkerError(f"{silence}, {VAIN} times, though all nodes live") from silence
 
     def _wait(self, timeout_s: float, wait: Callable[[float], Found]) -> Found:
@@ -82,7 +84,8 @@ class NodeWatch:
         try:
             return wait(left_s)
         except SilenceError as silence:
-            raise SilenceError(f"nothing has come for {timeout_s:g} s") from silence
+            text = f"nothing has come for {timeout_s:g} s"
+            raise SilenceError(text, silence.awaited) from silence
 
     def _ask(self, living: Sequence[int]) -> None:
         """Ask all nodes whether they live, and which nodes they wait for."""

@@ -339,9 +339,13 @@ class ZoneHosts:
         agent = self._agent(w, vehicle)
         if agent < 0:
             return
-        while (w, vehicle) not in self._come:
-            self._links.heed()
-            self._links.pump(None)
+        if (w, vehicle) not in self._come:
+            others = {node for zone, node in enumerate(self._node_of) if zone not in self._zones}
+            self._links.wanted = others  # all but the silent one have sent their next share
+            while (w, vehicle) not in self._come:
+                self._links.heed()
+                self._links.pump(None)
+            self._links.wanted = ()
         data, at = self._come.pop((w, vehicle)), 0
         for array in self._carried:
             kept = array[w, agent : agent + 1]
