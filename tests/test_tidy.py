@@ -62,7 +62,7 @@ PASSED_ON = {
 }
 
 # A new capability raises these two by what it needs; the commit says why.
-PACKAGE_LINES = 108_500
+PACKAGE_LINES = 109_000
 REACHABLE_LINES = 72_500  # from `make_vec` and `parallel_env`
 
 # Modules of one name, outside of cli/ and config/.
@@ -70,7 +70,6 @@ SHARED_MODULE_NAMES: set[str] = set()
 
 # Public classes of one name in several modules.
 SHARED_CLASS_NAMES = {"Job", "Parameters", "Spread", "Turn", "Within"}
-)
 
 # Persons where the field says vehicle, zone, worker. These numbers may only fall.
 PERSONS = re.compile(r"\b(who|whoever|nobody|somebody)\b", re.IGNORECASE)
