@@ -81,9 +81,11 @@ def _imported(tree: ast.Module) -> Iterator[tuple[str, str]]:
 def _called_by_plain(tree: ast.Module, kernels: set[str]) -> Iterator[str]:
     """Yield kernels that the same file names outside of kernels and of what makes kernels."""
     for statement in tree.body:
-        is_function = isinstance(statement, ast.FunctionDef)
-        makes_kernels = _is_made(statement) or (is_function and statement.name in _FACTORIES)
-        if not makes_kernels and not (is_function and _is_kernel(statement)):
+        is_of_kernels = _is_made(statement) or (
+            isinstance(statement, ast.FunctionDef)
+            and (_is_kernel(statement) or statement.name in _FACTORIES)
+        )
+        if not is_of_kernels:
             for node in ast.walk(statement):
                 if isinstance(node, ast.Name) and node.id in kernels:
                     yield node.id
