@@ -25,9 +25,10 @@ from cavmarl.engine.shared_outputs import SharedOutputs
 from cavmarl.engine.sumo_phases import SumoPhases
 from cavmarl.engine.tick_setup import cut_zones, make_frames, make_tick
 from cavmarl.engine.world_views import WorldViews
-from cavmarl.handoff.coordinator.coordinator_setup import WorldRun, make_coordinators
+from cavmarl.handoff.coordinator.coordinator_setup import OpenRun, make_coordinators
 from cavmarl.handoff.coordinator.coordinators import Coordination, Coordinators
 from cavmarl.handoff.coordinator.handoff_log import HandoffLog
+from cavmarl.handoff.coordinator.saved_ownership import SavedOwnership, zone_table
 from cavmarl.handoff.repartitioning import Recutter
 from cavmarl.ownership.messages import Switch
 from cavmarl.ownership.transfers import TransferLog
@@ -67,7 +68,7 @@ class Simulation(WorldViews):
         warm: bool = False,  # call every kernel now, so that none is loaded in a step
         zeros: Zeros = huge_zeros,  # makes the arrays that shards write
         like: Simulation | None = None,  # of the same environment, whose tables are used
-        runs: Sequence[WorldRun] | None = None,  # what coordinators go by; None: `config.zones`
+        runs: Sequence[OpenRun] | None = None,  # what coordinators go by; None: `config.zones`
         late_ticks: int = 0,  # for so many more a vehicle that has crossed may stay with its zone
     ) -> None:
         self.config = config
@@ -114,7 +115,7 @@ class Simulation(WorldViews):
                 )
             )
 
-    def _add_coordinators(self, runs: Sequence[WorldRun] | None) -> None:
+    def _add_coordinators(self, runs: Sequence[OpenRun] | None) -> None:
         """Coordinators, and what makes other zones, where the settings ask for them."""
         zones = self.config.zones
         watched = zones.journal or zones.check_invariants
@@ -134,7 +135,7 @@ class Simulation(WorldViews):
                 zones.repartition_tolerance,
             )
 
-    def _let_coordinate(self, runs: Sequence[WorldRun] | None) -> None:
+    def _let_coordinate(self, runs: Sequence[OpenRun] | None) -> None:
         """Let coordinators decide ownership; with one zone there are none."""
         tick = self._tick
         setup = make_coordinators(
@@ -331,6 +332,7 @@ class Simulation(WorldViews):
         """Go on from what `save` gave, in worlds of the same environment.
 
         Raises:
+            JournalError: the state is not one of the run whose journal this is.
             SumoError: SUMO moves vehicles there, and what it was told is not on record; see
                 `SumoTraffic.keep_logs`.
         """
@@ -351,9 +353,24 @@ class Simulation(WorldViews):
 
     def _put_back(self, saved: Sequence[NDArray[Any]], home: int | None = None) -> None:
         roots, episodes, *rest = saved
+        ownership = self._saved_ownership(rest)
         self.seed(*roots.tolist())
         self._episodes[:] = episodes
-        self._tick.gate = snapshot.load(self._parts(), rest, home)
+        self._tick.gate = snapshot.load(self._parts(), rest, ownership, home)
+
+    def _saved_ownership(self, saved: Sequence[NDArray[Any]]) -> list[SavedOwnership] | None:
+        """Who owns which vehicle in a saved state, if it is known and the zones are the same."""
+        found = snapshot.ownership_of(self._parts(), saved)
+        if found is None:
+            return None
+        if found[0].zones.tobytes() != zone_table(self.partition).tobytes():
+            if self._recutter is None:
+                return None
+            self.divide(found[0].partition())
+            self._tick.executor = ShardGroup(self._shards)
+        if self._recutter is not None:
+            self._recutter.steps = found[0].numbers.recut_steps
+        return found
 
     def share_of(self, world: int) -> list[NDArray[Any]]:
         """What `save` would give if there were no world but one; views, to be copied."""
@@ -377,6 +394,8 @@ class Simulation(WorldViews):
             traffic=tick.traffic,
             outputs=self.outputs,
             coordination=tick.coordination,
+            partition=self.partition,
+            recut_steps=0 if self._recutter is None else self._recutter.steps,
             has_past=self._carried_from < self.outputs.observations.shape[2],
             attached=tick.attached,
             sumo=tick.sumo.traffic,
