@@ -23,7 +23,8 @@ from cavmarl.engine.tick_setup import cut_zones, make_frames, make_tick
 from cavmarl.engine.v2x_component import without_network
 from cavmarl.engine.world_views import WorldViews
 from cavmarl.engine.zone_hosting import ZoneHosting
-from cavmarl.handoff.coordinator.coordinator_setup import WorldRun
+from cavmarl.handoff.coordinator.coordinator_setup import OpenRun
+from cavmarl.handoff.coordinator.saved_ownership import SavedOwnership
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.mounted.frames import Frames
 from cavmarl.sensors.observed import carried_from
@@ -57,7 +58,7 @@ class Simulation(WorldViews):
         warm: bool = False,  # call every kernel now, so that none is loaded in a step
         zeros: Zeros = huge_zeros,  # makes the arrays that shards write
         like: Simulation | None = None,  # of the same environment, whose tables are used
-        runs: Sequence[WorldRun] | None = None,  # what coordinators go by; None: `config.zones`
+        runs: Sequence[OpenRun] | None = None,  # what coordinators go by; None: `config.zones`
         late_ticks: int = 0,  # for so many more a vehicle that has crossed may stay with its zone
     ) -> None:
         self._carried_from = carried_from(config.sensors)
@@ -202,6 +203,7 @@ class Simulation(WorldViews):
         """Go on from what `save` gave, in worlds of the same environment.
 
         Raises:
+            JournalError: the state is not one of the run whose journal this is.
             SumoError: SUMO moves vehicles there, and what it was told is not on record; see
                 `SumoTraffic.keep_logs`.
         """
@@ -222,9 +224,15 @@ class Simulation(WorldViews):
 
     def _put_back(self, saved: Sequence[NDArray[Any]], home: int | None = None) -> None:
         roots, episodes, *rest = saved
+        ownership = self._saved_ownership(rest)
         self.seed(*roots.tolist())
         self._episodes[:] = episodes
-        self._tick.gate = snapshot.load(self._parts(), rest, home)
+        self._tick.gate = snapshot.load(self._parts(), rest, ownership, home)
+
+    def _saved_ownership(self, saved: Sequence[NDArray[Any]]) -> list[SavedOwnership] | None:
+        """Who owns which vehicle in a saved state, if it is known and the zones are the same."""
+        found = snapshot.ownership_of(self._parts(), saved)
+        return found if found is not None and self.zones.take_saved(found[0]) else None
 
     def share_of(self, world: int) -> list[NDArray[Any]]:
         """What `save` would give if there were no world but one; views, to be copied."""
@@ -248,6 +256,8 @@ class Simulation(WorldViews):
             traffic=tick.traffic,
             outputs=self.outputs,
             coordination=tick.coordination,
+            partition=self.partition,
+            recut_steps=self.zones.recut_steps,
             has_past=self._carried_from < self.outputs.observations.shape[2],
             attached=tick.attached,
             sumo=tick.sumo.traffic,

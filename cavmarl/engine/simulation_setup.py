@@ -10,7 +10,7 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.engine.sumo_phases import SumoPhases
 from cavmarl.engine.tick import Tick
-from cavmarl.handoff.coordinator.coordinator_setup import WorldRun, make_coordinators
+from cavmarl.handoff.coordinator.coordinator_setup import OpenRun, make_coordinators
 from cavmarl.handoff.coordinator.handoff_log import HandoffLog
 from cavmarl.ownership.messages import Switch
 from cavmarl.ownership.transfers import TransferLog
@@ -29,7 +29,7 @@ def add_sumo(tick: Tick, demand: object, network: RoadNetwork) -> None:
 
 
 def add_coordinators(
-    tick: Tick, config: EnvConfig, network: RoadNetwork, runs: Sequence[WorldRun] | None
+    tick: Tick, config: EnvConfig, network: RoadNetwork, runs: Sequence[OpenRun] | None
 ) -> tuple[TransferLog, ...]:
     """Let coordinators decide ownership, if there are several zones or they are watched.
 

@@ -13,6 +13,7 @@ from cavmarl.engine.peers import Peers
 from cavmarl.engine.shard_clock import ShardClock
 from cavmarl.engine.tick import Tick
 from cavmarl.handoff.coordinator.coordinators import Coordination, Coordinators
+from cavmarl.handoff.coordinator.saved_ownership import SavedOwnership, zone_table
 from cavmarl.handoff.division import ZoneLoads
 from cavmarl.handoff.repartitioning import Recut, Recutter
 from cavmarl.handoff.zone_view import ZoneView, view_zones
@@ -105,6 +106,25 @@ class ZoneHosting:
         clock = ShardClock(self._tick.shards, every)
         self._tick.executor = clock
         return clock
+
+    def take_saved(self, saved: SavedOwnership) -> bool:
+        """Take the zones of a saved state; return whether the worlds have these zones now.
+
+        Other zones than the present ones are taken only if zones may change while worlds run.
+        """
+        if saved.zones.tobytes() != zone_table(self.partition).tobytes():
+            if self._recutter is None:
+                return False
+            self.set_zones(saved.partition())
+            self._tick.executor = ShardGroup(self._tick.shards)
+        if self._recutter is not None:
+            self._recutter.steps = saved.numbers.recut_steps
+        return True
+
+    @property
+    def recut_steps(self) -> int:
+        """Steps that count towards the next look for better zones; 0: zones never change."""
+        return 0 if self._recutter is None else self._recutter.steps
 
     def refuse_changes(self, what: str) -> None:
         """Raise ConfigError if zones may change while the worlds run."""

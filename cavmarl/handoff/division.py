@@ -207,6 +207,7 @@ class Division:
         vehicles: Sequence[Sequence[NDArray[np.void]]],  # VEHICLE (n,) of each world and zone
         contacts: NDArray[np.int64],  # (W,) as `contacts` counts them
         home: int,  # the zone whose contacts these are from now on
+        keeps_epochs: bool = False,  # vehicles have changed their owner as often as their rows say
     ) -> None:
         """Give every zone the vehicles that it owned; ghosts are to be renewed."""
         self._zoned.step_at[...] = 0
@@ -218,7 +219,9 @@ class Division:
             for shard, rows in zip(self._shards, zones, strict=True):
                 worlds = shard.worlds
                 worlds.rows[w, : len(rows)] = rows
-                worlds.rows["epoch"][w, : len(rows)] = 0
+                if not keeps_epochs:
+                    worlds.rows["epoch"][w, : len(rows)] = 0
+                worlds.rows["owner"][w, : len(rows)] = shard.zone
                 worlds.num_owned[w] = worlds.num_rows[w] = len(rows)
         self._exchange(self._first_side, 0, self.num_worlds)
 

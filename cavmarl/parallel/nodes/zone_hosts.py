@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import MessageError, ProtocolError
 from cavmarl.core.records.arrays import Gate
-from cavmarl.handoff.coordinator.coordinator import Coordinator
+from cavmarl.handoff.coordinator.local_coordinator import LocalCoordinator
+from cavmarl.handoff.coordinator.saved_ownership import SavedOwnership
 from cavmarl.handoff.division import Division
 from cavmarl.handoff.kernels.invariant_checks import owned_sum
 from cavmarl.handoff.zone_view import TransferInFlight
@@ -56,7 +57,7 @@ NOTHING = Report([], [], False, [])
 class ZoneHosts:
     """Those of one node, of W worlds."""
 
-    coordinators: tuple[Coordinator, ...] = ()  # they are in another process
+    coordinators: tuple[LocalCoordinator, ...] = ()  # they are in another process
     needs_ghosts = True
 
     def __init__(
@@ -178,6 +179,13 @@ class ZoneHosts:
             self._gone[w] = {}
             self._targets[w] = {}
             self._stirred[w] = True
+
+    def save(self, w: int) -> None:
+        """The coordinator, in another process, knows the owners."""
+
+    def go_on(self, saved: Sequence[SavedOwnership] | None) -> None:
+        """Ownership begins anew, with the vehicles where they are."""
+        self.reset(np.ones(len(self._stirred), dtype=np.bool_))
 
     def in_flight(self, w: int) -> list[TransferInFlight]:
         return [
