@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import socket
-import zlib
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 
 import numpy as np
 import pytest
+from xxhash import xxh3_64_intdigest
 
 from cavmarl.core.errors import MessageError
 from cavmarl.ownership.decisions import Neighbours
@@ -42,14 +42,15 @@ def frame(kind: FrameKind, data: bytes | memoryview) -> bytes:
 
 def head(kind: int, size: int) -> bytes:
     """The head of a first frame."""
-    found = b"cavN\x06\x00" + kind.to_bytes(2, "little") + bytes(8) + size.to_bytes(8, "little")
-    found += bytes(4)
-    return found + zlib.crc32(found, 1).to_bytes(4, "little")
+    found = b"cavN\x07\x00" + kind.to_bytes(2, "little") + bytes(8) + size.to_bytes(8, "little")
+    found += bytes(8)
+    return found + xxh3_64_intdigest(found, 1).to_bytes(8, "little")
 
 
 def test_the_bytes_of_a_frame() -> None:
     assert frame(FrameKind.PING, b"abc").hex() == (
-        "6361764e06000d0007000000000000000300000000000000c2412435" + "72a90954" + b"abc".hex()
+        "6361764e07000d000700000000000000" + "0300000000000000" + "50392f89945faf78"
+        "30bc61f204c45035" + b"abc".hex()
     )
 
 
@@ -58,7 +59,7 @@ def test_the_bytes_of_a_frame() -> None:
     [
         (b"GET / HTTP/1.1\r\n" * 9, "begins no frame"),
         (head(FrameKind.PING, MAX_FRAME + 1), "is none"),
-        (b"cavN\x09\x00" + bytes(26), "version 9"),
+        (b"cavN\x09\x00" + bytes(34), "version 9"),
         (head(255, 0), "kind 255"),
         (frame(FrameKind.PING, b"abc")[:-1] + b"d", "not what was sent"),
         (2 * frame(FrameKind.SYNC, b"abc"), "not the next one"),

@@ -111,7 +111,7 @@ def test_nodes_that_do_not_heed_an_order_to_go_back(monkeypatch: pytest.MonkeyPa
 
 def test_frames_whose_head_is_not_guarded(monkeypatch: pytest.MonkeyPatch) -> None:
     """The campaign finds it: a damaged frame is taken for another one."""
-    monkeypatch.setattr("cavmarl.parallel.nodes.link.crc32", lambda data, first=0: 0)
+    monkeypatch.setattr("cavmarl.parallel.nodes.link.xxh3_64_intdigest", lambda data, seed=0: 0)
     found = verify_simulated_nodes("merge", [3], mixes=["damage"], seeds=3, **SMALL)
     assert not found.holds
 

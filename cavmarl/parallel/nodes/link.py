@@ -6,8 +6,9 @@ connection has ended. Nothing in a frame is ever run.
     head    magic, version, kind, number, bytes of what follows, checksum of what follows,
             checksum of the head
 
-The head's checksum begins with how many frames went before on that connection, so that one that
-comes twice or out of turn is no frame. It is compared before anything else of the frame is awaited.
+Checksums are XXH3 of 64 bits; they guard against accidents alone. The seed of the head's is how
+many frames went before on that connection, so that one that comes twice or out of turn is no frame.
+It is compared before anything else of the frame is awaited.
 """
 
 from __future__ import annotations
@@ -21,22 +22,21 @@ from contextlib import suppress
 from enum import IntEnum
 from itertools import islice
 from typing import Any, NamedTuple, TypeAlias
-from zlib import crc32
 
 import numpy as np
+from xxhash import xxh3_64_intdigest
 
 from cavmarl.core.errors import MessageError, NodeRefusedError
-from cavmarl.core.math.checksums import checksum
 
 MAGIC = b"cavN"
-VERSION = 6
+VERSION = 7
 MAX_FRAME = 1 << 32
-_ALL = (1 << 32) - 1
+_ALL = (1 << 64) - 1
 BEGIN = MAGIC + VERSION.to_bytes(2, "little")
-_HEAD = struct.Struct("<6sHQQI")
+_HEAD = struct.Struct("<6sHQQQ")
 SUMMED = _HEAD.size  # bytes of a head that its checksum is of
-_SUM = struct.Struct("<I")
-_WHOLE_HEAD = struct.Struct("<6sHQQII")
+_SUM = struct.Struct("<Q")
+_WHOLE_HEAD = struct.Struct("<6sHQQQQ")
 HEAD_BYTES = _WHOLE_HEAD.size
 MOST = 512  # frames that the system is given at once
 ROOM = 1 << 14  # bytes that are read at once where it is not known what comes
@@ -142,8 +142,8 @@ class Link:
         """
         data = _joined(pieces)
         self._num_sent = num_sent = self._num_sent + 1 & _ALL
-        head = _HEAD.pack(BEGIN, kind, number, len(data), checksum(data))
-        head += _SUM.pack(crc32(head, num_sent))
+        head = _HEAD.pack(BEGIN, kind, number, len(data), xxh3_64_intdigest(data))
+        head += _SUM.pack(xxh3_64_intdigest(head, num_sent))
         size, sent = HEAD_BYTES + len(data), 0
         if not self.waiting:
             try:
@@ -197,7 +197,7 @@ class Link:
         while filled - at >= HEAD_BYTES:
             begin, code, which, size, summed, own = _WHOLE_HEAD.unpack_from(room, at)
             self._num_heard = heard = self._num_heard + 1 & _ALL
-            is_next = crc32(room[at : at + SUMMED], heard) == own
+            is_next = xxh3_64_intdigest(room[at : at + SUMMED], heard) == own
             if begin != BEGIN or not is_next or code not in _KINDS or size > MAX_FRAME:
                 raise _stranger(begin, is_next, code, size)
             at += HEAD_BYTES
@@ -226,7 +226,7 @@ class Link:
         number: int,
     ) -> None:
         """Take a frame that has come whole."""
-        if checksum(frame.data) != summed:
+        if xxh3_64_intdigest(frame.data) != summed:
             raise MessageError("a frame is not what was sent")
         kind = frame.kind
         if kind not in _AT_ONCE:
