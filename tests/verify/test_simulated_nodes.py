@@ -15,9 +15,10 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import World, make_world
 from cavmarl.handoff.division import Division
 from cavmarl.ownership.messages import COORDINATOR
+from cavmarl.parallel.network.transport import Bytes
 from cavmarl.parallel.nodes import links as links_module
 from cavmarl.parallel.nodes.agent_stream import AgentStream
-from cavmarl.parallel.nodes.link import Bytes, FrameKind
+from cavmarl.parallel.nodes.link import FrameKind
 from cavmarl.parallel.nodes.links import Links
 from cavmarl.parallel.nodes.node_system import NodeSystem
 from cavmarl.parallel.nodes.row_stream import RowStream
@@ -44,7 +45,7 @@ def exchange(
 
     def node(system: NodeSystem) -> None:
         links = Links(lambda number, frame: None, system)
-        links.add(COORDINATOR, system.call(listener.place, bytes(32), 0, None))
+        links.add(COORDINATOR, system.open(listener.place, bytes(32), 0, None))
         for n in range(5):
             links.send(COORDINATOR, FrameKind.SHARE, n)
             links.take([COORDINATOR])

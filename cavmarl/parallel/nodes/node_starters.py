@@ -13,10 +13,10 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.core.huge_pages import huge_heap
 from cavmarl.core.processes import start_python
 from cavmarl.parallel.hosts.host_registry import Launcher
-from cavmarl.parallel.hosts.listener import Listener
 from cavmarl.parallel.hosts.ray_actors import RayActors
+from cavmarl.parallel.network.tcp_transport import TcpListener
+from cavmarl.parallel.network.transport import Place, TransportListener
 from cavmarl.parallel.nodes.node_process import run_on_ray
-from cavmarl.parallel.nodes.node_system import NodeListener
 from cavmarl.parallel.processes.watchdog import is_stopped
 
 NODE = "cavmarl.parallel.nodes.local_node"  # the program of a node
@@ -26,10 +26,10 @@ MIN_KEY = 32  # characters of a key file
 END_S = 5.0  # for nodes to end by themselves
 
 
-Route: TypeAlias = Callable[[tuple[str, int]], tuple[str, int]]
+Route: TypeAlias = Callable[[Place], Place]
 
 
-def straight(place: tuple[str, int]) -> tuple[str, int]:
+def straight(place: Place) -> Place:
     """Where to call in order to reach a place: there."""
     return place
 
@@ -62,8 +62,8 @@ class LocalNodes:
     def __init__(
         self,
         nodes: int,
-        listener: Listener,
-        place: tuple[str, int],
+        listener: TcpListener,
+        place: Place,
         max_retries: int,  # of nodes that are killed or stopped before they have begun
     ) -> None:
         self._listener, self._place = listener, place
@@ -139,7 +139,7 @@ class RayNodes:
     def __init__(
         self,
         actors: Launcher,
-        listener: Listener,
+        listener: TcpListener,
         max_retries: int,  # of nodes that are lost while they are given their zones
     ) -> None:
         self._actors = actors
@@ -190,7 +190,7 @@ class JoinedNodes:
 
 
 Start: TypeAlias = Callable[
-    [str, int, WorkersConfig, Path, Route], tuple[NodeStarter, NodeListener]
+    [str, int, WorkersConfig, Path, Route], tuple[NodeStarter, TransportListener]
 ]
 """Begins to start nodes; arguments as of `start_nodes`."""
 
@@ -201,7 +201,7 @@ def start_nodes(
     settings: WorkersConfig,
     base_dir: Path,  # the folder that a relative key file starts from
     route: Route,  # for nodes of this machine
-) -> tuple[NodeStarter, NodeListener]:
+) -> tuple[NodeStarter, TransportListener]:
     """Begin to start nodes; they call the listener.
 
     Raises:
@@ -210,11 +210,11 @@ def start_nodes(
         WorkerError: the port cannot be listened on, or nodes cannot be started.
     """
     if hosts == "":
-        listener = Listener(LOCAL)
+        listener = TcpListener(LOCAL)
         return LocalNodes(nodes, listener, route(listener.place), settings.max_retries), listener
     if hosts == RAY:
         actors = RayActors(run_on_ray, lambda workers: "", nodes, nodes)
-        listener = Listener(actors.address)
+        listener = TcpListener(actors.address)
         return RayNodes(actors, listener, settings.max_retries), listener
     host, port = place_of(hosts)
     if not settings.key_file:
@@ -222,10 +222,10 @@ def start_nodes(
             f"hosts = {hosts!r} without workers.key_file: name the file with the key that nodes "
             "have to know"
         )
-    return JoinedNodes(), Listener(host, read_key(base_dir / settings.key_file), port)
+    return JoinedNodes(), TcpListener(host, read_key(base_dir / settings.key_file), port)
 
 
-def place_of(text: str) -> tuple[str, int]:
+def place_of(text: str) -> Place:
     """HOST:PORT, read. Raises ConfigError: it is none."""
     host, colon, port = text.rpartition(":")
     if not (host and colon and port.isascii() and port.isdigit() and 0 < int(port) < 1 << 16):
