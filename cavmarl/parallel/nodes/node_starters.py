@@ -9,14 +9,16 @@ from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
 from cavmarl.config.workers import WorkersConfig
-from cavmarl.core.errors import ConfigError
+from cavmarl.core.errors import ConfigError, WorkerDeathError
 from cavmarl.core.huge_pages import huge_heap
 from cavmarl.core.processes import start_python
 from cavmarl.parallel.hosts.host_registry import Launcher
 from cavmarl.parallel.hosts.ray_actors import RayActors
+from cavmarl.parallel.network.mpi_transport import MPI, mpi_transport
 from cavmarl.parallel.network.tcp_transport import TcpListener
 from cavmarl.parallel.network.transport import Place, TransportListener
 from cavmarl.parallel.nodes.node_process import run_on_ray
+from cavmarl.parallel.nodes.node_system import MACHINE, Machine, NodeSystem
 from cavmarl.parallel.processes.watchdog import is_stopped
 
 NODE = "cavmarl.parallel.nodes.local_node"  # the program of a node
@@ -169,6 +171,38 @@ class RayNodes:
         self._actors.close()
 
 
+class MpiNodes:
+    """The other ranks of an MPI run, which has no failover.
+
+    Raises:
+        ConfigError: this process is not rank 0, or there are too few others.
+    """
+
+    def __init__(self, nodes: int) -> None:
+        mpi_transport().check_caller(nodes)
+
+    def trouble(self) -> str | None:
+        return None
+
+    def retry(self, number: int, pid: int, is_silent: bool) -> str | None:
+        mpi_transport().is_broken = True
+        return f"rank {number + 1} was lost before it had begun: MPI has no failover"
+
+    def replace(self, number: int, is_silent: bool) -> None:
+        """Raises WorkerDeathError: none takes the place of a lost rank."""
+        mpi_transport().is_broken = True
+        cause = "it says nothing" if is_silent else "its connection has ended"
+        raise WorkerDeathError(
+            number, f"rank {number + 1} of MPI, which has no failover", 0, "step", [cause]
+        )
+
+    def stopped(self) -> set[int]:
+        return set()  # they may be on other machines
+
+    def close(self) -> None:
+        """They end with the connection."""
+
+
 class JoinedNodes:
     """Nodes that are started by hand: `cavmarl node --join`."""
 
@@ -196,7 +230,8 @@ Start: TypeAlias = Callable[
 
 
 def start_nodes(
-    hosts: str,  # "": this machine; "ray"; else HOST:PORT, for nodes that are started by hand
+    # "": this machine; "ray"; "mpi"; else HOST:PORT, for nodes that are started by hand
+    hosts: str,
     nodes: int,
     settings: WorkersConfig,
     base_dir: Path,  # the folder that a relative key file starts from
@@ -206,7 +241,7 @@ def start_nodes(
 
     Raises:
         ConfigError: a place or a key file that cannot be.
-        MissingExtraError: Ray is not installed.
+        MissingExtraError: Ray, or mpi4py, is not installed.
         WorkerError: the port cannot be listened on, or nodes cannot be started.
     """
     if hosts == "":
@@ -216,6 +251,8 @@ def start_nodes(
         actors = RayActors(run_on_ray, lambda workers: "", nodes, nodes)
         listener = TcpListener(actors.address)
         return RayNodes(actors, listener, settings.max_retries), listener
+    if hosts == MPI:
+        return MpiNodes(nodes), mpi_transport().listen("", b"")
     host, port = place_of(hosts)
     if not settings.key_file:
         raise ConfigError(
@@ -223,6 +260,11 @@ def start_nodes(
             "have to know"
         )
     return JoinedNodes(), TcpListener(host, read_key(base_dir / settings.key_file), port)
+
+
+def system_of(hosts: str) -> NodeSystem:
+    """The system that such nodes are on; argument as of `start_nodes`."""
+    return Machine(mpi_transport()) if hosts == MPI else MACHINE
 
 
 def place_of(text: str) -> Place:
