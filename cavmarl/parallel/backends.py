@@ -11,7 +11,8 @@ from typing import Protocol
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import World, check_workers
 from cavmarl.parallel.hosts.remote_worlds import RemoteWorlds
-from cavmarl.parallel.nodes.node_starters import place_of
+from cavmarl.parallel.network.mpi_transport import MPI
+from cavmarl.parallel.nodes.node_starters import place_of, system_of
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.parallel.pooled_worlds import PooledWorlds
 from cavmarl.parallel.sensor_workers.sensor_worker_setup import local_worlds
@@ -80,7 +81,9 @@ def _nodes(
     in_next_step: bool,
     hosts: str = "",
 ) -> SteppedWorlds:
-    return NodeWorlds(world, base_dir, num_worlds, int(workers or 1), in_next_step, hosts)
+    return NodeWorlds(
+        world, base_dir, num_worlds, int(workers or 1), in_next_step, hosts, system=system_of(hosts)
+    )
 
 
 _BACKENDS = {
@@ -120,7 +123,7 @@ def places_of(
             f"nodes = {nodes!r} with workers = {workers!r}: nodes are processes of their own; "
             "leave one out"
         )
-    if hosts not in (None, RAY):
+    if hosts not in (None, RAY, MPI):
         place_of(str(hosts))
     if not check_workers(nodes):
         raise ConfigError(f"nodes = {nodes!r}: must be 1 or more; leave it out for this process")

@@ -11,19 +11,25 @@ from __future__ import annotations
 import heapq
 import random
 import select
-import socket
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from itertools import count
-from typing import Any, cast
+from typing import Any
 
 from cavmarl.core.errors import MessageError
 from cavmarl.engine.world_setup import World
 from cavmarl.parallel.journaled_worlds import unwatched
 from cavmarl.parallel.local_worlds import LocalWorlds
+from cavmarl.parallel.network.transport import (
+    Bytes,
+    Connection,
+    Place,
+    TransportListener,
+    TransportPoll,
+)
 from cavmarl.parallel.nodes.leases import late_ticks
-from cavmarl.parallel.nodes.node_system import NodeListener, NodeSystem, Place, Poll
+from cavmarl.parallel.nodes.node_system import NodeSystem
 
 ADDRESS = "node"
 ALIVE_S = 25.0  # until a system ends a connection over which no answer comes
@@ -217,7 +223,7 @@ class SimulatedMachine:
 
 
 class SimulatedSocket:
-    """One end of a connection, with as much of `socket.socket` as `Link` needs.
+    """A `Connection` in memory.
 
     `Link` sends a whole frame with each call of `sendmsg`.
 
@@ -229,7 +235,7 @@ class SimulatedSocket:
         is_mute: whether nothing that is sent arrives, and the sender does not notice.
     """
 
-    family = socket.AF_UNIX  # it has none of TCP's options
+    address, keeps_bytes = ADDRESS, False
 
     def __init__(self, machine: SimulatedMachine, owner: SimulatedProcess) -> None:
         self._machine, self.owner = machine, owner
@@ -246,13 +252,11 @@ class SimulatedSocket:
     def fileno(self) -> int:
         return self._number
 
-    def getsockname(self) -> Place:
-        return ADDRESS, self._number
+    @property
+    def closed(self) -> bool:
+        return self.has_ended and not self.come
 
-    def setblocking(self, flag: bool) -> None:
-        """It never blocks."""
-
-    def sendmsg(self, pieces: list[memoryview]) -> int:
+    def send(self, pieces: Sequence[Bytes]) -> int:
         machine, data = self._machine, b"".join(map(bytes, pieces))
         if self.owner.is_ended:
             raise ProcessEndedError
@@ -309,11 +313,9 @@ class SimulatedSocket:
 
         machine.at(self._last_s - machine.now_s, come)
 
-    def recv_into(self, room: memoryview) -> int:
+    def receive(self, room: memoryview) -> int:
         if not self.come:
-            if self.has_ended:
-                return 0
-            raise BlockingIOError
+            return 0
         chunk = self.come.popleft()
         size = min(len(room), len(chunk))
         room[:size] = chunk[:size]
@@ -348,9 +350,9 @@ class SimulatedListener:
     def is_readable(self) -> bool:
         return bool(self.callers)
 
-    def admit(self) -> list[tuple[int, socket.socket]]:
+    def admit(self) -> list[tuple[int, Connection]]:
         found, self.callers = self.callers, []
-        return [(number, cast("socket.socket", one)) for number, one in found]
+        return [*found]
 
     def close(self) -> None:
         self._machine.listeners.pop(self.place, None)
@@ -395,13 +397,13 @@ class _System:
     def now_s(self) -> float:
         return self._process.clock_s()
 
-    def poll(self) -> Poll:
+    def poll(self) -> TransportPoll:
         return _Poll(self._machine, self._process)
 
-    def listen(self, address: str, secret: bytes) -> NodeListener:
+    def listen(self, address: str, secret: bytes) -> TransportListener:
         return SimulatedListener(self._machine, self._process)
 
-    def call(self, place: Place, secret: bytes, number: int, answer_s: float | None) -> Any:
+    def open(self, place: Place, secret: bytes, number: int, answer_s: float | None) -> Connection:
         machine = self._machine
         listener = machine.listeners.get((str(place[0]), int(place[1])))
         if listener is None or listener.owner.is_ended:

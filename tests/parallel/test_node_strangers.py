@@ -15,6 +15,7 @@ from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.parallel.hosts.framed_socket import VERSION
 from cavmarl.parallel.hosts.host_process import code_stamp
 from cavmarl.parallel.hosts.listener import Listener, call
+from cavmarl.parallel.network.tcp_transport import TcpConnection, TcpListener
 from cavmarl.parallel.nodes import newcomers as newcomers_module
 from cavmarl.parallel.nodes.link import FrameKind
 from cavmarl.parallel.nodes.links import LinkLostError, Links
@@ -27,7 +28,7 @@ class Door:
     """A caller's end, in a thread."""
 
     def __init__(self, key: bytes, address: str = "127.0.0.1", room: int = 1) -> None:
-        self.listener = Listener(address, key)
+        self.listener = TcpListener(address, key)
         self.newcomers = Newcomers(self.listener, {}, [], lambda: room)
         self._is_open = True
         self._thread = threading.Thread(target=self._look)
@@ -120,7 +121,7 @@ def test_who_has_come_in_and_talks_nonsense_is_sent_away() -> None:
     with closing(Door(b"a" * 32)) as door:
         for said in (b"no JSON", b"[]", b"{}"):
             links = Links(lambda number, frame: None)
-            links.add(COORDINATOR, call(door.listener.place, b"a" * 32, ANYONE))
+            links.add(COORDINATOR, TcpConnection(call(door.listener.place, b"a" * 32, ANYONE)))
             links.send(COORDINATOR, FrameKind.JOIN, 0, [said])
             with pytest.raises(LinkLostError):
                 links.take([COORDINATOR], WAIT_S)

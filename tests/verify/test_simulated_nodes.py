@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
-from zlib import crc32
 
 import pytest
 from typer.testing import CliRunner
+from xxhash import xxh3_64_intdigest
 
 from cavmarl.cli import app
 from cavmarl.config.registry import load_config
@@ -16,9 +16,10 @@ from cavmarl.core.errors import ConfigError, WorkerDeathError, WorkerError
 from cavmarl.engine.world_setup import World, make_world
 from cavmarl.handoff.division import Division
 from cavmarl.ownership.messages import COORDINATOR
+from cavmarl.parallel.network.transport import Bytes
 from cavmarl.parallel.nodes import links as links_module
 from cavmarl.parallel.nodes.agent_stream import AgentStream
-from cavmarl.parallel.nodes.link import Bytes, FrameKind
+from cavmarl.parallel.nodes.link import FrameKind
 from cavmarl.parallel.nodes.links import Links
 from cavmarl.parallel.nodes.node_system import NodeSystem
 from cavmarl.parallel.nodes.row_stream import RowStream
@@ -54,7 +55,7 @@ def exchange(
 
     def node(system: NodeSystem) -> None:
         links = Links(lambda number, frame: None, system)
-        links.add(COORDINATOR, system.call(listener.place, bytes(32), 0, None))
+        links.add(COORDINATOR, system.open(listener.place, bytes(32), 0, None))
         for n in range(5):
             links.send(COORDINATOR, FrameKind.SHARE, n)
             links.take([COORDINATOR])
@@ -195,14 +196,17 @@ def test_nodes_that_do_not_heed_an_order_to_go_back(monkeypatch: pytest.MonkeyPa
 
 def test_frames_whose_head_is_not_guarded(monkeypatch: pytest.MonkeyPatch) -> None:
     """The campaign finds it: a damaged frame is taken for another one."""
-    monkeypatch.setattr("cavmarl.parallel.nodes.link.crc32", lambda data, first=0: 0)
+    monkeypatch.setattr("cavmarl.parallel.nodes.link.xxh3_64_intdigest", lambda data, seed=0: 0)
     assert one_line("damage", seeds=12).wrong
 
 
 @pytest.mark.parametrize("mix", ["lose", "duplicate", "reorder"])
 def test_frames_that_are_not_counted(monkeypatch: pytest.MonkeyPatch, mix: str) -> None:
     """The campaign finds it: a frame is missing, comes twice or comes out of turn."""
-    monkeypatch.setattr("cavmarl.parallel.nodes.link.crc32", lambda data, first=0: crc32(data))
+    monkeypatch.setattr(
+        "cavmarl.parallel.nodes.link.xxh3_64_intdigest",
+        lambda data, seed=0: xxh3_64_intdigest(data),
+    )
     assert one_line(mix, seeds=8).wrong
 
 
@@ -218,10 +222,10 @@ def test_a_state_that_is_not_gone_back_to(monkeypatch: pytest.MonkeyPatch) -> No
 
 def silenced(monkeypatch: pytest.MonkeyPatch, kind: FrameKind, nth: int) -> list[int]:
     """Let a connection between two nodes carry nothing more from the nth frame of a kind on."""
-    send = SimulatedSocket.sendmsg
+    send = SimulatedSocket.send
     seen: list[int] = []
 
-    def sendmsg(self: SimulatedSocket, pieces: list[memoryview]) -> int:
+    def send_or_fall_silent(self: SimulatedSocket, pieces: Sequence[Bytes]) -> int:
         if kind_of(b"".join(map(bytes, pieces))) is kind and self.other is not None:
             if "caller" not in (self.owner.name, self.other.owner.name):
                 seen.append(self.fileno())
@@ -229,7 +233,7 @@ def silenced(monkeypatch: pytest.MonkeyPatch, kind: FrameKind, nth: int) -> list
                     self.fall_silent()
         return send(self, pieces)
 
-    monkeypatch.setattr(SimulatedSocket, "sendmsg", sendmsg)
+    monkeypatch.setattr(SimulatedSocket, "send", send_or_fall_silent)
     return seen
 
 

@@ -20,7 +20,7 @@ from cavmarl.core.errors import MessageError
 from cavmarl.parallel.hosts.framed_socket import Frame, FramedSocket, Kind
 from cavmarl.parallel.hosts.listener import knock
 from cavmarl.parallel.processes.shared_memory import Segment
-from cavmarl.parallel.processes.state_image import Image, load_kernels
+from cavmarl.parallel.processes.state_image import Image
 from cavmarl.parallel.processes.worker_loop import NOTHING, OUT_OF_MEMORY, describe
 
 Array = NDArray[Any]
@@ -103,7 +103,6 @@ def serve(
     with suppress(EOFError, OSError, MessageError):  # the caller is gone, or wants us no more
         try:
             job = make_job()
-            load_kernels()
         except Exception as error:
             line.reply(Kind.FAILED, describe(error))
         else:

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import WorkerError
 from cavmarl.parallel.checkpoint.world_bytes import from_bytes, to_bytes
 from cavmarl.parallel.local_worlds import LocalWorlds
-from cavmarl.parallel.nodes.link import Bytes, FrameKind, NodeFrame
+from cavmarl.parallel.network.transport import Bytes
+from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
 from cavmarl.parallel.nodes.links import Links
 
 Array = NDArray[Any]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import select
-import socket
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
@@ -11,7 +9,8 @@ from typing import TypeAlias
 
 from cavmarl.core.errors import MessageError
 from cavmarl.ownership.messages import COORDINATOR
-from cavmarl.parallel.nodes.link import Bytes, FrameKind, Link, NodeFrame
+from cavmarl.parallel.network.transport import READS, READS_AND_WRITES, Bytes, Connection
+from cavmarl.parallel.nodes.link import FrameKind, Link, NodeFrame
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 
 LOST = (EOFError, OSError, MessageError)  # what ends a connection
@@ -58,18 +57,18 @@ class Links:
         self._looks = system.looks
         self._links: dict[int, Link] = {}
         self._poll = system.poll()
-        self._by_socket: dict[int, tuple[int, Link]] = {}
+        self._by_place: dict[int, tuple[int, Link]] = {}  # as the poll tells of them
         self._heard: deque[tuple[int, NodeFrame]] = deque()  # urgent frames, and their senders
         self.wanted: Collection[int] = ()  # whose frames this process waits for
         self.waited_s = 0.0
         self.sent_bytes = 0
         self.sent_frames = 0
 
-    def add(self, number: int, connection: socket.socket | Link) -> None:
+    def add(self, number: int, connection: Connection | Link) -> None:
         link = connection if isinstance(connection, Link) else Link(connection)
         self._links[number] = link
-        self._by_socket[link.socket.fileno()] = number, link
-        self._poll.register(link.socket, select.POLLIN)
+        self._by_place[link.connection.fileno()] = number, link
+        self._poll.register(link.connection, READS)
 
     @property
     def numbers(self) -> tuple[int, ...]:
@@ -96,7 +95,7 @@ class Links:
             raise self._lost(to, error) from error
         self.sent_frames += 1
         if link.waiting:
-            self._poll.modify(link.socket, select.POLLIN | select.POLLOUT)
+            self._poll.modify(link.connection, READS_AND_WRITES)
 
     def take(
         self,
@@ -196,13 +195,13 @@ class Links:
         else:
             ready = poll(timeout_ms)
         self.waited_s += self.now_s() - began_s
-        for socket_number, _ in ready:
-            number, link = self._by_socket[socket_number]
+        for place, _ in ready:
+            number, link = self._by_place[place]
             try:
                 if link.waiting:
                     link.go_on_sending()
                     if not link.waiting:
-                        self._poll.modify(link.socket, select.POLLIN)
+                        self._poll.modify(link.connection, READS)
                 link.receive(self._heard, number)
             except LOST as error:
                 self._tell()
@@ -231,12 +230,12 @@ class Links:
     def drop(self, number: int) -> None:
         """End a connection, if there is one."""
         if number in self._links:
-            self._forget(number).socket.close()
+            self._forget(number).connection.close()
 
     def _forget(self, number: int) -> Link:
         link = self._links.pop(number)
-        self._poll.unregister(link.socket)
-        del self._by_socket[link.socket.fileno()]
+        self._poll.unregister(link.connection)
+        del self._by_place[link.connection.fileno()]
         return link
 
     def end(self, timeout_s: float) -> None:

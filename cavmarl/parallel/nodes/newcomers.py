@@ -13,11 +13,12 @@ from cavmarl.core.errors import WorkerError, WorkerFailureError
 from cavmarl.ownership.decisions import Neighbours
 from cavmarl.parallel.commanded_worlds import own_error
 from cavmarl.parallel.hosts.host_process import code_stamp
+from cavmarl.parallel.network.transport import Place, TransportListener
 from cavmarl.parallel.nodes.link import FrameKind, Link, NodeFrame
 from cavmarl.parallel.nodes.links import LinkLostError, Links
 from cavmarl.parallel.nodes.node_cuts import read_neighbours
 from cavmarl.parallel.nodes.node_files import WorldFile
-from cavmarl.parallel.nodes.node_system import MACHINE, NodeListener, NodeSystem
+from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
 
 log = logging.getLogger("cavmarl.nodes")
 
@@ -33,7 +34,7 @@ class Newcomer:
     machine: str = "a machine"
     pid: int = 0  # of its process, there
     is_let_in: bool = False  # it runs what the caller runs
-    place: tuple[str, int] | None = None  # where other nodes can call, once it has loaded the world
+    place: Place | None = None  # where other nodes can call, once it has loaded the world
     neighbours: Neighbours | None = None  # between which zones vehicles change, by that world
 
 
@@ -49,7 +50,7 @@ class Newcomers:
 
     def __init__(
         self,
-        listener: NodeListener,
+        listener: TransportListener,
         job: Any,  # what they are told, as JSON knows it
         files: Sequence[WorldFile],  # that the world is made of
         room: Callable[[], int],  # how many more would be of use

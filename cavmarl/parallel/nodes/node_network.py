@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError, MessageError
 from cavmarl.ownership.messages import COORDINATOR
-from cavmarl.parallel.nodes.link import Bytes, FrameKind, NodeFrame
+from cavmarl.parallel.network.transport import Bytes
+from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
 from cavmarl.parallel.nodes.links import Links
 from cavmarl.v2x.bus import Bus
 from cavmarl.v2x.kernels.v2x_records import PACKET, RECEIVER

@@ -21,8 +21,9 @@ from cavmarl.core.records.codes import (
     POS_LAST,
 )
 from cavmarl.engine.simulation import Simulation
+from cavmarl.parallel.network.transport import Bytes
 from cavmarl.parallel.nodes.agent_stream import AgentStream
-from cavmarl.parallel.nodes.link import Bytes, FrameKind, NodeFrame
+from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
 from cavmarl.parallel.nodes.links import LinkLostError, Links, RecoveryOrderedError
 from cavmarl.parallel.nodes.row_stream import RowStream, forecast_of, passing_of
 from cavmarl.zones.kernels.agent_frames import UNOWNED

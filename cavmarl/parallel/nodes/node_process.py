@@ -19,9 +19,10 @@ from cavmarl.engine.shard_clock import ShardClock
 from cavmarl.handoff.shard_setup import limits_of
 from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.parallel.hosts.host_process import code_stamp
+from cavmarl.parallel.network.transport import Bytes, Place
 from cavmarl.parallel.nodes.agent_stream import ResultStream
 from cavmarl.parallel.nodes.kept_states import KeptStates
-from cavmarl.parallel.nodes.link import Bytes, FrameKind, NeededNoMoreError, NodeFrame
+from cavmarl.parallel.nodes.link import FrameKind, NeededNoMoreError, NodeFrame
 from cavmarl.parallel.nodes.links import LinkLostError, Links, RecoveryOrderedError
 from cavmarl.parallel.nodes.meeting import call_node, calls_of
 from cavmarl.parallel.nodes.node_actions import ActionsTaken, refusal
@@ -241,7 +242,7 @@ class NodeProgram:
             self._kept.load(state, adopted, donors, takers, mine, self._generation, self._check)
         self._hosts.report()
 
-    def _meet(self, places: Mapping[int, tuple[str, int]], others: Sequence[int]) -> None:
+    def _meet(self, places: Mapping[int, Place], others: Sequence[int]) -> None:
         """Connect with new nodes, by their places; of two of them the higher one calls.
 
         Raises:
@@ -388,7 +389,7 @@ def _ignore(number: int, frame: NodeFrame) -> None:
 
 
 def run_node(
-    place: tuple[str, int],  # where the caller listens
+    place: Place,  # where the caller listens
     secret: bytes,
     number: int,  # that it would have; ANYONE: any
     note: Callable[[str], None] = lambda text: None,  # what is told of its life
@@ -405,8 +406,8 @@ def run_node(
         MessageError: what listens there does not know the secret, or speaks another version.
         NodeRefusedError: the caller does not want it.
     """
-    connection = system.call(place, secret, number, None)
-    address = str(connection.getsockname()[0])
+    connection = system.open(place, secret, number, None)
+    address = connection.address
     links = Links(_ignore, system)
     links.add(COORDINATOR, connection)
     node = NodeProgram(system, links, address, secret)
@@ -437,7 +438,7 @@ def run_node(
         links.close()
 
 
-def run_on_ray(recipe: str, place: tuple[str, int], secret: bytes, number: int) -> None:
+def run_on_ray(recipe: str, place: Place, secret: bytes, number: int) -> None:
     """The same as an actor, which Ray starts again if it ends before it is needed no more."""
     if not run_node(place, secret, number):
         os._exit(1)

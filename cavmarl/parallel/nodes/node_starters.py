@@ -9,14 +9,16 @@ from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
 from cavmarl.config.workers import WorkersConfig
-from cavmarl.core.errors import ConfigError
+from cavmarl.core.errors import ConfigError, WorkerDeathError
 from cavmarl.core.huge_pages import huge_heap
 from cavmarl.core.processes import start_python
 from cavmarl.parallel.hosts.host_registry import Launcher
-from cavmarl.parallel.hosts.listener import Listener
 from cavmarl.parallel.hosts.ray_actors import RayActors
+from cavmarl.parallel.network.mpi_transport import MPI, mpi_transport
+from cavmarl.parallel.network.tcp_transport import TcpListener
+from cavmarl.parallel.network.transport import Place, TransportListener
 from cavmarl.parallel.nodes.node_process import run_on_ray
-from cavmarl.parallel.nodes.node_system import NodeListener
+from cavmarl.parallel.nodes.node_system import MACHINE, Machine, NodeSystem
 from cavmarl.parallel.processes.watchdog import is_stopped
 
 NODE = "cavmarl.parallel.nodes.local_node"  # the program of a node
@@ -26,10 +28,10 @@ MIN_KEY = 32  # characters of a key file
 END_S = 5.0  # for nodes to end by themselves
 
 
-Route: TypeAlias = Callable[[tuple[str, int]], tuple[str, int]]
+Route: TypeAlias = Callable[[Place], Place]
 
 
-def straight(place: tuple[str, int]) -> tuple[str, int]:
+def straight(place: Place) -> Place:
     """Where to call in order to reach a place: there."""
     return place
 
@@ -62,8 +64,8 @@ class LocalNodes:
     def __init__(
         self,
         nodes: int,
-        listener: Listener,
-        place: tuple[str, int],
+        listener: TcpListener,
+        place: Place,
         max_retries: int,  # of nodes that are killed or stopped before they have begun
     ) -> None:
         self._listener, self._place = listener, place
@@ -139,7 +141,7 @@ class RayNodes:
     def __init__(
         self,
         actors: Launcher,
-        listener: Listener,
+        listener: TcpListener,
         max_retries: int,  # of nodes that are lost while they are given their zones
     ) -> None:
         self._actors = actors
@@ -169,6 +171,38 @@ class RayNodes:
         self._actors.close()
 
 
+class MpiNodes:
+    """The other ranks of an MPI run, which has no failover.
+
+    Raises:
+        ConfigError: this process is not rank 0, or there are too few others.
+    """
+
+    def __init__(self, nodes: int) -> None:
+        mpi_transport().check_caller(nodes)
+
+    def trouble(self) -> str | None:
+        return None
+
+    def retry(self, number: int, pid: int, is_silent: bool) -> str | None:
+        mpi_transport().is_broken = True
+        return f"rank {number + 1} was lost before it had begun: MPI has no failover"
+
+    def replace(self, number: int, is_silent: bool) -> None:
+        """Raises WorkerDeathError: none takes the place of a lost rank."""
+        mpi_transport().is_broken = True
+        cause = "it says nothing" if is_silent else "its connection has ended"
+        raise WorkerDeathError(
+            number, f"rank {number + 1} of MPI, which has no failover", 0, "step", [cause]
+        )
+
+    def stopped(self) -> set[int]:
+        return set()  # they may be on other machines
+
+    def close(self) -> None:
+        """They end with the connection."""
+
+
 class JoinedNodes:
     """Nodes that are started by hand: `cavmarl node --join`."""
 
@@ -190,42 +224,50 @@ class JoinedNodes:
 
 
 Start: TypeAlias = Callable[
-    [str, int, WorkersConfig, Path, Route], tuple[NodeStarter, NodeListener]
+    [str, int, WorkersConfig, Path, Route], tuple[NodeStarter, TransportListener]
 ]
 """Begins to start nodes; arguments as of `start_nodes`."""
 
 
 def start_nodes(
-    hosts: str,  # "": this machine; "ray"; else HOST:PORT, for nodes that are started by hand
+    # "": this machine; "ray"; "mpi"; else HOST:PORT, for nodes that are started by hand
+    hosts: str,
     nodes: int,
     settings: WorkersConfig,
     base_dir: Path,  # the folder that a relative key file starts from
     route: Route,  # for nodes of this machine
-) -> tuple[NodeStarter, NodeListener]:
+) -> tuple[NodeStarter, TransportListener]:
     """Begin to start nodes; they call the listener.
 
     Raises:
         ConfigError: a place or a key file that cannot be.
-        MissingExtraError: Ray is not installed.
+        MissingExtraError: Ray, or mpi4py, is not installed.
         WorkerError: the port cannot be listened on, or nodes cannot be started.
     """
     if hosts == "":
-        listener = Listener(LOCAL)
+        listener = TcpListener(LOCAL)
         return LocalNodes(nodes, listener, route(listener.place), settings.max_retries), listener
     if hosts == RAY:
         actors = RayActors(run_on_ray, lambda workers: "", nodes, nodes)
-        listener = Listener(actors.address)
+        listener = TcpListener(actors.address)
         return RayNodes(actors, listener, settings.max_retries), listener
+    if hosts == MPI:
+        return MpiNodes(nodes), mpi_transport().listen("", b"")
     host, port = place_of(hosts)
     if not settings.key_file:
         raise ConfigError(
             f"hosts = {hosts!r} without workers.key_file: name the file with the key that nodes "
             "have to know"
         )
-    return JoinedNodes(), Listener(host, read_key(base_dir / settings.key_file), port)
+    return JoinedNodes(), TcpListener(host, read_key(base_dir / settings.key_file), port)
 
 
-def place_of(text: str) -> tuple[str, int]:
+def system_of(hosts: str) -> NodeSystem:
+    """The system that such nodes are on; argument as of `start_nodes`."""
+    return Machine(mpi_transport()) if hosts == MPI else MACHINE
+
+
+def place_of(text: str) -> Place:
     """HOST:PORT, read. Raises ConfigError: it is none."""
     host, colon, port = text.rpartition(":")
     if not (host and colon and port.isascii() and port.isdigit() and 0 < int(port) < 1 << 16):

@@ -16,7 +16,7 @@ from cavmarl.core.errors import MessageError
 from cavmarl.core.huge_pages import huge_zeros
 from cavmarl.core.records.arrays import Gate, RoadArrays, Zoned
 from cavmarl.driving.vehicles import VEHICLE
-from cavmarl.parallel.nodes.link import Bytes
+from cavmarl.parallel.network.transport import Bytes
 from cavmarl.roads.routing import PLAN
 from cavmarl.zones.kernels.ghost_forecast import PLACES, Forecast
 from cavmarl.zones.kernels.row_frames import (

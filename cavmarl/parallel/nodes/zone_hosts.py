@@ -30,7 +30,8 @@ from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import COORDINATOR, Done, Message, Prepare, Removed
 from cavmarl.ownership.offers import Approach
 from cavmarl.ownership.reactions import Advance, Hosting
-from cavmarl.parallel.nodes.link import Bytes, FrameKind, NodeFrame
+from cavmarl.parallel.network.transport import Bytes
+from cavmarl.parallel.nodes.link import FrameKind, NodeFrame
 from cavmarl.parallel.nodes.links import Links, RecoveryOrderedError
 from cavmarl.shards.shard import Commands
 from cavmarl.zones.kernels.zone_lookup import zones_of

@@ -1,0 +1,1 @@
+"""Connections between processes: one interface, over TCP or MPI."""
