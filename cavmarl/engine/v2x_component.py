@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -53,3 +53,6 @@ class Messaging:
     def arrays(self) -> Iterator[NDArray[Any]]:
         """The inboxes, the counts, and what is in flight."""
         return self.bus.arrays()
+
+    def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
+        return self.bus.wrong(saved)
